@@ -1,0 +1,57 @@
+"""Checked, read-only arrays for the frozen data types."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+
+def frozen_array(
+    value: npt.ArrayLike,
+    *,
+    name: str,
+    shape: tuple[int | None, ...],
+    dtype: npt.DTypeLike = np.float64,
+    finite: bool = True,
+) -> npt.NDArray[Any]:
+    """Copy `value` into a read-only array of the given dtype and shape.
+
+    Args:
+        value: Anything numpy accepts.
+        name: The field's name, for the message.
+        shape: Expected shape; None matches any length.
+        dtype: Target dtype.
+        finite: Refuse NaN and infinity.
+
+    Raises:
+        ValueError: The shape differs or a value is not finite.
+    """
+    array = np.array(value, dtype=dtype, copy=True)
+    matches = array.ndim == len(shape) and all(
+        want is None or want == got for want, got in zip(shape, array.shape, strict=True)
+    )
+    if not matches:
+        raise ValueError(f"{name}: shape {array.shape}, expected {shape}")
+    if finite and array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ValueError(f"{name}: holds NaN or infinity")
+    array.flags.writeable = False
+    return array
+
+
+def set_array(
+    owner: object,
+    name: str,
+    shape: tuple[int | None, ...],
+    dtype: npt.DTypeLike = np.float64,
+    *,
+    finite: bool = True,
+) -> None:
+    """Check and freeze the array field `name` of a frozen dataclass in its ``__post_init__``."""
+    value = frozen_array(getattr(owner, name), name=name, shape=shape, dtype=dtype, finite=finite)
+    object.__setattr__(owner, name, value)

@@ -1,0 +1,11 @@
+"""Job files and options."""
+
+from bodycap_batch.config.options import (
+    ExportOptions,
+    KeyframeOptions,
+    MapOptions,
+    MergeOptions,
+    RegistrationOptions,
+)
+
+__all__ = ["ExportOptions", "KeyframeOptions", "MapOptions", "MergeOptions", "RegistrationOptions"]

@@ -1,0 +1,55 @@
+"""The knobs of each stage, typed. A stage's artefact key holds its own options only."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Options(BaseModel):
+    """Base of all option blocks: frozen, unknown keys refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class KeyframeOptions(Options):
+    """Stage 1, keyframe selection."""
+
+    parallax_px: float = Field(60.0, gt=0, description="rotation-free parallax that asks for a keyframe, at 640 px width")
+    min_survival: float = Field(0.4, gt=0, lt=1, description="share of tracks left that asks for a keyframe")
+    max_gap_s: float = Field(1.0, gt=0, description="largest time between two keyframes")
+    min_gap_s: float = Field(0.05, ge=0, description="smallest time between two keyframes")
+
+
+class MapOptions(Options):
+    """Stage 2, the map."""
+
+    features: int = Field(2048, ge=128, description="SIFT features a keyframe")
+    pairs: Literal["exhaustive"] = Field("exhaustive", description="which keyframe pairs are matched")
+    seed: int = Field(0, ge=0, description="seed of every random choice")
+    min_coverage: float = Field(0.1, ge=0, le=1, description="share of keyframes below which the map is refused")
+
+
+class RegistrationOptions(Options):
+    """Stage 3, every frame."""
+
+    rounds: int = Field(3, ge=0, description="how often the map may grow where frames were lost")
+    min_inliers: int = Field(15, ge=4, description="PnP inliers below which a frame is refused")
+    max_sigma_depth: float = Field(0.05, gt=0, description="largest centre sigma as a share of the median depth")
+
+
+class MergeOptions(Options):
+    """Stage 4, the skeleton."""
+
+    fps: float | None = Field(None, gt=0, description="rate of the motion; default the torso camera's")
+    max_gap_s: float = Field(1.0, gt=0, description="longest gap that is filled without a mark")
+
+
+class ExportOptions(Options):
+    """Stage 5, the files."""
+
+    formats: tuple[Literal["ply", "bvh", "tum", "csv", "colmap"], ...] = ("ply", "bvh", "tum", "csv", "colmap")
+    units: Literal["cm", "m"] = Field("cm", description="unit of the BVH")
+    euler_order: Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"] = Field("ZXY", description="rotation channels")
+    hierarchy: Literal["full", "solved"] = Field("full", description="whole humanoid, or solved joints only")
