@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -72,6 +74,7 @@ class Map:
         point_error_px: (P,) mean reprojection error.
         obs_keyframe: (M,) keyframe index of each observation.
         obs_point: (M,) point index of each observation.
+        obs_feature: (M,) feature index of each observation in its keyframe.
         obs_px: (M,2) observed pixel, COLMAP origin, work size.
     """
 
@@ -85,6 +88,7 @@ class Map:
     point_error_px: FloatArray
     obs_keyframe: IntArray
     obs_point: IntArray
+    obs_feature: IntArray
     obs_px: FloatArray
 
     def __post_init__(self) -> None:
@@ -96,6 +100,7 @@ class Map:
         set_array(self, "point_error_px", (points,))
         set_array(self, "obs_keyframe", (observations,), np.int64)
         set_array(self, "obs_point", (observations,), np.int64)
+        set_array(self, "obs_feature", (observations,), np.int64)
         set_array(self, "obs_px", (observations, 2))
 
     def keyframes_of(self, camera: str) -> IntArray:
@@ -152,3 +157,46 @@ class Trajectory:
     def localised(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
         """(N,) True where the frame has a measured pose."""
         return np.array([status.localised for status in self.status], dtype=bool)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapResult:
+    """All that mapping leaves behind.
+
+    Attributes:
+        maps: The models, largest first; each in its own gauge.
+        workspace: Folder with ``database.db`` and ``sparse/<n>``, needed to extend the map.
+        log: JSON-able account: initial pairs tried, models, pairs matched, keyframes left out.
+    """
+
+    maps: tuple[Map, ...]
+    workspace: Path
+    log: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Registration:
+    """One camera's frames solved against the maps, with the observations behind each pose.
+
+    Attributes:
+        trajectory: A pose and a status for every frame.
+        obs_frame: (M,) frame index of each tracked observation.
+        obs_keyframe: (M,) frame index of the keyframe whose observation was tracked.
+        obs_feature: (M,) feature index in that keyframe (identifies the track after the map changed).
+        obs_px: (M,2) float32 tracked pixel, COLMAP origin.
+        wanted_keyframes: (W,) frames that should become keyframes where tracking failed.
+    """
+
+    trajectory: Trajectory
+    obs_frame: IntArray
+    obs_keyframe: IntArray
+    obs_feature: IntArray
+    obs_px: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
+    wanted_keyframes: IntArray
+
+    def __post_init__(self) -> None:
+        count = len(self.obs_px)
+        for name in ("obs_frame", "obs_keyframe", "obs_feature"):
+            set_array(self, name, (count,), np.int64)
+        set_array(self, "obs_px", (count, 2), np.float32)
+        set_array(self, "wanted_keyframes", (None,), np.int64)
