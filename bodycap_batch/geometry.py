@@ -115,9 +115,7 @@ class Similarity:
         return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
 
-def align_points(
-    x_in_source: FloatArray, x_in_target: FloatArray, *, with_scale: bool = True
-) -> Similarity:
+def align_points(x_in_source: FloatArray, x_in_target: FloatArray, *, with_scale: bool = True) -> Similarity:
     """Least-squares similarity (or rigid) transform between matched points (N,3).
 
     Raises:

@@ -16,7 +16,9 @@ class Options(BaseModel):
 class KeyframeOptions(Options):
     """Stage 1, keyframe selection."""
 
-    parallax_px: float = Field(60.0, gt=0, description="rotation-free parallax that asks for a keyframe, at 640 px width")
+    parallax_px: float = Field(
+        60.0, gt=0, description="rotation-free parallax that asks for a keyframe, at 640 px width"
+    )
     min_survival: float = Field(0.4, gt=0, lt=1, description="share of tracks left that asks for a keyframe")
     max_gap_s: float = Field(1.0, gt=0, description="largest time between two keyframes")
     min_gap_s: float = Field(0.05, ge=0, description="smallest time between two keyframes")
@@ -28,7 +30,9 @@ class MapOptions(Options):
     features: int = Field(2048, ge=128, description="SIFT features a keyframe")
     pairs: Literal["exhaustive"] = Field("exhaustive", description="which keyframe pairs are matched")
     seed: int = Field(0, ge=0, description="seed of every random choice")
-    min_coverage: float = Field(0.1, ge=0, le=1, description="share of keyframes below which the map is refused")
+    min_coverage: float = Field(
+        0.1, ge=0, le=1, description="share of keyframes below which the map is refused"
+    )
 
 
 class RegistrationOptions(Options):
@@ -36,7 +40,9 @@ class RegistrationOptions(Options):
 
     rounds: int = Field(3, ge=0, description="how often the map may grow where frames were lost")
     min_inliers: int = Field(15, ge=4, description="PnP inliers below which a frame is refused")
-    max_sigma_depth: float = Field(0.05, gt=0, description="largest centre sigma as a share of the median depth")
+    max_sigma_depth: float = Field(
+        0.05, gt=0, description="largest centre sigma as a share of the median depth"
+    )
 
 
 class MergeOptions(Options):
@@ -49,7 +55,15 @@ class MergeOptions(Options):
 class ExportOptions(Options):
     """Stage 5, the files."""
 
-    formats: tuple[Literal["ply", "bvh", "tum", "csv", "colmap"], ...] = ("ply", "bvh", "tum", "csv", "colmap")
+    formats: tuple[Literal["ply", "bvh", "tum", "csv", "colmap"], ...] = (
+        "ply",
+        "bvh",
+        "tum",
+        "csv",
+        "colmap",
+    )
     units: Literal["cm", "m"] = Field("cm", description="unit of the BVH")
-    euler_order: Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"] = Field("ZXY", description="rotation channels")
+    euler_order: Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"] = Field(
+        "ZXY", description="rotation channels"
+    )
     hierarchy: Literal["full", "solved"] = Field("full", description="whole humanoid, or solved joints only")
