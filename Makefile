@@ -1,0 +1,81 @@
+# Everything a fresh machine needs: `make job`, `make test`. `make help` lists the rest.
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+
+JOB ?= jobs/cpl_lab.yaml
+ARGS ?=
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
+# More than one test at a time; each of them in one thread.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 8
+LOCK := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --fork-strategy fewest \
+	--generate-hashes --no-emit-index-url --custom-compile-command "make lock" pyproject.toml
+
+.PHONY: help
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@echo "  JOB=FILE.yaml chooses the job (default $(JOB)), ARGS='--out DIR ...' adds flags to it."
+
+.PHONY: setup
+setup: $(VENV)/.project ## make .venv from requirements.lock and install bodycap into it
+
+.PHONY: job
+job: $(VENV)/.project ## run a job: make job JOB=jobs/cpl_lab.yaml
+	$(BIN)/bodycap run $(JOB) $(ARGS)
+
+.PHONY: test
+test: $(VENV)/.dev ## run the fast tests
+	$(PYTEST) $(ARGS)
+
+.PHONY: test-slow
+test-slow: $(VENV)/.dev ## run the slow tests and those on real captures
+	$(PYTEST) --dist loadfile -m "slow or data" --durations=20 $(ARGS)
+
+.PHONY: lint
+lint: $(VENV)/.dev ## check format, lint and types
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy --strict
+
+.PHONY: check
+check: lint test ## lint, types and the fast tests
+
+.PHONY: bench
+bench: $(VENV)/.dev ## measure exactness and speed on the captures (slow)
+	$(BIN)/python -m tests.bench $(ARGS)
+
+.PHONY: test-fresh
+test-fresh: ## run `make job` and `make test` in a new, minimal Debian 12 (root; needs debootstrap)
+	.ci/test-fresh $(ARGS)
+
+.PHONY: lock
+lock: $(VENV)/.dev ## resolve the dependencies anew into the two locks
+	$(LOCK) --group build --output-file requirements.lock
+	$(LOCK) --group build --group dev --constraints requirements.lock --output-file requirements-dev.lock
+
+.PHONY: clean
+clean: ## delete the environment, caches and results
+	rm -rf $(VENV) build dist out .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find bodycap_batch tests examples -name __pycache__ -prune -exec rm -rf {} +
+
+# Stamps: a re-run with nothing changed does nothing. The project itself cannot be part of a hash-checked
+# install, so it follows without dependencies, built by the backend the lock brought.
+$(VENV)/.created: .ci/system-packages
+	.ci/system-packages
+	"$$(.ci/system-packages --python)" -m venv $(VENV)
+	touch $@
+
+$(VENV)/.run: $(VENV)/.created requirements.lock
+	$(PIP) install --quiet --require-hashes -r requirements.lock
+	touch $@
+
+$(VENV)/.project: $(VENV)/.run pyproject.toml
+	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	touch $@
+
+$(VENV)/.dev: $(VENV)/.project requirements-dev.lock
+	$(PIP) install --quiet --require-hashes -r requirements-dev.lock
+	touch $@
