@@ -124,3 +124,30 @@ class Camera:
         return Camera(
             model=self.model, width_px=width_px, height_px=height_px, params=params, refine=self.refine
         )
+
+
+_TWO_FOCAL_TWIN = {
+    "SIMPLE_PINHOLE": ("PINHOLE", 0),
+    "SIMPLE_RADIAL": ("OPENCV", 1),
+    "RADIAL": ("OPENCV", 2),
+    "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", 1),
+    "RADIAL_FISHEYE": ("OPENCV_FISHEYE", 2),
+}
+
+
+def without_single_focal(camera: Camera) -> Camera:
+    """The same lens with a focal length per axis, so that both axes can scale on their own."""
+    if camera.model not in _TWO_FOCAL_TWIN:
+        return camera
+    model, radial = _TWO_FOCAL_TWIN[camera.model]
+    focal, cx, cy, *distortion = camera.params
+    params = np.zeros(_PARAM_COUNT[model])
+    params[:4] = focal, focal, cx, cy
+    params[4 : 4 + radial] = distortion[:radial]
+    return Camera(
+        model=model,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        params=params,
+        refine=camera.refine,
+    )

@@ -1,0 +1,6 @@
+"""The videos of a capture: cameras, timestamps, frame decoding."""
+
+from bodycap_batch.capture.cameras import Capture, CaptureCamera, rolling_shutter_delay_s
+from bodycap_batch.capture.opening import open_camera, open_capture
+
+__all__ = ["Capture", "CaptureCamera", "open_camera", "open_capture", "rolling_shutter_delay_s"]

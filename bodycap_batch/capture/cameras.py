@@ -1,0 +1,170 @@
+"""Cameras of a capture: their frames on the clock, decoded at the work size."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from bodycap_batch.arrays import FloatArray, IntArray, set_array
+from bodycap_batch.camera import Camera
+from bodycap_batch.capture.prefetch import prefetched
+from bodycap_batch.capture.video import VideoFile, turn_upright
+
+if TYPE_CHECKING:
+    from av.video.frame import VideoFrame
+
+Image = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CaptureCamera:
+    """One camera of a capture.
+
+    Attributes:
+        name: Names the camera in every result.
+        chapters: Its video files in order.
+        camera: Intrinsics at the work size, COLMAP's pixel origin.
+        calibrated: False where the intrinsics are a guess that mapping refines.
+        frame_numbers: (N,) numbers of the used frames in the joined video, from 0.
+        times_ns: (N,) their times on the camera's own clock, increasing.
+        nominal_fps: Frame rate the container states.
+        offset_s: Common time = camera time + offset_s.
+        rolling_shutter_s: Time from the first row's exposure to the last's.
+        notes: What opening found worth telling: gaps and overlaps of chapters, dropped frames.
+        videos: Frame index of each chapter.
+    """
+
+    name: str
+    chapters: tuple[Path, ...]
+    camera: Camera
+    calibrated: bool
+    frame_numbers: IntArray
+    times_ns: IntArray
+    nominal_fps: float
+    offset_s: float
+    rolling_shutter_s: float
+    notes: tuple[str, ...] = ()
+    videos: tuple[VideoFile, ...] = field(default=(), repr=False)
+
+    def __post_init__(self) -> None:
+        count = len(self.frame_numbers)
+        set_array(self, "frame_numbers", (count,), np.int64)
+        set_array(self, "times_ns", (count,), np.int64)
+        if count and ((np.diff(self.frame_numbers) <= 0).any() or (np.diff(self.times_ns) <= 0).any()):
+            raise ValueError("frame numbers and times must increase")
+
+    def common_times_ns(self) -> IntArray:
+        """(N,) frame times on the common clock."""
+        return np.asarray(self.times_ns + round(self.offset_s * 1e9), dtype=np.int64)
+
+    def row_times_ns(self, index: int, rows_px: npt.ArrayLike) -> IntArray:
+        """Common times at which pixel rows (M,) of one frame were exposed (rolling shutter)."""
+        delay_ns = rolling_shutter_delay_s(rows_px, self.camera.height_px, self.rolling_shutter_s) * 1e9
+        return np.asarray(self.common_times_ns()[index] + np.round(delay_ns), dtype=np.int64)
+
+    def grey_frames(self, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, Image]]:
+        """Stream grey frames (H,W) uint8 at the work size, decoded ahead in a thread.
+
+        Args:
+            start: First index into `frame_numbers`.
+            stop: One past the last; default all.
+
+        Yields:
+            The index and the image.
+
+        Raises:
+            CaptureError: A frame cannot be decoded.
+        """
+        indices = range(*slice(start, stop).indices(len(self.frame_numbers)))
+        return self.read(np.array(indices, dtype=np.int64))
+
+    def read(self, indices: Sequence[int] | IntArray, *, colour: bool = False) -> Iterator[tuple[int, Image]]:
+        """Decode chosen frames, grey (H,W) or RGB (H,W,3) uint8 at the work size.
+
+        Args:
+            indices: Increasing indices into `frame_numbers`.
+            colour: RGB instead of grey.
+
+        Raises:
+            CaptureError: A frame cannot be decoded.
+            ValueError: The indices do not increase or lie outside.
+        """
+        wanted = np.asarray(indices, dtype=np.int64)
+        if len(wanted) and (
+            wanted[0] < 0 or wanted[-1] >= len(self.frame_numbers) or (np.diff(wanted) <= 0).any()
+        ):
+            raise ValueError("indices must increase and lie inside the video")
+        return prefetched(self._decode(wanted, colour=colour))
+
+    def _decode(self, indices: IntArray, *, colour: bool) -> Generator[tuple[int, Image], None, None]:
+        size = (self.camera.width_px, self.camera.height_px)
+        first = 0
+        for video in self.videos:
+            numbers = self.frame_numbers[indices] - first
+            inside = (numbers >= 0) & (numbers < len(video.pts))
+            mine = indices[inside]
+            for index, (_, frame) in zip(mine, video.decode(numbers[inside]), strict=True):
+                image = _rgb(frame) if colour else _grey(frame)
+                yield int(index), _resized(image, video, size)
+            first += len(video.pts)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Capture:
+    """The cameras of one recording, on one common clock."""
+
+    cameras: tuple[CaptureCamera, ...]
+
+    def camera(self, name: str) -> CaptureCamera:
+        """Find a camera by name (KeyError if there is none)."""
+        for camera in self.cameras:
+            if camera.name == name:
+                return camera
+        raise KeyError(name)
+
+
+def rolling_shutter_delay_s(rows_px: npt.ArrayLike, height_px: int, rolling_shutter_s: float) -> FloatArray:
+    """Exposure of pixel rows relative to the frame's time: (row/height − ½) · rolling_shutter_s."""
+    rows = np.asarray(rows_px, dtype=np.float64)
+    return np.asarray((rows / height_px - 0.5) * rolling_shutter_s)
+
+
+# Formats whose first plane is 8-bit luma and can be taken as it is.
+_LUMA_FORMATS = frozenset(
+    f"{family}{layout}" for family in ("yuv", "yuvj") for layout in ("420p", "422p", "444p", "440p", "411p")
+) | {"nv12", "nv21", "nv16", "gray"}
+_FULL_RANGE = 2
+# Studio range to full range (ITU-R BT.601: black 16, white 235).
+_EXPAND = np.clip(np.round((np.arange(256) - 16.0) * (255.0 / 219.0)), 0, 255).astype(np.uint8)
+
+
+def _grey(frame: VideoFrame) -> Image:
+    """The luma plane (a copy-free view where possible), 0 black to 255 white."""
+    name = frame.format.name
+    if name not in _LUMA_FORMATS:
+        return np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)
+    plane = frame.planes[0]
+    luma = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: frame.height, : frame.width]
+    if name.startswith(("yuvj", "gray")) or frame.color_range == _FULL_RANGE:
+        return luma
+    return _EXPAND[luma]
+
+
+def _rgb(frame: VideoFrame) -> Image:
+    return np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
+
+
+def _resized(image: Image, video: VideoFile, size: tuple[int, int]) -> Image:
+    """Turn upright and shrink to (width, height); an own, contiguous array."""
+    import cv2
+
+    upright = turn_upright(image, video.orientation)
+    if (upright.shape[1], upright.shape[0]) == size:
+        return np.array(upright, order="C")
+    # Averaging over the source pixels keeps edges where they are and aliases least.
+    return np.asarray(cv2.resize(np.ascontiguousarray(upright), size, interpolation=cv2.INTER_AREA))

@@ -1,0 +1,143 @@
+"""Open the videos of a capture: frames on the clock, intrinsics at the work size."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodycap_batch.arrays import BoolArray, IntArray
+from bodycap_batch.camera import Camera, without_single_focal
+from bodycap_batch.capture.cameras import Capture, CaptureCamera
+from bodycap_batch.capture.timeline import join_chapters
+from bodycap_batch.capture.video import VideoFile, index_video
+from bodycap_batch.config.calibration import Calibration
+from bodycap_batch.config.models import CameraConfig, CaptureConfig
+from bodycap_batch.errors import CaptureError
+
+# Widest lens in common use as webcam or phone camera; mapping refines it.
+_GUESSED_FOV_DEG = 70.0
+_FULL_FRAME_MM = 36.0
+# One pixel of 640×480: sizes rounded to even numbers by encoders keep their aspect within this.
+_ASPECT_TOLERANCE = 0.004
+
+
+def open_capture(spec: CaptureConfig) -> Capture:
+    """Index every video of a resolved capture block (demuxed, not decoded).
+
+    Args:
+        spec: The capture block of a job that `load_job` returned.
+
+    Raises:
+        CaptureError: A video, its timestamps or calibration cannot be used, or nothing lies between
+            start_s and end_s.
+    """
+    return Capture(cameras=tuple(open_camera(spec, camera) for camera in spec.cameras))
+
+
+def open_camera(spec: CaptureConfig, config: CameraConfig) -> CaptureCamera:
+    """Index one camera's videos. Raises as `open_capture`."""
+    videos = tuple(index_video(path) for path in config.video)
+    _check_one_format(videos)
+    timeline = join_chapters(videos, config.timestamps)
+    offset_s = config.offset_s or 0.0
+    used = timeline.usable & _inside(timeline.times_ns, offset_s, spec)
+    if not used.any():
+        raise _nothing_left(spec, config, timeline.times_ns, offset_s)
+    calibration = config.calibration if isinstance(config.calibration, Calibration) else None
+    camera = (
+        guessed_camera(videos[0], spec.work_px, config.fov_deg)
+        if calibration is None
+        else work_camera(calibration, videos[0], spec.work_px)
+    )
+    return CaptureCamera(
+        name=config.name,
+        chapters=config.video,
+        camera=camera,
+        calibrated=calibration is not None,
+        frame_numbers=np.flatnonzero(used),
+        times_ns=timeline.times_ns[used],
+        nominal_fps=videos[0].fps,
+        offset_s=offset_s,
+        rolling_shutter_s=config.rolling_shutter_s or 0.0,
+        notes=timeline.notes,
+        videos=videos,
+    )
+
+
+def work_size(shown_size: tuple[int, int], work_px: int) -> tuple[int, int]:
+    """Size frames are worked at: the long side at most `work_px`, never enlarged."""
+    scale = min(1.0, work_px / max(shown_size))
+    width, height = (max(1, round(side * scale)) for side in shown_size)
+    return width, height
+
+
+def work_camera(calibration: Calibration, video: VideoFile, work_px: int) -> Camera:
+    """Scale a calibration to the work size.
+
+    Raises:
+        CaptureError: The calibration is of another aspect than the video.
+    """
+    width, height = video.shown_size
+    if abs(width * calibration.height / (height * calibration.width) - 1.0) > _ASPECT_TOLERANCE:
+        turned = abs(height * calibration.height / (width * calibration.width) - 1.0) <= _ASPECT_TOLERANCE
+        raise CaptureError(
+            f"calibrated at {calibration.width}×{calibration.height}, but the video shows {width}×{height}: "
+            "another aspect",
+            path=video.path,
+            field="calibration",
+            hint="the video is turned against the calibration: calibrate it as a player shows it"
+            if turned
+            else "calibrate in the video mode that was recorded (a crop cannot be guessed), or use `auto`",
+        )
+    camera = calibration.camera()
+    size = work_size((width, height), work_px)
+    if size[0] * camera.height_px != size[1] * camera.width_px:
+        camera = without_single_focal(camera)
+    return camera.scaled(*size)
+
+
+def guessed_camera(video: VideoFile, work_px: int, fov_deg: float | None) -> Camera:
+    """A first guess for mapping to refine: field of view given, from the metadata, or typical."""
+    width, height = work_size(video.shown_size, work_px)
+    long_side = max(width, height)
+    if fov_deg is not None:
+        focal = 0.5 * long_side / np.tan(0.5 * np.radians(fov_deg))
+    elif video.focal_35mm is not None:
+        focal = long_side * video.focal_35mm / _FULL_FRAME_MM
+    else:
+        focal = 0.5 * long_side / np.tan(0.5 * np.radians(_GUESSED_FOV_DEG))
+    params = np.array([focal, 0.5 * width, 0.5 * height, 0.0])
+    return Camera(model="SIMPLE_RADIAL", width_px=width, height_px=height, params=params, refine=True)
+
+
+def _check_one_format(videos: tuple[VideoFile, ...]) -> None:
+    for video in videos[1:]:
+        if video.shown_size != videos[0].shown_size:
+            raise CaptureError(
+                f"this chapter shows {video.shown_size[0]}×{video.shown_size[1]}, the first one "
+                f"{videos[0].shown_size[0]}×{videos[0].shown_size[1]}",
+                path=video.path,
+                hint="chapters of one camera come from one recording; make it a camera of its own",
+            )
+
+
+def _inside(times_ns: IntArray, offset_s: float, spec: CaptureConfig) -> BoolArray:
+    common = times_ns + round(offset_s * 1e9)
+    inside = np.ones(len(common), dtype=bool)
+    if spec.start_s is not None:
+        inside &= common >= round(spec.start_s * 1e9)
+    if spec.end_s is not None:
+        inside &= common <= round(spec.end_s * 1e9)
+    return inside
+
+
+def _nothing_left(
+    spec: CaptureConfig, config: CameraConfig, times_ns: IntArray, offset_s: float
+) -> CaptureError:
+    first, last = times_ns[0] / 1e9 + offset_s, times_ns[-1] / 1e9 + offset_s
+    return CaptureError(
+        f"camera {config.name} has no frame between start_s and end_s: it runs from {first:.2f} s to "
+        f"{last:.2f} s on the common clock",
+        path=config.video[0],
+        field="capture.start_s" if spec.start_s is not None else "capture.end_s",
+        hint="start_s and end_s are on the common clock: camera time + offset_s",
+    )

@@ -1,0 +1,31 @@
+"""Run a generator ahead of its consumer, in one thread with a bounded queue."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Generator
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+Item = TypeVar("Item")
+
+_AHEAD = 4
+
+
+def prefetched(source: Generator[Item, None, None], ahead: int = _AHEAD) -> Generator[Item, None, None]:
+    """Yield what `source` yields while the next `ahead` items are made in a thread.
+
+    Decoding and resizing release the interpreter's lock, so they overlap with the consumer's work.
+    The thread starts with the first item asked for and ends with the generator, also an abandoned
+    one. An error of the source is raised where its item would have come.
+    """
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="decode") as pool:
+        pending = deque(pool.submit(next, source, None) for _ in range(ahead))
+        try:
+            while (item := pending.popleft().result()) is not None:
+                pending.append(pool.submit(next, source, None))
+                yield item
+        finally:
+            for future in pending:
+                future.cancel()
+            pool.submit(source.close).result()

@@ -1,0 +1,159 @@
+"""Times of a camera's frames: container timestamps or sidecars, chapters joined."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from bodycap_batch.arrays import IntArray
+from bodycap_batch.capture.video import VideoFile
+from bodycap_batch.errors import CaptureError
+
+_NS = 1_000_000_000
+_MAX_BYTES = 256 << 20
+# Creation times come in whole seconds, and cameras stamp the start of writing, not of the exposure.
+_CLOCK_RESOLUTION_NS = 2 * _NS
+# About 146 years: keeps sums of times and offsets inside int64.
+_MAX_ABS_NS = 1 << 62
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Timeline:
+    """Frame times of one camera's joined chapters.
+
+    Attributes:
+        times_ns: (N,) the camera's own time of every frame.
+        usable: (N,) False for frames a later chapter repeats.
+        notes: Gaps and overlaps found.
+    """
+
+    times_ns: IntArray
+    usable: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+    notes: tuple[str, ...]
+
+
+def read_timestamps(path: Path) -> IntArray:
+    """Read a sidecar: seconds, one line a frame; empty lines and ``#`` comments are skipped.
+
+    Returns:
+        (N,) nanoseconds.
+
+    Raises:
+        CaptureError: Unreadable, not a number, or not increasing; names the line.
+    """
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise CaptureError("far too large for timestamps", path=path, hint="one time in seconds a line")
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise CaptureError(
+            f"cannot read the timestamps ({error})", path=path, hint="a text file of seconds"
+        ) from error
+    times: list[int] = []
+    for number, line in enumerate(lines, start=1):
+        text = line.split("#", 1)[0].strip()
+        if text:
+            times.append(_parse_seconds(text, path, number))
+            if len(times) > 1 and times[-1] <= times[-2]:
+                raise CaptureError(
+                    f"time {text} does not come after the one before",
+                    path=path,
+                    line=number,
+                    hint="one time a frame, in seconds, increasing",
+                )
+    return np.array(times, dtype=np.int64)
+
+
+def _parse_seconds(text: str, path: Path, line: int) -> int:
+    """Seconds as exact nanoseconds: a float64 of Unix time resolves only 200 ns."""
+    try:
+        value = Decimal(text)
+        if value.is_finite() and abs(value.adjusted()) < 12 and abs(value * _NS) < _MAX_ABS_NS:
+            return round(value * _NS)
+    except InvalidOperation:
+        pass
+    raise CaptureError(f"{text[:40]!r} is no time in seconds", path=path, line=line, hint="one number a line")
+
+
+def join_chapters(videos: tuple[VideoFile, ...], sidecar: Path | None) -> Timeline:
+    """Put the frames of all chapters on the camera's clock.
+
+    A sidecar for the whole camera decides; else sidecars of the chapters (``<video>.timestamps.txt``,
+    all or none); else the containers' exact timestamps. Chapters that start again at zero follow one
+    another without a gap, unless their creation times say that more than two seconds are missing.
+
+    Raises:
+        CaptureError: A sidecar does not fit its video.
+    """
+    if sidecar is not None:
+        times = _sidecar_times(sidecar, sum(len(video.pts) for video in videos))
+        return Timeline(times_ns=times, usable=np.ones(len(times), dtype=bool), notes=())
+    beside = [chapter_sidecar(video.path) for video in videos]
+    if all(beside):
+        parts = [_sidecar_times(path, len(v.pts)) for path, v in zip(beside, videos, strict=True) if path]
+        return _joined(videos, parts)
+    if any(beside):
+        lacking = next(video.path for video, path in zip(videos, beside, strict=True) if path is None)
+        raise CaptureError(
+            "this chapter has no .timestamps.txt, others of its camera have",
+            path=lacking,
+            hint="give every chapter its timestamps, or none",
+        )
+    return _joined(videos, _container_times(videos))
+
+
+def chapter_sidecar(video: Path) -> Path | None:
+    """The sidecar beside one video: ``torso.timestamps.txt`` or ``torso.mp4.timestamps.txt``."""
+    for name in (f"{video.stem}.timestamps.txt", f"{video.name}.timestamps.txt"):
+        if video.with_name(name).is_file():
+            return video.with_name(name)
+    return None
+
+
+def _sidecar_times(path: Path, frames: int) -> IntArray:
+    times = read_timestamps(path)
+    if len(times) != frames:
+        raise CaptureError(
+            f"{len(times)} timestamps for {frames} frames",
+            path=path,
+            hint="one line a frame of the video; export both again from the same recording",
+        )
+    return times
+
+
+def _container_times(videos: tuple[VideoFile, ...]) -> list[IntArray]:
+    """Each chapter's times, moved behind the chapter before it where it starts again at zero."""
+    parts = [videos[0].times_ns()]
+    for before, video in zip(videos, videos[1:], strict=False):
+        own, start = video.times_ns(), int(parts[-1][0])
+        runs_on = int(own[0]) > start + before.duration_ns // 2
+        shift = 0 if runs_on else start + before.duration_ns + _missing_ns(before, video) - int(own[0])
+        parts.append(own + shift)
+    return parts
+
+
+def _missing_ns(before: VideoFile, video: VideoFile) -> int:
+    """Recording time lost between two chapters by their creation times, 0 where they cannot tell."""
+    if before.created_s is None or video.created_s is None:
+        return 0
+    gap = round((video.created_s - before.created_s) * _NS) - before.duration_ns
+    return gap if gap > _CLOCK_RESOLUTION_NS else 0
+
+
+def _joined(videos: tuple[VideoFile, ...], parts: list[IntArray]) -> Timeline:
+    """Concatenate chapters; frames that do not come after all earlier ones are left out."""
+    times = np.concatenate(parts)
+    latest = np.maximum.accumulate(times)
+    usable = np.ones(len(times), dtype=bool)
+    usable[1:] = times[1:] > latest[:-1]
+    notes = []
+    for before, video, start, part in zip(videos, videos[1:], parts, parts[1:], strict=False):
+        gap_s = (int(part[0]) - int(start[0]) - before.duration_ns) / _NS
+        frame_s = before.duration_ns / _NS / len(before.pts)
+        if abs(gap_s) > 1.5 * frame_s:
+            kind = "a gap of" if gap_s > 0 else "an overlap of"
+            notes.append(f"{kind} {abs(gap_s):.2f} s between {before.path.name} and {video.path.name}")
+    return Timeline(times_ns=times, usable=usable, notes=tuple(notes))

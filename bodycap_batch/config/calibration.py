@@ -1,0 +1,165 @@
+"""Camera calibrations: given inline, read from ``calib.json``, or left to be estimated."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from bodycap_batch.camera import CAMERA_MODELS, CV2_PIXEL_OFFSET_PX, Camera, param_count
+from bodycap_batch.errors import CaptureError
+
+_MAX_BYTES = 1 << 20
+_MAX_SECONDS = 1e10
+_FIRST_CENTRE = {
+    "SIMPLE_PINHOLE": 1,
+    "SIMPLE_RADIAL": 1,
+    "RADIAL": 1,
+    "SIMPLE_RADIAL_FISHEYE": 1,
+    "RADIAL_FISHEYE": 1,
+}
+
+
+class Calibration(BaseModel):
+    """Intrinsics of one lens at the size it was calibrated at (upright, as a player shows it)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    model: str = Field(description="COLMAP camera model")
+    params: tuple[float, ...] = Field(description="the model's parameters in COLMAP's order, pixels")
+    width: int = Field(gt=0, le=65536, description="image width of the calibration, pixels")
+    height: int = Field(gt=0, le=65536, description="image height of the calibration, pixels")
+    pixel_origin: Literal["colmap", "opencv"] = Field(
+        "colmap", description="centre of the first pixel: colmap = (0.5, 0.5), opencv = (0, 0)"
+    )
+
+    @field_validator("model")
+    @classmethod
+    def _known_model(cls, value: str) -> str:
+        name = value.upper()
+        if name in CAMERA_MODELS:
+            return name
+        near = difflib.get_close_matches(name, CAMERA_MODELS, n=1)
+        also = f"did you mean {near[0]}?" if near else f"known: {', '.join(CAMERA_MODELS)}"
+        raise ValueError(f"unknown camera model {value!r}; {also}")
+
+    @field_validator("pixel_origin", mode="before")
+    @classmethod
+    def _origin_word(cls, value: object) -> object:
+        """Accept the sentence of a calib.json: ``OpenCV (centre of the first pixel = 0, 0)``."""
+        return value.split(maxsplit=1)[0].lower() if isinstance(value, str) and value.strip() else value
+
+    @model_validator(mode="after")
+    def _fits_model(self) -> Calibration:
+        want = param_count(self.model)
+        if len(self.params) != want:
+            raise ValueError(f"{self.model} takes {want} params, got {len(self.params)}")
+        if self.params[0] <= 0 or (self.model not in _FIRST_CENTRE and self.params[1] <= 0):
+            raise ValueError("the focal length must be positive")
+        return self
+
+    def camera(self) -> Camera:
+        """The lens at its calibrated size, in COLMAP's pixel origin."""
+        params = list(self.params)
+        if self.pixel_origin == "opencv":
+            first = _FIRST_CENTRE.get(self.model, 2)
+            params[first] += CV2_PIXEL_OFFSET_PX
+            params[first + 1] += CV2_PIXEL_OFFSET_PX
+        return Camera(model=self.model, width_px=self.width, height_px=self.height, params=params)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationEntry:
+    """What a calibration file says of one camera."""
+
+    calibration: Calibration
+    offset_s: float
+    rolling_shutter_s: float
+
+
+def read_calibration(path: Path, camera: str) -> CalibrationEntry:
+    """Read one camera's entry of a calibration file.
+
+    The file holds one calibration for all cameras, or ``{"cameras": {name: {...}}}`` (what stands
+    beside ``cameras`` holds for all). Keys: model, params, width, height, pixel_origin; offsets_s
+    (by camera name) or offset_s; rolling_shutter_s. Others are left alone.
+
+    Raises:
+        CaptureError: Unreadable, no such camera in it, or values that do not fit; names the field.
+    """
+    data = _read_object(path)
+    field = ""
+    if "cameras" in data:
+        cameras = data["cameras"]
+        if not isinstance(cameras, dict) or not isinstance(cameras.get(camera), dict):
+            raise _no_such_camera(path, camera, cameras)
+        field = f"cameras.{camera}."
+        data = {**data, **cameras[camera]}
+    try:
+        calibration = Calibration.model_validate(
+            {key: data[key] for key in Calibration.model_fields if key in data}
+        )
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        name = field + ".".join(str(part) for part in first["loc"])
+        raise CaptureError(
+            f"the calibration does not hold: {first['msg'].removeprefix('Value error, ')}",
+            path=path,
+            field=name or None,
+            hint='{"model": "PINHOLE", "params": [fx, fy, cx, cy], "width": 1920, "height": 1080}',
+        ) from error
+    offsets = data.get("offsets_s", {})
+    offset = data.get("offset_s", offsets.get(camera, 0.0) if isinstance(offsets, dict) else offsets)
+    return CalibrationEntry(
+        calibration=calibration,
+        offset_s=_seconds(offset, path, f"{field}offsets_s"),
+        rolling_shutter_s=_seconds(data.get("rolling_shutter_s", 0.0), path, f"{field}rolling_shutter_s"),
+    )
+
+
+def _read_object(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise CaptureError("far too large for a calibration", path=path, hint="give a calib.json")
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise CaptureError(
+            f"not JSON: {error.msg}",
+            path=path,
+            line=error.lineno,
+            hint="mend the file, or use calibration: auto",
+        ) from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise CaptureError(
+            f"cannot read the calibration ({error})",
+            path=path,
+            hint="give a calib.json, or calibration: auto",
+        ) from error
+    if not isinstance(data, dict):
+        raise CaptureError(
+            "the calibration is no JSON object", path=path, hint='it starts with {"model": ...'
+        )
+    return data
+
+
+def _no_such_camera(path: Path, camera: str, cameras: object) -> CaptureError:
+    names = [str(name) for name in cameras] if isinstance(cameras, dict) else []
+    near = difflib.get_close_matches(camera, names, n=1)
+    return CaptureError(
+        f"no calibration of a camera named {camera!r}",
+        path=path,
+        field="cameras",
+        hint=f"did you mean {near[0]!r}?" if near else f"it knows: {', '.join(names) or 'none'}",
+    )
+
+
+def _seconds(value: object, path: Path, field: str) -> float:
+    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _MAX_SECONDS:
+        return float(value)
+    raise CaptureError(
+        f"{value!r:.40} is no time in seconds", path=path, field=field, hint="a number, e.g. 0.12"
+    )

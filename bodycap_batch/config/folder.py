@@ -1,0 +1,129 @@
+"""A folder of videos as a capture: file stems name the cameras."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from bodycap_batch.config.mounts import MOUNT_NAMES, mount_of
+from bodycap_batch.errors import CaptureError, JobError
+
+VIDEO_SUFFIXES = frozenset(
+    {
+        ".mp4",
+        ".mov",
+        ".m4v",
+        ".avi",
+        ".mkv",
+        ".webm",
+        ".mts",
+        ".m2ts",
+        ".ts",
+        ".mpg",
+        ".mpeg",
+        ".insv",
+        ".3gp",
+        ".wmv",
+    }
+)
+_GOPRO = re.compile(r"^(G[HXPSLOT])(PR|[0-9]{2})([0-9]{4})$", re.IGNORECASE)
+
+
+def natural_key(path: Path) -> tuple[tuple[int, int | str], ...]:
+    """Sort key of chapters: numbers by value; GoPro's ``GX020123`` is chapter 2 of video 0123.
+
+    The first chapter of older GoPros is ``GOPR0123``, the next ``GP010123``.
+    """
+    gopro = _GOPRO.match(path.stem)
+    if gopro:
+        chapter = 0 if gopro.group(2).upper() == "PR" else int(gopro.group(2))
+        return ((0, int(gopro.group(3))), (0, chapter))
+    parts = re.split(r"([0-9]+)", path.stem.lower())
+    return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in parts if part)
+
+
+def is_video(path: Path) -> bool:
+    """True for a visible file with a video's suffix."""
+    return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".") and path.is_file()
+
+
+def chapters_in(folder: Path) -> tuple[Path, ...]:
+    """Videos of one camera's folder in recording order.
+
+    Raises:
+        CaptureError: There are none.
+    """
+    chapters = sorted((path for path in folder.iterdir() if is_video(path)), key=natural_key)
+    if not chapters:
+        raise CaptureError(
+            "no video in this camera's folder",
+            path=folder,
+            hint=f"known: {', '.join(sorted(VIDEO_SUFFIXES))}",
+        )
+    return tuple(chapters)
+
+
+def folder_capture(folder: Path) -> dict[str, object]:
+    """Describe a folder as the raw ``capture`` block of a job.
+
+    Raises:
+        CaptureError: No videos in it, or unreadable.
+        JobError: Several cameras, and one whose name says no place on the body; two of one name.
+    """
+    try:
+        entries = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+        videos = [
+            path
+            for path in entries
+            if is_video(path) or (path.is_dir() and any(map(is_video, path.iterdir())))
+        ]
+    except OSError as error:
+        raise CaptureError(f"cannot read the folder ({error})", path=folder, hint="check the path") from error
+    if not videos:
+        raise CaptureError(
+            "no video in this folder",
+            path=folder,
+            hint="name the videos after their place on the body, e.g. torso.mp4, left_palm.mp4, right_palm.mp4",
+        )
+    named = [(path.name if path.is_dir() else path.stem, path) for path in videos]
+    _refuse_doubles(named)
+    if len(named) > 1:
+        _refuse_nameless(named)
+    cameras = [_camera_block(folder, name, path) for name, path in named]
+    calibration = folder / "calib.json"
+    block: dict[str, object] = {"cameras": cameras}
+    block["calibration"] = str(calibration) if calibration.is_file() else "auto"
+    return block
+
+
+def _camera_block(folder: Path, name: str, path: Path) -> dict[str, object]:
+    block: dict[str, object] = {
+        "name": re.sub(r"[^A-Za-z0-9_\-]+", "_", name).strip("_-") or "camera",
+        "video": str(path),
+    }
+    sidecar = folder / f"{name}.timestamps.txt"
+    if sidecar.is_file():
+        block["timestamps"] = str(sidecar)
+    return block
+
+
+def _refuse_doubles(named: list[tuple[str, Path]]) -> None:
+    seen: dict[str, Path] = {}
+    for name, path in named:
+        if name.lower() in seen:
+            raise JobError(
+                f"two cameras named {name!r}: {seen[name.lower()].name} and {path.name}",
+                path=path.parent,
+                hint="rename one (torso and torso_back may share a segment), or put chapters into one folder",
+            )
+        seen[name.lower()] = path
+
+
+def _refuse_nameless(named: list[tuple[str, Path]]) -> None:
+    nameless = [path.name for name, path in named if mount_of(name) is None]
+    if nameless:
+        raise JobError(
+            f"where on the body was {', '.join(nameless)}? The name does not say",
+            path=named[0][1].parent,
+            hint=f"rename to one of {', '.join(MOUNT_NAMES)}; or write a job file with `mount:` for each camera",
+        )
