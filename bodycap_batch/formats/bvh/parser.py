@@ -1,0 +1,273 @@
+"""The text of a BVH file: braces, keywords and numbers, with the line of whatever is wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.errors import JobError
+
+_CHANNELS = {name.lower(): name for axis in "XYZ" for name in (f"{axis}position", f"{axis}rotation")}
+_MAX_JOINTS = 10_000
+"""A face-and-fingers production rig has a few hundred; beyond this it is no skeleton."""
+
+
+@dataclass(slots=True)
+class FileJoint:
+    """One ROOT or JOINT block, in the file's axes and units."""
+
+    name: str
+    parent: int
+    line: int
+    offset: FloatArray | None = None
+    end: FloatArray | None = None
+    channels: tuple[str, ...] = ()
+    children: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BvhText:
+    """A parsed file.
+
+    Attributes:
+        joints: Blocks in file order (a parent before its children).
+        values: (T, channels) the MOTION block, or None without frames.
+        frame_time: The Frame Time as written ("" without frames).
+    """
+
+    joints: list[FileJoint]
+    values: FloatArray | None
+    frame_time: str
+
+
+def parse_bvh(path: Path) -> BvhText:
+    """Parse a file.
+
+    Raises:
+        JobError: The file is missing or malformed; names the line.
+    """
+    try:
+        with open(path, "rb") as handle:
+            lines = _Lines(path, iter(handle))
+            joints, at_motion = _read_hierarchy(lines)
+            size_bytes = path.stat().st_size
+            values, frame_time = _read_motion(lines, joints, size_bytes) if at_motion else (None, "")
+    except OSError as error:
+        raise JobError(f"cannot read: {error.strerror or error}", path=path, hint="check the path") from error
+    return BvhText(joints=joints, values=values, frame_time=frame_time)
+
+
+@dataclass
+class _Lines:
+    """The file's non-empty lines with their numbers, read one at a time."""
+
+    path: Path
+    source: Iterator[bytes]
+    number: int = 0
+    pending: list[str] = field(default_factory=list)
+
+    def next(self) -> str | None:
+        """The next statement, or None at the end of the file. Braces are statements of their own."""
+        while not self.pending:
+            raw = next(self.source, None)
+            if raw is None:
+                return None
+            self.number += 1
+            text = _decode(raw).replace("{", "\n{\n").replace("}", "\n}\n")
+            self.pending = [part for line in text.split("\n") if (part := " ".join(line.split()))]
+        return self.pending.pop(0)
+
+    def error(self, message: str, *, line: int | None = None, hint: str | None = None) -> JobError:
+        """The typed error at this line."""
+        return JobError(message, path=self.path, line=self.number if line is None else line, hint=hint)
+
+
+def _decode(raw: bytes) -> str:
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return raw.decode("latin-1")
+
+
+def _read_hierarchy(lines: _Lines) -> tuple[list[FileJoint], bool]:
+    """Parse up to MOTION (True) or the end of the file (False)."""
+    if (lines.next() or "").upper() != "HIERARCHY":
+        raise lines.error("a BVH file begins with HIERARCHY", line=max(lines.number, 1))
+    joints: list[FileJoint] = []
+    stack: list[int | None] = []  # open blocks: a joint's index, or None for an End Site
+    opening: list[int | None] = []  # a header whose brace is still to come
+    at_motion = False
+    while (text := lines.next()) is not None:
+        keyword = text.split(" ", 1)[0].upper()
+        if keyword.startswith("MOTION"):
+            at_motion = True
+            break
+        if keyword == "{":
+            if not opening:
+                raise lines.error("an opening brace without ROOT, JOINT or End Site before it")
+            stack.append(opening.pop())
+        elif opening:
+            raise lines.error(f"expected an opening brace, found {text[:40]!r}")
+        elif keyword == "}":
+            if not stack:
+                raise lines.error("a closing brace too many")
+            stack.pop()
+        else:
+            _read_statement(lines, text, joints, stack, opening)
+    if stack or opening:
+        raise lines.error("the hierarchy ends inside an open block", hint="the file is truncated")
+    _check_joints(lines, joints)
+    return joints, at_motion
+
+
+def _read_statement(
+    lines: _Lines, text: str, joints: list[FileJoint], stack: list[int | None], opening: list[int | None]
+) -> None:
+    """Parse one ROOT, JOINT, End Site, OFFSET or CHANNELS line."""
+    keyword, _, rest = text.partition(" ")
+    keyword = keyword.upper()
+    if keyword in ("ROOT", "JOINT"):
+        inside = stack[-1] if stack else None
+        if keyword == "ROOT" and joints:
+            raise lines.error("a second ROOT", hint="one skeleton a file")
+        if keyword == "JOINT" and inside is None:
+            raise lines.error("a JOINT outside of ROOT or inside an End Site")
+        if len(joints) >= _MAX_JOINTS:
+            raise lines.error(f"more than {_MAX_JOINTS} joints")
+        parent = -1 if inside is None else inside
+        joints.append(FileJoint(_free_name(rest or f"joint{len(joints)}", joints), parent, lines.number))
+        if parent >= 0:
+            joints[parent].children += 1
+        opening.append(len(joints) - 1)
+        return
+    if keyword == "END":
+        if not stack or stack[-1] is None:
+            raise lines.error("an End Site outside of a joint")
+        opening.append(None)
+        return
+    if keyword not in ("OFFSET", "CHANNELS"):
+        raise lines.error(f"unknown keyword {text.split(' ', 1)[0][:40]!r}")
+    if not stack:
+        raise lines.error(f"{keyword} outside of a joint")
+    if keyword == "OFFSET":
+        _read_offset(lines, rest, joints, stack)
+    elif stack[-1] is not None:
+        joints[stack[-1]].channels = _read_channels(lines, rest)
+
+
+def _read_offset(lines: _Lines, rest: str, joints: list[FileJoint], stack: list[int | None]) -> None:
+    numbers = [_number(lines, token) for token in rest.split()]
+    if len(numbers) != 3:
+        raise lines.error(f"OFFSET needs 3 numbers, found {len(numbers)}")
+    inside = stack[-1]
+    if inside is None:
+        owner = next(index for index in reversed(stack) if index is not None)
+        joints[owner].end = np.array(numbers)
+    else:
+        joints[inside].offset = np.array(numbers)
+
+
+def _read_channels(lines: _Lines, rest: str) -> tuple[str, ...]:
+    count, *names = rest.split() or [""]
+    if not count.isdigit() or int(count) != len(names):
+        raise lines.error(f"CHANNELS {count or '?'} is followed by {len(names)} names")
+    unknown = [name for name in names if name.lower() not in _CHANNELS]
+    if unknown:
+        raise lines.error(f"unknown channel {unknown[0]!r}", hint=f"known: {', '.join(_CHANNELS.values())}")
+    channels = tuple(_CHANNELS[name.lower()] for name in names)
+    positions = [name for name in channels if name.endswith("position")]
+    if len(set(positions)) != len(positions):
+        raise lines.error("a position channel twice in one joint")
+    return channels
+
+
+def _free_name(name: str, joints: list[FileJoint]) -> str:
+    """The name, with a number added when an earlier joint has it."""
+    taken = {joint.name for joint in joints}
+    free, number = name, 2
+    while free in taken:
+        free, number = f"{name}_{number}", number + 1
+    return free
+
+
+def _check_joints(lines: _Lines, joints: list[FileJoint]) -> None:
+    if not joints:
+        raise lines.error("no ROOT in the hierarchy")
+    for joint in joints:
+        if joint.offset is None:
+            raise lines.error(f"joint {joint.name!r} has no OFFSET", line=joint.line)
+
+
+def _number(lines: _Lines, token: str) -> float:
+    """A finite number; a decimal comma is understood."""
+    try:
+        value = float(token.replace(",", "."))
+    except ValueError:
+        raise lines.error(f"{token[:40]!r} is not a number") from None
+    if not math.isfinite(value):
+        raise lines.error(f"{token[:40]!r} is not a finite number")
+    return value
+
+
+def _read_motion(lines: _Lines, joints: list[FileJoint], size_bytes: int) -> tuple[FloatArray | None, str]:
+    """Frames (T, channels) and the Frame Time as written; None when there are no frames."""
+    frames = _header(lines, "FRAMES")
+    if frames is None:
+        return None, ""
+    count = _number(lines, frames)
+    if count < 0 or count != int(count):
+        raise lines.error(f"Frames: {frames} is not a count")
+    if count == 0:
+        return None, ""
+    frame_time = _header(lines, "FRAME TIME")
+    if frame_time is None:
+        raise lines.error("no Frame Time")
+    if _number(lines, frame_time) < 0 or (_number(lines, frame_time) == 0 and count > 1):
+        raise lines.error(f"Frame Time {frame_time} is not a positive duration")
+    width = sum(len(joint.channels) for joint in joints)
+    wanted = int(count) * width
+    if 2 * wanted > size_bytes + 1:
+        raise lines.error(
+            f"{int(count)} frames of {width} channels do not fit into {size_bytes} bytes",
+            hint="the file is truncated, or Frames is wrong",
+        )
+    values = np.empty(wanted)
+    done = 0
+    while done < wanted and (text := lines.next()) is not None:
+        row = _row(lines, text)[: wanted - done]
+        values[done : done + len(row)] = row
+        done += len(row)
+    if done < wanted:
+        raise lines.error(
+            f"the motion ends after {done} of {wanted} values ({int(count)} frames of {width} channels)",
+            hint="the file is truncated, or Frames is wrong",
+        )
+    return values.reshape(int(count), width), frame_time
+
+
+def _header(lines: _Lines, label: str) -> str | None:
+    """The value of ``label: value``; None at the end of the file."""
+    text = lines.next()
+    if text is None:
+        return None
+    name, colon, value = text.partition(":")
+    value = value.strip()
+    if not colon or name.strip().upper() != label or len(value.split()) != 1:
+        raise lines.error(f"expected '{label.title()}: <number>', found {text[:40]!r}")
+    return value
+
+
+def _row(lines: _Lines, text: str) -> list[float]:
+    tokens = text.split()
+    try:
+        row = [float(token) for token in tokens]
+    except ValueError:
+        return [_number(lines, token) for token in tokens]
+    if not all(map(math.isfinite, row)):
+        raise lines.error("NaN or infinity in the motion")
+    return row

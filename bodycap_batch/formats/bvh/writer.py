@@ -1,0 +1,133 @@
+"""Writing BVH files that Blender, MotionBuilder and retargeters read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.formats.bvh.axes import file_from_world_points, file_from_world_rotations
+from bodycap_batch.formats.bvh.euler import continuous_angles
+from bodycap_batch.formats.files import replacing
+from bodycap_batch.skeleton import Motion, SkeletonModel
+
+_POSITIONS = ("Xposition", "Yposition", "Zposition")
+
+
+def write_bvh(path: Path | str, motion: Motion, *, units: str = "cm", euler_order: str = "ZXY") -> None:
+    """Write a motion.
+
+    A skeleton that came from a file keeps that file's hierarchy, OFFSETs and channel order; a joint
+    whose channels cannot hold a free rotation gets the missing ones after its own, and the root its
+    position.
+
+    Args:
+        path: The file; replaced in one step.
+        motion: What to write; world axes, metres (a `Motion` holds no NaN).
+        units: Length unit of the file, "cm" or "m".
+        euler_order: Rotation channels of joints whose skeleton names none.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
+    skeleton = motion.skeleton
+    channels = _all_channels(skeleton, euler_order)
+    order = _depth_first(skeleton)
+    values = _values(motion, channels, order, units)
+    row = " ".join(["%.6f" if units == "cm" else "%.8f"] * values.shape[1]) + "\n"
+    with replacing(Path(path)) as temporary, open(temporary, "w", encoding="utf-8", newline="\n") as handle:
+        handle.write("HIERARCHY\n")
+        handle.writelines(_hierarchy(skeleton, channels, order, units))
+        handle.write(f"MOTION\nFrames: {len(values)}\nFrame Time: {1.0 / motion.fps:.10f}\n")
+        handle.writelines(row % tuple(frame) for frame in values)
+
+
+def _depth_first(skeleton: SkeletonModel) -> list[int]:
+    """Joints in the order of the file: each followed by its whole subtree."""
+    children: list[list[int]] = [[] for _ in skeleton.joints]
+    for joint, parent in enumerate(skeleton.parents.tolist()[1:], start=1):
+        children[parent].append(joint)
+    order, waiting = [], [0]
+    while waiting:
+        order.append(waiting.pop())
+        waiting.extend(reversed(children[order[-1]]))
+    return order
+
+
+def _all_channels(skeleton: SkeletonModel, euler_order: str) -> list[tuple[str, ...]]:
+    """Channel names of each joint."""
+    out = []
+    for index, given in enumerate(skeleton.bvh_channels):
+        names = given or tuple(f"{axis}rotation" for axis in euler_order)
+        positions = tuple(name for name in names if name.endswith("position"))
+        rotations = tuple(name for name in names if name.endswith("rotation"))
+        if len(set(rotations)) != 3 or len(rotations) != 3:
+            unique = tuple(dict.fromkeys(rotations))
+            rotations = unique + tuple(f"{axis}rotation" for axis in "ZXY" if f"{axis}rotation" not in unique)
+            names = positions + rotations
+        if index == 0 and len(positions) != 3:
+            names = _POSITIONS + rotations
+        out.append(names)
+    return out
+
+
+def _values(motion: Motion, channels: list[tuple[str, ...]], order: list[int], units: str) -> FloatArray:
+    """Frames (T, channels) in file axes and units, degrees."""
+    orders = tuple("".join(name[0] for name in names if name.endswith("rotation")) for names in channels)
+    angles = np.rad2deg(continuous_angles(orders, file_from_world_rotations(motion.local_rotation)))
+    root = file_from_world_points(motion.root_in_world_m, units)
+    bones = file_from_world_points(motion.skeleton.offsets_m, units)
+    columns = []
+    for joint in order:
+        for name in channels[joint]:
+            if name.endswith("rotation"):
+                columns.append(angles[:, joint, orders[joint].index(name[0])])
+            else:
+                axis = "XYZ".index(name[0])
+                columns.append(root[:, axis] if joint == 0 else np.full(len(root), bones[joint, axis]))
+    return np.stack(columns, axis=1) + 0.0
+
+
+def _hierarchy(
+    skeleton: SkeletonModel, channels: list[tuple[str, ...]], order: list[int], units: str
+) -> list[str]:
+    """The text of the HIERARCHY block."""
+    offsets = file_from_world_points(skeleton.offsets_m, units)
+    ends = file_from_world_points(np.nan_to_num(skeleton.end_offsets_m), units)
+    if not any(skeleton.bvh_channels):
+        offsets[0] = 0.0  # readers disagree whether the root's channels add to its OFFSET
+    has_child = set(skeleton.parents.tolist())
+    lines: list[str] = []
+    open_joints: list[int] = []
+
+    def close() -> None:
+        open_joints.pop()
+        lines.append("\t" * len(open_joints) + "}\n")
+
+    for joint in order:
+        while open_joints and open_joints[-1] != skeleton.parents[joint]:
+            close()
+        tabs = "\t" * len(open_joints)
+        lines.append(f"{tabs}{'JOINT' if open_joints else 'ROOT'} {skeleton.joints[joint]}\n{tabs}{{\n")
+        lines.append(f"{tabs}\tOFFSET {_offset(offsets[joint])}\n")
+        lines.append(f"{tabs}\tCHANNELS {len(channels[joint])} {' '.join(channels[joint])}\n")
+        open_joints.append(joint)
+        if joint not in has_child:
+            lines.append(
+                f"{tabs}\tEnd Site\n{tabs}\t{{\n{tabs}\t\tOFFSET {_offset(ends[joint])}\n{tabs}\t}}\n"
+            )
+    while open_joints:
+        close()
+    return lines
+
+
+def _offset(vector: FloatArray) -> str:
+    """Three lengths: every digit the file had, six decimals or more, no negative zero."""
+    return " ".join(_length(float(value)) for value in vector)
+
+
+def _length(value: float) -> str:
+    text = f"{round(value, 12) + 0.0:.12f}".rstrip("0")
+    whole, _, decimals = text.partition(".")
+    return f"{whole}.{decimals:0<6}"

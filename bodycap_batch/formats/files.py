@@ -1,0 +1,62 @@
+"""Writing a result so that no reader ever meets half a file."""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from bodycap_batch.errors import StoreError
+
+_REMEDIES = {
+    errno.ENOSPC: "the disk is full: free some space, or write elsewhere with --out",
+    errno.EDQUOT: "the disk quota is used up: free some space, or write elsewhere with --out",
+    errno.EACCES: "no permission to write there: choose another folder with --out",
+    errno.EROFS: "the file system is read-only: choose another folder with --out",
+}
+
+
+def store_error(error: OSError, path: Path) -> StoreError:
+    """Turn a failed write to `path` into the typed error, with its remedy."""
+    return StoreError(
+        f"cannot write: {error.strerror or error}",
+        path=path,
+        hint=_REMEDIES.get(error.errno or 0, "check the folder and the disk"),
+    )
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a temporary sibling of `path`; rename it over `path` when the block ends well.
+
+    The sibling keeps the suffix (libraries choose the format by it) and is deleted on any failure, so
+    an earlier `path` stays as it was.
+
+    Raises:
+        StoreError: The file cannot be written (disk full, no permission ...).
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        with open(temporary, "rb") as handle:
+            os.fsync(handle.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise store_error(error, path) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a UTF-8 text file (LF line ends) in one step.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
+    with replacing(path) as temporary, open(temporary, "w", encoding="utf-8", newline="\n") as handle:
+        handle.write(text)
