@@ -185,6 +185,7 @@ class Registration:
         obs_feature: (M,) feature index in that keyframe (identifies the track after the map changed).
         obs_px: (M,2) float32 tracked pixel, COLMAP origin.
         wanted_keyframes: (W,) frames that should become keyframes where tracking failed.
+        tried_keyframes: (V,) frames of this camera that were offered to the map so far.
     """
 
     trajectory: Trajectory
@@ -193,6 +194,7 @@ class Registration:
     obs_feature: IntArray
     obs_px: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
     wanted_keyframes: IntArray
+    tried_keyframes: IntArray
 
     def __post_init__(self) -> None:
         count = len(self.obs_px)
@@ -200,3 +202,4 @@ class Registration:
             set_array(self, name, (count,), np.int64)
         set_array(self, "obs_px", (count, 2), np.float32)
         set_array(self, "wanted_keyframes", (None,), np.int64)
+        set_array(self, "tried_keyframes", (None,), np.int64)

@@ -1,0 +1,164 @@
+"""Stage 1: keyframes by rotation-free parallax, track survival and sharpness."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.camera import Camera
+from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.config import KeyframeOptions
+from bodycap_batch.context import StageContext
+from bodycap_batch.errors import CaptureError
+from bodycap_batch.scene import KeyframeSelection
+from bodycap_batch.tracking import (
+    GreyImage,
+    Pixels,
+    bearings,
+    detect_corners,
+    fit_rotation,
+    pixel_scale,
+    sharpness,
+    track_points,
+)
+
+_CORNERS = 200
+_CORNER_SPACING_PX = 12.0
+_MIN_TRACKS = 12
+_NOISE_SAMPLES = 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    """A recent frame that may still become a keyframe."""
+
+    index: int
+    grey: GreyImage
+    sharpness: float
+    survival: float
+
+
+@dataclass(slots=True)
+class _Tracker:
+    """Tracks from the last keyframe to the newest frame."""
+
+    camera: Camera
+    start_rays: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    px: Pixels = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    grey: GreyImage | None = None
+    started: int = 0
+    round_trips: list[Pixels] = field(default_factory=list)
+    kept_samples: int = 0
+
+    def restart(self, grey: GreyImage) -> None:
+        """Begin at a new keyframe."""
+        scale = pixel_scale(self.camera.width_px, self.camera.height_px)
+        self.px = detect_corners(grey, _CORNERS, _CORNER_SPACING_PX * scale)
+        self.start_rays = bearings(self.camera.unproject(self.px.astype(np.float64)))
+        self.started = len(self.px)
+        self.grey = grey
+
+    def step(self, grey: GreyImage) -> None:
+        """Follow the tracks into the next frame."""
+        assert self.grey is not None
+        flow = track_points(self.grey, grey, self.px)
+        self.px, self.start_rays = flow.px[flow.ok], self.start_rays[flow.ok]
+        if self.kept_samples < _NOISE_SAMPLES:
+            self.round_trips.append(flow.round_trip_px[flow.ok])
+            self.kept_samples += int(flow.ok.sum())
+        self.grey = grey
+
+    def survival(self) -> float:
+        """Share of the keyframe's corners still tracked."""
+        return len(self.px) / self.started if self.started else 0.0
+
+    def parallax_px(self) -> float:
+        """Median displacement that no rotation explains, in pixels at the image centre."""
+        if len(self.px) < _MIN_TRACKS:
+            return 0.0
+        rays = bearings(self.camera.unproject(self.px.astype(np.float64)))
+        usable = np.isfinite(rays).all(axis=1) & np.isfinite(self.start_rays).all(axis=1)
+        if usable.sum() < _MIN_TRACKS:
+            return 0.0
+        first, second = self.start_rays[usable], rays[usable]
+        rotation = fit_rotation(first, second)
+        return float(np.median(np.linalg.norm(second - first @ rotation.T, axis=1))) * self.camera.focal_px
+
+    def noise_px(self) -> float:
+        """One standard deviation, per axis, of a single track step."""
+        if not self.kept_samples:
+            return 0.0
+        # A Rayleigh variable's median is 1.177 σ; the round trip adds two steps' noise.
+        return float(np.median(np.concatenate(self.round_trips)) / (1.177 * np.sqrt(2.0)))
+
+
+def select_keyframes(
+    camera: CaptureCamera, options: KeyframeOptions, context: StageContext
+) -> KeyframeSelection:
+    """Choose the frames of one camera that the map is built from.
+
+    A keyframe is due once the scene moved by `parallax_px` beyond what a rotation explains, too few
+    tracks survive, or `max_gap_s` has passed; the sharpest of the last frames is then taken.
+
+    Args:
+        camera: The camera's video, calibrated.
+        options: Thresholds; pixels are for a 640 px long side.
+        context: Progress and cancellation.
+
+    Raises:
+        CaptureError: The camera has no frames.
+    """
+    times_s = (camera.times_ns - camera.times_ns[:1]) * 1e-9
+    count = len(times_s)
+    if count == 0:
+        raise CaptureError("no frames to work on", path=camera.chapters[0], hint="check start_s and end_s")
+    limit_px = options.parallax_px * pixel_scale(camera.camera.width_px, camera.camera.height_px)
+    sharp = np.zeros(count)
+    chosen: list[int] = []
+    tracker = _Tracker(camera.camera)
+    recent: deque[_Candidate] = deque(maxlen=options.window)
+    for index, grey in camera.grey_frames():
+        context.check_cancelled()
+        sharp[index] = sharpness(grey)
+        if not chosen:
+            chosen.append(index)
+            tracker.restart(grey)
+        else:
+            tracker.step(grey)
+            recent.append(_Candidate(index, grey, sharp[index], tracker.survival()))
+            gap_s = times_s[index] - times_s[chosen[-1]]
+            due = (
+                gap_s >= options.max_gap_s
+                or tracker.survival() < options.min_survival
+                or (gap_s >= options.min_gap_s and tracker.parallax_px() > limit_px)
+            )
+            if due:
+                chosen.append(_take_sharpest(recent, tracker))
+        if index % 30 == 0:
+            context.progress(index, count, "frames")
+    if chosen[-1] != count - 1:
+        chosen.append(count - 1)
+    context.progress(count, count, "frames")
+    return KeyframeSelection(
+        camera=camera.name,
+        frames=np.array(chosen, dtype=np.int64),
+        frame_count=count,
+        sharpness=sharp,
+        noise_px=tracker.noise_px(),
+    )
+
+
+def _take_sharpest(recent: deque[_Candidate], tracker: _Tracker) -> int:
+    """Pick the sharpest recent frame that still sees what the keyframe saw; restart the tracks there."""
+    usable = [frame for frame in recent if frame.survival >= 0.5 * recent[0].survival]
+    best = max(usable, key=lambda frame: frame.sharpness)
+    tracker.restart(best.grey)
+    while recent and recent[0].index <= best.index:
+        recent.popleft()
+    for position, frame in enumerate(recent):
+        tracker.step(frame.grey)
+        recent[position] = _Candidate(frame.index, frame.grey, frame.sharpness, tracker.survival())
+    return best.index

@@ -1,0 +1,169 @@
+"""Stage 2: one sparse map from the keyframes of all cameras."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bodycap_batch.arrays import IntArray
+from bodycap_batch.capture import Capture
+from bodycap_batch.config import MapOptions
+from bodycap_batch.context import StageContext
+from bodycap_batch.errors import EstimationError
+from bodycap_batch.mapping.convert import to_map
+from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, add_keyframes, image_ids
+from bodycap_batch.mapping.pairs import choose_pairs, match_pairs
+from bodycap_batch.mapping.solve import (
+    MODELS_NAME,
+    extend,
+    mapper_options,
+    reconstruct,
+    refine,
+    write_models,
+)
+from bodycap_batch.scene import KeyframeSelection, MapResult
+from bodycap_batch.tracking import pixel_scale
+
+__all__ = ["build_map", "extend_map"]
+
+
+def build_map(
+    capture: Capture,
+    selections: Sequence[KeyframeSelection],
+    options: MapOptions,
+    context: StageContext,
+) -> MapResult:
+    """Reconstruct the room and the keyframes' poses by incremental structure from motion.
+
+    Args:
+        capture: All cameras.
+        selections: Keyframes of each camera.
+        options: The stage's options.
+        context: Work folder (holds the database and models afterwards), threads, progress.
+
+    Returns:
+        The models, largest first, each in its own gauge.
+
+    Raises:
+        EstimationError: No initial pair held, or too few keyframes were registered.
+
+    Source: Schönberger, Frahm, "Structure-from-motion revisited", CVPR 2016 (COLMAP).
+    """
+    import pycolmap
+
+    workspace = context.work_dir / "workspace"
+    workspace.mkdir(parents=True, exist_ok=True)
+    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+        cameras = {item.camera: add_camera(database, capture.camera(item.camera)) for item in selections}
+    wanted = [
+        (capture.camera(item.camera), cameras[item.camera], np.asarray(item.frames)) for item in selections
+    ]
+    add_keyframes(workspace, wanted, options, context)
+    refs = [ImageRef(item.camera, int(frame)) for item in selections for frame in item.frames]
+    scale = _scale(capture)
+    pairs = choose_pairs(refs, refs)
+    match_pairs(workspace, pairs, options, context, scale)
+    settings = mapper_options(options, _constant(capture, cameras), scale, context.threads)
+    models, ladder = reconstruct(workspace, settings, context, len(refs))
+    log = {"keyframes": len(refs), "pairs": len(pairs), "initial_pair_ladder": ladder}
+    _require_coverage(models, len(refs), ladder, options)
+    write_models(workspace, models)
+    return _result(models, workspace, log)
+
+
+def extend_map(
+    capture: Capture,
+    previous: MapResult,
+    extra_frames: Mapping[str, IntArray],
+    options: MapOptions,
+    context: StageContext,
+) -> MapResult:
+    """Add keyframes to a map: existing poses are held while the new ones register, then all are refined.
+
+    Args:
+        capture: All cameras.
+        previous: The map so far; its workspace is copied, not changed.
+        extra_frames: New keyframes, frame indices by camera.
+        options: The stage's options.
+        context: Work folder, threads, progress.
+
+    Returns:
+        The grown models, each in a new gauge.
+    """
+    import pycolmap
+
+    workspace = context.work_dir / "workspace"
+    shutil.copytree(previous.workspace, workspace)
+    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+        known = image_ids(database)
+        cameras = {
+            ImageRef.parse(image.name).camera: int(image.camera_id) for image in database.read_all_images()
+        }
+    new = [
+        ImageRef(name, int(frame))
+        for name, frames in sorted(extra_frames.items())
+        for frame in frames
+        if ImageRef(name, int(frame)) not in known
+    ]
+    wanted = [
+        (capture.camera(name), cameras[name], np.array(sorted(r.frame for r in new if r.camera == name)))
+        for name in sorted({ref.camera for ref in new})
+    ]
+    add_keyframes(workspace, wanted, options, context)
+    scale = _scale(capture)
+    pairs = choose_pairs([*known, *new], new)
+    match_pairs(workspace, pairs, options, context, scale)
+    constant = _constant(capture, cameras)
+    models = []
+    for number in range(len(previous.maps)):
+        settings = mapper_options(options, constant, scale, context.threads)
+        source = workspace / MODELS_NAME / str(number)
+        model = extend(workspace, source, settings, context, len(known) + len(new))
+        if model is None:
+            model = pycolmap.Reconstruction(str(source))
+        refine(model, settings, constant)
+        models.append(model)
+    write_models(workspace, models)
+    log = {"keyframes": len(known) + len(new), "new_keyframes": len(new), "pairs": len(pairs)}
+    return _result(models, workspace, log)
+
+
+def _scale(capture: Capture) -> float:
+    """Factor on pixel thresholds: that of the largest image."""
+    return max(pixel_scale(item.camera.width_px, item.camera.height_px) for item in capture.cameras)
+
+
+def _constant(capture: Capture, ids: Mapping[str, int]) -> list[int]:
+    """Database ids of the calibrated cameras."""
+    return sorted(number for name, number in ids.items() if capture.camera(name).calibrated)
+
+
+def _require_coverage(models: Sequence[Any], keyframes: int, ladder: object, options: MapOptions) -> None:
+    registered = models[0].num_reg_images() if models else 0
+    if registered < max(2, options.min_coverage * keyframes):
+        raise EstimationError(
+            f"the map holds {registered} of {keyframes} keyframes, "
+            f"fewer than {options.min_coverage:.0%}; initial pairs tried: {ladder}",
+            hint="film sideways movement over textured, well lit surfaces; check the calibration",
+        )
+
+
+def _result(models: Sequence[Any], workspace: Path, log: dict[str, Any]) -> MapResult:
+    maps = tuple(to_map(model, workspace) for model in models)
+    log = {
+        **log,
+        "models": [
+            {
+                "gauge": item.gauge,
+                "keyframes": len(item.keyframe_camera),
+                "points": len(item.points),
+                "mean_error_px": round(item.mean_error_px(), 4),
+            }
+            for item in maps
+        ],
+    }
+    return MapResult(maps=maps, workspace=workspace, log=log)

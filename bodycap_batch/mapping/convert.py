@@ -1,0 +1,72 @@
+"""From COLMAP's reconstruction to our `Map`."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.camera import Camera
+from bodycap_batch.geometry import invert, make_transform
+from bodycap_batch.mapping.database import ImageRef, keypoint_colours
+from bodycap_batch.scene import Map
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+def to_map(model: pycolmap.Reconstruction, workspace: Path) -> Map:
+    """Turn a reconstruction into a `Map`, keyframes and points in a fixed order."""
+    images = sorted(
+        ((ImageRef.parse(model.image(image_id).name), image_id) for image_id in model.reg_image_ids()),
+    )
+    point_ids = sorted(model.point3D_ids())
+    row_of_point = {point_id: row for row, point_id in enumerate(point_ids)}
+    poses, keyframe_rows, point_rows, features, pixels = [], [], [], [], []
+    colour_sum = np.zeros((len(point_ids), 3))
+    for row, (_, image_id) in enumerate(images):
+        image = model.image(image_id)
+        cam_from_map = np.asarray(image.cam_from_world().matrix())
+        poses.append(make_transform(cam_from_map[:, :3], cam_from_map[:, 3]))
+        colours = keypoint_colours(workspace, image_id)
+        for feature in image.get_observation_point2D_idxs():
+            point = image.point2D(feature)
+            point_row = row_of_point[point.point3D_id]
+            keyframe_rows.append(row)
+            point_rows.append(point_row)
+            features.append(feature)
+            pixels.append(point.xy)
+            colour_sum[point_row] += colours[feature]
+    counts = np.bincount(np.array(point_rows, dtype=np.int64), minlength=len(point_ids))
+    map_from_cam = invert(np.array(poses))
+    return Map(
+        gauge=_gauge(map_from_cam),
+        cameras={ref.camera: _camera(model.image(image_id).camera) for ref, image_id in images},
+        keyframe_camera=tuple(ref.camera for ref, _ in images),
+        keyframe_frame=np.array([ref.frame for ref, _ in images], dtype=np.int64),
+        map_from_cam=map_from_cam,
+        points=np.array([model.point3D(point_id).xyz for point_id in point_ids]).reshape(-1, 3),
+        colors=np.round(colour_sum / np.maximum(counts, 1)[:, None]).astype(np.uint8),
+        point_error_px=np.array([model.point3D(point_id).error for point_id in point_ids]),
+        obs_keyframe=np.array(keyframe_rows, dtype=np.int64),
+        obs_point=np.array(point_rows, dtype=np.int64),
+        obs_feature=np.array(features, dtype=np.int64),
+        obs_px=np.array(pixels, dtype=np.float64).reshape(-1, 2),
+    )
+
+
+def _gauge(map_from_cam: FloatArray) -> str:
+    """Name a gauge by what defines it: the keyframes' poses."""
+    return hashlib.sha256(np.ascontiguousarray(map_from_cam).tobytes()).hexdigest()[:12]
+
+
+def _camera(camera: Any) -> Camera:
+    return Camera(
+        model=camera.model.name,
+        width_px=int(camera.width),
+        height_px=int(camera.height),
+        params=np.asarray(camera.params),
+    )

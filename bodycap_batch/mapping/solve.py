@@ -1,0 +1,167 @@
+"""Run COLMAP's incremental mapper over a database: from nothing, or on from an existing model."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bodycap_batch.config import MapOptions
+from bodycap_batch.context import StageContext
+from bodycap_batch.mapping.database import DATABASE_NAME
+
+if TYPE_CHECKING:
+    import pycolmap
+
+MODELS_NAME = "sparse"
+_LADDER = (
+    {"init_min_tri_angle": 16.0, "init_min_num_inliers": 100, "init_max_forward_motion": 0.95},
+    {"init_min_tri_angle": 6.0, "init_min_num_inliers": 50, "init_max_forward_motion": 0.99},
+    {"init_min_tri_angle": 2.0, "init_min_num_inliers": 25, "init_max_forward_motion": 1.0},
+)
+"""Demands on the initial pair, relaxed step by step; the first are COLMAP's own."""
+
+_MIN_MODEL_KEYFRAMES = 3
+_MAX_EXTRA_PARAM = 1e3
+"""A given calibration is trusted: COLMAP's own limit of 1 drops lenses with k3 > 1 silently."""
+
+
+def mapper_options(
+    options: MapOptions, constant_cameras: Collection[int], scale: float, threads: int
+) -> pycolmap.IncrementalPipelineOptions:
+    """Settings of the mapper: seeded, reproducible, given intrinsics held fixed.
+
+    Args:
+        options: The stage's options.
+        constant_cameras: Ids of calibrated cameras.
+        scale: Factor on pixel thresholds.
+        threads: Threads for matching and triangulation; bundle adjustment uses one, because several
+            add up residuals in an order that changes from run to run.
+    """
+    import pycolmap
+
+    settings = pycolmap.IncrementalPipelineOptions()
+    settings.random_seed = options.seed
+    settings.num_threads = threads
+    settings.ba_min_num_residuals_for_cpu_multi_threading = 2**31 - 1
+    settings.extract_colors = False
+    settings.min_model_size = _MIN_MODEL_KEYFRAMES
+    settings.constant_cameras = set(constant_cameras)
+    settings.ba_refine_sensor_from_rig = False
+    for part in (settings, settings.mapper, settings.triangulation):
+        part.max_extra_param = _MAX_EXTRA_PARAM
+    settings.mapper.abs_pose_max_error *= scale
+    settings.mapper.init_max_error *= scale
+    settings.mapper.filter_max_reproj_error *= scale
+    return settings
+
+
+def reconstruct(
+    workspace: Path, settings: pycolmap.IncrementalPipelineOptions, context: StageContext, total: int
+) -> tuple[list[Any], list[dict[str, object]]]:
+    """Build models from nothing, easing the demands on the initial pair until one stands.
+
+    Returns:
+        Reconstructions, largest first, and what each step of the ladder gave.
+    """
+    steps: list[dict[str, object]] = []
+    models: list[Any] = []
+    for step in _LADDER:
+        for name, value in step.items():
+            setattr(settings.mapper, name, value)
+        models = _run(workspace, settings, context, total)
+        steps.append({**step, "models": [model.num_reg_images() for model in models]})
+        if models:
+            break
+    return models, steps
+
+
+def extend(
+    workspace: Path,
+    model: Path,
+    settings: pycolmap.IncrementalPipelineOptions,
+    context: StageContext,
+    total: int,
+) -> Any:
+    """Register the database's new images in an existing model, whose poses stay where they are."""
+    settings.fix_existing_frames = True
+    settings.multiple_models = False
+    found = _run(workspace, settings, context, total, model)
+    return found[0] if found else None
+
+
+def _run(
+    workspace: Path,
+    settings: pycolmap.IncrementalPipelineOptions,
+    context: StageContext,
+    total: int,
+    model: Path | None = None,
+) -> list[Any]:
+    import pycolmap
+
+    target = workspace / "mapper"
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir()
+    token = pycolmap.CancellationToken()
+    images = workspace / "images"
+    images.mkdir(exist_ok=True)
+    found = pycolmap.incremental_mapping(
+        str(workspace / DATABASE_NAME),
+        str(images),
+        str(target),
+        settings,
+        str(model) if model else "",
+        next_image_callback=_ticker(context, token, total),
+        cancellation_token=token,
+    )
+    shutil.rmtree(target, ignore_errors=True)
+    context.check_cancelled()
+    return sorted(found.values(), key=lambda each: (-each.num_reg_images(), -each.num_points3D()))
+
+
+def _ticker(context: StageContext, token: pycolmap.CancellationToken, total: int) -> Callable[[], None]:
+    done = 0
+
+    def tick() -> None:
+        nonlocal done
+        done += 1
+        context.progress(min(done, total), total, "keyframes in the map")
+        if context.cancelled():
+            token.cancel()
+
+    return tick
+
+
+def write_models(workspace: Path, models: list[Any]) -> None:
+    """Write the models to ``sparse/<n>``, replacing what was there."""
+    folder = workspace / MODELS_NAME
+    shutil.rmtree(folder, ignore_errors=True)
+    for number, model in enumerate(models):
+        (folder / str(number)).mkdir(parents=True)
+        model.write(str(folder / str(number)))
+
+
+def refine(
+    model: Any, settings: pycolmap.IncrementalPipelineOptions, constant_cameras: Collection[int]
+) -> None:
+    """One bundle adjustment over the whole model, every pose free; the gauge moves.
+
+    Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999; robust loss, then outliers out.
+    """
+    import pycolmap
+
+    adjust = settings.get_global_bundle_adjustment()
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    for camera_id in constant_cameras:
+        if model.exists_camera(camera_id):
+            config.set_constant_cam_intrinsics(camera_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    summary = pycolmap.create_default_bundle_adjuster(adjust, config, model).solve()
+    del summary
+    pycolmap.ObservationManager(model).filter_all_points3D(
+        settings.mapper.filter_max_reproj_error, settings.mapper.filter_min_tri_angle
+    )
+    model.update_point_3d_errors()

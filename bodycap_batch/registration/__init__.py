@@ -1,0 +1,277 @@
+"""Stage 3: every frame's pose, by tracking the map's points into it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray, IntArray
+from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.config import RegistrationOptions
+from bodycap_batch.context import StageContext
+from bodycap_batch.geometry import invert
+from bodycap_batch.registration.growth import wanted_keyframes
+from bodycap_batch.registration.pose import FramePose, PoseLimits, judge_pose, solve_pose
+from bodycap_batch.registration.tracks import Anchor, Tracks, anchors_of, track_scale, track_stretch
+from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
+
+__all__ = ["register_frames"]
+
+_MAP_NOISE_PX = 0.6
+_THRESHOLD_SIGMAS = 3.5
+_BLUR_RATIO = 0.6
+_BLUR_WINDOW = 15
+
+
+def register_frames(
+    camera: CaptureCamera,
+    maps: Sequence[Map],
+    selection: KeyframeSelection,
+    options: RegistrationOptions,
+    context: StageContext,
+    previous: Registration | None = None,
+) -> Registration:
+    """Solve the pose of every frame of one camera against the map.
+
+    The map's points are tracked from both neighbouring keyframes; where both reach a frame, the
+    observation that travelled less is kept. No new points are made.
+
+    Args:
+        camera: The camera's video.
+        maps: Models of the room; the one with most of this camera's keyframes is used.
+        selection: The camera's keyframes (sharpness and track noise are read from it).
+        options: Limits.
+        context: Progress, cancellation.
+        previous: An earlier registration against a smaller map. Stretches whose keyframes did not
+            change keep their observations; every pose is solved again.
+
+    Returns:
+        A pose or a reason for every frame, and the frames that should become keyframes.
+    """
+    tried = _tried(selection, previous)
+    scene_map = _own_map(maps, camera.name)
+    if scene_map is None:
+        return _without_map(camera, tried)
+    anchors = anchors_of(scene_map, camera.name)
+    tracks = _all_tracks(camera, anchors, previous, context)
+    lookup = _PointLookup.of(scene_map, camera.name)
+    poses = _solve_all(camera, scene_map, lookup, tracks, _limits(camera, selection, options), context)
+    trajectory = _trajectory(camera, scene_map.gauge, poses, selection.sharpness)
+    return Registration(
+        trajectory=trajectory,
+        obs_frame=tracks.frame,
+        obs_keyframe=tracks.keyframe,
+        obs_feature=tracks.feature,
+        obs_px=tracks.px,
+        wanted_keyframes=wanted_keyframes(trajectory.localised, selection.sharpness, tried),
+        tried_keyframes=tried,
+    )
+
+
+def _tried(selection: KeyframeSelection, previous: Registration | None) -> IntArray:
+    if previous is None:
+        return np.asarray(selection.frames)
+    return np.union1d(previous.tried_keyframes, previous.wanted_keyframes)
+
+
+def _own_map(maps: Sequence[Map], camera: str) -> Map | None:
+    """The model with most of a camera's keyframes, or None."""
+    counts = [len(item.keyframes_of(camera)) for item in maps]
+    return maps[int(np.argmax(counts))] if counts and max(counts) > 0 else None
+
+
+def _limits(camera: CaptureCamera, selection: KeyframeSelection, options: RegistrationOptions) -> PoseLimits:
+    noise_px = np.hypot(_MAP_NOISE_PX * track_scale(camera), 2.0 * selection.noise_px)
+    return PoseLimits(
+        max_error_px=float(_THRESHOLD_SIGMAS * noise_px),
+        min_inliers=options.min_inliers,
+        max_sigma_depth=options.max_sigma_depth,
+    )
+
+
+def _without_map(camera: CaptureCamera, tried: IntArray) -> Registration:
+    none = Tracks.join([])
+    poses = [FramePose(status=FrameStatus.NO_MAP)] * len(camera.times_ns)
+    return Registration(
+        trajectory=_trajectory(camera, "none", poses, np.zeros(len(poses))),
+        obs_frame=none.frame,
+        obs_keyframe=none.keyframe,
+        obs_feature=none.feature,
+        obs_px=none.px,
+        wanted_keyframes=np.zeros(0, np.int64),
+        tried_keyframes=tried,
+    )
+
+
+def _all_tracks(
+    camera: CaptureCamera,
+    anchors: dict[int, Anchor],
+    previous: Registration | None,
+    context: StageContext,
+) -> Tracks:
+    """Track every stretch between neighbouring keyframes, or reuse what the last round tracked there."""
+    count = len(camera.times_ns)
+    frames = sorted(anchors)
+    stretches = list(zip([None, *frames], [*frames, None], strict=True))
+    known: set[tuple[int | None, int | None]] = set()
+    parts = []
+    if previous is not None:
+        status = previous.trajectory.status
+        before = [index for index, value in enumerate(status) if value is FrameStatus.KEYFRAME]
+        known = set(zip([None, *before], [*before, None], strict=True))
+        kept = [stretch for stretch in stretches if stretch in known]
+        parts.append(_reuse(previous, kept, count))
+    todo = _joined([stretch for stretch in stretches if stretch not in known], count)
+    total = sum(stop - start for start, stop in todo)
+    done = 0
+    for start, stop in todo:
+        for found in track_stretch(camera, anchors, start, stop, context):
+            parts.append(found)
+            context.progress(min(done + int(found.frame[0]) - start, total), total, "frames tracked")
+        done += stop - start
+    return Tracks.join(parts)
+
+
+def _joined(stretches: list[tuple[int | None, int | None]], count: int) -> list[tuple[int, int]]:
+    """Merge stretches that touch into ranges [start, stop) of frames, keyframes included."""
+    ranges: list[tuple[int, int]] = []
+    for first, last in stretches:
+        start, stop = first or 0, count if last is None else last + 1
+        if ranges and start < ranges[-1][1]:
+            ranges[-1] = (ranges[-1][0], stop)
+        else:
+            ranges.append((start, stop))
+    return ranges
+
+
+def _reuse(previous: Registration, stretches: list[tuple[int | None, int | None]], count: int) -> Tracks:
+    old = Tracks(previous.obs_frame, previous.obs_keyframe, previous.obs_feature, previous.obs_px)
+    inside = np.zeros(count, dtype=bool)
+    for first, last in stretches:
+        inside[(0 if first is None else first + 1) : (count if last is None else last)] = True
+    return old.select(inside[old.frame])
+
+
+@dataclass(frozen=True, slots=True)
+class _PointLookup:
+    """From (keyframe, feature) to the map's point, and each keyframe's own observations."""
+
+    key: IntArray
+    point: IntArray
+    pose_of: dict[int, FloatArray]
+
+    _STRIDE = 1 << 24
+
+    @staticmethod
+    def of(scene_map: Map, camera: str) -> _PointLookup:
+        mine = np.isin(scene_map.obs_keyframe, scene_map.keyframes_of(camera))
+        frame = scene_map.keyframe_frame[scene_map.obs_keyframe[mine]]
+        key = frame * _PointLookup._STRIDE + scene_map.obs_feature[mine]
+        order = np.argsort(key, kind="stable")
+        poses = {
+            int(scene_map.keyframe_frame[row]): scene_map.map_from_cam[row]
+            for row in scene_map.keyframes_of(camera)
+        }
+        return _PointLookup(key[order], scene_map.obs_point[mine][order], poses)
+
+    def points(self, keyframe: IntArray, feature: IntArray) -> IntArray:
+        """Point index of each (keyframe, feature); −1 where the map has none."""
+        if len(self.key) == 0:
+            return np.full(len(keyframe), -1, np.int64)
+        wanted = keyframe * _PointLookup._STRIDE + feature
+        at = np.minimum(np.searchsorted(self.key, wanted), len(self.key) - 1)
+        return np.where(self.key[at] == wanted, self.point[at], -1)
+
+
+def _solve_all(
+    camera: CaptureCamera,
+    scene_map: Map,
+    lookup: _PointLookup,
+    tracks: Tracks,
+    limits: PoseLimits,
+    context: StageContext,
+) -> list[FramePose]:
+    lens = scene_map.cameras[camera.name]
+    count = len(camera.times_ns)
+    bounds = np.searchsorted(tracks.frame, np.arange(count + 1))
+    point = lookup.points(tracks.keyframe, tracks.feature)
+    hops = np.abs(tracks.frame - tracks.keyframe)
+    keyframe_row = {
+        int(scene_map.keyframe_frame[row]): int(row) for row in scene_map.keyframes_of(camera.name)
+    }
+    poses = []
+    for frame in range(count):
+        if frame % 30 == 0:
+            context.check_cancelled()
+            context.progress(frame, count, "poses solved")
+        row = keyframe_row.get(frame)
+        if row is not None:
+            poses.append(_keyframe_pose(scene_map, row, limits))
+            continue
+        rows = np.arange(bounds[frame], bounds[frame + 1])
+        rows = rows[point[rows] >= 0]
+        rows = rows[np.lexsort((hops[rows], point[rows]))]
+        _, first = np.unique(point[rows], return_index=True)
+        rows = rows[first]
+        seen = scene_map.points[point[rows]]
+        poses.append(solve_pose(lens, seen, tracks.px[rows].astype(np.float64), limits))
+    context.progress(count, count, "poses solved")
+    return poses
+
+
+def _keyframe_pose(scene_map: Map, row: int, limits: PoseLimits) -> FramePose:
+    """The map's own pose of a keyframe, with the covariance its observations support."""
+    mine = scene_map.obs_keyframe == row
+    points = scene_map.points[scene_map.obs_point[mine]]
+    cam_from_map = invert(scene_map.map_from_cam[row])
+    judged = judge_pose(
+        scene_map.cameras[scene_map.keyframe_camera[row]],
+        cam_from_map,
+        points,
+        scene_map.obs_px[mine],
+        limits,
+    )
+    status = FrameStatus.KEYFRAME if judged.status is FrameStatus.REGISTERED else judged.status
+    return FramePose(
+        status=status,
+        gauge_from_cam=judged.gauge_from_cam,
+        covariance=judged.covariance,
+        inliers=judged.inliers,
+        error_px=judged.error_px,
+    )
+
+
+def _trajectory(
+    camera: CaptureCamera, gauge: str, poses: Sequence[FramePose], sharpness: FloatArray
+) -> Trajectory:
+    none4, none6 = np.full((4, 4), np.nan), np.full((6, 6), np.nan)
+    return Trajectory(
+        camera=camera.name,
+        gauge=gauge,
+        frame_numbers=camera.frame_numbers,
+        times_ns=camera.times_ns,
+        gauge_from_cam=np.array(
+            [none4 if pose.gauge_from_cam is None else pose.gauge_from_cam for pose in poses]
+        ).reshape(-1, 4, 4),
+        covariance=np.array(
+            [none6 if pose.covariance is None else pose.covariance for pose in poses]
+        ).reshape(-1, 6, 6),
+        status=tuple(_blamed(poses, sharpness)),
+        inliers=np.array([pose.inliers for pose in poses], dtype=np.int64),
+        error_px=np.array([pose.error_px for pose in poses]),
+    )
+
+
+def _blamed(poses: Sequence[FramePose], sharpness: FloatArray) -> list[FrameStatus]:
+    """Statuses; a frame without tracks that is much less sharp than its surroundings is called blurred."""
+    out = []
+    for index, pose in enumerate(poses):
+        status = pose.status
+        if status is FrameStatus.FEW_TRACKS:
+            near = sharpness[max(0, index - _BLUR_WINDOW) : index + _BLUR_WINDOW + 1]
+            if sharpness[index] < _BLUR_RATIO * np.median(near):
+                status = FrameStatus.BLUR
+        out.append(status)
+    return out

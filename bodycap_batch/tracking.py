@@ -1,0 +1,131 @@
+"""Sparse optical flow between two frames, checked forward and backward. Pixels have COLMAP's origin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from bodycap_batch.arrays import BoolArray, FloatArray
+from bodycap_batch.camera import CV2_PIXEL_OFFSET_PX
+
+GreyImage = npt.NDArray[np.uint8]
+Pixels = npt.NDArray[np.float32]
+
+REFERENCE_WIDTH_PX = 640.0
+"""Pixel thresholds are stated for images of this long side and scale with it."""
+
+_WINDOW_PX = 21
+_LEVELS = 4
+_ITERATIONS = 20
+_EPSILON_PX = 0.02
+_MAX_ROUND_TRIP_PX = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """Where points went.
+
+    Attributes:
+        px: (N,2) position in the second image, COLMAP origin.
+        ok: (N,) found, inside the image and returning to where it came from.
+        round_trip_px: (N,) distance between a point and its image after going there and back.
+    """
+
+    px: Pixels
+    ok: BoolArray
+    round_trip_px: Pixels
+
+
+def pixel_scale(width_px: int, height_px: int) -> float:
+    """Factor on pixel thresholds for an image of this size."""
+    return max(width_px, height_px) / REFERENCE_WIDTH_PX
+
+
+def track_points(first: GreyImage, second: GreyImage, px: Pixels, guess_px: Pixels | None = None) -> Flow:
+    """Follow points from one image to the next by pyramidal Lucas–Kanade, there and back.
+
+    Args:
+        first: (H,W) uint8 image.
+        second: (H,W) uint8 image.
+        px: (N,2) float32 points in the first image.
+        guess_px: (N,2) where to start looking in the second image.
+
+    Source: Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2000; the check is
+        Kalal, Mikolajczyk, Matas, "Forward-backward error", ICPR 2010.
+    """
+    import cv2
+
+    if len(px) == 0:
+        return Flow(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0, np.float32))
+    start = np.ascontiguousarray(px - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ITERATIONS, _EPSILON_PX)
+    window = (_WINDOW_PX, _WINDOW_PX)
+    flags = 0
+    there_start: npt.NDArray[np.float32] | None = None
+    if guess_px is not None:
+        there_start = np.ascontiguousarray(guess_px - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
+        flags = cv2.OPTFLOW_USE_INITIAL_FLOW
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        first, second, start, there_start, None, None, window, _LEVELS, criteria, flags
+    )
+    height, width = second.shape
+    inside = ((there >= 0) & (there <= (width - 1, height - 1))).all(axis=1)
+    alive = np.asarray(found).ravel().astype(bool) & inside
+    back = np.full_like(there, np.inf)
+    if alive.any():
+        returned, refound, _ = cv2.calcOpticalFlowPyrLK(
+            second, first, there[alive], None, None, None, window, _LEVELS, criteria, 0
+        )
+        returned[~np.asarray(refound).ravel().astype(bool)] = np.inf
+        back[alive] = returned
+    round_trip = np.linalg.norm(back - start, axis=1).astype(np.float32)
+    limit = _MAX_ROUND_TRIP_PX * pixel_scale(width, height)
+    return Flow((there + CV2_PIXEL_OFFSET_PX).astype(np.float32), alive & (round_trip < limit), round_trip)
+
+
+def detect_corners(grey: GreyImage, count: int, spacing_px: float) -> Pixels:
+    """Corners (N,2) worth tracking, strongest first, at least `spacing_px` apart.
+
+    Source: Shi, Tomasi, "Good features to track", CVPR 1994.
+    """
+    import cv2
+
+    corners = cv2.goodFeaturesToTrack(grey, count, 0.005, spacing_px)
+    if corners is None:
+        return np.zeros((0, 2), np.float32)
+    return np.asarray(corners.reshape(-1, 2) + CV2_PIXEL_OFFSET_PX, dtype=np.float32)
+
+
+def sharpness(grey: GreyImage) -> float:
+    """Spread of the image's second derivative: falls with blur, comparable between neighbouring frames.
+
+    Source: Pech-Pacheco et al., "Diatom autofocusing in brightfield microscopy", ICPR 2000.
+    """
+    import cv2
+
+    small = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(small, cv2.CV_16S, ksize=1).std())
+
+
+def bearings(rays: FloatArray) -> FloatArray:
+    """Unit directions (N,3) of rays (N,2) given at depth 1."""
+    full = np.column_stack([rays, np.ones(len(rays))])
+    return np.asarray(full / np.linalg.norm(full, axis=1, keepdims=True))
+
+
+def fit_rotation(first: FloatArray, second: FloatArray, rounds: int = 4) -> FloatArray:
+    """Rotation (3,3) that best turns unit directions (N,3) `first` into `second`, robustly.
+
+    Source: Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976, reweighted
+        with Cauchy weights at the median residual.
+    """
+    weight = np.ones(len(first))
+    rotation = np.eye(3)
+    for _ in range(rounds):
+        u, _, vt = np.linalg.svd((second * weight[:, None]).T @ first)
+        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
+        residual = np.linalg.norm(second - first @ rotation.T, axis=1)
+        weight = 1.0 / (1.0 + (residual / (np.median(residual) + 1e-9)) ** 2)
+    return np.asarray(rotation)
