@@ -1,0 +1,95 @@
+"""Each module alone in a fresh interpreter: import order must not matter, and a start must stay cheap."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+PACKAGE = REPOSITORY / "bodycap_batch"
+
+# Loaded before zlib, pycolmap makes every later compression abort: so whatever a module brings in, and
+# whatever comes after it, files must still be written and read back.
+AFTER_IMPORT = """
+import importlib, sys
+importlib.import_module(sys.argv[1])
+import pycolmap
+from pathlib import Path
+import cv2, numpy
+image = numpy.arange(120 * 160 * 3, dtype=numpy.uint32).astype(numpy.uint8).reshape(120, 160, 3)
+folder = Path(sys.argv[2])
+assert cv2.imwrite(str(folder / "image.png"), image)
+assert (cv2.imread(str(folder / "image.png")) == image).all()
+numpy.savez_compressed(folder / "arrays.npz", image=image)
+assert (numpy.load(folder / "arrays.npz")["image"] == image).all()
+"""
+# What costs tenths of seconds to seconds to load, or changes the process (pycolmap takes over SIGTERM).
+HEAVY = ("pycolmap", "open3d", "gtsam", "cv2", "av", "matplotlib", "pandas", "distributed", "pytest", "scipy")
+
+
+def module_names() -> list[str]:
+    """All importable modules; ``__main__`` acts when imported and is left to its own tests."""
+    paths = [path.relative_to(REPOSITORY).with_suffix("") for path in sorted(PACKAGE.rglob("*.py"))]
+    dotted = (".".join(path.parts).removesuffix(".__init__") for path in paths)
+    return [name for name in dotted if not name.endswith("__main__")]
+
+
+def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(REPOSITORY)}
+    return subprocess.run(
+        [sys.executable, *arguments],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+
+
+def modules_after(name: str) -> set[str]:
+    done = run_python("-c", f"import json, sys, {name}; print(json.dumps(list(sys.modules)))")
+    assert done.returncode == 0, done.stderr
+    return set(json.loads(done.stdout))
+
+
+def failures(names: list[str], folder: Path) -> str:
+    """Import each module in an interpreter of its own, as many at a time as there are cores."""
+
+    def failure(name: str) -> str:
+        (folder / name).mkdir()
+        done = run_python("-c", AFTER_IMPORT, name, str(folder / name))
+        return f"{name}: exit code {done.returncode}\n{done.stderr}" if done.returncode else ""
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return "\n".join(filter(None, pool.map(failure, names)))
+
+
+def test_each_room_alone_leaves_compression_working(tmp_path: Path) -> None:
+    rooms = [name for name in module_names() if name.count(".") <= 1]
+    assert "bodycap_batch.geometry" in rooms
+    assert not failures(rooms, tmp_path)
+
+
+@pytest.mark.slow
+def test_each_module_alone_leaves_compression_working(tmp_path: Path) -> None:
+    parts = [name for name in module_names() if name.count(".") > 1]
+    assert "bodycap_batch.config.options" in parts
+    assert not failures(parts, tmp_path)
+
+
+@pytest.mark.parametrize("name", ["bodycap_batch.cli", "bodycap_batch.pipeline"])
+def test_heavy_libraries_load_when_needed(name: str) -> None:
+    assert not modules_after(name) & set(HEAVY)
+
+
+def test_help_answers() -> None:
+    done = run_python("-c", "from bodycap_batch.cli import main; main()", "--help")
+    assert done.returncode == 0, done.stderr
+    for command in ("run", "check", "evaluate", "synth"):
+        assert command in done.stdout
