@@ -1,0 +1,41 @@
+"""What the export stage works on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bodycap_batch.body import CameraClock, MergeResult
+from bodycap_batch.scene import KeyframeSelection, Map, Trajectory
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExportInputs:
+    """All results of a job, before they become files.
+
+    Attributes:
+        out_dir: Folder the files go into (created where missing).
+        maps: The models, largest first, each in its own gauge.
+        trajectories: One per camera, in the gauge of the map it was solved in.
+        clocks: By camera name.
+        selections: Keyframe selections, one per camera.
+        merge: The body in the world; None for ``skeleton: none`` or when merging failed.
+        partial_reason: Why there is no body although one was asked for.
+        log: Plain JSON values about the map's making (no clocks, no paths), kept in ``metrics.json``.
+    """
+
+    out_dir: Path
+    maps: tuple[Map, ...]
+    trajectories: tuple[Trajectory, ...]
+    clocks: Mapping[str, CameraClock]
+    selections: tuple[KeyframeSelection, ...] = ()
+    merge: MergeResult | None = None
+    partial_reason: str | None = None
+    log: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        missing = [t.camera for t in self.trajectories if t.camera not in self.clocks]
+        if missing:
+            raise ValueError(f"no clock for {', '.join(missing)}")
