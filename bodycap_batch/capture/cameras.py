@@ -149,10 +149,12 @@ def _grey(frame: VideoFrame) -> Image:
     if name not in _LUMA_FORMATS:
         return np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)
     plane = frame.planes[0]
-    luma = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: frame.height, : frame.width]
+    luma = np.asarray(memoryview(plane), dtype=np.uint8).reshape(-1, plane.line_size)[
+        : frame.height, : frame.width
+    ]
     if name.startswith(("yuvj", "gray")) or frame.color_range == _FULL_RANGE:
         return luma
-    return _EXPAND[luma]
+    return np.asarray(_EXPAND[luma], dtype=np.uint8)
 
 
 def _rgb(frame: VideoFrame) -> Image:

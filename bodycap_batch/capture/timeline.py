@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -78,39 +79,23 @@ def _parse_seconds(text: str, path: Path, line: int) -> int:
     raise CaptureError(f"{text[:40]!r} is no time in seconds", path=path, line=line, hint="one number a line")
 
 
-def join_chapters(videos: tuple[VideoFile, ...], sidecar: Path | None) -> Timeline:
+def join_chapters(videos: tuple[VideoFile, ...], sidecars: tuple[Path, ...]) -> Timeline:
     """Put the frames of all chapters on the camera's clock.
 
-    A sidecar for the whole camera decides; else sidecars of the chapters (``<video>.timestamps.txt``,
-    all or none); else the containers' exact timestamps. Chapters that start again at zero follow one
-    another without a gap, unless their creation times say that more than two seconds are missing.
+    Sidecars decide (one for all chapters, or one each); without them, the containers' exact
+    timestamps. Chapters that start again at zero follow one another without a gap, unless their
+    creation times say that more than two seconds are missing.
 
     Raises:
         CaptureError: A sidecar does not fit its video.
     """
-    if sidecar is not None:
-        times = _sidecar_times(sidecar, sum(len(video.pts) for video in videos))
-        return Timeline(times_ns=times, usable=np.ones(len(times), dtype=bool), notes=())
-    beside = [chapter_sidecar(video.path) for video in videos]
-    if all(beside):
-        parts = [_sidecar_times(path, len(v.pts)) for path, v in zip(beside, videos, strict=True) if path]
+    if len(sidecars) == len(videos):
+        parts = [_sidecar_times(path, len(v.pts)) for path, v in zip(sidecars, videos, strict=True)]
         return _joined(videos, parts)
-    if any(beside):
-        lacking = next(video.path for video, path in zip(videos, beside, strict=True) if path is None)
-        raise CaptureError(
-            "this chapter has no .timestamps.txt, others of its camera have",
-            path=lacking,
-            hint="give every chapter its timestamps, or none",
-        )
+    if len(sidecars) == 1:
+        times = _sidecar_times(sidecars[0], sum(len(video.pts) for video in videos))
+        return _joined(videos, np.split(times, np.cumsum([len(video.pts) for video in videos])[:-1]))
     return _joined(videos, _container_times(videos))
-
-
-def chapter_sidecar(video: Path) -> Path | None:
-    """The sidecar beside one video: ``torso.timestamps.txt`` or ``torso.mp4.timestamps.txt``."""
-    for name in (f"{video.stem}.timestamps.txt", f"{video.name}.timestamps.txt"):
-        if video.with_name(name).is_file():
-            return video.with_name(name)
-    return None
 
 
 def _sidecar_times(path: Path, frames: int) -> IntArray:
@@ -127,7 +112,7 @@ def _sidecar_times(path: Path, frames: int) -> IntArray:
 def _container_times(videos: tuple[VideoFile, ...]) -> list[IntArray]:
     """Each chapter's times, moved behind the chapter before it where it starts again at zero."""
     parts = [videos[0].times_ns()]
-    for before, video in zip(videos, videos[1:], strict=False):
+    for before, video in itertools.pairwise(videos):
         own, start = video.times_ns(), int(parts[-1][0])
         runs_on = int(own[0]) > start + before.duration_ns // 2
         shift = 0 if runs_on else start + before.duration_ns + _missing_ns(before, video) - int(own[0])

@@ -91,13 +91,14 @@ def open_container(path: Path) -> InputContainer:
     if path.stat().st_size == 0:
         raise CaptureError("the video is empty (0 bytes)", path=path, hint=COPY_AGAIN)
     try:
-        return av.open(str(path))
+        container: InputContainer = av.open(str(path))
     except (av.error.FFmpegError, OSError) as error:
         raise CaptureError(
             f"not a readable video ({_reason(error)}); recordings cut short have no index",
             path=path,
             hint=COPY_AGAIN,
         ) from error
+    return container
 
 
 def _reason(error: Exception) -> str:
@@ -124,7 +125,7 @@ def index_video(path: Path) -> VideoFile:
                 hint=COPY_AGAIN,
             )
         metadata = {**container.metadata, **stream.metadata}
-        time_base, rate = Fraction(stream.time_base), stream.average_rate or stream.guessed_rate
+        time_base, rate = Fraction(stream.time_base or 0), stream.average_rate or stream.guessed_rate
     video = VideoFile(
         path=path,
         pts=pts,
@@ -208,13 +209,17 @@ def _with_first_frame(video: VideoFile) -> VideoFile:
 
 def _orientation(frame: VideoFrame) -> tuple[tuple[int, int], tuple[int, int]]:
     """Round the display matrix to a quarter turn or mirror: shown = matrix · stored, y down."""
-    for side_data in frame.side_data:
-        if side_data.type.name == "DISPLAYMATRIX":
-            a, b, _, c, d, *_ = struct.unpack("=9i", bytes(side_data)[:36])
-            if abs(a) + abs(d) >= abs(b) + abs(c):
-                return (int(np.sign(a) or 1), 0), (0, int(np.sign(d) or 1))
-            return (0, int(np.sign(c) or 1)), (int(np.sign(b) or 1), 0)
-    return (1, 0), (0, 1)
+    side_data: Any = frame.side_data.get("DISPLAYMATRIX")
+    if side_data is None:
+        return (1, 0), (0, 1)
+    a, b, _, c, d, *_ = struct.unpack("=9i", bytes(side_data)[:36])
+    if abs(a) + abs(d) >= abs(b) + abs(c):
+        return (_sign(a), 0), (0, _sign(d))
+    return (0, _sign(c)), (_sign(b), 0)
+
+
+def _sign(value: int) -> int:
+    return -1 if value < 0 else 1
 
 
 def turn_upright(
@@ -283,5 +288,5 @@ def _lost(video: VideoFile, index: int) -> CaptureError:
     return CaptureError(
         f"frame {index} (at {seconds:.2f} s) cannot be decoded",
         path=video.path,
-        hint="re-encode the video (ffmpeg -i in.mp4 -fps_mode passthrough out.mp4), or cut before it with end_s",
+        hint="re-encode it (ffmpeg -i in.mp4 -fps_mode passthrough out.mp4), or cut before it with end_s",
     )

@@ -83,7 +83,7 @@ def folder_capture(folder: Path) -> dict[str, object]:
         raise CaptureError(
             "no video in this folder",
             path=folder,
-            hint="name the videos after their place on the body, e.g. torso.mp4, left_palm.mp4, right_palm.mp4",
+            hint="name them after their place on the body, e.g. torso.mp4, left_palm.mp4, right_palm.mp4",
         )
     named = [(path.name if path.is_dir() else path.stem, path) for path in videos]
     _refuse_doubles(named)
@@ -104,6 +104,9 @@ def _camera_block(folder: Path, name: str, path: Path) -> dict[str, object]:
     sidecar = folder / f"{name}.timestamps.txt"
     if sidecar.is_file():
         block["timestamps"] = str(sidecar)
+    own = path / "calib.json"
+    if path.is_dir() and own.is_file():
+        block["calibration"] = str(own)
     return block
 
 
@@ -125,5 +128,6 @@ def _refuse_nameless(named: list[tuple[str, Path]]) -> None:
         raise JobError(
             f"where on the body was {', '.join(nameless)}? The name does not say",
             path=named[0][1].parent,
-            hint=f"rename to one of {', '.join(MOUNT_NAMES)}; or write a job file with `mount:` for each camera",
+            hint=f"rename to one of {', '.join(MOUNT_NAMES)}; put the chapters of one camera into a folder "
+            "of that name; or write a job file that gives each camera its `mount:`",
         )

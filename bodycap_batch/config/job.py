@@ -2,44 +2,212 @@
 
 from __future__ import annotations
 
+import json
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.config.calibration import Calibration, CalibrationEntry, read_calibration
+from pydantic import ValidationError
+
+from bodycap_batch.config.calibration import CalibrationEntry, read_calibration
+from bodycap_batch.config.explain import Problem, job_error, problems_of
 from bodycap_batch.config.folder import chapters_in, folder_capture
-from bodycap_batch.config.models import CameraConfig, CaptureConfig, Job
-from bodycap_batch.errors import JobError
+from bodycap_batch.config.models import SKELETON_PRESETS, CameraConfig, CaptureConfig, Job
+from bodycap_batch.config.rules import problems_in, skeleton_of
+from bodycap_batch.config.yaml_source import YamlSource, read_yaml
+from bodycap_batch.errors import CaptureError, JobError
+
+_HEIGHT_M = (0.4, 2.6)
+_LISTS = ("video", "timestamps")
+
+Prepare = Callable[[Mapping[str, Any], Path], None]
+"""Called with the options of `capture.synthetic` and the folder its videos belong into."""
 
 
-def load_job(path: Path) -> Job:
-    """Load and resolve a job."""
-    base = path.resolve()
-    job = Job.model_validate({"capture": folder_capture(base)})
-    return resolve_job(job, base, name=base.name)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Overrides:
+    """What the command line says over the job; relative paths are relative to the working folder."""
+
+    out: Path | None = None
+    skeleton: str | None = None
+    height_m: float | None = None
 
 
-def resolve_job(job: Job, base: Path, name: str) -> Job:
-    """Make paths absolute, list chapters, read calibration files, fill in what follows."""
-    cameras = tuple(_resolve_camera(camera, job.capture, base) for camera in job.capture.cameras)
+def load_job(path: Path, overrides: Overrides | None = None, *, prepare: Prepare | None = None) -> Job:
+    """Load a job and resolve it: absolute paths, chapters and sidecars listed, calibrations read.
+
+    Args:
+        path: A YAML file (paths in it are relative to it), or a folder of videos.
+        overrides: Values of the command line.
+        prepare: Makes the videos of a job with `capture.synthetic` before they are looked for.
+
+    Returns:
+        The job; `Job.model_validate(job.model_dump(mode="json"))` gives it back.
+
+    Raises:
+        JobError: The file is no valid job; names file, line, field and a remedy.
+        CaptureError: A calibration or a folder of videos cannot be used.
+    """
+    full = path.resolve()
+    if full.is_dir():
+        source, data, base = None, {"capture": folder_capture(full)}, full
+    else:
+        source = read_yaml(full)
+        data, base = _mapping(source), full.parent
+    job = _with_overrides(_validated(data, full, source), overrides or Overrides())
+    problems = problems_in(job)
+    if problems:
+        raise job_error(problems, full, source)
+    if job.capture.synthetic is not None:
+        _prepare_synthetic(job, base, full, prepare)
+    return _resolved(job, base, _safe_name(full.name if full.is_dir() else full.stem), full, source)
+
+
+def synthetic_folder(job: Job, base: Path) -> Path:
+    """Folder the videos of a synthetic capture belong into: the one that holds them all."""
+    folders = {(base / video).resolve().parent for camera in job.capture.cameras for video in camera.video}
+    if len(folders) > 1:
+        raise JobError(
+            "a synthetic capture's videos lie in one folder, these lie in several",
+            field="capture.cameras",
+            hint="bodycap synth writes <folder>/<camera>.mp4",
+        )
+    return folders.pop()
+
+
+def _mapping(source: YamlSource) -> dict[str, Any]:
+    if source.data is None:
+        raise JobError("the job is empty", path=source.path, hint="it needs at least `capture:`")
+    if not isinstance(source.data, dict):
+        raise JobError(
+            "the job is no block of `key: value` lines", path=source.path, hint="start with `capture:`"
+        )
+    return source.data
+
+
+def _validated(data: dict[str, Any], path: Path, source: YamlSource | None) -> Job:
+    """Check types strictly: by way of JSON, where a list may become a tuple but "5" no number."""
+    try:
+        return Job.model_validate_json(json.dumps(_with_lists(data)), strict=True)
+    except ValidationError as error:
+        raise job_error(problems_of(error, Job, data), path, source) from error
+
+
+def _with_lists(data: dict[str, Any]) -> dict[str, Any]:
+    """Write a single video or sidecar as a list of one (strict checks see no converted values)."""
+    capture = data.get("capture")
+    if not isinstance(capture, dict) or not isinstance(capture.get("cameras"), list):
+        return data
+    cameras = [
+        {key: [v] if key in _LISTS and isinstance(v, str) else v for key, v in camera.items()}
+        if isinstance(camera, dict)
+        else camera
+        for camera in capture["cameras"]
+    ]
+    return {**data, "capture": {**capture, "cameras": cameras}}
+
+
+def _with_overrides(job: Job, overrides: Overrides) -> Job:
+    update: dict[str, Any] = {}
+    if overrides.out is not None:
+        update["out"] = overrides.out.resolve()
+    if overrides.skeleton is not None:
+        preset = overrides.skeleton in SKELETON_PRESETS or not overrides.skeleton.lower().endswith(".bvh")
+        update["skeleton"] = overrides.skeleton if preset else str(Path(overrides.skeleton).resolve())
+    if overrides.height_m is not None:
+        if not _HEIGHT_M[0] <= overrides.height_m <= _HEIGHT_M[1]:
+            raise JobError(
+                f"a subject {overrides.height_m:g} m tall?",
+                field="height_m",
+                hint="the height in metres, e.g. 1.75",
+            )
+        update["height_m"] = float(overrides.height_m)
+    return job.model_copy(update=update)
+
+
+def _prepare_synthetic(job: Job, base: Path, path: Path, prepare: Prepare | None) -> None:
+    folder = synthetic_folder(job, base)
+    if prepare is not None:
+        prepare(dict(job.capture.synthetic or {}), folder)
+    missing = [v for camera in job.capture.cameras for v in camera.video if not (base / v).is_file()]
+    if missing:
+        raise CaptureError(
+            "the sample capture has not been rendered yet",
+            path=(base / missing[0]).resolve(),
+            field="capture.synthetic",
+            hint=f"`bodycap run {path.name}` renders it on first use",
+        )
+
+
+def _resolved(job: Job, base: Path, name: str, path: Path, source: YamlSource | None) -> Job:
+    cameras = tuple(
+        _resolved_camera(camera, index, job.capture, base) for index, camera in enumerate(job.capture.cameras)
+    )
+    skeleton = skeleton_of(job)
+    if skeleton not in SKELETON_PRESETS:
+        skeleton = str((base / skeleton).resolve())
+        if not Path(skeleton).is_file():
+            raise job_error(
+                [Problem(("skeleton",), f"no such file: {skeleton}", "check the path")], path, source
+            )
     capture = job.capture.model_copy(update={"cameras": cameras, "calibration": None})
-    return job.model_copy(update={"capture": capture, "name": job.name or name})
+    name = job.name or name
+    out = (base / job.out if job.out is not None else Path("out") / name).resolve()
+    return job.model_copy(update={"capture": capture, "name": name, "skeleton": skeleton, "out": out})
 
 
-def _resolve_camera(camera: CameraConfig, capture: CaptureConfig, base: Path) -> CameraConfig:
-    chapters: list[Path] = []
-    for video in camera.video:
-        full = base / video
-        chapters.extend(chapters_in(full) if full.is_dir() else [full])
+def _resolved_camera(camera: CameraConfig, index: int, capture: CaptureConfig, base: Path) -> CameraConfig:
+    videos, sidecars = _chapters(camera, base)
+    if camera.timestamps:
+        sidecars = tuple((base / path).resolve() for path in camera.timestamps)
+    if len(sidecars) not in (0, 1, len(videos)):
+        raise CaptureError(
+            f"camera {camera.name} has {len(sidecars)} timestamp files for {len(videos)} chapters",
+            path=sidecars[0],
+            field=f"capture.cameras.{index}.timestamps",
+            hint="one for the whole camera, or one beside every chapter",
+        )
     calibration = camera.calibration if camera.calibration is not None else capture.calibration
     entry: CalibrationEntry | None = None
     if isinstance(calibration, Path):
-        entry = read_calibration(base / calibration, camera.name)
+        entry = read_calibration((base / calibration).resolve(), camera.name)
         calibration = entry.calibration
-    update: dict[str, Any] = {"video": tuple(chapters), "calibration": calibration or "auto"}
-    if camera.timestamps is not None:
-        update["timestamps"] = base / camera.timestamps
+    update: dict[str, Any] = {"video": videos, "timestamps": sidecars, "calibration": calibration or "auto"}
     if camera.offset_s is None:
         update["offset_s"] = entry.offset_s if entry else 0.0
     if camera.rolling_shutter_s is None:
         update["rolling_shutter_s"] = entry.rolling_shutter_s if entry else 0.0
     return camera.model_copy(update=update)
+
+
+def _chapters(camera: CameraConfig, base: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """Video files in order, and the sidecars that lie beside them."""
+    videos: list[Path] = []
+    whole: list[Path] = []
+    for video in camera.video:
+        full = (base / video).resolve()
+        if full.is_dir():
+            videos.extend(chapters_in(full))
+            whole.extend(_existing(full.with_name(f"{full.name}.timestamps.txt")))
+        else:
+            videos.append(full)
+    if whole and len(camera.video) == 1:
+        return tuple(videos), tuple(whole)
+    beside = [sidecar for video in videos for sidecar in sidecars_of(video)]
+    return tuple(videos), tuple(beside)
+
+
+def sidecars_of(video: Path) -> list[Path]:
+    """The sidecar beside a video, if any: ``torso.timestamps.txt`` or ``torso.mp4.timestamps.txt``."""
+    names = (f"{video.stem}.timestamps.txt", f"{video.name}.timestamps.txt")
+    return [found for name in names for found in _existing(video.with_name(name))][:1]
+
+
+def _existing(path: Path) -> list[Path]:
+    return [path] if path.is_file() else []
+
+
+def _safe_name(text: str) -> str:
+    return re.sub(r"[^A-Za-z0-9._\-]+", "_", text).strip("._-") or "job"

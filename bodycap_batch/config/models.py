@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
 
+from bodycap_batch.arrays import FloatArray
 from bodycap_batch.config.calibration import Calibration
-from bodycap_batch.config.mounts import MOUNT_NAMES, mount_of, role_of_segment
+from bodycap_batch.config.mounts import mount_of, role_of_segment
 from bodycap_batch.config.options import (
     ExportOptions,
     KeyframeOptions,
@@ -16,67 +18,80 @@ from bodycap_batch.config.options import (
     MergeOptions,
     RegistrationOptions,
 )
+from bodycap_batch.geometry import make_transform, rotation_from_quat_xyzw
 
-SKELETON_PRESETS = ("none", "upper_body")
+NO_SKELETON = "none"
+SKELETON_PRESETS = (NO_SKELETON, "upper_body", "full_body")
+# A Unix time in seconds fits; sums in nanoseconds stay inside int64.
+_MAX_SECONDS = 4e9
 
 
 class _Block(BaseModel):
-    """Base of the job's blocks: frozen, unknown keys refused, no NaN, no silent conversions of text."""
+    """Base of the job's blocks: frozen, unknown keys refused, no NaN."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-def _as_list(value: object) -> object:
-    """A single video stands for a list of one."""
-    return [value] if isinstance(value, str | Path) else value
+def _calibration_kind(value: object) -> str:
+    if isinstance(value, dict | Calibration):
+        return "inline"
+    return "auto" if value == "auto" else "file"
+
+
+def _pose_kind(value: object) -> str:
+    return "matrix" if isinstance(value, list | tuple) else "parts"
+
+
+AnyCalibration = Annotated[
+    Annotated[Calibration, Tag("inline")]
+    | Annotated[Literal["auto"], Tag("auto")]
+    | Annotated[Path, Tag("file")],
+    Discriminator(_calibration_kind),
+]
+Seconds = Annotated[float, Field(ge=-_MAX_SECONDS, le=_MAX_SECONDS)]
+Row = tuple[float, float, float, float]
 
 
 class MountPose(_Block):
-    """Measured pose of a camera on its bone: x_in_joint = rotation · x_in_cam + translation."""
+    """Pose of a camera on its bone: x_in_joint = rotation · x_in_cam + translation."""
 
     translation_m: tuple[float, float, float]
-    quat_xyzw: tuple[float, float, float, float]
-
-    @field_validator("quat_xyzw")
-    @classmethod
-    def _unit(cls, value: tuple[float, ...]) -> tuple[float, ...]:
-        norm = float(sum(v * v for v in value)) ** 0.5
-        if norm < 1e-9:
-            raise ValueError("a quaternion of zero length is no rotation")
-        return tuple(v / norm for v in value)
+    quat_xyzw: Row
 
 
-Matrix4 = tuple[
-    tuple[float, float, float, float],
-    tuple[float, float, float, float],
-    tuple[float, float, float, float],
-    tuple[float, float, float, float],
+AnyPose = Annotated[
+    Annotated[MountPose, Tag("parts")] | Annotated[tuple[Row, Row, Row, Row], Tag("matrix")],
+    Discriminator(_pose_kind),
 ]
 
 
 class CameraConfig(_Block):
-    """One camera of the capture."""
+    """One camera of the capture. Loaded jobs hold absolute paths, every chapter and sidecar listed."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_\-]{0,63}$", description="names the camera's results")
-    video: Annotated[tuple[Path, ...], BeforeValidator(_as_list)] = Field(
+    name: str = Field(max_length=64, description="names the camera's results")
+    video: tuple[Path, ...] = Field(
         min_length=1, description="video file, folder of chapters, or list of chapters"
     )
     mount: str | None = Field(None, description="where it sits on the body; default: what its name says")
-    segment: str | None = Field(None, description="bone that carries it, where the mount's name does not say")
-    joint_from_cam: MountPose | Matrix4 | None = Field(
-        None, description="measured mount, 4x4 or translation + quaternion"
+    segment: str | None = Field(None, description="bone that carries it, where no mount's name fits")
+    joint_from_cam: AnyPose | None = Field(
+        None, description="measured mount: 4x4 matrix, or translation_m and quat_xyzw"
     )
     sigma_deg: float | None = Field(None, gt=0, le=180, description="uncertainty of the mount's rotation")
     sigma_m: float | None = Field(None, gt=0, le=10, description="uncertainty of the mount's position")
-    calibration: Calibration | Literal["auto"] | Path | None = Field(
-        None, description="inline block, path to a calib.json, or auto; default: the capture's"
+    calibration: AnyCalibration | None = Field(
+        None, description="inline block, path of a calib.json, or auto; default: the capture's"
     )
     fov_deg: float | None = Field(
-        None, gt=10, lt=170, description="field of view along the long side, first guess of calibration: auto"
+        None, gt=10, lt=170, description="field of view along the long side: first guess of calibration: auto"
     )
-    timestamps: Path | None = Field(None, description="sidecar with one time in seconds per frame")
-    offset_s: float | None = Field(None, description="common time = camera time + offset_s")
-    rolling_shutter_s: float | None = Field(None, ge=-1, le=1, description="read-out time, first row to last")
+    timestamps: tuple[Path, ...] = Field(
+        (), description="sidecar with one time in seconds per frame (of all chapters, or one per chapter)"
+    )
+    offset_s: Seconds | None = Field(None, description="common time = camera time + offset_s")
+    rolling_shutter_s: float | None = Field(
+        None, ge=-1, le=1, description="time from the first row's exposure to the last's"
+    )
 
     @property
     def role(self) -> str | None:
@@ -86,34 +101,45 @@ class CameraConfig(_Block):
         found = mount_of(self.mount or self.name)
         return None if found is None else found[1]
 
+    def mount_matrix(self) -> FloatArray | None:
+        """`joint_from_cam` as a (4,4) transform, None where the job does not give it."""
+        pose = self.joint_from_cam
+        if isinstance(pose, MountPose):
+            return make_transform(rotation_from_quat_xyzw(pose.quat_xyzw), pose.translation_m)
+        return None if pose is None else np.array(pose, dtype=np.float64)
+
+    def input_files(self) -> tuple[Path, ...]:
+        """Files whose content the camera's frames and times depend on."""
+        return (*self.video, *self.timestamps)
+
 
 class CaptureConfig(_Block):
     """The videos of one recording."""
 
-    cameras: tuple[CameraConfig, ...] = Field(min_length=1)
-    calibration: Calibration | Literal["auto"] | Path | None = Field(
+    cameras: tuple[CameraConfig, ...] = Field(min_length=1, max_length=64)
+    calibration: AnyCalibration | None = Field(
         None, description="calibration of every camera that has none of its own"
     )
-    start_s: float | None = Field(None, description="first moment used, common clock")
-    end_s: float | None = Field(None, description="last moment used, common clock")
+    start_s: Seconds | None = Field(None, description="first moment used, common clock")
+    end_s: Seconds | None = Field(None, description="last moment used, common clock")
     work_px: int = Field(
         960, ge=160, le=8192, description="long side the frames are worked at; never enlarged"
     )
     synthetic: dict[str, Any] | None = Field(
-        None, description="options of `bodycap synth`; the videos are rendered on first use"
+        None, description="options of `bodycap synth`: the videos are rendered on first use"
     )
 
 
 class Job(_Block):
-    """Everything a run needs."""
+    """Everything a run needs; only `capture` has no default."""
 
     capture: CaptureConfig
-    name: str = Field(
-        "", pattern=r"^[A-Za-z0-9._\-]{0,100}$", description="names the results; default: the file's"
+    name: str = Field("", max_length=100, description="names the results; default: the file's or folder's")
+    out: Path | None = Field(None, description="folder of the results; default out/<name>")
+    skeleton: str | None = Field(
+        None, description="none, upper_body, full_body or a BVH file; default upper_body, none for one camera"
     )
-    out: Path | None = Field(None, description="results' folder; default out/<name>")
-    skeleton: str | None = Field(None, description="none, upper_body, or a BVH file")
-    height_m: float | None = Field(None, gt=0.4, lt=2.6, description="the subject's height")
+    height_m: float | None = Field(None, ge=0.4, le=2.6, description="the subject's height")
     activity: Literal["walk", "generic"] = Field("generic", description="what the subject does")
     keyframes: KeyframeOptions = KeyframeOptions()
     map: MapOptions = MapOptions()

@@ -77,5 +77,4 @@ def mount_of(name: str) -> tuple[str, str] | None:
 def role_of_segment(segment: str) -> str | None:
     """Map ``segment:`` (a role such as ``LeftHand`` or any mount's name) to the role, or None."""
     roles = {_key(role): role for role in ROLES}
-    found = roles.get(_key(segment)) or _TABLE.get(_key(segment), ("", None))[1]
-    return found
+    return roles.get(_key(segment)) or _TABLE.get(_key(segment), ("", None))[1]

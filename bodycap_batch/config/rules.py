@@ -1,0 +1,115 @@
+"""What a job must hold beyond its types: names, mounts, skeleton, times."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterator
+
+import numpy as np
+
+from bodycap_batch.config.explain import Problem
+from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, Job, MountPose
+from bodycap_batch.config.mounts import MOUNT_NAMES, ROLES
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._\-]*")
+_UNFILLED = re.compile(r"<[^<>]*>")
+# Rounding a rotation to three decimals leaves it this close to orthonormal.
+_ROTATION_TOLERANCE = 5e-3
+
+
+def problems_in(job: Job) -> list[Problem]:
+    """Everything wrong with a job that its types let pass (no file is opened)."""
+    problems: list[Problem] = []
+    for index, camera in enumerate(job.capture.cameras):
+        for found in (*_camera_names(job, index), *_mount(job, camera), *_pose(camera), *_paths(camera)):
+            problems.append(found._replace(location=("capture", "cameras", index, *found.location)))
+    return [*problems, *_job_names(job), *_skeleton(job), *_times(job)]
+
+
+def skeleton_of(job: Job) -> str:
+    """The skeleton a job means: what it says; else none for one camera without a mount."""
+    if job.skeleton is not None:
+        return job.skeleton
+    cameras = job.capture.cameras
+    return NO_SKELETON if len(cameras) == 1 and cameras[0].role is None else "upper_body"
+
+
+def _camera_names(job: Job, index: int) -> Iterator[Problem]:
+    name = job.capture.cameras[index].name
+    if not _NAME.fullmatch(name):
+        yield Problem(("name",), f"{name!r} is no name for files", "letters, digits, _ and - only")
+    for other in job.capture.cameras[:index]:
+        if other.name.lower() == name.lower():
+            yield Problem(
+                ("name",),
+                f"two cameras named {name!r}",
+                "names differ, segments may be shared: torso and torso_back",
+            )
+        elif set(other.video) & set(job.capture.cameras[index].video):
+            yield Problem(("video",), f"the same video as camera {other.name!r}", "give each camera its own")
+
+
+def _mount(job: Job, camera: CameraConfig) -> Iterator[Problem]:
+    if camera.segment is not None and camera.role is None:
+        known = (*ROLES, *MOUNT_NAMES)
+        yield Problem(("segment",), f"unknown segment {camera.segment!r}", _nearest(camera.segment, known))
+    elif camera.segment is None and camera.mount is not None and camera.role is None:
+        yield Problem(("mount",), f"unknown mount {camera.mount!r}", _nearest(camera.mount, MOUNT_NAMES))
+    elif camera.role is None and skeleton_of(job) != NO_SKELETON:
+        near = [*difflib.get_close_matches(camera.name, MOUNT_NAMES, n=1), "torso"][0]
+        yield Problem(
+            (),
+            f"where on the body is camera {camera.name!r}? Its name does not say",
+            f"add `mount: {near}` (one of {', '.join(MOUNT_NAMES)}), or `skeleton: none`",
+        )
+
+
+def _pose(camera: CameraConfig) -> Iterator[Problem]:
+    where = ("joint_from_cam",)
+    if isinstance(camera.joint_from_cam, MountPose):
+        if abs(np.linalg.norm(camera.joint_from_cam.quat_xyzw) - 1.0) > _ROTATION_TOLERANCE:
+            yield Problem((*where, "quat_xyzw"), "the quaternion's length is not 1", "order: x, y, z, w")
+        return
+    matrix = camera.mount_matrix()
+    if matrix is None:
+        return
+    rotation = matrix[:3, :3]
+    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if off > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        yield Problem(where, "the upper left 3×3 is no rotation", "rows of an orthonormal matrix, det +1")
+    if not np.array_equal(matrix[3], [0, 0, 0, 1]):
+        yield Problem(where, "the last row is not 0, 0, 0, 1", "four rows, translation in the last column")
+
+
+def _paths(camera: CameraConfig) -> Iterator[Problem]:
+    for video in camera.video:
+        if _UNFILLED.search(str(video)):
+            yield Problem(("video",), f"still to be filled in: {video}", "put the path of your video here")
+    if len(set(camera.video)) < len(camera.video):
+        yield Problem(("video",), "a chapter is listed twice", "list each file once")
+
+
+def _job_names(job: Job) -> Iterator[Problem]:
+    if job.name and not _NAME.fullmatch(job.name):
+        yield Problem(("name",), f"{job.name!r} is no name for a folder", "letters, digits, ., _ and - only")
+
+
+def _skeleton(job: Job) -> Iterator[Problem]:
+    value = job.skeleton
+    if value is not None and value not in SKELETON_PRESETS and not value.lower().endswith(".bvh"):
+        hint = _nearest(value, SKELETON_PRESETS)
+        yield Problem(("skeleton",), f"unknown skeleton {value!r}", f"{hint}; or the path of a .bvh file")
+
+
+def _times(job: Job) -> Iterator[Problem]:
+    start, end = job.capture.start_s, job.capture.end_s
+    if start is not None and end is not None and end <= start:
+        yield Problem(("capture", "end_s"), f"end_s {end:g} is not after start_s {start:g}", "swap them?")
+
+
+def _nearest(value: str, known: tuple[str, ...]) -> str:
+    near = difflib.get_close_matches(value.lower(), [word.lower() for word in known], n=1)
+    if not near:
+        return f"one of {', '.join(known)}"
+    return f"did you mean {next(word for word in known if word.lower() == near[0])!r}?"

@@ -1,0 +1,186 @@
+"""Read YAML as plain values that remember their lines.
+
+Scalars follow YAML 1.2's core schema: ``no``, ``1:30`` and dates stay text, ``1e-3`` is a number.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from bodycap_batch.errors import JobError
+
+MAX_BYTES = 1 << 20
+MAX_DEPTH = 20
+
+Location = tuple[str | int, ...]
+"""Keys and list positions from the top of the file: ``("capture", "cameras", 0, "video")``."""
+
+_INT = re.compile(r"[-+]?[0-9]+")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+_WORDS: dict[str, bool | None] = {"": None, "~": None, "null": None, "Null": None, "NULL": None}
+_WORDS |= {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
+_MAX_INT = 1 << 63
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class YamlSource:
+    """A parsed YAML file.
+
+    Attributes:
+        path: The file.
+        data: Its value: dicts with text keys, lists, text, numbers, booleans, None.
+        lines: 1-based line of each value's key (of the item in a list), by location.
+    """
+
+    path: Path
+    data: object
+    lines: dict[Location, int]
+
+    def line_of(self, location: Location) -> int | None:
+        """Line of a location, or of the nearest thing around it."""
+        while location not in self.lines:
+            if not location:
+                return None
+            location = location[:-1]
+        return self.lines[location]
+
+
+def read_yaml(path: Path) -> YamlSource:
+    """Read a YAML file.
+
+    Raises:
+        JobError: Unreadable, no YAML, a key twice, anchors, or too large or deep; names the line.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise JobError("far too large for a job", path=path, hint="give the job's YAML file")
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise JobError(
+            "no such job file", path=path, hint="give a YAML file or a folder of videos"
+        ) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise JobError(
+            f"cannot read the job ({error})", path=path, hint="a YAML file, saved as UTF-8"
+        ) from error
+    try:
+        _refuse_traps(text, path)
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.MarkedYAMLError as error:
+        raise _syntax_error(error, path) from error
+    except (yaml.YAMLError, ValueError) as error:
+        raise JobError(
+            f"not YAML: {error}".splitlines()[0], path=path, hint="save the file as plain UTF-8 text"
+        ) from error
+    lines: dict[Location, int] = {}
+    data = None if node is None else _value(node, (), lines, path)
+    return YamlSource(path=path, data=data, lines=lines)
+
+
+def _refuse_traps(text: str, path: Path) -> None:
+    """Bound the depth before anything recurses, and refuse anchors, aliases and tags."""
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        line = 0 if event.start_mark is None else event.start_mark.line + 1
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+            if depth > MAX_DEPTH:
+                message = f"nested deeper than {MAX_DEPTH} levels"
+                raise JobError(message, path=path, line=line, hint="no job is that deep")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        for trap, mark in (("anchor", "& or *"), ("tag", "!")):
+            if getattr(event, trap, None) is not None:
+                raise JobError(
+                    f"{trap}s are not for jobs ({getattr(event, trap)})",
+                    path=path,
+                    line=line,
+                    hint=f'write the value out; put text that starts with {mark} in quotes "..."',
+                )
+
+
+def _syntax_error(error: yaml.MarkedYAMLError, path: Path) -> JobError:
+    mark = error.problem_mark or error.context_mark
+    problem = " ".join(part for part in (error.problem, error.context) if part)
+    hint = "check indentation, colons and quotes on this line and the one before"
+    if mark is not None and mark.buffer is not None and "\t" in _line_around(mark.buffer, mark.pointer):
+        problem, hint = "a tab where YAML wants spaces", "indent with spaces; YAML does not allow tabs"
+    return JobError(
+        problem if "tab" in problem else f"not YAML: {problem}",
+        path=path,
+        line=None if mark is None else mark.line + 1,
+        hint=hint,
+    )
+
+
+def _line_around(text: str, position: int) -> str:
+    start = text.rfind("\n", 0, position) + 1
+    end = text.find("\n", position)
+    return text[start : end if end >= 0 else len(text)]
+
+
+def _value(node: yaml.Node, location: Location, lines: dict[Location, int], path: Path) -> object:
+    """Turn a node into plain values and note the lines of everything below it."""
+    lines.setdefault(location, node.start_mark.line + 1)
+    if isinstance(node, yaml.MappingNode):
+        return _mapping(node, location, lines, path)
+    if isinstance(node, yaml.SequenceNode):
+        return [_value(item, (*location, index), lines, path) for index, item in enumerate(node.value)]
+    return _scalar(node, path)
+
+
+def _mapping(
+    node: yaml.MappingNode, location: Location, lines: dict[Location, int], path: Path
+) -> dict[str, object]:
+    out: dict[str, object] = {}
+    for key_node, value_node in node.value:
+        line = key_node.start_mark.line + 1
+        if not isinstance(key_node, yaml.ScalarNode):
+            raise JobError("a key must be a word", path=path, line=line, hint="write `key: value`")
+        key = str(key_node.value)
+        here = (*location, key)
+        if key in out:
+            raise JobError(
+                f"{key!r} is given twice, first on line {lines[here]}",
+                path=path,
+                line=line,
+                field=dotted(here),
+                hint="keep one of them",
+            )
+        lines[here] = line
+        out[key] = _value(value_node, here, lines, path)
+    return out
+
+
+def _scalar(node: yaml.Node, path: Path) -> object:
+    """A scalar by YAML 1.2's core schema; quoted text stays text."""
+    text = str(node.value)
+    if getattr(node, "style", None) is not None:
+        return text
+    if text in _WORDS:
+        return _WORDS[text]
+    number: int | float
+    if _INT.fullmatch(text) and len(text) < 20:
+        number = int(text)
+    elif _FLOAT.fullmatch(text):
+        number = float(text)
+    else:
+        return text
+    if not math.isfinite(number) or abs(number) >= _MAX_INT:
+        raise JobError(
+            f"number out of range: {text[:40]}",
+            path=path,
+            line=node.start_mark.line + 1,
+            hint="check the digits",
+        )
+    return number
+
+
+def dotted(location: Location) -> str:
+    """A location as users read it: ``capture.cameras.0.video``."""
+    return ".".join(str(part) for part in location)
