@@ -1,0 +1,146 @@
+"""COLMAP's sparse model, binary: what COLMAP, Blender add-ons, nerfstudio and splatting tools open."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray, IntArray
+from bodycap_batch.camera import Camera
+from bodycap_batch.formats.files import replacing
+from bodycap_batch.geometry import Similarity, invert, quat_xyzw_from_rotation
+from bodycap_batch.scene import Map
+
+_MODEL_IDS = {
+    "SIMPLE_PINHOLE": 0,
+    "PINHOLE": 1,
+    "SIMPLE_RADIAL": 2,
+    "RADIAL": 3,
+    "OPENCV": 4,
+    "OPENCV_FISHEYE": 5,
+    "FULL_OPENCV": 6,
+    "FOV": 7,
+    "SIMPLE_RADIAL_FISHEYE": 8,
+    "RADIAL_FISHEYE": 9,
+    "THIN_PRISM_FISHEYE": 10,
+}
+"""Model numbers of COLMAP's binary format."""
+
+_POINT2D = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
+_TRACK = np.dtype([("image", "<i4"), ("index", "<i4")])
+
+MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
+
+
+def image_name(camera: str, frame_number: int) -> str:
+    """Name of a keyframe's image: one folder a camera, the frame's number in the video."""
+    return f"{camera}/{frame_number:06d}.png"
+
+
+def write_colmap_model(
+    folder: Path,
+    scene: Map,
+    target_from_map: Similarity | None = None,
+    frame_numbers: Mapping[str, IntArray] | None = None,
+) -> tuple[Path, ...]:
+    """Write cameras.bin, images.bin and points3D.bin.
+
+    An image's 2D points are its triangulated observations only. Ids count from 1: cameras in name
+    order, images in (camera, frame) order, points in the map's order.
+
+    Args:
+        folder: The model's folder.
+        scene: The map.
+        target_from_map: Moves the model into another frame (the world).
+        frame_numbers: By camera, the video's frame number of each frame index, for the image names;
+            without it the index itself.
+
+    Returns:
+        The files written.
+
+    Raises:
+        StoreError: A file cannot be written.
+    """
+    move = target_from_map or Similarity(1.0, np.eye(3), np.zeros(3))
+    numbers = frame_numbers or {}
+    names = sorted(scene.cameras)
+    order = sorted(
+        range(len(scene.keyframe_camera)), key=lambda k: (scene.keyframe_camera[k], scene.keyframe_frame[k])
+    )
+    titles = []
+    for keyframe in order:
+        camera, frame = scene.keyframe_camera[keyframe], int(scene.keyframe_frame[keyframe])
+        titles.append(image_name(camera, int(numbers[camera][frame]) if camera in numbers else frame))
+    image_of = np.empty(len(order), dtype=np.int64)
+    image_of[order] = np.arange(1, len(order) + 1)
+    by_image = np.lexsort((scene.obs_feature, image_of[scene.obs_keyframe]))
+    images = image_of[scene.obs_keyframe][by_image]
+    starts = np.searchsorted(images, np.arange(1, len(order) + 2))
+    cam_from_target = invert(move.apply_to_poses(scene.map_from_cam[order]))
+    blobs = (
+        _cameras([(index, scene.cameras[name]) for index, name in enumerate(names, start=1)]),
+        _images(
+            cam_from_target,
+            [names.index(scene.keyframe_camera[keyframe]) + 1 for keyframe in order],
+            titles,
+            _observations(scene, by_image, starts),
+        ),
+        _points(scene, move.apply(scene.points), by_image, images, starts),
+    )
+    written = []
+    for file, blob in zip(MODEL_FILES, blobs, strict=True):
+        written.append(folder / file)
+        with replacing(written[-1]) as temporary:
+            temporary.write_bytes(blob)
+    return tuple(written)
+
+
+def _cameras(cameras: list[tuple[int, Camera]]) -> bytes:
+    parts = [struct.pack("<Q", len(cameras))]
+    for index, camera in cameras:
+        parts.append(struct.pack("<iiQQ", index, _MODEL_IDS[camera.model], camera.width_px, camera.height_px))
+        parts.append(np.asarray(camera.params, dtype="<f8").tobytes())
+    return b"".join(parts)
+
+
+def _observations(scene: Map, by_image: IntArray, starts: IntArray) -> list[bytes]:
+    """Each image's 2D points."""
+    table = np.empty(len(by_image), dtype=_POINT2D)
+    table["x"], table["y"] = scene.obs_px[by_image].T
+    table["point"] = scene.obs_point[by_image] + 1
+    return [table[start:end].tobytes() for start, end in pairwise(starts)]
+
+
+def _images(
+    cam_from_target: FloatArray, camera_ids: list[int], titles: list[str], points2d: list[bytes]
+) -> bytes:
+    quats = np.roll(quat_xyzw_from_rotation(cam_from_target[:, :3, :3]), 1, axis=-1)
+    parts = [struct.pack("<Q", len(titles))]
+    for index, title in enumerate(titles):
+        pose = (*quats[index], *cam_from_target[index, :3, 3])
+        parts.append(struct.pack("<i7di", index + 1, *pose, camera_ids[index]))
+        parts.append(title.encode("utf-8") + b"\0")
+        parts.append(struct.pack("<Q", len(points2d[index]) // _POINT2D.itemsize) + points2d[index])
+    return b"".join(parts)
+
+
+def _points(
+    scene: Map, positions: FloatArray, by_image: IntArray, images: IntArray, starts: IntArray
+) -> bytes:
+    track = np.empty(len(by_image), dtype=_TRACK)
+    track["image"] = images
+    track["index"] = np.arange(len(by_image)) - starts[images - 1]
+    points = scene.obs_point[by_image]
+    by_point = np.argsort(points, kind="stable")
+    track, bounds = track[by_point], np.searchsorted(points[by_point], np.arange(len(positions) + 1))
+    parts = [struct.pack("<Q", len(positions))]
+    for index, position in enumerate(positions):
+        mine = track[bounds[index] : bounds[index + 1]]
+        color = scene.colors[index].tolist()
+        parts.append(struct.pack("<Q3d3Bd", index + 1, *position, *color, scene.point_error_px[index]))
+        parts.append(struct.pack("<Q", len(mine)) + mine.tobytes())
+    return b"".join(parts)

@@ -1,0 +1,103 @@
+"""PLY: a coloured point cloud, the cameras' paths as dense coloured samples in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from bodycap_batch.arrays import FloatArray, set_array
+from bodycap_batch.errors import StoreError
+from bodycap_batch.formats.files import replacing
+
+Colors = npt.NDArray[np.uint8]
+
+# Okabe and Ito's palette, told apart by colour-blind eyes too, without its black and yellow.
+PATH_COLORS = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (213, 94, 0), (204, 121, 167), (0, 114, 178))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointCloud:
+    """Coloured points.
+
+    Attributes:
+        points: (P,3).
+        colors: (P,3) uint8 RGB.
+    """
+
+    points: FloatArray
+    colors: Colors
+
+    def __post_init__(self) -> None:
+        set_array(self, "points", (None, 3))
+        set_array(self, "colors", (len(self.points), 3), np.uint8)
+
+
+def with_paths(cloud: PointCloud, paths: Mapping[str, FloatArray], spacing: float) -> PointCloud:
+    """Add each camera's path as a string of points in a colour of its own.
+
+    Args:
+        cloud: The map.
+        paths: (N,3) camera centres in time order, NaN where there is a gap, by camera name.
+        spacing: Largest distance between two samples, in the cloud's unit.
+    """
+    points, colors = [cloud.points], [cloud.colors]
+    for number, name in enumerate(sorted(paths)):
+        samples = _sampled(np.asarray(paths[name], dtype=np.float64).reshape(-1, 3), spacing)
+        points.append(samples)
+        color = np.array(PATH_COLORS[number % len(PATH_COLORS)], dtype=np.uint8)
+        colors.append(np.broadcast_to(color, samples.shape))
+    return PointCloud(points=np.concatenate(points), colors=np.concatenate(colors))
+
+
+def _sampled(path: FloatArray, spacing: float) -> FloatArray:
+    """Points along a polyline at most `spacing` apart, every vertex kept, gaps left open."""
+    out = []
+    for start, end in pairwise(path):
+        if np.isfinite(start).all():
+            steps = 1
+            if np.isfinite(end).all():
+                steps = max(1, min(100, int(np.ceil(np.linalg.norm(end - start) / spacing))))
+            out.append(start + np.arange(steps)[:, None] / steps * np.nan_to_num(end - start))
+    out.append(path[-1:][np.isfinite(path[-1:]).all(axis=1)])
+    return np.concatenate(out)
+
+
+def write_ply(path: Path, cloud: PointCloud) -> None:
+    """Write a binary PLY through Open3D and verify it by reading it back.
+
+    Raises:
+        StoreError: The file cannot be written, or does not hold what was written.
+    """
+    import open3d
+
+    content = open3d.geometry.PointCloud()
+    content.points = open3d.utility.Vector3dVector(cloud.points.copy())
+    content.colors = open3d.utility.Vector3dVector(cloud.colors / 255.0)
+    with replacing(path) as temporary:
+        # Open3D says no more than False: a folder or disk that cannot be written to is told by the system.
+        temporary.write_bytes(b"")
+        if not open3d.io.write_point_cloud(temporary, content, write_ascii=False):
+            hint = "check that the disk is not full"
+            raise StoreError("Open3D could not write the point cloud", path=path, hint=hint)
+        back = read_ply(temporary)
+        same = back.points.shape == cloud.points.shape and np.array_equal(back.points, cloud.points)
+        if not same or not np.array_equal(back.colors, cloud.colors):
+            hint = "check that the disk is not full"
+            raise StoreError("the point cloud read back differs from what was written", path=path, hint=hint)
+
+
+def read_ply(path: Path) -> PointCloud:
+    """Read a PLY's points and colours (black where it has none)."""
+    import open3d
+
+    content = open3d.io.read_point_cloud(path)
+    points = np.asarray(content.points, dtype=np.float64)
+    colors = np.asarray(content.colors, dtype=np.float64)
+    if len(colors) != len(points):
+        colors = np.zeros_like(points)
+    return PointCloud(points=points, colors=np.round(colors * 255.0).astype(np.uint8))

@@ -1,0 +1,115 @@
+"""TUM trajectories: ``timestamp tx ty tz qx qy qz qw`` a line, seconds, world_from_camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray, IntArray, set_array
+from bodycap_batch.errors import JobError
+from bodycap_batch.formats.files import write_text
+from bodycap_batch.geometry import make_transform, quat_xyzw_from_rotation, rotation_from_quat_xyzw
+
+_NS_PER_S = 1_000_000_000
+_COLUMNS = "timestamp tx ty tz qx qy qz qw"
+_COMMENTS = ("#", "%", "//", ";")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimedPoses:
+    """Poses in time order.
+
+    Attributes:
+        times_ns: (N,) increasing.
+        world_from_cam: (N,4,4).
+    """
+
+    times_ns: IntArray
+    world_from_cam: FloatArray
+
+    def __post_init__(self) -> None:
+        set_array(self, "times_ns", (None,), np.int64)
+        set_array(self, "world_from_cam", (len(self.times_ns), 4, 4))
+        if (np.diff(self.times_ns) <= 0).any():
+            raise ValueError("times_ns: must increase")
+
+
+def read_tum(path: Path | str) -> TimedPoses:
+    """Read a trajectory: comments, a heading, commas, tabs and CRLF are understood.
+
+    Rows out of order are sorted; of rows with the same time the first counts.
+
+    Raises:
+        JobError: The file is missing, malformed or empty; names the line.
+    """
+    path = Path(path)
+    times: list[int] = []
+    rows: list[list[float]] = []
+    try:
+        with open(path, encoding="utf-8-sig", errors="replace") as handle:
+            for number, line in enumerate(handle, start=1):
+                words = line.replace(",", " ").split()
+                if not words or words[0].startswith(_COMMENTS):
+                    continue
+                if not rows and words[0].strip("'\"").lower() in ("timestamp", "time", "t"):
+                    continue
+                time_ns, row = _parse(path, number, words)
+                times.append(time_ns)
+                rows.append(row)
+    except OSError as error:
+        raise JobError(f"cannot read: {error.strerror or error}", path=path, hint="check the path") from error
+    if not rows:
+        raise JobError("no poses in the file", path=path, hint=f"a line holds: {_COLUMNS}")
+    times_ns, first = np.unique(np.array(times, dtype=np.int64), return_index=True)
+    table = np.array(rows)[first]
+    poses = make_transform(rotation_from_quat_xyzw(table[:, 3:]), table[:, :3])
+    return TimedPoses(times_ns=times_ns, world_from_cam=poses)
+
+
+def _parse(path: Path, number: int, words: list[str]) -> tuple[int, list[float]]:
+    """Time and the seven numbers of one line."""
+    if len(words) != 8:
+        message = f"{len(words)} columns, expected 8"
+        raise JobError(message, path=path, line=number, hint=f"a line holds: {_COLUMNS}")
+    try:
+        time_ns = int((Decimal(words[0]) * _NS_PER_S).to_integral_value())
+        row = [float(word) for word in words[1:]]
+    except (ValueError, InvalidOperation, OverflowError):
+        raise JobError("not a number", path=path, line=number, hint=f"a line holds: {_COLUMNS}") from None
+    if not np.isfinite(row).all() or abs(time_ns) >= 2**63:
+        raise JobError("NaN, infinity or a time out of range", path=path, line=number)
+    if np.linalg.norm(row[3:]) < 1e-6:
+        raise JobError("the quaternion is zero", path=path, line=number, hint="order: qx qy qz qw")
+    return time_ns, row
+
+
+def write_tum(path: Path, poses: TimedPoses, comments: Sequence[str] = ()) -> None:
+    """Write a trajectory with 9 decimals: nanoseconds, nanometres.
+
+    Args:
+        path: The file; replaced in one step.
+        poses: What to write.
+        comments: Lines for the head of the file, without the ``#``.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
+    quats = quat_xyzw_from_rotation(poses.world_from_cam[:, :3, :3])
+    lines = [f"# {comment}\n" for comment in (*comments, _COLUMNS)]
+    for time_ns, position, quat in zip(
+        poses.times_ns.tolist(), poses.world_from_cam[:, :3, 3], quats, strict=True
+    ):
+        numbers = " ".join(f"{value:.9f}" for value in (*position, *quat))
+        lines.append(f"{seconds_text(time_ns)} {numbers}\n")
+    write_text(path, "".join(lines))
+
+
+def seconds_text(time_ns: int) -> str:
+    """Nanoseconds as seconds with all nine decimals."""
+    sign = "-" if time_ns < 0 else ""
+    whole, rest = divmod(abs(int(time_ns)), _NS_PER_S)
+    return f"{sign}{whole}.{rest:09d}"

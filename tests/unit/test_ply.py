@@ -1,0 +1,61 @@
+"""PLY: points, colours and camera paths, through Open3D and by an independent reading of the header."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bodycap_batch.errors import StoreError
+from bodycap_batch.formats.ply import PATH_COLORS, PointCloud, read_ply, with_paths, write_ply
+
+
+def cloud(count: int) -> PointCloud:
+    rng = np.random.default_rng(3)
+    return PointCloud(
+        points=rng.normal(size=(count, 3)), colors=rng.integers(0, 256, size=(count, 3)).astype(np.uint8)
+    )
+
+
+def test_round_trip_and_an_independent_reading(tmp_path: Path) -> None:
+    written = cloud(500)
+    write_ply(tmp_path / "map.ply", written)
+    back = read_ply(tmp_path / "map.ply")
+    np.testing.assert_array_equal(back.points, written.points)
+    np.testing.assert_array_equal(back.colors, written.colors)
+    head, _, body = (tmp_path / "map.ply").read_bytes().partition(b"end_header\n")
+    assert head.startswith(b"ply\nformat binary_little_endian 1.0\n")
+    assert b"element vertex 500\n" in head
+    record = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("rgb", "u1", 3)])
+    table = np.frombuffer(body, dtype=record)
+    np.testing.assert_array_equal(table["z"], written.points[:, 2])
+    np.testing.assert_array_equal(table["rgb"], written.colors)
+
+
+def test_paths_keep_every_vertex_and_leave_gaps_open() -> None:
+    path = np.array([[0, 0, 0], [1, 0, 0], [np.nan] * 3, [5, 0, 0], [5, 0.05, 0]])
+    both = with_paths(cloud(10), {"b": path, "a": np.full((2, 3), np.nan)}, spacing=0.25)
+    mine = both.points[10:]
+    np.testing.assert_allclose(mine[:, 0], [0, 0.25, 0.5, 0.75, 1, 5, 5])
+    assert (both.colors[10:] == PATH_COLORS[1]).all()
+
+
+def test_a_missing_folder_is_made_and_a_forbidden_one_named(tmp_path: Path) -> None:
+    write_ply(tmp_path / "new" / "map.ply", cloud(1))
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="cannot write"):
+        write_ply(tmp_path / "file" / "map.ply", cloud(1))
+
+
+def test_a_failing_writer_keeps_the_earlier_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "map.ply"
+    path.write_text("earlier")
+    monkeypatch.setattr("open3d.io.write_point_cloud", lambda *_, **__: False)
+    with pytest.raises(StoreError, match="could not write"):
+        write_ply(path, cloud(5))
+    monkeypatch.setattr("open3d.io.write_point_cloud", lambda *_, **__: True)
+    with pytest.raises(StoreError, match="differs"):
+        write_ply(path, cloud(5))
+    assert [p.name for p in tmp_path.iterdir()] == ["map.ply"]
+    assert path.read_text() == "earlier"
