@@ -62,6 +62,16 @@ class CaptureCamera:
         """(N,) frame times on the common clock."""
         return np.asarray(self.times_ns + round(self.offset_s * 1e9), dtype=np.int64)
 
+    def key_indices(self) -> IntArray:
+        """Indices into `frame_numbers` of frames that decode without their neighbours."""
+        numbers: list[IntArray] = []
+        first = 0
+        for video in self.videos:
+            numbers.append(first + np.searchsorted(video.pts, video.key_pts))
+            first += len(video.pts)
+        keys = np.isin(self.frame_numbers, np.concatenate(numbers)) if numbers else np.zeros(0, dtype=bool)
+        return np.asarray(np.flatnonzero(keys), dtype=np.int64)
+
     def row_times_ns(self, index: int, rows_px: npt.ArrayLike) -> IntArray:
         """Common times at which pixel rows (M,) of one frame were exposed (rolling shutter)."""
         delay_ns = rolling_shutter_delay_s(rows_px, self.camera.height_px, self.rolling_shutter_s) * 1e9

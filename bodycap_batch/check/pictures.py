@@ -1,0 +1,61 @@
+"""Look at a few frames of a camera: is there anything to see?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodycap_batch.arrays import IntArray
+from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.errors import CaptureError
+
+_SAMPLES = 8
+# Sensor noise of a covered lens stays below this grey value (of 255) in 99 of 100 pixels.
+_BLACK_LEVEL = 20.0
+# A wall out of focus, fog on the lens: fewer grey levels than this between dark and bright.
+_FLAT_CONTRAST = 12.0
+# Decoding this many frames for one sample takes a second or two.
+_STRETCH = 250
+
+
+def look_at_frames(camera: CaptureCamera) -> list[str]:
+    """Decode a few evenly spread frames.
+
+    Returns:
+        Notes about pictures that make a hard job.
+
+    Raises:
+        CaptureError: A frame cannot be decoded, or all are black.
+    """
+    dark, bright = [], []
+    for _, image in camera.read(sample_indices(camera, _SAMPLES)):
+        low, high = np.percentile(image, (1, 99))
+        dark.append(float(low))
+        bright.append(float(high))
+    black = int(np.sum(np.array(bright) < _BLACK_LEVEL))
+    if black == len(bright):
+        raise CaptureError(
+            f"camera {camera.name} shows black pictures only ({black} of {black} looked at)",
+            path=camera.chapters[0],
+            hint="was the lens covered? Leave the camera out, or convert the video to H.264 if players show it",
+        )
+    notes = []
+    if black:
+        notes.append(
+            f"{black} of {len(bright)} pictures looked at are black; cut them off with start_s and end_s"
+        )
+    contrast = np.array(bright) - np.array(dark)
+    if float(np.median(contrast)) < _FLAT_CONTRAST:
+        notes.append("hardly any contrast in the pictures: little will be found to track")
+    return notes
+
+
+def sample_indices(camera: CaptureCamera, count: int) -> IntArray:
+    """Evenly spread frames, moved to the nearest one that decodes without its neighbours."""
+    frames = len(camera.frame_numbers)
+    even = np.unique(np.linspace(0, frames - 1, min(count, frames)).round().astype(np.int64))
+    keys = camera.key_indices()
+    if len(keys) < len(even):
+        # Few key frames: other samples cost a stretch of decoding, so only the end is added to them.
+        latest = int(keys[-1]) if len(keys) else 0
+        return np.unique(np.append(keys, [0, min(frames - 1, latest + _STRETCH)]))
+    return np.unique(keys[np.abs(keys[None] - even[:, None]).argmin(axis=1)])

@@ -1,0 +1,212 @@
+"""The checks in order: job, cameras, clocks, skeleton, disk."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from bodycap_batch.capture import CaptureCamera, open_camera
+from bodycap_batch.check.pictures import look_at_frames
+from bodycap_batch.check.report import CameraFinding, CheckReport
+from bodycap_batch.config.job import Overrides, load_job
+from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, Job
+from bodycap_batch.errors import BodycapError, CaptureError, JobError, StoreError
+from bodycap_batch.formats.bvh import read_bvh
+
+# Frames whose distance differs by more than this share from the usual one make a variable rate.
+_RATE_TOLERANCE = 0.2
+_SHORT_S = 2.0
+_UNIX_TIME_S = 1e8
+_TRUNK = ("Hips", "Spine", "Spine1", "Neck", "Head")
+
+
+def check_path(path: Path, overrides: Overrides | None = None) -> CheckReport:
+    """Check a job file or a folder of videos. All errors are in the report, none is raised."""
+    try:
+        job = load_job(path, overrides)
+    except (JobError, CaptureError) as error:
+        if error.field == "capture.synthetic":
+            note = f"a sample capture: `bodycap run {path.name}` renders its videos first"
+            return CheckReport(notes=(note,))
+        return CheckReport(errors=(error,))
+    return check_job(job)
+
+
+def require_ready(job: Job) -> CheckReport:
+    """Check a resolved job and raise its first error, if any (before hours of work)."""
+    report = check_job(job)
+    if report.errors:
+        raise report.errors[0]
+    return report
+
+
+def check_job(job: Job) -> CheckReport:
+    """Check a resolved job: every video opened and looked at, calibration, clocks, skeleton, disk."""
+    errors: list[BodycapError] = []
+    findings: list[CameraFinding] = []
+    for config in job.capture.cameras:
+        try:
+            camera = open_camera(job.capture, config)
+            findings.append(_finding(camera, config, look_at_frames(camera)))
+        except CaptureError as error:
+            errors.append(error)
+    notes = _body_notes(job)
+    for check in (_check_clocks, _check_skeleton, _check_disk):
+        try:
+            notes += check(job, findings)
+        except BodycapError as error:
+            errors.append(error)
+    return CheckReport(job=job, cameras=tuple(findings), notes=tuple(notes), errors=tuple(errors))
+
+
+def _finding(camera: CaptureCamera, config: CameraConfig, notes: list[str]) -> CameraFinding:
+    times_s = camera.common_times_ns() / 1e9
+    steps = np.diff(camera.times_ns)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    variable = len(steps) > 0 and bool((np.abs(steps - usual) > _RATE_TOLERANCE * usual).any())
+    duration = float(times_s[-1] - times_s[0])
+    return CameraFinding(
+        name=camera.name,
+        role=config.role,
+        files=tuple(path.name for path in camera.chapters),
+        frames=sum(len(video.pts) for video in camera.videos),
+        used_frames=len(camera.frame_numbers),
+        start_s=float(times_s[0]),
+        end_s=float(times_s[-1]),
+        fps=camera.nominal_fps,
+        variable_rate=variable,
+        size_px=camera.videos[0].shown_size,
+        work_size_px=(camera.camera.width_px, camera.camera.height_px),
+        lens=_lens(camera),
+        notes=(*camera.notes, *notes, *_rate_notes(camera, usual), *_lens_notes(camera), *_short(duration)),
+    )
+
+
+def _lens(camera: CaptureCamera) -> str:
+    width, focal = max(camera.camera.width_px, camera.camera.height_px), camera.camera.focal_px
+    view = 2.0 * np.degrees(np.arctan(0.5 * width / focal))
+    if camera.calibrated:
+        return f"calibrated: {camera.camera.model}, focal length {focal:.0f} px at the work size"
+    return f"not calibrated: starts from a guess of {view:.0f}° along the long side, refined while mapping"
+
+
+def _lens_notes(camera: CaptureCamera) -> list[str]:
+    lens = camera.camera
+    long_side = max(lens.width_px, lens.height_px)
+    notes = []
+    if not 0.2 < lens.focal_px / long_side < 3.0:
+        notes.append(
+            f"a focal length of {lens.focal_px / long_side:.2f} image widths is unusual; right calibration?"
+        )
+    centre_x, centre_y = lens.principal_point_px
+    off = max(abs(centre_x / lens.width_px - 0.5), abs(centre_y / lens.height_px - 0.5))
+    if off > 0.15:
+        notes.append(f"the principal point lies {100 * off:.0f} % off the centre; right calibration?")
+    return notes
+
+
+def _rate_notes(camera: CaptureCamera, usual_ns: float) -> list[str]:
+    """Frames a recording dropped: times say so, whatever the nominal rate."""
+    if usual_ns <= 0.0:
+        return []
+    lost = np.round(np.diff(camera.times_ns) / usual_ns) - 1
+    lost = lost[lost > 0]
+    if not len(lost):
+        return []
+    longest = (lost.max() + 1) * usual_ns / 1e9
+    return [
+        f"{int(lost.sum())} frames were dropped at {len(lost)} places, the longest hole is {longest:.2f} s"
+    ]
+
+
+def _short(duration_s: float) -> list[str]:
+    return [f"only {duration_s:.1f} s: hardly enough movement for a map"] if duration_s < _SHORT_S else []
+
+
+def _body_notes(job: Job) -> list[str]:
+    if job.skeleton == NO_SKELETON:
+        return []
+    roles = {camera.role for camera in job.capture.cameras}
+    notes = []
+    if not roles & set(_TRUNK):
+        notes.append("no camera on the trunk or head: where the body is can only be inferred from the limbs")
+    if job.height_m is None and job.skeleton in SKELETON_PRESETS:
+        notes.append("no height_m: a mean adult's is assumed, and distances scale with it")
+    return notes
+
+
+def _check_clocks(job: Job, findings: list[CameraFinding]) -> list[str]:
+    """Cameras of one body must be running at the same time."""
+    if len(findings) < 2:
+        return []
+    for camera in findings:
+        others = [other for other in findings if other is not camera]
+        if all(other.end_s <= camera.start_s or camera.end_s <= other.start_s for other in others):
+            raise _no_common_time(job, camera, others)
+    start, end = max(c.start_s for c in findings), min(c.end_s for c in findings)
+    if end <= start:
+        return ["there is no moment that all cameras saw"]
+    return [
+        f"all cameras run together for {end - start:.1f} s, {start:.2f} to {end:.2f} s on the common clock"
+    ]
+
+
+def _no_common_time(job: Job, camera: CameraFinding, others: list[CameraFinding]) -> CaptureError:
+    config = next(c for c in job.capture.cameras if c.name == camera.name)
+    clocks = {c.start_s > _UNIX_TIME_S for c in (camera, *others)}
+    hint = "set offset_s: common time = camera time + offset_s"
+    if len(clocks) == 2:
+        hint = "some timestamps are Unix times, others start near 0; " + hint
+    first, last = min(o.start_s for o in others), max(o.end_s for o in others)
+    return CaptureError(
+        f"camera {camera.name} ({camera.start_s:.2f} to {camera.end_s:.2f} s) shares no time with the others "
+        f"({first:.2f} to {last:.2f} s)",
+        path=config.video[0],
+        field="offset_s",
+        hint=hint,
+    )
+
+
+def _check_skeleton(job: Job, _findings: list[CameraFinding]) -> list[str]:
+    """A skeleton file must be readable and have the bones the cameras ride on."""
+    if job.skeleton is None or job.skeleton in SKELETON_PRESETS:
+        return []
+    path = Path(job.skeleton)
+    skeleton, _ = read_bvh(path)
+    for camera in job.capture.cameras:
+        if camera.role is not None and skeleton.index_of_role(camera.role) is None:
+            raise JobError(
+                f"no joint of it is recognised as {camera.role}, which carries camera {camera.name}",
+                path=path,
+                field="skeleton",
+                hint=f"its joints: {', '.join(skeleton.joints[:30])}; rename them the HumanIK way",
+            )
+    return [f"skeleton {path.name}: {len(skeleton.joints)} joints"]
+
+
+# Measured on sample jobs: features, matches and results take this much disk.
+_BYTES_PER_FRAME = 200_000
+_BYTES_AT_LEAST = 50_000_000
+
+
+def _check_disk(job: Job, findings: list[CameraFinding]) -> list[str]:
+    """Room for the job's results and intermediate files, and the right to write them."""
+    folder = job.out or Path("out").resolve()
+    while not folder.exists():
+        folder = folder.parent
+    if not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise StoreError(
+            "results cannot be written here", path=folder, hint="choose another folder with --out"
+        )
+    need = _BYTES_AT_LEAST + _BYTES_PER_FRAME * sum(camera.used_frames for camera in findings)
+    free = shutil.disk_usage(folder).free
+    if free < need:
+        raise StoreError(
+            f"{free / 1e6:.0f} MB free, the job may need {need / 1e6:.0f} MB",
+            path=folder,
+            hint="make room, or choose another disk with --out",
+        )
+    return []

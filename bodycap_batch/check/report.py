@@ -1,0 +1,116 @@
+"""What a pre-flight finds, and how it is told."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+from bodycap_batch.config.models import Job
+from bodycap_batch.errors import BodycapError
+
+_MANY_FILES = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraFinding:
+    """One camera as its files show it.
+
+    Attributes:
+        name: Camera name.
+        role: Bone that carries it, None where there is none.
+        files: Names of its video files.
+        frames: Frames in all.
+        used_frames: Frames between start_s and end_s.
+        start_s: Common time of the first used frame.
+        end_s: Common time of the last used frame.
+        fps: Nominal rate.
+        variable_rate: True where frames are not evenly spaced.
+        size_px: Width and height as a player shows it.
+        work_size_px: Width and height frames are worked at.
+        lens: Calibration in words.
+        notes: Worth telling, no error.
+    """
+
+    name: str
+    role: str | None
+    files: tuple[str, ...]
+    frames: int
+    used_frames: int
+    start_s: float
+    end_s: float
+    fps: float
+    variable_rate: bool
+    size_px: tuple[int, int]
+    work_size_px: tuple[int, int]
+    lens: str
+    notes: tuple[str, ...] = ()
+
+    def lines(self) -> list[str]:
+        """The finding as a person reads it."""
+        files = ", ".join(self.files[:_MANY_FILES])
+        if len(self.files) > _MANY_FILES:
+            files += f" … ({len(self.files)} chapters)"
+        width, height = self.size_px
+        size = f"{width}×{height}"
+        if self.work_size_px != self.size_px:
+            size += f" (worked at {self.work_size_px[0]}×{self.work_size_px[1]})"
+        rate = f"{self.fps:.2f} fps{', variable rate' if self.variable_rate else ''}"
+        used = "" if self.used_frames == self.frames else f" ({self.used_frames} used)"
+        span = (
+            f"{self.end_s - self.start_s:.1f} s, {self.start_s:.2f} to {self.end_s:.2f} s on the common clock"
+        )
+        return [
+            f"{self.name}: {files} -> {self.role or 'no bone'}",
+            f"  {size}, {rate}, {self.frames} frames{used}, {span}",
+            f"  {self.lens}",
+            *(f"  note: {note}" for note in self.notes),
+        ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckReport:
+    """Everything a pre-flight found.
+
+    Attributes:
+        job: The resolved job, None where it could not be loaded that far.
+        cameras: One finding per camera that opened.
+        notes: Worth telling about the job as a whole.
+        errors: What stops the job.
+    """
+
+    job: Job | None = None
+    cameras: tuple[CameraFinding, ...] = ()
+    notes: tuple[str, ...] = ()
+    errors: tuple[BodycapError, ...] = ()
+
+    @property
+    def ready(self) -> bool:
+        """True where nothing stops the job."""
+        return not self.errors
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code of the first error, 0 where there is none."""
+        return self.errors[0].exit_code if self.errors else 0
+
+    def lines(self) -> list[str]:
+        """The report as a person reads it."""
+        out = [line for camera in self.cameras for line in camera.lines()]
+        out += [f"note: {note}" for note in self.notes]
+        out += [f"problem: {error}" for error in self.errors]
+        if self.ready:
+            out.append("ready to run" if self.cameras else "nothing stands in the way")
+        else:
+            count = len(self.errors)
+            out.append(f"not ready: {count} problem{'s' if count > 1 else ''}")
+        return out
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report as plain JSON values."""
+        return {
+            "ready": self.ready,
+            "cameras": [dataclasses.asdict(camera) for camera in self.cameras],
+            "notes": list(self.notes),
+            "errors": [error.to_dict() for error in self.errors],
+        }

@@ -1,0 +1,69 @@
+"""Small videos for tests, encoded on the spot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import numpy.typing as npt
+
+Image = npt.NDArray[np.uint8]
+
+
+def textured_frame(index: int, width: int = 64, height: int = 48) -> Image:
+    """A grey image whose mean says its index (40 + 4·index) and whose top left quarter is brighter."""
+    image = np.full((height, width), 40 + 4 * index, dtype=np.uint8)
+    image[: height // 2, : width // 2] += 60
+    return image
+
+
+def write_video(
+    path: Path,
+    frames: Sequence[Image],
+    *,
+    fps: int = 30,
+    pts: Sequence[int] | None = None,
+    gop: int = 12,
+    rotation: int = 0,
+    pix_fmt: str = "yuv420p",
+    metadata: dict[str, str] | None = None,
+    bframes: bool = True,
+) -> Path:
+    """Encode grey (H,W) or RGB (H,W,3) images; `pts` in units of 1/(10·fps) s.
+
+    Args:
+        rotation: Counter-clockwise degrees a player turns the stored frames by.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        container.metadata.update(metadata or {})
+        options = {"crf": "8", "preset": "ultrafast", "g": str(gop), "bf": "2" if bframes else "0"}
+        stream = container.add_stream("libx264", rate=fps, options=options)
+        stream.height, stream.width = frames[0].shape[:2]
+        stream.pix_fmt = pix_fmt
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 10 * fps)
+        if rotation:
+            stream.set_display_rotation(rotation)
+        for index, image in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(image, format="gray" if image.ndim == 2 else "rgb24")
+            frame.pts = 10 * index if pts is None else pts[index]
+            frame.time_base = Fraction(1, 10 * fps)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def write_tone(path: Path, seconds: float = 0.2) -> Path:
+    """A file with sound only."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("aac", rate=16000)
+        for start in range(0, int(16000 * seconds), 1024):
+            wave = (0.1 * np.sin(np.arange(start, start + 1024) * 0.17)).astype(np.float32)
+            frame = av.AudioFrame.from_ndarray(wave[None], format="fltp", layout="mono")
+            frame.sample_rate, frame.pts = 16000, start
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
