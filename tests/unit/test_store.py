@@ -111,9 +111,14 @@ def test_an_artefact_under_another_key_is_not_taken(tmp_path: Path) -> None:
 
 def test_a_draft_leaves_nothing_behind(tmp_path: Path) -> None:
     store = Store(tmp_path)
-    with pytest.raises(FileNotFoundError), store.draft(key()) as draft:
-        (draft.work / "scratch").write_bytes(b"x")
-        (draft.work / "missing").read_bytes()
+
+    def fail() -> None:
+        with store.draft(key()) as draft:
+            (draft.work / "scratch").write_bytes(b"x")
+            (draft.work / "missing").read_bytes()
+
+    with pytest.raises(FileNotFoundError):
+        fail()
     assert list((tmp_path / "tmp").iterdir()) == []
     assert store.find(key()) is None
 

@@ -1,0 +1,78 @@
+"""Versions of algorithms and libraries, so that a stored result is never taken for another's."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterable, Iterator
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+
+_PACKAGE = Path(__file__).parent
+_IMPORT = re.compile(r"^\s*(?:from|import) bodycap_batch(?:\.([\w.]+))?", re.MULTILINE)
+_NOT_COMPUTING = frozenset({"errors", "context", "progress", "config", "config.options", "config.models"})
+"""Modules that decide nothing about a result: options are part of the key by their values."""
+_SKIPPED_SUFFIXES = (".pyc", ".pyo")
+
+
+@cache
+def algorithm_version(room: str) -> str:
+    """Version of a stage's algorithm: a digest of its own source files and of all they import from here.
+
+    Derived rather than counted by hand, so that changed code can never be answered with an old result.
+
+    Args:
+        room: The stage's module below this package (``mapping``).
+    """
+    digest = hashlib.sha256()
+    for path in sorted(_closure((room, "tasks"))):
+        digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")
+        digest.update(path.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
+
+
+@cache
+def library_versions(names: tuple[str, ...]) -> dict[str, str]:
+    """Installed version of each distribution; of alternatives (``a|b``) the one that is installed."""
+    return {name.split("|")[0]: _installed(name.split("|")) for name in names}
+
+
+def _installed(alternatives: Iterable[str]) -> str:
+    for name in alternatives:
+        try:
+            return metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return "none"
+
+
+def _closure(modules: Iterable[str]) -> set[Path]:
+    """Files of the modules and of what they import from here; `tasks` imports all, so is not followed."""
+    waiting, found = list(modules), set[Path]()
+    while waiting:
+        name = waiting.pop()
+        new = set(_files(name)) - found
+        found |= new
+        if name != "tasks":
+            waiting.extend(part for path in new if path.suffix == ".py" for part in _imports(path))
+    return found
+
+
+def _imports(path: Path) -> Iterator[str]:
+    for match in _IMPORT.finditer(path.read_text(encoding="utf-8")):
+        if (name := match.group(1)) and name not in _NOT_COMPUTING:
+            yield name
+
+
+def _files(name: str) -> Iterator[Path]:
+    """Files of a module; a package's are all files in it, data included."""
+    path = _PACKAGE.joinpath(*name.split("."))
+    if path.is_dir():
+        yield from (
+            file for file in path.rglob("*") if file.is_file() and not file.name.endswith(_SKIPPED_SUFFIXES)
+        )
+    elif (file := path.with_suffix(".py")).is_file():
+        yield file
+    elif "." in name:
+        yield from _files(name.rpartition(".")[0])

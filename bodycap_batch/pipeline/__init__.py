@@ -1,0 +1,6 @@
+"""A job from its videos to its results: the stages in order."""
+
+from bodycap_batch.pipeline.flow import Settings, StageRecord
+from bodycap_batch.pipeline.run import RunSummary, prepare_capture, run_job
+
+__all__ = ["RunSummary", "Settings", "StageRecord", "prepare_capture", "run_job"]

@@ -1,0 +1,108 @@
+"""What each stage is made from: digests for the store's keys, arguments for the child."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from bodycap_batch.config.models import CameraConfig, CaptureConfig, Job
+from bodycap_batch.digests import FileDigests, json_digest
+from bodycap_batch.errors import CaptureError, JobError
+from bodycap_batch.identity import algorithm_version, library_versions
+from bodycap_batch.store import ArtefactKey
+from bodycap_batch.tasks import STAGES
+
+_FILES = ("video", "timestamps")
+_BODY = ("mount", "segment", "joint_from_cam", "sigma_deg", "sigma_m")
+"""Fields about where a camera sits: they matter to the skeleton only."""
+
+
+def key_of(stage: str, options: Mapping[str, Any], inputs: Mapping[str, Any]) -> ArtefactKey:
+    """Key of an artefact of `stage`."""
+    entry = STAGES[stage]
+    return ArtefactKey(
+        stage=stage,
+        algorithm=algorithm_version(entry.room),
+        options=dict(options),
+        inputs=dict(inputs),
+        libraries=library_versions(entry.libraries),
+    )
+
+
+def camera_digest(
+    capture: CaptureConfig,
+    camera: CameraConfig,
+    digests: FileDigests,
+    on_bytes: Callable[[int], None] | None = None,
+) -> str:
+    """Digest of all that decides what a camera's frames are: bytes of its files, clock, lens, window.
+
+    Raises:
+        CaptureError: A file cannot be read.
+    """
+    settings = camera.model_dump(mode="json", exclude=set(_FILES + _BODY))
+    shared = capture.model_dump(mode="json", include={"start_s", "end_s", "work_px"})
+    files = [*camera.video, *camera.timestamps]
+    try:
+        content = [digests.sha256(path, on_bytes) for path in files]
+    except FileNotFoundError as error:
+        raise CaptureError("there is no such file", path=error.filename, hint="check the path") from error
+    except OSError as error:
+        raise CaptureError(f"cannot be read: {error.strerror}", path=error.filename) from error
+    return json_digest({**settings, **shared, "files": content, "chapters": len(camera.video)})
+
+
+def one_camera(capture: CaptureConfig, camera: CameraConfig) -> dict[str, Any]:
+    """The capture block with a single camera, as JSON values."""
+    return capture.model_copy(update={"cameras": (camera,), "synthetic": None}).model_dump(mode="json")
+
+
+def all_cameras(capture: CaptureConfig) -> dict[str, Any]:
+    """The capture block as JSON values."""
+    return capture.model_copy(update={"synthetic": None}).model_dump(mode="json")
+
+
+def body_arguments(job: Job) -> dict[str, Any]:
+    """Skeleton, stature, activity and mounts, as the merge task takes them.
+
+    Raises:
+        JobError: A camera's place on the body is not known.
+    """
+    path = skeleton_file(job)
+    return {
+        "skeleton": None if path else job.skeleton,
+        "skeleton_file": str(path) if path else None,
+        "height_m": job.height_m,
+        "activity": job.activity,
+        "mounts": [_mount_block(camera) for camera in job.capture.cameras],
+    }
+
+
+def body_digest(job: Job, digests: FileDigests) -> dict[str, Any]:
+    """The same with the skeleton file's content in the place of its path."""
+    path = skeleton_file(job)
+    content = digests.sha256(path) if path else None
+    return {**body_arguments(job), "skeleton_file": content}
+
+
+def has_body(job: Job) -> bool:
+    """False where the job asks for no skeleton."""
+    return job.skeleton not in (None, "none")
+
+
+def skeleton_file(job: Job) -> Path | None:
+    """The user's BVH file, if the job names one."""
+    named = job.skeleton or ""
+    return Path(named) if named.lower().endswith(".bvh") else None
+
+
+def _mount_block(camera: CameraConfig) -> dict[str, Any]:
+    if camera.role is None:
+        raise JobError(
+            f"where on the body is camera {camera.name!r}?",
+            field=f"capture.cameras.{camera.name}.mount",
+            hint="name its mount, e.g. `mount: torso`, or set `skeleton: none`",
+        )
+    block = camera.model_dump(mode="json", include={"joint_from_cam", "sigma_deg", "sigma_m"})
+    return {"camera": camera.name, "role": camera.role, **block}

@@ -1,0 +1,85 @@
+"""Results on their way from the store to the user's folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from bodycap_batch.digests import write_atomically
+from bodycap_batch.store import disk_errors
+
+RUN_FILE = "run.json"
+PARTIAL = "partial"
+
+
+def publish(files: Mapping[str, Path], folder: Path) -> None:
+    """Bring files to a folder one by one, each whole or not at all; by hard link where possible.
+
+    Args:
+        files: Relative name in the folder -> file in the store.
+        folder: Made when absent.
+
+    Raises:
+        StoreError: The folder cannot be written.
+    """
+    with disk_errors(folder):
+        for name, source in files.items():
+            target = folder / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if not (target.exists() and target.samefile(source)):
+                _place(source, target)
+
+
+def write_results_file(folder: Path, name: str, text: str) -> None:
+    """Write a small file that belongs to the results. Raises `StoreError`."""
+    with disk_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(folder / name, text.encode())
+
+
+def remove_outdated(folder: Path, keep: Iterable[str]) -> None:
+    """Remove the files that the run before left here and this one did not renew."""
+    kept = set(keep)
+    for name in _files_of_last_run(folder):
+        path = folder / name
+        if name not in kept and path.resolve().is_relative_to(folder.resolve()):
+            path.unlink(missing_ok=True)
+            _remove_empty(path.parent, folder)
+
+
+def clear_partial(folder: Path) -> None:
+    """Remove what an earlier, incomplete run left; complete results have taken its place."""
+    shutil.rmtree(folder / PARTIAL, ignore_errors=True)
+
+
+def _place(source: Path, target: Path) -> None:
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
+    temporary.unlink(missing_ok=True)
+    try:
+        try:
+            os.link(source, temporary)
+        except OSError:  # another file system, or one without hard links
+            shutil.copyfile(source, temporary)
+            with temporary.open("rb") as stream:
+                os.fsync(stream.fileno())
+        os.replace(temporary, target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _files_of_last_run(folder: Path) -> list[str]:
+    try:
+        last: Any = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+        return [str(name) for name in last["files"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+
+
+def _remove_empty(folder: Path, top: Path) -> None:
+    while folder != top and not any(folder.iterdir()):
+        folder.rmdir()
+        folder = folder.parent

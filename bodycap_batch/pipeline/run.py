@@ -1,0 +1,148 @@
+"""`run_job`: the stages in order, on one screen."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+import bodycap_batch
+from bodycap_batch.config.models import Job
+from bodycap_batch.errors import BodycapError, EstimationError
+from bodycap_batch.pipeline.flow import Flow, Settings, StageRecord
+from bodycap_batch.pipeline.inputs import has_body, key_of
+from bodycap_batch.pipeline.results import (
+    PARTIAL,
+    RUN_FILE,
+    clear_partial,
+    publish,
+    remove_outdated,
+    write_results_file,
+)
+from bodycap_batch.runner import Task
+from bodycap_batch.store import Artefact
+from bodycap_batch.tasks import RESULTS
+
+JOB_FILE = "job.yaml"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunSummary:
+    """What a finished job left behind.
+
+    Attributes:
+        out_dir: Folder of the results.
+        files: Their names, relative to it.
+        stages: Every stage that went into them, executed or reused.
+    """
+
+    out_dir: Path
+    files: tuple[str, ...]
+    stages: tuple[StageRecord, ...]
+
+    @property
+    def executed(self) -> int:
+        """How many stages had to be computed."""
+        return sum(not stage.reused for stage in self.stages)
+
+
+def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
+    """Take a job through all stages; whatever the store already holds is not computed again.
+
+    Args:
+        job: A resolved job.
+        out_dir: Folder of the results; what an earlier run left there stays until this one succeeds.
+        settings: Store, threads, listener, cancellation.
+
+    Raises:
+        BodycapError: A stage failed. Where the skeleton could not be solved, the map, the cameras' paths
+            and the frames are in ``<out_dir>/partial``.
+    """
+    settings.store.sweep()
+    with Flow(job, settings, logs=out_dir / "logs") as flow:
+        keyframes = flow.keyframes()
+        scene = flow.map(keyframes)
+        registrations = flow.registrations(scene, keyframes)
+        scene, registrations = flow.grow(scene, registrations, keyframes)
+        merged, failure = _merge(job, flow, scene, registrations)
+        exported = flow.export(keyframes, scene, registrations, merged, failure)
+    summary = RunSummary(out_dir=out_dir, files=_names(exported), stages=tuple(flow.records))
+    if failure is not None:
+        _finish(job, exported, replace(summary, out_dir=out_dir / PARTIAL), settings)
+        raise _with_partial_results(failure, out_dir / PARTIAL)
+    _finish(job, exported, summary, settings)
+    clear_partial(out_dir)
+    return summary
+
+
+def prepare_capture(options: Mapping[str, Any], folder: Path, settings: Settings) -> None:
+    """Render a synthetic capture into a folder, unless it is complete there.
+
+    Raises:
+        BodycapError: The options are wrong or rendering failed.
+    """
+    task = Task(key=key_of("synth", options, {}), threads=settings.threads)
+    runner = settings.runner(logs=folder.parent / f".{folder.name}-logs")
+    artefact, _ = runner.run(task)
+    publish({Path(name).relative_to("capture").as_posix(): path for name, path in _all(artefact)}, folder)
+    shutil.rmtree(folder.parent / f".{folder.name}-logs", ignore_errors=True)
+
+
+def _merge(
+    job: Job, flow: Flow, scene: Artefact, registrations: Mapping[str, Artefact]
+) -> tuple[Artefact | None, EstimationError | None]:
+    """The skeleton, or the reason why the data did not support one."""
+    if not has_body(job):
+        return None, None
+    try:
+        return flow.merge(scene, registrations), None
+    except EstimationError as error:
+        return None, error
+
+
+def _finish(job: Job, exported: Artefact, summary: RunSummary, settings: Settings) -> None:
+    """Results first, then the record of the run, so that the record never speaks of what is not there."""
+    out_dir = summary.out_dir
+    publish(dict(_exported(exported)), out_dir)
+    resolved = yaml.safe_dump(
+        job.model_dump(mode="json", exclude_none=True), sort_keys=False, allow_unicode=True
+    )
+    write_results_file(out_dir, JOB_FILE, resolved)
+    remove_outdated(out_dir, summary.files)
+    record = {
+        "bodycap_batch": bodycap_batch.__version__,
+        "threads": settings.threads,
+        "seconds": round(sum(stage.seconds for stage in summary.stages), 3),
+        "peak_memory_mb": max((stage.peak_memory_mb for stage in summary.stages), default=0.0),
+        "stages": [asdict(stage) for stage in summary.stages],
+        "files": list(summary.files),
+    }
+    write_results_file(out_dir, RUN_FILE, json.dumps(record, indent=1) + "\n")
+
+
+def _with_partial_results(error: EstimationError, folder: Path) -> BodycapError:
+    kept = f"the map, the cameras' paths and the frames are in {folder}"
+    error.hint = f"{error.hint}; {kept}" if error.hint else kept
+    return error
+
+
+def _all(artefact: Artefact) -> list[tuple[str, Path]]:
+    return [(name, artefact.path / name) for name in artefact.files if name.startswith("capture/")]
+
+
+def _exported(artefact: Artefact) -> list[tuple[str, Path]]:
+    """Name in the results' folder and file in the store of each exported file."""
+    return [
+        (Path(name).relative_to(RESULTS).as_posix(), artefact.path / name)
+        for name in artefact.files
+        if name.startswith(f"{RESULTS}/")
+    ]
+
+
+def _names(artefact: Artefact) -> tuple[str, ...]:
+    return tuple(name for name, _ in _exported(artefact))

@@ -1,0 +1,150 @@
+"""The child's side: run one stage, commit its artefact, tell the parent."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TextIO
+
+from bodycap_batch.context import StageContext
+from bodycap_batch.errors import EXIT_BUG, BodycapError, StoreError
+from bodycap_batch.runner.task import Task, TaskFunction, task_from_json
+from bodycap_batch.store import DISK_ERRORS, Store, store_error
+
+_PROGRESS_PERIOD_S = 0.2
+_GRACE_S = 3.0
+FULL_DISK_BYTES = 8 << 20
+"""Below this much free space a failure is put down to the full disk: libraries hide ENOSPC."""
+
+
+def main(arguments: Sequence[str], table: Mapping[str, TaskFunction] | None = None) -> int:
+    """Run the task described in a JSON file.
+
+    Args:
+        arguments: The path of the task file.
+        table: What to call for each stage; the project's own stages by default.
+
+    Returns:
+        The exit code: 0, that of a typed error, or 70.
+    """
+    speak = _Speaker()
+    stopped = threading.Event()
+    threading.Thread(target=_follow_parent, args=(stopped,), daemon=True).start()
+    task, root = task_from_json(json.loads(Path(arguments[0]).read_text(encoding="utf-8")))
+    try:
+        store = Store(root)
+        _run(task, store, _function(task.key.stage, table), (speak, stopped))
+    except BodycapError as error:
+        speak.say("error", error=error.to_dict())
+        return error.exit_code
+    except Exception as error:  # noqa: BLE001 - the one place where a task's bugs are caught
+        return _report_unexpected(error, root, speak)
+    return 0
+
+
+def _run(task: Task, store: Store, function: TaskFunction, link: tuple[_Speaker, threading.Event]) -> None:
+    speak, stopped = link
+    started = time.monotonic()
+    with store.draft(task.key) as draft, _DiskWatch(store):
+        context = StageContext(
+            work_dir=draft.work, threads=task.threads, progress=speak.progress, cancelled=stopped.is_set
+        )
+        function(task.key.options, task.arguments, context, draft.files)
+        made = {
+            "seconds": round(time.monotonic() - started, 3),
+            "peak_memory_mb": round(peak_memory_mb(), 1),
+            "threads": task.threads,
+        }
+        store.commit(draft, task.key, made)
+    speak.say("done", **made)
+
+
+def _function(stage: str, table: Mapping[str, TaskFunction] | None) -> TaskFunction:
+    if table is None:
+        from bodycap_batch.tasks import functions
+
+        table = functions()
+    return table[stage]
+
+
+class _DiskWatch:
+    """Turns what a stage raises when the disk fails into `StoreError`, before the draft is removed."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+
+    def __enter__(self) -> None:
+        """Nothing to prepare."""
+
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
+        if isinstance(error, OSError) and error.errno in DISK_ERRORS:
+            raise store_error(error, self._store.root) from error
+        unexplained = isinstance(error, Exception) and not isinstance(error, BodycapError)
+        if unexplained and self._store.free_bytes() < FULL_DISK_BYTES:
+            raise disk_full(self._store.root) from error
+
+
+def disk_full(root: Path) -> StoreError:
+    """The disk has no room left."""
+    hint = "free some space, or name a folder on another disk with --store; finished stages are kept"
+    return StoreError("No space left on device", path=root, hint=hint)
+
+
+def _report_unexpected(error: Exception, root: Path, speak: _Speaker) -> int:
+    if isinstance(error, MemoryError):
+        full = BodycapError("out of memory", hint="close other programs, or lower work_px in the job")
+        speak.say("error", error=full.to_dict())
+        return full.exit_code
+    text = traceback.format_exc()
+    sys.stderr.write(text)
+    bug = BodycapError(f"{type(error).__name__}: {error}", path=root if isinstance(error, OSError) else None)
+    speak.say("error", error=bug.to_dict(), traceback=text)
+    return EXIT_BUG
+
+
+def peak_memory_mb() -> float:
+    """Largest resident memory of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1 << 20) if sys.platform == "darwin" else peak / (1 << 10)
+
+
+class _Speaker:
+    """JSON lines to the parent; the libraries' own prints go to the log instead."""
+
+    def __init__(self) -> None:
+        self._stream: TextIO = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+        sys.stdout.flush()
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+        self._lock = threading.Lock()
+        self._last = 0.0
+
+    def say(self, event: str, **values: Any) -> None:
+        """Write one line."""
+        with self._lock:
+            self._stream.write(json.dumps({"event": event, **values}) + "\n")
+            self._stream.flush()
+
+    def progress(self, done: int, total: int, what: str = "") -> None:
+        """Tell the progress, not more often than anyone can see."""
+        now = time.monotonic()
+        if done < total and now - self._last < _PROGRESS_PERIOD_S:
+            return
+        self._last = now
+        self.say("progress", done=int(done), total=int(total), what=what)
+
+
+def _follow_parent(stopped: threading.Event) -> None:
+    """Stop when standard input closes: the parent asked for it, or is gone."""
+    while os.read(sys.stdin.fileno(), 1024):
+        pass
+    stopped.set()
+    time.sleep(_GRACE_S)
+    os.kill(os.getpid(), signal.SIGKILL)

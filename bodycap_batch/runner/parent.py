@@ -1,0 +1,203 @@
+"""The parent's side: look a task's artefact up, else start a child and follow it."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import bodycap_batch
+from bodycap_batch.errors import BodycapError, Cancelled, StoreError, error_from_dict
+from bodycap_batch.progress import Event, Listener
+from bodycap_batch.runner.child import FULL_DISK_BYTES, disk_full
+from bodycap_batch.runner.task import Task
+from bodycap_batch.store import Artefact, Store, disk_errors
+
+CHILD = (sys.executable, "-P", "-m", "bodycap_batch.runner")
+KILL_AFTER_S = 3.0
+_POLL_S = 0.2
+_THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+)
+
+
+class Runner:
+    """Runs tasks in child processes; safe to be used from several threads.
+
+    Args:
+        store: Where artefacts are kept.
+        logs: Folder for one log file and one task file per task.
+        listener: Told what happens.
+        cancelled: Asked several times a second whether to stop.
+        command: The child's command line, without the task file.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        *,
+        logs: Path,
+        listener: Listener,
+        cancelled: Callable[[], bool],
+        command: Sequence[str] = CHILD,
+    ) -> None:
+        self.store = store
+        self._logs = logs
+        self._listener = listener
+        self._cancelled = cancelled
+        self._command = tuple(command)
+
+    def run(self, task: Task) -> tuple[Artefact, bool]:
+        """Return the task's artefact and whether it had to be made.
+
+        Raises:
+            BodycapError: What the child reported, `StoreError` for the disk, `Cancelled` when stopped.
+        """
+        if (found := self.store.find(task.key)) is not None:
+            self._tell(task, "reused")
+            return found, False
+        self._tell(task, "started")
+        try:
+            artefact = self._make(task)
+        except BodycapError:
+            self._tell(task, "failed")
+            raise
+        self._tell(task, "finished", seconds=float(artefact.made["seconds"]))
+        return artefact, True
+
+    def _make(self, task: Task) -> Artefact:
+        log = self._logs / f"{task.file_stem}.log"
+        with disk_errors(self._logs):
+            self._logs.mkdir(parents=True, exist_ok=True)
+            order = log.with_suffix(".task.json")
+            order.write_text(json.dumps(task.to_json(self.store.root), indent=1), encoding="utf-8")
+        child = _Child((*self._command, str(order)), log, task.threads)
+        failure = child.follow(self._cancelled, lambda message: self._forward(task, message))
+        if self._cancelled():
+            raise Cancelled("stopped on request; finished stages are kept", hint="run it again to go on")
+        if failure is not None or child.returncode != 0:
+            raise self._explain(task, failure, child.returncode, log)
+        if (artefact := self.store.find(task.key)) is None:
+            raise StoreError(f"{task.label}: its result is gone", path=self.store.root, hint="run it again")
+        return artefact
+
+    def _explain(
+        self, task: Task, failure: dict[str, Any] | None, returncode: int, log: Path
+    ) -> BodycapError:
+        if failure is not None:
+            error = error_from_dict(failure["error"])
+            if "traceback" in failure:
+                error.message = f"{task.label}: {error.message}"
+                error.hint = f"this is a bug; please report it with {log} and the job file"
+                error.add_note(failure["traceback"])
+            return error
+        if self.store.free_bytes() < FULL_DISK_BYTES:
+            return disk_full(self.store.root)
+        return BodycapError(f"{task.label}: {_death(returncode)}", path=log, hint=_crash_hint(returncode))
+
+    def _forward(self, task: Task, message: dict[str, Any]) -> None:
+        self._tell(
+            task, "progress", done=message["done"], total=message["total"], what=message.get("what", "")
+        )
+
+    def _tell(self, task: Task, kind: Any, **values: Any) -> None:
+        self._listener(Event(kind=kind, stage=task.key.stage, camera=task.camera, round=task.round, **values))
+
+
+class _Child:
+    """One child process in its own process group."""
+
+    def __init__(self, command: Sequence[str], log: Path, threads: int) -> None:
+        with log.open("wb") as stream:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=stream,
+                env=_environment(threads),
+                start_new_session=True,
+            )
+
+    @property
+    def returncode(self) -> int:
+        """Exit code; negative for a signal."""
+        return self._process.returncode
+
+    def follow(
+        self, cancelled: Callable[[], bool], on_progress: Callable[[dict[str, Any]], None]
+    ) -> dict[str, Any] | None:
+        """Read the child's lines until it ends; returns its error message, if it sent one."""
+        assert self._process.stdout is not None  # noqa: S101 - opened as a pipe
+        failure: dict[str, Any] | None = None
+        pipe, rest = self._process.stdout.fileno(), b""
+        try:
+            while not cancelled():
+                if not select.select([pipe], [], [], _POLL_S)[0]:
+                    continue
+                if not (data := os.read(pipe, 1 << 16)):
+                    break
+                *lines, rest = (rest + data).split(b"\n")
+                for message in map(json.loads, lines):
+                    if message["event"] == "progress":
+                        on_progress(message)
+                    elif message["event"] == "error":
+                        failure = message
+        finally:
+            self._end(at_once=cancelled())
+        return failure
+
+    def _end(self, *, at_once: bool) -> None:
+        """Wait for the child, or stop its process group: SIGTERM, and SIGKILL after 3 s."""
+        assert self._process.stdin is not None  # noqa: S101 - opened as a pipe
+        assert self._process.stdout is not None  # noqa: S101 - opened as a pipe
+        self._process.stdin.close()
+        if at_once:
+            self._signal(signal.SIGTERM)
+        try:
+            self._process.wait(KILL_AFTER_S)
+        except subprocess.TimeoutExpired:
+            self._signal(signal.SIGKILL)
+            self._process.wait()
+        self._process.stdout.close()
+
+    def _signal(self, number: signal.Signals) -> None:
+        try:
+            os.killpg(self._process.pid, number)
+        except ProcessLookupError:
+            return
+
+
+def _environment(threads: int) -> dict[str, str]:
+    """The child's environment: threads pinned before any library is loaded, this package found."""
+    package = str(Path(bodycap_batch.__file__).parent.parent)
+    path = os.pathsep.join(part for part in (package, os.environ.get("PYTHONPATH")) if part)
+    pinned = dict.fromkeys(_THREAD_VARIABLES, str(threads))
+    return {**os.environ, **pinned, "PYTHONPATH": path, "PYTHONUNBUFFERED": "1"}
+
+
+def _death(returncode: int) -> str:
+    if returncode >= 0:
+        return f"the stage's process ended with code {returncode} and no message"
+    try:
+        name = signal.Signals(-returncode).name
+    except ValueError:
+        name = f"signal {-returncode}"
+    return f"the stage's process was ended by {name}"
+
+
+def _crash_hint(returncode: int) -> str:
+    if returncode == -signal.SIGKILL:
+        return (
+            "probably out of memory: close other programs, or lower work_px in the job; run it again to go on"
+        )
+    return "a native library crashed; run it again, and if it stays, please report it with this log"

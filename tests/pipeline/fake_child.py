@@ -1,0 +1,90 @@
+"""A child process with stages made for tests: it computes, fails, crashes or hangs on demand."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from bodycap_batch.context import StageContext
+from bodycap_batch.errors import EstimationError
+from bodycap_batch.runner.child import main
+
+Json = Mapping[str, Any]
+
+
+def work(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    for step in range(3):
+        context.progress(step + 1, 3, "steps")
+    (files / "threads.txt").write_text(f"{context.threads} {os.environ['OMP_NUM_THREADS']}")
+    (files / "result.txt").write_text(f"{options['value']} {arguments.get('say', '')}")
+
+
+def noisy(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    os.write(1, b"a native library prints\n")
+    print("so does Python")
+    sys.stderr.write("and this is a log line\n")
+    (files / "result.txt").write_text("done")
+
+
+def refuse(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    raise EstimationError("only 3 of 50 frames", path="video.mp4", hint="film more")
+
+
+def bug(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    {}["nothing"]
+
+
+def crash(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    ctypes.string_at(0)
+
+
+def hang(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    (context.work_dir / "started").write_text(str(os.getpid()))
+    Path(arguments["started"]).write_text(f"{os.getpid()} {context.work_dir}")
+    while True:
+        time.sleep(0.05)
+
+
+def polite(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    Path(arguments["started"]).write_text(f"{os.getpid()} {context.work_dir}")
+    while True:
+        context.check_cancelled()
+        time.sleep(0.02)
+
+
+def fill(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    with (files / "big.bin").open("wb") as stream:
+        for _ in range(1000):
+            stream.write(bytes(1 << 20))
+
+
+def fill_quietly(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    """As a library that hides the cause: the disk fills up and something else is raised."""
+    try:
+        fill(options, arguments, context, files)
+    except OSError:
+        raise RuntimeError("cannot write database") from None
+
+
+def fill_and_die(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    try:
+        fill(options, arguments, context, files)
+    except OSError:
+        os.abort()
+
+
+TABLE = {
+    function.__name__: function
+    for function in (work, noisy, refuse, bug, crash, hang, polite, fill, fill_quietly, fill_and_die)
+}
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:], TABLE))

@@ -1,0 +1,238 @@
+"""Tasks in child processes: results, failures, crashes, cancelling, kill -9, full disks."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bodycap_batch.errors import BodycapError, Cancelled, EstimationError, StoreError
+from bodycap_batch.progress import Event
+from bodycap_batch.runner import Runner, Task
+from bodycap_batch.store import ArtefactKey, Store
+
+ROOT = Path(__file__).parents[2]
+FAKE = (sys.executable, str(ROOT / "tests" / "pipeline" / "fake_child.py"))
+
+
+def a_task(stage: str, value: int = 1, **arguments: Any) -> Task:
+    key = ArtefactKey(stage=stage, algorithm="1", options={"value": value}, inputs={}, libraries={})
+    return Task(key=key, arguments=arguments, camera="torso", threads=2)
+
+
+class Bench:
+    """A runner on an empty store that writes down what it hears."""
+
+    def __init__(self, folder: Path) -> None:
+        self.store = Store(folder / "store")
+        self.logs = folder / "logs"
+        self.events: list[Event] = []
+        self.stop = threading.Event()
+        self.runner = Runner(
+            self.store,
+            logs=self.logs,
+            listener=self.events.append,
+            cancelled=self.stop.is_set,
+            command=FAKE,
+        )
+
+    def kinds(self) -> list[str]:
+        return [event.kind for event in self.events]
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    return Bench(tmp_path)
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it never happened"
+        time.sleep(0.02)
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+def test_a_task_makes_its_artefact_once(bench: Bench) -> None:
+    made, executed = bench.runner.run(a_task("work", say="hello"))
+    assert executed
+    assert (made.path / "result.txt").read_text() == "1 hello"
+    again, executed = bench.runner.run(a_task("work", say="something else"))
+    assert not executed
+    assert again == made
+    assert bench.kinds()[0] == "started"
+    assert bench.kinds()[-2:] == ["finished", "reused"]
+
+
+def test_threads_are_pinned_before_libraries_load(bench: Bench) -> None:
+    made, _ = bench.runner.run(a_task("work"))
+    assert (made.path / "threads.txt").read_text() == "2 2"
+
+
+def test_progress_arrives_with_stage_and_camera(bench: Bench) -> None:
+    bench.runner.run(a_task("work"))
+    progress = [event for event in bench.events if event.kind == "progress"]
+    assert (progress[-1].done, progress[-1].total, progress[-1].what) == (3, 3, "steps")
+    assert {(event.stage, event.camera) for event in bench.events} == {("work", "torso")}
+
+
+def test_cost_is_recorded_outside_the_content(bench: Bench) -> None:
+    made, _ = bench.runner.run(a_task("work"))
+    assert made.made["peak_memory_mb"] > 1
+    assert made.made["seconds"] >= 0
+    assert "manifest.json" not in made.files
+
+
+def test_prints_of_libraries_go_to_the_log(bench: Bench) -> None:
+    bench.runner.run(a_task("noisy"))
+    log = (bench.logs / "noisy_torso.log").read_text()
+    for line in ("a native library prints", "so does Python", "and this is a log line"):
+        assert line in log
+
+
+def test_a_typed_error_crosses_whole(bench: Bench) -> None:
+    with pytest.raises(EstimationError) as caught:
+        bench.runner.run(a_task("refuse"))
+    error = caught.value
+    assert (error.message, error.path, error.hint) == ("only 3 of 50 frames", "video.mp4", "film more")
+    assert bench.kinds()[-1] == "failed"
+    assert bench.store.find(a_task("refuse").key) is None
+
+
+def test_a_bug_names_the_stage_and_brings_its_traceback(bench: Bench) -> None:
+    with pytest.raises(BodycapError, match="bug torso: KeyError") as caught:
+        bench.runner.run(a_task("bug"))
+    assert caught.value.exit_code == 70
+    assert "bug_torso.log" in str(caught.value.hint)
+    assert 'File "' in "".join(caught.value.__notes__)
+    assert "Traceback" in (bench.logs / "bug_torso.log").read_text()
+
+
+def test_a_native_crash_is_told_with_its_signal_and_log(bench: Bench) -> None:
+    with pytest.raises(BodycapError, match="SIGSEGV") as caught:
+        bench.runner.run(a_task("crash"))
+    assert caught.value.exit_code == 70
+    assert str(caught.value.path).endswith("crash_torso.log")
+    assert bench.runner.run(a_task("work"))[1]
+
+
+@pytest.mark.parametrize("stage", ["hang", "polite"])
+def test_cancelling_stops_the_child_and_cleans_up(bench: Bench, tmp_path: Path, stage: str) -> None:
+    started = tmp_path / "started"
+    failures: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            bench.runner.run(a_task(stage, started=str(started)))
+        except Cancelled as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    wait_for(lambda: started.exists() and " " in started.read_text())
+    bench.stop.set()
+    thread.join(20)
+    pid, work = started.read_text().split(" ", 1)
+    assert len(failures) == 1
+    assert not alive(int(pid))
+    bench.store.sweep()
+    assert not Path(work).exists()
+
+
+def test_a_child_killed_with_kill_9_is_told_and_the_task_can_be_run_again(
+    bench: Bench, tmp_path: Path
+) -> None:
+    started = tmp_path / "started"
+    failures: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            bench.runner.run(a_task("hang", started=str(started)))
+        except BodycapError as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    wait_for(lambda: started.exists() and " " in started.read_text())
+    pid, work = started.read_text().split(" ", 1)
+    os.kill(int(pid), signal.SIGKILL)
+    thread.join(20)
+    assert "SIGKILL" in str(failures[0])
+    assert bench.store.find(a_task("hang").key) is None
+    assert bench.store.sweep() == 1
+    assert not Path(work).exists()
+    assert bench.runner.run(a_task("work"))[1]
+
+
+def test_children_do_not_outlive_a_killed_parent(tmp_path: Path) -> None:
+    started = tmp_path / "started"
+    script = textwrap.dedent(f"""
+        from pathlib import Path
+        from tests.unit.test_runner import Bench, a_task
+        Bench(Path({str(tmp_path)!r})).runner.run(a_task("hang", started={str(started)!r}))
+    """)
+    parent = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT)
+    wait_for(lambda: started.exists() and " " in started.read_text())
+    child = int(started.read_text().split()[0])
+    assert alive(child)
+    parent.kill()
+    parent.wait()
+    wait_for(lambda: not alive(child))
+
+
+_FULL_DISK = """
+import sys
+from pathlib import Path
+from bodycap_batch.errors import StoreError
+from tests.unit.test_runner import Bench, a_task
+bench = Bench(Path(sys.argv[1]))
+assert bench.runner.run(a_task("work"))[1]
+try:
+    bench.runner.run(a_task(sys.argv[2]))
+except StoreError as error:
+    assert "space" in error.message and "--store" in error.hint, error
+else:
+    sys.exit("the disk was not full")
+bench.store.sweep()
+assert bench.store.find(a_task(sys.argv[2]).key) is None
+assert not bench.runner.run(a_task("work"))[1]
+"""
+
+
+@pytest.mark.parametrize("stage", ["fill", "fill_quietly", "fill_and_die"])
+def test_a_full_disk_is_a_typed_error_and_loses_nothing(tmp_path: Path, stage: str) -> None:
+    mount = ["unshare", "--mount", "--propagation", "private", "sh", "-c"]
+    if subprocess.run([*mount, "mount -t tmpfs none /mnt"], capture_output=True, check=False).returncode:
+        pytest.skip("needs the right to mount a tmpfs in a mount namespace of its own (root)")
+    command = f'mount -t tmpfs -o size=24m none "$1" && exec "$2" -c "$3" "$1" {stage}'
+    done = subprocess.run(
+        [*mount, command, "sh", str(tmp_path), sys.executable, _FULL_DISK],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_store_error_is_what_a_removed_store_gives(bench: Bench) -> None:
+    (bench.store.root / "tmp").rmdir()
+    (bench.store.root / "tmp").write_text("in the way")
+    with pytest.raises(StoreError):
+        bench.runner.run(a_task("work"))
