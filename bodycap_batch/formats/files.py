@@ -6,7 +6,7 @@ import errno
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from bodycap_batch.errors import StoreError
@@ -49,7 +49,8 @@ def replacing(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise store_error(error, path) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # gone after the rename; nothing to do where the folder itself is bad
+            temporary.unlink()
 
 
 def write_text(path: Path, text: str) -> None:

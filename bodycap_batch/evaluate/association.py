@@ -1,0 +1,65 @@
+"""Which truth belongs to which estimate: by time, interpolated or nearest."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.formats.tum import TimedPoses
+from bodycap_batch.geometry import interpolate_pose
+
+Association = Literal["interpolate", "nearest"]
+
+_SNAP_NS = 1_000_000
+"""Timestamps are written with as few as four decimals: a pose this near needs no neighbour."""
+
+
+def interpolate_truth(
+    truth: TimedPoses, times_ns: IntArray, max_gap_s: float
+) -> tuple[FloatArray, BoolArray]:
+    """The truth at given times: slerp and linear between its two neighbours.
+
+    Args:
+        truth: Poses in time order.
+        times_ns: (N,) when.
+        max_gap_s: Where the neighbours are further apart than this, there is no truth.
+
+    Returns:
+        (N,4,4) poses (identity where there is none) and (N,) which there are.
+    """
+    after = np.clip(np.searchsorted(truth.times_ns, times_ns), 1, max(1, len(truth.times_ns) - 1))
+    after = np.minimum(after, len(truth.times_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    start, end = truth.times_ns[before], truth.times_ns[after]
+    gap = np.maximum(end - start, 1)
+    alpha = np.clip((times_ns - start) / gap, 0.0, 1.0)
+    nearest_ns = np.minimum(np.abs(times_ns - start), np.abs(times_ns - end))
+    inside = (times_ns >= start) & (times_ns <= end) & (gap <= round(max_gap_s * 1e9))
+    found = inside | (nearest_ns <= _SNAP_NS)
+    alpha = np.where(inside, alpha, np.round(alpha))
+    poses = np.tile(np.eye(4), (len(times_ns), 1, 1))
+    poses[found] = interpolate_pose(
+        truth.world_from_cam[before[found]], truth.world_from_cam[after[found]], alpha[found]
+    )
+    return poses, found
+
+
+def nearest_truth(truth: TimedPoses, times_ns: IntArray, max_diff_s: float) -> tuple[FloatArray, BoolArray]:
+    """The truth nearest to given times, as benchmark tools associate.
+
+    Args:
+        truth: Poses in time order.
+        times_ns: (N,) when.
+        max_diff_s: Largest time difference of a pair.
+
+    Returns:
+        (N,4,4) poses and (N,) which are near enough.
+    """
+    after = np.minimum(np.searchsorted(truth.times_ns, times_ns), len(truth.times_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    closer = np.abs(times_ns - truth.times_ns[before]) <= np.abs(truth.times_ns[after] - times_ns)
+    index = np.where(closer, before, after)
+    found = np.abs(truth.times_ns[index] - times_ns) <= round(max_diff_s * 1e9)
+    return truth.world_from_cam[index], found

@@ -1,0 +1,251 @@
+"""Scores: equal to evo, blind to what they should be blind to, and not to the rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.errors import JobError
+from bodycap_batch.evaluate import (
+    TrajectoryOptions,
+    evaluate_trajectories,
+    normalised_errors,
+    relative_camera_error,
+    score_trajectories,
+)
+from bodycap_batch.formats.tum import TimedPoses, read_tum, write_tum
+from bodycap_batch.geometry import Similarity, make_transform, so3_exp
+
+RATE_NS = 33_333_333
+
+
+def walk(seed: int, frames: int = 300, *, noise_m: float = 0.0, phase: float = 0.0) -> TimedPoses:
+    """A camera that walks a bent path and looks around."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(frames) / 30.0
+    position = np.stack([np.sin(time + phase), 1.3 * np.cos(0.7 * time), 0.05 * np.sin(9 * time)], axis=1)
+    turn = Rotation.from_euler(
+        "ZXY", np.stack([40 * time, 9 * np.sin(5 * time), 0 * time], axis=1), degrees=True
+    )
+    turn = turn * Rotation.from_rotvec(rng.normal(scale=noise_m, size=(frames, 3)))
+    position = position + rng.normal(scale=noise_m, size=(frames, 3)) if noise_m else position
+    return TimedPoses(
+        times_ns=1_000_000_000_000 + np.arange(frames) * RATE_NS,
+        world_from_cam=make_transform(turn.as_matrix(), position),
+    )
+
+
+def moved(poses: TimedPoses, by: Similarity) -> TimedPoses:
+    return TimedPoses(times_ns=poses.times_ns, world_from_cam=by.apply_to_poses(poses.world_from_cam))
+
+
+def evo_errors(
+    estimate: Path, truth: Path, *, scale: bool, max_diff_s: float, delta: int = 0
+) -> dict[str, float]:
+    from evo.core import metrics, sync
+    from evo.tools import file_interface
+
+    true = file_interface.read_tum_trajectory_file(str(truth))
+    mine = file_interface.read_tum_trajectory_file(str(estimate))
+    true, mine = sync.associate_trajectories(true, mine, max_diff=max_diff_s)
+    mine.align(true, correct_scale=scale)
+    ate = metrics.APE(metrics.PoseRelation.translation_part)
+    ate.process_data((true, mine))
+    out = {"ate": ate.get_statistic(metrics.StatisticsType.rmse), "count": float(len(ate.error))}
+    if delta:
+        rpe = metrics.RPE(metrics.PoseRelation.translation_part, delta, metrics.Unit.frames, all_pairs=True)
+        rpe.process_data((true, mine))
+        out["rpe"] = rpe.get_statistic(metrics.StatisticsType.rmse)
+        turn = metrics.RPE(
+            metrics.PoseRelation.rotation_angle_deg, delta, metrics.Unit.frames, all_pairs=True
+        )
+        turn.process_data((true, mine))
+        out["rpe_deg"] = turn.get_statistic(metrics.StatisticsType.rmse)
+    return out
+
+
+@pytest.mark.parametrize("align", ["sim3", "se3"])
+def test_same_as_evo(tmp_path: Path, align: str) -> None:
+    truth, noisy = walk(0), walk(1, noise_m=0.02)
+    shift = Similarity(
+        0.31 if align == "sim3" else 1.0, so3_exp([0.3, 2.0, -1.0]), np.array([5.0, -2.0, 1.0])
+    )
+    write_tum(tmp_path / "truth.tum", truth)
+    write_tum(tmp_path / "mine.tum", moved(noisy, shift))
+    options = TrajectoryOptions(align=align, association="nearest", max_diff_s=0.01, rpe_delta_s=1.0)  # type: ignore[arg-type]
+    ours = evaluate_trajectories({"a": tmp_path / "mine.tum"}, {"a": tmp_path / "truth.tum"}, options).total
+    theirs = evo_errors(
+        tmp_path / "mine.tum", tmp_path / "truth.tum", scale=align == "sim3", max_diff_s=0.01, delta=30
+    )
+    assert ours.ate_m is not None
+    assert ours.rpe_m is not None
+    assert ours.rpe_deg is not None
+    assert ours.scored == theirs["count"] == 300
+    assert ours.ate_m.rmse == pytest.approx(theirs["ate"], abs=1e-6)
+    assert ours.rpe_m.rmse == pytest.approx(theirs["rpe"], abs=1e-6)
+    assert ours.rpe_deg.rmse == pytest.approx(theirs["rpe_deg"], abs=1e-6)
+    # 2 cm a coordinate, less the seven fitted parameters of 900: 3.5 cm
+    assert 0.030 < ours.ate_m.rmse < 0.038
+
+
+@pytest.mark.data
+def test_same_as_evo_on_real_data(data_root: Path, tmp_path: Path) -> None:
+    """Motion capture at 100 Hz with a gap, frames at 30 Hz, an estimate with noise."""
+    truth_path = data_root / "tum_fr1_xyz" / "groundtruth.txt"
+    truth = read_tum(truth_path)
+    stamps = np.loadtxt(data_root / "tum_fr1_xyz" / "camera.timestamps.txt")
+    rng = np.random.default_rng(5)
+    index = np.abs(truth.times_ns[None] - np.round(stamps * 1e9).astype(np.int64)[:, None]).argmin(axis=1)
+    noisy = truth.world_from_cam[index].copy()
+    noisy[:, :3, 3] = 0.4 * noisy[:, :3, 3] + rng.normal(scale=0.004, size=(len(index), 3))
+    times, kept = np.unique(np.round(stamps * 1e9).astype(np.int64), return_index=True)
+    write_tum(tmp_path / "mine.tum", TimedPoses(times_ns=times, world_from_cam=noisy[kept]))
+    options = TrajectoryOptions(association="nearest", max_diff_s=0.02)
+    ours = evaluate_trajectories({"a": tmp_path / "mine.tum"}, {"a": truth_path}, options).total
+    theirs = evo_errors(tmp_path / "mine.tum", truth_path, scale=True, max_diff_s=0.02)
+    assert ours.scored == theirs["count"]
+    assert ours.ate_m is not None
+    assert ours.ate_m.rmse == pytest.approx(theirs["ate"], abs=1e-6)
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    scale=st.floats(0.01, 100.0),
+    vector=st.lists(st.floats(-3, 3), min_size=6, max_size=6),
+)
+def test_moving_turning_and_scaling_the_estimate_changes_nothing(
+    seed: int, scale: float, vector: list[float]
+) -> None:
+    truths = {"a": walk(seed, 60), "b": walk(seed, 60, phase=0.4)}
+    estimates = {"a": walk(seed, 60, noise_m=0.01), "b": walk(seed + 1, 60, noise_m=0.01, phase=0.4)}
+    change = Similarity(scale, so3_exp(vector[:3]), np.array(vector[3:]))
+    before = score_trajectories(estimates, truths)
+    after = score_trajectories({name: moved(poses, change) for name, poses in estimates.items()}, truths)
+    assert before.total.ate_m is not None
+    assert after.total.ate_m is not None
+    assert after.total.ate_m.rmse == pytest.approx(before.total.ate_m.rmse, rel=1e-9)
+    assert after.scale == pytest.approx(before.scale / scale, rel=1e-9)
+    assert after.total.rotation_deg is not None
+    assert before.total.rotation_deg is not None
+    assert after.total.rotation_deg.rmse == pytest.approx(before.total.rotation_deg.rmse, rel=1e-6)
+
+
+def test_one_similarity_for_all_cameras() -> None:
+    """Each camera alone is perfect, together they are 10 cm off: that must show."""
+    truths = {"a": walk(0), "b": walk(0, phase=0.4)}
+    shifted = moved(truths["b"], Similarity(1.0, np.eye(3), np.array([0.1, 0.0, 0.0])))
+    together = score_trajectories({"a": truths["a"], "b": shifted}, truths).total.ate_m
+    alone = score_trajectories({"b": shifted}, truths).total.ate_m
+    assert together is not None
+    assert alone is not None
+    assert alone.rmse < 1e-9
+    # the best compromise puts each camera 5 cm off; turn and scale mend little of it
+    assert 0.035 < together.rmse < 0.0501
+
+
+def test_alignment_modes_see_scale_and_place() -> None:
+    truth = walk(0)
+    scaled = moved(truth, Similarity(1.1, np.eye(3), np.zeros(3)))
+    shifted = moved(truth, Similarity(1.0, np.eye(3), np.array([0.0, 0.0, 0.2])))
+
+    def rmse(poses: TimedPoses, align: str) -> float:
+        options = TrajectoryOptions(align=align)  # type: ignore[arg-type]
+        score = score_trajectories({"a": poses}, {"a": truth}, options).total.ate_m
+        assert score is not None
+        return score.rmse
+
+    assert rmse(scaled, "sim3") < 1e-9
+    assert rmse(scaled, "se3") > 0.05
+    assert rmse(shifted, "se3") < 1e-9
+    assert rmse(shifted, "none") == pytest.approx(0.2)
+
+
+def test_truth_is_interpolated_and_long_gaps_are_refused() -> None:
+    """A frame half way between two truths is half way; inside a gap of 0.5 s there is no truth."""
+    times = np.array([0, 100, 200, 700, 800]) * 1_000_000
+    position = np.stack([times / 1e9, np.zeros(5), np.zeros(5)], axis=1)
+    turn = so3_exp(np.stack([np.zeros(5), np.zeros(5), times / 1e9], axis=1))
+    truth = TimedPoses(times_ns=times, world_from_cam=make_transform(turn, position))
+    at = np.array([-50, 50, 150, 450, 700, 750, 900]) * 1_000_000
+    exact = make_transform(
+        so3_exp(np.stack([np.zeros(7), np.zeros(7), at / 1e9], axis=1)),
+        np.stack([at / 1e9, np.zeros(7), np.zeros(7)], axis=1),
+    )
+    options = TrajectoryOptions(align="none", max_gap_s=0.1)
+    score = score_trajectories(
+        {"a": TimedPoses(times_ns=at, world_from_cam=exact)}, {"a": truth}, options, {"a": 14}
+    )
+    assert (score.total.registered, score.total.scored, score.total.coverage) == (7, 4, 0.5)
+    assert score.total.ate_m is not None
+    assert score.total.rotation_deg is not None
+    assert score.total.ate_m.max < 1e-12
+    assert score.total.rotation_deg.max < 1e-6
+
+
+def test_a_time_a_hair_outside_the_truth_still_counts() -> None:
+    truth = walk(0, 10)
+    late = TimedPoses(times_ns=truth.times_ns + 50_000, world_from_cam=truth.world_from_cam)
+    assert score_trajectories({"a": late}, {"a": truth}).total.scored == 10
+
+
+def test_a_wrong_clock_shows() -> None:
+    truth = walk(0)
+    late = TimedPoses(times_ns=truth.times_ns + 120_000_000, world_from_cam=truth.world_from_cam)
+    error = score_trajectories({"a": late}, {"a": truth}, TrajectoryOptions(align="none")).total.ate_m
+    assert error is not None
+    # 0.12 s at 0.4 to 1.4 m/s
+    assert 0.04 < error.mean < 0.17
+
+
+def test_missing_truth_and_other_clocks_are_named() -> None:
+    with pytest.raises(JobError, match="no truth for camera b"):
+        score_trajectories({"a": walk(0), "b": walk(0)}, {"a": walk(0)})
+    other = TimedPoses(times_ns=np.arange(5), world_from_cam=walk(0, 5).world_from_cam)
+    with pytest.raises(JobError, match="0 poses have a truth"):
+        score_trajectories({"a": walk(0)}, {"a": other})
+
+
+def test_relative_error_of_two_cameras() -> None:
+    """A palm 3 cm off in the torso's frame, the whole capture moved and turned: 3 cm, and scale shows."""
+    truths = {"torso": walk(0), "palm": walk(0, phase=0.4)}
+    off: FloatArray = truths["torso"].world_from_cam[:, :3, :3] @ np.array([0.0, 0.03, 0.0])
+    palm = truths["palm"].world_from_cam.copy()
+    palm[:, :3, 3] += off
+    change = Similarity(1.0, so3_exp([0.1, 0.2, 1.0]), np.array([4.0, 0.0, 1.0]))
+    estimates = {
+        "torso": moved(truths["torso"], change),
+        "palm": moved(TimedPoses(times_ns=truths["palm"].times_ns, world_from_cam=palm), change),
+    }
+    error = relative_camera_error(estimates, truths, "palm", "torso")
+    assert error.frames == 300
+    assert error.in_reference_m.mean == pytest.approx(0.03, abs=1e-9)
+    # the alignment is of both paths, not of their difference: a tenth either way
+    assert 0.027 < error.vector_m.mean < 0.033
+    bigger = {n: moved(p, Similarity(1.2, np.eye(3), np.zeros(3))) for n, p in truths.items()}
+    span = np.linalg.norm(
+        truths["palm"].world_from_cam[:, :3, 3] - truths["torso"].world_from_cam[:, :3, 3], axis=1
+    )
+    in_reference = relative_camera_error(bigger, truths, "palm", "torso").in_reference_m
+    assert in_reference.mean == pytest.approx(0.2 * span.mean())
+
+
+def test_normalised_errors_are_one_per_dimension() -> None:
+    """Poses drawn from their own covariance: mean 6, and 24 after doubling the error."""
+    rng = np.random.default_rng(2)
+    count = 4000
+    root = rng.normal(size=(6, 6)) * np.array([[0.01], [0.01], [0.02], [0.05], [0.02], [0.01]])
+    covariance = root @ root.T
+    draws = rng.multivariate_normal(np.zeros(6), covariance, size=count)
+    estimate = walk(0, count).world_from_cam
+    for factor, expected in ((1.0, 6.0), (2.0, 24.0)):
+        step = make_transform(so3_exp(factor * draws[:, :3]), factor * draws[:, 3:])
+        errors = normalised_errors(estimate, np.tile(covariance, (count, 1, 1)), estimate @ step)
+        # a chi-square mean of 6 with variance 12: ± 4 sigma of the mean
+        assert errors.mean() == pytest.approx(expected, rel=4 * np.sqrt(12 / count) / 6)
