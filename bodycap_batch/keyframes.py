@@ -63,8 +63,7 @@ class _Tracker:
 
     def step(self, grey: GreyImage) -> None:
         """Follow the tracks into the next frame."""
-        assert self.grey is not None
-        flow = track_points(self.grey, grey, self.px)
+        flow = track_points(grey if self.grey is None else self.grey, grey, self.px)
         self.px, self.start_rays = flow.px[flow.ok], self.start_rays[flow.ok]
         if self.kept_samples < _NOISE_SAMPLES:
             self.round_trips.append(flow.round_trip_px[flow.ok])

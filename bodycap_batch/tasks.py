@@ -57,6 +57,16 @@ def _synth(options: Json, _: Json, context: StageContext, files: Path) -> None:
     synthesise(SynthOptions.model_validate(options), files / "capture", context)
 
 
+def _check(_: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    from bodycap_batch.check import require_ready
+    from bodycap_batch.config.models import Job
+
+    context.check_cancelled()
+    report = require_ready(Job.model_validate(arguments["job"]))
+    notes = [f"{camera.name}: {note}" for camera in report.cameras for note in camera.notes]
+    _write_summary(files, notes=[*notes, *report.notes])
+
+
 def _keyframes(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
     from bodycap_batch.config import KeyframeOptions
     from bodycap_batch.formats.bundle import write_bundle
@@ -277,6 +287,7 @@ def _write_summary(files: Path, **values: Any) -> None:
 _VISION = ("numpy", "av", "opencv-python-headless|opencv-python")
 STAGES = {
     "synth": Stage(function=_synth, room="synthetic", libraries=("numpy", "av", "open3d-cpu|open3d")),
+    "check": Stage(function=_check, room="check", libraries=_VISION),
     "keyframes": Stage(function=_keyframes, room="keyframes", libraries=_VISION),
     "map": Stage(function=_map, room="mapping", libraries=(*_VISION, "pycolmap")),
     "extend": Stage(function=_extend, room="mapping", libraries=(*_VISION, "pycolmap")),

@@ -63,10 +63,11 @@ def track_points(first: GreyImage, second: GreyImage, px: Pixels, guess_px: Pixe
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ITERATIONS, _EPSILON_PX)
     window = (_WINDOW_PX, _WINDOW_PX)
     flags = 0
-    there_start: npt.NDArray[np.float32] | None = None
+    there_guess: npt.NDArray[np.float32] | None = None
     if guess_px is not None:
-        there_start = np.ascontiguousarray(guess_px - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
+        there_guess = np.ascontiguousarray(guess_px - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
         flags = cv2.OPTFLOW_USE_INITIAL_FLOW
+    there_start = None if there_guess is None else there_guess.copy()
     there, found, _ = cv2.calcOpticalFlowPyrLK(
         first, second, start, there_start, None, None, window, _LEVELS, criteria, flags
     )
@@ -75,8 +76,10 @@ def track_points(first: GreyImage, second: GreyImage, px: Pixels, guess_px: Pixe
     alive = np.asarray(found).ravel().astype(bool) & inside
     back = np.full_like(there, np.inf)
     if alive.any():
+        # The way back starts from the guess's own shift, so that it does not know the answer.
+        back_start = None if there_guess is None else there[alive] - (there_guess - start)[alive]
         returned, refound, _ = cv2.calcOpticalFlowPyrLK(
-            second, first, there[alive], None, None, None, window, _LEVELS, criteria, 0
+            second, first, there[alive], back_start, None, None, window, _LEVELS, criteria, flags
         )
         returned[~np.asarray(refound).ravel().astype(bool)] = np.inf
         back[alive] = returned

@@ -135,10 +135,10 @@ def _joined(videos: tuple[VideoFile, ...], parts: list[IntArray]) -> Timeline:
     usable = np.ones(len(times), dtype=bool)
     usable[1:] = times[1:] > latest[:-1]
     notes = []
-    for before, video, start, part in zip(videos, videos[1:], parts, parts[1:], strict=False):
-        gap_s = (int(part[0]) - int(start[0]) - before.duration_ns) / _NS
-        frame_s = before.duration_ns / _NS / len(before.pts)
-        if abs(gap_s) > 1.5 * frame_s:
-            kind = "a gap of" if gap_s > 0 else "an overlap of"
-            notes.append(f"{kind} {abs(gap_s):.2f} s between {before.path.name} and {video.path.name}")
+    for (before, start), (video, part) in itertools.pairwise(zip(videos, parts, strict=True)):
+        frame_ns = float(np.median(np.diff(start))) if len(start) > 1 else before.duration_ns
+        gap_ns = int(part[0]) - (int(start[-1]) + frame_ns)
+        if abs(gap_ns) > 1.5 * frame_ns:
+            kind = "a gap of" if gap_ns > 0 else "an overlap of"
+            notes.append(f"{kind} {abs(gap_ns) / _NS:.2f} s between {before.path.name} and {video.path.name}")
     return Timeline(times_ns=times, usable=usable, notes=tuple(notes))

@@ -36,7 +36,7 @@ def look_at_frames(camera: CaptureCamera) -> list[str]:
         raise CaptureError(
             f"camera {camera.name} shows black pictures only ({black} of {black} looked at)",
             path=camera.chapters[0],
-            hint="was the lens covered? Leave the camera out, or convert the video to H.264 if players show it",
+            hint="was the lens covered? Leave the camera out; if a player shows it, convert it to H.264",
         )
     notes = []
     if black:

@@ -130,7 +130,10 @@ def _with_overrides(job: Job, overrides: Overrides) -> Job:
 def _prepare_synthetic(job: Job, base: Path, path: Path, prepare: Prepare | None) -> None:
     folder = synthetic_folder(job, base)
     if prepare is not None:
-        prepare(dict(job.capture.synthetic or {}), folder)
+        options = dict(job.capture.synthetic or {})
+        if isinstance(options.get("motion"), str):
+            options["motion"] = str((base / options["motion"]).resolve())
+        prepare(options, folder)
     missing = [v for camera in job.capture.cameras for v in camera.video if not (base / v).is_file()]
     if missing:
         raise CaptureError(

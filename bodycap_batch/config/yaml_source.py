@@ -24,6 +24,7 @@ _INT = re.compile(r"[-+]?[0-9]+")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _WORDS: dict[str, bool | None] = {"": None, "~": None, "null": None, "Null": None, "NULL": None}
 _WORDS |= {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
+_TAB_INDENT = re.compile(r" *\t")
 _MAX_INT = 1 << 63
 
 
@@ -72,7 +73,7 @@ def read_yaml(path: Path) -> YamlSource:
         _refuse_traps(text, path)
         node = yaml.compose(text, Loader=yaml.SafeLoader)
     except yaml.MarkedYAMLError as error:
-        raise _syntax_error(error, path) from error
+        raise _syntax_error(error, text, path) from error
     except (yaml.YAMLError, ValueError) as error:
         raise JobError(
             f"not YAML: {error}".splitlines()[0], path=path, hint="save the file as plain UTF-8 text"
@@ -104,24 +105,20 @@ def _refuse_traps(text: str, path: Path) -> None:
                 )
 
 
-def _syntax_error(error: yaml.MarkedYAMLError, path: Path) -> JobError:
+def _syntax_error(error: yaml.MarkedYAMLError, text: str, path: Path) -> JobError:
     mark = error.problem_mark or error.context_mark
+    line = None if mark is None else mark.line + 1
+    tabbed = next((n for n, row in enumerate(text.splitlines(), 1) if _TAB_INDENT.match(row)), None)
+    if tabbed is not None or "'\\t'" in str(error.problem):
+        return JobError(
+            "a tab where YAML wants spaces",
+            path=path,
+            line=tabbed or line,
+            hint="indent with spaces, not tabs",
+        )
     problem = " ".join(part for part in (error.problem, error.context) if part)
     hint = "check indentation, colons and quotes on this line and the one before"
-    if mark is not None and mark.buffer is not None and "\t" in _line_around(mark.buffer, mark.pointer):
-        problem, hint = "a tab where YAML wants spaces", "indent with spaces; YAML does not allow tabs"
-    return JobError(
-        problem if "tab" in problem else f"not YAML: {problem}",
-        path=path,
-        line=None if mark is None else mark.line + 1,
-        hint=hint,
-    )
-
-
-def _line_around(text: str, position: int) -> str:
-    start = text.rfind("\n", 0, position) + 1
-    end = text.find("\n", position)
-    return text[start : end if end >= 0 else len(text)]
+    return JobError(f"not YAML: {problem}", path=path, line=line, hint=hint)
 
 
 def _value(node: yaml.Node, location: Location, lines: dict[Location, int], path: Path) -> object:

@@ -16,6 +16,7 @@ from bodycap_batch.pipeline.inputs import (
     body_arguments,
     body_digest,
     camera_digest,
+    has_body,
     key_of,
     one_camera,
 )
@@ -95,6 +96,18 @@ class Flow:
     def __exit__(self, *_: object) -> None:
         self._abort.set()
         self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def check(self) -> None:
+        """Refuse what cannot work before hours are spent on it; tell what is worth knowing.
+
+        Raises:
+            BodycapError: The job, a video or a calibration cannot be used.
+        """
+        body = body_digest(self._job, self._settings.store.digests) if has_body(self._job) else None
+        key = key_of("check", {}, {"cameras": self._digests, "body": body})
+        artefact = self._one(Task(key=key, arguments={"job": self._job.model_dump(mode="json")}))
+        for note in read_summary(artefact.path)["notes"]:
+            self._settings.listener(Event(kind="note", stage="check", what=f"note: {note}"))
 
     def keyframes(self) -> ByCamera:
         """Keyframes of every camera."""

@@ -82,7 +82,10 @@ def body_arguments(job: Job) -> dict[str, Any]:
 def body_digest(job: Job, digests: FileDigests) -> dict[str, Any]:
     """The same with the skeleton file's content in the place of its path."""
     path = skeleton_file(job)
-    content = digests.sha256(path) if path else None
+    try:
+        content = digests.sha256(path) if path else None
+    except OSError as error:
+        raise JobError(f"cannot be read: {error.strerror}", path=path, field="skeleton") from error
     return {**body_arguments(job), "skeleton_file": content}
 
 

@@ -65,6 +65,7 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
     """
     settings.store.sweep()
     with Flow(job, settings, logs=out_dir / "logs") as flow:
+        flow.check()
         keyframes = flow.keyframes()
         scene = flow.map(keyframes)
         registrations = flow.registrations(scene, keyframes)

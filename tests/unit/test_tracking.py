@@ -1,0 +1,92 @@
+"""Sparse flow, rotation fit and sharpness on images with a known warp."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bodycap_batch.tracking import (
+    bearings,
+    detect_corners,
+    fit_rotation,
+    pixel_scale,
+    sharpness,
+    track_points,
+)
+
+
+def _texture(seed: int = 0, width: int = 320, height: int = 240) -> np.ndarray:
+    noise = np.random.default_rng(seed).random((height, width)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def test_tracks_follow_a_known_shift_in_colmap_pixels() -> None:
+    shift = np.array([3.25, -1.5])
+    first = _texture()
+    second = cv2.warpAffine(first, np.float32([[1, 0, shift[0]], [0, 1, shift[1]]]), (320, 240))
+    corners = detect_corners(first, 200, 8.0)
+    inside = ((corners > 25) & (corners < (295, 215))).all(axis=1)
+    flow = track_points(first, second, corners[inside])
+    assert flow.ok.mean() > 0.95
+    # Bilinear warping of 8-bit texture leaves a few hundredths of a pixel.
+    error = np.linalg.norm(flow.px[flow.ok] - corners[inside][flow.ok] - shift, axis=1)
+    assert np.median(error) < 0.05
+
+
+def test_corners_use_colmaps_pixel_origin() -> None:
+    image = np.zeros((60, 80), np.uint8)
+    image[20:40, 30:50] = 255
+    corners = detect_corners(image, 10, 5.0)
+    # The square's edges lie between pixels: at x = 30 and 50, y = 20 and 40 from the image's corner.
+    expected = np.array([[30, 20], [50, 20], [30, 40], [50, 40]], dtype=float)
+    distance = np.linalg.norm(corners[:, None] - expected[None], axis=2).min(axis=0)
+    assert (distance < 1.0).all()
+
+
+def test_a_point_whose_surroundings_change_is_dropped() -> None:
+    first, second = _texture(0), _texture(1)
+    flow = track_points(first, second, detect_corners(first, 100, 8.0))
+    assert flow.ok.mean() < 0.2
+
+
+def test_a_guess_carries_tracking_over_a_large_motion() -> None:
+    first = _texture(2, 640, 480)
+    shift = np.array([150.0, 40.0], np.float32)
+    second = cv2.warpAffine(first, np.float32([[1, 0, shift[0]], [0, 1, shift[1]]]), (640, 480))
+    corners = detect_corners(first, 100, 12.0)
+    corners = corners[((corners > 30) & (corners < (440, 390))).all(axis=1)]
+    plain = track_points(first, second, corners)
+    guided = track_points(first, second, corners, corners + shift + 2.0)
+    right = np.linalg.norm(guided.px - corners - shift, axis=1) < 0.2
+    assert (guided.ok & right).mean() > 0.9
+    assert (guided.ok & right).sum() > (
+        plain.ok & (np.linalg.norm(plain.px - corners - shift, axis=1) < 0.2)
+    ).sum()
+
+
+def test_no_points_give_an_empty_flow() -> None:
+    flow = track_points(_texture(), _texture(), np.zeros((0, 2), np.float32))
+    assert flow.px.shape == (0, 2)
+    assert detect_corners(np.full((60, 80), 7, np.uint8), 10, 5.0).shape == (0, 2)
+
+
+@pytest.mark.parametrize("degrees", [0.5, 10.0, 60.0])
+def test_rotation_is_found_despite_a_third_of_moving_points(degrees: float) -> None:
+    rng = np.random.default_rng(3)
+    first = bearings(rng.uniform(-0.7, 0.7, (120, 2)))
+    truth = Rotation.from_rotvec(np.radians(degrees) * np.array([0.6, 0.0, 0.8])).as_matrix()
+    second = first @ truth.T
+    second[:40] += rng.normal(0, 0.15, (40, 3))
+    second /= np.linalg.norm(second, axis=1, keepdims=True)
+    error = Rotation.from_matrix(fit_rotation(first, second, rounds=15).T @ truth).magnitude()
+    assert np.degrees(error) < 0.1
+
+
+def test_blur_lowers_sharpness_and_scale_follows_the_image() -> None:
+    image = _texture(4)
+    assert sharpness(cv2.GaussianBlur(image, (0, 0), 3.0)) < 0.5 * sharpness(image)
+    assert pixel_scale(1280, 720) == 2.0
+    assert pixel_scale(480, 640) == 1.0
