@@ -18,6 +18,8 @@ REFERENCE_WIDTH_PX = 640.0
 
 _WINDOW_PX = 21
 _LEVELS = 4
+_GUIDED_LEVELS = 2
+"""With a guess the coarse levels only add ways to go wrong."""
 _ITERATIONS = 20
 _EPSILON_PX = 0.02
 _MAX_ROUND_TRIP_PX = 1.0
@@ -63,13 +65,14 @@ def track_points(first: GreyImage, second: GreyImage, px: Pixels, guess_px: Pixe
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ITERATIONS, _EPSILON_PX)
     window = (_WINDOW_PX, _WINDOW_PX)
     flags = 0
+    levels = _LEVELS if guess_px is None else _GUIDED_LEVELS
     there_guess: npt.NDArray[np.float32] | None = None
     if guess_px is not None:
         there_guess = np.ascontiguousarray(guess_px - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
         flags = cv2.OPTFLOW_USE_INITIAL_FLOW
     there_start = None if there_guess is None else there_guess.copy()
     there, found, _ = cv2.calcOpticalFlowPyrLK(
-        first, second, start, there_start, None, None, window, _LEVELS, criteria, flags
+        first, second, start, there_start, None, None, window, levels, criteria, flags
     )
     height, width = second.shape
     inside = ((there >= 0) & (there <= (width - 1, height - 1))).all(axis=1)
@@ -79,7 +82,7 @@ def track_points(first: GreyImage, second: GreyImage, px: Pixels, guess_px: Pixe
         # The way back starts from the guess's own shift, so that it does not know the answer.
         back_start = None if there_guess is None else there[alive] - (there_guess - start)[alive]
         returned, refound, _ = cv2.calcOpticalFlowPyrLK(
-            second, first, there[alive], back_start, None, None, window, _LEVELS, criteria, flags
+            second, first, there[alive], back_start, None, None, window, levels, criteria, flags
         )
         returned[~np.asarray(refound).ravel().astype(bool)] = np.inf
         back[alive] = returned
