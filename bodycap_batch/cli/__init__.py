@@ -1,0 +1,55 @@
+"""The `bodycap` command: where errors become messages and exit codes."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Sequence
+
+from bodycap_batch.cli import check, evaluate, run, synth
+from bodycap_batch.cli.base import app
+from bodycap_batch.cli.stop import exit_code_of_stop, stop_by_exception
+from bodycap_batch.errors import EXIT_BUG, BodycapError, Cancelled
+
+__all__ = ["check", "evaluate", "main", "run", "synth"]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: The words after ``bodycap``; default those of the process.
+
+    Returns:
+        The exit code. Without `arguments` the process is left with it.
+    """
+    with stop_by_exception():
+        code = _run(sys.argv[1:] if arguments is None else list(arguments))
+    if arguments is None:
+        sys.exit(code)
+    return code
+
+
+def _run(arguments: Sequence[str]) -> int:
+    try:
+        app(list(arguments), prog_name="bodycap")
+    except SystemExit as leave:
+        return leave.code if isinstance(leave.code, int) else 0
+    except Cancelled as error:
+        _say(str(error))
+        return exit_code_of_stop()
+    except BodycapError as error:
+        _say(f"error: {error}")
+        for note in getattr(error, "__notes__", []):
+            _say(note)
+        return error.exit_code
+    except Exception:  # noqa: BLE001 - the one place where bugs are caught
+        _say(traceback.format_exc())
+        _say("This is a bug in bodycap. Please report the lines above, the command and the job file.")
+        return EXIT_BUG
+    return 0
+
+
+def _say(text: str) -> None:
+    sys.stderr.write(text.rstrip() + "\n")
+    sys.stderr.flush()

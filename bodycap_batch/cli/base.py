@@ -1,0 +1,50 @@
+"""The application that the commands register with."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+import bodycap_batch
+
+# Help is plain text: rich's rendering would take as long again as everything else about `--help`.
+app = typer.Typer(
+    name="bodycap",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"bodycap {bodycap_batch.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Body motion and a map of the room from body-worn cameras.
+
+    Videos in; out come the room (PLY), the motion (BVH), camera paths (TUM) and figures.
+
+    \b
+    Try it:
+      bodycap run my_walk/            a folder with torso.mp4, left_palm.mp4, right_palm.mp4
+      bodycap check my_walk/          what would be used, and what is wrong with it
+      bodycap run jobs/cpl_lab.yaml   the shipped example
+
+    \b
+    Exit codes:
+      0 done            3 unusable video or calibration    70 a bug
+      2 wrong job or    4 the videos did not support       130 or 143 stopped; run it
+        command line      an answer                          again to go on
+                        5 disk or store
+    """  # noqa: D301 - \b keeps lines as they are

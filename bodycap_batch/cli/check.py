@@ -1,0 +1,40 @@
+"""`bodycap check`."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated
+
+import typer
+
+from bodycap_batch.cli.base import app
+from bodycap_batch.cli.run import HeightOption, JobArgument, OutOption, SkeletonOption
+
+
+@app.command()
+def check(
+    job: JobArgument,
+    out: OutOption = None,
+    skeleton: SkeletonOption = None,
+    height: HeightOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+) -> None:
+    """Say what a job would use, and what is wrong with it.
+
+    Opens every video and prints which file became which camera; looks at calibration, mounts, clocks and disk
+    space. Nothing is computed or written.
+
+    \b
+    Example:
+      bodycap check my_walk/ --height 1.75
+    """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.check import check_path
+    from bodycap_batch.config.job import Overrides
+
+    report = check_path(job, Overrides(out=out, skeleton=skeleton, height_m=height))
+    if as_json:
+        typer.echo(json.dumps(report.to_dict(), indent=1))
+    else:
+        for line in report.lines():
+            typer.echo(line)
+    raise typer.Exit(report.exit_code)

@@ -1,0 +1,205 @@
+"""Progress for people at a terminal, for logs, and for machines."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from types import TracebackType
+from typing import TYPE_CHECKING, Protocol, Self
+
+from bodycap_batch.progress import Event
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, Task, TaskID
+
+_LINE_PERIOD_S = 5.0
+_LINE_STEP = 0.1
+
+
+class Display(Protocol):
+    """Shows events; a context manager."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def __call__(self, event: Event) -> None:
+        """Show one event."""
+
+
+def make_display(*, as_json: bool) -> Display:
+    """Bars on a terminal, JSON lines when asked for, else plain lines."""
+    if as_json:
+        return JsonLines()
+    return Bars() if sys.stderr.isatty() else Lines()
+
+
+class JsonLines:
+    """One JSON object a line on standard output."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing is left open."""
+
+    def __call__(self, event: Event) -> None:
+        """Write one event."""
+        with self._lock:
+            sys.stdout.write(json.dumps(event.to_dict()) + "\n")
+            sys.stdout.flush()
+
+
+class Lines:
+    """Plain lines on standard error, every few seconds or every tenth of a stage."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._pace: dict[str, _Pace] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing is left open."""
+
+    def __call__(self, event: Event) -> None:
+        """Write one event, unless the stage has just been heard of."""
+        with self._lock:
+            if event.kind == "progress":
+                pace = self._pace.setdefault(f"{event.label} {event.what}", _Pace())
+                if (text := pace.line(event)) is not None:
+                    self._write(text)
+            else:
+                self._write(_sentence(event))
+
+    def _write(self, text: str) -> None:
+        sys.stderr.write(f"{time.strftime('%H:%M:%S')} {text}\n")
+        sys.stderr.flush()
+
+
+class _Pace:
+    """When a stage was last written about, and how fast it goes."""
+
+    def __init__(self) -> None:
+        self._started = self._written = time.monotonic()
+        self._share = 0.0
+
+    def line(self, event: Event) -> str | None:
+        """The line to write now, or None."""
+        now, share = time.monotonic(), event.done / event.total if event.total else 0.0
+        due = now - self._written >= _LINE_PERIOD_S or share - self._share >= _LINE_STEP
+        if not due or now == self._started:
+            return None
+        self._written, self._share = now, share
+        rate = event.done / (now - self._started)
+        text = f"{event.label}: {event.done}"
+        if event.total:
+            text += f" of {event.total} {event.what} ({share:.0%})"
+            if rate > 0 and event.done < event.total:
+                text += f", {rate:.3g}/s, {_duration((event.total - event.done) / rate)} left"
+            return text
+        return f"{text} {event.what}, {rate:.3g}/s"
+
+
+class Bars:
+    """A bar per stage and camera, with rate and time left, on standard error."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._bars: dict[str, TaskID] = {}
+        self._progress = _progress()
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the terminal as it was."""
+        self._progress.stop()
+
+    def __call__(self, event: Event) -> None:
+        """Move the event's bar."""
+        with self._lock:
+            if event.kind == "note":
+                self._progress.console.print(event.what, highlight=False)
+                return
+            bar = self._bars.get(event.label)
+            if bar is None:
+                bar = self._progress.add_task(event.label, total=None, what="")
+                self._bars[event.label] = bar
+            if event.kind == "progress":
+                self._progress.update(bar, completed=event.done, total=event.total or None, what=event.what)
+            elif event.kind != "started":
+                self._close(bar, event)
+
+    def _close(self, bar: TaskID, event: Event) -> None:
+        total = self._progress.tasks[bar].total or 1
+        words = {
+            "reused": "already done",
+            "finished": f"done in {_duration(event.seconds)}",
+            "failed": "failed",
+        }
+        if event.kind != "failed":
+            self._progress.update(bar, completed=total, total=total)
+        self._progress.update(bar, what=words[event.kind])
+        self._progress.stop_task(bar)
+
+
+def _progress() -> Progress:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.text import Text
+
+    class Rate(ProgressColumn):
+        """Units per second."""
+
+        def render(self, task: Task) -> Text:
+            """Show the rate once there is one."""
+            speed = task.finished_speed or task.speed
+            return Text("" if speed is None or task.finished else f"{speed:.3g}/s", style="dim")
+
+    class Count(ProgressColumn):
+        """Units done, of all."""
+
+        def render(self, task: Task) -> Text:
+            """Show the count where the total is known."""
+            known = task.total is not None and not task.finished
+            return Text(f"{int(task.completed)}/{int(task.total or 0)}" if known else "")
+
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=30),
+        Count(),
+        TextColumn("{task.fields[what]}"),
+        Rate(),
+        TimeRemainingColumn(compact=True, elapsed_when_finished=False),
+        console=Console(stderr=True),
+    )
+
+
+def _sentence(event: Event) -> str:
+    if event.kind == "note":
+        return event.what
+    words = {
+        "started": "started",
+        "reused": "already done, taken from the store",
+        "finished": f"done in {_duration(event.seconds)}",
+        "failed": "failed",
+    }
+    return f"{event.label}: {words[event.kind]}"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s"

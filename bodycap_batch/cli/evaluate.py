@@ -1,0 +1,184 @@
+"""`bodycap evaluate`."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections import Counter
+from collections.abc import Iterable
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from bodycap_batch.cli.base import app
+from bodycap_batch.errors import JobError
+
+TUM_SUFFIXES = (".tum", ".txt")
+_MOTION = "motion.bvh"
+_JOINTS = ("joints.npz", "motion.bvh")
+
+
+class Align(StrEnum):
+    """How the estimate may be moved onto the truth."""
+
+    SIM3 = "sim3"
+    SE3 = "se3"
+    NONE = "none"
+
+
+@app.command()
+def evaluate(
+    estimate: Annotated[
+        Path,
+        typer.Argument(metavar="ESTIMATE", help="Results of a run, a folder of .tum files, a .tum or .bvh."),
+    ],
+    truth: Annotated[
+        Path,
+        typer.Argument(
+            metavar="TRUTH", help="The same for the truth: a gt/ folder, a .tum, a .bvh or joints.npz."
+        ),
+    ],
+    align: Annotated[
+        Align, typer.Option(help="One alignment for all cameras: similarity, rigid, or none.")
+    ] = Align.SIM3,
+    reference: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CAMERA", help="Also every camera against this one (torso), metric, no scaling."
+        ),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print all figures as JSON.")] = False,
+) -> None:
+    """Compare results with the truth.
+
+    Camera paths: ATE, RPE and coverage; a motion: joint error. Cameras are paired by file name and aligned
+    together; a frame without a pose counts against coverage.
+
+    \b
+    Examples:
+      bodycap evaluate out/my_walk my_walk/gt
+      bodycap evaluate camera.tum groundtruth.txt
+      bodycap evaluate out/my_walk/motion.bvh mocap.bvh
+    """  # noqa: D301 - \b keeps lines as they are
+    pairs, motions = _trajectories(estimate, truth), _motions(estimate, truth)
+    reports: dict[str, Any] = {}
+    if pairs:
+        reports |= _score_trajectories(pairs, estimate, align.value, reference)
+    if motions is not None:
+        from bodycap_batch.evaluate import evaluate_motion
+
+        reports["motion"] = evaluate_motion(*motions)
+    if not reports:
+        raise JobError(
+            f"nothing in {estimate} can be compared with {truth}",
+            hint="give two .tum files, two .bvh files, or two folders whose .tum files have the same names",
+        )
+    values = {name: report.to_dict() for name, report in reports.items()}
+    typer.echo(json.dumps(values, indent=1) if as_json else "\n".join(_lines(values)))
+
+
+def _score_trajectories(
+    pairs: dict[str, tuple[Path, Path]], results: Path, align: str, reference: str | None
+) -> dict[str, Any]:
+    from bodycap_batch.evaluate import TrajectoryOptions, relative_camera_error, score_trajectories
+    from bodycap_batch.formats.tum import read_tum
+
+    mine = {name: read_tum(pair[0]) for name, pair in pairs.items()}
+    theirs = {name: read_tum(pair[1]) for name, pair in pairs.items()}
+    frames = _frames(results) if results.is_dir() else {}
+    reports: dict[str, Any] = {
+        "trajectories": score_trajectories(mine, theirs, TrajectoryOptions(align=align), frames)  # type: ignore[arg-type]
+    }
+    if reference is not None:
+        for name in sorted(set(pairs) - {reference}):
+            reports[f"{name} from {reference}"] = relative_camera_error(mine, theirs, name, reference)
+    return reports
+
+
+def _frames(results: Path) -> dict[str, int]:
+    """Frames of each camera's video, from the results' frames.csv."""
+    try:
+        with (results / "frames.csv").open(newline="", encoding="utf-8") as stream:
+            return dict(Counter(row["camera"] for row in csv.DictReader(stream)))
+    except (FileNotFoundError, KeyError):
+        return {}
+
+
+def _lines(reports: dict[str, Any]) -> list[str]:
+    """The figures as a person reads them."""
+    lines: list[str] = []
+    for name, report in reports.items():
+        if name == "trajectories":
+            lines.append(f"{'camera':14}{'frames':>8}{'posed':>8}{'share':>8}{_HEADS}")
+            rows = {**report["cameras"], "all": report["total"]}
+            lines += [_camera_line(camera, score) for camera, score in rows.items()]
+            lines.append(f"scale of the alignment: {report['scale']:.6g}")
+        elif name == "motion":
+            lines.append(f"motion: {report['frames']} frames, {len(report['joints'])} joints")
+            lines += [
+                f"  {label:32}{_stat(report[key], factor)}"
+                for key, label, factor in _MOTION_ROWS
+                if report[key]
+            ]
+        else:
+            lines.append(f"{name}: {report['frames']} frames")
+            lines += [f"  {label:32}{_stat(report[key], 100)}" for key, label in _RELATIVE_ROWS]
+    return lines
+
+
+_HEADS = f"{'ATE rmse':>10}{'max':>8}{'cm':>4}{'turn rmse':>11}{'deg':>5}{'RPE rmse':>10}{'cm/s':>6}"
+_MOTION_ROWS = (
+    ("mpjpe_m", "joints, cm", 100),
+    ("root_relative_m", "joints from the root, cm", 100),
+    ("procrustes_m", "joints, shape alone, cm", 100),
+    ("angle_deg", "angles, degrees", 1),
+    ("angle_offset_free_deg", "angles less a constant, degrees", 1),
+)
+_RELATIVE_ROWS = (("vector_m", "vector, cm"), ("in_reference_m", "in its frame, cm"))
+
+
+def _camera_line(name: str, score: dict[str, Any]) -> str:
+    frames = "?" if score["frames"] is None else str(score["frames"])
+    share = "?" if score["coverage"] is None else f"{score['coverage']:.1%}"
+    line = f"{name:14}{frames:>8}{score['registered']:>8}{share:>8}"
+    if score["ate_m"] is None:
+        return f"{line}  no truth"
+    line += f"{100 * score['ate_m']['rmse']:>10.3f}{100 * score['ate_m']['max']:>8.2f}{'':4}"
+    line += f"{score['rotation_deg']['rmse']:>11.3f}{'':5}" if score["rotation_deg"] else " " * 16
+    return line + (f"{100 * score['rpe_m']['rmse']:>10.3f}" if score["rpe_m"] else "")
+
+
+def _stat(summary: dict[str, float], factor: float) -> str:
+    parts = ((key, factor * summary[key]) for key in ("mean", "rmse", "median", "p95", "max"))
+    return "  ".join(f"{key} {value:.3f}" for key, value in parts)
+
+
+def _trajectories(estimate: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
+    """Estimate and truth of each camera that both sides have."""
+    if estimate.is_file() and truth.is_file():
+        both = estimate.suffix in TUM_SUFFIXES and truth.suffix in TUM_SUFFIXES
+        return {estimate.stem: (estimate, truth)} if both else {}
+    if not (estimate.is_dir() and truth.is_dir()):
+        return {}
+    mine = _by_stem([*estimate.glob("*.tum"), *(estimate / "trajectories").glob("*.tum")])
+    theirs = _by_stem([*truth.glob("*.tum"), *(truth / "gt").glob("*.tum")])
+    return {name: (mine[name], theirs[name]) for name in sorted(mine.keys() & theirs.keys())}
+
+
+def _motions(estimate: Path, truth: Path) -> tuple[Path, Path] | None:
+    """A motion and its truth, if both sides have one."""
+    mine = estimate / _MOTION if estimate.is_dir() else estimate
+    theirs = truth
+    if truth.is_dir():
+        found = [truth / part / name for part in ("", "gt") for name in _JOINTS]
+        theirs = next((path for path in found if path.is_file()), truth)
+    usable = (
+        mine.suffix == ".bvh" and mine.is_file() and theirs.suffix in (".bvh", ".npz") and theirs.is_file()
+    )
+    return (mine, theirs) if usable else None
+
+
+def _by_stem(paths: Iterable[Path]) -> dict[str, Path]:
+    return {path.stem: path for path in paths}

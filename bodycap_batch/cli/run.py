@@ -1,0 +1,129 @@
+"""`bodycap run`."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from bodycap_batch.cli.base import app
+from bodycap_batch.cli.display import Display, make_display
+from bodycap_batch.cli.stop import stoppable
+
+if TYPE_CHECKING:
+    from bodycap_batch.config.models import Job
+    from bodycap_batch.pipeline import RunSummary, Settings
+
+STORE_VARIABLE = "BODYCAP_STORE"
+JobArgument = Annotated[
+    Path, typer.Argument(metavar="JOB_OR_FOLDER", help="A job file (YAML), or a folder of videos.")
+]
+OutOption = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="Folder for the results (default: out/<job>).")
+]
+SkeletonOption = Annotated[
+    str | None,
+    typer.Option(metavar="NAME|FILE.bvh", help="none, upper_body, full_body, or the subject's own BVH file."),
+]
+HeightOption = Annotated[
+    float | None, typer.Option("--height", metavar="METRES", help="The subject's height, e.g. 1.75.")
+]
+ThreadsOption = Annotated[
+    int | None, typer.Option(min=1, max=1024, help="Cores to keep busy (default: all).", show_default=False)
+]
+StoreOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        help="Where finished stages are kept for the next run (default: .store beside the results).",
+        envvar=STORE_VARIABLE,
+        show_envvar=True,
+    ),
+]
+
+
+@app.command()
+def run(  # noqa: PLR0913, PLR0917 - the flags a user types
+    job: JobArgument,
+    out: OutOption = None,
+    skeleton: SkeletonOption = None,
+    height: HeightOption = None,
+    threads: ThreadsOption = None,
+    store: StoreOption = None,
+    json_progress: Annotated[
+        bool, typer.Option("--json-progress", help="Progress as JSON lines on standard output.")
+    ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Say what each stage cost at the end.")
+    ] = False,
+) -> None:
+    """Turn a capture into its map, camera paths and motion.
+
+    Finished stages are kept: a run that was stopped, or is started again with other options, goes on from
+    what is already there. The last line printed names the folder of the results.
+
+    \b
+    Examples:
+      bodycap run my_walk/ --height 1.75
+      bodycap run my_walk/ --skeleton subject.bvh --out results/my_walk
+      bodycap run single_camera/ --skeleton none
+      bodycap run jobs/cpl_lab.yaml
+    """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.config.job import Overrides, load_job
+    from bodycap_batch.pipeline import Settings, prepare_capture, run_job
+    from bodycap_batch.store import Store
+
+    overrides = Overrides(out=out, skeleton=skeleton, height_m=height)
+    with stoppable() as stop, make_display(as_json=json_progress) as display:
+
+        def settings(default_store: Path) -> Settings:
+            return Settings(
+                store=Store(store or default_store),
+                threads=threads or cores(),
+                listener=display,
+                cancelled=stop.is_set,
+            )
+
+        def prepare(options: Mapping[str, Any], folder: Path) -> None:
+            prepare_capture(options, folder, settings(_default_store(out or _default_out())))
+
+        resolved = load_job(job, overrides, prepare=prepare)
+        out_dir = resolved.out or _default_out() / resolved.name
+        summary = run_job(resolved, out_dir=out_dir, settings=settings(_default_store(out_dir)))
+    _report(summary, resolved, display, verbose=verbose)
+
+
+def cores() -> int:
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _default_out() -> Path:
+    return Path.cwd() / "out"
+
+
+def _default_store(out_dir: Path) -> Path:
+    """One store for all of ``out/``; results put elsewhere have their own."""
+    shared = _default_out()
+    return (shared if out_dir in (shared, shared / out_dir.name) else out_dir) / ".store"
+
+
+def _report(summary: RunSummary, job: Job, display: Display, *, verbose: bool) -> None:
+    from bodycap_batch.cli.display import JsonLines
+
+    if isinstance(display, JsonLines):
+        last = {"kind": "done", "out_dir": str(summary.out_dir), "files": list(summary.files)}
+        sys.stdout.write(json.dumps({**last, "executed": summary.executed}) + "\n")
+        return
+    if verbose:
+        for stage in summary.stages:
+            cost = f"{stage.seconds:8.1f} s {stage.peak_memory_mb:7.0f} MB"
+            typer.echo(f"{cost}  {stage.stage} {stage.camera}{' (kept)' if stage.reused else ''}".rstrip())
+    if summary.executed == 0:
+        typer.echo(f"{job.name}: nothing to do, all {len(summary.stages)} stages were done before")
+    typer.echo(f"results: {summary.out_dir}")

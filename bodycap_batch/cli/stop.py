@@ -1,0 +1,54 @@
+"""Ctrl-C and SIGTERM: the work is asked to stop, and the process leaves with the signal's exit code."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from bodycap_batch.errors import Cancelled
+
+_received: list[int] = []
+
+
+@contextmanager
+def stop_by_exception() -> Iterator[None]:
+    """Let SIGINT and SIGTERM raise `Cancelled` in the main thread."""
+
+    def stop() -> None:
+        raise Cancelled("stopped on request")
+
+    with _handled(stop):
+        yield
+
+
+@contextmanager
+def stoppable() -> Iterator[threading.Event]:
+    """Yield an event that SIGINT and SIGTERM set, for work that ends itself in good order."""
+    event = threading.Event()
+    with _handled(event.set):
+        yield event
+
+
+def exit_code_of_stop() -> int:
+    """128 + the signal that stopped the work."""
+    return 128 + (_received[-1] if _received else signal.SIGINT)
+
+
+@contextmanager
+def _handled(action: Callable[[], None]) -> Iterator[None]:
+    def handle(number: int, _: FrameType | None) -> None:
+        _received.append(number)
+        action()
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,85 @@
+"""All stages of a job as small text files: what each was made of, and what a test asks of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from bodycap_batch.context import StageContext
+from bodycap_batch.errors import EstimationError
+from bodycap_batch.runner.child import main
+
+Json = Mapping[str, Any]
+ORDERS = "BODYCAP_FAKE_ORDERS"
+"""Path of a JSON file: {"fail": stage, "hang": stage, "wanted": [per round], "localised": [per round]}."""
+
+
+def orders() -> dict[str, Any]:
+    path = os.environ.get(ORDERS)
+    return dict(json.loads(Path(path).read_text())) if path else {}
+
+
+def made_of(value: Any) -> Any:
+    """A value with every artefact's path replaced by what that artefact holds."""
+    if isinstance(value, Mapping):
+        return {key: made_of(part) for key, part in value.items() if key not in ("video", "out", "job")}
+    if isinstance(value, list):
+        return [made_of(part) for part in value]
+    if isinstance(value, str) and (Path(value) / "made_of.txt").is_file():
+        return (Path(value) / "made_of.txt").read_text()
+    return value
+
+
+def stage(name: str) -> Any:
+    def run(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+        context.progress(1, 1, "steps")
+        if orders().get("hang") == name:
+            Path(orders()["started"]).write_text(str(os.getpid()))
+            while True:
+                time.sleep(0.05)
+        if orders().get("fail") == name:
+            raise EstimationError(f"{name} does not work out", hint="film more")
+        content = [name, dict(options), made_of(arguments), videos(arguments)]
+        (files / "made_of.txt").write_text(json.dumps(content, sort_keys=True))
+        EXTRA.get(name, summary)(options, arguments, files)
+
+    return run
+
+
+def videos(arguments: Json) -> list[str]:
+    cameras = arguments.get("capture", {}).get("cameras", [])
+    return [Path(video).read_text() for camera in cameras for video in camera["video"]]
+
+
+def summary(options: Json, arguments: Json, files: Path) -> None:
+    (files / "summary.json").write_text(json.dumps({"notes": ["a note"]}))
+
+
+def registered(options: Json, arguments: Json, files: Path) -> None:
+    before = arguments["previous"]
+    again = json.loads((Path(before) / "summary.json").read_text())["round"] + 1 if before else 0
+    wanted = [*orders().get("wanted", []), *[[]] * 9][again]
+    localised = [*orders().get("localised", []), *[10] * 9][again]
+    values = {"round": again, "wanted": wanted, "localised": localised}
+    (files / "summary.json").write_text(json.dumps(values))
+
+
+def exported(options: Json, arguments: Json, files: Path) -> None:
+    results = files / "results"
+    (results / "trajectories").mkdir(parents=True)
+    for kind in options["formats"]:
+        (results / f"result.{kind}").write_text(json.dumps(made_of(arguments), sort_keys=True))
+    (results / "trajectories" / "torso.tum").write_text("0 0 0 0 0 0 0 1\n")
+    (results / "metrics.json").write_text(json.dumps({"partial": arguments["failure"] is not None}))
+
+
+EXTRA = {"registration": registered, "export": exported}
+NAMES = ("check", "keyframes", "map", "extend", "registration", "merge", "export")
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:], {name: stage(name) for name in NAMES}))

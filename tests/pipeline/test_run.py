@@ -1,0 +1,326 @@
+"""`run_job` with stand-in stages: order, reuse, resume, growth of the map, partial results."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from bodycap_batch.config.models import Job
+from bodycap_batch.errors import BodycapError, Cancelled, EstimationError
+from bodycap_batch.pipeline import RunSummary, Settings, run_job
+from bodycap_batch.progress import Event
+from bodycap_batch.store import Store
+from tests.pipeline.fake_stages import ORDERS
+
+CHILD = (sys.executable, str(Path(__file__).with_name("fake_stages.py")))
+CAMERAS = ("torso", "left_palm")
+
+
+class Bench:
+    """A capture of two small files, a store, and a job on them."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder = folder
+        self.out = folder / "out" / "walk"
+        self.stop = threading.Event()
+        self.events: list[Event] = []
+        for name in CAMERAS:
+            (folder / f"{name}.mp4").write_text(f"frames of {name}")
+        self._orders = folder / "orders.json"
+        monkeypatch.setenv(ORDERS, str(self._orders))
+        self.order()
+
+    def order(self, **orders: Any) -> None:
+        self._orders.write_text(json.dumps({"started": str(self.folder / "started"), **orders}))
+
+    def job(self, **changes: Any) -> Job:
+        cameras = [
+            {
+                "name": name,
+                "video": [str(self.folder / f"{name}.mp4")],
+                "calibration": "auto",
+                "offset_s": 0.0,
+                "rolling_shutter_s": 0.0,
+                **changes.pop(name, {}),
+            }
+            for name in CAMERAS
+        ]
+        return Job.model_validate(
+            {
+                "capture": {"cameras": cameras, **changes.pop("capture", {})},
+                "name": "walk",
+                "skeleton": "upper_body",
+                **changes,
+            }
+        )
+
+    def run(self, **changes: Any) -> RunSummary:
+        settings = Settings(
+            store=Store(self.folder / "store"),
+            threads=2,
+            listener=self.events.append,
+            cancelled=self.stop.is_set,
+            command=CHILD,
+        )
+        return run_job(self.job(**changes), out_dir=self.out, settings=settings)
+
+    def executed(self, **changes: Any) -> list[str]:
+        """Run, and list what was not taken from the store."""
+        summary = self.run(**changes)
+        return sorted(f"{s.stage} {s.camera}".strip() for s in summary.stages if not s.reused)
+
+    def results(self) -> dict[str, bytes]:
+        skipped = {"run.json", "job.yaml"}
+        return {
+            path.relative_to(self.out).as_posix(): path.read_bytes()
+            for path in sorted(self.out.rglob("*"))
+            if path.is_file() and path.name not in skipped and "logs" not in path.parts
+        }
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    """Nothing has been run yet."""
+    return Bench(tmp_path, monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def done_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("done")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        Bench(folder, monkeypatch).run()
+    return folder
+
+
+@pytest.fixture
+def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done_once: Path) -> Bench:
+    """The job has been run with its default options."""
+    shutil.copytree(done_once / "store", tmp_path / "store")
+    shutil.copytree(done_once / "out", tmp_path / "out")
+    return Bench(tmp_path, monkeypatch)
+
+
+PER_CAMERA = ["keyframes left_palm", "keyframes torso"]
+REGISTERED = ["registration left_palm", "registration torso"]
+ALL = sorted(["check", *PER_CAMERA, "map", *REGISTERED, "merge", "export"])
+
+
+def test_all_stages_run_and_the_results_are_there(bench: Bench) -> None:
+    assert bench.executed() == ALL
+    names = set(bench.results())
+    assert {"metrics.json", "result.ply", "result.bvh", "trajectories/torso.tum"} <= names
+    resolved = Job.model_validate(yaml.safe_load((bench.out / "job.yaml").read_text()))
+    assert resolved == bench.job()
+    record = json.loads((bench.out / "run.json").read_text())
+    assert sorted(record["files"]) == sorted(names)
+    assert {stage["stage"] for stage in record["stages"]} == {name.split()[0] for name in ALL}
+    assert all(stage["peak_memory_mb"] > 0 for stage in record["stages"])
+
+
+def test_a_finished_job_executes_nothing(done: Bench) -> None:
+    before = done.results()
+    assert done.executed() == []
+    assert done.results() == before
+    assert json.loads((done.out / "run.json").read_text())["seconds"] >= 0
+
+
+def test_touching_a_video_executes_nothing(done: Bench) -> None:
+    os.utime(done.folder / "torso.mp4", (1e9, 1e9))
+    assert done.executed() == []
+
+
+def test_moving_the_capture_executes_nothing(done: Bench) -> None:
+    moved = done.folder / "elsewhere"
+    moved.mkdir()
+    for name in CAMERAS:
+        (done.folder / f"{name}.mp4").rename(moved / f"{name}.mp4")
+    assert (
+        done.executed(
+            torso={"video": [str(moved / "torso.mp4")]}, left_palm={"video": [str(moved / "left_palm.mp4")]}
+        )
+        == []
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"export": {"units": "m"}}, ["export"]),
+        ({"merge": {"max_gap_s": 0.5}}, ["export", "merge"]),
+        ({"height_m": 1.8}, ["check", "export", "merge"]),
+        ({"activity": "walk"}, ["check", "export", "merge"]),
+        ({"torso": {"sigma_deg": 3.0}}, ["check", "export", "merge"]),
+        ({"registration": {"min_inliers": 20}}, ["export", "merge", *REGISTERED]),
+        ({"registration": {"rounds": 1}}, []),
+        ({"map": {"features": 1024}}, ["export", "map", "merge", *REGISTERED]),
+        ({"keyframes": {"parallax_px": 50.0}}, sorted(set(ALL) - {"check"})),
+        ({"torso": {"offset_s": 0.1}}, sorted(set(ALL) - {"keyframes left_palm"})),
+        ({"capture": {"work_px": 640}}, ALL),
+        ({"name": "other", "out": "/elsewhere"}, []),
+    ],
+    ids=lambda value: str(value)[:40],
+)
+def test_a_changed_option_reruns_exactly_what_depends_on_it(
+    done: Bench, changes: dict[str, Any], expected: list[str]
+) -> None:
+    found = done.executed(**changes)
+    if changes.get("torso", {}).get("offset_s"):
+        # the other camera's registration depends on the map, which the changed camera is part of
+        assert set(expected) - {"registration left_palm"} <= set(found) <= set(expected)
+    else:
+        assert found == sorted(expected)
+
+
+def test_a_changed_video_reruns_its_stages(done: Bench) -> None:
+    (done.folder / "torso.mp4").write_text("other frames")
+    assert done.executed() == sorted(set(ALL) - {"keyframes left_palm"})
+
+
+def test_going_back_to_earlier_options_finds_the_earlier_results(done: Bench) -> None:
+    before = done.results()
+    done.run(map={"features": 1024})
+    assert done.results() != before
+    assert done.executed() == []
+    assert done.results() == before
+
+
+def test_results_of_the_last_run_that_are_no_longer_made_vanish_and_other_files_stay(done: Bench) -> None:
+    (done.out / "my notes.txt").write_text("mine")
+    done.run(export={"formats": ["ply"]})
+    assert (done.out / "result.ply").exists()
+    assert not (done.out / "result.bvh").exists()
+    assert (done.out / "my notes.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("stage", ["check", "keyframes", "map", "registration", "merge", "export"])
+def test_a_corrupt_artefact_is_rebuilt(done: Bench, stage: str) -> None:
+    before = done.results()
+    folder = sorted((done.folder / "store" / "artefacts" / stage).iterdir())[0]
+    victim = next(path for path in sorted(folder.rglob("*")) if path.is_file() and path.stat().st_size)
+    data = bytearray(victim.read_bytes())
+    data[len(data) // 2] ^= 1
+    victim.unlink()
+    victim.write_bytes(data)
+    assert [name.split()[0] for name in done.executed()] == [stage]
+    assert done.results() == before
+    assert len(list((done.folder / "store" / "corrupt").iterdir())) == 1
+
+
+def test_a_result_edited_by_the_user_is_restored(done: Bench) -> None:
+    before = done.results()
+    (done.out / "metrics.json").write_text("{}")
+    done.run()
+    assert done.results() == before
+
+
+def test_no_skeleton_no_merge(bench: Bench) -> None:
+    assert bench.executed(skeleton="none") == sorted(set(ALL) - {"merge"})
+
+
+def test_a_failed_stage_leaves_earlier_results_intact(done: Bench) -> None:
+    before = done.results()
+    done.order(fail="map")
+    with pytest.raises(EstimationError, match="map does not work out"):
+        done.run(map={"features": 1024})
+    assert done.results() == before
+
+
+def test_without_a_skeleton_the_rest_is_kept_and_called_partial(done: Bench) -> None:
+    complete = done.results()
+    done.order(fail="merge")
+    with pytest.raises(EstimationError, match="merge does not work out") as caught:
+        done.run(merge={"max_gap_s": 0.5})
+    assert caught.value.exit_code == 4
+    partial = done.out / "partial"
+    assert str(partial) in str(caught.value.hint)
+    assert json.loads((partial / "metrics.json").read_text()) == {"partial": True}
+    assert (partial / "result.ply").exists()
+    assert {name: data for name, data in done.results().items() if "partial" not in name} == complete
+    done.order()
+    done.run(merge={"max_gap_s": 0.5})
+    assert not partial.exists()
+    assert json.loads((done.out / "metrics.json").read_text()) == {"partial": False}
+
+
+def test_the_map_grows_until_nothing_is_wanted(bench: Bench) -> None:
+    bench.order(wanted=[[5], [7]], localised=[5, 8, 9])
+    executed = bench.executed()
+    assert executed.count("extend") == 2
+    assert executed.count("registration torso") == 3
+    assert bench.executed() == []
+
+
+def test_the_map_stops_growing_when_nothing_is_gained(bench: Bench) -> None:
+    bench.order(wanted=[[5], [7], [9]], localised=[5, 8, 8])
+    summary = bench.run()
+    assert max(stage.round for stage in summary.stages) == 2
+    used = json.loads(json.loads((bench.out / "result.ply").read_text())["registrations"][0])
+    before = json.loads(used[2]["previous"])
+    assert before[2]["previous"] is None, "the round that gained nothing is not used"
+
+
+def test_rounds_limit_the_growth(bench: Bench) -> None:
+    bench.order(wanted=[[5]] * 5, localised=[1, 2, 3, 4, 5, 6])
+    assert bench.executed(registration={"rounds": 1}).count("extend") == 1
+
+
+@pytest.mark.parametrize("stage", ["keyframes", "map", "merge", "export"])
+def test_a_stopped_run_goes_on_where_it_was(bench: Bench, stage: str) -> None:
+    bench.order(hang=stage)
+    failures: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            bench.run()
+        except Cancelled as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    end = time.monotonic() + 30
+    while not (bench.folder / "started").exists():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    bench.stop.set()
+    thread.join(30)
+    assert len(failures) == 1
+    assert bench.results() == {}
+    bench.stop.clear()
+    bench.order()
+    executed = bench.executed()
+    assert "check" not in executed
+    assert any(name.startswith(stage) for name in executed)
+    assert [name for name in ALL if not name.startswith(stage)] != executed
+    assert "metrics.json" in bench.results()
+
+
+def test_a_bug_in_a_stage_is_no_estimation_error(bench: Bench) -> None:
+    (bench.folder / "orders.json").write_text("no JSON")
+    with pytest.raises(BodycapError, match="check: JSONDecodeError") as caught:
+        bench.run()
+    assert caught.value.exit_code == 70
+
+
+def test_a_missing_video_is_named_before_anything_is_computed(bench: Bench) -> None:
+    (bench.folder / "torso.mp4").unlink()
+    with pytest.raises(BodycapError, match="no such file") as caught:
+        bench.run()
+    assert caught.value.exit_code == 3
+    assert str(caught.value.path).endswith("torso.mp4")
+    assert bench.events == [] or all(event.kind == "progress" for event in bench.events)
+
+
+def test_events_tell_every_stage(bench: Bench) -> None:
+    bench.run()
+    finished = sorted(event.label for event in bench.events if event.kind == "finished")
+    assert finished == ALL
+    assert "note: a note" in [event.what for event in bench.events if event.kind == "note"]
