@@ -1,0 +1,245 @@
+"""Mounts and metric scale from free motion: one graph over sampled ticks, solved along a line of scales."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from bodycap_batch.arrays import BoolArray, FloatArray
+from bodycap_batch.errors import EstimationError
+from bodycap_batch.geometry import invert
+from bodycap_batch.merging.bones import JOINT_SLACK_M, Bone, hinges
+from bodycap_batch.merging.graph import (
+    JointFactors,
+    MountPoints,
+    add_mount_measurement,
+    add_mount_prior,
+    bone_key,
+    insert_mount,
+    mount_keys,
+    mount_sigmas,
+    optimise,
+    read_mount,
+)
+from bodycap_batch.merging.initial import fill_gaps, pose_bones
+from bodycap_batch.merging.tracks import MIN_SIGMA_M, MIN_SIGMA_RAD, Track
+from bodycap_batch.skeleton import Mount, SkeletonModel
+
+PRIOR_SCALE = 4.0
+"""The pose prior counts once per tick here; its sigmas are widened, or it would outvote the cameras."""
+SAMPLE_REACH_NS = 100_000_000
+"""Longest hole between two frames that is interpolated for a sample."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Samples:
+    """Camera poses at the ticks the calibration uses.
+
+    Attributes:
+        cameras: Names, in the order of the other fields.
+        bones: Index of each camera's bone.
+        map_from_cam: (C,K,4,4).
+        valid: (C,K) where a camera was measured.
+        sigma_rad: (C,) rotation sigma of each camera's measurements.
+        sigma_map: (C,) centre sigma, map units.
+    """
+
+    cameras: tuple[str, ...]
+    bones: tuple[int, ...]
+    map_from_cam: FloatArray
+    valid: BoolArray
+    sigma_rad: FloatArray
+    sigma_map: FloatArray
+
+    def points(self, scale: float) -> list[MountPoints]:
+        """The points that stand for each camera's mount at a scale."""
+        return [
+            MountPoints(float(r), float(scale * m))
+            for r, m in zip(self.sigma_rad, self.sigma_map, strict=True)
+        ]
+
+
+def take_samples(tracks: Sequence[Track], provisional: float, count: int) -> Samples:
+    """Pick up to `count` times, evenly among those where most cameras were measured together.
+
+    Args:
+        tracks: Cleaned tracks, the trunk's first.
+        provisional: Metres per map unit.
+        count: Most times to take.
+
+    Raises:
+        EstimationError: The trunk's camera never saw the map together with another one.
+    """
+    times_ns = tracks[0].times_ns
+    looks = [track.at(times_ns, reach_ns=SAMPLE_REACH_NS) for track in tracks]
+    together = np.sum([valid for _, valid in looks], axis=0)
+    if len(tracks) > 1 and (together >= 2).sum() < 10:
+        raise EstimationError(
+            f"camera {tracks[0].camera!r} was localised together with another camera in only "
+            f"{(together >= 2).sum()} frames",
+            hint="10 are needed to find how the cameras sit on the body; see frames.csv",
+        )
+    wanted = np.flatnonzero(together >= min(2, len(tracks)))
+    full = np.flatnonzero(together == together.max())
+    pool = full if len(full) >= count else wanted
+    pick = pool[np.unique(np.linspace(0, len(pool) - 1, count).round().astype(np.int64))]
+    return Samples(
+        cameras=tuple(track.camera for track in tracks),
+        bones=tuple(track.bone for track in tracks),
+        map_from_cam=np.array([poses[pick] for poses, _ in looks]),
+        valid=np.array([valid[pick] for _, valid in looks]),
+        sigma_rad=np.array([max(float(np.median(track.sigma_rad)), MIN_SIGMA_RAD) for track in tracks]),
+        sigma_map=np.array(
+            [max(float(np.median(track.sigma_map)), MIN_SIGMA_M / provisional) for track in tracks]
+        ),
+    )
+
+
+class Calibration:
+    """The calibration graph at any scale, warm-started from the last one solved.
+
+    What is uncertain in map units (camera centres, and with them the joints' gaps) keeps its sigma there:
+    sigmas fixed in metres would reward a small scale for making all residuals small.
+
+    Args:
+        skeleton: The body.
+        bones: The graph's bones.
+        samples: The camera poses.
+        priors: Mount priors by camera.
+        provisional: A scale near the right one, at which a joint's gap has its nominal sigma.
+        step: Called after each iteration; may raise to stop.
+    """
+
+    def __init__(
+        self,
+        skeleton: SkeletonModel,
+        bones: Sequence[Bone],
+        samples: Samples,
+        priors: Mapping[str, Mount],
+        provisional: float,
+        step: Callable[[], None],
+    ) -> None:
+        self._skeleton, self._bones, self._samples = skeleton, bones, samples
+        self._priors, self._step = priors, step
+        self._slack_map = JOINT_SLACK_M / provisional
+        self._values: Any = None
+        self._scale = 1.0
+        self.mounts = {name: np.array(priors[name].joint_from_cam) for name in samples.cameras}
+
+    def solve(self, scale: float, iterations: int = 30) -> float:
+        """Solve at a scale; return the cost (half the sum of squares, robust).
+
+        Args:
+            scale: Metres per map unit.
+            iterations: Most Levenberg-Marquardt steps.
+        """
+        poses = self._samples.map_from_cam.copy()
+        poses[..., :3, 3] *= scale
+        points = self._samples.points(scale)
+        graph = self._graph(poses, scale)
+        start = self._start(poses, scale)
+        last = [key for camera in range(len(self._samples.cameras)) for key in mount_keys(camera)]
+        self._values, _ = optimise(graph, start, iterations=iterations, last=last, step=self._step)
+        self._scale = scale
+        for camera, name in enumerate(self._samples.cameras):
+            self.mounts[name] = read_mount(self._values, camera, points[camera])
+        return float(graph.error(self._values))
+
+    def solved_mounts(self, sigma_log: float, slope: Mapping[str, FloatArray]) -> tuple[Mount, ...]:
+        """The mounts of the last solution with their sigmas.
+
+        Args:
+            sigma_log: Sigma of the scale's logarithm.
+            slope: By camera, change of joint_from_cam (4,4) per unit of log scale.
+        """
+        poses = self._samples.map_from_cam.copy()
+        poses[..., :3, 3] *= self._scale
+        marginals = gtsam.Marginals(self._graph(poses, self._scale), self._values)
+        out = []
+        for camera, (name, points) in enumerate(
+            zip(self._samples.cameras, self._samples.points(self._scale), strict=True)
+        ):
+            keys = gtsam.KeyVector(mount_keys(camera))
+            covariance = marginals.jointMarginalCovariance(keys).fullMatrix()
+            sigma_rad, sigma_m = mount_sigmas(covariance, self.mounts[name], points)
+            turned = slope[name][:3, :3] @ self.mounts[name][:3, :3].T
+            # The antisymmetric part of dR Rᵀ holds the turn twice, over three axes.
+            turn = sigma_log * float(np.linalg.norm(turned - turned.T)) / np.sqrt(8.0 * 3.0)
+            shift = sigma_log * float(np.linalg.norm(slope[name][:3, 3])) / np.sqrt(3.0)
+            out.append(
+                Mount(
+                    camera=name,
+                    role=self._priors[name].role,
+                    joint_from_cam=self.mounts[name],
+                    sigma_rad=float(np.hypot(sigma_rad, turn)),
+                    sigma_m=float(np.hypot(sigma_m, shift)),
+                )
+            )
+        return tuple(out)
+
+    def _graph(self, world_from_cam: FloatArray, scale: float) -> Any:
+        samples, graph = self._samples, gtsam.NonlinearFactorGraph()
+        all_points = samples.points(scale)
+        for camera, name in enumerate(samples.cameras):
+            prior, points = self._priors[name], all_points[camera]
+            add_mount_prior(graph, camera, prior.joint_from_cam, points, (prior.sigma_rad, prior.sigma_m))
+            for tick in np.flatnonzero(samples.valid[camera]).tolist():
+                key = bone_key(tick, samples.bones[camera])
+                add_mount_measurement(graph, key, camera, world_from_cam[camera, tick], points)
+        joints = JointFactors(
+            self._bones,
+            hinges(self._skeleton, tuple(self._bones)),
+            prior_scale=PRIOR_SCALE,
+            slack_m=scale * self._slack_map,
+        )
+        for tick in range(samples.valid.shape[1]):
+            joints.add(graph, tick)
+        return graph
+
+    def _start(self, world_from_cam: FloatArray, scale: float) -> Any:
+        if self._values is not None:
+            return self._with_mounts(self._rescaled(scale / self._scale), scale)
+        samples = self._samples
+        measured = {
+            bone: fill_gaps(world_from_cam[camera], samples.valid[camera]) @ invert(self.mounts[name])
+            for camera, (name, bone) in reversed(
+                list(enumerate(zip(samples.cameras, samples.bones, strict=True)))
+            )
+        }
+        poses = pose_bones(self._skeleton, self._bones, measured)
+        return self._with_mounts(_pose_values(poses), scale)
+
+    def _with_mounts(self, values: Any, scale: float) -> Any:
+        for camera, points in enumerate(self._samples.points(scale)):
+            insert_mount(values, camera, self.mounts[self._samples.cameras[camera]], points)
+        return values
+
+    def _rescaled(self, ratio: float) -> Any:
+        """Take the last solution to another scale: each tick's body keeps its shape and moves as a whole."""
+        poses = self.poses()
+        shift = (ratio - 1.0) * poses[:, :1, :3, 3]
+        poses[..., :3, 3] += shift
+        return _pose_values(poses)
+
+    def poses(self) -> FloatArray:
+        """World_from_bone (K,B,4,4) of the last solution."""
+        ticks = self._samples.valid.shape[1]
+        return np.array(
+            [
+                [self._values.atPose3(bone_key(tick, bone)).matrix() for bone in range(len(self._bones))]
+                for tick in range(ticks)
+            ]
+        )
+
+
+def _pose_values(poses: FloatArray) -> Any:
+    """Values of bone poses (T,B,4,4)."""
+    values = gtsam.Values()
+    for tick in range(poses.shape[0]):
+        for bone in range(poses.shape[1]):
+            values.insert(bone_key(tick, bone), gtsam.Pose3(poses[tick, bone]))
+    return values

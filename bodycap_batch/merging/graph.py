@@ -1,0 +1,233 @@
+"""The factor graph's pieces: joints, hinges, camera measurements, mounts; all of them GTSAM's own C++.
+
+Keys: ``b`` a bone's pose at a tick, ``v`` its velocity, ``m`` the four points that stand for a mount.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.merging.bones import JOINT_SLACK_M, Bone, Hinge
+
+MAX_BONES = 64
+GEMAN_MCCLURE_C = 6.0
+"""In sigmas of a six-dimensional residual, whose typical length is 2.4: at 3 the motion model wins over right
+measurements of violent motion (palm 6.4 cm off instead of 0.6); gross errors have been dropped before."""
+_AXIS_WEIGHT = 0.1
+"""Information of a mount's axis points over its centre's: small, so that turning and moving decouple."""
+
+
+def bone_key(tick: int, bone: int) -> int:
+    """Key of a bone's pose."""
+    return int(gtsam.symbol("b", tick * MAX_BONES + bone))
+
+
+def velocity_key(tick: int, bone: int) -> int:
+    """Key of a bone's velocity (6-vector, in its own frame, rotation first)."""
+    return int(gtsam.symbol("v", tick * MAX_BONES + bone))
+
+
+def mount_keys(camera: int) -> list[int]:
+    """Keys of a mount's centre point and its three axis points, in the bone's frame."""
+    return [int(gtsam.symbol("m", 4 * camera + point)) for point in range(4)]
+
+
+@dataclass(frozen=True, slots=True)
+class MountPoints:
+    """Four points fixed in a camera that carry a pose measurement of the given precision.
+
+    The centre point has standard deviation ``sigma_m``; the axis points have a tenth of its information and
+    lie as far out as makes them fix the rotation to ``sigma_rad``.
+    """
+
+    sigma_rad: float
+    sigma_m: float
+
+    @property
+    def axis_sigma_m(self) -> float:
+        """Standard deviation of an axis point."""
+        return float(self.sigma_m / np.sqrt(_AXIS_WEIGHT))
+
+    @property
+    def radius_m(self) -> float:
+        """Distance of the axis points from the centre: rotation information is 2 r² / σ²."""
+        return float(self.axis_sigma_m / (np.sqrt(2.0) * self.sigma_rad))
+
+    def x_in_cam(self) -> FloatArray:
+        """(4,3) the points."""
+        return np.vstack([np.zeros(3), self.radius_m * np.eye(3)])
+
+
+def robust(noise: Any) -> Any:
+    """Wrap a noise model in Geman-McClure's loss."""
+    kernel = gtsam.noiseModel.mEstimator.GemanMcClure.Create(GEMAN_MCCLURE_C)
+    return gtsam.noiseModel.Robust.Create(kernel, noise)
+
+
+class JointFactors:
+    """Adds the body's own factors of a tick: ball joints with a pose prior, and hinges.
+
+    Args:
+        bones: The graph's bones.
+        joints: Its hinges.
+        prior_scale: Widens the pose prior.
+        slack_m: Sigma of a joint's gap.
+    """
+
+    def __init__(
+        self,
+        bones: Sequence[Bone],
+        joints: Sequence[Hinge],
+        *,
+        prior_scale: float = 1.0,
+        slack_m: float = JOINT_SLACK_M,
+    ) -> None:
+        self._hinges = joints
+        self._children = [(index, bone) for index, bone in enumerate(bones) if bone.parent >= 0]
+        self._rest = {
+            index: gtsam.Pose3(gtsam.Rot3(bone.mean_rotation), bone.offset_m)
+            for index, bone in self._children
+        }
+        self._noise = {index: _joint_noise(bone, prior_scale, slack_m) for index, bone in self._children}
+        self._hinge_noise = gtsam.noiseModel.Isotropic.Sigma(1, 2.0 * slack_m)
+        self._anchors = [
+            [gtsam.Pose3(gtsam.Rot3(), anchor) for anchor in hinge.anchors_m] for hinge in joints
+        ]
+
+    def add(self, graph: Any, tick: int) -> None:
+        """Add the factors of one tick."""
+        for index, bone in self._children:
+            parent, child = bone_key(tick, bone.parent), bone_key(tick, index)
+            graph.add(gtsam.BetweenFactorPose3(parent, child, self._rest[index], self._noise[index]))
+        for hinge, anchors in zip(self._hinges, self._anchors, strict=True):
+            upper, following = bone_key(tick, hinge.upper), bone_key(tick, hinge.following)
+            for anchor in anchors:
+                graph.add(
+                    gtsam.RangeFactorWithTransformPose3(
+                        upper, following, hinge.range_m, self._hinge_noise, anchor
+                    )
+                )
+
+
+def _joint_noise(bone: Bone, prior_scale: float, slack_m: float) -> Any:
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = prior_scale**2 * bone.rotation_covariance
+    covariance[3:, 3:] = slack_m**2 * np.eye(3)
+    return gtsam.noiseModel.Gaussian.Covariance(covariance)
+
+
+def add_mount_measurement(
+    graph: Any, bone: int, camera: int, world_from_cam: FloatArray, points: MountPoints
+) -> None:
+    """Measure a bone through a camera whose mount is unknown.
+
+    Args:
+        graph: Receives the factors.
+        bone: Key of the bone's pose.
+        camera: Index of the camera, for its mount's keys.
+        world_from_cam: (4,4) measured pose.
+        points: The points that stand for the mount.
+    """
+    x_in_world = points.x_in_cam() @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
+    sigmas = (points.sigma_m, points.axis_sigma_m, points.axis_sigma_m, points.axis_sigma_m)
+    for key, x, sigma in zip(mount_keys(camera), x_in_world, sigmas, strict=True):
+        noise = robust(gtsam.noiseModel.Isotropic.Sigma(3, sigma))
+        graph.add(gtsam.GPSFactorArmCalib(bone, key, x, noise))
+
+
+def add_mount_prior(
+    graph: Any, camera: int, joint_from_cam: FloatArray, points: MountPoints, sigmas: tuple[float, float]
+) -> None:
+    """Hold a mount near what its name or the job says.
+
+    Args:
+        graph: Receives the factors.
+        camera: Index of the camera.
+        joint_from_cam: (4,4) the prior's mean.
+        points: The points that stand for the mount.
+        sigmas: Of the rotation (rad) and the position (m), per axis.
+    """
+    centre, *axes = mount_keys(camera)
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, sigmas[1])
+    graph.add(gtsam.PriorFactorPoint3(centre, joint_from_cam[:3, 3], noise))
+    # Three differences of length r with noise σ fix the rotation to σ / (r √2).
+    arm = gtsam.noiseModel.Isotropic.Sigma(3, points.radius_m * np.sqrt(2.0) * sigmas[0])
+    for axis, key in enumerate(axes):
+        graph.add(gtsam.BetweenFactorPoint3(centre, key, points.radius_m * joint_from_cam[:3, axis], arm))
+
+
+def read_mount(values: Any, camera: int, points: MountPoints) -> FloatArray:
+    """Read joint_from_cam (4,4) off a mount's four points by a rigid fit about the centre point."""
+    centre, *axes = (np.asarray(values.atPoint3(key)) for key in mount_keys(camera))
+    u, _, vt = np.linalg.svd((np.array(axes) - centre).T)
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    out = np.eye(4)
+    out[:3, :3] = rotation
+    weight = _AXIS_WEIGHT
+    shifted = [axes[i] - points.radius_m * rotation[:, i] for i in range(3)]
+    out[:3, 3] = (centre + weight * np.sum(shifted, axis=0)) / (1.0 + 3.0 * weight)
+    return out
+
+
+def mount_sigmas(
+    covariance: FloatArray, joint_from_cam: FloatArray, points: MountPoints
+) -> tuple[float, float]:
+    """Sigmas per axis (rad, m) of a mount from the covariance (12,12) of its four points."""
+    turn = np.zeros((3, 12))
+    for axis in range(3):
+        arm = points.radius_m * joint_from_cam[:3, axis]
+        cross = np.array([[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]])
+        turn[:, 3 + 3 * axis : 6 + 3 * axis] = cross / (2.0 * points.radius_m**2)
+        turn[:, :3] -= cross / (2.0 * points.radius_m**2)
+    rotation = turn @ covariance @ turn.T
+    return float(np.sqrt(np.trace(rotation) / 3.0)), float(np.sqrt(np.trace(covariance[:3, :3]) / 3.0))
+
+
+def insert_mount(values: Any, camera: int, joint_from_cam: FloatArray, points: MountPoints) -> None:
+    """Put a mount's four points among the start values."""
+    x_in_joint = points.x_in_cam() @ joint_from_cam[:3, :3].T + joint_from_cam[:3, 3]
+    for key, x in zip(mount_keys(camera), x_in_joint, strict=True):
+        values.insert(key, x)
+
+
+def optimise(
+    graph: Any,
+    values: Any,
+    *,
+    iterations: int,
+    last: Sequence[int] = (),
+    step: Callable[[], None] | None = None,
+) -> tuple[Any, int]:
+    """Run Levenberg-Marquardt to a relative decrease of 1e-5.
+
+    Args:
+        graph: The factors.
+        values: The start.
+        iterations: Most steps.
+        last: Keys eliminated last (calibration shared by all ticks).
+        step: Called after each iteration; may raise to stop.
+
+    Returns:
+        The solution and the iterations taken.
+    """
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(1e-5)
+    params.setMaxIterations(iterations)
+    if last:
+        params.setOrdering(gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, list(last)))
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
+    error = optimizer.error()
+    for count in range(1, iterations + 1):
+        optimizer.iterate()
+        if step is not None:
+            step()
+        decrease, error = error - optimizer.error(), optimizer.error()
+        if decrease <= 1e-5 * max(error, 1e-9):
+            return optimizer.values(), count
+    return optimizer.values(), iterations

@@ -1,0 +1,216 @@
+"""Start values: a provisional scale from the body's reach, bone poses by two-bone inverse kinematics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from bodycap_batch.arrays import BoolArray, FloatArray
+from bodycap_batch.errors import EstimationError
+from bodycap_batch.geometry import interpolate_pose, invert, make_transform
+from bodycap_batch.merging.bones import LIMB_LINKS, Bone, proper_axes
+from bodycap_batch.merging.tracks import Track
+from bodycap_batch.skeleton import Mount, SkeletonModel
+from bodycap_batch.skeleton_presets import split_side
+
+_REACH_QUANTILE = 0.9
+_STRETCHED = 0.96
+"""A limb's extension over its length when nearly straight: walking elbows keep 15 to 30° of flexion."""
+
+
+def provisional_scale(bones: Sequence[Bone], tracks: Sequence[Track], mounts: Mapping[str, Mount]) -> float:
+    """Estimate metres per map unit from how far apart the cameras of linked bones come.
+
+    Every pair of cameras gives, for a scale, the distance between two points of the body that the bones'
+    lengths bound; the scale that makes the largest distances equal the stretched limb wins.
+
+    Raises:
+        EstimationError: No two cameras were localised at the same time, or they never moved apart.
+    """
+    pairs = [pair for pair in _pairs(bones, tracks, mounts) if pair is not None]
+    if not pairs:
+        raise EstimationError(
+            "no two cameras on different places of the body were localised at the same time",
+            hint="metric scale comes from the distances between cameras on one body",
+        )
+    typical = [
+        (reach + np.linalg.norm(fixed, axis=1).mean())
+        / max(float(np.median(np.linalg.norm(apart, axis=1))), 1e-12)
+        for apart, fixed, reach in pairs
+    ]
+    scales = float(np.median(typical)) * np.geomspace(0.2, 5.0, 320)
+    costs = np.array([sum(_reach_cost(scale, *pair) for pair in pairs) for scale in scales])
+    best = int(np.argmin(costs))
+    if best in (0, len(scales) - 1):
+        raise EstimationError(
+            f"the cameras' distances fit no person: the scale runs out of bounds, {scales[best]:.3g} m a unit",
+            hint="check which camera sits where (the job's mounts)",
+        )
+    return float(scales[best])
+
+
+def _reach_cost(scale: float, apart: FloatArray, fixed: FloatArray, reach: float) -> float:
+    distance = np.linalg.norm(scale * apart + fixed, axis=1)
+    if reach > 0.0:
+        return abs(float(np.quantile(distance, _REACH_QUANTILE)) - _STRETCHED * reach)
+    return float(np.median(distance))
+
+
+def _pairs(
+    bones: Sequence[Bone], tracks: Sequence[Track], mounts: Mapping[str, Mount]
+) -> list[tuple[FloatArray, FloatArray, float] | None]:
+    """Per camera and its nearest measured relative up the tree: centre differences, mount parts, reach."""
+    out: list[tuple[FloatArray, FloatArray, float] | None] = []
+    by_bone = {track.bone: track for track in reversed(tracks)}
+    root = next((track for track in tracks if track.bone == min(by_bone)), tracks[0])
+    for track in tracks:
+        above = bones[track.bone].parent
+        while above >= 0 and above not in by_bone:
+            above = bones[above].parent
+        other = by_bone.get(above, root)
+        if other is not track:
+            out.append(_pair(bones, track, other, mounts))
+    return out
+
+
+def _pair(
+    bones: Sequence[Bone], track: Track, other: Track, mounts: Mapping[str, Mount]
+) -> tuple[FloatArray, FloatArray, float] | None:
+    anchor, reach = _anchor_and_reach(bones, track.bone, other.bone)
+    poses, valid = other.at(track.times_ns, reach_ns=200_000_000)
+    if valid.sum() < 10:
+        return None
+    mine, theirs = track.map_from_cam[valid], poses[valid]
+    cam_from_joint = invert(mounts[track.camera].joint_from_cam)
+    cam_from_other = invert(mounts[other.camera].joint_from_cam)
+    tip = mine[:, :3, :3] @ cam_from_joint[:3, 3]
+    base = theirs[:, :3, :3] @ (cam_from_other[:3, :3] @ anchor + cam_from_other[:3, 3])
+    return mine[:, :3, 3] - theirs[:, :3, 3], tip - base, reach
+
+
+def _anchor_and_reach(bones: Sequence[Bone], bone: int, other: int) -> tuple[FloatArray, float]:
+    """Point in the other bone's frame from which `bone`'s joint is at most `reach` away."""
+    anchor, reach = np.zeros(3), 0.0
+    current = bone
+    while current >= 0 and current != other:
+        if split_side(bones[bones[current].parent].role)[1] in LIMB_LINKS and bones[current].parent != other:
+            reach += float(np.linalg.norm(bones[current].offset_m))
+        else:
+            anchor += bones[current].offset_m
+        current = bones[current].parent
+    if current < 0:
+        raise EstimationError(
+            f"no bone links {bones[bone].role} with {bones[other].role}",
+            hint="mount a camera on the trunk, or on the limb's upper segment",
+        )
+    return anchor, reach
+
+
+def fill_gaps(poses: FloatArray, valid: BoolArray) -> FloatArray:
+    """Interpolate poses (T,4,4) on SE(3) over ticks where `valid` (T,) is False; ends are held."""
+    known = np.flatnonzero(valid)
+    ticks = np.arange(len(poses))
+    after = known[np.clip(np.searchsorted(known, ticks), 0, len(known) - 1)]
+    before = known[np.clip(np.searchsorted(known, ticks, side="right") - 1, 0, len(known) - 1)]
+    alpha = np.clip((ticks - before) / np.maximum(after - before, 1), 0.0, 1.0)
+    return interpolate_pose(poses[before], poses[after], alpha)
+
+
+def pose_bones(
+    skeleton: SkeletonModel, bones: Sequence[Bone], measured: Mapping[int, FloatArray]
+) -> FloatArray:
+    """Give every bone a pose at every tick.
+
+    Args:
+        skeleton: The body.
+        bones: The graph's bones.
+        measured: By bone index, world_from_bone (T,4,4) from its camera, without gaps.
+
+    Returns:
+        (T,B,4,4). Unmeasured limb bones by two-bone inverse kinematics with the elbow out and back (the knee
+        forward), everything else at ease on its parent.
+    """
+    ticks = len(next(iter(measured.values())))
+    out = np.tile(np.eye(4), (ticks, len(bones), 1, 1))
+    out[:, 0] = measured[0] if 0 in measured else _first_from_below(bones, measured)
+    index = {bone.role: position for position, bone in enumerate(bones)}
+    for position, bone in enumerate(bones):
+        if position in measured:
+            out[:, position] = measured[position]
+        elif position > 0:
+            out[:, position] = out[:, bone.parent] @ make_transform(bone.mean_rotation, bone.offset_m)
+            _reach_for_next(skeleton, bones, index, out, (position, measured))
+    return out
+
+
+def _first_from_below(bones: Sequence[Bone], measured: Mapping[int, FloatArray]) -> FloatArray:
+    """Pose of the first bone from the nearest measured one, every joint between at ease."""
+    nearest = min(measured)
+    pose, current = measured[nearest], nearest
+    while current > 0:
+        bone = bones[current]
+        pose = pose @ invert(make_transform(bone.mean_rotation, bone.offset_m))
+        current = bone.parent
+    return np.asarray(pose)
+
+
+def _reach_for_next(
+    skeleton: SkeletonModel,
+    bones: Sequence[Bone],
+    index: Mapping[str, int],
+    out: FloatArray,
+    target: tuple[int, Mapping[int, FloatArray]],
+) -> None:
+    """Turn an unmeasured limb bone towards the measured end of its limb."""
+    position, measured = target
+    side, part = split_side(bones[position].role)
+    links = LIMB_LINKS.get(part)
+    if links is None:
+        return
+    lower, end = (index.get(side + name) if name else None for name in links)
+    joint = out[:, position, :3, 3]
+    axes = proper_axes(skeleton, bones[position].role)
+    flexion = out[:, position, :3, :3] @ axes[:, 2]
+    aim = next((bone for bone in (lower, end if lower is None else None) if bone in measured), None)
+    if aim is not None:
+        along = measured[aim][:, :3, 3] - joint
+    elif lower is not None and end is not None and end in measured:
+        lengths = [float(np.linalg.norm(bones[i].offset_m)) for i in (lower, end)]
+        trunk = out[:, bones[position].parent, :3, :3]
+        to_goal = measured[end][:, :3, 3] - joint
+        if part == "Arm":
+            along, flexion = _two_bones(to_goal, lengths, trunk @ [0.5 if side == "Left" else -0.5, 1.0, 0.0])
+        else:
+            along, extension = _two_bones(to_goal, lengths, trunk @ [0.0, -1.0, 0.0])
+            flexion = -extension
+    else:
+        return
+    out[:, position, :3, :3] = _frame(along, flexion) @ axes.T
+
+
+def _two_bones(
+    to_goal: FloatArray, lengths: Sequence[float], pole: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Direction (N,3) of the upper bone that reaches a goal with the middle joint at the pole's side.
+
+    Also the axis (N,3) about which the lower bone is turned against it.
+    """
+    upper, lower = lengths
+    distance = np.linalg.norm(to_goal, axis=1, keepdims=True)
+    reach = np.clip(distance, abs(upper - lower) * 1.001 + 1e-6, 0.999 * (upper + lower))
+    towards = to_goal / np.maximum(distance, 1e-9)
+    side = pole - (pole * towards).sum(axis=1, keepdims=True) * towards
+    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
+    cosine = np.clip((upper**2 + reach**2 - lower**2) / (2.0 * upper * reach), -1.0, 1.0)
+    along = cosine * towards + np.sqrt(1.0 - cosine**2) * side
+    # The lower bone turns from the upper one's direction towards the goal: about upper × goal.
+    return along, np.cross(side, towards)
+
+
+def _frame(along: FloatArray, third: FloatArray) -> FloatArray:
+    """Rotations (N,3,3) with columns along, third × along, third (made orthogonal to along)."""
+    along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    third = third - (third * along).sum(axis=1, keepdims=True) * along
+    third /= np.maximum(np.linalg.norm(third, axis=1, keepdims=True), 1e-9)
+    return np.stack([along, np.cross(third, along), third], axis=-1)

@@ -1,0 +1,230 @@
+"""All ticks at once: bones in continuous time, every measurement at its own timestamp, mounts held."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray, IntArray
+from bodycap_batch.geometry import interpolate_pose, invert, so3_log
+from bodycap_batch.merging.bones import Bone, hinges
+from bodycap_batch.merging.graph import (
+    GEMAN_MCCLURE_C,
+    MAX_BONES,
+    JointFactors,
+    bone_key,
+    optimise,
+    robust,
+    velocity_key,
+)
+from bodycap_batch.merging.initial import fill_gaps, pose_bones
+from bodycap_batch.merging.tracks import MIN_SIGMA_M, MIN_SIGMA_RAD, Track
+from bodycap_batch.skeleton import SkeletonModel
+
+ON_TICK_NS = 1_000_000
+"""A measurement this close to a tick counts there: at 3 m/s the hand moves 3 mm in a millisecond."""
+
+_VELOCITY_SIGMA = np.array([8.0, 8.0, 8.0, 3.0, 3.0, 3.0])
+"""Weak prior that keeps velocities of unmeasured stretches finite (rad/s, m/s)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Solution:
+    """Bones at every tick.
+
+    Attributes:
+        world_from_bone: (T,B,4,4).
+        residual_m: By camera, (N,) distance of the measured centre from the solved one.
+        residual_rad: By camera, (N,) angle between them.
+        weights: By camera, (N,) robust weight of each measurement, 1 = kept whole.
+        iterations: Steps the optimiser took.
+        errors: Half the sum of squares by kind of factor.
+    """
+
+    world_from_bone: FloatArray
+    residual_m: Mapping[str, FloatArray]
+    residual_rad: Mapping[str, FloatArray]
+    weights: Mapping[str, FloatArray]
+    iterations: int
+    errors: Mapping[str, float]
+
+
+class MotionGraph:
+    """The graph over the whole timeline.
+
+    A measurement off the ticks gets a state of its own in the bone's motion chain. GTSAM's
+    ``WnoaInterpFactorPose3`` would interpolate without the extra state, but crashes when its noise is robust.
+
+    Args:
+        skeleton: The body.
+        bones: The graph's bones.
+        tick_times_ns: (T,) the timeline.
+        tracks: Cleaned tracks, poses in metres.
+        mounts: joint_from_cam (4,4) by camera.
+    """
+
+    def __init__(
+        self,
+        skeleton: SkeletonModel,
+        bones: Sequence[Bone],
+        tick_times_ns: IntArray,
+        tracks: Sequence[Track],
+        mounts: Mapping[str, FloatArray],
+    ) -> None:
+        self._skeleton, self._bones, self._times = skeleton, bones, tick_times_ns
+        self._tracks, self._mounts = tracks, mounts
+        self._graph = gtsam.NonlinearFactorGraph()
+        self._sizes: dict[str, int] = {}
+        self._measured_keys: dict[str, list[int]] = {}
+        self._chains: list[list[tuple[int, int, int]]] = []
+        self._add_measurements()
+        self._add_motion()
+        self._add_joints()
+
+    def solve(self, iterations: int, step: Callable[[], None]) -> Solution:
+        """Optimise and read the result off."""
+        values, count = optimise(self._graph, self._start(), iterations=iterations, step=step)
+        poses = np.array(
+            [
+                [values.atPose3(bone_key(tick, bone)).matrix() for bone in range(len(self._bones))]
+                for tick in range(len(self._times))
+            ]
+        )
+        return self._read(values, poses, count)
+
+    def _node_keys(self) -> list[dict[int, tuple[int, int]]]:
+        """Per bone: time of each state -> its pose and velocity keys, ticks first."""
+        ticks = self._times.tolist()
+        return [
+            {time: (bone_key(tick, bone), velocity_key(tick, bone)) for tick, time in enumerate(ticks)}
+            for bone in range(len(self._bones))
+        ]
+
+    def _add_measurements(self) -> None:
+        nodes = self._node_keys()
+        extra = [0] * len(self._bones)
+        for track in self._tracks:
+            keys = []
+            noises = _measurement_noises(track, self._mounts[track.camera])
+            poses = track.map_from_cam @ invert(self._mounts[track.camera])
+            for time, pose, noise in zip(track.times_ns.tolist(), poses, noises, strict=True):
+                near = self._nearest_tick(time)
+                if abs(near - time) > ON_TICK_NS and time not in nodes[track.bone]:
+                    index = extra[track.bone] * MAX_BONES + track.bone
+                    nodes[track.bone][time] = (int(gtsam.symbol("e", index)), int(gtsam.symbol("w", index)))
+                    extra[track.bone] += 1
+                key = nodes[track.bone][near if abs(near - time) <= ON_TICK_NS else time][0]
+                self._graph.add(gtsam.PriorFactorPose3(key, gtsam.Pose3(pose), robust(noise)))
+                keys.append(key)
+            self._measured_keys[track.camera] = keys
+        self._chains = [sorted((time, *keys) for time, keys in chain.items()) for chain in nodes]
+        self._sizes["measurements"] = int(self._graph.size())
+
+    def _nearest_tick(self, time_ns: int) -> int:
+        after = int(np.clip(np.searchsorted(self._times, time_ns), 1, max(len(self._times) - 1, 1)))
+        candidates = self._times[max(after - 1, 0) : after + 1].tolist()
+        return int(min(candidates, key=lambda tick: abs(tick - time_ns)))
+
+    def _add_motion(self) -> None:
+        before = self._graph.size()
+        start = int(self._times[0])
+        weak = gtsam.noiseModel.Diagonal.Sigmas(_VELOCITY_SIGMA)
+        for bone, chain in zip(self._bones, self._chains, strict=True):
+            states = [
+                gtsam.StateData(pose, velocity, 1e-9 * (time - start)) for time, pose, velocity in chain
+            ]
+            for first, second in pairwise(states):
+                self._graph.add(gtsam.WnoaMotionFactorPose3(first, second, bone.psd))
+            for _, _, velocity in (chain[0], chain[-1]):
+                self._graph.add(gtsam.PriorFactorVector(velocity, np.zeros(6), weak))
+        self._sizes["smoothness"] = int(self._graph.size() - before)
+
+    def _add_joints(self) -> None:
+        before = self._graph.size()
+        joints = JointFactors(self._bones, hinges(self._skeleton, tuple(self._bones)))
+        for tick in range(len(self._times)):
+            joints.add(self._graph, tick)
+        self._sizes["joints"] = int(self._graph.size() - before)
+
+    def _start(self) -> Any:
+        measured = {}
+        for track in reversed(self._tracks):
+            poses, valid = track.at(self._times, reach_ns=200_000_000)
+            measured[track.bone] = fill_gaps(poses, valid) @ invert(self._mounts[track.camera])
+        poses = pose_bones(self._skeleton, self._bones, measured)
+        seconds = 1e-9 * (self._times - self._times[0])
+        values = gtsam.Values()
+        for bone, chain in enumerate(self._chains):
+            times = 1e-9 * (np.array([time for time, _, _ in chain]) - self._times[0])
+            at_states, velocities = _states(poses[:, bone], seconds, times)
+            for (_, pose_key, speed_key), pose, velocity in zip(chain, at_states, velocities, strict=True):
+                values.insert(pose_key, gtsam.Pose3(pose))
+                values.insert(speed_key, velocity)
+        return values
+
+    def _read(self, values: Any, poses: FloatArray, count: int) -> Solution:
+        residual_m, residual_rad, weights = {}, {}, {}
+        for track in self._tracks:
+            mount = self._mounts[track.camera]
+            keys = self._measured_keys[track.camera]
+            solved = np.array([values.atPose3(key).matrix() for key in keys]).reshape(-1, 4, 4) @ mount
+            off = invert(track.map_from_cam) @ solved
+            residual_m[track.camera] = np.linalg.norm(off[:, :3, 3], axis=1)
+            residual_rad[track.camera] = np.linalg.norm(so3_log(off[:, :3, :3]), axis=1)
+            whitened = np.linalg.solve(np.linalg.cholesky(camera_covariance(track)), _log(off)[..., None])
+            weights[track.camera] = _geman_mcclure(np.linalg.norm(whitened[..., 0], axis=1))
+        errors, first = {}, 0
+        for kind, size in self._sizes.items():
+            errors[kind] = float(sum(self._graph.at(i).error(values) for i in range(first, first + size)))
+            first += size
+        return Solution(
+            world_from_bone=poses,
+            residual_m=residual_m,
+            residual_rad=residual_rad,
+            weights=weights,
+            iterations=count,
+            errors=errors,
+        )
+
+
+def camera_covariance(track: Track) -> FloatArray:
+    """(N,6,6) of each measured pose in the camera's frame, rotation first, with the floors in place."""
+    variances = np.empty((len(track.times_ns), 6))
+    variances[:, :3] = np.maximum(track.sigma_rad, MIN_SIGMA_RAD)[:, None] ** 2
+    variances[:, 3:] = np.maximum(track.sigma_map, MIN_SIGMA_M)[:, None] ** 2
+    return np.asarray(variances[:, :, None] * np.eye(6))
+
+
+def _measurement_noises(track: Track, joint_from_cam: FloatArray) -> list[Any]:
+    """Noise of the bone's pose behind each measurement: the camera's, carried through the mount."""
+    adjoint = gtsam.Pose3(joint_from_cam).AdjointMap()
+    covariance = adjoint @ camera_covariance(track) @ adjoint.T
+    return [gtsam.noiseModel.Gaussian.Covariance(each) for each in covariance]
+
+
+def _log(pose: FloatArray) -> FloatArray:
+    """Rotation vector and translation (N,6) of small poses (N,4,4)."""
+    return np.hstack([so3_log(pose[:, :3, :3]), pose[:, :3, 3]])
+
+
+def _geman_mcclure(distance: FloatArray) -> FloatArray:
+    """Weight of a residual of that many sigmas."""
+    squared = GEMAN_MCCLURE_C**2
+    return np.asarray((squared / (squared + distance**2)) ** 2)
+
+
+def _states(poses: FloatArray, seconds: FloatArray, times: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Poses (N,4,4) and velocities (N,6) at `times` (N,) from poses (T,4,4) at `seconds` (T,)."""
+    last = len(seconds) - 1
+    if last == 0:
+        return np.repeat(poses, len(times), axis=0), np.zeros((len(times), 6))
+    first = np.clip(np.searchsorted(seconds, times, side="right") - 1, 0, last - 1)
+    span = seconds[first + 1] - seconds[first]
+    alpha = np.clip((times - seconds[first]) / span, 0.0, 1.0)
+    step = invert(poses[first]) @ poses[first + 1]
+    return interpolate_pose(poses[first], poses[first + 1], alpha), _log(step) / span[:, None]

@@ -1,0 +1,250 @@
+"""The stage, step by step: choose, calibrate, solve, place, complete, report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray, IntArray
+from bodycap_batch.body import MergeInputs, MergeResult
+from bodycap_batch.config.options import MergeOptions
+from bodycap_batch.context import StageContext
+from bodycap_batch.errors import EstimationError
+from bodycap_batch.geometry import Similarity
+from bodycap_batch.merging import gauge
+from bodycap_batch.merging.bones import Bone, graph_bones
+from bodycap_batch.merging.calibrate import Calibration, Samples, take_samples
+from bodycap_batch.merging.complete import complete_body, observed_joints
+from bodycap_batch.merging.initial import provisional_scale
+from bodycap_batch.merging.report import build_report
+from bodycap_batch.merging.scale import ScaleEstimate, find_scale, weigh_floor
+from bodycap_batch.merging.solve import MotionGraph, Solution
+from bodycap_batch.merging.tracks import Track, adapt_psd, clean, make_track
+from bodycap_batch.scene import Trajectory
+from bodycap_batch.skeleton import Mount
+
+MIN_FRAMES = 15
+"""Localised frames below which a camera tells nothing about a motion: half a second at 30 fps."""
+_TRUNK = ("Spine1", "Spine", "Hips", "Neck", "Head")
+_CALIBRATION_TICKS = 80
+_ITERATIONS = 20
+
+
+class _Progress:
+    """Counts the optimiser's iterations, reports them, and stops the work when asked."""
+
+    def __init__(self, context: StageContext) -> None:
+        self._context, self._done, self._total = context, 0, 80
+        self.what = "calibrating"
+
+    def __call__(self) -> None:
+        self._context.check_cancelled()
+        self._done += 1
+        self._total = max(self._total, self._done + _ITERATIONS)
+        self._context.progress(self._done, self._total, self.what)
+
+    def finish(self) -> None:
+        """Report the whole as done."""
+        self._context.progress(self._total, self._total, "merged")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibrated:
+    """What is constant over the capture."""
+
+    scale: float
+    sigma_log: float
+    estimate: ScaleEstimate
+    mounts: tuple[Mount, ...]
+    up: gauge.Direction
+    floor_believed: bool
+    hips_over_floor_m: float | None
+
+
+def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> MergeResult:
+    """See `bodycap_batch.merging.merge_trajectories`."""
+    step = _Progress(context)
+    used, unused = choose_cameras(inputs)
+    bones = graph_bones(inputs.skeleton, {inputs.mount_of(each.camera).role for each in used})
+    fps = options.fps or inputs.clocks[used[0].camera].nominal_fps
+    tick_times = timeline(inputs, fps)
+    tracks, provisional, dropped = _clean_tracks(inputs, used, bones)
+    calibrated = _calibrate(inputs, bones, tracks, provisional, step)
+    step.what = "solving"
+    metric = [_in_metres(track, calibrated.scale) for track in tracks]
+    graph = MotionGraph(
+        inputs.skeleton,
+        adapt_psd(bones, metric),
+        tick_times,
+        metric,
+        {mount.camera: mount.joint_from_cam for mount in calibrated.mounts},
+    )
+    solution = graph.solve(_ITERATIONS, step)
+    world_from_solved, joints, solved, floor = _place(inputs, bones, solution, calibrated, fps)
+    place = Similarity(calibrated.scale, world_from_solved.rotation, world_from_solved.translation)
+    step.finish()
+    return MergeResult(
+        skeleton=inputs.skeleton,
+        fps=fps,
+        start_ns=int(tick_times[0]),
+        world_from_joint=joints,
+        solved=solved,
+        observed=observed_joints(inputs.skeleton, bones, tracks, tick_times, options.max_gap_s),
+        world_from_map={used[0].gauge: place},
+        trajectories=tuple(_in_world(trajectory, place) for trajectory in used),
+        mounts=calibrated.mounts,
+        unused_cameras=unused,
+        report=build_report(
+            inputs, calibrated, solution, tracks, {"dropped": dropped, "floor": floor, "unused": unused}
+        ),
+    )
+
+
+def choose_cameras(inputs: MergeInputs) -> tuple[list[Trajectory], dict[str, str]]:
+    """Pick the cameras of the gauge the trunk's camera is in, the trunk's first; say why others are left out.
+
+    Raises:
+        EstimationError: The trunk's camera was hardly localised.
+    """
+    counts = {each.camera: int(each.localised.sum()) for each in inputs.trajectories}
+
+    def rank(trajectory: Trajectory) -> tuple[int, int]:
+        role = inputs.mount_of(trajectory.camera).role
+        return (_TRUNK.index(role) if role in _TRUNK else len(_TRUNK), -counts[trajectory.camera])
+
+    ranked = sorted(inputs.trajectories, key=rank)
+    first = ranked[0]
+    if counts[first.camera] < MIN_FRAMES:
+        raise EstimationError(
+            f"camera {first.camera!r}, which carries the body, has {counts[first.camera]} localised frames "
+            f"of {len(first.status)}; a skeleton needs {MIN_FRAMES}",
+            hint="see frames.csv for the reasons; more texture, light or a slower start helps",
+        )
+    used, unused = [], {}
+    for trajectory in ranked:
+        if counts[trajectory.camera] < MIN_FRAMES:
+            unused[trajectory.camera] = f"{counts[trajectory.camera]} localised frames, {MIN_FRAMES} needed"
+        elif trajectory.gauge != first.gauge:
+            unused[trajectory.camera] = (
+                f"its map {trajectory.gauge} shares no view with {first.camera}'s {first.gauge}"
+            )
+        else:
+            used.append(trajectory)
+    return used, unused
+
+
+def timeline(inputs: MergeInputs, fps: float) -> IntArray:
+    """Ticks (T,) on the common clock, from the capture's earliest timestamp to its latest."""
+    times = [
+        inputs.clocks[each.camera].common_times_ns(each.times_ns)
+        for each in inputs.trajectories
+        if len(each.times_ns)
+    ]
+    start, end = min(int(each.min()) for each in times), max(int(each.max()) for each in times)
+    count = int(np.floor((end - start) * 1e-9 * fps + 1e-6)) + 1
+    return np.asarray(start + np.round(np.arange(count) * (1e9 / fps)), dtype=np.int64)
+
+
+def _clean_tracks(
+    inputs: MergeInputs, used: Sequence[Trajectory], bones: Sequence[Bone]
+) -> tuple[list[Track], float, dict[str, int]]:
+    index = {bone.role: position for position, bone in enumerate(bones)}
+    mounts = {mount.camera: mount for mount in inputs.mounts}
+    tracks = [make_track(inputs, each, index[mounts[each.camera].role]) for each in used]
+    provisional = provisional_scale(bones, tracks, mounts)
+    cleaned, dropped = [], {}
+    for track in tracks:
+        kept, dropped[track.camera] = clean(track, provisional, inputs.clocks[track.camera].nominal_fps)
+        cleaned.append(kept)
+    return cleaned, provisional_scale(bones, cleaned, mounts), dropped
+
+
+def _calibrate(
+    inputs: MergeInputs,
+    bones: Sequence[Bone],
+    tracks: Sequence[Track],
+    provisional: float,
+    step: Callable[[], None],
+) -> Calibrated:
+    samples: Samples = take_samples(tracks, provisional, _CALIBRATION_TICKS)
+    priors = {mount.camera: mount for mount in inputs.mounts}
+    calibration = Calibration(inputs.skeleton, bones, samples, priors, provisional, step)
+    estimate = find_scale(calibration, provisional)
+    points = inputs.map_points.get(_gauge_of(inputs, tracks[0].camera), np.zeros((0, 3)))
+    poses = calibration.poses()
+    body = gauge.body_up(inputs.skeleton, bones, poses)
+    up = gauge.refine_up(estimate.scale * points, body, np.random.default_rng(0))
+    hips = _hips_over_floor(inputs, bones, poses, up, estimate.scale * points)
+    factor, sigma, believed = (1.0, estimate.sigma_log, False)
+    if hips is not None:
+        standing = gauge.standing_hip_height(inputs.skeleton)
+        factor, sigma, believed = weigh_floor(estimate, hips, standing)
+    scale = factor * estimate.scale
+    if factor != 1.0:
+        calibration.solve(scale)
+    return Calibrated(
+        scale=scale,
+        sigma_log=sigma,
+        estimate=estimate,
+        mounts=calibration.solved_mounts(sigma, estimate.mount_slope),
+        up=up,
+        floor_believed=believed,
+        hips_over_floor_m=hips,
+    )
+
+
+def _gauge_of(inputs: MergeInputs, camera: str) -> str:
+    return next(each.gauge for each in inputs.trajectories if each.camera == camera)
+
+
+def _hips_over_floor(
+    inputs: MergeInputs, bones: Sequence[Bone], poses: FloatArray, up: gauge.Direction, points_m: FloatArray
+) -> float | None:
+    """Median height of the hips over the map's floor, or None where the map shows none."""
+    rotation = gauge.upright(up.up)
+    hips = complete_body(inputs.skeleton, bones, _turned(rotation, poses))[0][:, 0, 2, 3]
+    standing = gauge.standing_hip_height(inputs.skeleton)
+    floor = gauge.find_floor(points_m @ rotation[2], float(np.median(hips)) - standing, standing)
+    return float(np.median(hips)) - floor.height_m if floor.source == "map" else None
+
+
+def _turned(rotation: FloatArray, poses: FloatArray) -> FloatArray:
+    return Similarity(1.0, rotation, np.zeros(3)).apply_to_poses(poses)
+
+
+def _place(
+    inputs: MergeInputs, bones: Sequence[Bone], solution: Solution, calibrated: Calibrated, fps: float
+) -> tuple[Similarity, FloatArray, Any, gauge.Floor]:
+    """Find the world and put the whole body into it."""
+    rotation = gauge.upright(calibrated.up.up)
+    turned = _turned(rotation, solution.world_from_bone)
+    joints, solved = complete_body(inputs.skeleton, bones, turned)
+    hips = joints[:, 0, :3, 3]
+    standing = gauge.standing_hip_height(inputs.skeleton)
+    points = inputs.map_points.get(_gauge_of(inputs, next(iter(solution.weights))), np.zeros((0, 3)))
+    heights = calibrated.scale * points @ rotation[2]
+    expected = float(np.median(hips[:, 2])) - gauge.WALKING_HEIGHT * standing
+    floor = gauge.find_floor(heights, expected, standing)
+    forward = -joints[:, 0, :3, 1]
+    placed = gauge.place(rotation, hips[0], floor.height_m, gauge.heading(forward, hips, fps))
+    to_world = Similarity(1.0, placed.rotation @ rotation.T, placed.translation)
+    return placed, to_world.apply_to_poses(joints), solved, floor
+
+
+def _in_metres(track: Track, scale: float) -> Track:
+    poses = track.map_from_cam.copy()
+    poses[:, :3, 3] *= scale
+    return replace(track, map_from_cam=poses, sigma_map=scale * track.sigma_map)
+
+
+def _in_world(trajectory: Trajectory, world_from_map: Similarity) -> Trajectory:
+    unit = np.repeat([1.0, world_from_map.scale], 3)
+    return replace(
+        trajectory,
+        gauge="world",
+        gauge_from_cam=world_from_map.apply_to_poses(trajectory.gauge_from_cam),
+        covariance=trajectory.covariance * np.outer(unit, unit),
+    )

@@ -1,0 +1,168 @@
+"""Measured camera paths on the common clock, cleaned of gross errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.body import MergeInputs
+from bodycap_batch.geometry import interpolate_pose, so3_log
+from bodycap_batch.merging.bones import Bone
+from bodycap_batch.scene import Trajectory
+
+CLEAN_HALF_WINDOW = 6
+CLEAN_LIMIT_M = 0.12
+"""A quadratic over ±6 frames at 30 fps follows a throwing hand to a few cm; wrong poses are off by more."""
+
+MIN_SIGMA_M = 0.004
+MIN_SIGMA_RAD = float(np.radians(0.4))
+"""Floors of a pose's sigma: PnP's covariance knows image noise, not the map's error or a strap's give."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Track:
+    """The localised frames of one camera.
+
+    Attributes:
+        camera: Camera name.
+        bone: Index of the bone that carries it.
+        frames: (N,) indices into the trajectory.
+        times_ns: (N,) common clock, increasing.
+        map_from_cam: (N,4,4) poses in the map's gauge.
+        sigma_rad: (N,) rotation sigma per axis.
+        sigma_map: (N,) centre sigma per axis, map units.
+    """
+
+    camera: str
+    bone: int
+    frames: IntArray
+    times_ns: IntArray
+    map_from_cam: FloatArray
+    sigma_rad: FloatArray
+    sigma_map: FloatArray
+
+    def keep(self, mask: BoolArray) -> Track:
+        """Keep the frames where `mask` (N,) is True."""
+        return replace(
+            self,
+            frames=self.frames[mask],
+            times_ns=self.times_ns[mask],
+            map_from_cam=self.map_from_cam[mask],
+            sigma_rad=self.sigma_rad[mask],
+            sigma_map=self.sigma_map[mask],
+        )
+
+    def at(self, times_ns: IntArray, *, reach_ns: int) -> tuple[FloatArray, BoolArray]:
+        """Interpolate between neighbouring frames.
+
+        Args:
+            times_ns: (T,) wanted times.
+            reach_ns: Largest time between the two frames around a wanted time.
+
+        Returns:
+            Poses (T,4,4), nearest-frame ones where there is nothing to interpolate, and (T,) whether it was.
+        """
+        last = len(self.times_ns) - 1
+        after = np.clip(np.searchsorted(self.times_ns, times_ns, side="left"), 0, last)
+        before = np.where(self.times_ns[after] == times_ns, after, np.maximum(after - 1, 0))
+        span = np.maximum(self.times_ns[after] - self.times_ns[before], 1)
+        alpha = np.clip((times_ns - self.times_ns[before]) / span, 0.0, 1.0)
+        poses = interpolate_pose(self.map_from_cam[before], self.map_from_cam[after], alpha)
+        inside = (times_ns >= self.times_ns[0]) & (times_ns <= self.times_ns[-1])
+        return poses, inside & (self.times_ns[after] - self.times_ns[before] <= reach_ns)
+
+
+def make_track(inputs: MergeInputs, trajectory: Trajectory, bone: int) -> Track:
+    """Take the localised frames of a trajectory onto the common clock."""
+    frames = np.flatnonzero(trajectory.localised)
+    rows = inputs.row_fraction.get(trajectory.camera)
+    times_ns = inputs.clocks[trajectory.camera].common_times_ns(
+        trajectory.times_ns[frames], None if rows is None else rows[frames]
+    )
+    order = np.argsort(times_ns, kind="stable")
+    variances = np.diagonal(trajectory.covariance[frames], axis1=1, axis2=2)[order]
+    return Track(
+        camera=trajectory.camera,
+        bone=bone,
+        frames=frames[order].astype(np.int64),
+        times_ns=times_ns[order],
+        map_from_cam=trajectory.gauge_from_cam[frames][order],
+        sigma_rad=np.sqrt(variances[:, :3].mean(axis=1)),
+        sigma_map=np.sqrt(variances[:, 3:].mean(axis=1)),
+    )
+
+
+def clean(track: Track, scale: float, fps: float) -> tuple[Track, int]:
+    """Drop frames whose centre lies off a robust quadratic through its neighbours.
+
+    Args:
+        track: The measured path.
+        scale: Metres per map unit (a provisional one will do).
+        fps: Nominal rate of the camera.
+
+    Returns:
+        The cleaned track and how many frames were dropped.
+    """
+    count = len(track.times_ns)
+    steps = np.array([step for step in range(-CLEAN_HALF_WINDOW, CLEAN_HALF_WINDOW + 1) if step])
+    index = np.arange(count)[:, None] + steps
+    valid = (index >= 0) & (index < count)
+    index = np.clip(index, 0, count - 1)
+    time = (track.times_ns[index] - track.times_ns[:, None]) * (1e-9 * fps)
+    valid &= np.abs(time) <= CLEAN_HALF_WINDOW + 0.5
+    centre = scale * (track.map_from_cam[index, :3, 3] - track.map_from_cam[:, None, :3, 3])
+    predicted = _robust_quadratic(time / CLEAN_HALF_WINDOW, centre, valid)
+    # Extrapolation at the end of a stretch cannot tell a turn of the path from an error.
+    inner = ((time < 0) & valid).sum(axis=1).clip(max=2) + ((time > 0) & valid).sum(axis=1).clip(max=2) == 4
+    bad = (np.linalg.norm(predicted, axis=1) > CLEAN_LIMIT_M) & inner & (valid.sum(axis=1) >= 6)
+    return track.keep(~bad), int(bad.sum())
+
+
+def _robust_quadratic(time: FloatArray, centre: FloatArray, valid: BoolArray) -> FloatArray:
+    """Value at time 0 (N,3) of quadratics through (N,W) times and (N,W,3) centres, Cauchy-weighted."""
+    basis = np.stack([np.ones_like(time), time, time**2], axis=-1)
+    weight = valid.astype(np.float64)
+    for _ in range(8):
+        weighted = basis * weight[..., None]
+        normal = np.einsum("nwi,nwj->nij", weighted, basis) + 1e-9 * np.eye(3)
+        coefficients = np.linalg.solve(normal, np.einsum("nwi,nwk->nik", weighted, centre))
+        residual = np.linalg.norm(centre - basis @ coefficients, axis=-1)
+        weight = valid / (1.0 + (residual / (0.25 * CLEAN_LIMIT_M)) ** 2)
+    return np.asarray(coefficients[:, 0])
+
+
+def adapt_psd(bones: Sequence[Bone], tracks: Sequence[Track]) -> tuple[Bone, ...]:
+    """Loosen the motion model where the measured motion is wilder than its table.
+
+    The second difference of a path that follows the model has variance 2/3 q h³ besides its noise's 6 σ².
+    Bones without a camera take over the largest ratio found below them, since the limb swings as a whole.
+
+    Args:
+        bones: The graph's bones.
+        tracks: Cleaned tracks in metres.
+    """
+    ratio = np.ones((len(bones), 2))
+    for track in tracks:
+        step_s = float(np.median(np.diff(track.times_ns))) * 1e-9
+        even = np.abs(np.diff(track.times_ns) * 1e-9 - step_s) < 0.2 * step_s
+        even = even[1:] & even[:-1]
+        rotation, centre = track.map_from_cam[:, :3, :3], track.map_from_cam[:, :3, 3]
+        turn = so3_log(np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:])
+        for axis, (second, sigma) in enumerate(
+            ((np.diff(turn, axis=0), track.sigma_rad), (np.diff(centre, n=2, axis=0), track.sigma_map))
+        ):
+            if even.sum() >= 10:
+                variance = float((second[even] ** 2).mean()) - 6.0 * float(np.median(sigma)) ** 2
+                density = variance / (2.0 / 3.0 * step_s**3)
+                table = float(bones[track.bone].psd[3 * axis])
+                ratio[track.bone, axis] = max(ratio[track.bone, axis], density / table)
+    measured = {track.bone for track in tracks}
+    for index in range(len(bones) - 1, 0, -1):
+        if bones[index].parent not in measured:
+            ratio[bones[index].parent] = np.maximum(ratio[bones[index].parent], ratio[index].max())
+    return tuple(
+        replace(bone, psd=bone.psd * np.repeat(factor, 3)) for bone, factor in zip(bones, ratio, strict=True)
+    )
