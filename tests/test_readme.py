@@ -1,0 +1,95 @@
+"""What the README promises exists: commands, flags, targets, job fields, statuses and exit codes."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import typer
+
+from bodycap_batch import cli, errors
+from bodycap_batch.cli.base import app
+from bodycap_batch.config.calibration import read_calibration
+from bodycap_batch.config.job import load_job
+from bodycap_batch.config.models import Job
+from bodycap_batch.scene import FrameStatus
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+README = re.sub(r"<!--.*?-->", "", (REPOSITORY / "README.md").read_text(encoding="utf-8"), flags=re.DOTALL)
+
+
+def blocks(language: str) -> list[str]:
+    found = re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+    assert found
+    return found
+
+
+def lines_starting(word: str) -> list[list[str]]:
+    lines = [line for block in blocks("sh") for line in block.splitlines()]
+    return [words for line in lines if (words := shlex.split(line, comments=True))[:1] == [word]]
+
+
+@pytest.mark.parametrize("words", lines_starting("make"), ids=" ".join)
+def test_make_targets_exist(words: list[str]) -> None:
+    makefile = (REPOSITORY / "Makefile").read_text(encoding="utf-8")
+    assert re.search(rf"^{words[1]}:.*## \w", makefile, re.MULTILINE)
+
+
+@pytest.mark.parametrize("words", lines_starting("bodycap"), ids=" ".join)
+def test_commands_and_flags_exist(words: list[str]) -> None:
+    assert cli.main  # importing the package registers its commands
+    group = typer.main.get_command(app)
+    command = group.commands[words[1]]
+    # parses the words without running the command; an unknown flag or a missing argument raises
+    command.make_context(words[1], words[2:])
+
+
+def test_the_job_in_the_readme_loads_and_shows_every_top_level_field(tmp_path: Path) -> None:
+    (text,) = blocks("yaml")
+    calibration = '{"model": "PINHOLE", "params": [1e3, 1e3, 960, 540], "width": 1920, "height": 1080}'
+    (tmp_path / "calib.json").write_text(calibration, encoding="utf-8")
+    (tmp_path / "job.yaml").write_text(text, encoding="utf-8")
+    job = load_job(tmp_path / "job.yaml")
+    assert [camera.name for camera in job.capture.cameras] == ["torso", "left_palm", "right_palm"]
+    assert set(Job.model_fields) == {*re.findall(r"^(\w+):", text, re.MULTILINE)}
+
+
+def test_the_option_blocks_in_the_readme_show_the_defaults(tmp_path: Path) -> None:
+    (text,) = blocks("yaml")
+    shown = re.search(r"^keyframes:.*^export:[^\n]*\n", text, re.MULTILINE | re.DOTALL)
+    assert shown is not None
+    path = tmp_path / "job.yaml"
+    path.write_text(f"capture: {{cameras: [{{name: torso, video: a.mp4}}]}}\n{shown[0]}", encoding="utf-8")
+    job, plain = load_job(path), Job.model_validate({"capture": {"cameras": [{"name": "a", "video": ["a"]}]}})
+    for stage in ("keyframes", "map", "registration", "export"):
+        assert getattr(job, stage) == getattr(plain, stage)
+
+
+def test_the_calibration_in_the_readme_is_read(tmp_path: Path) -> None:
+    (text,) = blocks("json")
+    (tmp_path / "calib.json").write_text(text, encoding="utf-8")
+    for camera in ("torso", "left_palm"):
+        read_calibration(tmp_path / "calib.json", camera)
+
+
+def test_exit_codes_are_those_of_the_errors() -> None:
+    table = README.partition("### Exit codes")[2].partition("## ")[0]
+    rows = re.findall(r"^\| ([0-9, ]+) \|", table, re.MULTILINE)
+    codes = {int(code) for row in rows for code in row.split(",")}
+    typed = {kind.exit_code for kind in errors.BodycapError.__subclasses__()}
+    assert {errors.EXIT_OK, errors.EXIT_BUG, *typed} <= codes
+
+
+def test_reasons_for_lost_frames_are_explained() -> None:
+    assert not [status for status in FrameStatus if not status.localised and f"`{status}`" not in README]
+
+
+def test_links_and_pictures_lead_somewhere() -> None:
+    targets = re.findall(r"\]\(([^)#]+)\)", README)
+    targets += re.findall(
+        r"`((?:bodycap_batch|tests|jobs|examples|\.ci)/[\w./]+\.\w+|\.ci/\w+|LICENSE)`", README
+    )
+    assert targets
+    assert not [target for target in targets if "://" not in target and not (REPOSITORY / target).exists()]
