@@ -92,6 +92,8 @@ def open_container(path: Path) -> InputContainer:
         raise CaptureError("the video is empty (0 bytes)", path=path, hint=COPY_AGAIN)
     try:
         container: InputContainer = av.open(str(path))
+    except av.error.EOFError as error:
+        raise CaptureError("the video holds no frame", path=path, hint=COPY_AGAIN) from error
     except (av.error.FFmpegError, OSError) as error:
         raise CaptureError(
             f"not a readable video ({_reason(error)}); recordings cut short have no index",
@@ -113,7 +115,8 @@ def index_video(path: Path) -> VideoFile:
     """
     with open_container(path) as container:
         if not container.streams.video:
-            raise CaptureError("no video in it, sound only", path=path, hint="give the camera's video file")
+            what = "no video in it, sound only" if container.streams.audio else "the video holds no frame"
+            raise CaptureError(what, path=path, hint="give the file that holds the camera's pictures")
         stream = container.streams.video[0]
         pts, key_pts, end = _scan_packets(path, container, stream)
         if len(pts) == 0:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from bodycap_batch.config.yaml_source import Location, YamlSource, dotted
 from bodycap_batch.errors import JobError
@@ -60,7 +61,8 @@ def problems_of(error: ValidationError, model: type[BaseModel], data: object) ->
     errors = error.errors(include_url=False)
     # A list whose items are all wrong is also called too short: the items' errors say it better.
     told = [e for e in errors if e["type"] != "too_short" or not _has_deeper(e, errors)]
-    return [_problem(details, model, data) for details in told]
+    problems = [_problem(details, model, data) for details in told]
+    return [p if p.hint else p._replace(hint=_meaning(p.location, model)) for p in problems]
 
 
 def _has_deeper(error: Any, errors: Sequence[Any]) -> bool:
@@ -100,6 +102,17 @@ def _present(loc: Sequence[str | int], data: object, *, missing: bool) -> Locati
     return tuple(kept)
 
 
+def _meaning(location: Location, model: type[BaseModel]) -> str:
+    """What the field at a location, or the nearest one around it, is for."""
+    while location:
+        fields = _fields_at(location[:-1], model)
+        about = fields[str(location[-1])].description if str(location[-1]) in fields else None
+        if about:
+            return f"{location[-1]}: {about}"
+        location = location[:-1]
+    return "jobs/cpl_lab.yaml is a commented example"
+
+
 def _unknown_key(location: Location, model: type[BaseModel]) -> Problem:
     known = known_keys(model, location[:-1])
     near = difflib.get_close_matches(str(location[-1]), known, n=1)
@@ -120,12 +133,16 @@ def _not_among(location: Location, details: Any) -> Problem:
 
 def known_keys(model: type[BaseModel], location: Location) -> list[str]:
     """Keys allowed at a location of a model (empty where it is no model)."""
+    return list(_fields_at(location, model))
+
+
+def _fields_at(location: Location, model: type[BaseModel]) -> dict[str, FieldInfo]:
     models = [model]
     for part in location:
         if isinstance(part, str):
             fields = [m.model_fields[part].annotation for m in models if part in m.model_fields]
             models = [found for annotation in fields for found in _models_in(annotation)]
-    return list(dict.fromkeys(key for m in models for key in m.model_fields))
+    return {key: field for m in models for key, field in m.model_fields.items()}
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:

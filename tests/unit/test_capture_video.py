@@ -1,0 +1,142 @@
+"""Decoding: exact timestamps, orientation, random access, grey levels."""
+
+from __future__ import annotations
+
+import threading
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bodycap_batch.capture import CaptureCamera, open_camera
+from bodycap_batch.capture.prefetch import prefetched
+from bodycap_batch.capture.video import VideoFile, index_video, turn_upright
+from bodycap_batch.config.models import CameraConfig, CaptureConfig
+from tests.videos import textured_frame, write_video
+
+FRAMES = [textured_frame(index) for index in range(40)]
+
+
+def opened(*videos: Path, **capture: object) -> CaptureCamera:
+    config = CameraConfig(name="torso", video=videos, calibration="auto")
+    return open_camera(CaptureConfig(cameras=(config,), **capture), config)
+
+
+def shown_index(image: np.ndarray) -> int:
+    """Index a frame was drawn with: the bottom right quarter is 40 + 4·index, then expanded to full range."""
+    value = np.median(image[image.shape[0] // 2 + 4 :, image.shape[1] // 2 + 4 :])
+    return round((float(value) - 40.0) / 4.0)
+
+
+def test_times_are_the_containers_exact_timestamps(tmp_path: Path) -> None:
+    pts = np.cumsum([0, 10, 13, 7, 22, 10, 10, 31, 9, 10]).tolist()
+    video = index_video(write_video(tmp_path / "a.mkv", FRAMES[:10], pts=pts))
+    # Matroska keeps milliseconds: half of one is the most it may round.
+    assert np.abs(video.times_ns() - np.array(pts) / 300 * 1e9).max() <= 0.5e6 + 1
+    exact = index_video(write_video(tmp_path / "a.mp4", FRAMES[:10], pts=pts))
+    assert exact.times_ns().tolist() == [round(Fraction(p, 300) * 10**9) for p in pts]
+
+
+def test_b_frames_come_in_display_order(tmp_path: Path) -> None:
+    camera = opened(write_video(tmp_path / "a.mp4", FRAMES, bframes=True))
+    seen = [(index, shown_index(image)) for index, image in camera.grey_frames()]
+    assert seen == [(k, k) for k in range(40)]
+
+
+def test_random_reads_equal_the_stream(tmp_path: Path) -> None:
+    camera = opened(write_video(tmp_path / "a.mp4", FRAMES, gop=8))
+    stream = dict(camera.grey_frames())
+    for wanted in ([0], [39], [7, 8], [3, 17, 18, 39], list(range(5, 40, 11))):
+        got = dict(camera.read(wanted))
+        assert list(got) == wanted
+        assert all(np.array_equal(got[k], stream[k]) for k in wanted)
+
+
+def test_a_far_read_skips_what_lies_between(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    video = index_video(write_video(tmp_path / "a.mp4", FRAMES, gop=8, bframes=False))
+    from bodycap_batch.capture import video as module
+
+    starts: list[int] = []
+    original = module._frames_from
+
+    def counted(file: VideoFile, container: object, index: int) -> object:
+        starts.append(index)
+        return original(file, container, index)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(module, "_frames_from", counted)
+    assert [i for i, _ in video.decode(np.array([1, 2, 5, 33, 39]))] == [1, 2, 5, 33, 39]
+    assert starts == [0, 32]
+
+
+@pytest.mark.parametrize(("rotation", "turns"), [(0, 0), (90, 1), (180, 2), (-90, 3)])
+def test_the_rotation_flag_is_applied(tmp_path: Path, rotation: int, turns: int) -> None:
+    camera = opened(write_video(tmp_path / "a.mp4", FRAMES[:3], rotation=rotation))
+    upright = np.rot90(textured_frame(0), turns)
+    image = next(camera.grey_frames())[1]
+    assert image.shape == upright.shape == (camera.camera.height_px, camera.camera.width_px)
+    # CRF 8 at flat grey is exact to a few levels; the bright quarter stands 60 above the rest.
+    assert np.abs(image.astype(int) - upright).mean() < 4
+
+
+def test_mirrors_are_undone_too() -> None:
+    image = np.arange(6, dtype=np.uint8).reshape(2, 3)
+    assert np.array_equal(turn_upright(image, ((-1, 0), (0, 1))), image[:, ::-1])
+    assert np.array_equal(turn_upright(image, ((0, 1), (1, 0))), image.T)
+
+
+@pytest.mark.parametrize("pix_fmt", ["yuv420p", "yuv444p", "yuvj420p"])
+def test_grey_is_full_range_whatever_the_video(tmp_path: Path, pix_fmt: str) -> None:
+    wedge = np.repeat(np.linspace(0, 255, 64)[None], 48, axis=0).astype(np.uint8)
+    camera = opened(write_video(tmp_path / "a.mp4", [wedge] * 3, pix_fmt=pix_fmt))
+    image = next(camera.grey_frames())[1].astype(int)
+    assert np.abs(image[:, 4:-4] - wedge[:, 4:-4]).max() <= 6  # encoder loss at CRF 8
+
+
+def test_colour_frames_are_rgb(tmp_path: Path) -> None:
+    red = np.zeros((48, 64, 3), dtype=np.uint8)
+    red[..., 0], red[..., 1] = 200, 40
+    camera = opened(write_video(tmp_path / "a.mp4", [red] * 3, pix_fmt="yuv444p"))
+    image = next(camera.read([1], colour=True))[1]
+    assert image.shape == (48, 64, 3)
+    assert np.abs(image.reshape(-1, 3).mean(axis=0) - (200, 40, 0)).max() < 8
+
+
+def test_wrong_indices_are_refused(tmp_path: Path) -> None:
+    camera = opened(write_video(tmp_path / "a.mp4", FRAMES[:5]))
+    for wrong in ([3, 2], [1, 1], [-1], [5]):
+        with pytest.raises(ValueError, match="indices"):
+            camera.read(wrong)
+
+
+def test_decoding_ahead_is_bounded_and_ends_with_its_consumer() -> None:
+    made: list[int] = []
+    closed = threading.Event()
+
+    def source():  # type: ignore[no-untyped-def]
+        try:
+            for k in range(1000):
+                made.append(k)
+                yield k
+        finally:
+            closed.set()
+
+    threads = threading.active_count()
+    stream = prefetched(source(), ahead=3)
+    assert [next(stream) for _ in range(5)] == list(range(5))
+    stream.close()
+    assert closed.is_set()
+    assert len(made) <= 5 + 3 + 1
+    assert threading.active_count() == threads
+
+
+def test_an_error_ahead_arrives_in_its_place() -> None:
+    def source():  # type: ignore[no-untyped-def]
+        yield 1
+        yield 2
+        raise KeyError("third")
+
+    stream = prefetched(source())
+    assert [next(stream), next(stream)] == [1, 2]
+    with pytest.raises(KeyError, match="third"):
+        next(stream)

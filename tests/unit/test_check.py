@@ -1,0 +1,139 @@
+"""The pre-flight: what it tells of a good capture, and what it says of a doubtful one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bodycap_batch.capture import open_capture
+from bodycap_batch.check import check_job, check_path
+from bodycap_batch.check.pictures import sample_indices
+from bodycap_batch.config.job import Overrides, load_job
+from tests.videos import textured_frame, write_video
+
+FRAMES = [textured_frame(index % 40) for index in range(75)]
+LENS = {"model": "PINHOLE", "params": [40, 40, 32, 24], "width": 64, "height": 48}
+
+
+@pytest.fixture
+def walk(tmp_path: Path) -> Path:
+    """Two cameras, 2.5 s each."""
+    root = tmp_path / "walk"
+    for name in ("torso", "left_palm"):
+        write_video(root / f"{name}.mp4", FRAMES)
+    (root / "calib.json").write_text(json.dumps(LENS))
+    return root
+
+
+def test_a_good_capture(walk: Path, tmp_path: Path) -> None:
+    report = check_path(walk, Overrides(out=tmp_path / "out", height_m=1.8))
+    assert report.ready
+    assert report.exit_code == 0
+    palm, torso = report.cameras
+    assert (torso.name, torso.role, torso.frames, torso.used_frames) == ("torso", "Spine1", 75, 75)
+    assert torso.size_px == torso.work_size_px == (64, 48)
+    assert not torso.variable_rate
+    assert torso.notes == palm.notes == ()
+    text = "\n".join(report.lines())
+    assert "torso: torso.mp4 -> Spine1" in text
+    assert "all cameras run together for 2.5 s" in text
+    assert json.loads(json.dumps(report.to_dict()))["ready"] is True
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_a_colleague_would_mention(walk: Path) -> None:
+    lens = {**LENS, "params": [4, 4, 32, 24]}
+    sharp = {**LENS, "params": [40, 40, 55, 24]}
+    (walk / "calib.json").write_text(json.dumps({"cameras": {"torso": lens, "left_palm": sharp}}))
+    times = np.delete(np.arange(79), [10, 11, 30, 31]) / 30
+    (walk / "torso.timestamps.txt").write_text("".join(f"{t:.6f}\n" for t in times))
+    palm, torso = check_path(walk).cameras
+    assert torso.variable_rate
+    assert "4 frames were dropped at 2 places, the longest hole is 0.10 s" in torso.notes
+    assert any("focal length" in note for note in torso.notes)
+    assert any("principal point" in note for note in palm.notes)
+
+
+def test_short_grey_and_partly_black_videos_are_mentioned(tmp_path: Path) -> None:
+    flat, black = np.full((48, 64), 120, np.uint8), np.zeros((48, 64), np.uint8)
+    write_video(tmp_path / "torso.mp4", [flat] * 20)
+    write_video(tmp_path / "head.mp4", [black] * 10 + FRAMES[:20], gop=5)
+    head, torso = check_path(tmp_path).cameras
+    assert any("contrast" in note for note in torso.notes)
+    assert any("hardly enough movement" in note for note in torso.notes)
+    assert any("black; cut them off" in note for note in head.notes)
+
+
+def test_cameras_that_never_ran_together(walk: Path) -> None:
+    job = load_job(walk)
+    palm, torso = job.capture.cameras
+
+    def with_offset(offset_s: float):  # type: ignore[no-untyped-def]
+        cameras = (palm.model_copy(update={"offset_s": offset_s}), torso)
+        return check_job(
+            job.model_copy(update={"capture": job.capture.model_copy(update={"cameras": cameras})})
+        )
+
+    assert with_offset(2.0).ready
+    late = with_offset(2.6)
+    assert late.exit_code == 3
+    assert "left_palm (2.60 to 5.07 s) shares no time" in late.errors[0].message
+    assert late.errors[0].field == "offset_s"
+    assert "Unix" in str(with_offset(1.7e9).errors[0].hint)
+
+
+def test_every_problem_is_collected(walk: Path) -> None:
+    (walk / "torso.mp4").write_bytes(b"")
+    (walk / "left_palm.mp4").write_bytes(b"no video at all")
+    report = check_path(walk)
+    assert len(report.errors) == 2
+    assert report.exit_code == 3
+    assert report.lines()[-1] == "not ready: 2 problems"
+
+
+def test_the_skeleton_file_must_carry_the_cameras(walk: Path, tmp_path: Path) -> None:
+    bvh = tmp_path / "s.bvh"
+    channels = "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation"
+    bvh.write_text(
+        f"HIERARCHY\nROOT Hips\n{{\nOFFSET 0 0 0\n{channels}\nEnd Site\n{{\nOFFSET 0 10 0\n}}\n}}\n"
+        "MOTION\nFrames: 1\nFrame Time: 0.0333333\n0 0 0 0 0 0\n"
+    )
+    report = check_path(walk, Overrides(skeleton=str(bvh)))
+    assert report.exit_code == 2
+    assert report.errors[0].path == str(bvh)
+    assert "LeftHand" in report.errors[0].message
+    bvh.write_text("HIERARCHY\n")
+    assert check_path(walk, Overrides(skeleton=str(bvh))).errors[0].path == str(bvh)
+
+
+def test_room_on_the_disk(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import shutil
+    from collections import namedtuple
+
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**9, 10**9 - 10**6, 10**6))
+    report = check_path(walk, Overrides(out=tmp_path / "a" / "b"))
+    assert report.exit_code == 5
+    assert report.errors[0].path == str(tmp_path)
+    assert "--out" in str(report.errors[0].hint)
+
+
+def test_samples_are_key_frames_where_there_are_enough(tmp_path: Path) -> None:
+    write_video(tmp_path / "torso.mp4", FRAMES, gop=5, bframes=False)
+    write_video(tmp_path / "head.mp4", FRAMES, gop=1000, bframes=False)
+    capture = open_capture(load_job(tmp_path).capture)
+    assert (sample_indices(capture.camera("torso"), 8) % 5 == 0).all()
+    assert sample_indices(capture.camera("head"), 8).tolist() == [0, 74]
+
+
+def test_the_sample_job_before_it_is_rendered(tmp_path: Path) -> None:
+    path = tmp_path / "lab.yaml"
+    path.write_text(
+        "capture:\n  cameras: [{name: torso, video: sample/torso.mp4}]\n  synthetic: {seconds: 1}\n"
+    )
+    report = check_path(path)
+    assert report.ready
+    assert "renders its videos" in report.notes[0]

@@ -1,0 +1,137 @@
+"""A folder of videos as a job: names, aliases, sidecars, calibrations."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from bodycap_batch.config.job import load_job
+from bodycap_batch.config.models import SKELETON_PRESETS
+from bodycap_batch.config.mounts import MOUNT_NAMES, ROLES, mount_of, role_of_segment
+from bodycap_batch.errors import CaptureError, JobError
+from bodycap_batch.skeleton_presets import load_skeleton
+
+LENS = {"model": "PINHOLE", "params": [420, 420, 320, 240], "width": 640, "height": 480}
+
+
+def folder(tmp_path: Path, *names: str) -> Path:
+    for name in names:
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"not opened when a job is loaded")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("name", "role"),
+    [
+        ("torso", "Spine1"),
+        ("Chest", "Spine1"),
+        ("torso_back", "Spine1"),
+        ("torso-2", "Spine1"),
+        ("head", "Head"),
+        ("left_palm", "LeftHand"),
+        ("LeftHand", "LeftHand"),
+        ("left hand", "LeftHand"),
+        ("hand_l", "LeftHand"),
+        ("left_palm_b", "LeftHand"),
+        ("right_upper_arm", "RightArm"),
+        ("right_forearm", "RightForeArm"),
+        ("left_thigh", "LeftUpLeg"),
+        ("left_shin", "LeftLeg"),
+        ("right_foot", "RightFoot"),
+        ("waist", "Hips"),
+    ],
+)
+def test_names_say_where_a_camera_sits(name: str, role: str) -> None:
+    found = mount_of(name)
+    assert found is not None
+    assert found[1] == role
+
+
+@pytest.mark.parametrize(
+    "name", ["", "camera", "GX010123", "left", "palm", "back", "front_2", "handle", "leftover"]
+)
+def test_other_names_are_not_guessed(name: str) -> None:
+    assert mount_of(name) is None
+
+
+def test_every_mount_rides_on_a_joint_of_the_presets() -> None:
+    for preset in SKELETON_PRESETS[1:]:
+        skeleton = load_skeleton(preset)
+        assert skeleton.index_of_role("Spine1") is not None
+    full = load_skeleton("full_body")
+    assert all(full.index_of_role(role) is not None for role in ROLES)
+    assert all(mount_of(name) == (name, role_of_segment(name)) for name in MOUNT_NAMES)
+
+
+def test_a_folder_is_a_job(tmp_path: Path) -> None:
+    root = folder(
+        tmp_path / "my walk", "torso.mp4", "left_palm.MOV", ".right_palm.mp4", "notes.txt", "gt/torso.tum"
+    )
+    (root / "calib.json").write_text(
+        json.dumps({**LENS, "offsets_s": {"torso": 0.12}, "rolling_shutter_s": 0.02})
+    )
+    (root / "torso.timestamps.txt").write_text("0\n")
+    job = load_job(root)
+    assert job.name == "my_walk"
+    assert job.skeleton == "upper_body"
+    by_name = {camera.name: camera for camera in job.capture.cameras}
+    assert set(by_name) == {"torso", "left_palm"}
+    assert by_name["torso"].timestamps == (root / "torso.timestamps.txt",)
+    assert (by_name["torso"].offset_s, by_name["left_palm"].offset_s) == (0.12, 0.0)
+    assert by_name["left_palm"].rolling_shutter_s == 0.02
+    assert by_name["torso"].input_files() == (root / "torso.mp4", root / "torso.timestamps.txt")
+
+
+def test_a_single_camera_may_have_any_name(tmp_path: Path) -> None:
+    job = load_job(folder(tmp_path, "My Phone.mp4"))
+    assert job.skeleton == "none"
+    assert job.capture.cameras[0].name == "My_Phone"
+    assert job.capture.cameras[0].calibration == "auto"
+
+
+def test_a_single_camera_with_a_mounts_name_has_a_body(tmp_path: Path) -> None:
+    assert load_job(folder(tmp_path, "head.mp4")).skeleton == "upper_body"
+
+
+def test_a_name_is_asked_for_instead_of_guessed(tmp_path: Path) -> None:
+    with pytest.raises(JobError, match=r"GX010007\.MP4") as caught:
+        load_job(folder(tmp_path, "torso.mp4", "GX010007.MP4"))
+    assert "left_palm" in str(caught.value.hint)
+    assert "folder" in str(caught.value.hint)
+
+
+def test_two_of_one_name(tmp_path: Path) -> None:
+    with pytest.raises(JobError, match="two cameras named") as caught:
+        load_job(folder(tmp_path, "torso.mp4", "torso.mov"))
+    assert "rename" in str(caught.value.hint)
+
+
+def test_a_camera_may_be_a_folder(tmp_path: Path) -> None:
+    root = folder(tmp_path, "torso/GX020001.MP4", "torso/GX010001.MP4", "torso/GX010001.THM", "head.mp4")
+    (root / "torso" / "calib.json").write_text(json.dumps(LENS))
+    job = load_job(root)
+    torso = next(camera for camera in job.capture.cameras if camera.name == "torso")
+    assert [path.name for path in torso.video] == ["GX010001.MP4", "GX020001.MP4"]
+    assert torso.calibration != "auto"
+
+
+@pytest.mark.parametrize("names", [(), ("readme.txt", "gt/a.tum")])
+def test_a_folder_without_videos(tmp_path: Path, names: tuple[str, ...]) -> None:
+    with pytest.raises(CaptureError, match="no video") as caught:
+        load_job(folder(tmp_path, *names))
+    assert "torso.mp4" in str(caught.value.hint)
+
+
+def test_sidecars_of_some_chapters_only(tmp_path: Path) -> None:
+    root = folder(
+        tmp_path,
+        *(f"torso/GX0{k}0001.MP4" for k in (1, 2, 3)),
+        "torso/GX010001.timestamps.txt",
+        "torso/GX020001.timestamps.txt",
+    )
+    with pytest.raises(CaptureError, match="2 timestamp files for 3 chapters"):
+        load_job(root)

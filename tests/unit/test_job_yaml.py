@@ -1,0 +1,291 @@
+"""YAML jobs: typed, and every refusal names file, line, field and remedy."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bodycap_batch.config.job import Overrides, load_job
+from bodycap_batch.config.models import Job
+from bodycap_batch.errors import CaptureError, JobError
+
+MINIMAL = """\
+capture:
+  cameras:
+    - name: torso
+      video: torso.mp4
+    - name: left_palm
+      video: [left/a.mp4, left/b.mp4]
+"""
+
+
+def load(tmp_path: Path, text: str, overrides: Overrides | None = None) -> Job:
+    path = tmp_path / "my job.yaml"
+    path.write_text(text, encoding="utf-8")
+    return load_job(path, overrides)
+
+
+def refused(tmp_path: Path, text: str) -> JobError:
+    with pytest.raises(JobError) as caught:
+        load(tmp_path, text)
+    error = caught.value
+    assert error.exit_code == 2
+    assert error.path == str((tmp_path / "my job.yaml").resolve())
+    return error
+
+
+def test_only_the_capture_is_needed(tmp_path: Path) -> None:
+    job = load(tmp_path, MINIMAL)
+    assert job.name == "my_job"
+    assert job.skeleton == "upper_body"
+    assert job.out == Path("out/my_job").resolve()
+    torso, palm = job.capture.cameras
+    assert torso.video == (tmp_path / "torso.mp4",)
+    assert palm.video == (tmp_path / "left/a.mp4", tmp_path / "left/b.mp4")
+    assert (torso.role, palm.role) == ("Spine1", "LeftHand")
+    assert torso.calibration == "auto"
+    assert (torso.offset_s, torso.rolling_shutter_s) == (0.0, 0.0)
+
+
+def test_a_resolved_job_survives_json(tmp_path: Path) -> None:
+    text = (
+        MINIMAL
+        + "  calibration: {model: opencv, params: [1e3, 1000, 960, 540, -0.1, 0, 0, 1e-3],\n"
+        + "    width: 1920, height: 1080}\n"
+    )
+    text += "  start_s: 0.25\nheight_m: 1.8\nout: results\nexport: {units: m}\n"
+    job = load(tmp_path, text)
+    assert job.out == tmp_path / "results"
+    assert Job.model_validate(json.loads(json.dumps(job.model_dump(mode="json")))) == job
+    written = tmp_path / "job.json"
+    written.write_text(json.dumps(job.model_dump(mode="json"), indent=1))
+    assert load_job(written) == job
+
+
+def test_the_command_line_wins(tmp_path: Path) -> None:
+    overrides = Overrides(out=tmp_path / "elsewhere", skeleton="none", height_m=1.62)
+    job = load(tmp_path, MINIMAL + "height_m: 1.8\nskeleton: upper_body\n", overrides)
+    assert (job.out, job.skeleton, job.height_m) == (tmp_path / "elsewhere", "none", 1.62)
+    with pytest.raises(JobError, match="175 m tall"):
+        load(tmp_path, MINIMAL, Overrides(height_m=175))
+
+
+def test_yaml_words_are_not_turned_into_other_things(tmp_path: Path) -> None:
+    text = MINIMAL.replace("name: torso", "name: no\n      mount: torso") + "name: 2026-03-01\n"
+    job = load(tmp_path, text)
+    assert job.capture.cameras[0].name == "no"
+    assert job.name == "2026-03-01"
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "field", "message", "hint"),
+    [
+        (MINIMAL + "heigth_m: 1.8\n", 7, "heigth_m", "unknown key", "'height_m'"),
+        (MINIMAL + "  work_pixel: 640\n", 7, "capture.work_pixel", "unknown key", "'work_px'"),
+        (MINIMAL + "      montu: torso\n", 7, "capture.cameras.1.montu", "unknown key", "'mount'"),
+        (MINIMAL + "map:\n  featurs: 3\n", 8, "map.featurs", "unknown key", "'features'"),
+        (MINIMAL + "height_m: tall\n", 7, "height_m", "'tall' should be a number", None),
+        (MINIMAL + "height_m: true\n", 7, "height_m", "True should be a number", None),
+        (MINIMAL + 'height_m: "1.8"\n', 7, "height_m", "should be a number", None),
+        (MINIMAL + "height_m: 17.5\n", 7, "height_m", "less than or equal to 2.6", None),
+        (MINIMAL + "  work_px: 640.5\n", 7, "capture.work_px", "640.5", None),
+        (MINIMAL + "  start_s: .nan\n", 7, "capture.start_s", "should be a number", None),
+        (MINIMAL + "  start_s: 1e999\n", 7, None, "out of range", "digits"),
+        (MINIMAL + "activity: wlak\n", 7, "activity", "none of walk, generic", "'walk'"),
+        (MINIMAL + "skeleton: uper_body\n", 7, "skeleton", "unknown skeleton", "'upper_body'"),
+        (MINIMAL + "skeleton: body.bvh\n", 7, "skeleton", "no such file", "path"),
+        (MINIMAL + "name: a/b\n", 7, "name", "no name for a folder", "letters"),
+        (MINIMAL + "      mount: left_plam\n", 7, "capture.cameras.1.mount", "unknown mount", "'left_palm'"),
+        (MINIMAL + "      segment: LeftHnad\n", 7, "capture.cameras.1.segment", "unknown", "'LeftHand'"),
+        (MINIMAL.replace("left_palm", "Torso"), 5, "capture.cameras.1.name", "two cameras", "torso_back"),
+        (MINIMAL.replace("left_palm", "a/../b"), 5, "capture.cameras.1.name", "no name for files", "letters"),
+        (MINIMAL.replace("left_palm", "wide"), 5, "capture.cameras.1", "where on the body", "mount"),
+        (MINIMAL.replace("left/b", "left/a"), 6, "capture.cameras.1.video", "listed twice", "once"),
+        (MINIMAL.replace("[left/a.mp4, left/b.mp4]", "torso.mp4"), 6, "capture.cameras.1.video", "same", ""),
+        (MINIMAL.replace("torso.mp4", "17"), 4, "capture.cameras.0.video", "should be a list", None),
+        (MINIMAL.replace("torso.mp4", '"<yours>.mp4"'), 4, "capture.cameras.0.video", "filled in", "path"),
+        (MINIMAL.replace("      video: torso.mp4\n", ""), 3, "capture.cameras.0.video", "missing", "video"),
+        (MINIMAL + "  start_s: 5\n  end_s: 5\n", 8, "capture.end_s", "not after", None),
+        ("height_m: 1.8\n", 1, "capture", "missing", "capture"),
+        ("capture: {cameras: []}\n", 1, "capture.cameras", "at least 1", None),
+        (MINIMAL + "skeleton: none\nskeleton: none\n", 8, "skeleton", "twice, first on line 7", "one"),
+        (MINIMAL.replace("    - name: left", "\t- name: left"), 5, None, "tab", "spaces"),
+        (MINIMAL + "name:\tx\n\tout: y\n", 8, None, "tab", "spaces"),
+        ("capture: [1, 2\n", 2, None, "not YAML", None),
+        ("", None, None, "empty", "capture"),
+        ("- a\n", None, None, "no block", "capture"),
+        (MINIMAL + "name: &a b\n", 7, None, "anchors", "quotes"),
+        (MINIMAL + "name: !!python/object:os.system x\n", 7, None, "tags", "quotes"),
+        ("{" * 200, 1, None, "deeper", None),
+        ("[" * 100_000, 1, None, "deeper", None),
+    ],
+)  # fmt: skip
+def test_refusals(
+    tmp_path: Path, text: str, line: int | None, field: str | None, message: str, hint: str | None
+) -> None:
+    error = refused(tmp_path, text)
+    assert message in error.message
+    assert error.line == line
+    assert error.field == field
+    assert hint is None or hint in str(error.hint)
+
+
+def test_every_problem_is_told_at_once(tmp_path: Path) -> None:
+    error = refused(tmp_path, MINIMAL + "heigth_m: 1.8\nactivity: run\n")
+    assert error.line == 7
+    assert "also line 8 activity" in error.message
+
+
+def test_files_that_are_no_text(tmp_path: Path) -> None:
+    path = tmp_path / "job.yaml"
+    path.write_bytes(b"\xff\xfe\x00\x01")
+    with pytest.raises(JobError):
+        load_job(path)
+    path.write_bytes(b"capture: \x00")
+    with pytest.raises(JobError, match="not YAML"):
+        load_job(path)
+    path.write_text("#" * (1 << 20) + "#")
+    with pytest.raises(JobError, match="too large"):
+        load_job(path)
+    with pytest.raises(JobError, match="no such job file"):
+        load_job(tmp_path / "other.yaml")
+
+
+POSE = MINIMAL + "      joint_from_cam: {translation_m: [0.1, 0, 0.02], quat_xyzw: [0, 0, 0.7071, 0.7071]}\n"
+MATRIX = MINIMAL + "      joint_from_cam: [[0, -1, 0, 0.1], [1, 0, 0, 0], [0, 0, 1, 0.02], [0, 0, 0, 1]]\n"
+
+
+def test_measured_mounts(tmp_path: Path) -> None:
+    expected = [[0, -1, 0, 0.1], [1, 0, 0, 0], [0, 0, 1, 0.02], [0, 0, 0, 1]]
+    for text in (POSE, MATRIX):
+        job = load(tmp_path, text + "      sigma_deg: 3\n      sigma_m: 0.01\n")
+        matrix = job.capture.cameras[1].mount_matrix()
+        assert matrix is not None
+        assert np.allclose(matrix, expected, atol=1e-9)
+        assert Job.model_validate(job.model_dump(mode="json")) == job
+    assert load(tmp_path, MINIMAL).capture.cameras[1].mount_matrix() is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (MATRIX.replace("[0, -1, 0, 0.1]", "[0, -2, 0, 0.1]"), "no rotation"),
+        (MATRIX.replace("[0, -1, 0, 0.1]", "[0, 1, 0, 0.1]"), "no rotation"),
+        (MATRIX.replace("[0, 0, 0, 1]]", "[0, 0, 1, 1]]"), "last row"),
+        (POSE.replace("0.7071, 0.7071]", "0, 0]"), "length is not 1"),
+    ],
+)
+def test_wrong_mount_poses(tmp_path: Path, text: str, message: str) -> None:
+    error = refused(tmp_path, text)
+    assert message in error.message
+    assert error.line == 7
+
+
+def test_several_cameras_on_one_segment(tmp_path: Path) -> None:
+    text = MINIMAL.replace("left_palm", "torso_back")
+    assert [camera.role for camera in load(tmp_path, text).capture.cameras] == ["Spine1", "Spine1"]
+    text = MINIMAL.replace("left_palm", "wide") + "      segment: LeftForeArm\n"
+    assert load(tmp_path, text).capture.cameras[1].role == "LeftForeArm"
+
+
+def test_a_single_camera_needs_no_body(tmp_path: Path) -> None:
+    text = "capture: {cameras: [{name: phone, video: a.mp4}]}\n"
+    assert load(tmp_path, text).skeleton == "none"
+    assert "where on the body" in refused(tmp_path, text + "skeleton: upper_body\n").message
+
+
+def test_synthetic_videos_are_prepared_before_they_are_looked_for(tmp_path: Path) -> None:
+    path = tmp_path / "job.yaml"
+    path.write_text(
+        MINIMAL.replace("[left/a.mp4, left/b.mp4]", "left.mp4")
+        + "  calibration: calib.json\n  synthetic: {seconds: 2, motion: a.bvh}\n"
+    )
+    with pytest.raises(CaptureError, match="not been rendered"):
+        load_job(path)
+    calls: list[tuple[Mapping[str, Any], Path]] = []
+
+    def prepare(options: Mapping[str, Any], folder: Path) -> None:
+        calls.append((options, folder))
+        for name in ("torso.mp4", "left.mp4"):
+            (folder / name).write_bytes(b"x")
+        lens = {"model": "PINHOLE", "params": [420, 420, 320, 240], "width": 640, "height": 480}
+        (folder / "calib.json").write_text(json.dumps(lens))
+
+    job = load_job(path, prepare=prepare)
+    assert calls == [({"seconds": 2, "motion": str(tmp_path / "a.bvh")}, tmp_path)]
+    assert all(camera.calibration != "auto" for camera in job.capture.cameras)
+
+
+def test_shipped_jobs(tmp_path: Path) -> None:
+    jobs = Path(__file__).resolve().parents[2] / "jobs"
+    with pytest.raises(JobError, match="filled in") as unfilled:
+        load_job(jobs / "tum_rgbd.yaml")
+    assert unfilled.value.field == "capture.cameras.0.video"
+    filled = (jobs / "tum_rgbd.yaml").read_text().replace("<path of your camera.mp4>", "camera.mp4")
+    job = load(tmp_path, filled)
+    assert (job.skeleton, job.name) == ("none", "tum_rgbd")
+    assert "synthetic" in (jobs / "cpl_lab.yaml").read_text()
+    own = (
+        (jobs / "cpl_lab.yaml")
+        .read_text()
+        .split("  # Delete this block")[0]
+        .replace("../examples/cpl_lab/calib.json", "auto")
+    )
+    assert [camera.role for camera in load(tmp_path, own).capture.cameras] == [
+        "Spine1",
+        "LeftHand",
+        "RightHand",
+    ]
+
+
+yaml_bits = st.sampled_from(
+    ["capture", "cameras", "name", "video", ":", " ", "\n", "\n  ", "- ", "[", "]", "{", "}", "'", '"', "\t",
+     "|", "torso", "1", "-", "?", "&a", "*a", "!!set", "#", ",", "~", "1e9", "%", "@", "\x00", "é", "map"]
+)  # fmt: skip
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(yaml_bits, max_size=40).map("".join) | st.text(max_size=60))
+def test_any_text_is_a_job_or_a_job_error(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+    path = tmp_path_factory.getbasetemp() / "fuzz.yaml"
+    path.write_text(text, encoding="utf-8", errors="surrogatepass")
+    try:
+        load_job(path)
+    except JobError as refusal:
+        named = refusal.path
+    else:
+        named = str(path.resolve())
+    assert named == str(path.resolve())
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.floats(-1e300, 1e300) | st.integers() | st.text(max_size=5),
+        lambda inner: st.lists(inner, max_size=3)
+        | st.dictionaries(
+            st.sampled_from(["capture", "cameras", "name", "video", "calibration", "joint_from_cam",
+                             "synthetic", "map", "export", "formats", "start_s", "skeleton", "timestamps"]),
+            inner,
+        ),
+        max_leaves=12,
+    )
+)  # fmt: skip
+def test_any_values_are_a_job_or_a_typed_error(
+    tmp_path_factory: pytest.TempPathFactory, value: object
+) -> None:
+    camera = {"name": "torso", "video": "a.mp4"}
+    path = tmp_path_factory.getbasetemp() / "fuzz.json"
+    for data in (value, {"capture": value}, {"capture": {"cameras": [value, camera]}}):
+        path.write_text(json.dumps(data))
+        try:
+            load_job(path)
+        except (JobError, CaptureError):
+            continue
