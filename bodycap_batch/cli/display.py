@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from rich.progress import Progress, Task, TaskID
 
 _LINE_PERIOD_S = 5.0
+_LINE_PAUSE_S = 1.0
 _LINE_STEP = 0.1
+"""A line every five seconds, or every tenth of a stage but not more often than once a second."""
 
 
 class Display(Protocol):
@@ -89,24 +91,26 @@ class _Pace:
     """When a stage was last written about, and how fast it goes."""
 
     def __init__(self) -> None:
-        self._started = self._written = time.monotonic()
-        self._share = 0.0
+        self._first: tuple[float, int] | None = None
+        self._written, self._share = time.monotonic(), 0.0
 
     def line(self, event: Event) -> str | None:
         """The line to write now, or None."""
         now, share = time.monotonic(), event.done / event.total if event.total else 0.0
-        due = now - self._written >= _LINE_PERIOD_S or share - self._share >= _LINE_STEP
-        if not due or now == self._started:
+        self._first = self._first or (now, event.done)
+        waited = now - self._written
+        if waited < _LINE_PERIOD_S and not (waited >= _LINE_PAUSE_S and share - self._share >= _LINE_STEP):
             return None
         self._written, self._share = now, share
-        rate = event.done / (now - self._started)
+        seconds, done = now - self._first[0], event.done - self._first[1]
+        rate = done / seconds if seconds > 0 and done > 0 else None
         text = f"{event.label}: {event.done}"
-        if event.total:
-            text += f" of {event.total} {event.what} ({share:.0%})"
-            if rate > 0 and event.done < event.total:
-                text += f", {rate:.3g}/s, {_duration((event.total - event.done) / rate)} left"
-            return text
-        return f"{text} {event.what}, {rate:.3g}/s"
+        text += f" of {event.total} {event.what} ({share:.0%})" if event.total else f" {event.what}"
+        if rate is not None:
+            text += f", {rate:.3g}/s"
+            if event.done < event.total:
+                text += f", {_duration((event.total - event.done) / rate)} left"
+        return text
 
 
 class Bars:
