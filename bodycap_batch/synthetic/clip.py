@@ -1,0 +1,65 @@
+"""A recorded motion from a BVH file, at any time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.errors import JobError
+from bodycap_batch.formats.bvh import read_bvh
+from bodycap_batch.geometry import interpolate_pose, make_transform
+from bodycap_batch.skeleton import Motion, SkeletonModel, forward_kinematics
+
+
+class Clip:
+    """A motion interpolated between its frames (slerp and linear), held at both ends.
+
+    Args:
+        motion: What was recorded.
+        start_s: Its time at which the capture's clock reads zero.
+        length_s: Time the capture covers; that stretch is moved to the room's middle, its lowest joint to
+            the floor.
+    """
+
+    def __init__(self, motion: Motion, start_s: float, length_s: float) -> None:
+        self.skeleton: SkeletonModel = motion.skeleton
+        first = int(start_s * motion.fps)
+        used = slice(first, first + max(2, int(np.ceil(length_s * motion.fps)) + 1))
+        poses = forward_kinematics(motion.skeleton, motion.root_in_world_m[used], motion.local_rotation[used])
+        travelled = poses[:, 0, :3, 3]
+        middle = (travelled.min(axis=0) + travelled.max(axis=0)) / 2
+        middle[2] = poses[:, :, 2, 3].min()
+        self._start_s, self._fps = start_s, motion.fps
+        self._local = make_transform(motion.local_rotation, np.zeros(3))
+        self._local[:, 0, :3, 3] = motion.root_in_world_m - middle
+
+    def pose(self, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Root positions (T,3) in the world (m) and local rotations (T,J,3,3) at times (T,)."""
+        frame = np.clip((t_s + self._start_s) * self._fps, 0, len(self._local) - 1)
+        before = np.minimum(frame.astype(np.int64), max(len(self._local) - 2, 0))
+        after = np.minimum(before + 1, len(self._local) - 1)
+        share = np.broadcast_to((frame - before)[:, None], (len(frame), self._local.shape[1]))
+        poses = interpolate_pose(self._local[before], self._local[after], share)
+        return np.asarray(poses[:, 0, :3, 3]), np.asarray(poses[..., :3, :3])
+
+
+def load_clip(path: Path, start_s: float, length_s: float) -> Clip:
+    """Read a BVH file as the motion of a capture.
+
+    Raises:
+        JobError: The file cannot be read, holds no motion, or is over too early.
+    """
+    _, motion = read_bvh(path)
+    if motion is None or len(motion.root_in_world_m) < 2:
+        raise JobError("holds no motion", path=path, field="motion", hint="a BVH file of two frames or more")
+    lasts = (len(motion.root_in_world_m) - 1) / motion.fps
+    if start_s + length_s > lasts + 1.5 / motion.fps:
+        raise JobError(
+            f"the motion lasts {lasts:.2f} s, the capture needs {start_s:.2f} to {start_s + length_s:.2f} s",
+            path=path,
+            field="motion",
+            hint="a smaller seconds or motion_start_s",
+        )
+    return Clip(motion, start_s, length_s)

@@ -1,0 +1,127 @@
+"""What each camera records: poses over time, exposure, rolling shutter, noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.skeleton import Mount, SkeletonModel, forward_kinematics
+from bodycap_batch.synthetic.atlas import Atlas, Bytes, Float32
+from bodycap_batch.synthetic.lens import RayGrid
+from bodycap_batch.synthetic.render import Triangles, View, joined
+from bodycap_batch.synthetic.wearer import Wearer
+
+_BLUR_STEP_PX = 1.0
+_MAX_BLUR_STEPS = 24
+_SHUTTER_BANDS = 16
+"""Stretches of a rolling-shutter image for which the wearer's body stands still."""
+
+
+class Moving(Protocol):
+    """A body in motion."""
+
+    skeleton: SkeletonModel
+
+    def pose(self, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Root positions (T,3) in the world (m) and local rotations (T,J,3,3) at times (T,)."""
+        ...
+
+
+def joints_at(motion: Moving, t_s: FloatArray) -> FloatArray:
+    """World poses (T,J,4,4) of all joints at common times (T,)."""
+    return forward_kinematics(motion.skeleton, *motion.pose(np.asarray(t_s, dtype=np.float64)))
+
+
+def camera_at(motion: Moving, mount: Mount, t_s: FloatArray) -> FloatArray:
+    """world_from_cam (T,4,4) at common times (T,)."""
+    joint = motion.skeleton.index_of_role(mount.role)
+    return np.asarray(joints_at(motion, t_s)[:, joint] @ mount.joint_from_cam)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Film:
+    """A camera on a moving body in a room.
+
+    Attributes:
+        motion: The body.
+        mount: Where the camera truly sits.
+        grid: Its lens.
+        room: The room's triangles.
+        atlas: All textures.
+        view: The room alone, ready to be looked at.
+        wearer: The body's surface, or None where it is not shown.
+        exposure_s: Exposure time.
+        rolling_shutter_s: Time from the first row to the last.
+    """
+
+    motion: Moving
+    mount: Mount
+    grid: RayGrid
+    room: Triangles
+    atlas: Atlas
+    view: View
+    wearer: Wearer | None
+    exposure_s: float
+    rolling_shutter_s: float
+
+    def frame(self, t_s: float) -> Float32:
+        """The image (H,W,3) whose exposure is centred on a common time, without noise."""
+        steps = self._blur_steps(t_s)
+        shifts = self.exposure_s * ((np.arange(steps) + 0.5) / steps - 0.5)
+        total = np.zeros(self.grid.in_cam.shape, np.float32)
+        for shift in shifts:
+            total += self._instant(t_s + float(shift))
+        return np.asarray(total / np.float32(steps))
+
+    def _instant(self, t_s: float) -> Bytes:
+        """One image without motion blur."""
+        height = self.grid.in_cam.shape[0]
+        if self.rolling_shutter_s == 0.0:
+            pose = camera_at(self.motion, self.mount, np.array([t_s]))
+            return self._view(t_s).image(self.grid, pose[0], slice(0, height))
+        rows_s = t_s + ((np.arange(height) + 0.5) / height - 0.5) * self.rolling_shutter_s
+        poses = camera_at(self.motion, self.mount, rows_s)
+        edges = np.linspace(0, height, min(_SHUTTER_BANDS, height) + 1).astype(int)
+        bands = [slice(low, high) for low, high in pairwise(edges.tolist())]
+        views = [self._view(float(rows_s[band].mean())) for band in bands]
+        parts = [view.image(self.grid, poses[band], band) for view, band in zip(views, bands, strict=True)]
+        return np.concatenate(parts)
+
+    def _view(self, t_s: float) -> View:
+        """The room, with the wearer in it as at that time."""
+        if self.wearer is None:
+            return self.view
+        joints = joints_at(self.motion, np.array([t_s]))[0]
+        return View(joined(self.room, self.wearer.at(joints)), self.atlas)
+
+    def _blur_steps(self, t_s: float) -> int:
+        """Sub-frames needed for a blur without visible steps."""
+        if self.exposure_s == 0.0:
+            return 1
+        half = self.exposure_s / 2
+        start, end = camera_at(self.motion, self.mount, np.array([t_s - half, t_s + half]))
+        px_per_rad = 1.0 / float(np.linalg.norm(self.grid.per_px_x, axis=-1).max())
+        cosine = (np.trace(start[:3, :3].T @ end[:3, :3]) - 1) / 2
+        # Things are rarely nearer than half a metre.
+        motion_rad = np.arccos(np.clip(cosine, -1, 1)) + 2.0 * np.linalg.norm(end[:3, 3] - start[:3, 3])
+        return int(np.clip(np.ceil(motion_rad * px_per_rad / _BLUR_STEP_PX), 2, _MAX_BLUR_STEPS))
+
+
+def exposed(image: Float32, noise: float, gain: FloatArray, rng: np.random.Generator) -> Bytes:
+    """Turn an ideal image into a recorded one: white balance, shot and read noise, 8 bits.
+
+    Args:
+        image: (H,W,3), 0 … 255.
+        noise: Standard deviation at mid grey; half of its variance does not depend on the light.
+        gain: (3,) factor of each colour channel.
+        rng: This frame's own source of noise.
+    """
+    out = image * gain.astype(np.float32)
+    if noise > 0:
+        sigma = np.float32(noise) * np.sqrt(np.float32(0.5) + out * np.float32(0.5 / 128.0))
+        out += sigma * rng.standard_normal(out.shape, dtype=np.float32)
+    return np.asarray(np.clip(np.rint(out), 0, 255), dtype=np.uint8)

@@ -1,0 +1,181 @@
+"""Viewing rays of a lens, by inverting its distortion at every pixel.
+
+Written from the models' published formulas and used by the renderer alone: the solver projects through
+another implementation, so a mistake in either shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodycap_batch.arrays import BoolArray, FloatArray
+from bodycap_batch.camera import Camera
+
+_NEWTON_STEPS = 30
+_DERIVATIVE_STEP = 1e-6
+_CONVERGED = 1e-9
+_BRANCH_SAMPLES = 8
+_SINGLE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+
+Distortion = Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RayGrid:
+    """What every pixel of a lens looks at.
+
+    Attributes:
+        in_cam: (H,W,3) unit directions in the camera frame (x right, y down, z forward).
+        per_px_x: (H,W,3) change of the direction one pixel to the right.
+        per_px_y: (H,W,3) change of the direction one pixel down.
+        valid: (H,W) False where the lens shows nothing (the distortion has no inverse).
+    """
+
+    in_cam: FloatArray
+    per_px_x: FloatArray
+    per_px_y: FloatArray
+    valid: BoolArray
+
+
+def is_fisheye(model: str) -> bool:
+    """True where the model bends an equidistant image plane (angle · direction)."""
+    return model.endswith("FISHEYE")
+
+
+def _rational(plane: FloatArray, radial: FloatArray, p1: float, p2: float) -> FloatArray:
+    """Brown's model with a rational radial term; `radial` holds k1 … k6.
+
+    Source: Brown, "Decentering distortion of lenses", 1966; the rational term as in OpenCV.
+    """
+    x, y = plane[..., 0], plane[..., 1]
+    r2 = x * x + y * y
+    k1, k2, k3, k4, k5, k6 = radial
+    gain = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    return np.stack(
+        [
+            x * gain + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * gain + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+def _thin_prism(plane: FloatArray, params: FloatArray) -> FloatArray:
+    """Radial, tangential and thin-prism terms added on an equidistant plane.
+
+    Source: Weng, Cohen, Herniou, "Camera calibration with distortion models", PAMI 1992.
+    """
+    k1, k2, p1, p2, k3, k4, sx1, sy1 = params
+    u, v = plane[..., 0], plane[..., 1]
+    r2 = u * u + v * v
+    gain = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+    return np.stack(
+        [
+            u * gain + 2 * p1 * u * v + p2 * (r2 + 2 * u * u) + sx1 * r2,
+            v * gain + 2 * p2 * u * v + p1 * (r2 + 2 * v * v) + sy1 * r2,
+        ],
+        axis=-1,
+    )
+
+
+def _field_of_view(plane: FloatArray, omega_rad: float) -> FloatArray:
+    """One-parameter wide-angle model on a perspective plane.
+
+    Source: Devernay, Faugeras, "Straight lines have to be straight", MVA 2001.
+    """
+    radius = np.linalg.norm(plane, axis=-1, keepdims=True)
+    slope = 2 * np.tan(omega_rad / 2)
+    gain = np.where(
+        radius > 1e-9, np.arctan(radius * slope) / np.maximum(radius, 1e-9) / omega_rad, slope / omega_rad
+    )
+    return np.asarray(plane * gain)
+
+
+def distortion_of(camera: Camera) -> Distortion:
+    """The model's map from the ideal to the distorted image plane, both (...,2) and free of pixels."""
+    extra = camera.params[(3 if camera.model in _SINGLE_FOCAL else 4) :]
+    if camera.model == "FOV":
+        return lambda plane: _field_of_view(plane, float(extra[0]))
+    if camera.model == "THIN_PRISM_FISHEYE":
+        return lambda plane: _thin_prism(plane, extra)
+    radial, p1, p2 = np.zeros(6), 0.0, 0.0
+    if camera.model in ("OPENCV", "FULL_OPENCV"):
+        radial[:2], (p1, p2) = extra[:2], extra[2:4]
+        radial[2 : 2 + len(extra) - 4] = extra[4:]
+    elif camera.model == "OPENCV_FISHEYE":
+        prism = np.concatenate([extra[:2], [0.0, 0.0], extra[2:], [0.0, 0.0]])
+        return lambda plane: _thin_prism(plane, prism)
+    else:
+        radial[: len(extra)] = extra
+    return lambda plane: _rational(plane, radial, p1, p2)
+
+
+def focal_and_centre(camera: Camera) -> tuple[FloatArray, FloatArray]:
+    """Focal lengths (2,) and principal point (2,) in pixels."""
+    if camera.model in _SINGLE_FOCAL:
+        return np.repeat(camera.params[:1], 2), np.asarray(camera.params[1:3])
+    return np.asarray(camera.params[:2]), np.asarray(camera.params[2:4])
+
+
+def _jacobian(distort: Distortion, plane: FloatArray) -> FloatArray:
+    """(N,2,2) derivative of the distortion by central differences."""
+    columns = []
+    for axis in range(2):
+        step = np.zeros(2)
+        step[axis] = _DERIVATIVE_STEP
+        columns.append((distort(plane + step) - distort(plane - step)) / (2 * _DERIVATIVE_STEP))
+    return np.stack(columns, axis=-1)
+
+
+def undistort(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Invert a distortion for points (N,2) by Newton's method.
+
+    Returns:
+        The ideal points (N,2), and (N,) True where the inverse exists on the branch around the centre.
+    """
+    plane = distorted.copy()
+    with np.errstate(all="ignore"):
+        for _ in range(_NEWTON_STEPS):
+            residual = distort(plane) - distorted
+            if np.nanmax(np.abs(residual), initial=0.0) < 1e-14:
+                break
+            jacobian = _jacobian(distort, plane)
+            det = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
+            det = np.where(np.abs(det) < 1e-12, 1e-12, det)
+            step_x = (jacobian[:, 1, 1] * residual[:, 0] - jacobian[:, 0, 1] * residual[:, 1]) / det
+            step_y = (jacobian[:, 0, 0] * residual[:, 1] - jacobian[:, 1, 0] * residual[:, 0]) / det
+            step = np.stack([step_x, step_y], axis=-1)
+            length = np.linalg.norm(step, axis=-1, keepdims=True)
+            plane = plane - step * np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))
+        valid = np.abs(distort(plane) - distorted).max(axis=-1, initial=0.0) < _CONVERGED
+        for fraction in np.linspace(1.0 / _BRANCH_SAMPLES, 1.0, _BRANCH_SAMPLES):
+            valid &= np.linalg.det(np.nan_to_num(_jacobian(distort, plane * fraction))) > 0
+    return plane, np.asarray(valid)
+
+
+def ray_grid(camera: Camera) -> RayGrid:
+    """Directions through the centres of all pixels (COLMAP's origin: the first is 0.5, 0.5)."""
+    focal, centre = focal_and_centre(camera)
+    # One ring of pixels around the image, so that the derivatives are central everywhere.
+    x, y = np.meshgrid(
+        np.arange(-1, camera.width_px + 1) + 0.5, np.arange(-1, camera.height_px + 1) + 0.5, indexing="xy"
+    )
+    distorted = (np.stack([x, y], axis=-1) - centre) / focal
+    plane, valid = undistort(distortion_of(camera), distorted.reshape(-1, 2))
+    if is_fisheye(camera.model):
+        angle = np.linalg.norm(plane, axis=-1, keepdims=True)
+        valid &= angle[:, 0] < np.pi
+        direction = np.concatenate([plane * np.sinc(angle / np.pi), np.cos(angle)], axis=-1)
+    else:
+        direction = np.concatenate([plane, np.ones((len(plane), 1))], axis=-1)
+        direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    direction = np.where(valid[:, None], direction, [0.0, 0.0, 1.0]).reshape(*x.shape, 3)
+    return RayGrid(
+        in_cam=direction[1:-1, 1:-1],
+        per_px_x=(direction[1:-1, 2:] - direction[1:-1, :-2]) / 2,
+        per_px_y=(direction[2:, 1:-1] - direction[:-2, 1:-1]) / 2,
+        valid=valid.reshape(x.shape)[1:-1, 1:-1],
+    )

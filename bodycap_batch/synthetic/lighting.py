@@ -1,0 +1,80 @@
+"""Light that falls on a room's surfaces, computed once and painted into their textures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.synthetic.raycast import RayScene
+from bodycap_batch.synthetic.surfaces import Surface
+from bodycap_batch.synthetic.textures import shaded
+
+_CELL_M = 0.08
+_AMBIENT = 0.60
+_LAMP_SAMPLES = 6
+_LAMP_SIZE_M = 0.35
+_LIFT_M = 0.004
+
+
+def light_surfaces(surfaces: Sequence[Surface], lamps: FloatArray, rng: np.random.Generator) -> list[Surface]:
+    """Multiply every texture by its irradiance: ambient light plus lamps with soft shadows.
+
+    Args:
+        surfaces: The room.
+        lamps: (L,3) centres of ceiling lamps (m), shining down.
+        rng: Jitters the shadow rays.
+    """
+    corners = np.concatenate([surface.corners() for surface in surfaces])
+    quads = np.arange(len(surfaces), dtype=np.uint32)[:, None] * 4
+    triangles = np.concatenate([quads + np.array([0, 1, 2]), quads + np.array([0, 2, 3])]).astype(np.uint32)
+    scene = RayScene(corners, triangles)
+    grids = [_cells(surface) for surface in surfaces]
+    points = np.concatenate([grid.reshape(-1, 3) for grid in grids])
+    normals = np.concatenate(
+        [
+            np.tile(surface.normal, (grid[..., 0].size, 1))
+            for surface, grid in zip(surfaces, grids, strict=True)
+        ]
+    )
+    light = np.full(len(points), _AMBIENT)
+    brightness = 1.0 / (len(lamps) * _LAMP_SAMPLES)
+    for lamp in lamps:
+        for _ in range(_LAMP_SAMPLES):
+            source = lamp + np.append(rng.uniform(-0.5, 0.5, 2) * _LAMP_SIZE_M, 0.0)
+            ray = source - points
+            distance = np.linalg.norm(ray, axis=1)
+            cosine = np.clip((ray * normals).sum(axis=1) / distance, 0, None)
+            emitted = np.clip(ray[:, 2] / distance, 0.05, None)
+            lit = cosine > 0
+            rays = np.concatenate([points + normals * _LIFT_M, ray], axis=1)[lit].astype(np.float32)
+            hidden = scene.hidden(rays, 0.98)
+            strength = 10.0 * cosine[lit] * emitted[lit] / (1.0 + distance[lit] ** 2)
+            light[lit] += brightness * np.where(hidden, 0.0, strength)
+    out, start = [], 0
+    for surface, grid in zip(surfaces, grids, strict=True):
+        stop = start + grid[..., 0].size
+        out.append(_paint(surface, light[start:stop].reshape(grid.shape[:2])))
+        start = stop
+    return out
+
+
+def _cells(surface: Surface) -> FloatArray:
+    """World positions (R,C,3) of a grid over a surface, both borders included."""
+    rows = max(2, int(np.linalg.norm(surface.down) / _CELL_M) + 1)
+    columns = max(2, int(np.linalg.norm(surface.across) / _CELL_M) + 1)
+    v, u = np.meshgrid(np.linspace(0.02, 0.98, rows), np.linspace(0.02, 0.98, columns), indexing="ij")
+    return np.asarray(surface.corner + u[..., None] * surface.across + v[..., None] * surface.down)
+
+
+def _paint(surface: Surface, light: FloatArray) -> Surface:
+    """The surface with its light multiplied in."""
+    if surface.shines:
+        return surface
+    height, width = surface.image.shape[:2]
+    smooth = cv2.GaussianBlur(light.astype(np.float32), (3, 3), 0.8)
+    gain = cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR)
+    return replace(surface, image=shaded(surface.image, gain))

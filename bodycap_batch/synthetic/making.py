@@ -1,0 +1,275 @@
+"""Put a synthetic capture together, in a folder that appears only when it is complete."""
+
+from __future__ import annotations
+
+import secrets
+import shutil
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.context import StageContext
+from bodycap_batch.errors import JobError
+from bodycap_batch.formats.files import store_error
+from bodycap_batch.skeleton import Mount
+from bodycap_batch.synthetic.atlas import Atlas, Bytes
+from bodycap_batch.synthetic.clip import load_clip
+from bodycap_batch.synthetic.filming import Film, Moving, camera_at, exposed
+from bodycap_batch.synthetic.gait import Walk
+from bodycap_batch.synthetic.lens import focal_and_centre, ray_grid
+from bodycap_batch.synthetic.measured import measure
+from bodycap_batch.synthetic.options import SynthOptions
+from bodycap_batch.synthetic.person import draw_body, draw_mounts
+from bodycap_batch.synthetic.render import View, triangles_of
+from bodycap_batch.synthetic.room import build_room
+from bodycap_batch.synthetic.truth import (
+    MARKER,
+    common_ticks_ns,
+    in_seconds,
+    write_calibration,
+    write_path,
+    write_timestamps,
+    write_truth,
+)
+from bodycap_batch.synthetic.video import VideoWriter
+from bodycap_batch.synthetic.wearer import Wearer
+
+_TEXELS_PER_PIXEL_M = 0.85
+"""Texture detail: at 1 m a texel covers a little more than a pixel."""
+_MAX_TEXELS_PER_M = 700.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Subject:
+    """Who is filmed.
+
+    Attributes:
+        motion: The body in motion, centred in the room.
+        mounts: Where its cameras truly sit.
+        seeds: Independent sources of randomness for room, body, images, poses and lost frames.
+    """
+
+    motion: Moving
+    mounts: tuple[Mount, ...]
+    seeds: dict[str, np.random.SeedSequence]
+
+
+def draw_subject(options: SynthOptions) -> Subject:
+    """Draw body, motion and mounts from the seed.
+
+    Raises:
+        JobError: The BVH file cannot be used.
+    """
+    names = ("body", "walk", "mounts", "room", "clothes", "images", "poses", "drops")
+    children = np.random.SeedSequence(options.seed).spawn(len(names))
+    seeds = dict(zip(names, children, strict=True))
+    length_s = options.seconds + max(0.0, *options.offsets_s.values(), 0.0)
+    motion: Moving
+    if options.motion is not None:
+        motion = load_clip(options.motion, options.motion_start_s, length_s - 1.0 / options.fps)
+    else:
+        body = draw_body(
+            options.subject_height_m, options.proportion_range, np.random.default_rng(seeds["body"])
+        )
+        motion = Walk(body, length_s, options.t_pose_s, np.random.default_rng(seeds["walk"]))
+    sigmas = options.mount_sigma_deg, options.mount_sigma_m
+    mounts = draw_mounts(options.cameras, motion.skeleton, sigmas, np.random.default_rng(seeds["mounts"]))
+    return Subject(motion=motion, mounts=mounts, seeds=seeds)
+
+
+def make(options: SynthOptions, out_dir: Path, context: StageContext, *, overwrite: bool) -> None:
+    """Write a capture to `out_dir`; see `bodycap_batch.synthetic.synthesise`."""
+    out_dir = Path(out_dir)
+    _refuse_foreign(out_dir, overwrite)
+    subject = draw_subject(options)
+    with _appearing(out_dir) as folder:
+        write_calibration(folder, options)
+        kept = _kept_frames(options, subject)
+        for mount in subject.mounts:
+            _write_camera_truth(folder, options, subject, mount, kept[mount.camera])
+        if not options.poses_only:
+            _film(folder, options, subject, kept, context)
+        write_truth(folder, options, subject.motion, subject.mounts)
+
+
+def _kept_frames(options: SynthOptions, subject: Subject) -> dict[str, BoolArray]:
+    """Which frames each camera delivers; the first and the last always."""
+    rng = np.random.default_rng(subject.seeds["drops"])
+    out = {}
+    for camera in options.cameras:
+        kept = rng.uniform(size=options.frame_count) >= options.drop_frames
+        kept[[0, -1]] = True
+        out[camera] = kept
+    return out
+
+
+def frame_times_ns(options: SynthOptions) -> IntArray:
+    """A camera's own time of each frame."""
+    return np.asarray(np.round(np.arange(options.frame_count) * (1e9 / options.fps)), dtype=np.int64)
+
+
+def _write_camera_truth(
+    folder: Path, options: SynthOptions, subject: Subject, mount: Mount, kept: BoolArray
+) -> None:
+    """The camera's true path, its timestamps where frames are lost, and its measured poses."""
+    times_ns, camera = frame_times_ns(options)[kept], mount.camera
+    poses = camera_at(subject.motion, mount, in_seconds(times_ns) + options.offsets_s.get(camera, 0.0))
+    write_path(folder / "gt" / f"{camera}.tum", times_ns, poses, "world_from_camera, the camera's own clock")
+    if not kept.all():
+        write_timestamps(folder / f"{camera}.timestamps.txt", times_ns)
+    if options.poses_only:
+        seed = [options.cameras.index(camera), *subject.seeds["poses"].generate_state(4).tolist()]
+        seen = measure(poses, options, np.random.default_rng(seed))
+        write_path(
+            folder / "poses" / f"{camera}.tum",
+            times_ns[seen.present],
+            seen.world_from_cam[seen.present],
+            "world_from_camera with noise, gross errors and gaps; the camera's own clock",
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Shooting:
+    """One camera's frames, each a function of its number alone."""
+
+    film: Film
+    times_s: FloatArray
+    noise: float
+    gain: FloatArray
+    seed: list[int]
+
+    def __call__(self, frame: int) -> Bytes:
+        rng = np.random.default_rng([frame, *self.seed])
+        return exposed(self.film.frame(float(self.times_s[frame])), self.noise, self.gain, rng)
+
+
+def _film(
+    folder: Path, options: SynthOptions, subject: Subject, kept: dict[str, BoolArray], context: StageContext
+) -> None:
+    """Render and encode every camera's video."""
+    total, done = sum(int(frames.sum()) for frames in kept.values()), 0
+    context.progress(0, total, "room")
+    films = build_films(options, subject)
+    with _one_opencv_thread(), ThreadPoolExecutor(max_workers=max(1, context.threads)) as pool:
+        for index, film in enumerate(films):
+            camera = film.mount.camera
+            seed = [index, *subject.seeds["images"].generate_state(4).tolist()]
+            shoot = _Shooting(
+                film=film,
+                times_s=in_seconds(frame_times_ns(options)) + options.offsets_s.get(camera, 0.0),
+                noise=options.noise,
+                gain=np.random.default_rng(seed).uniform(0.94, 1.06, 3),
+                seed=seed,
+            )
+            size = (options.width, options.height)
+            with VideoWriter(folder / f"{camera}.mp4", options.fps, size, options.quality) as video:
+                for image in _in_order(pool, shoot, np.flatnonzero(kept[camera]).tolist(), context):
+                    video.add(image)
+                    done += 1
+                    context.progress(done, total, camera)
+
+
+def build_films(options: SynthOptions, subject: Subject) -> list[Film]:
+    """Build the room around the motion and point every camera at it."""
+    camera = options.camera()
+    focal, _ = focal_and_centre(camera)
+    texels_per_m = min(_TEXELS_PER_PIXEL_M * float(focal.mean()), _MAX_TEXELS_PER_M)
+    travelled = subject.motion.pose(in_seconds(common_ticks_ns(options)))[0][:, :2]
+    extent_x, extent_y = np.abs(travelled).max(axis=0).tolist()
+    surfaces = build_room(
+        (extent_x, extent_y), texels_per_m, subject.seeds["room"], repeated_posters=options.repeated_posters
+    )
+    images = [surface.image for surface in surfaces]
+    wearer = Wearer(subject.motion.skeleton, subject.seeds["clothes"]) if options.body_in_view else None
+    atlas = Atlas(images + (wearer.images if wearer else []))
+    if wearer:
+        wearer.place_textures(atlas.origins[len(images) :])
+    room = triangles_of(surfaces, atlas.origins[: len(images)])
+    view, grid = View(room, atlas), ray_grid(camera)
+    return [
+        Film(
+            motion=subject.motion,
+            mount=mount,
+            grid=grid,
+            room=room,
+            atlas=atlas,
+            view=view,
+            wearer=wearer.seen_by(mount, subject.motion.skeleton) if wearer else None,
+            exposure_s=options.exposure_s,
+            rolling_shutter_s=options.rolling_shutter_s,
+        )
+        for mount in subject.mounts
+    ]
+
+
+def _in_order(
+    pool: ThreadPoolExecutor, shoot: _Shooting, frames: list[int], context: StageContext
+) -> Iterator[Bytes]:
+    """Render frames side by side and yield them one after the other; few wait at any time."""
+    waiting: deque[Future[Bytes]] = deque()
+    try:
+        for frame in frames:
+            waiting.append(pool.submit(shoot, frame))
+            if len(waiting) > 2 * max(1, context.threads):
+                context.check_cancelled()
+                yield waiting.popleft().result()
+        while waiting:
+            context.check_cancelled()
+            yield waiting.popleft().result()
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+@contextmanager
+def _one_opencv_thread() -> Iterator[None]:
+    """Keep OpenCV from spreading over all cores while frames are rendered side by side."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def _refuse_foreign(out_dir: Path, overwrite: bool) -> None:
+    """Never replace anything but a synthetic capture, and that only when asked to.
+
+    Raises:
+        JobError: Something is there already.
+    """
+    if not out_dir.exists() or (out_dir.is_dir() and not any(out_dir.iterdir())):
+        return
+    if not overwrite:
+        raise JobError("exists already", path=out_dir, hint="name another folder, or delete this one")
+    if not (out_dir / MARKER).is_file():
+        raise JobError("is no synthetic capture, so it stays", path=out_dir, hint="name another folder")
+
+
+@contextmanager
+def _appearing(out_dir: Path) -> Iterator[Path]:
+    """Yield a new folder beside `out_dir`; it takes that name when the block ends well, else it is deleted.
+
+    Raises:
+        StoreError: The disk refuses.
+    """
+    folder = out_dir.with_name(f".{out_dir.name}.{secrets.token_hex(4)}")
+    old = folder.with_name(folder.name + ".old")
+    try:
+        (folder / "gt").mkdir(parents=True)
+        yield folder
+        if out_dir.exists():
+            out_dir.rename(old)
+        folder.rename(out_dir)
+    except OSError as error:
+        raise store_error(error, out_dir) from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)

@@ -1,0 +1,107 @@
+"""What a synthetic capture may look like."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from bodycap_batch.camera import CAMERA_MODELS, Camera, param_count
+from bodycap_batch.config.mounts import mount_of
+from bodycap_batch.config.options import Options
+
+_EARLIEST_S = 3.0
+"""The walk begins a little before the common clock's zero."""
+
+
+class SynthOptions(Options):
+    """A walker with body cameras in a textured room."""
+
+    seconds: float = Field(12.0, gt=0, le=3600, description="length of each camera's video")
+    fps: float = Field(30.0, gt=0, le=240, description="frames per second of every camera")
+    width: int = Field(640, ge=32, le=7680, multiple_of=2, description="image width in pixels (even)")
+    height: int = Field(480, ge=32, le=4320, multiple_of=2, description="image height in pixels (even)")
+    cameras: tuple[str, ...] = Field(
+        ("torso", "left_palm", "right_palm"), min_length=1, description="mount names, one camera each"
+    )
+    lens: str = Field("PINHOLE", description="COLMAP camera model of every camera")
+    lens_params: tuple[float, ...] | None = Field(
+        None,
+        description="parameters in COLMAP's order, pixels of the given size, COLMAP's pixel origin; "
+        "default: a lens 75 degrees wide, principal point in the middle, no distortion",
+    )
+    seed: int = Field(0, ge=0, description="seed of body, mounts, walk, textures and noise")
+    subject_height_m: float = Field(1.75, ge=1.2, le=2.2, description="stature of the built-in walker")
+    motion: Path | None = Field(None, description="BVH file to follow instead of the built-in walk")
+    motion_start_s: float = Field(0.0, ge=0, description="where in the BVH file the capture begins")
+    t_pose_s: float = Field(0.0, ge=0, description="seconds the built-in walker first stands in a T-pose")
+    proportion_range: float = Field(
+        0.05, ge=0, lt=0.5, description="bones of the built-in walker differ by up to this share"
+    )
+    mount_sigma_deg: float = Field(15.0, ge=0, description="how far mounts are turned off nominal, in all")
+    mount_sigma_m: float = Field(0.05, ge=0, description="how far mounts sit off nominal, in all")
+    noise: float = Field(2.0, ge=0, le=50, description="image noise at mid grey, grey levels of 255")
+    exposure_s: float = Field(0.0, ge=0, description="exposure time: motion blur, timestamp at its middle")
+    rolling_shutter_s: float = Field(0.0, ge=0, description="time from the first row to the last")
+    offsets_s: Mapping[str, float] = Field(
+        default_factory=dict, description="clock offset by camera: common time = camera time + offset"
+    )
+    drop_frames: float = Field(
+        0.0, ge=0, lt=0.5, description="share of frames lost; writes <camera>.timestamps.txt"
+    )
+    body_in_view: bool = Field(False, description="render the wearer's own body")
+    repeated_posters: bool = Field(False, description="hang one and the same poster in several places")
+    poses_only: bool = Field(False, description="write noisy camera poses, no video")
+    pose_sigma_m: float = Field(0.005, ge=0, description="poses only: noise of each position, per axis")
+    pose_sigma_deg: float = Field(0.3, ge=0, description="poses only: noise of each rotation, per axis")
+    outliers: float = Field(0.02, ge=0, lt=0.5, description="poses only: share of gross outliers, in bursts")
+    gaps: int = Field(6, ge=0, description="poses only: gaps of 10 to 60 frames per 1,000 frames and camera")
+    quality: Literal["high", "lossless"] = Field("high", description="H.264 at CRF 16, or lossless")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        for name in self.cameras:
+            if mount_of(name) is None:
+                raise ValueError(f"cameras: {name!r} names no place on the body")
+        if len(set(self.cameras)) != len(self.cameras):
+            raise ValueError("cameras: every name once")
+        if self.lens not in CAMERA_MODELS:
+            raise ValueError(f"lens: unknown model {self.lens!r}; known: {', '.join(CAMERA_MODELS)}")
+        if self.lens_params is not None and len(self.lens_params) != param_count(self.lens):
+            raise ValueError(f"lens_params: {self.lens} takes {param_count(self.lens)} parameters")
+        unknown = sorted(set(self.offsets_s) - set(self.cameras))
+        if unknown:
+            raise ValueError(f"offsets_s: no camera {', '.join(unknown)}")
+        if min(self.offsets_s.values(), default=0.0) < -_EARLIEST_S:
+            raise ValueError(f"offsets_s: no earlier than -{_EARLIEST_S:g} s")
+        if self.exposure_s > 1.0 / self.fps or self.rolling_shutter_s > 1.0 / self.fps:
+            raise ValueError("exposure_s and rolling_shutter_s cannot exceed the frame interval")
+        if self.motion is not None and self.t_pose_s > 0:
+            raise ValueError("t_pose_s: a BVH motion is followed as it is")
+        return self
+
+    @property
+    def frame_count(self) -> int:
+        """Frames each camera exposes (dropped ones included)."""
+        return max(1, round(self.seconds * self.fps))
+
+    def camera(self) -> Camera:
+        """The lens that every camera of the capture has."""
+        params = self.lens_params
+        if params is None:
+            params = _plain_lens(self.lens, self.width, self.height)
+        return Camera(model=self.lens, width_px=self.width, height_px=self.height, params=list(params))  # type: ignore[arg-type]
+
+
+def _plain_lens(model: str, width: int, height: int) -> tuple[float, ...]:
+    """Parameters of an undistorted lens of usual width; 640 px wide gives a focal length of 420 px."""
+    focal = width * 420.0 / 640.0
+    single = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+    head = [focal] if single else [focal, focal]
+    head += [width / 2.0, height / 2.0]
+    rest = [0.0] * (param_count(model) - len(head))
+    if model == "FOV":
+        rest = [0.8]
+    return tuple(head + rest)

@@ -1,0 +1,82 @@
+"""The person who wears the cameras: true proportions and true mounts, both off nominal."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.config.mounts import mount_of
+from bodycap_batch.geometry import make_transform, so3_exp
+from bodycap_batch.skeleton import Mount, SkeletonModel
+from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount, rest_positions, split_side
+
+
+def draw_body(height_m: float, proportion_range: float, rng: np.random.Generator) -> SkeletonModel:
+    """A body of the given stature whose bones differ from the textbook's.
+
+    Each bone's length changes by up to ±`proportion_range` (left and right alike), then the whole body is
+    scaled so that its stature stays what a tape would read.
+    """
+    nominal = load_skeleton("full_body", height_m)
+    factors: dict[str, float] = {}
+    for name in nominal.joints:
+        factors.setdefault(split_side(name)[1], 1.0 + float(rng.uniform(-1, 1)) * proportion_range)
+    gain = np.array([factors[split_side(name)[1]] for name in nominal.joints])
+    offsets = nominal.offsets_m * gain[:, None]
+    ends = nominal.end_offsets_m * gain[:, None]
+    offsets[0] = 0.0
+    body = _with_bones(nominal, offsets, ends)
+    low, high = _extent(body)
+    scale = height_m / (high - low)
+    offsets, ends = offsets * scale, ends * scale
+    offsets[0] = (0.0, 0.0, -low * scale)
+    return _with_bones(nominal, offsets, ends)
+
+
+def _with_bones(model: SkeletonModel, offsets_m: FloatArray, end_offsets_m: FloatArray) -> SkeletonModel:
+    return SkeletonModel(
+        name="synthetic",
+        joints=model.joints,
+        parents=model.parents,
+        offsets_m=offsets_m,
+        end_offsets_m=end_offsets_m,
+        roles=model.roles,
+        bvh_channels=model.bvh_channels,
+    )
+
+
+def _extent(body: SkeletonModel) -> tuple[float, float]:
+    """Height of the sole and of the crown over the root, zero pose (m)."""
+    joints = rest_positions(body)
+    tips = joints + np.nan_to_num(body.end_offsets_m)
+    height = np.concatenate([joints[:, 2], tips[:, 2]])
+    return float(height.min()), float(height.max())
+
+
+def draw_mounts(
+    cameras: tuple[str, ...],
+    skeleton: SkeletonModel,
+    sigmas: tuple[float, float],
+    rng: np.random.Generator,
+) -> tuple[Mount, ...]:
+    """True mounts: nominal ones turned and shifted at random.
+
+    Args:
+        cameras: Mount names.
+        skeleton: The body that wears them.
+        sigmas: Degrees and metres, all three axes together (each axis gets 1/√3 of it).
+        rng: Source of the draws.
+
+    Raises:
+        JobError: The skeleton has no joint for a camera.
+    """
+    out = []
+    for camera in cameras:
+        place = mount_of(camera)
+        assert place is not None  # SynthOptions refuses other names
+        nominal = nominal_mount(camera, place[1], skeleton)
+        turn = so3_exp(rng.normal(0.0, np.radians(sigmas[0]) / np.sqrt(3.0), 3))
+        shift = rng.normal(0.0, sigmas[1] / np.sqrt(3.0), 3)
+        pose = make_transform(nominal.joint_from_cam[:3, :3] @ turn, nominal.joint_from_cam[:3, 3] + shift)
+        out.append(Mount(camera=camera, role=place[1], joint_from_cam=pose, sigma_rad=0.0, sigma_m=0.0))
+    return tuple(out)

@@ -1,0 +1,43 @@
+"""Which triangle a ray meets first: Embree, through Open3D."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
+
+NOTHING = -1
+"""Index for a ray that meets no triangle."""
+
+_Float32 = npt.NDArray[np.float32]
+
+
+class RayScene:
+    """Triangles to shoot at; one thread a call, calls may run side by side.
+
+    Args:
+        vertices: (V,3) positions.
+        faces: (F,3) vertex indices.
+    """
+
+    def __init__(self, vertices: FloatArray, faces: npt.NDArray[np.uint32]) -> None:
+        open3d: Any = import_module("open3d")
+        self._tensor = open3d.core.Tensor
+        self._scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+        self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(faces))
+
+    def first_face(self, rays: _Float32) -> IntArray:
+        """(N,) the face each ray (origin and direction, (N,6)) meets first, or `NOTHING`."""
+        answer = self._scene.cast_rays(self._tensor.from_numpy(rays), nthreads=1)
+        faces = np.asarray(answer["primitive_ids"].numpy(), dtype=np.int64)
+        faces[~np.isfinite(answer["t_hit"].numpy())] = NOTHING
+        return faces
+
+    def hidden(self, rays: _Float32, reach: float) -> BoolArray:
+        """(N,) True where something lies on a ray within `reach` direction lengths."""
+        found = self._scene.test_occlusions(self._tensor.from_numpy(rays), tnear=0.0, tfar=reach, nthreads=1)
+        return np.asarray(found.numpy(), dtype=np.bool_)

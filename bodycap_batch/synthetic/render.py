@@ -1,0 +1,203 @@
+"""Images of textured triangles: Embree finds what each pixel sees, a homography per triangle where on it.
+
+Every triangle is flat and its texture affine on it, so texture coordinates are a projective function of the
+viewing direction; its derivative gives each pixel's footprint exactly. Pixels on the edge between two
+surfaces are sampled four times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from bodycap_batch.arrays import FloatArray, IntArray
+from bodycap_batch.synthetic.atlas import Atlas, Bytes, Float32
+from bodycap_batch.synthetic.lens import RayGrid
+from bodycap_batch.synthetic.raycast import NOTHING, RayScene
+from bodycap_batch.synthetic.surfaces import Surface
+
+_NEAR_M = 0.03
+_SUBPIXELS = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
+"""A rotated grid: four samples with four different rows and columns."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Triangles:
+    """Triangles with their planes and textures, all in one frame.
+
+    Attributes:
+        vertices: (V,3) positions (m).
+        faces: (F,3) vertex indices.
+        normal: (F,3) unit normals.
+        point: (F,3) a point on each plane.
+        texel_at_point: (F,2) atlas coordinates there.
+        texels_per_m: (F,2,3) gradient of the atlas coordinates.
+        surface: (F,) which surface each belongs to.
+        gain: (F,) brightness factor.
+    """
+
+    vertices: FloatArray
+    faces: npt.NDArray[np.uint32]
+    normal: FloatArray
+    point: FloatArray
+    texel_at_point: FloatArray
+    texels_per_m: FloatArray
+    surface: IntArray
+    gain: Float32
+
+
+def triangles_of(surfaces: Sequence[Surface], origins: FloatArray) -> Triangles:
+    """Two triangles for each rectangle; `origins` (N,2) is where its image lies in the atlas."""
+    corners = np.array([surface.corners() for surface in surfaces])
+    quads = np.arange(len(surfaces))[:, None, None] * 4
+    faces = (quads + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
+    edges = np.array([[surface.across, surface.down] for surface in surfaces])
+    texels = np.array([surface.image.shape[1::-1] for surface in surfaces], dtype=np.float64)
+    gradient = edges * (texels / (edges**2).sum(axis=2))[..., None]
+    owner = np.repeat(np.arange(len(surfaces)), 2)
+    return Triangles(
+        vertices=corners.reshape(-1, 3),
+        faces=faces.astype(np.uint32),
+        normal=np.array([surface.normal for surface in surfaces])[owner],
+        point=corners[owner, 0],
+        texel_at_point=origins[owner],
+        texels_per_m=gradient[owner],
+        surface=owner,
+        gain=np.ones(len(owner), np.float32),
+    )
+
+
+def joined(first: Triangles, second: Triangles) -> Triangles:
+    """Both sets of triangles in one."""
+    return Triangles(
+        vertices=np.concatenate([first.vertices, second.vertices]),
+        faces=np.concatenate([first.faces, second.faces + np.uint32(len(first.vertices))]),
+        normal=np.concatenate([first.normal, second.normal]),
+        point=np.concatenate([first.point, second.point]),
+        texel_at_point=np.concatenate([first.texel_at_point, second.texel_at_point]),
+        texels_per_m=np.concatenate([first.texels_per_m, second.texels_per_m]),
+        surface=np.concatenate([first.surface, second.surface + first.surface.max(initial=0) + 1]),
+        gain=np.concatenate([first.gain, second.gain]),
+    )
+
+
+def _components(vectors: FloatArray) -> Float32:
+    """(H,W,3) vectors as (3,H·W), each component contiguous."""
+    return np.ascontiguousarray(vectors.reshape(-1, 3).T, dtype=np.float32)
+
+
+def _dot(first: Float32, second: Float32) -> Float32:
+    """Scalar products (N,) of (3,N) vectors."""
+    return np.asarray(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
+
+
+class View:
+    """Triangles ready to be looked at.
+
+    Args:
+        triangles: Everything in the world frame.
+        atlas: Their textures.
+    """
+
+    def __init__(self, triangles: Triangles, atlas: Atlas) -> None:
+        self._triangles = triangles
+        self._atlas = atlas
+        self._shaded = bool((triangles.gain != 1).any())
+        self._scene = RayScene(triangles.vertices, triangles.faces)
+
+    def image(self, grid: RayGrid, world_from_cam: FloatArray, rows: slice) -> Bytes:
+        """Render some rows of an image.
+
+        Args:
+            grid: The lens.
+            world_from_cam: (4,4) pose of all rows, or (rows,4,4), one for each.
+            rows: Which rows.
+
+        Returns:
+            (rows,W,3) RGB, 0 … 255, no noise.
+        """
+        poses = world_from_cam.reshape(-1, 4, 4)
+        lens = [_components(part[rows]) for part in (grid.in_cam, grid.per_px_x, grid.per_px_y)]
+        height, width = grid.valid[rows].shape
+        pose_of = np.repeat(np.arange(height), width) if len(poses) > 1 else None
+        tables = self._homographies(poses)
+        faces = self._hit(lens[0], poses, pose_of)
+        colours = self._colours(faces, pose_of, tables, lens)
+        edge = np.flatnonzero(self._edges(faces.reshape(height, width)))
+        if len(edge):
+            rays, right, down = (part[:, edge] for part in lens)
+            near = [rays + np.float32(x) * right + np.float32(y) * down for x, y in _SUBPIXELS]
+            again = len(_SUBPIXELS)
+            fine = [np.concatenate(near, axis=1), np.tile(right, again), np.tile(down, again)]
+            fine_pose_of = None if pose_of is None else np.tile(pose_of[edge], again)
+            hits = self._hit(fine[0], poses, fine_pose_of)
+            samples = self._colours(hits, fine_pose_of, tables, fine)
+            colours[edge] = samples.reshape(again, -1, 3).mean(axis=0)
+        colours[~grid.valid[rows].reshape(-1)] = 0
+        return np.asarray(colours.reshape(height, width, 3))
+
+    def _homographies(self, poses: FloatArray) -> Float32:
+        """(9,B·F): direction in the camera -> (u·w, v·w, w), row by row, for each pose and triangle."""
+        shape, out = self._triangles, np.empty((3, 3, len(poses), len(self._triangles.faces)))
+        rotation, centre = poses[:, :3, :3], poses[:, :3, 3]
+        normal = np.einsum("bji,fj->ibf", rotation, shape.normal)
+        offset = shape.point[None] - centre[:, None]
+        depth = np.einsum("fj,bfj->bf", shape.normal, offset)
+        for axis in range(2):
+            gradient = shape.texels_per_m[:, axis]
+            here = shape.texel_at_point[:, axis] - np.einsum("fj,bfj->bf", gradient, offset)
+            out[axis] = here * normal + depth * np.einsum("bji,fj->ibf", rotation, gradient)
+        out[2] = normal
+        return out.reshape(9, -1).astype(np.float32)
+
+    def _hit(self, rays: Float32, poses: FloatArray, pose_of: IntArray | None) -> IntArray:
+        """(N,) the triangle each ray (3,N) meets first, or −1."""
+        rotation, centre = poses[:, :3, :3].astype(np.float32), poses[:, :3, 3].astype(np.float32)
+        origin_and_ray = np.empty((rays.shape[1], 6), np.float32)
+        if pose_of is None:
+            turned, start = rotation[0] @ rays, centre[0][:, None]
+        else:
+            turned, start = np.einsum("nij,jn->in", rotation[pose_of], rays), centre[pose_of].T
+        origin_and_ray[:, 3:] = turned.T
+        origin_and_ray[:, :3] = (start + np.float32(_NEAR_M) * turned).T
+        return self._scene.first_face(origin_and_ray)
+
+    def _colours(
+        self, faces: IntArray, pose_of: IntArray | None, tables: Float32, lens: Sequence[Float32]
+    ) -> Bytes:
+        """(N,3) filtered texture where the rays (and their derivatives) meet their triangles."""
+        found = np.maximum(faces, 0)
+        entry = found if pose_of is None else pose_of * len(self._triangles.faces) + found
+        rows = tables[:, entry]
+        rays, right, down = lens
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            inverse = np.float32(1) / _dot(rows[6:], rays)
+            at = np.stack([_dot(rows[:3], rays), _dot(rows[3:6], rays)]) * inverse
+            footprint = np.empty((4, len(faces)), np.float32)
+            for index, step in enumerate((right, down)):
+                change = _dot(rows[6:], step)
+                footprint[2 * index] = (_dot(rows[:3], step) - at[0] * change) * inverse
+                footprint[2 * index + 1] = (_dot(rows[3:6], step) - at[1] * change) * inverse
+        missed = faces < 0
+        if missed.any():
+            at[:, missed], footprint[:, missed] = 0.0, 0.0
+        colours = self._atlas.sample(at, footprint)
+        if self._shaded:
+            gain = self._triangles.gain[found]
+            colours = np.clip(colours * gain[:, None], 0, 255).astype(np.uint8)
+        colours[missed] = 0
+        return colours
+
+    def _edges(self, faces: IntArray) -> npt.NDArray[np.bool_]:
+        """(H,W) True where a neighbouring pixel shows another surface."""
+        owner = np.append(self._triangles.surface, NOTHING)[faces]
+        edge = np.zeros(owner.shape, dtype=bool)
+        across, along = owner[:, 1:] != owner[:, :-1], owner[1:] != owner[:-1]
+        edge[:, 1:] |= across
+        edge[:, :-1] |= across
+        edge[1:] |= along
+        edge[:-1] |= along
+        return edge

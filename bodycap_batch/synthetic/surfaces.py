@@ -1,0 +1,78 @@
+"""Flat, textured rectangles: all that a room is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.geometry import so3_exp
+
+UINT8 = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Surface:
+    """A rectangle that carries an image.
+
+    Attributes:
+        corner: (3,) world position of the image's top left corner (m).
+        across: (3,) from there to the top right corner.
+        down: (3,) from there to the bottom left corner.
+        image: (H,W,3) RGB texture.
+        shines: True for a lamp: light falling on it changes nothing.
+    """
+
+    corner: FloatArray
+    across: FloatArray
+    down: FloatArray
+    image: UINT8
+    shines: bool = False
+
+    @property
+    def normal(self) -> FloatArray:
+        """Unit vector towards whoever sees the image the right way round."""
+        normal = np.cross(self.down, self.across)
+        return np.asarray(normal / np.linalg.norm(normal))
+
+    def corners(self) -> FloatArray:
+        """(4,3) corners: top left, top right, bottom right, bottom left."""
+        edges = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) @ np.stack([self.across, self.down])
+        return np.asarray(self.corner + edges)
+
+
+def surface_facing(
+    centre: npt.ArrayLike, normal: npt.ArrayLike, size_m: tuple[float, float], image: UINT8
+) -> Surface:
+    """An upright rectangle (width, height) about `centre` facing a horizontal direction."""
+    normal = np.asarray(normal, dtype=np.float64)
+    up = np.array([0.0, 0.0, 1.0])
+    across = np.cross(up, normal) * size_m[0]
+    down = -up * size_m[1]
+    corner = np.asarray(centre, dtype=np.float64) - across / 2 - down / 2
+    return Surface(corner=corner, across=across, down=down, image=image)
+
+
+def box_faces(centre: npt.ArrayLike, size_m: npt.ArrayLike, yaw_deg: float) -> list[Surface]:
+    """The six faces of a box without images (1×1 texels): four sides, top, bottom.
+
+    Args:
+        centre: (3,) middle of the box (m).
+        size_m: (3,) extents along its own x, y and the vertical.
+        yaw_deg: Turn about the vertical.
+    """
+    centre, size = np.asarray(centre, dtype=np.float64), np.asarray(size_m, dtype=np.float64)
+    turn = so3_exp(np.array([0.0, 0.0, np.radians(yaw_deg)]))
+    blank = np.zeros((1, 1, 3), np.uint8)
+    faces = []
+    for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        normal = turn[:, axis] * sign
+        middle = centre + normal * size[axis] / 2
+        faces.append(surface_facing(middle, normal, (float(size[1 - axis]), float(size[2])), blank))
+    for top in (1.0, -1.0):
+        across, down = turn[:, 0] * size[0], turn[:, 1] * size[1] * -top
+        middle = centre + np.array([0, 0, top * size[2] / 2])
+        faces.append(Surface(corner=middle - across / 2 - down / 2, across=across, down=down, image=blank))
+    return faces

@@ -1,0 +1,141 @@
+"""The files beside the videos: calibration, true paths, joints, body, motion and mounts."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray, IntArray
+from bodycap_batch.formats.bvh import write_bvh
+from bodycap_batch.formats.files import replacing, write_text
+from bodycap_batch.formats.tum import TimedPoses, seconds_text, write_tum
+from bodycap_batch.geometry import quat_xyzw_from_rotation
+from bodycap_batch.skeleton import Motion, Mount, SkeletonModel
+from bodycap_batch.synthetic.filming import Moving, joints_at
+from bodycap_batch.synthetic.options import SynthOptions
+
+JOINT_ROLES = {
+    "root": "Hips", "torso": "Spine1", "head": "Head", "left_palm": "LeftHand", "right_palm": "RightHand",
+    "left_elbow": "LeftForeArm", "right_elbow": "RightForeArm", "left_shoulder": "LeftArm",
+    "right_shoulder": "RightArm", "left_knee": "LeftLeg", "right_knee": "RightLeg", "left_hip": "LeftUpLeg",
+    "right_hip": "RightUpLeg", "left_ankle": "LeftFoot", "right_ankle": "RightFoot",
+}  # fmt: skip
+"""Names in ``gt/joints.npz`` and the joints they stand for."""
+
+_README = """Ground truth of a synthetic capture. Metres, Z up, floor at z = 0.
+
+<camera>.tum   world_from_camera (OpenCV axes), one line a frame: timestamp tx ty tz qx qy qz qw.
+               Timestamps are the camera's own; common time = camera time + offsets_s of calib.json.
+               With a rolling shutter this is the pose of the middle of the image; with motion blur that
+               of the middle of the exposure.
+joints.npz     names (J,), t (T,) s on the common clock, world (T,J,3) m: joint centres.
+motion.bvh     the motion on the common clock, at the cameras' rate; frame 0 is the earliest frame.
+mounts.json    joint_from_cam of each camera: where it truly sits. Not what its name promises.
+synth.json     the options the capture was made with.
+
+The body's true proportions are those of ../skeleton.bvh, the motion's too.
+"""
+MARKER = Path("gt", "synth.json")
+"""Present in every capture that was written to its end."""
+
+
+def write_calibration(folder: Path, options: SynthOptions) -> None:
+    """Write ``calib.json``: one lens for all cameras, and their clocks."""
+    content: dict[str, Any] = {
+        "width": options.width,
+        "height": options.height,
+        "fps": options.fps,
+        "model": options.lens,
+        "params": options.camera().params.tolist(),
+        "rolling_shutter_s": options.rolling_shutter_s,
+        "offsets_s": {name: options.offsets_s.get(name, 0.0) for name in options.cameras},
+        "exposure_s": options.exposure_s,
+        "timestamp": "middle of the exposure",
+        "pixel_origin": "COLMAP (centre of first pixel = 0.5)",
+    }
+    _write_json(folder / "calib.json", content)
+
+
+def write_truth(folder: Path, options: SynthOptions, motion: Moving, mounts: tuple[Mount, ...]) -> None:
+    """Write everything below ``gt/`` but the cameras' paths, and ``skeleton.bvh``."""
+    truth = folder / "gt"
+    ticks = common_ticks_ns(options)
+    root, local = motion.pose(in_seconds(ticks))
+    moved = Motion(
+        skeleton=motion.skeleton,
+        fps=options.fps,
+        start_ns=int(ticks[0]),
+        root_in_world_m=root,
+        local_rotation=local,
+        observed=np.ones(local.shape[:2], dtype=bool),
+    )
+    write_bvh(truth / "motion.bvh", moved)
+    write_bvh(folder / "skeleton.bvh", _standing(motion.skeleton, options.fps))
+    _write_joints(truth / "joints.npz", motion, ticks)
+    content = {
+        mount.camera: {
+            "role": mount.role,
+            "joint_from_cam": mount.joint_from_cam.tolist(),
+            "translation_m": mount.joint_from_cam[:3, 3].tolist(),
+            "quat_xyzw": quat_xyzw_from_rotation(mount.joint_from_cam[:3, :3]).tolist(),
+        }
+        for mount in mounts
+    }
+    _write_json(truth / "mounts.json", content)
+    write_text(truth / "README.txt", _README)
+    settings = options.model_dump(mode="json")
+    if options.motion is not None:
+        settings["motion"] = options.motion.name
+    _write_json(folder / MARKER, settings)
+
+
+def in_seconds(times_ns: IntArray) -> FloatArray:
+    """Nanoseconds as seconds."""
+    return np.asarray(times_ns * 1e-9, dtype=np.float64)
+
+
+def common_ticks_ns(options: SynthOptions) -> IntArray:
+    """Ticks of the capture on the common clock: from the earliest timestamp to the latest."""
+    offsets = [options.offsets_s.get(name, 0.0) for name in options.cameras]
+    lasts_s = (options.frame_count - 1) / options.fps + max(offsets) - min(offsets)
+    ticks = np.arange(int(np.floor(lasts_s * options.fps + 1e-6)) + 1)
+    return np.asarray(np.round(min(offsets) * 1e9 + ticks * (1e9 / options.fps)), dtype=np.int64)
+
+
+def write_path(path: Path, times_ns: IntArray, world_from_cam: FloatArray, note: str) -> None:
+    """Write a camera's path on its own clock."""
+    poses = TimedPoses(times_ns=times_ns, world_from_cam=world_from_cam)
+    write_tum(path, poses, (note,))
+
+
+def write_timestamps(path: Path, times_ns: IntArray) -> None:
+    """Write the times of a video's frames: seconds, one a line."""
+    write_text(path, "".join(f"{seconds_text(int(time))}\n" for time in times_ns))
+
+
+def _standing(skeleton: SkeletonModel, fps: float) -> Motion:
+    """The zero pose as a motion of one frame."""
+    count = len(skeleton.joints)
+    return Motion(
+        skeleton=skeleton,
+        fps=fps,
+        start_ns=0,
+        root_in_world_m=np.asarray(skeleton.offsets_m[:1]),
+        local_rotation=np.tile(np.eye(3), (1, count, 1, 1)),
+        observed=np.ones((1, count), dtype=bool),
+    )
+
+
+def _write_joints(path: Path, motion: Moving, ticks_ns: IntArray) -> None:
+    indices = {name: motion.skeleton.index_of_role(role) for name, role in JOINT_ROLES.items()}
+    present = {name: index for name, index in indices.items() if index is not None}
+    world = joints_at(motion, in_seconds(ticks_ns))[:, list(present.values())][..., :3, 3]
+    with replacing(path) as temporary:
+        np.savez(temporary, names=np.array(list(present)), t=in_seconds(ticks_ns), world=world)
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    write_text(path, json.dumps(content, indent=1) + "\n")

@@ -1,0 +1,84 @@
+"""Writing a video, one frame after the other."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from bodycap_batch.errors import StoreError
+from bodycap_batch.formats.files import store_error
+from bodycap_batch.synthetic.atlas import Bytes
+
+_TIME_BASE = 15360
+_OPTIONS = {
+    "high": {"crf": "16", "preset": "veryfast"},
+    "lossless": {"crf": "0", "preset": "ultrafast"},
+}
+
+
+class VideoWriter:
+    """H.264 in an MP4 file. One encoder thread, so that the same frames give the same bytes.
+
+    Args:
+        path: The file.
+        fps: Frames per second.
+        size: Width and height.
+        quality: "high" or "lossless" (but for the chroma, which has half the resolution).
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
+
+    def __init__(self, path: Path, fps: float, size: tuple[int, int], quality: str) -> None:
+        import av
+
+        self._av = av
+        self._path = path
+        rate = Fraction(fps).limit_denominator(100_000)
+        try:
+            self._container = av.open(str(path), "w")
+            self._stream = self._container.add_stream("libx264", rate=rate)
+        except (OSError, av.error.FFmpegError) as error:
+            raise self._failure(error) from error
+        self._stream.width, self._stream.height = size
+        self._stream.pix_fmt = "yuv420p"
+        self._stream.options = _OPTIONS[quality]
+        self._stream.codec_context.thread_count = 1
+        self._frame_duration = Fraction(1) / rate
+        self._count = 0
+
+    def add(self, image: Bytes) -> None:
+        """Append an RGB image (H,W,3)."""
+        frame = self._av.VideoFrame.from_ndarray(image, format="rgb24")
+        frame.pts = round(self._count * self._frame_duration * _TIME_BASE)
+        frame.time_base = Fraction(1, _TIME_BASE)
+        self._count += 1
+        self._send(frame)
+
+    def _send(self, frame: object) -> None:
+        try:
+            for packet in self._stream.encode(frame):
+                self._container.mux(packet)
+        except (OSError, self._av.error.FFmpegError) as error:
+            raise self._failure(error) from error
+
+    def _failure(self, error: Exception) -> StoreError:
+        if isinstance(error, OSError):
+            return store_error(error, self._path)
+        return StoreError(f"cannot write the video: {error}", path=self._path, hint="check the disk")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self._send(None)
+        try:
+            self._container.close()
+        except (OSError, self._av.error.FFmpegError) as problem:
+            if kind is None:
+                raise self._failure(problem) from problem

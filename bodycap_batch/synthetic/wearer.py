@@ -1,0 +1,209 @@
+"""The wearer's body as the cameras see it: rounded limbs that follow the joints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.skeleton import Mount, SkeletonModel
+from bodycap_batch.skeleton_presets import rest_positions, split_side
+from bodycap_batch.synthetic import textures
+from bodycap_batch.synthetic.render import Triangles
+from bodycap_batch.synthetic.surfaces import UINT8
+
+# Radii at both ends of the bone that starts at a joint (m).
+_RADII = {
+    "Hips": (0.15, 0.14),
+    "Spine": (0.14, 0.145),
+    "Spine1": (0.15, 0.10),
+    "Neck": (0.055, 0.055),
+    "Head": (0.09, 0.085),
+    "Arm": (0.050, 0.040),
+    "ForeArm": (0.040, 0.028),
+    "Hand": (0.035, 0.022),
+    "UpLeg": (0.080, 0.055),
+    "Leg": (0.052, 0.035),
+    "Foot": (0.035, 0.035),
+    "ToeBase": (0.03, 0.02),
+}
+_SKIN = ("Hand", "Neck", "Head")
+_AROUND = 14
+_CAP_RINGS = 3
+_TEXELS_PER_M = 300.0
+_CLEARANCE_M = 0.02
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Limb:
+    """One rounded cone in its joint's frame."""
+
+    joint: int
+    triangles: Triangles
+
+
+class Wearer:
+    """All limbs of a body that a camera may see.
+
+    Args:
+        skeleton: The true body.
+        seed: Source of clothes and skin.
+    """
+
+    def __init__(self, skeleton: SkeletonModel, seed: np.random.SeedSequence) -> None:
+        self._bones = _bones(skeleton)
+        self.images: list[UINT8] = []
+        for _, start, end, radii, part in self._bones:
+            rng = np.random.default_rng(seed.spawn(1)[0])
+            size = float(np.linalg.norm(end - start)) + sum(radii), 2 * np.pi * max(radii)
+            height, width = (max(16, round(side * _TEXELS_PER_M)) for side in size)
+            self.images.append(_skin(height, width, rng) if part in _SKIN else _cloth(height, width, rng))
+        self._limbs: list[_Limb] = []
+
+    def place_textures(self, origins: FloatArray) -> None:
+        """Build the limbs once their images (N) have their places (N,2) in the atlas."""
+        self._limbs = [
+            _Limb(joint=joint, triangles=_mesh(start, end, radii, image, origin, index))
+            for index, ((joint, start, end, radii, _), image, origin) in enumerate(
+                zip(self._bones, self.images, origins, strict=True)
+            )
+        ]
+
+    def seen_by(self, mount: Mount, skeleton: SkeletonModel) -> Wearer:
+        """The same body without the limb a camera sits inside of (its housing would press the cloth in)."""
+        joint = skeleton.index_of_role(mount.role)
+        centre = mount.joint_from_cam[:3, 3]
+        kept = object.__new__(Wearer)
+        kept._bones, kept.images = self._bones, self.images
+        kept._limbs = [
+            limb
+            for limb, (_, start, end, radii, _) in zip(self._limbs, self._bones, strict=True)
+            if limb.joint != joint or _distance(centre, start, end) > max(radii) + _CLEARANCE_M
+        ]
+        return kept
+
+    def at(self, world_from_joint: FloatArray) -> Triangles:
+        """All limbs in the world, for joint poses (J,4,4)."""
+        parts = [_moved(limb.triangles, world_from_joint[limb.joint]) for limb in self._limbs]
+        starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
+        return Triangles(
+            vertices=np.concatenate([part.vertices for part in parts]),
+            faces=np.concatenate(
+                [part.faces + np.uint32(start) for part, start in zip(parts, starts, strict=True)]
+            ),
+            normal=np.concatenate([part.normal for part in parts]),
+            point=np.concatenate([part.point for part in parts]),
+            texel_at_point=np.concatenate([part.texel_at_point for part in parts]),
+            texels_per_m=np.concatenate([part.texels_per_m for part in parts]),
+            surface=np.concatenate([part.surface for part in parts]),
+            gain=np.concatenate([part.gain for part in parts]),
+        )
+
+
+_Bone = tuple[int, FloatArray, FloatArray, tuple[float, float], str]
+
+
+def _bones(skeleton: SkeletonModel) -> list[_Bone]:
+    """Joint, start and end in the joint's frame, radii and body part of each limb."""
+    rest, out = rest_positions(skeleton), []
+    for joint, role in enumerate(skeleton.roles):
+        part = split_side(role)[1]
+        if part not in _RADII:
+            continue
+        end = skeleton.end_offsets_m[joint]
+        children = np.flatnonzero(skeleton.parents == joint)
+        if len(children):
+            # A trunk's bone goes to the child straight above it, a limb's to its only child.
+            ahead = rest[children] - rest[joint]
+            end = ahead[np.argmin(np.abs(ahead[:, 0]))]
+        if np.isfinite(end).all() and np.linalg.norm(end) > 0.01:
+            out.append((joint, np.zeros(3), np.asarray(end), _RADII[part], part))
+    return out
+
+
+def _distance(point: FloatArray, start: FloatArray, end: FloatArray) -> float:
+    """From a point to a segment."""
+    share = np.clip((point - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
+    return float(np.linalg.norm(point - start - share * (end - start)))
+
+
+def _mesh(
+    start: FloatArray,
+    end: FloatArray,
+    radii: tuple[float, float],
+    image: UINT8,
+    origin: FloatArray,
+    index: int,
+) -> Triangles:
+    """Triangles of a rounded cone, its image wrapped around it."""
+    axis = (end - start) / np.linalg.norm(end - start)
+    side = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [0.0, 1.0, 0.0])
+    side /= np.linalg.norm(side)
+    other = np.cross(axis, side)
+    rings = []
+    for angle in np.linspace(-np.pi / 2, 0, _CAP_RINGS + 1):
+        rings.append((start + axis * radii[0] * np.sin(angle), radii[0] * max(np.cos(angle), 1e-3)))
+    for angle in np.linspace(0, np.pi / 2, _CAP_RINGS + 1):
+        rings.append((end + axis * radii[1] * np.sin(angle), radii[1] * max(np.cos(angle), 1e-3)))
+    turn = np.linspace(0, 2 * np.pi, _AROUND + 1)
+    circle = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * other
+    vertices = np.array([centre + radius * circle for centre, radius in rings])
+    rows, columns = vertices.shape[:2]
+    v, u = np.meshgrid(np.linspace(0.01, 0.99, rows), np.linspace(0.01, 0.99, columns), indexing="ij")
+    texels = origin + np.stack([u * image.shape[1], v * image.shape[0]], axis=-1)
+    ids = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]
+    faces = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
+    return _textured(vertices.reshape(-1, 3), texels.reshape(-1, 2), faces, index)
+
+
+def _textured(vertices: FloatArray, texels: FloatArray, faces: FloatArray, index: int) -> Triangles:
+    """Planes and texture gradients from positions and atlas coordinates at vertices."""
+    corner = vertices[faces]
+    first, second = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    normal = np.cross(first, second)
+    area2 = (normal**2).sum(axis=1)
+    keep = area2 > 1e-16
+    corner, first, second, normal, area2 = (part[keep] for part in (corner, first, second, normal, area2))
+    at = texels[faces[keep]]
+    step_first, step_second = at[:, 1] - at[:, 0], at[:, 2] - at[:, 0]
+    along, across = np.cross(second, normal), np.cross(normal, first)
+    gradient = step_first[:, :, None] * along[:, None] + step_second[:, :, None] * across[:, None]
+    return Triangles(
+        vertices=vertices,
+        faces=faces[keep].astype(np.uint32),
+        normal=normal / np.sqrt(area2)[:, None],
+        point=corner[:, 0],
+        texel_at_point=at[:, 0],
+        texels_per_m=gradient / area2[:, None, None],
+        surface=np.full(int(keep.sum()), index),
+        gain=np.ones(int(keep.sum()), np.float32),
+    )
+
+
+def _moved(limb: Triangles, world_from_joint: FloatArray) -> Triangles:
+    """A limb in the world, lit from above."""
+    turn, shift = world_from_joint[:3, :3], world_from_joint[:3, 3]
+    normal = limb.normal @ turn.T
+    return Triangles(
+        vertices=limb.vertices @ turn.T + shift,
+        faces=limb.faces,
+        normal=normal,
+        point=limb.point @ turn.T + shift,
+        texel_at_point=limb.texel_at_point,
+        texels_per_m=limb.texels_per_m @ turn.T,
+        surface=limb.surface,
+        gain=(0.75 + 0.25 * normal[:, 2]).astype(np.float32),
+    )
+
+
+def _skin(height: int, width: int, rng: np.random.Generator) -> UINT8:
+    shade = 0.85 + 0.03 * textures.fractal(height, width, 20.0, rng, 3)
+    return textures.tinted(shade, np.array([222, 170, 140], np.float32))
+
+
+def _cloth(height: int, width: int, rng: np.random.Generator) -> UINT8:
+    folds = 0.9 + 0.12 * textures.fractal(height, width, 40.0, rng, 4)
+    weave = 0.05 * rng.standard_normal((height, width), dtype=np.float32)
+    return textures.tinted(folds + weave, textures.colour(rng, 0.4, (0.25, 0.6)))

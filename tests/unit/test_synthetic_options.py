@@ -1,0 +1,45 @@
+import pytest
+from pydantic import ValidationError
+
+from bodycap_batch.camera import CAMERA_MODELS
+from bodycap_batch.synthetic import SynthOptions
+
+
+def test_the_default_is_the_papers_three_cameras():
+    options = SynthOptions()
+    assert options.cameras == ("torso", "left_palm", "right_palm")
+    assert options.frame_count == 360
+    assert options.camera().params.tolist() == [420.0, 420.0, 320.0, 240.0]
+
+
+@pytest.mark.parametrize("model", CAMERA_MODELS)
+def test_every_lens_has_a_default(model):
+    camera = SynthOptions(lens=model, width=320, height=240).camera()
+    assert camera.focal_px == 210.0
+    assert camera.principal_point_px == (160.0, 120.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"cameras": ("elbow_x",)}, "no place on the body"),
+        ({"cameras": ("torso", "torso")}, "every name once"),
+        ({"lens": "MAGIC"}, "unknown model"),
+        ({"lens": "OPENCV", "lens_params": (1.0, 2.0)}, "takes 8 parameters"),
+        ({"offsets_s": {"head": 0.1}}, "no camera head"),
+        ({"offsets_s": {"torso": -5.0}}, "no earlier"),
+        ({"exposure_s": 0.05}, "frame interval"),
+        ({"rolling_shutter_s": 0.05}, "frame interval"),
+        ({"motion": "walk.bvh", "t_pose_s": 2.0}, "followed as it is"),
+        ({"colour": True}, "Extra inputs"),
+        ({"width": 641}, "multiple of 2"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(values, message):
+    with pytest.raises(ValidationError, match=message):
+        SynthOptions.model_validate(values)
+
+
+def test_options_survive_json():
+    options = SynthOptions(offsets_s={"torso": 0.12}, lens="OPENCV_FISHEYE", seed=7)
+    assert SynthOptions.model_validate(options.model_dump(mode="json")) == options
