@@ -1,6 +1,7 @@
 """Rigid and similarity transforms on arrays of 4×4 matrices.
 
-Transforms are ``target_from_source``, float64, column vectors. Quaternions are xyzw.
+Transforms are ``target_from_source``, float64, column vectors. Quaternions are xyzw. scipy takes a second
+to import and is imported where it is needed: ``bodycap --help`` and finished jobs do without it.
 """
 
 from __future__ import annotations
@@ -9,9 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
 
 
 def make_transform(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> FloatArray:
@@ -41,6 +41,8 @@ def transform_points(target_from_source: FloatArray, x_in_source: FloatArray) ->
 
 def quat_xyzw_from_rotation(rotation: FloatArray) -> FloatArray:
     """Convert (...,3,3) rotations to unit quaternions (...,4), w ≥ 0."""
+    from scipy.spatial.transform import Rotation
+
     flat = rotation.reshape(-1, 3, 3)
     if len(flat) == 0:
         return np.zeros((*rotation.shape[:-2], 4))
@@ -50,6 +52,8 @@ def quat_xyzw_from_rotation(rotation: FloatArray) -> FloatArray:
 
 def rotation_from_quat_xyzw(quat_xyzw: npt.ArrayLike) -> FloatArray:
     """Convert quaternions (...,4) (any norm but zero) to (...,3,3) rotations."""
+    from scipy.spatial.transform import Rotation
+
     quat = np.asarray(quat_xyzw, dtype=np.float64)
     if quat.size == 0:
         return np.zeros((*quat.shape[:-1], 3, 3))
@@ -59,6 +63,8 @@ def rotation_from_quat_xyzw(quat_xyzw: npt.ArrayLike) -> FloatArray:
 
 def so3_exp(rotvec_rad: npt.ArrayLike) -> FloatArray:
     """Rotation vectors (...,3) to rotations (...,3,3)."""
+    from scipy.spatial.transform import Rotation
+
     vec = np.asarray(rotvec_rad, dtype=np.float64)
     matrix = Rotation.from_rotvec(vec.reshape(-1, 3)).as_matrix()
     return np.asarray(matrix.reshape(*vec.shape[:-1], 3, 3))
@@ -66,6 +72,8 @@ def so3_exp(rotvec_rad: npt.ArrayLike) -> FloatArray:
 
 def so3_log(rotation: FloatArray) -> FloatArray:
     """Rotations (...,3,3) to rotation vectors (...,3), angle ≤ π."""
+    from scipy.spatial.transform import Rotation
+
     vec = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
     return np.asarray(vec.reshape(*rotation.shape[:-2], 3))
 
@@ -88,6 +96,37 @@ def interpolate_pose(start: FloatArray, end: FloatArray, alpha: npt.ArrayLike) -
     rotation = start[..., :3, :3] @ so3_exp(weight * delta)
     translation = (1.0 - weight) * start[..., :3, 3] + weight * end[..., :3, 3]
     return make_transform(rotation, translation)
+
+
+def poses_at(
+    times_ns: IntArray, poses: FloatArray, at_ns: IntArray, *, max_gap_ns: int, snap_ns: int = 0
+) -> tuple[FloatArray, BoolArray]:
+    """Interpolate timed poses between their two neighbours.
+
+    Args:
+        times_ns: (N,) increasing, N ≥ 1.
+        poses: (N,4,4).
+        at_ns: (M,) wanted times.
+        max_gap_ns: Where the neighbours are further apart than this, there is no pose.
+        snap_ns: A pose this near in time is taken as it is, even outside the range or in a gap.
+
+    Returns:
+        (M,4,4) poses, identity where there is none, and (M,) where there is one.
+    """
+    last = len(times_ns) - 1
+    after = np.minimum(np.maximum(np.searchsorted(times_ns, at_ns), 1), last)
+    before = np.maximum(after - 1, 0)
+    start, end = times_ns[before], times_ns[after]
+    gap = np.maximum(end - start, 1)
+    inside = (at_ns >= start) & (at_ns <= end) & (gap <= max_gap_ns)
+    near = np.minimum(np.abs(at_ns - start), np.abs(at_ns - end)) <= snap_ns
+    alpha = np.clip((at_ns - start) / gap, 0.0, 1.0)
+    alpha = np.where(inside, alpha, np.round(alpha))
+    found = inside | near
+    out = np.tile(np.eye(4), (len(at_ns), 1, 1))
+    if found.any():
+        out[found] = interpolate_pose(poses[before[found]], poses[after[found]], alpha[found])
+    return out, np.asarray(found)
 
 
 @dataclass(frozen=True, slots=True)

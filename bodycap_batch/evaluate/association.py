@@ -8,7 +8,7 @@ import numpy as np
 
 from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.formats.tum import TimedPoses
-from bodycap_batch.geometry import interpolate_pose
+from bodycap_batch.geometry import poses_at
 
 Association = Literal["interpolate", "nearest"]
 
@@ -29,21 +29,13 @@ def interpolate_truth(
     Returns:
         (N,4,4) poses (identity where there is none) and (N,) which there are.
     """
-    after = np.clip(np.searchsorted(truth.times_ns, times_ns), 1, max(1, len(truth.times_ns) - 1))
-    after = np.minimum(after, len(truth.times_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    start, end = truth.times_ns[before], truth.times_ns[after]
-    gap = np.maximum(end - start, 1)
-    alpha = np.clip((times_ns - start) / gap, 0.0, 1.0)
-    nearest_ns = np.minimum(np.abs(times_ns - start), np.abs(times_ns - end))
-    inside = (times_ns >= start) & (times_ns <= end) & (gap <= round(max_gap_s * 1e9))
-    found = inside | (nearest_ns <= _SNAP_NS)
-    alpha = np.where(inside, alpha, np.round(alpha))
-    poses = np.tile(np.eye(4), (len(times_ns), 1, 1))
-    poses[found] = interpolate_pose(
-        truth.world_from_cam[before[found]], truth.world_from_cam[after[found]], alpha[found]
+    return poses_at(
+        truth.times_ns,
+        truth.world_from_cam,
+        times_ns,
+        max_gap_ns=round(max_gap_s * 1e9),
+        snap_ns=_SNAP_NS,
     )
-    return poses, found
 
 
 def nearest_truth(truth: TimedPoses, times_ns: IntArray, max_diff_s: float) -> tuple[FloatArray, BoolArray]:

@@ -1,0 +1,234 @@
+"""The least-squares solve behind the projection: Gauss-Newton over all ticks at once.
+
+Unknowns of a tick are a shift of the root and, for each solved joint, a rotation of everything below it
+about its centre, in world axes. Ticks are tied to their neighbours only, so the normal equations are block
+tridiagonal and the solve is linear in time.
+
+Source: D. C. Fraser, J. E. Potter, "The optimum linear smoother as a combination of two optimum linear
+    filters", IEEE Trans. Automatic Control 1969 (the forward-backward elimination used here).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.geometry import so3_exp, so3_log
+from bodycap_batch.skeleton import SkeletonModel, forward_kinematics
+
+_CAMERA_SIGMA = np.repeat([np.deg2rad(0.5), 0.005], 3)
+"""Rotation and centre of a localised camera: what easy captures reach (0.3-0.5°, 5 mm)."""
+
+_GRAPH_SIGMA = np.repeat([np.deg2rad(3.0), 0.01], 3)
+"""How far a joint may leave the graph: its pose priors are wider (20-45°), its joints' slack is 5 mm."""
+
+_CHANGE_SIGMA = np.repeat([0.002, np.deg2rad(0.3)], 3)
+"""Change of the correction a tick, root shift and rotations: below what a viewer sees as jitter."""
+
+_OUTLIER_SCALE = 100.0
+"""Geman-McClure's c² on the squared error in sigmas: 3 to 4 sigmas on each of six numbers."""
+
+_MAX_STEPS = 12
+_ENOUGH = 1e-6
+"""Largest step (m, rad) below which the solve is done: a thousandth of what the file resolves."""
+
+_CHUNK_TICKS = 1000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tracked:
+    """A camera on a bone, measured at the ticks (T,); `world_from_cam` counts where `found`."""
+
+    camera: str
+    joint: int
+    joint_from_cam: FloatArray
+    world_from_cam: FloatArray
+    found: BoolArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Problem:
+    """What the corrected motion should meet: graph poses (T,J,4,4) of the solved joints, and cameras."""
+
+    skeleton: SkeletonModel
+    solved: IntArray
+    world_from_joint: FloatArray
+    cameras: tuple[Tracked, ...]
+
+    def reach(self) -> FloatArray:
+        """(J,S) one where a solved joint turns a joint: itself and its ancestors."""
+        out = np.zeros((len(self.skeleton.joints), len(self.solved)))
+        for joint in range(len(out)):
+            ancestor = joint
+            while ancestor >= 0:
+                out[joint, self.solved == ancestor] = 1.0
+                ancestor = int(self.skeleton.parents[ancestor])
+        return out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Correction:
+    """A rigid motion: root (T,3) and local rotations (T,J,3,3)."""
+
+    root: FloatArray
+    local: FloatArray
+
+
+def solve_correction(problem: Problem, start: Correction) -> Correction:
+    """Fit the rigid motion (Levenberg-Marquardt: a step that does not help is shortened)."""
+    reach = problem.reach()
+    now, damping = start, 1e-6
+    cost = _cost(problem, now)
+    for _ in range(_MAX_STEPS):
+        blocks, coupling, gradient = _normal_equations(problem, now, reach)
+        step = _solve_tridiagonal(blocks, coupling, -gradient, damping)
+        trial = _moved(problem, now, step)
+        trial_cost = _cost(problem, trial)
+        if trial_cost > cost:
+            damping *= 100.0
+            continue
+        now, cost, damping = trial, trial_cost, max(damping * 0.1, 1e-9)
+        if np.abs(step).max(initial=0.0) < _ENOUGH:
+            break
+    return now
+
+
+def _moved(problem: Problem, now: Correction, step: FloatArray) -> Correction:
+    """Apply a step (T, 3+3S): shift the root, turn solved joints by rotation vectors in world axes."""
+    rotation = forward_kinematics(problem.skeleton, now.root, now.local)[..., :3, :3]
+    local = now.local.copy()
+    for column, joint in enumerate(problem.solved):
+        turn = step[:, 3 + 3 * column : 6 + 3 * column]
+        if joint > 0:
+            parent = rotation[:, problem.skeleton.parents[joint]]
+            turn = np.einsum("tji,tj->ti", parent, turn)
+        local[:, joint] = so3_exp(turn) @ local[:, joint]
+    return Correction(root=now.root + step[:, :3], local=local)
+
+
+def _camera_error(tracked: Tracked, world: FloatArray, ticks: slice) -> tuple[FloatArray, FloatArray]:
+    """Errors (T,6) in sigmas, zero where not measured, and the exported centres (T,3)."""
+    exported = world[:, tracked.joint] @ tracked.joint_from_cam
+    measured = tracked.world_from_cam[ticks]
+    turn = so3_log(exported[:, :3, :3] @ np.swapaxes(measured[:, :3, :3], -1, -2))
+    error = np.concatenate([turn, exported[:, :3, 3] - measured[:, :3, 3]], axis=1) / _CAMERA_SIGMA
+    return np.where(tracked.found[ticks, None], error, 0.0), exported[:, :3, 3]
+
+
+def _graph_error(problem: Problem, world: FloatArray, ticks: slice) -> FloatArray:
+    """Errors (T,S,6) of the solved joints against the graph, rotation first, in rad and m."""
+    graph, rigid = problem.world_from_joint[ticks][:, problem.solved], world[:, problem.solved]
+    turn = so3_log(rigid[..., :3, :3] @ np.swapaxes(graph[..., :3, :3], -1, -2))
+    return np.concatenate([turn, rigid[..., :3, 3] - graph[..., :3, 3]], axis=-1)
+
+
+def _change(problem: Problem, now: Correction, graph: FloatArray) -> FloatArray:
+    """What may change only slowly (T, 3+3S): the root's shift and the joints' turns off the graph."""
+    shift = now.root - problem.world_from_joint[:, 0, :3, 3]
+    return np.concatenate([shift, graph[..., :3].reshape(len(shift), -1)], axis=1) / _change_sigma(problem)
+
+
+def _change_sigma(problem: Problem) -> FloatArray:
+    return np.concatenate([_CHANGE_SIGMA[:3], np.tile(_CHANGE_SIGMA[3:], len(problem.solved))])
+
+
+def _cost(problem: Problem, now: Correction) -> float:
+    everything = slice(None)
+    world = forward_kinematics(problem.skeleton, now.root, now.local)
+    graph = _graph_error(problem, world, everything)
+    cost = float(((graph / _GRAPH_SIGMA) ** 2).sum())
+    cost += float((np.diff(_change(problem, now, graph), axis=0) ** 2).sum())
+    for tracked in problem.cameras:
+        squared = (_camera_error(tracked, world, everything)[0] ** 2).sum(axis=1)
+        cost += float((_OUTLIER_SCALE * squared / (_OUTLIER_SCALE + squared)).sum())
+    return cost
+
+
+def _normal_equations(
+    problem: Problem, now: Correction, reach: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Diagonal blocks (T,n,n), the one block (n,n) that ties neighbours, and the gradient (T,n)."""
+    world = forward_kinematics(problem.skeleton, now.root, now.local)
+    ticks, size = len(world), 3 + 3 * len(problem.solved)
+    blocks, gradient = np.zeros((ticks, size, size)), np.zeros((ticks, size))
+    for first in range(0, ticks, _CHUNK_TICKS):
+        chunk = slice(first, min(first + _CHUNK_TICKS, ticks))
+        for jacobian, error in _rows(problem, world[chunk], reach, chunk):
+            transposed = np.swapaxes(jacobian, -1, -2)
+            blocks[chunk] += transposed @ jacobian
+            gradient[chunk] += (transposed @ error[..., None])[..., 0]
+    change = _change(problem, now, _graph_error(problem, world, slice(None)))
+    turns = np.zeros((size, size))
+    turns[:3, :3] = np.eye(3)
+    turns[3:, 3:] = np.kron(reach[problem.solved], np.eye(3))
+    turns /= _change_sigma(problem)[:, None]
+    coupling = turns.T @ turns
+    neighbours = np.full(ticks, 2.0)
+    neighbours[[0, -1]] = 1.0 if ticks > 1 else 0.0
+    blocks += neighbours[:, None, None] * coupling
+    pull = np.zeros_like(gradient)
+    pull[:-1] -= np.diff(change, axis=0)
+    pull[1:] += np.diff(change, axis=0)
+    gradient += pull @ turns
+    return blocks, -coupling, gradient
+
+
+def _rows(
+    problem: Problem, world: FloatArray, reach: FloatArray, ticks: slice
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Jacobians (T,6,n) and errors (T,6) in sigmas of every joint and camera."""
+    centres = world[:, problem.solved][..., :3, 3]
+    out = []
+    graph = _graph_error(problem, world, ticks)
+    for column, joint in enumerate(problem.solved):
+        jacobian = _jacobian(centres, world[:, joint, :3, 3], reach[joint])
+        out.append((jacobian / _GRAPH_SIGMA[:, None], graph[:, column] / _GRAPH_SIGMA))
+    for tracked in problem.cameras:
+        error, centre = _camera_error(tracked, world, ticks)
+        root_weight = _OUTLIER_SCALE / (_OUTLIER_SCALE + (error**2).sum(axis=1)) * tracked.found[ticks]
+        jacobian = _jacobian(centres, centre, reach[tracked.joint]) / _CAMERA_SIGMA[:, None]
+        out.append((jacobian * root_weight[:, None, None], error * root_weight[:, None]))
+    return out
+
+
+def _jacobian(centres: FloatArray, point: FloatArray, reach: FloatArray) -> FloatArray:
+    """Turn and shift (T,6,n) of a body point by the unknowns.
+
+    Args:
+        centres: (T,S,3) what the solved joints turn about.
+        point: (T,3) the point.
+        reach: (S,) one where a solved joint carries the point.
+    """
+    ticks, solved = centres.shape[:2]
+    out = np.zeros((ticks, 6, 3 + 3 * solved))
+    out[:, 3:, :3] = np.eye(3)
+    for column in np.flatnonzero(reach):
+        place = slice(3 + 3 * column, 6 + 3 * column)
+        out[:, :3, place] = np.eye(3)
+        x, y, z = (point - centres[:, column]).T
+        out[:, 3:, place] = np.stack([0 * x, z, -y, -z, 0 * x, x, y, -x, 0 * x], axis=1).reshape(-1, 3, 3)
+    return out
+
+
+def _solve_tridiagonal(
+    blocks: FloatArray, coupling: FloatArray, right: FloatArray, damping: float
+) -> FloatArray:
+    """Solve the block tridiagonal system by elimination forwards, substitution backwards."""
+    ticks, size = right.shape
+    diagonal = blocks.copy()
+    index = np.arange(size)
+    diagonal[:, index, index] *= 1.0 + damping
+    carried = np.empty_like(blocks)
+    out = np.empty_like(right)
+    for tick in range(ticks):
+        block, value = diagonal[tick], right[tick]
+        if tick:
+            block = block - coupling.T @ carried[tick - 1]
+            value = value - coupling.T @ out[tick - 1]
+        both = np.linalg.solve(block, np.column_stack([coupling, value]))
+        carried[tick], out[tick] = both[:, :-1], both[:, -1]
+    for tick in range(ticks - 2, -1, -1):
+        out[tick] -= carried[tick] @ out[tick + 1]
+    return out

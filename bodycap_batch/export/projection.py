@@ -1,0 +1,138 @@
+"""From the graph's bones, whose joints have slack, to a rigid skeleton that still meets the cameras.
+
+The exported motion moves by rotations and the root's travel alone. Both start from the graph's and are
+corrected by a short least-squares solve: meet the measured cameras, stay close to the graph, and let the
+correction change slowly over time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bodycap_batch.arrays import BoolArray, FloatArray
+from bodycap_batch.body import CameraClock, MergeResult
+from bodycap_batch.export.corrections import Correction, Problem, Tracked, solve_correction
+from bodycap_batch.geometry import invert, poses_at, rotation_angle_rad
+from bodycap_batch.skeleton import Motion, SkeletonModel, forward_kinematics
+
+_MAX_GAP_FRAMES = 1.6
+"""A measured pose is interpolated between neighbouring frames, never across a lost one."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Projection:
+    """A motion of the rigid skeleton, and how far it is from what it stands for.
+
+    Attributes:
+        motion: The rigid motion.
+        gap: JSON values: graph joints against its joints, measured cameras against its cameras.
+    """
+
+    motion: Motion
+    gap: Mapping[str, Any]
+
+
+def project_motion(merge: MergeResult, clocks: Mapping[str, CameraClock]) -> Projection:
+    """Project a merge result onto its own skeleton.
+
+    Args:
+        merge: The solved bones.
+        clocks: By camera name.
+
+    Returns:
+        The motion on the merge's timeline. Joints the graph did not solve keep their local rotations.
+    """
+    cameras = _tracked(merge, clocks)
+    solved = np.flatnonzero(merge.solved)
+    start = _start(merge.skeleton, merge.world_from_joint, merge.solved)
+    problem = Problem(
+        skeleton=merge.skeleton, solved=solved, world_from_joint=merge.world_from_joint, cameras=cameras
+    )
+    result = solve_correction(problem, start)
+    motion = Motion(
+        skeleton=merge.skeleton,
+        fps=merge.fps,
+        start_ns=merge.start_ns,
+        root_in_world_m=result.root,
+        local_rotation=result.local,
+        observed=merge.observed,
+    )
+    return Projection(motion=motion, gap=_gap(merge, motion, cameras))
+
+
+def _start(skeleton: SkeletonModel, world_from_joint: FloatArray, solved: BoolArray) -> Correction:
+    """The graph's rotations, and the root where the solved joints fit best."""
+    rotation = world_from_joint[..., :3, :3]
+    local = rotation.copy()
+    for joint in range(1, len(skeleton.joints)):
+        local[:, joint] = np.swapaxes(rotation[:, skeleton.parents[joint]], -1, -2) @ rotation[:, joint]
+    placed = forward_kinematics(skeleton, np.zeros((len(local), 3)), local)[..., :3, 3]
+    trusted = solved if solved.any() else np.ones(len(solved), dtype=bool)
+    root = (world_from_joint[:, trusted][..., :3, 3] - placed[:, trusted]).mean(axis=1)
+    return Correction(root=root, local=local)
+
+
+def _tracked(merge: MergeResult, clocks: Mapping[str, CameraClock]) -> tuple[Tracked, ...]:
+    """Each camera's measured poses at the ticks of the motion."""
+    out = []
+    mounts = {mount.camera: mount for mount in merge.mounts}
+    for trajectory in merge.trajectories:
+        kept = trajectory.localised
+        mount = mounts.get(trajectory.camera)
+        joint = None if mount is None else merge.skeleton.index_of_role(mount.role)
+        if mount is None or joint is None or not kept.any():
+            continue
+        times = clocks[trajectory.camera].common_times_ns(trajectory.times_ns)
+        interval = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+        poses, found = poses_at(
+            times[kept],
+            trajectory.gauge_from_cam[kept],
+            merge.times_ns(),
+            max_gap_ns=round(_MAX_GAP_FRAMES * interval),
+            snap_ns=1_000_000,
+        )
+        out.append(
+            Tracked(
+                camera=trajectory.camera,
+                joint=joint,
+                joint_from_cam=mount.joint_from_cam,
+                world_from_cam=poses,
+                found=found,
+            )
+        )
+    return tuple(out)
+
+
+def _gap(merge: MergeResult, motion: Motion, cameras: tuple[Tracked, ...]) -> dict[str, Any]:
+    """How far the exported motion is from the graph and from the cameras."""
+    exported = motion.world_from_joint()
+    out: dict[str, Any] = {}
+    if merge.solved.any():
+        graph, rigid = merge.world_from_joint[:, merge.solved], exported[:, merge.solved]
+        out["joints"] = _difference(graph, rigid)
+    out["cameras"] = {
+        tracked.camera: _difference(
+            tracked.world_from_cam[tracked.found],
+            exported[tracked.found, tracked.joint] @ tracked.joint_from_cam,
+        )
+        for tracked in cameras
+        if tracked.found.any()
+    }
+    return out
+
+
+def _difference(first: FloatArray, second: FloatArray) -> dict[str, float]:
+    """Median and 95th percentile of distance and angle between poses (...,4,4)."""
+    difference = invert(first) @ second
+    distance = np.linalg.norm(difference[..., :3, 3], axis=-1)
+    angle = np.rad2deg(rotation_angle_rad(difference[..., :3, :3]))
+    return {
+        "p50_m": float(np.percentile(distance, 50)),
+        "p95_m": float(np.percentile(distance, 95)),
+        "p50_deg": float(np.percentile(angle, 50)),
+        "p95_deg": float(np.percentile(angle, 95)),
+    }

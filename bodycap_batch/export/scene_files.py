@@ -1,0 +1,104 @@
+"""Files of the room and the cameras: PLY, TUM trajectories, COLMAP models."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.export.inputs import ExportInputs
+from bodycap_batch.export.placed import WORLD, PlacedMap, main_frame, place_maps, place_trajectories
+from bodycap_batch.formats.colmap import write_colmap_model
+from bodycap_batch.formats.ply import PointCloud, with_paths, write_ply
+from bodycap_batch.formats.tum import TimedPoses, write_tum
+from bodycap_batch.scene import Trajectory
+
+PATH_SPACING_M = 0.01
+_PATH_SPACING_SHARE = 1e-3
+"""In a map's own gauge: this share of its points' extent (a room of 10 m: 1 cm)."""
+
+
+def write_maps(inputs: ExportInputs) -> list[Path]:
+    """``map.ply`` in the results' frame; maps in other gauges as ``map_<n>.ply``.
+
+    Raises:
+        StoreError: A file cannot be written.
+    """
+    frame = main_frame(inputs)
+    written = []
+    groups: dict[str, list[PlacedMap]] = {}
+    for placed in place_maps(inputs):
+        groups.setdefault(placed.frame, []).append(placed)
+    for number, (name, members) in enumerate(groups.items()):
+        points = [_moved_points(member) for member in members]
+        cloud = PointCloud(
+            points=np.concatenate(points), colors=np.concatenate([member.scene.colors for member in members])
+        )
+        paths = {item.camera: _centres(item) for item in place_trajectories(inputs) if item.gauge == name}
+        spacing = PATH_SPACING_M if name == WORLD else _PATH_SPACING_SHARE * _extent(cloud.points)
+        file = inputs.out_dir / ("map.ply" if name == frame else f"map_{number}.ply")
+        write_ply(file, with_paths(cloud, paths, spacing) if paths else cloud)
+        written.append(file)
+    return written
+
+
+def write_trajectories(inputs: ExportInputs) -> list[Path]:
+    """One TUM file a camera, localised frames only, the camera's own timestamps.
+
+    A camera whose map merging could not place goes to ``trajectories/unplaced/``: its frame is not the
+    others'.
+
+    Raises:
+        StoreError: A file cannot be written.
+    """
+    frame = main_frame(inputs)
+    written = []
+    for trajectory in place_trajectories(inputs):
+        kept = trajectory.localised
+        folder = inputs.out_dir / "trajectories"
+        folder = folder if trajectory.gauge == frame or not kept.any() else folder / "unplaced"
+        file = folder / f"{trajectory.camera}.tum"
+        poses = TimedPoses(times_ns=trajectory.times_ns[kept], world_from_cam=trajectory.gauge_from_cam[kept])
+        write_tum(file, poses, _heading(trajectory))
+        written.append(file)
+    return written
+
+
+def _heading(trajectory: Trajectory) -> list[str]:
+    frame = "world_from_camera: metres, Z up, floor at z = 0"
+    if trajectory.gauge != WORLD:
+        frame = f"map_from_camera: gauge {trajectory.gauge}, its scale and axes are arbitrary"
+    return [f"camera {trajectory.camera}", frame, "timestamps: the camera's own clock, seconds"]
+
+
+def write_colmap(inputs: ExportInputs) -> list[Path]:
+    """One COLMAP model a map: ``colmap/0``, ``colmap/1`` ..., the world's first.
+
+    Raises:
+        StoreError: A file cannot be written.
+    """
+    numbers = {item.camera: item.frame_numbers for item in inputs.trajectories}
+    written: list[Path] = []
+    for index, placed in enumerate(place_maps(inputs)):
+        folder = inputs.out_dir / "colmap" / str(index)
+        written += write_colmap_model(folder, placed.scene, placed.target_from_map, numbers)
+    return written
+
+
+def _moved_points(placed: PlacedMap) -> FloatArray:
+    points = placed.scene.points
+    return points if placed.target_from_map is None else placed.target_from_map.apply(points)
+
+
+def _centres(trajectory: Trajectory) -> FloatArray:
+    """(N,3) camera centres, NaN where not localised."""
+    return np.asarray(trajectory.gauge_from_cam[:, :3, 3])
+
+
+def _extent(points: FloatArray) -> float:
+    """Size of the cloud without its farthest points, 1 for an empty one."""
+    if len(points) < 2:
+        return 1.0
+    low, high = np.percentile(points, [5, 95], axis=0)
+    return float(np.linalg.norm(high - low)) or 1.0

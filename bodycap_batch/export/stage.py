@@ -1,0 +1,72 @@
+"""The order of the files; figures come last, so that they stand for files that are there."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from bodycap_batch.config.options import ExportOptions
+from bodycap_batch.context import StageContext
+from bodycap_batch.export.inputs import ExportInputs
+from bodycap_batch.export.metrics import collect_metrics
+from bodycap_batch.export.motion import only_solved, write_motion
+from bodycap_batch.export.projection import project_motion
+from bodycap_batch.export.scene_files import write_colmap, write_maps, write_trajectories
+from bodycap_batch.export.tables import write_frames
+from bodycap_batch.formats.files import write_text
+from bodycap_batch.skeleton import Motion
+
+
+def export_results(inputs: ExportInputs, options: ExportOptions, context: StageContext) -> tuple[Path, ...]:
+    """Write a job's results into ``inputs.out_dir``, each file whole or not at all, and verify them.
+
+    ``map.ply``, ``trajectories/<camera>.tum``, ``colmap/<n>/``, ``frames.csv``, ``motion.bvh`` (as the
+    options ask) and always ``metrics.json``. Everything is in the world where there is one.
+
+    Args:
+        inputs: Maps, trajectories and the merged body.
+        options: Which files, and how the BVH is laid out.
+        context: Progress and cancelling.
+
+    Returns:
+        The files written, relative to the folder.
+
+    Raises:
+        StoreError: A file cannot be written, or read back it differs from what was meant.
+    """
+    motion, gap = _project(inputs, options)
+    steps: dict[str, Callable[[], list[Path]]] = {"tum": lambda: write_trajectories(inputs)}
+    if inputs.maps:
+        steps |= {"ply": lambda: write_maps(inputs), "colmap": lambda: write_colmap(inputs)}
+    steps["csv"] = lambda: [write_frames(inputs.out_dir / "frames.csv", inputs)]
+    if motion is not None:
+        steps["bvh"] = lambda: [write_motion(inputs.out_dir / "motion.bvh", motion, options)]
+    steps = {name: write for name, write in steps.items() if name in options.formats}
+    steps["metrics"] = lambda: [_write_metrics(inputs, motion, gap)]
+    written: list[Path] = []
+    for number, (name, write) in enumerate(steps.items()):
+        context.check_cancelled()
+        context.progress(number, len(steps), name)
+        written += write()
+    context.progress(len(steps), len(steps), "")
+    return tuple(path.relative_to(inputs.out_dir) for path in written)
+
+
+def _write_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[str, Any]) -> Path:
+    path = inputs.out_dir / "metrics.json"
+    metrics = collect_metrics(inputs, motion, gap)
+    write_text(path, json.dumps(metrics, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+    return path
+
+
+def _project(inputs: ExportInputs, options: ExportOptions) -> tuple[Motion | None, dict[str, Any]]:
+    """The motion to export and its distance from the graph; None without a body."""
+    if inputs.merge is None:
+        return None, {}
+    projection = project_motion(inputs.merge, inputs.clocks)
+    motion = projection.motion
+    if options.hierarchy == "solved":
+        motion = only_solved(motion, inputs.merge.solved)
+    return motion, dict(projection.gap)

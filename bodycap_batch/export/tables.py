@@ -1,0 +1,52 @@
+"""``frames.csv``: every frame of every camera, localised or not and why."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+
+from bodycap_batch.export.inputs import ExportInputs
+from bodycap_batch.export.placed import place_trajectories
+from bodycap_batch.formats.files import write_text
+from bodycap_batch.formats.tum import seconds_text
+from bodycap_batch.scene import FrameStatus
+
+COLUMNS = ("camera", "frame", "time", "common_time", "status", "reason", "inliers", "error")
+LOST = "LOST"
+
+
+def write_frames(path: Path, inputs: ExportInputs) -> Path:
+    """Write the table (times in seconds, error in pixels at the work size) and return its path.
+
+    `status` is KEYFRAME, REGISTERED or LOST; `reason` says why a frame is lost.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for trajectory in place_trajectories(inputs):
+        common = inputs.clocks[trajectory.camera].common_times_ns(trajectory.times_ns)
+        for index, status in enumerate(trajectory.status):
+            error = trajectory.error_px[index]
+            writer.writerow(
+                (
+                    trajectory.camera,
+                    int(trajectory.frame_numbers[index]),
+                    seconds_text(int(trajectory.times_ns[index])),
+                    seconds_text(int(common[index])),
+                    *_status(status),
+                    int(trajectory.inliers[index]),
+                    f"{error:.3f}" if np.isfinite(error) else "",
+                )
+            )
+    write_text(path, text.getvalue())
+    return path
+
+
+def _status(status: FrameStatus) -> tuple[str, str]:
+    return (status.value, "") if status.localised else (LOST, status.value)

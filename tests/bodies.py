@@ -1,0 +1,110 @@
+"""A moving body with cameras on it, as merging would hand it over: joints with slack, cameras with noise."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.body import CameraClock, MergeResult
+from bodycap_batch.geometry import Similarity, make_transform, so3_exp
+from bodycap_batch.scene import FrameStatus, Trajectory
+from bodycap_batch.skeleton import Motion, Mount, SkeletonModel
+from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount
+
+CAMERAS = {"torso": "Spine1", "left_palm": "LeftHand", "right_palm": "RightHand"}
+ARMS = ("Spine1", "LeftArm", "LeftForeArm", "LeftHand", "RightArm", "RightForeArm", "RightHand")
+
+
+def reaching(ticks: int = 60, skeleton: SkeletonModel | None = None) -> Motion:
+    """A body that walks forward (−Y), turns and swings its arms; its legs stay at rest."""
+    body = skeleton or load_skeleton("upper_body", 1.75)
+    time = np.arange(ticks) / 30.0
+    local = np.tile(np.eye(3), (ticks, len(body.joints), 1, 1))
+
+    def turn(role: str, *vector: FloatArray) -> None:
+        joint = body.index_of_role(role)
+        assert joint is not None
+        local[:, joint] = so3_exp(np.stack(np.broadcast_arrays(*vector), axis=1))
+
+    turn("Hips", 0 * time, 0 * time, 0.4 * time)
+    turn("Spine1", 0.1 * np.sin(3 * time), 0 * time, 0.2 * np.sin(2 * time))
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        turn(f"{side}Arm", 0.5 * np.sin(3 * time), sign * (1.1 + 0.1 * np.sin(time)), 0.2 * np.sin(4 * time))
+        turn(f"{side}ForeArm", 0 * time, 0 * time, -sign * (0.6 + 0.3 * np.sin(3 * time)))
+        turn(f"{side}Hand", 0.2 * np.sin(5 * time), 0 * time, 0 * time)
+    return Motion(
+        skeleton=body,
+        fps=30.0,
+        start_ns=5_000_000_000,
+        root_in_world_m=np.stack([0 * time, -1.1 * time, 0.93 + 0.02 * np.sin(9 * time)], axis=1),
+        local_rotation=local,
+        observed=np.zeros((ticks, len(body.joints)), dtype=bool),
+    )
+
+
+def trajectory_of(
+    motion: Motion, mount: Mount, rng: np.random.Generator, *, noise_m: float, lost: slice, offset_ns: int
+) -> Trajectory:
+    """The camera's measured path: noise of `noise_m` and the same in 0.3° per 5 mm, some frames lost."""
+    joint = motion.skeleton.index_of_role(mount.role)
+    poses = motion.world_from_joint()[:, joint] @ mount.joint_from_cam
+    count = len(poses)
+    turn = so3_exp(rng.normal(scale=np.deg2rad(0.3) * noise_m / 0.005, size=(count, 3)))
+    poses = poses @ make_transform(turn, rng.normal(scale=noise_m, size=(count, 3)))
+    status = [FrameStatus.REGISTERED] * count
+    status[lost] = [FrameStatus.BLUR] * len(status[lost])
+    kept = np.array([item.localised for item in status])
+    return Trajectory(
+        camera=mount.camera,
+        gauge="world",
+        frame_numbers=np.arange(count),
+        times_ns=motion.times_ns() - offset_ns,
+        gauge_from_cam=np.where(kept[:, None, None], poses, np.nan),
+        covariance=np.where(kept[:, None, None], np.eye(6) * 1e-4, np.nan),
+        status=tuple(status),
+        inliers=np.where(kept, 80, 3),
+        error_px=np.where(kept, 0.5, np.nan),
+    )
+
+
+def merged(
+    motion: Motion,
+    *,
+    slack_m: float = 0.004,
+    slack_rad: float = 0.01,
+    noise_m: float = 0.003,
+    offset_s: float = 0.0,
+    world_from_map: dict[str, Similarity] | None = None,
+) -> tuple[MergeResult, dict[str, CameraClock]]:
+    """What the skeleton stage would return for this motion, with slack in its joints."""
+    rng = np.random.default_rng(8)
+    body = motion.skeleton
+    solved = np.array([role in ARMS for role in body.roles])
+    graph = motion.world_from_joint()
+    shape = graph.shape[:2]
+    loose = make_transform(
+        so3_exp(rng.normal(scale=slack_rad, size=(*shape, 3))), rng.normal(scale=slack_m, size=(*shape, 3))
+    )
+    graph = np.where(solved[:, None, None], graph @ loose, graph)
+    mounts = tuple(nominal_mount(camera, role, body) for camera, role in CAMERAS.items())
+    paths = tuple(
+        trajectory_of(
+            motion, mount, rng, noise_m=noise_m, lost=slice(20, 25), offset_ns=round(offset_s * 1e9)
+        )
+        for mount in mounts
+    )
+    observed = np.array([role in CAMERAS.values() for role in body.roles])
+    result = MergeResult(
+        skeleton=body,
+        fps=motion.fps,
+        start_ns=motion.start_ns,
+        world_from_joint=graph,
+        solved=solved,
+        observed=np.tile(observed, (shape[0], 1)),
+        world_from_map=world_from_map or {},
+        trajectories=paths,
+        mounts=mounts,
+        unused_cameras={},
+        report={"scale": {"source": "height", "value": 1.75}, "floor": float("nan")},
+    )
+    return result, {camera: CameraClock(nominal_fps=30.0, offset_s=offset_s) for camera in CAMERAS}

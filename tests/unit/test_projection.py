@@ -1,0 +1,150 @@
+"""From loose bones to the rigid skeleton."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bodycap_batch.export.corrections import (
+    Correction,
+    Problem,
+    _cost,
+    _moved,
+    _normal_equations,
+    solve_correction,
+)
+from bodycap_batch.export.projection import project_motion
+from bodycap_batch.geometry import rotation_angle_rad
+from tests.bodies import merged, reaching
+
+
+def joint_error(motion_world: np.ndarray, true_world: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(motion_world[..., :3, 3] - true_world[..., :3, 3], axis=-1)
+
+
+def test_a_rigid_graph_stays_as_it_is() -> None:
+    truth = reaching()
+    result, clocks = merged(truth, slack_m=0.0, slack_rad=0.0, noise_m=0.0)
+    projection = project_motion(result, clocks)
+    assert joint_error(projection.motion.world_from_joint(), truth.world_from_joint()).max() < 1e-9
+    assert projection.gap["joints"]["p95_m"] < 1e-9
+    assert projection.gap["cameras"]["left_palm"]["p95_m"] < 1e-9
+
+
+def test_slack_is_taken_out_and_the_cameras_pull_towards_the_truth() -> None:
+    truth = reaching()
+    result, clocks = merged(truth)
+    projection = project_motion(result, clocks)
+    world, true = projection.motion.world_from_joint(), truth.world_from_joint()
+    loose = joint_error(result.world_from_joint, true)[:, result.solved].mean()
+    rigid = joint_error(world, true)[:, result.solved].mean()
+    # the graph's joints are off by 4 mm a coordinate, 6.4 mm in all; the cameras know better
+    assert rigid < 0.65 * loose
+    centres = world[..., :3, 3]
+    bones = np.linalg.norm(centres[:, 1:] - centres[:, truth.skeleton.parents[1:]], axis=-1)
+    np.testing.assert_allclose(
+        bones, np.broadcast_to(np.linalg.norm(truth.skeleton.offsets_m[1:], axis=1), bones.shape)
+    )
+    assert 0.003 < projection.gap["joints"]["p50_m"] < 0.012
+
+
+def test_joints_nothing_measures_keep_their_rotations() -> None:
+    truth = reaching()
+    result, clocks = merged(truth)
+    motion = project_motion(result, clocks).motion
+    for role in ("LeftUpLeg", "RightLeg", "Neck", "Head"):
+        joint = truth.skeleton.index_of_role(role)
+        assert joint is not None
+        expected = result.world_from_joint[:, truth.skeleton.parents[joint]]
+        local = np.swapaxes(expected[:, :3, :3], -1, -2) @ result.world_from_joint[:, joint, :3, :3]
+        np.testing.assert_allclose(motion.local_rotation[:, joint], local, atol=1e-12)
+        assert not motion.observed[:, joint].any()
+
+
+@pytest.mark.parametrize("wrong_by_s", [0.0, 0.24])
+def test_the_clock_offset_has_a_sign(wrong_by_s: float) -> None:
+    """Cameras 0.12 s off the common clock are met; with the sign flipped (0.24 s) they are missed."""
+    truth = reaching()
+    result, clocks = merged(truth, noise_m=0.0, slack_m=0.0, slack_rad=0.0, offset_s=0.12)
+    clocks = {name: replace(clock, offset_s=clock.offset_s - wrong_by_s) for name, clock in clocks.items()}
+    gap = project_motion(result, clocks).gap["cameras"]["torso"]["p50_m"]
+    # 1.1 m/s · 0.24 s = 26 cm
+    assert gap < 1e-9 if wrong_by_s == 0.0 else gap > 0.15
+
+
+def test_a_camera_far_off_does_not_drag_the_body() -> None:
+    truth = reaching()
+    result, clocks = merged(truth)
+    poses = result.trajectories[1].gauge_from_cam.copy()
+    poses[30:34, :3, 3] += 0.6
+    paths = (
+        result.trajectories[0],
+        replace(result.trajectories[1], gauge_from_cam=poses),
+        result.trajectories[2],
+    )
+    clean = project_motion(result, clocks).motion.world_from_joint()
+    pulled = project_motion(replace(result, trajectories=paths), clocks).motion.world_from_joint()
+    # 60 cm is 120 sigmas: what is left of it is below the noise
+    assert joint_error(pulled, clean).max() < 0.01
+
+
+def test_the_correction_does_not_jitter() -> None:
+    """White noise of the cameras must not become jitter of the body: a hand's second difference."""
+    truth = reaching(120)
+    result, clocks = merged(truth, slack_m=0.0, slack_rad=0.0, noise_m=0.005)
+    hand = truth.skeleton.index_of_role("LeftHand")
+    rough = np.diff(project_motion(result, clocks).motion.world_from_joint()[:, hand, :3, 3], n=2, axis=0)
+    smooth = np.diff(truth.world_from_joint()[:, hand, :3, 3], n=2, axis=0)
+    # white noise of 5 mm a coordinate has a second difference of 5 · √6 = 12 mm
+    assert np.std(rough - smooth) < 0.003
+
+
+def test_gradient_and_optimum() -> None:
+    """The analytic gradient is that of the cost, and no small step from the solution lowers it."""
+    truth = reaching(6)
+    result, clocks = merged(truth, noise_m=0.004)
+    problem = problem_of(result, clocks)
+    rotation = result.world_from_joint[..., :3, :3]
+    local = rotation.copy()
+    for joint in range(1, len(truth.skeleton.joints)):
+        local[:, joint] = np.swapaxes(rotation[:, truth.skeleton.parents[joint]], -1, -2) @ rotation[:, joint]
+    start = Correction(root=truth.root_in_world_m.copy(), local=local)
+    _, _, gradient = _normal_equations(problem, start, problem.reach())
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        step = rng.normal(size=gradient.shape)
+        change = _cost(problem, _moved(problem, start, 1e-6 * step)) - _cost(
+            problem, _moved(problem, start, -1e-6 * step)
+        )
+        # logarithms' own derivative is taken as the identity: errors here are up to 0.03 rad
+        assert change / 2e-6 == pytest.approx(2.0 * float((gradient * step).sum()), rel=0.03)
+    found = solve_correction(problem, start)
+    best = _cost(problem, found)
+    assert best < _cost(problem, start)
+    for _ in range(20):
+        step = 1e-3 * rng.normal(size=gradient.shape)
+        assert _cost(problem, _moved(problem, found, step)) > best
+
+
+def problem_of(result, clocks) -> Problem:  # type: ignore[no-untyped-def]
+    from bodycap_batch.export.projection import _tracked
+
+    return Problem(
+        skeleton=result.skeleton,
+        solved=np.flatnonzero(result.solved),
+        world_from_joint=result.world_from_joint,
+        cameras=_tracked(result, clocks),
+    )
+
+
+def test_no_camera_and_nothing_solved() -> None:
+    truth = reaching(3)
+    result, clocks = merged(truth, slack_m=0.0, slack_rad=0.0)
+    bare = replace(result, trajectories=(), mounts=(), solved=np.zeros(len(result.solved), dtype=bool))
+    projection = project_motion(bare, clocks)
+    turned = np.swapaxes(projection.motion.local_rotation, -1, -2) @ truth.local_rotation
+    assert rotation_angle_rad(turned).max() < 1e-9
+    assert joint_error(projection.motion.world_from_joint(), truth.world_from_joint()).max() < 1e-9
+    assert projection.gap == {"cameras": {}}
