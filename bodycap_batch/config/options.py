@@ -29,7 +29,9 @@ class MapOptions(Options):
     """Stage 2, the map."""
 
     features: int = Field(2048, ge=128, description="SIFT features a keyframe")
-    pairs: Literal["exhaustive"] = Field("exhaustive", description="which keyframe pairs are matched")
+    pairs: Literal["retrieval", "exhaustive"] = Field(
+        "retrieval", description="keyframe pairs to match: neighbours and look-alikes, or all"
+    )
     seed: int = Field(0, ge=0, description="seed of every random choice")
     min_coverage: float = Field(
         0.1, ge=0, le=1, description="share of keyframes below which the map is refused"

@@ -65,7 +65,7 @@ def build_map(
     add_keyframes(workspace, wanted, options, context)
     refs = [ImageRef(item.camera, int(frame)) for item in selections for frame in item.frames]
     scale = _scale(capture)
-    pairs = choose_pairs(refs, refs)
+    pairs = choose_pairs(workspace, refs, _common_ns(capture), options)
     match_pairs(workspace, pairs, options, context, scale)
     settings = mapper_options(options, _constant(capture, cameras), scale, context.threads)
     models, ladder = reconstruct(workspace, settings, context, len(refs))
@@ -115,7 +115,7 @@ def extend_map(
     ]
     add_keyframes(workspace, wanted, options, context)
     scale = _scale(capture)
-    pairs = choose_pairs([*known, *new], new)
+    pairs = choose_pairs(workspace, new, _common_ns(capture), options)
     match_pairs(workspace, pairs, options, context, scale)
     constant = _constant(capture, cameras)
     models = []
@@ -130,6 +130,10 @@ def extend_map(
     write_models(workspace, models)
     log = {"keyframes": len(known) + len(new), "new_keyframes": len(new), "pairs": len(pairs)}
     return _result(models, workspace, log)
+
+
+def _common_ns(capture: Capture) -> dict[str, IntArray]:
+    return {camera.name: camera.common_times_ns() for camera in capture.cameras}
 
 
 def _scale(capture: Capture) -> float:

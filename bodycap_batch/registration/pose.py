@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 _MIN_INLIER_RATIO = 0.3
 _MIN_NOISE_PX = 0.3
+_RAY_STEP = 1e-4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,7 +119,7 @@ def _covariance(camera: Camera, x_in_cam: FloatArray, residual: FloatArray, inli
     """Inverse of the Gauss–Newton information at the solution, scaled by the inliers' own spread.
 
     A right perturbation (rotation ω, translation v) of gauge_from_cam moves a point in the camera frame
-    by −ω × x − v. Pixels are taken as focal · x/z: distortion changes the scale of noise only a little.
+    by −ω × x − v.
     """
     x, y, z = x_in_cam[inlier].T
     zero = np.zeros_like(x)
@@ -126,10 +127,20 @@ def _covariance(camera: Camera, x_in_cam: FloatArray, residual: FloatArray, inli
     motion = np.concatenate([skew, np.broadcast_to(-np.eye(3), skew.shape)], axis=2)
     row_u = np.stack([1 / z, zero, -x / z**2], axis=1)
     row_v = np.stack([zero, 1 / z, -y / z**2], axis=1)
-    jacobian = camera.focal_px * np.stack([row_u, row_v], axis=1) @ motion
+    jacobian = _lens_jacobian(camera, x_in_cam[inlier]) @ np.stack([row_u, row_v], axis=1) @ motion
     information = np.einsum("nij,nik->jk", jacobian, jacobian)
     spread = 1.4826 * np.median(np.abs(residual[inlier]))
     noise_px = max(float(spread), _MIN_NOISE_PX)
     if np.linalg.matrix_rank(information) < 6:
         return np.asarray(np.eye(6) * np.inf)
     return np.asarray(np.linalg.inv(information) * noise_px**2)
+
+
+def _lens_jacobian(camera: Camera, x_in_cam: FloatArray) -> FloatArray:
+    """Derivative (N,2,2) of the pixel by the ray (x/z, y/z), by central differences."""
+    rays = x_in_cam[:, :2] / x_in_cam[:, 2:]
+    columns = []
+    for step in np.eye(2) * _RAY_STEP:
+        moved = [np.column_stack([rays + sign * step, np.ones(len(rays))]) for sign in (1.0, -1.0)]
+        columns.append((camera.project(moved[0]) - camera.project(moved[1])) / (2.0 * _RAY_STEP))
+    return np.stack(columns, axis=2)

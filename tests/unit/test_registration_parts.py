@@ -1,0 +1,108 @@
+"""Pose from points, its covariance, and where the map should grow."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodycap_batch.camera import Camera
+from bodycap_batch.geometry import invert, make_transform, so3_exp, so3_log
+from bodycap_batch.registration.growth import lost_runs, wanted_keyframes
+from bodycap_batch.registration.pose import PoseLimits, solve_pose
+from bodycap_batch.scene import FrameStatus
+
+CAMERA = Camera(
+    model="OPENCV",
+    width_px=640,
+    height_px=480,
+    params=np.array([420.0, 430.0, 322.0, 238.0, -0.2, 0.05, 1e-3, -5e-4]),
+)
+LIMITS = PoseLimits(max_error_px=2.5, min_inliers=15, max_sigma_depth=0.05)
+
+
+def _scene(rng: np.random.Generator, count: int, patch_px: float | None = None) -> tuple[np.ndarray, ...]:
+    """Points (N,3) in the gauge, their exact pixels and cam_from_gauge; depth 2 to 5."""
+    low, high = np.array([20.0, 20.0]), np.array([620.0, 460.0])
+    if patch_px is not None:
+        low, high = np.array([300.0, 200.0]), np.array([300.0, 200.0]) + patch_px
+    px = rng.uniform(low, high, (count, 2))
+    rays = CAMERA.unproject(px)
+    depth = rng.uniform(2.0, 5.0, (count, 1)) if patch_px is None else np.full((count, 1), 3.0)
+    x_in_cam = np.hstack([rays, np.ones((count, 1))]) * depth
+    cam_from_gauge = make_transform(so3_exp([0.3, -0.5, 0.2]), [0.4, -0.2, 1.0])
+    gauge_from_cam = invert(cam_from_gauge)
+    points = x_in_cam @ gauge_from_cam[:3, :3].T + gauge_from_cam[:3, 3]
+    return points, CAMERA.project(x_in_cam), gauge_from_cam
+
+
+def test_pose_survives_a_third_of_wrong_points() -> None:
+    rng = np.random.default_rng(0)
+    points, px, truth = _scene(rng, 120)
+    seen = px + rng.normal(0, 0.5, px.shape)
+    seen[:40] += rng.uniform(10, 60, (40, 2))
+    found = solve_pose(CAMERA, points, seen, LIMITS)
+    assert found.status is FrameStatus.REGISTERED
+    assert 75 <= found.inliers <= 82
+    assert found.gauge_from_cam is not None
+    # 80 inliers at 0.5 px and 420 px focal length: about 3.5 m · 0.5/420 · 3/√80 ≈ 1.4 mm.
+    assert np.linalg.norm(found.gauge_from_cam[:3, 3] - truth[:3, 3]) < 0.006
+
+
+def test_normalised_error_of_the_covariance_is_near_one() -> None:
+    errors = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        points, px, truth = _scene(rng, 80)
+        found = solve_pose(CAMERA, points, px + rng.normal(0, 0.5, px.shape), LIMITS)
+        assert found.gauge_from_cam is not None
+        assert found.covariance is not None
+        delta = invert(truth) @ found.gauge_from_cam
+        error = np.concatenate([so3_log(delta[:3, :3]), delta[:3, 3]])
+        errors.append(error @ np.linalg.solve(found.covariance, error) / 6)
+    # χ²(360)/360 lies in [0.86, 1.15] with 95 %; the noise is itself estimated from 80 points (± 10 %).
+    assert 0.7 < np.mean(errors) < 1.4
+
+
+def test_a_small_patch_of_perfect_inliers_is_refused() -> None:
+    rng = np.random.default_rng(1)
+    points, px, _ = _scene(rng, 25, patch_px=42.0)
+    found = solve_pose(CAMERA, points, px + rng.normal(0, 0.5, px.shape), LIMITS)
+    assert found.status is FrameStatus.UNCONSTRAINED
+    assert found.gauge_from_cam is None
+
+
+@pytest.mark.parametrize(("count", "status"), [(10, FrameStatus.FEW_TRACKS), (60, FrameStatus.FEW_INLIERS)])
+def test_too_little_evidence_names_its_reason(count: int, status: FrameStatus) -> None:
+    rng = np.random.default_rng(2)
+    points, px, _ = _scene(rng, count)
+    found = solve_pose(CAMERA, points, rng.permutation(px), LIMITS)
+    assert found.status is status
+    assert found.gauge_from_cam is None
+
+
+def test_lost_runs_are_maximal() -> None:
+    localised = np.array([0, 1, 1, 0, 0, 1, 0], dtype=bool)
+    assert lost_runs(localised) == [(0, 1), (3, 5), (6, 7)]
+    assert lost_runs(np.ones(4, dtype=bool)) == []
+
+
+def test_growth_takes_the_sharpest_lost_frames_and_the_ends_they_hang_on() -> None:
+    localised = np.ones(40, dtype=bool)
+    localised[10:16] = False
+    sharpness = np.ones(40)
+    sharpness[[11, 14]] = 2.0
+    wanted = wanted_keyframes(localised, sharpness, np.array([0, 39]))
+    assert wanted.tolist() == [9, 11, 14, 16]
+
+
+def test_growth_ends_once_every_lost_stretch_was_tried() -> None:
+    localised = np.ones(40, dtype=bool)
+    localised[10:16] = False
+    tried = np.array([0, 11, 14, 39])
+    assert len(wanted_keyframes(localised, np.ones(40), tried)) == 0
+
+
+def test_growth_is_bounded() -> None:
+    wanted = wanted_keyframes(np.zeros(3000, dtype=bool), np.ones(3000), np.arange(0, 3000, 50))
+    assert 20 <= len(wanted) <= 30
+    assert (np.diff(wanted) > 0).all()
