@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +68,6 @@ class StageRecord:
     reused: bool
     seconds: float
     peak_memory_mb: float
-    libraries: Mapping[str, str] = field(default_factory=dict)
 
 
 class Flow:
@@ -82,6 +81,7 @@ class Flow:
 
     def __init__(self, job: Job, settings: Settings, *, logs: Path) -> None:
         self.records: list[StageRecord] = []
+        self.libraries: dict[str, str] = {}
         self._job = job
         self._settings = settings
         self._abort = threading.Event()
@@ -252,6 +252,7 @@ class Flow:
 
     def _one(self, task: Task) -> Artefact:
         artefact, made = self._runner.run(task)
+        self.libraries.update(task.key.libraries)
         self.records.append(
             StageRecord(
                 stage=task.key.stage,
@@ -260,7 +261,6 @@ class Flow:
                 reused=not made,
                 seconds=float(artefact.made["seconds"]),
                 peak_memory_mb=float(artefact.made["peak_memory_mb"]),
-                libraries=task.key.libraries,
             )
         )
         return artefact

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import platform
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -39,11 +40,13 @@ class RunSummary:
         out_dir: Folder of the results.
         files: Their names, relative to it.
         stages: Every stage that went into them, executed or reused.
+        versions: Python, this program and the libraries that computed.
     """
 
     out_dir: Path
     files: tuple[str, ...]
     stages: tuple[StageRecord, ...]
+    versions: Mapping[str, str]
 
     @property
     def executed(self) -> int:
@@ -72,7 +75,9 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
         scene, registrations = flow.grow(scene, registrations, keyframes)
         merged, failure = _merge(job, flow, scene, registrations)
         exported = flow.export(keyframes, scene, registrations, merged, failure)
-    summary = RunSummary(out_dir=out_dir, files=_names(exported), stages=tuple(flow.records))
+    summary = RunSummary(
+        out_dir=out_dir, files=_names(exported), stages=tuple(flow.records), versions=_versions(flow)
+    )
     if failure is not None:
         _finish(job, exported, replace(summary, out_dir=out_dir / PARTIAL), settings)
         raise _with_partial_results(failure, out_dir / PARTIAL)
@@ -116,7 +121,7 @@ def _finish(job: Job, exported: Artefact, summary: RunSummary, settings: Setting
     write_results_file(out_dir, JOB_FILE, resolved)
     remove_outdated(out_dir, summary.files)
     record = {
-        "bodycap_batch": bodycap_batch.__version__,
+        "versions": dict(summary.versions),
         "threads": settings.threads,
         "seconds": round(sum(stage.seconds for stage in summary.stages), 3),
         "peak_memory_mb": max((stage.peak_memory_mb for stage in summary.stages), default=0.0),
@@ -124,6 +129,11 @@ def _finish(job: Job, exported: Artefact, summary: RunSummary, settings: Setting
         "files": list(summary.files),
     }
     write_results_file(out_dir, RUN_FILE, json.dumps(record, indent=1) + "\n")
+
+
+def _versions(flow: Flow) -> dict[str, str]:
+    own = {"bodycap_batch": bodycap_batch.__version__, "python": platform.python_version()}
+    return {**own, **dict(sorted(flow.libraries.items()))}
 
 
 def _with_partial_results(error: EstimationError, folder: Path) -> BodycapError:

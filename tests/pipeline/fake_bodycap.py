@@ -1,0 +1,16 @@
+"""The `bodycap` command with stand-in stages."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from pathlib import Path
+
+from bodycap_batch import pipeline
+from bodycap_batch.cli import main
+
+CHILD = (sys.executable, str(Path(__file__).with_name("fake_stages.py")))
+
+if __name__ == "__main__":
+    pipeline.Settings = functools.partial(pipeline.Settings, command=CHILD)  # type: ignore[assignment, misc]
+    main()

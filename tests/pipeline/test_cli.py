@@ -1,0 +1,283 @@
+"""The command line: messages, exit codes, progress, signals."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import bodycap_batch
+from bodycap_batch.cli import main
+from tests.pipeline.fake_stages import ORDERS
+
+ROOT = Path(__file__).parents[2]
+BODYCAP = (sys.executable, str(Path(__file__).with_name("fake_bodycap.py")))
+
+
+class Bench:
+    """A folder with two videos to run `bodycap` in."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.capture = folder / "my walk"
+        self.capture.mkdir()
+        for name in ("torso", "left_palm"):
+            (self.capture / f"{name}.mp4").write_text(f"frames of {name}")
+        self.environment = {**os.environ, "PYTHONPATH": str(ROOT), ORDERS: str(folder / "orders.json")}
+        self.environment.pop("BODYCAP_STORE", None)
+        self.order()
+
+    def order(self, **orders: Any) -> None:
+        started = str(self.folder / "started")
+        (self.folder / "orders.json").write_text(json.dumps({"started": started, **orders}))
+
+    def start(self, *arguments: str, **options: Any) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [*BODYCAP, *arguments],
+            cwd=self.folder,
+            env=self.environment,
+            text=True,
+            **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options},
+        )
+
+    def run(self, *arguments: str) -> tuple[int, str, str]:
+        process = self.start(*arguments)
+        out, err = process.communicate(timeout=60)
+        return process.returncode, out, err
+
+    def wait_until_started(self) -> int:
+        end = time.monotonic() + 30
+        while not (self.folder / "started").exists() or not (self.folder / "started").read_text():
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        return int((self.folder / "started").read_text())
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    return Bench(tmp_path)
+
+
+def gone(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+
+
+def test_a_folder_runs_without_a_job_and_the_last_line_names_the_results(bench: Bench) -> None:
+    code, out, err = bench.run("run", "my walk")
+    assert code == 0, err
+    results = bench.folder / "out" / "my_walk"
+    assert out.splitlines()[-1] == f"results: {results}"
+    assert (results / "metrics.json").is_file()
+    assert (bench.folder / "out" / ".store" / "artefacts").is_dir()
+    for line in ("keyframes torso: done", "map: started", "note: a note"):
+        assert line in err
+
+
+def test_the_second_run_says_that_nothing_had_to_be_done(bench: Bench) -> None:
+    bench.run("run", "my walk")
+    code, out, _ = bench.run("run", "my walk")
+    assert code == 0
+    assert "nothing to do, all 8 stages were done before" in out
+
+
+def test_results_elsewhere_have_their_store_beside_them(bench: Bench) -> None:
+    code, out, _ = bench.run("run", "my walk", "--out", "elsewhere", "--skeleton", "none")
+    assert code == 0
+    assert out.splitlines()[-1] == f"results: {bench.folder / 'elsewhere'}"
+    assert (bench.folder / "elsewhere" / ".store" / "artefacts").is_dir()
+    assert not (bench.folder / "out").exists()
+
+
+def test_the_store_can_be_named_by_option_or_variable(bench: Bench) -> None:
+    assert bench.run("run", "my walk", "--store", "kept")[0] == 0
+    bench.environment["BODYCAP_STORE"] = str(bench.folder / "kept")
+    assert "nothing to do" in bench.run("run", "my walk", "--out", "elsewhere")[1]
+
+
+def test_progress_for_machines_is_json_on_every_line(bench: Bench) -> None:
+    code, out, err = bench.run("run", "my walk", "--json-progress")
+    assert code == 0, err
+    events = [json.loads(line) for line in out.splitlines()]
+    assert {event["stage"] for event in events[:-1]} >= {"keyframes", "map", "merge", "export"}
+    assert events[-1]["kind"] == "done"
+    assert events[-1]["out_dir"] == str(bench.folder / "out" / "my_walk")
+
+
+def test_a_terminal_gets_bars(bench: Bench) -> None:
+    ours, theirs = pty.openpty()
+    bench.environment |= {"TERM": "xterm", "COLUMNS": "120"}
+    with bench.start("run", "my walk", stderr=theirs) as process:
+        os.close(theirs)
+        text = b""
+        while True:
+            try:
+                data = os.read(ours, 1 << 16)
+            except OSError:
+                break
+            if not data:
+                break
+            text += data
+        assert process.wait(60) == 0
+    assert b"keyframes torso" in text
+    assert b"\x1b[" in text
+    assert "━" in text.decode()
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_stops_the_children_and_the_next_run_goes_on(
+    bench: Bench, number: signal.Signals, code: int
+) -> None:
+    bench.order(hang="map")
+    process = bench.start("run", "my walk")
+    child = bench.wait_until_started()
+    process.send_signal(number)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == code
+    assert "stopped" in err
+    assert "Traceback" not in err
+    assert gone(child)
+    assert not (bench.folder / "out" / "my_walk" / "metrics.json").exists()
+    bench.order()
+    again, _, err = bench.run("run", "my walk")
+    assert again == 0, err
+    assert "keyframes torso: already done" in err
+
+
+def test_kill_9_at_any_stage_costs_that_stage_only(bench: Bench) -> None:
+    reference = Bench(_made(bench.folder / "reference"))
+    reference.run("run", "my walk")
+    expected = _results(reference.folder / "out" / "my_walk")
+    for stage in ("keyframes", "export"):
+        (bench.folder / "started").unlink(missing_ok=True)
+        bench.order(hang=stage)
+        process = bench.start("run", "my walk", stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        child = bench.wait_until_started()
+        process.kill()
+        process.wait()
+        os.kill(child, signal.SIGKILL)
+    bench.order()
+    code, _, err = bench.run("run", "my walk")
+    assert code == 0, err
+    for done in ("check", "map", "merge"):
+        assert f"{done}: already done" in err
+    assert _results(bench.folder / "out" / "my_walk") == expected
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+def _results(folder: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and "logs" not in path.parts and path.name not in ("run.json", "job.yaml")
+    }
+
+
+def test_no_answer_from_the_data_is_exit_code_4_with_partial_results(bench: Bench) -> None:
+    bench.order(fail="merge")
+    code, _, err = bench.run("run", "my walk")
+    assert code == 4
+    assert "merge does not work out" in err
+    assert "hint: film more" in err
+    assert (bench.folder / "out" / "my_walk" / "partial" / "metrics.json").is_file()
+
+
+def test_a_bug_is_exit_code_70_with_a_traceback_and_what_to_report(bench: Bench) -> None:
+    (bench.folder / "orders.json").write_text("no JSON")
+    code, _, err = bench.run("run", "my walk")
+    assert code == 70
+    assert "Traceback" in err
+    assert "please report" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["run"], 2, "Missing argument"),
+        (["fly"], 2, "No such command"),
+        (["run", "nothing.yaml"], 2, "nothing.yaml"),
+        (["run", "{folder}", "--height", "175"], 2, "height"),
+        (["run", "{folder}", "--skeleton", "centaur"], 2, "centaur"),
+        (["run", "{folder}", "--threads", "0"], 2, "threads"),
+        (["run", "{empty}"], 3, "no video"),
+        (["check", "{empty}"], 3, "no video"),
+        (["synth", "{empty}/new", "--set", "fog=1"], 2, "fog"),
+        (["synth", "{empty}/new", "--set", "noise"], 2, "KEY=VALUE"),
+        (["synth", "{empty}/new", "--size", "big"], 2, "640x480"),
+        (["evaluate", "{folder}", "{empty}"], 2, "compared"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_what_the_user_typed_wrong_is_named(
+    bench: Bench, capfd: pytest.CaptureFixture[str], arguments: list[str], code: int, words: str
+) -> None:
+    (bench.folder / "empty").mkdir()
+    places = {"folder": str(bench.capture), "empty": str(bench.folder / "empty")}
+    assert main([part.format(**places) for part in arguments]) == code
+    captured = capfd.readouterr()
+    assert words in captured.err + captured.out
+    assert "Traceback" not in captured.err
+
+
+def test_an_unwritable_place_for_results_is_named(bench: Bench) -> None:
+    (bench.folder / "out").write_text("a file")
+    code, _, err = bench.run("run", "my walk")
+    assert code == 5
+    assert str(bench.folder / "out") in err
+    assert "hint:" in err
+
+
+def test_the_version_is_told(capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capfd.readouterr().out.strip() == f"bodycap {bodycap_batch.__version__}"
+
+
+@pytest.mark.parametrize("command", ["run", "check", "evaluate", "synth"])
+def test_every_command_has_help_with_an_example(command: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--help"]) == 0
+    text = capfd.readouterr().out
+    assert f"  bodycap {command} " in text
+    assert "[default" not in text.split("Options:")[0]
+
+
+def _write_tum(path: Path, centres: np.ndarray) -> None:
+    rows = [f"{0.1 * i} {x} {y} {z} 0 0 0 1" for i, (x, y, z) in enumerate(centres)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(rows) + "\n")
+
+
+def test_evaluate_aligns_all_cameras_together_and_counts_lost_frames(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(3)
+    for name in ("torso", "left_palm"):
+        centres = rng.normal(size=(50, 3))
+        _write_tum(tmp_path / "gt" / f"{name}.tum", centres)
+        _write_tum(tmp_path / "mine" / "trajectories" / f"{name}.tum", 2.0 * centres + 1.0)
+    rows = [f"{name},{i}" for name in ("torso", "left_palm") for i in range(100)]
+    (tmp_path / "mine" / "frames.csv").write_text("\n".join(["camera,frame", *rows]) + "\n")
+    assert main(["evaluate", str(tmp_path / "mine"), str(tmp_path), "--json"]) == 0
+    report = json.loads(capfd.readouterr().out)["trajectories"]
+    assert report["scale"] == pytest.approx(0.5, abs=1e-9)
+    assert report["total"]["ate_m"]["rmse"] == pytest.approx(0.0, abs=1e-9)
+    assert report["total"]["coverage"] == 0.5
+    assert main(["evaluate", str(tmp_path / "mine"), str(tmp_path), "--reference", "torso"]) == 0
+    text = capfd.readouterr().out
+    assert "left_palm from torso: 50 frames" in text
+    assert "50.0%" in text
