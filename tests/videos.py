@@ -31,8 +31,10 @@ def write_video(
     pix_fmt: str = "yuv420p",
     metadata: dict[str, str] | None = None,
     bframes: bool = True,
+    codec: str = "libx264",
+    ticks: int = 10,
 ) -> Path:
-    """Encode grey (H,W) or RGB (H,W,3) images; `pts` in units of 1/(10·fps) s.
+    """Encode grey (H,W) or RGB (H,W,3) images; `pts` in units of 1/(ticks·fps) s.
 
     Args:
         rotation: Counter-clockwise degrees a player turns the stored frames by.
@@ -40,17 +42,21 @@ def write_video(
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         container.metadata.update(metadata or {})
-        options = {"crf": "8", "preset": "ultrafast", "g": str(gop), "bf": "2" if bframes else "0"}
-        stream = container.add_stream("libx264", rate=fps, options=options)
+        options = (
+            {}
+            if codec != "libx264"
+            else {"crf": "8", "preset": "ultrafast", "g": str(gop), "bf": "2" if bframes else "0"}
+        )
+        stream = container.add_stream(codec, rate=fps, options=options)
         stream.height, stream.width = frames[0].shape[:2]
         stream.pix_fmt = pix_fmt
-        stream.time_base = stream.codec_context.time_base = Fraction(1, 10 * fps)
+        stream.time_base = stream.codec_context.time_base = Fraction(1, ticks * fps)
         if rotation:
             stream.set_display_rotation(rotation)
         for index, image in enumerate(frames):
             frame = av.VideoFrame.from_ndarray(image, format="gray" if image.ndim == 2 else "rgb24")
-            frame.pts = 10 * index if pts is None else pts[index]
-            frame.time_base = Fraction(1, 10 * fps)
+            frame.pts = ticks * index if pts is None else pts[index]
+            frame.time_base = Fraction(1, ticks * fps)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
     return path

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from bodycap_batch.arrays import FloatArray, IntArray, set_array
 from bodycap_batch.camera import Camera
+from bodycap_batch.capture.decoding import decode_frames
 from bodycap_batch.capture.prefetch import prefetched
 from bodycap_batch.capture.video import VideoFile, turn_upright
 
@@ -118,7 +119,7 @@ class CaptureCamera:
             numbers = self.frame_numbers[indices] - first
             inside = (numbers >= 0) & (numbers < len(video.pts))
             mine = indices[inside]
-            for index, (_, frame) in zip(mine, video.decode(numbers[inside]), strict=True):
+            for index, (_, frame) in zip(mine, decode_frames(video, numbers[inside]), strict=True):
                 image = _rgb(frame) if colour else _grey(frame)
                 yield int(index), _resized(image, video, size)
             first += len(video.pts)

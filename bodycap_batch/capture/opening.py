@@ -7,8 +7,9 @@ import numpy as np
 from bodycap_batch.arrays import BoolArray, IntArray
 from bodycap_batch.camera import Camera, without_single_focal
 from bodycap_batch.capture.cameras import Capture, CaptureCamera
+from bodycap_batch.capture.indexing import index_video
 from bodycap_batch.capture.timeline import join_chapters
-from bodycap_batch.capture.video import VideoFile, index_video
+from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.config.calibration import Calibration
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.errors import CaptureError

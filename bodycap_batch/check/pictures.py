@@ -50,12 +50,13 @@ def look_at_frames(camera: CaptureCamera) -> list[str]:
 
 
 def sample_indices(camera: CaptureCamera, count: int) -> IntArray:
-    """Evenly spread frames, moved to the nearest one that decodes without its neighbours."""
-    frames = len(camera.frame_numbers)
-    even = np.unique(np.linspace(0, frames - 1, min(count, frames)).round().astype(np.int64))
+    """Evenly spread frames that decode without their neighbours, the first and, if near one, the last."""
+    last = len(camera.frame_numbers) - 1
+    even = np.unique(np.linspace(0, last, min(count, last + 1)).round().astype(np.int64))
     keys = camera.key_indices()
-    if len(keys) < len(even):
-        # Few key frames: other samples cost a stretch of decoding, so only the end is added to them.
-        latest = int(keys[-1]) if len(keys) else 0
-        return np.unique(np.append(keys, [0, min(frames - 1, latest + _STRETCH)]))
-    return np.unique(keys[np.abs(keys[None] - even[:, None]).argmin(axis=1)])
+    if not len(keys):
+        return even[:1]
+    picked = keys[np.abs(keys[None] - even[:, None]).argmin(axis=1)]
+    # The end is where a broken recording shows; without a key frame near it, it costs too much.
+    end = min(last, int(keys[-1]) + _STRETCH)
+    return np.unique(np.append(picked, [0, end]))

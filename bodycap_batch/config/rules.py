@@ -28,11 +28,12 @@ def problems_in(job: Job) -> list[Problem]:
 
 
 def skeleton_of(job: Job) -> str:
-    """The skeleton a job means: what it says; else none for one camera without a mount."""
+    """The skeleton a job means: what it says; else none where all cameras ride on one bone."""
     if job.skeleton is not None:
         return job.skeleton
-    cameras = job.capture.cameras
-    return NO_SKELETON if len(cameras) == 1 and cameras[0].role is None else "upper_body"
+    roles = {camera.role for camera in job.capture.cameras}
+    alone = len(job.capture.cameras) == 1 or (len(roles) == 1 and None not in roles)
+    return NO_SKELETON if alone else "upper_body"
 
 
 def _camera_names(job: Job, index: int) -> Iterator[Problem]:
@@ -100,6 +101,13 @@ def _skeleton(job: Job) -> Iterator[Problem]:
     if value is not None and value not in SKELETON_PRESETS and not value.lower().endswith(".bvh"):
         hint = _nearest(value, SKELETON_PRESETS)
         yield Problem(("skeleton",), f"unknown skeleton {value!r}", f"{hint}; or the path of a .bvh file")
+    roles = {camera.role for camera in job.capture.cameras}
+    if skeleton_of(job) != NO_SKELETON and len(roles) == 1 and None not in roles:
+        yield Problem(
+            ("skeleton",),
+            f"every camera rides on {roles.pop()}; a body's motion takes cameras on two bones or more",
+            "`skeleton: none` gives the cameras' path and the map",
+        )
 
 
 def _times(job: Job) -> Iterator[Problem]:

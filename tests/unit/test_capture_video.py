@@ -6,12 +6,14 @@ import threading
 from fractions import Fraction
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
-from bodycap_batch.capture import CaptureCamera, open_camera
+from bodycap_batch.capture import CaptureCamera, decoding, open_camera
+from bodycap_batch.capture.indexing import index_video
 from bodycap_batch.capture.prefetch import prefetched
-from bodycap_batch.capture.video import VideoFile, index_video, turn_upright
+from bodycap_batch.capture.video import turn_upright
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from tests.videos import textured_frame, write_video
 
@@ -55,18 +57,16 @@ def test_random_reads_equal_the_stream(tmp_path: Path) -> None:
 
 def test_a_far_read_skips_what_lies_between(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     video = index_video(write_video(tmp_path / "a.mp4", FRAMES, gop=8, bframes=False))
-    from bodycap_batch.capture import video as module
+    sought: list[int] = []
+    original = decoding._Cursor._seek
 
-    starts: list[int] = []
-    original = module._frames_from
+    def counted(self: decoding._Cursor, index: int) -> None:
+        sought.append(index)
+        original(self, index)
 
-    def counted(file: VideoFile, container: object, index: int) -> object:
-        starts.append(index)
-        return original(file, container, index)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(module, "_frames_from", counted)
-    assert [i for i, _ in video.decode(np.array([1, 2, 5, 33, 39]))] == [1, 2, 5, 33, 39]
-    assert starts == [0, 32]
+    monkeypatch.setattr(decoding._Cursor, "_seek", counted)
+    assert [i for i, _ in decoding.decode_frames(video, np.array([1, 2, 5, 33, 39]))] == [1, 2, 5, 33, 39]
+    assert sought == [32]
 
 
 @pytest.mark.parametrize(("rotation", "turns"), [(0, 0), (90, 1), (180, 2), (-90, 3)])
@@ -140,3 +140,58 @@ def test_an_error_ahead_arrives_in_its_place() -> None:
     assert [next(stream), next(stream)] == [1, 2]
     with pytest.raises(KeyError, match="third"):
         next(stream)
+
+
+def remuxed(source: Path, target: Path, shift: int = 0, skip: int = 0, **options: str) -> Path:
+    """Copy packets into another container, moved by `shift` time units and without the first `skip`."""
+    with av.open(str(source)) as old, av.open(str(target), "w", options=options) as new:
+        stream = new.add_stream_from_template(old.streams.video[0])
+        for number, packet in enumerate(old.demux(video=0)):
+            if packet.dts is not None and number >= skip:
+                packet.pts, packet.dts = (packet.pts or 0) + shift, packet.dts + shift
+                packet.stream = stream
+                new.mux(packet)
+    return target
+
+
+@pytest.mark.parametrize(
+    ("suffix", "codec", "ticks"),
+    [
+        ("avi", "libx264", 1),
+        ("avi", "mjpeg", 10),  # nine empty packets between frames, as for frames a webcam dropped
+        ("avi", "mjpeg", 1),
+        ("mkv", "libx264", 10),
+        ("ts", "libx264", 10),
+        ("mov", "libx264", 10),
+        ("mpg", "mpeg2video", 1),
+    ],
+)
+def test_containers(tmp_path: Path, suffix: str, codec: str, ticks: int) -> None:
+    pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+    path = write_video(tmp_path / f"a.{suffix}", FRAMES, codec=codec, ticks=ticks, pix_fmt=pix_fmt)
+    camera = opened(path)
+    stream = dict(camera.grey_frames())
+    assert list(stream) == list(range(40))
+    # Matroska keeps milliseconds.
+    assert np.abs(np.diff(camera.times_ns) - 1e9 / 30).max() <= 1.1e6
+    if codec == "libx264":  # the others blur levels
+        assert [shown_index(image) for image in stream.values()] == list(range(40))
+    for wanted in ([39], [5, 20, 38]):
+        assert all(np.array_equal(image, stream[k]) for k, image in camera.read(wanted))
+
+
+def test_a_video_trimmed_by_its_edit_list(tmp_path: Path) -> None:
+    source = write_video(tmp_path / "a.mp4", FRAMES, gop=10)
+    # 13 of 40 frames lie before the start of the shown part (640 units a frame).
+    camera = opened(remuxed(source, tmp_path / "trimmed.mp4", shift=-13 * 640, avoid_negative_ts="disabled"))
+    assert camera.times_ns[0] == 0
+    assert [shown_index(image) for _, image in camera.grey_frames()] == list(range(13, 40))
+    assert [shown_index(image) for _, image in camera.read([0, 26])] == [13, 39]
+
+
+@pytest.mark.parametrize("suffix", ["mkv", "ts"])
+def test_a_stream_cut_inside_a_group_starts_where_it_decodes(tmp_path: Path, suffix: str) -> None:
+    source = write_video(tmp_path / "a.mp4", FRAMES, gop=10)
+    camera = opened(remuxed(source, tmp_path / f"cut.{suffix}", shift=20 * 640, skip=3))
+    assert [shown_index(image) for _, image in camera.grey_frames()] == list(range(10, 40))
+    assert camera.frame_numbers[0] == 0

@@ -121,11 +121,13 @@ def test_room_on_the_disk(walk: Path, tmp_path: Path, monkeypatch: pytest.Monkey
     assert "--out" in str(report.errors[0].hint)
 
 
-def test_samples_are_key_frames_where_there_are_enough(tmp_path: Path) -> None:
+def test_samples_are_key_frames_and_the_end(tmp_path: Path) -> None:
     write_video(tmp_path / "torso.mp4", FRAMES, gop=5, bframes=False)
     write_video(tmp_path / "head.mp4", FRAMES, gop=1000, bframes=False)
     capture = open_capture(load_job(tmp_path).capture)
-    assert (sample_indices(capture.camera("torso"), 8) % 5 == 0).all()
+    samples = sample_indices(capture.camera("torso"), 8)
+    assert (samples[:-1] % 5 == 0).all()
+    assert (len(samples), samples[-1]) == (9, 74)
     assert sample_indices(capture.camera("head"), 8).tolist() == [0, 74]
 
 

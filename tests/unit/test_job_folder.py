@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bodycap_batch.config.job import load_job
+from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import SKELETON_PRESETS
 from bodycap_batch.config.mounts import MOUNT_NAMES, ROLES, mount_of, role_of_segment
 from bodycap_batch.errors import CaptureError, JobError
@@ -93,8 +93,14 @@ def test_a_single_camera_may_have_any_name(tmp_path: Path) -> None:
     assert job.capture.cameras[0].calibration == "auto"
 
 
-def test_a_single_camera_with_a_mounts_name_has_a_body(tmp_path: Path) -> None:
-    assert load_job(folder(tmp_path, "head.mp4")).skeleton == "upper_body"
+def test_cameras_on_one_bone_make_no_body(tmp_path: Path) -> None:
+    root = folder(tmp_path, "head.mp4")
+    assert load_job(root).skeleton == "none"
+    assert load_job(folder(tmp_path, "head_back.mp4")).skeleton == "none"
+    with pytest.raises(JobError, match="two bones") as caught:
+        load_job(root, Overrides(skeleton="upper_body"))
+    assert "skeleton: none" in str(caught.value.hint)
+    assert load_job(folder(tmp_path, "torso.mp4")).skeleton == "upper_body"
 
 
 def test_a_name_is_asked_for_instead_of_guessed(tmp_path: Path) -> None:

@@ -1,0 +1,127 @@
+"""Decode frames of a video by index, seeking over what is not wanted."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bodycap_batch.arrays import IntArray
+from bodycap_batch.capture.video import COPY_AGAIN, VideoFile, open_container, reason_of
+from bodycap_batch.errors import CaptureError
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+    from av.video.frame import VideoFrame
+    from av.video.stream import VideoStream
+
+
+def decode_frames(video: VideoFile, indices: IntArray) -> Iterator[tuple[int, VideoFrame]]:
+    """Decode the frames with these increasing indices.
+
+    Raises:
+        CaptureError: A frame cannot be decoded.
+    """
+    import av
+
+    cursor = _Cursor(video)
+    try:
+        for wanted in map(int, indices):
+            frame = cursor.advance(wanted)
+            if frame is None and cursor.sought:
+                # Some containers seek badly (MPEG program streams): the plain way, from the start.
+                cursor.close()
+                cursor = _Cursor(video, seek=False)
+                frame = cursor.advance(wanted)
+            if frame is None:
+                raise _lost(video, wanted)
+            yield wanted, frame
+    except av.error.FFmpegError as error:
+        raise CaptureError(
+            f"decoding fails after frame {cursor.position} ({reason_of(error)})",
+            path=video.path,
+            hint=COPY_AGAIN,
+        ) from error
+    finally:
+        cursor.close()
+
+
+def first_frame(video: VideoFile) -> tuple[VideoFrame, bool]:
+    """The first frame that decodes, and whether the codec reorders frames.
+
+    Raises:
+        CaptureError: There is none.
+    """
+    import av
+
+    with open_container(video.path) as container:
+        stream = _video_stream(container)
+        try:
+            for frame in container.decode(stream):
+                return frame, bool(stream.codec_context.has_b_frames)
+        except av.error.FFmpegError as error:
+            raise CaptureError(
+                f"no frame of it can be decoded ({reason_of(error)})", path=video.path, hint=COPY_AGAIN
+            ) from error
+    raise CaptureError("no frame of it can be decoded", path=video.path, hint=COPY_AGAIN)
+
+
+def _video_stream(container: InputContainer) -> VideoStream:
+    stream = container.streams.video[0]
+    stream.thread_type = "AUTO"
+    # The process's thread budget, where one is set; all processors otherwise.
+    stream.codec_context.thread_count = int(os.environ.get("OMP_NUM_THREADS", "0") or 0)
+    return stream
+
+
+class _Cursor:
+    """A decoder's place in a video, moving forwards only."""
+
+    def __init__(self, video: VideoFile, *, seek: bool = True) -> None:
+        self.position = -1  # index of the last decoded frame, −1 before the first
+        self.sought = False
+        self._video = video
+        self._may_seek = seek and not video.counted
+        self._container = open_container(video.path)
+        self._stream = _video_stream(self._container)
+        self._frames: Iterator[VideoFrame] = self._container.decode(self._stream)
+        self._key_index = np.searchsorted(video.pts, video.key_pts)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._container.close()
+
+    def advance(self, wanted: int) -> VideoFrame | None:
+        """Decode up to a frame; None where it does not come."""
+        if self._may_seek:
+            keys = self._key_index[: int(np.searchsorted(self._key_index, wanted, side="right"))]
+            if len(keys) and keys[-1] > self.position + 1:
+                self._seek(int(keys[-1]))
+        for frame in self._frames:
+            if self._video.counted:
+                self.position += 1
+            else:
+                if frame.pts is None:
+                    continue
+                self.position = int(np.searchsorted(self._video.pts, frame.pts))
+            if self.position >= wanted:
+                exact = self._video.counted or frame.pts == self._video.pts[wanted]
+                return frame if exact and self.position == wanted else None
+        return None
+
+    def _seek(self, index: int) -> None:
+        """Go to a key frame, or to an earlier one where the container cannot do better."""
+        self._container.seek(int(self._video.pts[index]), stream=self._stream, backward=True)
+        self._frames = self._container.decode(self._stream)
+        self.sought = True
+
+
+def _lost(video: VideoFile, index: int) -> CaptureError:
+    seconds = float((int(video.pts[index]) - int(video.pts[0])) * video.time_base)
+    return CaptureError(
+        f"frame {index} (at {seconds:.2f} s) cannot be decoded",
+        path=video.path,
+        hint="re-encode it (ffmpeg -i in.mp4 -fps_mode passthrough out.mp4), or cut before it with end_s",
+    )

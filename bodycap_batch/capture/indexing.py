@@ -1,0 +1,128 @@
+"""List a video's frames without decoding them."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import replace
+from datetime import UTC, datetime
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bodycap_batch.arrays import IntArray
+from bodycap_batch.capture.decoding import first_frame
+from bodycap_batch.capture.video import COPY_AGAIN, VideoFile, open_container, orientation_of, reason_of
+from bodycap_batch.errors import CaptureError
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+
+
+def index_video(path: Path) -> VideoFile:
+    """List a video's frames without decoding them (one frame is decoded, for its orientation).
+
+    Raises:
+        CaptureError: No video stream, no frames, or the file ends before its index says.
+    """
+    with open_container(path) as container:
+        if not container.streams.video:
+            what = "no video in it, sound only" if container.streams.audio else "the video holds no frame"
+            raise CaptureError(what, path=path, hint="give the file that holds the camera's pictures")
+        stream = container.streams.video[0]
+        container_format = container.format.name
+        # MP4 lists every packet it should hold; looked at before reading adds to the list.
+        listed = len(stream.index_entries) if "mp4" in container_format else 0
+        pts, key_pts, end = _scan_packets(path, container, stream, listed)
+        metadata = {**container.metadata, **stream.metadata}
+        time_base, rate = Fraction(stream.time_base or 0), stream.average_rate or stream.guessed_rate
+    video = VideoFile(
+        path=path,
+        pts=pts,
+        key_pts=key_pts,
+        time_base=time_base,
+        fps=_nominal_fps(pts, time_base, rate),
+        duration_ns=round((end - int(pts[0])) * time_base * 1_000_000_000),
+        stored_size=(0, 0),
+        orientation=((1, 0), (0, 1)),
+        created_s=_creation_time(metadata),
+        focal_35mm=_focal_35mm(metadata),
+    )
+    return _with_first_frame(video, container_format)
+
+
+def _scan_packets(
+    path: Path, container: InputContainer, stream: Any, listed: int
+) -> tuple[IntArray, IntArray, int]:
+    """Timestamps of all frames, of those decoding can start from, and the end of the last one."""
+    import av
+
+    pts: list[int] = []
+    key: list[int] = []
+    read, end = 0, 0
+    try:
+        for packet in container.demux(stream):
+            read += packet.size > 0
+            if packet.pts is None or packet.is_discard or packet.size == 0:
+                continue
+            pts.append(packet.pts)
+            end = max(end, packet.pts + (packet.duration or 0))
+            if packet.is_keyframe:
+                key.append(packet.pts)
+    except av.error.FFmpegError as error:
+        raise CaptureError(
+            f"the video breaks off after {len(pts)} frames ({reason_of(error)})", path=path, hint=COPY_AGAIN
+        ) from error
+    if read < listed:
+        message = f"the video is cut short: {read} of the {listed} frames its index lists"
+        raise CaptureError(message, path=path, hint=COPY_AGAIN)
+    if not pts:
+        raise CaptureError("the video holds no frame", path=path, hint=COPY_AGAIN)
+    shown = np.unique(np.array(pts, dtype=np.int64))
+    if len(shown) > 1 and end <= int(shown[-1]):
+        end = int(shown[-1]) + int(np.median(np.diff(shown)))
+    return shown, np.unique(np.array(key, dtype=np.int64)), end
+
+
+def _nominal_fps(pts: IntArray, time_base: Fraction, rate: Fraction | None) -> float:
+    """The container's rate, or the median frame distance where it states none."""
+    if rate:
+        return float(rate)
+    steps = np.diff(pts)
+    return float(1 / (int(np.median(steps)) * time_base)) if len(steps) else 0.0
+
+
+def _creation_time(metadata: dict[str, str]) -> float | None:
+    """Creation time as Unix seconds, None where absent or the epoch of an unset clock."""
+    text = metadata.get("creation_time", "")
+    try:
+        stamp = datetime.fromisoformat(text.replace("Z", "+00:00"))
+    except ValueError:
+        return None
+    if stamp.tzinfo is None:
+        stamp = stamp.replace(tzinfo=UTC)
+    return stamp.timestamp() if stamp.year > 1980 else None
+
+
+def _focal_35mm(metadata: dict[str, str]) -> float | None:
+    """35 mm equivalent focal length that phones write, None where absent."""
+    for key, text in metadata.items():
+        if key.lower().endswith("focal_length.35mm_equivalent"):
+            with contextlib.suppress(ValueError):
+                value = float(text)
+                return value if 5.0 < value < 300.0 else None
+    return None
+
+
+def _with_first_frame(video: VideoFile, container_format: str) -> VideoFile:
+    """Decode one frame: the size and display matrix a decoder delivers are the ones that count.
+
+    Frames before the first that decodes (a stream cut inside a group of pictures) are left out.
+    """
+    frame, reordered = first_frame(video)
+    video = replace(video, stored_size=(frame.width, frame.height), orientation=orientation_of(frame))
+    if container_format == "avi" and reordered:
+        return replace(video, counted=True, key_pts=video.pts[:1])
+    first = int(np.searchsorted(video.pts, frame.pts or 0))
+    return replace(video, pts=video.pts[first:], key_pts=video.key_pts[video.key_pts >= video.pts[first]])
