@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from bodycap_batch.check import check_path, require_ready
+from bodycap_batch.cli import main
 from bodycap_batch.config.job import load_job
 from bodycap_batch.errors import BodycapError
 from tests.videos import textured_frame, write_tone, write_video
@@ -159,3 +160,32 @@ def test_bad_input(
     assert error.hint
     with pytest.raises(BodycapError):
         require_ready(load_job(capture / "job.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("break_it", "code", "message"),
+    [
+        (black, 3, "torso.mp4: camera torso shows black pictures only"),
+        (edit("capture:", "hight_m: 1\ncapture:"), 2, "job.yaml:1: hight_m: unknown key"),
+    ],
+)
+def test_a_refused_run_leaves_earlier_results(
+    capture: Path,
+    break_it: Callable[[Path], None],
+    code: int,
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(capture)
+    results = {"motion.bvh": b"earlier", "trajectories/torso.tum": b"0 0 0 0 0 0 0 1\n"}
+    for name, data in results.items():
+        (capture / "results" / name).parent.mkdir(parents=True, exist_ok=True)
+        (capture / "results" / name).write_bytes(data)
+    break_it(capture)
+    assert main(["run", "job.yaml", "--out", "results"]) == code
+    told = capsys.readouterr().err
+    assert message in told
+    assert "hint: " in told
+    assert {name: (capture / "results" / name).read_bytes() for name in results} == results
+    assert main(["check", "job.yaml"]) == code

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import weakref
 from fractions import Fraction
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from bodycap_batch.capture.indexing import index_video
 from bodycap_batch.capture.prefetch import prefetched
 from bodycap_batch.capture.video import turn_upright
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
+from bodycap_batch.errors import CaptureError
 from tests.videos import textured_frame, write_video
 
 FRAMES = [textured_frame(index) for index in range(40)]
@@ -195,3 +197,30 @@ def test_a_stream_cut_inside_a_group_starts_where_it_decodes(tmp_path: Path, suf
     camera = opened(remuxed(source, tmp_path / f"cut.{suffix}", shift=20 * 640, skip=3))
     assert [shown_index(image) for _, image in camera.grey_frames()] == list(range(10, 40))
     assert camera.frame_numbers[0] == 0
+
+
+def test_only_a_few_frames_are_in_memory(tmp_path: Path) -> None:
+    camera = opened(write_video(tmp_path / "a.mp4", FRAMES))
+    alive: list[weakref.ref[np.ndarray]] = []
+    most = 0
+    for _, image in camera.grey_frames():
+        alive = [reference for reference in alive if reference() is not None]
+        alive.append(weakref.ref(image))
+        most = max(most, len(alive))
+    # The one in hand and the one just let go; those decoded ahead are bounded by another test.
+    assert most <= 2
+
+
+def test_nothing_outside_the_window_is_decoded(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "a.mp4", FRAMES, gop=10, bframes=False)
+    with av.open(str(path)) as container:
+        packets = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+    data = bytearray(path.read_bytes())
+    for position, size in (*packets[10:20], *packets[30:]):
+        data[position : position + size] = bytes(size)
+    path.write_bytes(bytes(data))
+    # Frames 22 to 26 of the third group; the second and the fourth group are destroyed.
+    camera = opened(path, start_s=22 / 30 - 0.01, end_s=26 / 30 + 0.01)
+    assert [shown_index(image) for _, image in camera.grey_frames()] == [22, 23, 24, 25, 26]
+    with pytest.raises(CaptureError, match=r"frame 1[0-9] |after frame"):
+        list(opened(path).grey_frames())

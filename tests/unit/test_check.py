@@ -114,11 +114,18 @@ def test_room_on_the_disk(walk: Path, tmp_path: Path, monkeypatch: pytest.Monkey
     from collections import namedtuple
 
     usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**9, 10**9 - 10**6, 10**6))
-    report = check_path(walk, Overrides(out=tmp_path / "a" / "b"))
+    job = load_job(walk, Overrides(out=tmp_path / "a" / "b", height_m=1.8))
+    free = 10**6
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**9, 10**9 - free, free))
+    report = check_job(job)
     assert report.exit_code == 5
     assert report.errors[0].path == str(tmp_path)
     assert "--out" in str(report.errors[0].hint)
+    # Two cameras of 75 frames: 50 MB and 50 kB a frame are the least, four times that is plenty.
+    free = 60 * 10**6
+    assert any("easy capture" in note for note in check_job(job).notes)
+    free = 240 * 10**6
+    assert len(check_job(job).notes) == 1
 
 
 def test_samples_are_key_frames_and_the_end(tmp_path: Path) -> None:
