@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -231,18 +232,23 @@ def test_shipped_jobs(tmp_path: Path) -> None:
     filled = (jobs / "tum_rgbd.yaml").read_text().replace("<path of your camera.mp4>", "camera.mp4")
     job = load(tmp_path, filled)
     assert (job.skeleton, job.name) == ("none", "tum_rgbd")
-    assert "synthetic" in (jobs / "cpl_lab.yaml").read_text()
-    own = (
-        (jobs / "cpl_lab.yaml")
-        .read_text()
-        .split("  # Delete this block")[0]
-        .replace("../examples/cpl_lab/calib.json", "auto")
-    )
-    assert [camera.role for camera in load(tmp_path, own).capture.cameras] == [
-        "Spine1",
-        "LeftHand",
-        "RightHand",
-    ]
+
+
+def test_the_commented_sample_holds_what_it_says(tmp_path: Path) -> None:
+    """Every commented line of it, taken as it is, is a valid setting."""
+    text = (Path(__file__).resolve().parents[2] / "jobs" / "cpl_lab.yaml").read_text()
+    text = re.sub(r"  # Delete this block.*?(?=# none)", "", text, flags=re.DOTALL)
+    text = text.replace("calibration: ../examples/cpl_lab/calib.json", "calibration: auto")
+    text = re.sub(r"^( *)# ( *[a-z_]+:.*)$", r"\1\2", text, flags=re.MULTILINE)
+    (tmp_path / "torso.timestamps.txt").write_text("")
+    job = load(tmp_path, text)
+    torso, left, right = job.capture.cameras
+    assert (torso.role, left.role, right.role) == ("Spine1", "LeftHand", "RightHand")
+    assert torso.mount_matrix() is not None
+    assert (torso.sigma_deg, torso.sigma_m) == (5, 0.02)
+    assert torso.timestamps == (tmp_path / "torso.timestamps.txt",)
+    assert (job.capture.start_s, job.capture.work_px) == (2.0, 960)
+    assert (job.registration.rounds, job.merge.fps, job.export.units) == (5, 60, "m")
 
 
 yaml_bits = st.sampled_from(
