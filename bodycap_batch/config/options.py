@@ -30,7 +30,7 @@ class MapOptions(Options):
 
     features: int = Field(2048, ge=128, description="SIFT features a keyframe")
     pairs: Literal["retrieval", "exhaustive"] = Field(
-        "retrieval", description="keyframe pairs to match: neighbours and look-alikes, or all"
+        "exhaustive", description="keyframe pairs to match: neighbours and look-alikes, or all"
     )
     seed: int = Field(0, ge=0, description="seed of every random choice")
     min_coverage: float = Field(

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 _MIN_INLIER_RATIO = 0.3
 _MIN_NOISE_PX = 0.3
 _RAY_STEP = 1e-4
+_REFINEMENTS = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,19 +72,40 @@ def solve_pose(camera: Camera, points: FloatArray, px: FloatArray, limits: PoseL
     found = pycolmap.estimate_and_refine_absolute_pose(px, points, model, estimation, refinement)
     if found is None:
         return FramePose(status=FrameStatus.FEW_INLIERS)
-    cam_from_gauge = np.asarray(found["cam_from_world"].matrix())
-    cam_from_gauge = make_transform(cam_from_gauge[:, :3], cam_from_gauge[:, 3])
-    return judge_pose(camera, cam_from_gauge, points, px, limits)
+    pose = found["cam_from_world"]
+    for _ in range(_REFINEMENTS):
+        cam_from_gauge = _as_matrix(pose)
+        inlier = _residuals(camera, cam_from_gauge, points, px)[1] < limits.max_error_px
+        if inlier.sum() < limits.min_inliers:
+            break
+        # From the sampled inliers to all of them: the answer no longer hangs on the samples.
+        refined = pycolmap.refine_absolute_pose(pose, px, points, inlier, model, refinement)
+        if refined is None:
+            break
+        pose = refined["cam_from_world"]
+    return judge_pose(camera, _as_matrix(pose), points, px, limits)
+
+
+def _as_matrix(pose: pycolmap.Rigid3d) -> FloatArray:
+    matrix = np.asarray(pose.matrix())
+    return make_transform(matrix[:, :3], matrix[:, 3])
+
+
+def _residuals(
+    camera: Camera, cam_from_gauge: FloatArray, points: FloatArray, px: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Residual (N,2), its length (N,) (infinite behind the camera) and the points in the camera frame."""
+    x_in_cam = points @ cam_from_gauge[:3, :3].T + cam_from_gauge[:3, 3]
+    residual = camera.project(x_in_cam) - px
+    return residual, np.nan_to_num(np.linalg.norm(residual, axis=1), nan=np.inf), x_in_cam
 
 
 def judge_pose(
     camera: Camera, cam_from_gauge: FloatArray, points: FloatArray, px: FloatArray, limits: PoseLimits
 ) -> FramePose:
     """Count a pose's inliers, estimate its covariance, and accept or refuse it."""
-    x_in_cam = points @ cam_from_gauge[:3, :3].T + cam_from_gauge[:3, 3]
-    residual = camera.project(x_in_cam) - px
-    error = np.linalg.norm(residual, axis=1)
-    inlier = np.nan_to_num(error, nan=np.inf) < limits.max_error_px
+    residual, error, x_in_cam = _residuals(camera, cam_from_gauge, points, px)
+    inlier = error < limits.max_error_px
     count = int(inlier.sum())
     if count < max(limits.min_inliers, _MIN_INLIER_RATIO * len(points)):
         return FramePose(status=FrameStatus.FEW_INLIERS, inliers=count)

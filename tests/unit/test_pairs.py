@@ -50,7 +50,7 @@ def _database(folder: Path, keyframes: int) -> dict[str, np.ndarray]:
 def test_pairs_per_keyframe_are_bounded(tmp_path: Path, keyframes: int) -> None:
     times = _database(tmp_path, keyframes)
     refs = [ImageRef(camera, frame) for camera in times for frame in range(keyframes)]
-    pairs = choose_pairs(tmp_path, refs, times, MapOptions())
+    pairs = choose_pairs(tmp_path, refs, times, MapOptions(pairs="retrieval"))
     # Quota per keyframe: 12 neighbours, 8 of its own at another time, 8 of the other camera.
     assert len(pairs) <= 28 * len(refs)
     assert len(set(pairs)) == len(pairs)
@@ -63,6 +63,6 @@ def test_pairs_per_keyframe_are_bounded(tmp_path: Path, keyframes: int) -> None:
 def test_growing_matches_new_keyframes_only(tmp_path: Path) -> None:
     times = _database(tmp_path, 60)
     new = [ImageRef("a", 5), ImageRef("b", 30)]
-    pairs = choose_pairs(tmp_path, new, times, MapOptions())
+    pairs = choose_pairs(tmp_path, new, times, MapOptions(pairs="retrieval"))
     assert all(a in new or b in new for a, b in pairs)
     assert len(pairs) <= 28 * len(new)

@@ -1,0 +1,106 @@
+"""A box room with textured walls, rendered by intersecting pixel rays with its six faces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from bodycap_batch.camera import Camera
+from bodycap_batch.capture import Capture, open_capture
+from bodycap_batch.config.job import load_job
+from bodycap_batch.geometry import make_transform, so3_exp
+from tests.videos import write_video
+
+HALF_M = np.array([3.0, 2.5, 1.4])
+TEXTURE_PX = 768
+LENS = {"model": "PINHOLE", "width": 320, "height": 240, "params": [210.0, 210.0, 160.0, 120.0]}
+
+
+@dataclass(frozen=True)
+class Room:
+    """Six face textures (6,T,T)."""
+
+    faces: np.ndarray
+
+    @staticmethod
+    def make(seed: int = 0) -> Room:
+        """Patterns of blobs at several scales, different on every face."""
+        rng = np.random.default_rng(seed)
+        faces = np.zeros((6, TEXTURE_PX, TEXTURE_PX), np.float32)
+        for face, cells in product(faces, (7, 17, 41, 90)):
+            noise = rng.random((cells, cells)).astype(np.float32)
+            np.add(
+                face,
+                cv2.resize(noise, (TEXTURE_PX, TEXTURE_PX), interpolation=cv2.INTER_CUBIC) > 0.55,
+                out=face,
+            )
+        return Room(np.stack([cv2.GaussianBlur(face, (0, 0), 1.2) for face in faces]) * 60 + 8)
+
+    def view(self, camera: Camera, world_from_cam: np.ndarray) -> np.ndarray:
+        """Grey image (H,W) uint8 from a pose inside the room."""
+        column, row = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
+        rays = camera.unproject(np.column_stack([column.ravel(), row.ravel()]))
+        ray = np.column_stack([rays, np.ones(len(rays))]) @ world_from_cam[:3, :3].T
+        centre = world_from_cam[:3, 3]
+        with np.errstate(divide="ignore"):
+            distance = (np.sign(ray) * HALF_M - centre) / ray
+        axis = np.argmin(np.where(ray == 0, np.inf, distance), axis=1)
+        rows = np.arange(len(ray))
+        hit = centre + ray * distance[rows, axis][:, None]
+        face = 2 * axis + (ray[rows, axis] > 0)
+        others = np.array([[1, 2], [0, 2], [0, 1]])[axis]
+        at = (hit[rows[:, None], others] / HALF_M[others] + 1) * 0.5 * (TEXTURE_PX - 1)
+        shape = (camera.height_px, camera.width_px)
+        u, v = (value.reshape(shape) for value in at.astype(np.float32).T)
+        image = np.zeros(shape, np.float32)
+        for number in np.unique(face):
+            seen = cv2.remap(self.faces[number], u, v, cv2.INTER_LINEAR)
+            image = np.where(face.reshape(shape) == number, seen, image)
+        return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def look(forward_yaw_rad: float, pitch_rad: float = 0.0) -> np.ndarray:
+    """world_from_cam rotation (3,3): forward at a yaw about Z from +X, nose up by pitch; image down is −Z."""
+    level = np.column_stack([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    return so3_exp([0, 0, forward_yaw_rad]) @ so3_exp([0, -pitch_rad, 0]) @ level
+
+
+def stroll(count: int) -> dict[str, np.ndarray]:
+    """Poses (N,4,4) of two body cameras at 30 Hz: the body walks and turns, the palm swings beside it."""
+    t = np.arange(count) / 30.0
+    body = np.stack([-1.2 + 0.7 * t, 0.5 * np.sin(1.3 * t), 0.05 * np.sin(7 * t)], axis=1)
+    palm = body + np.stack([0.25 * np.sin(4 * t), -0.3 + 0 * t, -0.35 + 0.1 * np.cos(4 * t)], axis=1)
+    torso = [make_transform(look(0.5 * np.sin(t)), p) for t, p in zip(t, body, strict=True)]
+    hand = [
+        make_transform(look(-0.6 + 0.4 * np.sin(4 * t), 0.25 * np.cos(4 * t)), p)
+        for t, p in zip(t, palm, strict=True)
+    ]
+    return {"torso": np.array(torso), "left_palm": np.array(hand)}
+
+
+def write_capture(
+    folder: Path,
+    paths: Mapping[str, np.ndarray],
+    black: Mapping[str, range] | None = None,
+    seed: int = 0,
+) -> Capture:
+    """Render a folder capture and open it; frames in `black` are dark."""
+    room = Room.make(seed)
+    camera = Camera(model="PINHOLE", width_px=320, height_px=240, params=np.array(LENS["params"]))
+    rng = np.random.default_rng(seed)
+    for name, poses in paths.items():
+        frames = []
+        for index, pose in enumerate(poses):
+            image = room.view(camera, pose).astype(np.float32)
+            if black and index in black.get(name, range(0)):
+                image[:] = 12.0
+            frames.append(np.clip(image + rng.normal(0, 1.5, image.shape), 0, 255).astype(np.uint8))
+        write_video(folder / f"{name}.mp4", frames)
+    lens = str(LENS).replace("'", '"')
+    (folder / "calib.json").write_text(lens.replace("}", ', "pixel_origin": "COLMAP"}'), encoding="utf-8")
+    return open_capture(load_job(folder).capture)
