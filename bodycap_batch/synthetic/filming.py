@@ -6,17 +6,19 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Protocol
 
+import cv2
 import numpy as np
 
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.skeleton import Mount, SkeletonModel, forward_kinematics
-from bodycap_batch.synthetic.atlas import Atlas, Bytes, Float32
+from bodycap_batch.synthetic.atlas import Atlas, Bytes
 from bodycap_batch.synthetic.lens import RayGrid
 from bodycap_batch.synthetic.render import Triangles, View, joined
 from bodycap_batch.synthetic.wearer import Wearer
 
 _BLUR_STEP_PX = 1.0
 _MAX_BLUR_STEPS = 24
+_NOISE_SURPLUS = 1 << 21
 _SHUTTER_BANDS = 16
 """Stretches of a rolling-shutter image for which the wearer's body stands still."""
 
@@ -68,14 +70,16 @@ class Film:
     exposure_s: float
     rolling_shutter_s: float
 
-    def frame(self, t_s: float) -> Float32:
+    def frame(self, t_s: float) -> Bytes:
         """The image (H,W,3) whose exposure is centred on a common time, without noise."""
         steps = self._blur_steps(t_s)
         shifts = self.exposure_s * ((np.arange(steps) + 0.5) / steps - 0.5)
+        if steps == 1:
+            return self._instant(t_s)
         total = np.zeros(self.grid.in_cam.shape, np.float32)
         for shift in shifts:
-            total += self._instant(t_s + float(shift))
-        return np.asarray(total / np.float32(steps))
+            cv2.accumulate(self._instant(t_s + float(shift)), total)
+        return np.asarray(cv2.convertScaleAbs(total, alpha=1.0 / steps))
 
     def _instant(self, t_s: float) -> Bytes:
         """One image without motion blur."""
@@ -111,17 +115,29 @@ class Film:
         return int(np.clip(np.ceil(motion_rad * px_per_rad / _BLUR_STEP_PX), 2, _MAX_BLUR_STEPS))
 
 
-def exposed(image: Float32, noise: float, gain: FloatArray, rng: np.random.Generator) -> Bytes:
-    """Turn an ideal image into a recorded one: white balance, shot and read noise, 8 bits.
+class Sensor:
+    """Turns ideal images into recorded ones: white balance, shot and read noise, 8 bits.
 
     Args:
-        image: (H,W,3), 0 … 255.
         noise: Standard deviation at mid grey; half of its variance does not depend on the light.
-        gain: (3,) factor of each colour channel.
-        rng: This frame's own source of noise.
+        size: Values of one image.
+        seed: Source of white balance and noise.
     """
-    out = image * gain.astype(np.float32)
-    if noise > 0:
-        sigma = np.float32(noise) * np.sqrt(np.float32(0.5) + out * np.float32(0.5 / 128.0))
-        out += sigma * rng.standard_normal(out.shape, dtype=np.float32)
-    return np.asarray(np.clip(np.rint(out), 0, 255), dtype=np.uint8)
+
+    def __init__(self, noise: float, size: int, seed: np.random.SeedSequence) -> None:
+        self._seed, self._count = seed.generate_state(4).tolist(), size
+        rng = np.random.default_rng(seed)
+        gain = rng.uniform(0.94, 1.06, 3)
+        self._mean = (np.arange(256)[:, None] * gain)[None].astype(np.float32)
+        self._sigma = (noise * np.sqrt(0.5 + self._mean * (0.5 / 128.0))).astype(np.float32)
+        # Drawing a million numbers a frame costs as much as the frame: each takes a stretch of these.
+        self._normal = rng.standard_normal(size + _NOISE_SURPLUS if noise > 0 else 0, dtype=np.float32)
+
+    def record(self, image: Bytes, frame: int) -> Bytes:
+        """The image (H,W,3) as this camera's frame of that number."""
+        mean = cv2.LUT(image, self._mean)
+        if len(self._normal):
+            start = int(np.random.default_rng([frame, *self._seed]).integers(0, _NOISE_SURPLUS))
+            normal = self._normal[start : start + self._count].reshape(image.shape)
+            mean += cv2.multiply(cv2.LUT(image, self._sigma), normal)
+        return np.asarray(cv2.convertScaleAbs(np.maximum(mean, 0.0)))

@@ -21,7 +21,7 @@ from bodycap_batch.formats.files import store_error
 from bodycap_batch.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
 from bodycap_batch.synthetic.clip import load_clip
-from bodycap_batch.synthetic.filming import Film, Moving, camera_at, exposed
+from bodycap_batch.synthetic.filming import Film, Moving, Sensor, camera_at
 from bodycap_batch.synthetic.gait import Walk
 from bodycap_batch.synthetic.lens import focal_and_centre, ray_grid
 from bodycap_batch.synthetic.measured import measure
@@ -140,14 +140,11 @@ class _Shooting:
     """One camera's frames, each a function of its number alone."""
 
     film: Film
+    sensor: Sensor
     times_s: FloatArray
-    noise: float
-    gain: FloatArray
-    seed: list[int]
 
     def __call__(self, frame: int) -> Bytes:
-        rng = np.random.default_rng([frame, *self.seed])
-        return exposed(self.film.frame(float(self.times_s[frame])), self.noise, self.gain, rng)
+        return self.sensor.record(self.film.frame(float(self.times_s[frame])), frame)
 
 
 def _film(
@@ -158,15 +155,12 @@ def _film(
     context.progress(0, total, "room")
     films = build_films(options, subject)
     with _one_opencv_thread(), ThreadPoolExecutor(max_workers=max(1, context.threads)) as pool:
-        for index, film in enumerate(films):
+        for film, seed in zip(films, subject.seeds["images"].spawn(len(films)), strict=True):
             camera = film.mount.camera
-            seed = [index, *subject.seeds["images"].generate_state(4).tolist()]
             shoot = _Shooting(
                 film=film,
+                sensor=Sensor(options.noise, 3 * options.width * options.height, seed),
                 times_s=in_seconds(frame_times_ns(options)) + options.offsets_s.get(camera, 0.0),
-                noise=options.noise,
-                gain=np.random.default_rng(seed).uniform(0.94, 1.06, 3),
-                seed=seed,
             )
             size = (options.width, options.height)
             with VideoWriter(folder / f"{camera}.mp4", options.fps, size, options.quality) as video:

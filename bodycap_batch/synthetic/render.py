@@ -2,7 +2,8 @@
 
 Every triangle is flat and its texture affine on it, so texture coordinates are a projective function of the
 viewing direction; its derivative gives each pixel's footprint exactly. Pixels on the edge between two
-surfaces are sampled four times.
+surfaces are sampled four times. Where four rays two pixels apart meet one plane, so do those between them:
+what is thinner than two pixels may be missed there.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ class Triangles:
         point: (F,3) a point on each plane.
         texel_at_point: (F,2) atlas coordinates there.
         texels_per_m: (F,2,3) gradient of the atlas coordinates.
+        plane: (F,) the same number for triangles that continue each other in one plane with one texture.
         surface: (F,) which surface each belongs to.
         gain: (F,) brightness factor.
     """
@@ -45,6 +47,7 @@ class Triangles:
     point: FloatArray
     texel_at_point: FloatArray
     texels_per_m: FloatArray
+    plane: IntArray
     surface: IntArray
     gain: Float32
 
@@ -65,6 +68,7 @@ def triangles_of(surfaces: Sequence[Surface], origins: FloatArray) -> Triangles:
         point=corners[owner, 0],
         texel_at_point=origins[owner],
         texels_per_m=gradient[owner],
+        plane=owner,
         surface=owner,
         gain=np.ones(len(owner), np.float32),
     )
@@ -79,6 +83,7 @@ def joined(first: Triangles, second: Triangles) -> Triangles:
         point=np.concatenate([first.point, second.point]),
         texel_at_point=np.concatenate([first.texel_at_point, second.texel_at_point]),
         texels_per_m=np.concatenate([first.texels_per_m, second.texels_per_m]),
+        plane=np.concatenate([first.plane, second.plane + first.plane.max(initial=0) + 1]),
         surface=np.concatenate([first.surface, second.surface + first.surface.max(initial=0) + 1]),
         gain=np.concatenate([first.gain, second.gain]),
     )
@@ -124,7 +129,7 @@ class View:
         height, width = grid.valid[rows].shape
         pose_of = np.repeat(np.arange(height), width) if len(poses) > 1 else None
         tables = self._homographies(poses)
-        faces = self._hit(lens[0], poses, pose_of)
+        faces = self._hit_grid(lens[0], (height, width), poses, pose_of)
         colours = self._colours(faces, pose_of, tables, lens)
         edge = np.flatnonzero(self._edges(faces.reshape(height, width)))
         if len(edge):
@@ -152,6 +157,30 @@ class View:
             out[axis] = here * normal + depth * np.einsum("bji,fj->ibf", rotation, gradient)
         out[2] = normal
         return out.reshape(9, -1).astype(np.float32)
+
+    def _hit_grid(
+        self, rays: Float32, size: tuple[int, int], poses: FloatArray, pose_of: IntArray | None
+    ) -> IntArray:
+        """(H·W,) first triangles of a whole grid of rays (3,H·W), most of them without a ray of their own."""
+        faces = np.full(size[0] * size[1], NOTHING, np.int64)
+        index = np.arange(len(faces)).reshape(size)
+
+        def shoot(at: IntArray) -> None:
+            faces[at] = self._hit(rays[:, at], poses, None if pose_of is None else pose_of[at])
+
+        coarse = index[::2, ::2]
+        shoot(coarse.ravel())
+        plane = np.append(self._triangles.plane, NOTHING)[faces[coarse]]
+        corners = plane[:-1, :-1], plane[:-1, 1:], plane[1:, :-1], plane[1:, 1:]
+        alike = np.logical_and.reduce([corners[0] == other for other in corners[1:]])
+        known = np.zeros(size, dtype=bool)
+        inside = np.repeat(np.repeat(alike, 2, axis=0), 2, axis=1)
+        known[: inside.shape[0], : inside.shape[1]] = inside
+        copied = np.repeat(np.repeat(faces[coarse], 2, axis=0), 2, axis=1)[: size[0], : size[1]]
+        faces[known.ravel()] = copied[known]
+        known[::2, ::2] = True
+        shoot(index[~known])
+        return faces
 
     def _hit(self, rays: Float32, poses: FloatArray, pose_of: IntArray | None) -> IntArray:
         """(N,) the triangle each ray (3,N) meets first, or −1."""

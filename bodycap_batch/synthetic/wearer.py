@@ -96,6 +96,7 @@ class Wearer:
             point=np.concatenate([part.point for part in parts]),
             texel_at_point=np.concatenate([part.texel_at_point for part in parts]),
             texels_per_m=np.concatenate([part.texels_per_m for part in parts]),
+            plane=np.arange(sum(len(part.faces) for part in parts)),
             surface=np.concatenate([part.surface for part in parts]),
             gain=np.concatenate([part.gain for part in parts]),
         )
@@ -177,6 +178,7 @@ def _textured(vertices: FloatArray, texels: FloatArray, faces: FloatArray, index
         point=corner[:, 0],
         texel_at_point=at[:, 0],
         texels_per_m=gradient / area2[:, None, None],
+        plane=np.arange(int(keep.sum())),
         surface=np.full(int(keep.sum()), index),
         gain=np.ones(int(keep.sum()), np.float32),
     )
@@ -193,6 +195,7 @@ def _moved(limb: Triangles, world_from_joint: FloatArray) -> Triangles:
         point=limb.point @ turn.T + shift,
         texel_at_point=limb.texel_at_point,
         texels_per_m=limb.texels_per_m @ turn.T,
+        plane=limb.plane,
         surface=limb.surface,
         gain=(0.75 + 0.25 * normal[:, 2]).astype(np.float32),
     )

@@ -1,0 +1,246 @@
+"""Whole synthetic captures, small ones: layout, clocks, determinism, failures."""
+
+import hashlib
+import json
+
+import av
+import numpy as np
+import pytest
+
+from bodycap_batch.capture import open_capture
+from bodycap_batch.config.job import load_job
+from bodycap_batch.context import StageContext
+from bodycap_batch.errors import Cancelled, JobError, StoreError
+from bodycap_batch.formats.bvh import read_bvh
+from bodycap_batch.formats.tum import read_tum
+from bodycap_batch.geometry import interpolate_pose, invert, rotation_angle_rad
+from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount, rest_positions
+from bodycap_batch.synthetic import SynthOptions, synthesise
+
+TINY = {"width": 64, "height": 48, "seconds": 0.3, "cameras": ("torso", "left_palm")}
+
+
+def _make(folder, progress=None, cancelled=None, overwrite=False, **values):
+    hooks = {"progress": progress} if progress else {}
+    hooks |= {"cancelled": cancelled} if cancelled else {}
+    context = StageContext(work_dir=folder.parent, threads=2, **hooks)
+    synthesise(SynthOptions(**{**TINY, **values}), folder, context, overwrite=overwrite)
+    return folder
+
+
+def _frames(path):
+    with av.open(str(path)) as video:
+        return [frame.to_ndarray(format="rgb24").astype(float) for frame in video.decode(video=0)]
+
+
+def _digests(folder):
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return _make(tmp_path_factory.mktemp("synthetic") / "capture")
+
+
+def test_the_layout(capture):
+    names = {str(path.relative_to(capture)) for path in capture.rglob("*") if path.is_file()}
+    assert names == {
+        *("torso.mp4", "left_palm.mp4", "calib.json", "skeleton.bvh"),
+        *("gt/torso.tum", "gt/left_palm.tum", "gt/joints.npz", "gt/motion.bvh"),
+        *("gt/mounts.json", "gt/README.txt", "gt/synth.json"),
+    }
+    assert [path.name for path in capture.parent.iterdir()] == ["capture"]
+    calib = json.loads((capture / "calib.json").read_text())
+    assert calib["model"] == "PINHOLE"
+    assert calib["params"] == [42.0, 42.0, 32.0, 24.0]
+    assert calib["offsets_s"] == {"torso": 0.0, "left_palm": 0.0}
+    text = "".join(p.read_text() for p in capture.rglob("*") if p.suffix in (".json", ".tum", ".bvh", ".txt"))
+    assert str(capture.parent) not in text
+
+
+def test_truth_stays_out_of_what_a_job_reads(capture):
+    assert "joint_from_cam" not in (capture / "calib.json").read_text()
+    assert "seed" not in (capture / "calib.json").read_text()
+
+
+def test_a_job_opens_the_folder(capture):
+    opened = open_capture(load_job(capture).capture)
+    assert [camera.name for camera in opened.cameras] == ["left_palm", "torso"]
+    for camera in opened.cameras:
+        assert camera.calibrated
+        truth = read_tum(capture / "gt" / f"{camera.name}.tum")
+        assert len(camera.times_ns) == 9
+        # The container counts in 1/15360 s: exact for 30 frames a second up to the rounding of a nanosecond.
+        assert np.abs(camera.times_ns - truth.times_ns).max() <= 1
+
+
+def test_truth_agrees_with_itself(capture):
+    """Cameras = joints of motion.bvh · mounts.json; joints.npz = the same joints."""
+    skeleton, motion = read_bvh(capture / "gt" / "motion.bvh")
+    mounts = json.loads((capture / "gt" / "mounts.json").read_text())
+    joints = motion.world_from_joint()
+    data = np.load(capture / "gt" / "joints.npz")
+    assert data["world"].shape == (9, 15, 3)
+    names = data["names"].tolist()
+    # BVH angles have 6 decimals in degrees, lengths 1e-8 m: micrometres at an arm's length.
+    for name, role in (("torso", "Spine1"), ("left_palm", "LeftHand"), ("right_ankle", "RightFoot")):
+        bone = joints[:, skeleton.index_of_role(role), :3, 3]
+        assert np.abs(data["world"][:, names.index(name)] - bone).max() < 1e-5
+    for name, mount in mounts.items():
+        truth = read_tum(capture / "gt" / f"{name}.tum")
+        seen = joints[:, skeleton.index_of_role(mount["role"])] @ np.array(mount["joint_from_cam"])
+        assert np.abs(seen[:, :3, 3] - truth.world_from_cam[:, :3, 3]).max() < 1e-5
+        turned = rotation_angle_rad(invert(seen)[:, :3, :3] @ truth.world_from_cam[:, :3, :3])
+        assert turned.max() < 1e-5
+
+
+def test_mounts_and_bones_are_off_nominal(capture):
+    mounts = json.loads((capture / "gt" / "mounts.json").read_text())
+    nominal_body = load_skeleton("full_body", 1.75)
+    for name, mount in mounts.items():
+        nominal = nominal_mount(name, mount["role"], nominal_body).joint_from_cam
+        off = invert(nominal) @ np.array(mount["joint_from_cam"])
+        # σ = 15° and 5 cm in all; a Maxwell variable is below 5 % of it in 1 of 5,000 draws.
+        assert 0.7 < np.degrees(rotation_angle_rad(off[:3, :3])) < 45
+        assert 0.0025 < np.linalg.norm(off[:3, 3]) < 0.15
+    body, _ = read_bvh(capture / "skeleton.bvh")
+    moving, _ = read_bvh(capture / "gt" / "motion.bvh")
+    assert np.allclose(rest_positions(body) - body.offsets_m[0], rest_positions(moving) - moving.offsets_m[0])
+    ratio = np.linalg.norm(body.offsets_m[1:], axis=1) / np.linalg.norm(nominal_body.offsets_m[1:], axis=1)
+    assert ratio.std() > 0.01
+
+
+def test_same_options_same_files_and_another_seed_another_capture(capture, tmp_path):
+    again = _make(tmp_path / "again")
+    assert _digests(again) == _digests(capture)
+    other = _digests(_make(tmp_path / "other", seed=1))
+    assert other["torso.mp4"] != _digests(capture)["torso.mp4"]
+    assert other["skeleton.bvh"] != _digests(capture)["skeleton.bvh"]
+
+
+def test_a_clock_offset_shifts_what_a_camera_sees_and_where_it_is(capture, tmp_path):
+    late = _make(tmp_path / "late", offsets_s={"left_palm": 0.1})
+    assert json.loads((late / "calib.json").read_text())["offsets_s"] == {"torso": 0.0, "left_palm": 0.1}
+    here, there = (read_tum(folder / "gt" / "left_palm.tum") for folder in (late, capture))
+    assert (here.times_ns == there.times_ns).all()
+    # Common time = camera time + 0.1 s: its frame 0 is the synchronous camera's frame 3.
+    assert np.abs(here.world_from_cam[:6] - there.world_from_cam[3:]).max() < 1e-6
+    seen, expected = _frames(late / "left_palm.mp4"), _frames(capture / "left_palm.mp4")
+    right = np.abs(seen[0] - expected[3]).mean()
+    wrong = np.abs(seen[0] - expected[0]).mean()
+    assert right < 0.5 * wrong
+    data = np.load(late / "gt" / "joints.npz")
+    assert data["t"][0] == 0.0
+    assert data["t"][-1] == pytest.approx(8 / 30 + 0.1, abs=1 / 30)
+
+
+def test_lost_frames_come_with_their_times(tmp_path):
+    folder = _make(tmp_path / "lossy", drop_frames=0.4, seconds=1.0, cameras=("torso",))
+    times = [float(line) for line in (folder / "torso.timestamps.txt").read_text().split()]
+    assert 10 < len(times) < 27
+    assert len(_frames(folder / "torso.mp4")) == len(times)
+    truth = read_tum(folder / "gt" / "torso.tum")
+    assert np.allclose(truth.times_ns * 1e-9, times)
+    assert np.allclose(np.array(times) * 30, np.round(np.array(times) * 30), atol=1e-6)
+    assert (times[0], round(times[-1] * 30)) == (0.0, 29)
+
+
+def test_poses_only(tmp_path):
+    folder = _make(
+        tmp_path / "poses", poses_only=True, seconds=40, cameras=("torso", "left_palm", "right_palm")
+    )
+    assert not list(folder.glob("*.mp4"))
+    for name in ("torso", "left_palm", "right_palm"):
+        truth, seen = (read_tum(folder / where / f"{name}.tum") for where in ("gt", "poses"))
+        index = np.searchsorted(truth.times_ns, seen.times_ns)
+        assert (truth.times_ns[index] == seen.times_ns).all()
+        # Seven gaps of 10 to 60 of 1,200 frames, some of them overlapping.
+        assert 7 <= 1200 - len(seen.times_ns) <= 7 * 60
+        off = invert(truth.world_from_cam[index]) @ seen.world_from_cam
+        shift = np.linalg.norm(seen.world_from_cam[:, :3, 3] - truth.world_from_cam[index, :3, 3], axis=1)
+        gross = shift > 0.04  # eight sigma of 5 mm
+        assert 0.005 < gross.mean() < 0.03
+        # About 800 poses of three axes: the RMS to 2 %, five sigma of that is 10 %.
+        assert np.sqrt((shift[~gross] ** 2).mean() / 3) == pytest.approx(0.005, rel=0.1)
+        turned = np.degrees(rotation_angle_rad(off[~gross, :3, :3]))
+        assert np.sqrt((turned**2).mean() / 3) == pytest.approx(0.3, rel=0.1)
+
+
+def test_a_motion_file_is_followed(capture, tmp_path):
+    folder = _make(tmp_path / "moved", motion=capture / "gt" / "motion.bvh", seconds=0.2, cameras=("torso",))
+    _, given = read_bvh(capture / "gt" / "motion.bvh")
+    _, followed = read_bvh(folder / "gt" / "motion.bvh")
+    # The same turns (6 decimals of a degree each way), moved to the room's middle.
+    assert np.abs(followed.local_rotation - given.local_rotation[:6]).max() < 1e-6
+    moved = followed.root_in_world_m - given.root_in_world_m[:6]
+    assert np.ptp(moved, axis=0).max() < 1e-6
+    assert json.loads((folder / "gt" / "synth.json").read_text())["motion"] == "motion.bvh"
+
+
+def test_blur_shutter_body_and_fisheye_in_one(tmp_path):
+    folder = _make(
+        tmp_path / "all",
+        seconds=0.1,
+        cameras=("right_palm",),
+        lens="OPENCV_FISHEYE",
+        lens_params=(24.0, 24.0, 32.0, 24.0, 0.02, -0.005, 0.0, 0.0),
+        exposure_s=0.015,
+        rolling_shutter_s=0.02,
+        body_in_view=True,
+        repeated_posters=True,
+    )
+    frames = _frames(folder / "right_palm.mp4")
+    assert len(frames) == 3
+    assert all(frame.std() > 15 for frame in frames)
+    calib = json.loads((folder / "calib.json").read_text())
+    assert (calib["rolling_shutter_s"], calib["exposure_s"], calib["model"]) == (
+        0.02,
+        0.015,
+        "OPENCV_FISHEYE",
+    )
+
+
+def test_progress_counts_every_frame(tmp_path):
+    calls = []
+    _make(tmp_path / "c", progress=lambda *call: calls.append(call), seconds=0.1)
+    assert calls[0] == (0, 6, "room")
+    assert calls[1:] == [(n, 6, "torso" if n <= 3 else "left_palm") for n in range(1, 7)]
+
+
+def test_cancelling_leaves_nothing(tmp_path):
+    with pytest.raises(Cancelled):
+        _make(tmp_path / "c", cancelled=lambda: True)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_in_use_is_left_alone(capture, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("important")
+    with pytest.raises(JobError, match="exists already"):
+        _make(tmp_path / "mine")
+    with pytest.raises(JobError, match="no synthetic capture"):
+        _make(tmp_path / "mine", overwrite=True)
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
+
+
+def test_an_earlier_capture_is_replaced_when_asked(tmp_path):
+    _make(tmp_path / "c", poses_only=True)
+    with pytest.raises(JobError, match="exists already"):
+        _make(tmp_path / "c", poses_only=True)
+    _make(tmp_path / "c", poses_only=True, overwrite=True, cameras=("head",))
+    assert [path.name for path in (tmp_path / "c" / "poses").iterdir()] == ["head.tum"]
+    assert [path.name for path in tmp_path.iterdir()] == ["c"]
+
+
+def test_a_disk_that_refuses_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="cannot write"):
+        _make(tmp_path / "file" / "capture", poses_only=True)
+
+
+def test_frames_lie_between_their_neighbours(capture):
+    truth = read_tum(capture / "gt" / "torso.tum").world_from_cam
+    middle = interpolate_pose(truth[:-2], truth[2:], 0.5)
+    # Accelerations stay below 10 m/s²: half of that times (1/30 s)² is 6 mm.
+    assert np.abs(middle[:, :3, 3] - truth[1:-1, :3, 3]).max() < 0.006
