@@ -31,6 +31,11 @@ from bodycap_batch.skeleton import Mount, SkeletonModel
 
 PRIOR_SCALE = 4.0
 """The pose prior counts once per tick here; its sigmas are widened, or it would outvote the cameras."""
+MAP_ERROR_M = 0.01
+MAP_ERROR_RAD = float(np.radians(0.5))
+MAP_ERROR_S = 1.0
+"""Maps bend: camera paths are off by about this much for about this long, all poses of a stretch together.
+What repeats must not count as often as it was sampled, or the mounts follow the map (one by 10 cm)."""
 SAMPLE_REACH_NS = 100_000_000
 """Longest hole between two frames that is interpolated for a sample."""
 
@@ -46,6 +51,7 @@ class Samples:
         valid: (C,K) where a camera was measured.
         sigma_rad: (C,) rotation sigma of each camera's measurements.
         sigma_map: (C,) centre sigma, map units.
+        repeats: How many samples share one error of the map, 1 or more.
     """
 
     cameras: tuple[str, ...]
@@ -54,6 +60,7 @@ class Samples:
     valid: BoolArray
     sigma_rad: FloatArray
     sigma_map: FloatArray
+    repeats: float
 
     def points(self, scale: float) -> list[MountPoints]:
         """The points that stand for each camera's mount at a scale."""
@@ -87,15 +94,20 @@ def take_samples(tracks: Sequence[Track], provisional: float, count: int) -> Sam
     full = np.flatnonzero(together == together.max())
     pool = full if len(full) >= count else wanted
     pick = pool[np.unique(np.linspace(0, len(pool) - 1, count).round().astype(np.int64))]
+    seconds = 1e-9 * float(times_ns[pick[-1]] - times_ns[pick[0]])
+    repeats = max(1.0, MAP_ERROR_S * len(pick) / max(seconds, 1e-3))
+    white_rad = np.array([max(float(np.median(track.sigma_rad)), MIN_SIGMA_RAD) for track in tracks])
+    white_map = np.array(
+        [max(float(np.median(track.sigma_map)), MIN_SIGMA_M / provisional) for track in tracks]
+    )
     return Samples(
         cameras=tuple(track.camera for track in tracks),
         bones=tuple(track.bone for track in tracks),
         map_from_cam=np.array([poses[pick] for poses, _ in looks]),
         valid=np.array([valid[pick] for _, valid in looks]),
-        sigma_rad=np.array([max(float(np.median(track.sigma_rad)), MIN_SIGMA_RAD) for track in tracks]),
-        sigma_map=np.array(
-            [max(float(np.median(track.sigma_map)), MIN_SIGMA_M / provisional) for track in tracks]
-        ),
+        sigma_rad=np.sqrt(white_rad**2 + repeats * MAP_ERROR_RAD**2),
+        sigma_map=np.sqrt(white_map**2 + repeats * (MAP_ERROR_M / provisional) ** 2),
+        repeats=repeats,
     )
 
 
@@ -125,7 +137,7 @@ class Calibration:
     ) -> None:
         self._skeleton, self._bones, self._samples = skeleton, bones, samples
         self._priors, self._step = priors, step
-        self._slack_map = JOINT_SLACK_M / provisional
+        self._slack_map = JOINT_SLACK_M * np.sqrt(samples.repeats) / provisional
         self._values: Any = None
         self._scale = 1.0
         self.mounts = {name: np.array(priors[name].joint_from_cam) for name in samples.cameras}

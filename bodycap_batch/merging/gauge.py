@@ -11,18 +11,19 @@ from scipy.spatial.transform import Rotation
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.geometry import Similarity, so3_exp
 from bodycap_batch.merging.bones import Bone, proper_axes
+from bodycap_batch.merging.planes import find_planes, vertical
 from bodycap_batch.skeleton import SkeletonModel
 from bodycap_batch.skeleton_presets import rest_positions, split_side
 
 MOVING_M_PER_S = 0.4
-WALKING_HEIGHT = 0.98
-"""Mean hip height in walking over standing hip height."""
+WALKING_HEIGHT = 0.97
+"""Mean height of the trunk in walking over its standing height: 0.95 to 1.00 on four captures."""
 
 _SLAB_M = 0.03
-_TILT_LIMIT_DEG = 25.0
-_MIN_POINTS = 200
-_MIN_CONTRAST = 1.5
-"""How much fuller the map's horizontal slabs must be at the best direction than at a typical one."""
+_MIN_POINTS = 100
+_MIN_FLOOR_POINTS = 30
+_MOST_BELOW = 0.02
+_LEGLESS_HIP_M = 0.9
 _ANKLE_OVER_LEG = 0.039 / 0.491
 """Ankle height over leg length (Drillis and Contini), for rigs whose feet end at the ankle."""
 
@@ -33,8 +34,8 @@ class Direction:
 
     up: FloatArray
     source: str
-    body_disagreement_deg: float
-    contrast: float
+    body_off_deg: float | None
+    plane_share: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,80 +62,57 @@ def body_up(skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: Flo
     return np.asarray(direction / np.linalg.norm(direction))
 
 
-def refine_up(points_m: FloatArray, body: FloatArray, rng: np.random.Generator) -> Direction:
-    """Turn the body's up onto the map's horizontal surfaces where it shows them.
-
-    Floor, ceiling and table tops fill thin slabs of height when looked at along the vertical; the direction
-    within `_TILT_LIMIT_DEG` of the body's that fills the fullest slabs wins, if it stands out.
+def find_up(points_m: FloatArray, body: FloatArray, rng: np.random.Generator) -> Direction:
+    """Turn the body's up onto the vertical of the map's walls, floor and ceiling where they show it.
 
     Args:
         points_m: (P,3) map points in the solved frame.
         body: (3,) the body's up.
-        rng: Picks a subset of large maps.
+        rng: Draws the planes' hypotheses.
     """
-    if len(points_m) < _MIN_POINTS:
-        return Direction(body, "body", 0.0, 0.0)
-    points = points_m if len(points_m) <= 6000 else rng.choice(points_m, 6000, replace=False)
-    points = points[np.linalg.norm(points - np.median(points, axis=0), axis=1) < 12.0]
-    first, second = np.linalg.svd(body[None])[2][1:]
-    centre, typical, tilt = np.zeros(2), 0.0, _TILT_LIMIT_DEG
-    best = 0.0
-    for _ in range(4):
-        grid = np.linspace(-tilt, tilt, 21)
-        offsets = centre + np.array([(x, y) for x in grid for y in grid])
-        offsets = offsets[np.hypot(*offsets.T) <= _TILT_LIMIT_DEG]
-        scores = np.array([_slab_score(points @ _tilted(body, first, second, pair)) for pair in offsets])
-        typical = typical or float(np.median(scores))
-        centre, best = offsets[int(np.argmax(scores))], float(scores.max())
-        tilt *= 0.2
-    angle = float(np.hypot(*centre))
-    if best < _MIN_CONTRAST * typical or angle > 0.9 * _TILT_LIMIT_DEG:
-        return Direction(body, "body", angle, best / typical)
-    return Direction(_tilted(body, first, second, centre), "map", angle, best / typical)
+    found = vertical(find_planes(points_m, rng), body)
+    if found is None:
+        return Direction(body, "body", None, 0.0)
+    up, share = found
+    angle = float(np.degrees(np.arccos(np.clip(up @ body, -1.0, 1.0))))
+    return Direction(up, "map", angle, share)
 
 
-def _tilted(body: FloatArray, first: FloatArray, second: FloatArray, degrees: FloatArray) -> FloatArray:
-    return np.asarray(so3_exp(np.radians(degrees[0]) * first + np.radians(degrees[1]) * second) @ body)
-
-
-def _slab_score(height: FloatArray) -> float:
-    bins = np.bincount(np.floor((height - height.min()) / _SLAB_M).astype(np.int64))
-    # Neighbouring bins together: a surface may straddle a border.
-    pairs = bins[:-1] + bins[1:] if len(bins) > 1 else bins
-    return float((pairs.astype(np.float64) ** 2).sum() / len(height) ** 2)
-
-
-def find_floor(heights_m: FloatArray, expected_m: float, standing_m: float) -> Floor:
+def find_floor(heights_m: FloatArray, up: Direction, expected_m: float, standing_m: float) -> Floor:
     """Find the floor among the heights (P,) of the map's points.
 
     The floor is a well-filled slab near where the standing body's soles are, with next to nothing below it.
+    It is looked for only where the map itself gave the vertical: two degrees of tilt smear it over a
+    decimetre.
 
     Args:
         heights_m: Along up.
+        up: Where up came from.
         expected_m: Height of the soles from the body alone.
-        standing_m: Height of the hips above the soles; sets how far off the floor may be.
+        standing_m: Height of a trunk joint above the soles; sets how far off the floor may be.
     """
-    if len(heights_m) >= _MIN_POINTS:
-        reach = 0.3 * standing_m
-        edges = np.arange(expected_m - reach, expected_m + reach, 0.5 * _SLAB_M)
-        counts = np.array([((heights_m >= e) & (heights_m < e + _SLAB_M)).sum() for e in edges])
-        below = np.array([(heights_m < e - 2.0 * _SLAB_M).mean() for e in edges])
-        enough = max(25, 0.01 * len(heights_m))
-        good = (counts >= enough) & (below < 0.03)
-        if good.any():
-            best = int(np.argmax(np.where(good, counts, 0)))
+    if up.source == "map" and len(heights_m) >= _MIN_POINTS:
+        reach = 0.25 * standing_m
+        edges = np.arange(expected_m - reach, expected_m + reach, 0.25 * _SLAB_M)
+        inside = (heights_m >= edges[:, None]) & (heights_m < edges[:, None] + _SLAB_M)
+        below = (heights_m < edges[:, None] - 2.0 * _SLAB_M).mean(axis=1)
+        counts = np.where(below < _MOST_BELOW, inside.sum(axis=1), 0)
+        best = int(np.argmax(counts))
+        # Clutter spreads evenly over heights; a floor stands out from it.
+        if counts[best] >= max(_MIN_FLOOR_POINTS, 3.0 * float(np.median(inside.sum(axis=1)))):
             slab = heights_m[np.abs(heights_m - edges[best] - 0.5 * _SLAB_M) < _SLAB_M]
             return Floor(float(np.median(slab)), "map", len(slab))
     return Floor(expected_m, "standing hip height", 0)
 
 
-def standing_hip_height(skeleton: SkeletonModel) -> float:
-    """Height of the root joint over the soles with straight legs.
+def standing_height(skeleton: SkeletonModel, joint: int) -> float:
+    """Height of a trunk joint over the soles with straight legs.
 
     A rig's zero pose may spread its legs and put its root anywhere: the bones' lengths are added up.
     """
     heights = []
     rest = rest_positions(skeleton)
+    above_root = float(rest[joint][2] - rest[0][2])
     for side in ("Left", "Right"):
         chain = [skeleton.index_of_role(side + part) for part in ("UpLeg", "Leg", "Foot")]
         if None in chain:
@@ -145,8 +123,8 @@ def standing_hip_height(skeleton: SkeletonModel) -> float:
         drop = float(ankle[2] - rest[toe][2]) if toe is not None else 0.0
         heights.append(float(rest[0][2] - hip[2]) + leg + max(drop, _ANKLE_OVER_LEG * leg))
     if heights:
-        return float(np.mean(heights))
-    return float(rest[0][2]) if rest[0][2] > 0.3 else 0.9
+        return above_root + float(np.mean(heights))
+    return above_root + (float(rest[0][2]) if rest[0][2] > 0.3 else _LEGLESS_HIP_M)
 
 
 def heading(forward: FloatArray, centre_m: FloatArray, fps: float) -> float:

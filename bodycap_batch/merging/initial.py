@@ -44,7 +44,7 @@ def provisional_scale(bones: Sequence[Bone], tracks: Sequence[Track], mounts: Ma
     best = int(np.argmin(costs))
     if best in (0, len(scales) - 1):
         raise EstimationError(
-            f"the cameras' distances fit no person: the scale runs out of bounds, {scales[best]:.3g} m a unit",
+            f"the cameras' distances fit no person: {scales[best]:.3g} m per map unit is out of bounds",
             hint="check which camera sits where (the job's mounts)",
         )
     return float(scales[best])

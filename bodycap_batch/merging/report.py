@@ -38,8 +38,10 @@ def build_report(
         "scale": _scale(inputs, calibrated),
         "up": {
             "source": calibrated.up.source,
-            "body_disagreement_deg": round(calibrated.up.body_disagreement_deg, 3),
-            "contrast": round(calibrated.up.contrast, 3),
+            "body_off_deg": None
+            if calibrated.up.body_off_deg is None
+            else round(calibrated.up.body_off_deg, 3),
+            "plane_points_share": round(calibrated.up.plane_share, 3),
         },
         "floor": {"source": floor.source, "points": floor.support},
         "mounts": {mount.camera: _mount(inputs, mount.camera, calibrated) for mount in calibrated.mounts},
@@ -80,7 +82,7 @@ def _scale(inputs: MergeInputs, calibrated: Calibrated) -> dict[str, Any]:
         },
         "floor": {
             "believed": calibrated.floor_believed,
-            "hips_over_floor_m": calibrated.hips_over_floor_m,
+            "trunk_over_floor_m": calibrated.height_over_floor_m,
         },
     }
 

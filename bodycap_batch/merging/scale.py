@@ -14,8 +14,8 @@ from bodycap_batch.merging.gauge import WALKING_HEIGHT
 _FIRST_STEPS = (1.0, 0.85, 1.18)
 _MAX_SOLVES = 12
 _MIN_SIGMA = 0.01
-FLOOR_SIGMA = 0.05
-"""Of the log of hips-over-floor against standing height: walking knees bend 1 to 4 cm, shoes add 1 to 3."""
+FLOOR_SIGMA = 0.06
+"""Of the log of a trunk joint's height over the floor: knees bend 1 to 6 cm, shoes add 1 to 3."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,24 +76,22 @@ def find_scale(calibration: Calibration, provisional: float) -> ScaleEstimate:
     )
 
 
-def weigh_floor(
-    estimate: ScaleEstimate, hips_over_floor_m: float, standing_m: float
-) -> tuple[float, float, bool]:
-    """Let the height of the hips over the map's floor correct the scale.
+def weigh_floor(estimate: ScaleEstimate, height_m: float, standing_m: float) -> tuple[float, float, bool]:
+    """Let the height of the trunk over the map's floor correct the scale.
 
     Args:
         estimate: The body's own estimate.
-        hips_over_floor_m: Median height of the hips over the floor at that scale.
-        standing_m: Hip height of the standing skeleton.
+        height_m: Median height of a trunk joint over the floor at that scale.
+        standing_m: Its height in the standing skeleton.
 
     Returns:
-        Factor on the scale, its sigma, and whether the floor was believed (within 3 sigma of the body).
+        Factor on the scale, its sigma, and whether the floor was believed (within 2 sigma of the body).
     """
-    if hips_over_floor_m <= 0.0:
+    if height_m <= 0.0:
         return 1.0, estimate.sigma_log, False
-    difference = float(np.log(WALKING_HEIGHT * standing_m / hips_over_floor_m))
+    difference = float(np.log(WALKING_HEIGHT * standing_m / height_m))
     body, floor = estimate.sigma_log**2, FLOOR_SIGMA**2
-    if difference**2 > 9.0 * (body + floor):
+    if difference**2 > 4.0 * (body + floor):
         return 1.0, estimate.sigma_log, False
     return (
         float(np.exp(difference * body / (body + floor))),

@@ -25,6 +25,7 @@ from bodycap_batch.merging.solve import MotionGraph, Solution
 from bodycap_batch.merging.tracks import Track, adapt_psd, clean, make_track
 from bodycap_batch.scene import Trajectory
 from bodycap_batch.skeleton import Mount
+from bodycap_batch.skeleton_presets import split_side
 
 MIN_FRAMES = 15
 """Localised frames below which a camera tells nothing about a motion: half a second at 30 fps."""
@@ -61,7 +62,7 @@ class Calibrated:
     mounts: tuple[Mount, ...]
     up: gauge.Direction
     floor_believed: bool
-    hips_over_floor_m: float | None
+    height_over_floor_m: float | None
 
 
 def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> MergeResult:
@@ -176,12 +177,12 @@ def _calibrate(
     points = inputs.map_points.get(_gauge_of(inputs, tracks[0].camera), np.zeros((0, 3)))
     poses = calibration.poses()
     body = gauge.body_up(inputs.skeleton, bones, poses)
-    up = gauge.refine_up(estimate.scale * points, body, np.random.default_rng(0))
-    hips = _hips_over_floor(inputs, bones, poses, up, estimate.scale * points)
+    up = gauge.find_up(estimate.scale * points, body, np.random.default_rng(0))
+    height = _height_over_floor(inputs, bones, poses, up, estimate.scale * points)
     factor, sigma, believed = (1.0, estimate.sigma_log, False)
-    if hips is not None:
-        standing = gauge.standing_hip_height(inputs.skeleton)
-        factor, sigma, believed = weigh_floor(estimate, hips, standing)
+    if height is not None:
+        standing = gauge.standing_height(inputs.skeleton, bones[0].joint)
+        factor, sigma, believed = weigh_floor(estimate, height, standing)
     scale = factor * estimate.scale
     if factor != 1.0:
         calibration.solve(scale)
@@ -192,7 +193,7 @@ def _calibrate(
         mounts=calibration.solved_mounts(sigma, estimate.mount_slope),
         up=up,
         floor_believed=believed,
-        hips_over_floor_m=hips,
+        height_over_floor_m=height,
     )
 
 
@@ -200,15 +201,16 @@ def _gauge_of(inputs: MergeInputs, camera: str) -> str:
     return next(each.gauge for each in inputs.trajectories if each.camera == camera)
 
 
-def _hips_over_floor(
+def _height_over_floor(
     inputs: MergeInputs, bones: Sequence[Bone], poses: FloatArray, up: gauge.Direction, points_m: FloatArray
 ) -> float | None:
-    """Median height of the hips over the map's floor, or None where the map shows none."""
-    rotation = gauge.upright(up.up)
-    hips = complete_body(inputs.skeleton, bones, _turned(rotation, poses))[0][:, 0, 2, 3]
-    standing = gauge.standing_hip_height(inputs.skeleton)
-    floor = gauge.find_floor(points_m @ rotation[2], float(np.median(hips)) - standing, standing)
-    return float(np.median(hips)) - floor.height_m if floor.source == "map" else None
+    """Median height of the trunk's first solved joint over the map's floor, None where the map shows none."""
+    if split_side(bones[0].role)[0]:
+        return None
+    height = float(np.median(poses[:, 0, :3, 3] @ up.up))
+    standing = gauge.standing_height(inputs.skeleton, bones[0].joint)
+    floor = gauge.find_floor(points_m @ up.up, up, height - gauge.WALKING_HEIGHT * standing, standing)
+    return height - floor.height_m if floor.source == "map" else None
 
 
 def _turned(rotation: FloatArray, poses: FloatArray) -> FloatArray:
@@ -223,11 +225,11 @@ def _place(
     turned = _turned(rotation, solution.world_from_bone)
     joints, solved = complete_body(inputs.skeleton, bones, turned)
     hips = joints[:, 0, :3, 3]
-    standing = gauge.standing_hip_height(inputs.skeleton)
+    standing = gauge.standing_height(inputs.skeleton, 0)
     points = inputs.map_points.get(_gauge_of(inputs, next(iter(solution.weights))), np.zeros((0, 3)))
     heights = calibrated.scale * points @ rotation[2]
     expected = float(np.median(hips[:, 2])) - gauge.WALKING_HEIGHT * standing
-    floor = gauge.find_floor(heights, expected, standing)
+    floor = gauge.find_floor(heights, calibrated.up, expected, standing)
     forward = -joints[:, 0, :3, 1]
     placed = gauge.place(rotation, hips[0], floor.height_m, gauge.heading(forward, hips, fps))
     to_world = Similarity(1.0, placed.rotation @ rotation.T, placed.translation)
