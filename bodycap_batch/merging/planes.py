@@ -63,11 +63,11 @@ def find_planes(points_m: FloatArray, rng: np.random.Generator) -> list[Plane]:
 def _fullest(points: FloatArray, rng: np.random.Generator) -> Plane | None:
     tree = cKDTree(points)
     seeds = rng.integers(len(points), size=_HYPOTHESES)
-    neighbours = tree.query_ball_point(points[seeds], _NEAR_M)
+    groups = [tree.query_ball_point(point, _NEAR_M) for point in points[seeds]]
     triples = np.array(
         [
             [seed, *rng.choice(near, 2, replace=False)]
-            for seed, near in zip(seeds.tolist(), list(neighbours), strict=True)
+            for seed, near in zip(seeds.tolist(), groups, strict=True)
             if len(near) > 3
         ],
         dtype=np.int64,
