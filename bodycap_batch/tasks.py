@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from bodycap_batch.skeleton import Mount, SkeletonModel
 
 SUMMARY = "summary.json"
+CAPTURE = "capture"
+"""Folder of a synth artefact that holds the videos and the truth."""
 RESULTS = "results"
 """Folder of an export artefact that holds what goes to the user."""
 Json = Mapping[str, Any]
@@ -54,7 +56,7 @@ def read_summary(artefact: Path) -> dict[str, Any]:
 def _synth(options: Json, _: Json, context: StageContext, files: Path) -> None:
     from bodycap_batch.synthetic import SynthOptions, synthesise
 
-    synthesise(SynthOptions.model_validate(options), files / "capture", context)
+    synthesise(SynthOptions.model_validate(options), files / CAPTURE, context)
 
 
 def _check(_: Json, arguments: Json, context: StageContext, files: Path) -> None:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import platform
-import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -16,7 +14,7 @@ import bodycap_batch
 from bodycap_batch.config.models import Job
 from bodycap_batch.errors import BodycapError, EstimationError
 from bodycap_batch.pipeline.flow import Flow, Settings, StageRecord
-from bodycap_batch.pipeline.inputs import has_body, key_of
+from bodycap_batch.pipeline.inputs import has_body
 from bodycap_batch.pipeline.results import (
     PARTIAL,
     RUN_FILE,
@@ -25,7 +23,6 @@ from bodycap_batch.pipeline.results import (
     remove_outdated,
     write_results_file,
 )
-from bodycap_batch.runner import Task
 from bodycap_batch.store import Artefact
 from bodycap_batch.tasks import RESULTS
 
@@ -86,19 +83,6 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
     return summary
 
 
-def prepare_capture(options: Mapping[str, Any], folder: Path, settings: Settings) -> None:
-    """Render a synthetic capture into a folder, unless it is complete there.
-
-    Raises:
-        BodycapError: The options are wrong or rendering failed.
-    """
-    task = Task(key=key_of("synth", options, {}), threads=settings.threads)
-    runner = settings.runner(logs=folder.parent / f".{folder.name}-logs")
-    artefact, _ = runner.run(task)
-    publish({Path(name).relative_to("capture").as_posix(): path for name, path in _all(artefact)}, folder)
-    shutil.rmtree(folder.parent / f".{folder.name}-logs", ignore_errors=True)
-
-
 def _merge(
     job: Job, flow: Flow, scene: Artefact, registrations: Mapping[str, Artefact]
 ) -> tuple[Artefact | None, EstimationError | None]:
@@ -140,10 +124,6 @@ def _with_partial_results(error: EstimationError, folder: Path) -> BodycapError:
     kept = f"the map, the cameras' paths and the frames are in {folder}"
     error.hint = f"{error.hint}; {kept}" if error.hint else kept
     return error
-
-
-def _all(artefact: Artefact) -> list[tuple[str, Path]]:
-    return [(name, artefact.path / name) for name in artefact.files if name.startswith("capture/")]
 
 
 def _exported(artefact: Artefact) -> list[tuple[str, Path]]:

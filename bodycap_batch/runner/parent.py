@@ -137,7 +137,7 @@ class _Child:
         self, cancelled: Callable[[], bool], on_progress: Callable[[dict[str, Any]], None]
     ) -> dict[str, Any] | None:
         """Read the child's lines until it ends; returns its error message, if it sent one."""
-        assert self._process.stdout is not None  # noqa: S101 - opened as a pipe
+        assert self._process.stdout is not None
         failure: dict[str, Any] | None = None
         pipe, rest = self._process.stdout.fileno(), b""
         try:
@@ -158,8 +158,8 @@ class _Child:
 
     def _end(self, *, at_once: bool) -> None:
         """Wait for the child, or stop its process group: SIGTERM, and SIGKILL after 3 s."""
-        assert self._process.stdin is not None  # noqa: S101 - opened as a pipe
-        assert self._process.stdout is not None  # noqa: S101 - opened as a pipe
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
         self._process.stdin.close()
         if at_once:
             self._signal(signal.SIGTERM)
