@@ -11,8 +11,11 @@ from bodycap_batch.arrays import FloatArray
 from bodycap_batch.merging.calibrate import Calibration
 from bodycap_batch.merging.gauge import WALKING_HEIGHT
 
-_FIRST_STEPS = (1.0, 0.85, 1.18)
-_MAX_SOLVES = 12
+_COARSE = 0.16
+_FINE = 0.05
+"""Steps of the log scale. The cost is skewed (an arm cannot stretch, but it can bend), so that the coarse
+parabola leans to small scales; the fine one decides."""
+_MAX_SOLVES = 14
 _MIN_SIGMA = 0.01
 FLOOR_SIGMA = 0.06
 """Of the log of a trunk joint's height over the floor: knees bend 1 to 6 cm, shoes add 1 to 3."""
@@ -36,44 +39,48 @@ class ScaleEstimate:
 
 
 def find_scale(calibration: Calibration, provisional: float) -> ScaleEstimate:
-    """Minimise the calibration's cost over the logarithm of the scale by successive parabolas.
+    """Minimise the calibration's cost over the logarithm of the scale, by parabolas of shrinking width.
 
     The calibration is left solved at the returned scale.
     """
     costs: dict[float, float] = {}
     mounts: dict[float, dict[str, FloatArray]] = {}
 
-    def evaluate(log_scale: float) -> None:
-        costs[log_scale] = calibration.solve(float(np.exp(log_scale)))
-        mounts[log_scale] = {name: pose.copy() for name, pose in calibration.mounts.items()}
+    def cost(log_scale: float) -> float:
+        if log_scale not in costs:
+            costs[log_scale] = calibration.solve(float(np.exp(log_scale)))
+            mounts[log_scale] = {name: pose.copy() for name, pose in calibration.mounts.items()}
+        return costs[log_scale]
 
-    for factor in _FIRST_STEPS:
-        evaluate(float(np.log(provisional * factor)))
-    curvature = 0.0
-    while len(costs) < _MAX_SOLVES:
-        at = sorted(costs)
-        lowest = min(at, key=costs.__getitem__)
-        if lowest in (at[0], at[-1]):
-            evaluate(lowest + (0.15 if lowest == at[-1] else -0.15))
-            continue
-        middle = at.index(lowest)
-        points = at[middle - 1 : middle + 2]
-        bend, slope, _ = np.polyfit(np.array(points) - lowest, [costs[x] for x in points], 2)
-        curvature = 2.0 * float(bend)
-        following = float(np.clip(lowest - slope / curvature, points[0], points[2])) if bend > 0 else lowest
-        if abs(following - lowest) < 0.005:
-            break
-        evaluate(following)
-    best = min(costs, key=costs.__getitem__)
-    other = min((x for x in costs if x != best), key=lambda x: abs(x - best))
-    slope_of = {name: (mounts[other][name] - mounts[best][name]) / (other - best) for name in mounts[best]}
-    evaluate(best)
+    centre, curvature = float(np.log(provisional)), 0.0
+    for step in (_COARSE, _FINE):
+        while len(costs) < _MAX_SOLVES:
+            low, middle, high = cost(centre - step), cost(centre), cost(centre + step)
+            if middle <= min(low, high):
+                curvature = (low + high - 2.0 * middle) / step**2
+                centre += float(0.5 * (low - high) / (curvature * step)) if curvature > 0.0 else 0.0
+                break
+            centre += step if high < low else -step
+    cost(centre)
+    before, after = (_mounts_beside(mounts, centre, sign * _FINE) for sign in (-1.0, 1.0))
+    width = after[0] - before[0]
+    slope = {name: (after[1][name] - before[1][name]) / width for name in after[1]}
+    costs.pop(centre)
+    cost(centre)
     return ScaleEstimate(
-        scale=float(np.exp(best)),
+        scale=float(np.exp(centre)),
         sigma_log=max(1.0 / np.sqrt(curvature), _MIN_SIGMA) if curvature > 0 else 1.0,
-        costs=tuple(sorted((float(np.exp(x)), cost) for x, cost in costs.items())),
-        mount_slope=slope_of,
+        costs=tuple(sorted((float(np.exp(x)), value) for x, value in costs.items())),
+        mount_slope=slope,
     )
+
+
+def _mounts_beside(
+    mounts: Mapping[float, Mapping[str, FloatArray]], centre: float, offset: float
+) -> tuple[float, Mapping[str, FloatArray]]:
+    """The solve nearest to an offset from the centre, and its mounts."""
+    nearest = min((x for x in mounts if (x - centre) * offset > 0.0), key=lambda x: abs(x - centre - offset))
+    return nearest, mounts[nearest]
 
 
 def weigh_floor(estimate: ScaleEstimate, height_m: float, standing_m: float) -> tuple[float, float, bool]:
