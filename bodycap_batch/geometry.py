@@ -104,7 +104,7 @@ def poses_at(
     """Interpolate timed poses between their two neighbours.
 
     Args:
-        times_ns: (N,) increasing, N ≥ 1.
+        times_ns: (N,) increasing.
         poses: (N,4,4).
         at_ns: (M,) wanted times.
         max_gap_ns: Where the neighbours are further apart than this, there is no pose.
@@ -113,6 +113,9 @@ def poses_at(
     Returns:
         (M,4,4) poses, identity where there is none, and (M,) where there is one.
     """
+    out = np.tile(np.eye(4), (len(at_ns), 1, 1))
+    if len(times_ns) == 0:
+        return out, np.zeros(len(at_ns), dtype=bool)
     last = len(times_ns) - 1
     after = np.minimum(np.maximum(np.searchsorted(times_ns, at_ns), 1), last)
     before = np.maximum(after - 1, 0)
@@ -123,7 +126,6 @@ def poses_at(
     alpha = np.clip((at_ns - start) / gap, 0.0, 1.0)
     alpha = np.where(inside, alpha, np.round(alpha))
     found = inside | near
-    out = np.tile(np.eye(4), (len(at_ns), 1, 1))
     if found.any():
         out[found] = interpolate_pose(poses[before[found]], poses[after[found]], alpha[found])
     return out, np.asarray(found)

@@ -49,6 +49,8 @@ def nearest_truth(truth: TimedPoses, times_ns: IntArray, max_diff_s: float) -> t
     Returns:
         (N,4,4) poses and (N,) which are near enough.
     """
+    if len(truth.times_ns) == 0:
+        return np.tile(np.eye(4), (len(times_ns), 1, 1)), np.zeros(len(times_ns), dtype=bool)
     after = np.minimum(np.searchsorted(truth.times_ns, times_ns), len(truth.times_ns) - 1)
     before = np.maximum(after - 1, 0)
     closer = np.abs(times_ns - truth.times_ns[before]) <= np.abs(truth.times_ns[after] - times_ns)

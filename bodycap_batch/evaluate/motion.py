@@ -47,12 +47,14 @@ class MotionOptions:
         root: Role whose position is subtracted for the root-relative error.
         offset_s: Added to the estimate's times before the truth is looked up.
         max_gap_s: No truth inside a longer gap.
+        roles: Compare these joints only (with the root); all that both have when empty.
     """
 
     align: Literal["se3", "none"] = "se3"
     root: str = "Hips"
     offset_s: float = 0.0
     max_gap_s: float = 0.1
+    roles: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,7 +155,8 @@ def _from_motion(motion: Motion) -> _Joints:
 
 
 def _score(estimate: _Joints, truth: _Joints, options: MotionOptions) -> MotionReport:
-    roles = tuple(role for role in estimate.roles if role in truth.roles)
+    wanted = {*options.roles, options.root} if options.roles else set(truth.roles)
+    roles = tuple(role for role in estimate.roles if role in truth.roles and role in wanted)
     if options.root not in roles or len(roles) < 3:
         message = f"the two share {len(roles)} joints ({', '.join(roles)}); needs {options.root} and two more"
         raise JobError(message, hint="joints are matched by name: HumanIK, Mixamo, Biped, CMU ... names")

@@ -163,6 +163,9 @@ def score_trajectories(
     if missing:
         hint = f"truth is given for {', '.join(sorted(truths)) or 'none'}"
         raise JobError(f"no truth for camera {', '.join(missing)}", hint=hint)
+    empty = sorted(name for name in estimates if len(truths[name].times_ns) == 0)
+    if empty:
+        raise JobError(f"the truth of camera {', '.join(empty)} holds no poses")
     pairs = {name: _pair(estimates[name], truths[name], options) for name in sorted(estimates)}
     alignment = _align(pairs, options.align)
     counts = frames or {}

@@ -86,10 +86,10 @@ def solve_correction(problem: Problem, start: Correction) -> Correction:
         step = _solve_tridiagonal(blocks, coupling, -gradient, damping)
         trial = _moved(problem, now, step)
         trial_cost = _cost(problem, trial)
-        if trial_cost > cost:
+        if trial_cost <= cost:
+            now, cost, damping = trial, trial_cost, max(damping * 0.1, 1e-9)
+        else:
             damping *= 100.0
-            continue
-        now, cost, damping = trial, trial_cost, max(damping * 0.1, 1e-9)
         if np.abs(step).max(initial=0.0) < _ENOUGH:
             break
     return now

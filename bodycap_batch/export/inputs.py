@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from bodycap_batch.arrays import FloatArray
 from bodycap_batch.body import CameraClock, MergeResult
 from bodycap_batch.scene import KeyframeSelection, Map, Trajectory
 
@@ -23,6 +24,8 @@ class ExportInputs:
         selections: Keyframe selections, one per camera.
         merge: The body in the world; None for ``skeleton: none`` or when merging failed.
         partial_reason: Why there is no body although one was asked for.
+        row_fraction: By camera, (N,) mean row of the observations behind each pose over the image height, for
+            rolling shutters; a camera that is missing is taken at the middle row.
         log: Plain JSON values about the map's making (no clocks, no paths), kept in ``metrics.json``.
     """
 
@@ -33,6 +36,7 @@ class ExportInputs:
     selections: tuple[KeyframeSelection, ...] = ()
     merge: MergeResult | None = None
     partial_reason: str | None = None
+    row_fraction: Mapping[str, FloatArray] = field(default_factory=dict)
     log: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -36,17 +36,22 @@ class Projection:
     gap: Mapping[str, Any]
 
 
-def project_motion(merge: MergeResult, clocks: Mapping[str, CameraClock]) -> Projection:
+def project_motion(
+    merge: MergeResult,
+    clocks: Mapping[str, CameraClock],
+    row_fraction: Mapping[str, FloatArray] | None = None,
+) -> Projection:
     """Project a merge result onto its own skeleton.
 
     Args:
         merge: The solved bones.
         clocks: By camera name.
+        row_fraction: By camera, (N,) mean row behind each pose over the image height (rolling shutter).
 
     Returns:
         The motion on the merge's timeline. Joints the graph did not solve keep their local rotations.
     """
-    cameras = _tracked(merge, clocks)
+    cameras = _tracked(merge, clocks, row_fraction or {})
     solved = np.flatnonzero(merge.solved)
     start = _start(merge.skeleton, merge.world_from_joint, merge.solved)
     problem = Problem(
@@ -76,23 +81,29 @@ def _start(skeleton: SkeletonModel, world_from_joint: FloatArray, solved: BoolAr
     return Correction(root=root, local=local)
 
 
-def _tracked(merge: MergeResult, clocks: Mapping[str, CameraClock]) -> tuple[Tracked, ...]:
+def _tracked(
+    merge: MergeResult, clocks: Mapping[str, CameraClock], row_fraction: Mapping[str, FloatArray]
+) -> tuple[Tracked, ...]:
     """Each camera's measured poses at the ticks of the motion."""
     out = []
     mounts = {mount.camera: mount for mount in merge.mounts}
     for trajectory in merge.trajectories:
-        kept = trajectory.localised
+        kept = np.flatnonzero(trajectory.localised)
         mount = mounts.get(trajectory.camera)
         joint = None if mount is None else merge.skeleton.index_of_role(mount.role)
-        if mount is None or joint is None or not kept.any():
+        if mount is None or joint is None or not len(kept):
             continue
-        times = clocks[trajectory.camera].common_times_ns(trajectory.times_ns)
-        interval = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+        rows = row_fraction.get(trajectory.camera)
+        times = clocks[trajectory.camera].common_times_ns(
+            trajectory.times_ns[kept], None if rows is None else rows[kept]
+        )
+        order = np.argsort(times, kind="stable")
+        interval = np.median(np.diff(trajectory.times_ns)) if len(trajectory.times_ns) > 1 else 0.0
         poses, found = poses_at(
-            times[kept],
-            trajectory.gauge_from_cam[kept],
+            times[order],
+            trajectory.gauge_from_cam[kept[order]],
             merge.times_ns(),
-            max_gap_ns=round(_MAX_GAP_FRAMES * interval),
+            max_gap_ns=round(_MAX_GAP_FRAMES * float(interval)),
             snap_ns=1_000_000,
         )
         out.append(

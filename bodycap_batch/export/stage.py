@@ -65,7 +65,7 @@ def _project(inputs: ExportInputs, options: ExportOptions) -> tuple[Motion | Non
     """The motion to export and its distance from the graph; None without a body."""
     if inputs.merge is None:
         return None, {}
-    projection = project_motion(inputs.merge, inputs.clocks)
+    projection = project_motion(inputs.merge, inputs.clocks, inputs.row_fraction)
     motion = projection.motion
     if options.hierarchy == "solved":
         motion = only_solved(motion, inputs.merge.solved)

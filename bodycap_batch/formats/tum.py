@@ -17,6 +17,7 @@ from bodycap_batch.geometry import make_transform, quat_xyzw_from_rotation, rota
 _NS_PER_S = 1_000_000_000
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
 _COMMENTS = ("#", "%", "//", ";")
+_HEADINGS = ("timestamp", "time", "t")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,7 +42,8 @@ class TimedPoses:
 def read_tum(path: Path | str) -> TimedPoses:
     """Read a trajectory: comments, a heading, commas, tabs and CRLF are understood.
 
-    Rows out of order are sorted; of rows with the same time the first counts.
+    Rows out of order are sorted; of rows with the same time the first counts. A file of comments alone
+    is a camera that was never localised: no poses.
 
     Raises:
         JobError: The file is missing, malformed or empty; names the line.
@@ -49,23 +51,25 @@ def read_tum(path: Path | str) -> TimedPoses:
     path = Path(path)
     times: list[int] = []
     rows: list[list[float]] = []
+    headed = False
     try:
         with open(path, encoding="utf-8-sig", errors="replace") as handle:
             for number, line in enumerate(handle, start=1):
                 words = line.replace(",", " ").split()
-                if not words or words[0].startswith(_COMMENTS):
+                if not words:
                     continue
-                if not rows and words[0].strip("'\"").lower() in ("timestamp", "time", "t"):
+                if words[0].startswith(_COMMENTS) or (not rows and words[0].lower() in _HEADINGS):
+                    headed = True
                     continue
                 time_ns, row = _parse(path, number, words)
                 times.append(time_ns)
                 rows.append(row)
     except OSError as error:
         raise JobError(f"cannot read: {error.strerror or error}", path=path, hint="check the path") from error
-    if not rows:
+    if not rows and not headed:
         raise JobError("no poses in the file", path=path, hint=f"a line holds: {_COLUMNS}")
     times_ns, first = np.unique(np.array(times, dtype=np.int64), return_index=True)
-    table = np.array(rows)[first]
+    table = np.array(rows).reshape(-1, 7)[first]
     poses = make_transform(rotation_from_quat_xyzw(table[:, 3:]), table[:, :3])
     return TimedPoses(times_ns=times_ns, world_from_cam=poses)
 

@@ -410,3 +410,47 @@ def test_real_skeleton_files(data_root: Path, tmp_path: Path, folder: str, chest
             assert ours == words
         elif words[0] == "OFFSET":
             assert list(map(float, ours[1:])) == list(map(float, words[1:]))
+
+
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(data=st.data())
+def test_damaged_files_are_read_or_refused_but_never_crash(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    """Lines dropped, doubled, swapped, cut, or sprinkled with noise."""
+    lines = PAIR.encode().split(b"\n")
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(lines) - 1))
+        kind = data.draw(st.sampled_from(["drop", "double", "cut", "noise", "truncate", "swap"]))
+        if kind == "drop":
+            del lines[at]
+        elif kind == "double":
+            lines.insert(at, lines[at])
+        elif kind == "swap":
+            lines[at], lines[-1] = lines[-1], lines[at]
+        elif kind == "truncate":
+            lines = lines[: at + 1]
+        elif kind == "cut":
+            lines[at] = lines[at][: data.draw(st.integers(0, max(0, len(lines[at]))))]
+        else:
+            lines[at] += data.draw(
+                st.sampled_from([b" 1", b" -", b" {", b"}", b"\xff\xfe", b" 1e999", b" nan"])
+            )
+        lines = lines or [b""]
+    path = tmp_path_factory.mktemp("fuzz") / "file.bvh"
+    path.write_bytes(b"\n".join(lines))
+    refused = None
+    try:
+        model, moving = read_bvh(path)
+    except JobError as error:
+        refused = error.path
+    if refused is not None:
+        assert refused == str(path)
+        return
+    assert model.joints[0]
+    if moving is not None:
+        assert np.isfinite(moving.world_from_joint()).all()
+        write_bvh(path.with_name("again.bvh"), moving)
+        again = read_bvh(path.with_name("again.bvh"), units="cm")[1]
+        assert again is not None
+        assert len(again.root_in_world_m) == len(moving.root_in_world_m)

@@ -204,6 +204,18 @@ def test_a_wrong_clock_shows() -> None:
     assert 0.04 < error.mean < 0.17
 
 
+def test_a_camera_without_poses_counts_against_coverage() -> None:
+    nothing = TimedPoses(times_ns=np.zeros(0, dtype=np.int64), world_from_cam=np.zeros((0, 4, 4)))
+    truths = {"a": walk(0), "b": walk(0)}
+    score = score_trajectories({"a": walk(0), "b": nothing}, truths, frames={"a": 300, "b": 300})
+    assert score.cameras["b"].ate_m is None
+    assert (score.cameras["b"].coverage, score.total.coverage) == (0.0, 0.5)
+    with pytest.raises(JobError, match="0 frames have both"):
+        relative_camera_error({"a": walk(0), "b": nothing}, truths, "a", "b")
+    with pytest.raises(JobError, match="truth of camera b holds no poses"):
+        score_trajectories({"b": walk(0)}, {"b": nothing})
+
+
 def test_missing_truth_and_other_clocks_are_named() -> None:
     with pytest.raises(JobError, match="no truth for camera b"):
         score_trajectories({"a": walk(0), "b": walk(0)}, {"a": walk(0)})

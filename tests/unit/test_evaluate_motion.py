@@ -109,6 +109,13 @@ def test_truth_from_joint_positions(tmp_path: Path) -> None:
     assert report.mpjpe_m.mean < 0.025
 
 
+def test_only_the_joints_asked_for() -> None:
+    options = MotionOptions(align="none", roles=("RightArm", "RightHand"))
+    report = score_motion(swinging(reach_rad=0.2), swinging(), options)
+    assert sorted(report.joints) == ["Hips", "RightArm", "RightHand"]
+    assert report.mpjpe_m.max < 1e-9
+
+
 def test_what_cannot_be_compared_is_named(tmp_path: Path) -> None:
     write_bvh(tmp_path / "a.bvh", swinging())
     np.savez(tmp_path / "b.npz", names=["root", "tail"], t=np.arange(3), world=np.zeros((3, 2, 3)))

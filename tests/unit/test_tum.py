@@ -82,9 +82,14 @@ def test_broken_rows_are_named(tmp_path: Path, row: str, says: str) -> None:
 def test_missing_and_empty_files(tmp_path: Path) -> None:
     with pytest.raises(JobError, match="cannot read"):
         read_tum(tmp_path / "none.tum")
-    (tmp_path / "empty.tum").write_text("# nothing\n")
+    (tmp_path / "empty.tum").write_text("\n")
     with pytest.raises(JobError, match="no poses"):
         read_tum(tmp_path / "empty.tum")
+
+
+def test_a_camera_that_was_never_localised(tmp_path: Path) -> None:
+    write_tum(tmp_path / "a.tum", poses(0, 0), ["camera left_palm"])
+    assert len(read_tum(tmp_path / "a.tum").times_ns) == 0
 
 
 def test_seconds_text() -> None:
