@@ -10,23 +10,24 @@ from importlib import metadata
 from pathlib import Path
 
 _PACKAGE = Path(__file__).parent
-_IMPORT = re.compile(r"^\s*(?:from|import) bodycap_batch(?:\.([\w.]+))?", re.MULTILINE)
+_MENTION = re.compile(r"\bbodycap_batch(?:\.| import )(\w+(?:\.\w+)*)")
+"""An import, or a package named in a string to read its data files."""
 _NOT_COMPUTING = frozenset({"errors", "context", "progress", "config", "config.options", "config.models"})
 """Modules that decide nothing about a result: options are part of the key by their values."""
 _SKIPPED_SUFFIXES = (".pyc", ".pyo")
 
 
 @cache
-def algorithm_version(room: str) -> str:
+def algorithm_version(rooms: tuple[str, ...]) -> str:
     """Version of a stage's algorithm: a digest of its own source files and of all they import from here.
 
     Derived rather than counted by hand, so that changed code can never be answered with an old result.
 
     Args:
-        room: The stage's module below this package (``mapping``).
+        rooms: Modules below this package: the stage's own (``mapping``) and what its task calls besides.
     """
     digest = hashlib.sha256()
-    for path in sorted(_closure((room, "tasks"))):
+    for path in sorted(_closure((*rooms, "tasks"))):
         digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")
         digest.update(path.read_bytes() + b"\0")
     return digest.hexdigest()[:16]
@@ -60,9 +61,9 @@ def _closure(modules: Iterable[str]) -> set[Path]:
 
 
 def _imports(path: Path) -> Iterator[str]:
-    for match in _IMPORT.finditer(path.read_text(encoding="utf-8")):
-        if (name := match.group(1)) and name not in _NOT_COMPUTING:
-            yield name
+    for match in _MENTION.finditer(path.read_text(encoding="utf-8")):
+        if match.group(1) not in _NOT_COMPUTING:
+            yield match.group(1)
 
 
 def _files(name: str) -> Iterator[Path]:

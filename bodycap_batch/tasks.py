@@ -34,12 +34,12 @@ class Stage:
 
     Attributes:
         function: Called in the child with options, arguments, context and the artefact's folder.
-        room: The module that holds the algorithm.
+        rooms: The module that holds the algorithm, and what the task itself computes or writes with.
         libraries: Distributions the result depends on (``a|b``: either).
     """
 
     function: Callable[[Json, Json, StageContext, Path], None]
-    room: str
+    rooms: tuple[str, ...]
     libraries: tuple[str, ...]
 
 
@@ -287,13 +287,22 @@ def _write_summary(files: Path, **values: Any) -> None:
 
 
 _VISION = ("numpy", "av", "opencv-python-headless|opencv-python")
+_KEPT = ("formats.bundle", "scene")
 STAGES = {
-    "synth": Stage(function=_synth, room="synthetic", libraries=("numpy", "av", "open3d-cpu|open3d")),
-    "check": Stage(function=_check, room="check", libraries=_VISION),
-    "keyframes": Stage(function=_keyframes, room="keyframes", libraries=_VISION),
-    "map": Stage(function=_map, room="mapping", libraries=(*_VISION, "pycolmap")),
-    "extend": Stage(function=_extend, room="mapping", libraries=(*_VISION, "pycolmap")),
-    "registration": Stage(function=_registration, room="registration", libraries=(*_VISION, "pycolmap")),
-    "merge": Stage(function=_merge, room="merging", libraries=("numpy", "scipy", "gtsam")),
-    "export": Stage(function=_export, room="export", libraries=("numpy", "scipy", "open3d-cpu|open3d")),
+    "synth": Stage(function=_synth, rooms=("synthetic",), libraries=("numpy", "av", "open3d-cpu|open3d")),
+    "check": Stage(function=_check, rooms=("check",), libraries=_VISION),
+    "keyframes": Stage(function=_keyframes, rooms=("keyframes", *_KEPT), libraries=_VISION),
+    "map": Stage(function=_map, rooms=("mapping", *_KEPT), libraries=(*_VISION, "pycolmap")),
+    "extend": Stage(function=_extend, rooms=("mapping", *_KEPT), libraries=(*_VISION, "pycolmap")),
+    "registration": Stage(
+        function=_registration, rooms=("registration", "body", *_KEPT), libraries=(*_VISION, "pycolmap")
+    ),
+    "merge": Stage(
+        function=_merge,
+        rooms=("merging", "skeleton_presets", "formats.bvh", *_KEPT),
+        libraries=("numpy", "scipy", "gtsam"),
+    ),
+    "export": Stage(
+        function=_export, rooms=("export", *_KEPT), libraries=("numpy", "scipy", "open3d-cpu|open3d")
+    ),
 }

@@ -101,7 +101,8 @@ def _frames(results: Path) -> dict[str, int]:
     """Frames of each camera's video, from the results' frames.csv."""
     try:
         with (results / "frames.csv").open(newline="", encoding="utf-8") as stream:
-            return dict(Counter(row["camera"] for row in csv.DictReader(stream)))
+            rows = csv.DictReader(line for line in stream if not line.startswith("#"))
+            return dict(Counter(row["camera"] for row in rows))
     except (FileNotFoundError, KeyError):
         return {}
 

@@ -271,7 +271,7 @@ def test_evaluate_aligns_all_cameras_together_and_counts_lost_frames(
         _write_tum(tmp_path / "gt" / f"{name}.tum", centres)
         _write_tum(tmp_path / "mine" / "trajectories" / f"{name}.tum", 2.0 * centres + 1.0)
     rows = [f"{name},{i}" for name in ("torso", "left_palm") for i in range(100)]
-    (tmp_path / "mine" / "frames.csv").write_text("\n".join(["camera,frame", *rows]) + "\n")
+    (tmp_path / "mine" / "frames.csv").write_text("\n".join(["# a comment", "camera,frame", *rows]) + "\n")
     assert main(["evaluate", str(tmp_path / "mine"), str(tmp_path), "--json"]) == 0
     report = json.loads(capfd.readouterr().out)["trajectories"]
     assert report["scale"] == pytest.approx(0.5, abs=1e-9)

@@ -1,0 +1,99 @@
+"""Versions of algorithms follow the source they are made of."""
+
+from __future__ import annotations
+
+import ast
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from bodycap_batch import identity
+from bodycap_batch.tasks import STAGES
+
+PACKAGE = Path(identity.__file__).parent
+IGNORED = {"errors", "context", "progress"}
+
+
+@pytest.fixture
+def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The package's sources in a folder of their own, where they may be changed."""
+    folder = tmp_path / "bodycap_batch"
+    shutil.copytree(PACKAGE, folder, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(identity, "_PACKAGE", folder)
+    identity.algorithm_version.cache_clear()
+    yield folder
+    identity.algorithm_version.cache_clear()
+
+
+def versions() -> dict[str, str]:
+    identity.algorithm_version.cache_clear()
+    return {name: identity.algorithm_version(stage.rooms) for name, stage in STAGES.items()}
+
+
+def changed_by(path: Path, text: str = "\nANOTHER = 1\n") -> set[str]:
+    before = versions()
+    with path.open("a", encoding="utf-8") as stream:
+        stream.write(text)
+    after = versions()
+    return {name for name in before if before[name] != after[name]}
+
+
+def imported_rooms(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("bodycap_batch."):
+            yield str(node.module).split(".")[1]
+
+
+def test_the_same_sources_have_the_same_version(copied: Path) -> None:
+    assert versions() == versions()
+    assert len(set(versions().values())) == len({stage.rooms for stage in STAGES.values()})
+
+
+@pytest.mark.parametrize("stage", sorted(STAGES))
+def test_everything_a_stage_imports_counts(copied: Path, stage: str) -> None:
+    found = identity._closure(STAGES[stage].rooms)
+    rooms = {path.relative_to(copied).parts[0].removesuffix(".py") for path in found}
+    wanted = {room for path in found if path.suffix == ".py" for room in imported_rooms(path)}
+    assert wanted - rooms - IGNORED - {"config"} == set()
+    assert STAGES[stage].rooms[0] in rooms
+
+
+def test_a_stage_is_changed_by_its_own_code_and_no_other_stage_is(copied: Path) -> None:
+    assert changed_by(copied / "mapping" / "__init__.py") == {"map", "extend"}
+    assert changed_by(copied / "keyframes.py") == {"keyframes"}
+
+
+def test_shared_geometry_changes_what_computes_with_it(copied: Path) -> None:
+    assert changed_by(copied / "geometry.py") >= {"map", "registration", "merge", "export"}
+
+
+def test_the_glue_of_the_tasks_counts_for_all(copied: Path) -> None:
+    assert changed_by(copied / "tasks.py") == set(STAGES)
+
+
+@pytest.mark.parametrize("name", ["humanoid.yaml", "mounts.yaml"])
+def test_data_files_of_the_body_count(copied: Path, name: str) -> None:
+    assert "merge" in changed_by(copied / "presets" / name, "\n# another body\n")
+
+
+def test_what_reads_a_users_skeleton_counts(copied: Path) -> None:
+    assert "merge" in changed_by(copied / "formats" / "bvh" / "reader.py")
+
+
+def test_how_results_are_kept_counts(copied: Path) -> None:
+    assert changed_by(copied / "formats" / "bundle.py") == set(STAGES) - {"synth", "check"}
+
+
+def test_what_only_talks_does_not_count(copied: Path) -> None:
+    assert changed_by(copied / "cli" / "display.py") == set()
+    assert changed_by(copied / "progress.py") == set()
+    assert changed_by(copied / "config" / "options.py") == set()
+
+
+def test_libraries_are_named_with_their_versions() -> None:
+    found = identity.library_versions(("numpy", "not-a-library|pydantic", "nothing-of-that-name"))
+    assert found["numpy"].count(".") >= 1
+    assert found["not-a-library"].count(".") >= 1
+    assert found["nothing-of-that-name"] == "none"
