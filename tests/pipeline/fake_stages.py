@@ -78,8 +78,16 @@ def exported(options: Json, arguments: Json, files: Path) -> None:
     (results / "metrics.json").write_text(json.dumps({"partial": arguments["failure"] is not None}))
 
 
-EXTRA = {"registration": registered, "export": exported}
-NAMES = ("check", "keyframes", "map", "extend", "registration", "merge", "export")
+def rendered(options: Json, arguments: Json, files: Path) -> None:
+    capture = files / "capture"
+    (capture / "gt").mkdir(parents=True)
+    for name in options["cameras"]:
+        (capture / f"{name}.mp4").write_text(f"{name} for {options['seconds']} s")
+    (capture / "gt" / "torso.tum").write_text("0 0 0 0 0 0 0 1\n")
+
+
+EXTRA = {"registration": registered, "export": exported, "synth": rendered}
+NAMES = ("synth", "check", "keyframes", "map", "extend", "registration", "merge", "export")
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:], {name: stage(name) for name in NAMES}))
