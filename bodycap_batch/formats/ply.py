@@ -20,6 +20,10 @@ Colors = npt.NDArray[np.uint8]
 PATH_COLORS = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (213, 94, 0), (204, 121, 167), (0, 114, 178))
 
 
+_VERTEX_BYTES = 3 * 8 + 3
+_HEADER_BYTES = 512
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointCloud:
     """Coloured points.
@@ -79,8 +83,8 @@ def write_ply(path: Path, cloud: PointCloud) -> None:
     content.points = open3d.utility.Vector3dVector(cloud.points.copy())
     content.colors = open3d.utility.Vector3dVector(cloud.colors / 255.0)
     with replacing(path) as temporary:
-        # Open3D says no more than False: a folder or disk that cannot be written to is told by the system.
-        temporary.write_bytes(b"")
+        # Open3D gives no reason, and tells of a full disk by a flood of lines: ask the system first.
+        temporary.write_bytes(bytes(_HEADER_BYTES + _VERTEX_BYTES * len(cloud.points)))
         if not open3d.io.write_point_cloud(temporary, content, write_ascii=False):
             hint = "check that the disk is not full"
             raise StoreError("Open3D could not write the point cloud", path=path, hint=hint)

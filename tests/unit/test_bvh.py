@@ -412,7 +412,7 @@ def test_real_skeleton_files(data_root: Path, tmp_path: Path, folder: str, chest
             assert list(map(float, ours[1:])) == list(map(float, words[1:]))
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=150, deadline=None, derandomize=True)
 @given(data=st.data())
 def test_damaged_files_are_read_or_refused_but_never_crash(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
