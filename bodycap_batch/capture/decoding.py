@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bodycap_batch.arrays import IntArray
-from bodycap_batch.capture.video import COPY_AGAIN, VideoFile, open_container, reason_of
+from bodycap_batch.capture.video import COPY_AGAIN, VideoFile, open_container, reason_of, video_stream
 from bodycap_batch.errors import CaptureError
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def first_frame(video: VideoFile) -> tuple[VideoFrame, bool]:
     import av
 
     with open_container(video.path) as container:
-        stream = _video_stream(container)
+        stream = _decoder(container, video)
         try:
             for frame in container.decode(stream):
                 return frame, bool(stream.codec_context.has_b_frames)
@@ -68,8 +68,8 @@ def first_frame(video: VideoFile) -> tuple[VideoFrame, bool]:
     raise CaptureError("no frame of it can be decoded", path=video.path, hint=COPY_AGAIN)
 
 
-def _video_stream(container: InputContainer) -> VideoStream:
-    stream = container.streams.video[0]
+def _decoder(container: InputContainer, video: VideoFile) -> VideoStream:
+    stream = video_stream(container, video.path)
     stream.thread_type = "AUTO"
     # The process's thread budget, where one is set; all processors otherwise.
     stream.codec_context.thread_count = int(os.environ.get("OMP_NUM_THREADS", "0") or 0)
@@ -85,7 +85,7 @@ class _Cursor:
         self._video = video
         self._may_seek = seek and not video.counted
         self._container = open_container(video.path)
-        self._stream = _video_stream(self._container)
+        self._stream = _decoder(self._container, video)
         self._frames: Iterator[VideoFrame] = self._container.decode(self._stream)
         self._key_index = np.searchsorted(video.pts, video.key_pts)
 

@@ -13,11 +13,22 @@ import numpy as np
 
 from bodycap_batch.arrays import IntArray
 from bodycap_batch.capture.decoding import first_frame
-from bodycap_batch.capture.video import COPY_AGAIN, VideoFile, open_container, orientation_of, reason_of
+from bodycap_batch.capture.video import (
+    COPY_AGAIN,
+    VideoFile,
+    open_container,
+    orientation_of,
+    reason_of,
+    video_stream,
+)
 from bodycap_batch.errors import CaptureError
 
 if TYPE_CHECKING:
     from av.container import InputContainer
+
+
+# Later than any Unix time of a recording, and far from the end of 64-bit nanoseconds.
+_MAX_SECONDS = 4e9
 
 
 def index_video(path: Path) -> VideoFile:
@@ -27,16 +38,15 @@ def index_video(path: Path) -> VideoFile:
         CaptureError: No video stream, no frames, or the file ends before its index says.
     """
     with open_container(path) as container:
-        if not container.streams.video:
-            what = "no video in it, sound only" if container.streams.audio else "the video holds no frame"
-            raise CaptureError(what, path=path, hint="give the file that holds the camera's pictures")
-        stream = container.streams.video[0]
+        stream = video_stream(container, path)
         container_format = container.format.name
         # MP4 lists every packet it should hold; looked at before reading adds to the list.
         listed = len(stream.index_entries) if "mp4" in container_format else 0
         pts, key_pts, end = _scan_packets(path, container, stream, listed)
         metadata = {**container.metadata, **stream.metadata}
         time_base, rate = Fraction(stream.time_base or 0), stream.average_rate or stream.guessed_rate
+    if max(abs(int(pts[0])), abs(int(pts[-1]))) * time_base > _MAX_SECONDS or time_base <= 0:
+        raise CaptureError("its timestamps are out of all bounds", path=path, hint=COPY_AGAIN)
     video = VideoFile(
         path=path,
         pts=pts,
@@ -121,7 +131,12 @@ def _with_first_frame(video: VideoFile, container_format: str) -> VideoFile:
     Frames before the first that decodes (a stream cut inside a group of pictures) are left out.
     """
     frame, reordered = first_frame(video)
-    video = replace(video, stored_size=(frame.width, frame.height), orientation=orientation_of(frame))
+    video = replace(
+        video,
+        stored_size=(frame.width, frame.height),
+        orientation=orientation_of(frame),
+        interlaced=bool(frame.interlaced_frame),
+    )
     if container_format == "avi" and reordered:
         return replace(video, counted=True, key_pts=video.pts[:1])
     first = int(np.searchsorted(video.pts, frame.pts or 0))

@@ -40,6 +40,7 @@ def open_camera(spec: CaptureConfig, config: CameraConfig) -> CaptureCamera:
     _check_one_format(videos)
     timeline = join_chapters(videos, config.timestamps)
     offset_s = config.offset_s or 0.0
+    rolling_shutter_s, rolling_notes = _shown_rolling_shutter(config.rolling_shutter_s or 0.0, videos[0])
     used = timeline.usable & _inside(timeline.times_ns, offset_s, spec)
     if not used.any():
         raise _nothing_left(spec, config, timeline.times_ns, offset_s)
@@ -58,8 +59,8 @@ def open_camera(spec: CaptureConfig, config: CameraConfig) -> CaptureCamera:
         times_ns=timeline.times_ns[used],
         nominal_fps=videos[0].fps,
         offset_s=offset_s,
-        rolling_shutter_s=config.rolling_shutter_s or 0.0,
-        notes=timeline.notes,
+        rolling_shutter_s=rolling_shutter_s,
+        notes=(*timeline.notes, *rolling_notes),
         videos=videos,
     )
 
@@ -108,6 +109,13 @@ def guessed_camera(video: VideoFile, work_px: int, fov_deg: float | None) -> Cam
         focal = 0.5 * long_side / np.tan(0.5 * np.radians(_GUESSED_FOV_DEG))
     params = np.array([focal, 0.5 * width, 0.5 * height, 0.0])
     return Camera(model="SIMPLE_RADIAL", width_px=width, height_px=height, params=params, refine=True)
+
+
+def _shown_rolling_shutter(rolling_shutter_s: float, video: VideoFile) -> tuple[float, tuple[str, ...]]:
+    """Read-out time along the rows as shown: a sensor upside down is read from below."""
+    if rolling_shutter_s and not video.orientation[1][1]:
+        return 0.0, ("a quarter turn in the video: its rolling shutter runs along columns and is left out",)
+    return rolling_shutter_s * (video.orientation[1][1] or 1), ()
 
 
 def _check_one_format(videos: tuple[VideoFile, ...]) -> None:

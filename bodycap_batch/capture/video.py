@@ -17,6 +17,7 @@ from bodycap_batch.errors import CaptureError
 if TYPE_CHECKING:
     from av.container import InputContainer
     from av.video.frame import VideoFrame
+    from av.video.stream import VideoStream
 
 COPY_AGAIN = "copy it again from the camera's card, or leave this camera out"
 
@@ -38,6 +39,7 @@ class VideoFile:
         focal_35mm: 35 mm equivalent focal length of the metadata.
         counted: True where decoders return no timestamps to know a frame by (AVI with B-frames):
             frames are counted from the start, and are evenly spaced.
+        interlaced: True where a frame holds two half pictures of different times.
     """
 
     path: Path
@@ -51,6 +53,7 @@ class VideoFile:
     created_s: float | None = None
     focal_35mm: float | None = None
     counted: bool = False
+    interlaced: bool = False
 
     @property
     def shown_size(self) -> tuple[int, int]:
@@ -80,7 +83,7 @@ def open_container(path: Path) -> InputContainer:
     if path.stat().st_size == 0:
         raise CaptureError("the video is empty (0 bytes)", path=path, hint=COPY_AGAIN)
     try:
-        container: InputContainer = av.open(str(path))
+        container: InputContainer = av.open(str(path), metadata_errors="replace")
     except av.error.EOFError as error:
         raise CaptureError("the video holds no frame", path=path, hint=COPY_AGAIN) from error
     except (av.error.FFmpegError, OSError) as error:
@@ -90,6 +93,25 @@ def open_container(path: Path) -> InputContainer:
             hint=COPY_AGAIN,
         ) from error
     return container
+
+
+def video_stream(container: InputContainer, path: Path) -> VideoStream:
+    """The stream that holds the camera's pictures, not a cover picture beside it.
+
+    Raises:
+        CaptureError: There is none, or no decoder for it.
+    """
+    import av
+
+    cover = av.stream.Disposition.attached_pic
+    streams = [stream for stream in container.streams.video if not stream.disposition & cover]
+    if not streams:
+        what = "no video in it, sound only" if container.streams.audio else "the video holds no frame"
+        raise CaptureError(what, path=path, hint="give the file that holds the camera's pictures")
+    for stream in streams:
+        if stream.codec_context is not None:
+            return stream
+    raise CaptureError("no decoder knows this kind of video", path=path, hint="convert it to H.264")
 
 
 def reason_of(error: Exception) -> str:

@@ -39,6 +39,10 @@ def look_at_frames(camera: CaptureCamera) -> list[str]:
             hint="was the lens covered? Leave the camera out; if a player shows it, convert it to H.264",
         )
     notes = []
+    if any(video.interlaced for video in camera.videos):
+        notes.append(
+            "interlaced: make whole pictures of it first (ffmpeg -i in -vf bwdif=send_frame out.mp4)"
+        )
     if black:
         notes.append(
             f"{black} of {len(bright)} pictures looked at are black; cut them off with start_s and end_s"

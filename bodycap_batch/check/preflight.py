@@ -81,7 +81,13 @@ def _finding(camera: CaptureCamera, config: CameraConfig, notes: list[str]) -> C
         size_px=camera.videos[0].shown_size,
         work_size_px=(camera.camera.width_px, camera.camera.height_px),
         lens=_lens(camera),
-        notes=(*camera.notes, *notes, *_rate_notes(camera, usual), *_lens_notes(camera), *_short(duration)),
+        notes=(
+            *camera.notes,
+            *notes,
+            *_rate_notes(camera, usual),
+            *_lens_notes(camera),
+            *_short(duration),
+        ),
     )
 
 
@@ -97,6 +103,10 @@ def _lens_notes(camera: CaptureCamera) -> list[str]:
     lens = camera.camera
     long_side = max(lens.width_px, lens.height_px)
     notes = []
+    if any(video.interlaced for video in camera.videos):
+        notes.append(
+            "interlaced: make whole pictures of it first (ffmpeg -i in -vf bwdif=send_frame out.mp4)"
+        )
     if not 0.2 < lens.focal_px / long_side < 3.0:
         notes.append(
             f"a focal length of {lens.focal_px / long_side:.2f} image widths is unusual; right calibration?"

@@ -42,6 +42,15 @@ def test_rows_are_exposed_one_after_the_other(tmp_path: Path) -> None:
     assert rolling_shutter_delay_s(480, 480, 0.02) == pytest.approx(0.01)
 
 
+def test_a_turned_sensor_is_read_the_other_way(tmp_path: Path) -> None:
+    rolling = {"rolling_shutter_s": 0.02}
+    upside_down = opened(write_video(tmp_path / "a.mp4", FRAMES, rotation=180), camera=rolling)
+    assert upside_down.rolling_shutter_s == -0.02
+    quarter = opened(write_video(tmp_path / "b.mp4", FRAMES, rotation=90), camera=rolling)
+    assert quarter.rolling_shutter_s == 0.0
+    assert "columns" in quarter.notes[0]
+
+
 def test_the_window_is_on_the_common_clock(tmp_path: Path) -> None:
     path = write_video(tmp_path / "a.mp4", FRAMES)
     camera = opened(path, camera={"offset_s": 10.0}, start_s=10.1, end_s=10.2)

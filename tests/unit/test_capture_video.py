@@ -17,7 +17,7 @@ from bodycap_batch.capture.prefetch import prefetched
 from bodycap_batch.capture.video import turn_upright
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.errors import CaptureError
-from tests.videos import textured_frame, write_video
+from tests.videos import textured_frame, write_tone, write_video
 
 FRAMES = [textured_frame(index) for index in range(40)]
 
@@ -224,3 +224,48 @@ def test_nothing_outside_the_window_is_decoded(tmp_path: Path) -> None:
     assert [shown_index(image) for _, image in camera.grey_frames()] == [22, 23, 24, 25, 26]
     with pytest.raises(CaptureError, match=r"frame 1[0-9] |after frame"):
         list(opened(path).grey_frames())
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv", "avi", "ts"])
+def test_damaged_files_give_frames_or_a_typed_error(tmp_path: Path, suffix: str) -> None:
+    metadata = {"title": "a title that damage turns into something else than text"}
+    data = write_video(tmp_path / f"a.{suffix}", FRAMES[:8], metadata=metadata).read_bytes()
+    path = tmp_path / f"damaged.{suffix}"
+    outcomes = set()
+    for seed in range(15):
+        rng = np.random.default_rng(seed)
+        damaged = np.frombuffer(data, dtype=np.uint8).copy()
+        damaged[rng.integers(0, len(damaged), 8)] = rng.integers(0, 256, 8)
+        path.write_bytes(damaged[: None if seed % 4 else int(rng.integers(len(damaged)))].tobytes())
+        try:
+            outcomes.add(sum(1 for _ in opened(path).grey_frames()) > 0)
+        except CaptureError as error:
+            outcomes.add(error.path)
+    assert outcomes <= {True, str(path)}
+
+
+def test_text_in_another_encoding_does_no_harm(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "a.mp4", FRAMES[:3], metadata={"title": "Kamera Kuche"})
+    data = path.read_bytes()
+    assert data.count(b"Kuche") == 1
+    path.write_bytes(data.replace(b"Kuche", "Küche".encode("latin-1")))
+    assert len(opened(path).frame_numbers) == 3
+
+
+def test_sound_beside_the_pictures_is_left_alone(tmp_path: Path) -> None:
+    pictures, sound = write_video(tmp_path / "a.mp4", FRAMES[:10]), write_tone(tmp_path / "s.m4a", 0.5)
+    with (
+        av.open(str(pictures)) as video,
+        av.open(str(sound)) as audio,
+        av.open(str(tmp_path / "both.mp4"), "w") as both,
+    ):
+        # Sound first, so that the pictures are not stream 0.
+        sources = [(audio, audio.streams.audio[0]), (video, video.streams.video[0])]
+        streams = [both.add_stream_from_template(stream) for _, stream in sources]
+        for (source, old), new in zip(sources, streams, strict=True):
+            for packet in source.demux(old):
+                if packet.dts is not None:
+                    packet.stream = new
+                    both.mux(packet)
+    camera = opened(tmp_path / "both.mp4")
+    assert [shown_index(image) for _, image in camera.grey_frames()] == list(range(10))
