@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,10 +14,10 @@ from bodycap_batch.context import StageContext
 
 if TYPE_CHECKING:
     from bodycap_batch.arrays import FloatArray
-    from bodycap_batch.body import MergeInputs
+    from bodycap_batch.body import CameraClock, MergeInputs
     from bodycap_batch.camera import Camera
     from bodycap_batch.capture import Capture
-    from bodycap_batch.scene import MapResult, Registration
+    from bodycap_batch.scene import MapResult, Registration, Trajectory
     from bodycap_batch.skeleton import Mount, SkeletonModel
 
 SUMMARY = "summary.json"
@@ -144,29 +144,26 @@ def _merge(options: Json, arguments: Json, context: StageContext, files: Path) -
 
 
 def _export(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
-    from bodycap_batch.body import CameraClock, MergeResult
+    from bodycap_batch.body import MergeResult
     from bodycap_batch.config import ExportOptions
     from bodycap_batch.export import ExportInputs, export_results
     from bodycap_batch.formats.bundle import read_bundle
     from bodycap_batch.scene import KeyframeSelection
 
     scene = _load_map(arguments["map"])
-    paths = [Path(path) for path in arguments["registrations"]]
-    trajectories = tuple(_load_registration(str(path)).trajectory for path in paths)
+    found = _Registered.load(arguments["registrations"])
     merged = arguments["merge"]
     inputs = ExportInputs(
         out_dir=files / RESULTS,
         maps=scene.maps,
-        trajectories=trajectories,
-        clocks={
-            trajectory.camera: read_bundle(CameraClock, path, "clock")
-            for trajectory, path in zip(trajectories, paths, strict=True)
-        },
+        trajectories=found.trajectories,
+        clocks=found.clocks,
         selections=tuple(
             read_bundle(KeyframeSelection, Path(path), "keyframes") for path in arguments["keyframes"]
         ),
         merge=None if merged is None else read_bundle(MergeResult, Path(merged), "merge"),
         partial_reason=arguments["failure"],
+        row_fraction=found.row_fraction,
         log=scene.log,
     )
     export_results(inputs, ExportOptions.model_validate(options), context)
@@ -205,28 +202,52 @@ def _load_registration(path: str) -> Registration:
 
 
 def _merge_inputs(arguments: Json) -> MergeInputs:
-    from bodycap_batch.body import CameraClock, MergeInputs
-    from bodycap_batch.camera import Camera
-    from bodycap_batch.formats.bundle import read_bundle
+    from bodycap_batch.body import MergeInputs
 
-    found = {Path(path): _load_registration(path) for path in arguments["registrations"]}
-    clocks = {item.trajectory.camera: read_bundle(CameraClock, path, "clock") for path, item in found.items()}
+    found = _Registered.load(arguments["registrations"])
     skeleton = _skeleton(arguments)
     return MergeInputs(
-        trajectories=tuple(item.trajectory for item in found.values()),
-        clocks=clocks,
+        trajectories=found.trajectories,
+        clocks=found.clocks,
         skeleton=skeleton,
         mounts=tuple(_mount(block, skeleton) for block in arguments["mounts"]),
         skeleton_is_measured=arguments["skeleton_file"] is not None,
         height_m=arguments["height_m"],
         activity=arguments["activity"],
         map_points={item.gauge: item.points for item in _load_map(arguments["map"]).maps},
-        row_fraction={
-            item.trajectory.camera: _row_fraction(item, read_bundle(Camera, path, "camera"))
-            for path, item in found.items()
-            if clocks[item.trajectory.camera].rolling_shutter_s
-        },
+        row_fraction=found.row_fraction,
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Registered:
+    """What registration left of all cameras."""
+
+    trajectories: tuple[Trajectory, ...]
+    clocks: Mapping[str, CameraClock]
+    row_fraction: Mapping[str, FloatArray]
+
+    @staticmethod
+    def load(paths: Sequence[str]) -> _Registered:
+        """Read one artefact per camera; rows matter to cameras with a rolling shutter only."""
+        from bodycap_batch.body import CameraClock
+        from bodycap_batch.camera import Camera
+        from bodycap_batch.formats.bundle import read_bundle
+
+        found = {path: _load_registration(path) for path in paths}
+        clocks = {
+            item.trajectory.camera: read_bundle(CameraClock, Path(path), "clock")
+            for path, item in found.items()
+        }
+        return _Registered(
+            trajectories=tuple(item.trajectory for item in found.values()),
+            clocks=clocks,
+            row_fraction={
+                item.trajectory.camera: _row_fraction(item, read_bundle(Camera, Path(path), "camera"))
+                for path, item in found.items()
+                if clocks[item.trajectory.camera].rolling_shutter_s
+            },
+        )
 
 
 def _skeleton(arguments: Json) -> SkeletonModel:

@@ -67,9 +67,7 @@ def evaluate(
     if pairs:
         reports |= _score_trajectories(pairs, estimate, align.value, reference)
     if motions is not None:
-        from bodycap_batch.evaluate import evaluate_motion
-
-        reports["motion"] = evaluate_motion(*motions)
+        reports |= _score_motion(*motions)
     if not reports:
         raise JobError(
             f"nothing in {estimate} can be compared with {truth}",
@@ -97,6 +95,30 @@ def _score_trajectories(
     return reports
 
 
+def _score_motion(estimate: Path, truth: Path) -> dict[str, Any]:
+    """All joints, and those that a run's own figures call measured."""
+    from bodycap_batch.evaluate import MotionOptions, evaluate_motion
+
+    told = _motion_figures(estimate.parent)
+    # A BVH file starts at zero; the joints of a capture are on its common clock.
+    offset_s = float(told.get("start_s", 0.0)) if truth.suffix == ".npz" else 0.0
+    reports = {"motion": evaluate_motion(estimate, truth, MotionOptions(offset_s=offset_s))}
+    joints = told.get("joints", {}).values()
+    roles = tuple(joint["role"] for joint in joints if joint["observed"] and joint["role"])
+    if roles:
+        options = MotionOptions(offset_s=offset_s, roles=roles)
+        reports["motion, measured joints"] = evaluate_motion(estimate, truth, options)
+    return reports
+
+
+def _motion_figures(results: Path) -> dict[str, Any]:
+    """The block about the motion in the results' metrics.json."""
+    try:
+        return dict(json.loads((results / "metrics.json").read_text(encoding="utf-8"))["motion"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
 def _frames(results: Path) -> dict[str, int]:
     """Frames of each camera's video, from the results' frames.csv."""
     try:
@@ -116,8 +138,8 @@ def _lines(reports: dict[str, Any]) -> list[str]:
             rows = {**report["cameras"], "all": report["total"]}
             lines += [_camera_line(camera, score) for camera, score in rows.items()]
             lines.append(f"scale of the alignment: {report['scale']:.6g}")
-        elif name == "motion":
-            lines.append(f"motion: {report['frames']} frames, {len(report['joints'])} joints")
+        elif name.startswith("motion"):
+            lines.append(f"{name}: {report['frames']} frames, {len(report['joints'])} joints")
             lines += [
                 f"  {label:32}{_stat(report[key], factor)}"
                 for key, label, factor in _MOTION_ROWS
