@@ -1,0 +1,1 @@
+"""Benchmarks: slow figures against ground truth, printed by ``make bench``."""
