@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -13,13 +12,9 @@ import numpy.typing as npt
 from bodycap_batch.arrays import FloatArray, IntArray, set_array
 from bodycap_batch.camera import Camera
 from bodycap_batch.capture.decoding import decode_frames
+from bodycap_batch.capture.images import Image, work_image
 from bodycap_batch.capture.prefetch import prefetched
-from bodycap_batch.capture.video import VideoFile, turn_upright
-
-if TYPE_CHECKING:
-    from av.video.frame import VideoFrame
-
-Image = npt.NDArray[np.uint8]
+from bodycap_batch.capture.video import VideoFile
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,8 +115,7 @@ class CaptureCamera:
             inside = (numbers >= 0) & (numbers < len(video.pts))
             mine = indices[inside]
             for index, (_, frame) in zip(mine, decode_frames(video, numbers[inside]), strict=True):
-                image = _rgb(frame) if colour else _grey(frame)
-                yield int(index), _resized(image, video, size)
+                yield int(index), work_image(frame, video.orientation, size, colour=colour)
             first += len(video.pts)
 
 
@@ -143,41 +137,3 @@ def rolling_shutter_delay_s(rows_px: npt.ArrayLike, height_px: int, rolling_shut
     """Exposure of pixel rows relative to the frame's time: (row/height − ½) · rolling_shutter_s."""
     rows = np.asarray(rows_px, dtype=np.float64)
     return np.asarray((rows / height_px - 0.5) * rolling_shutter_s)
-
-
-# Formats whose first plane is 8-bit luma and can be taken as it is.
-_LUMA_FORMATS = frozenset(
-    f"{family}{layout}" for family in ("yuv", "yuvj") for layout in ("420p", "422p", "444p", "440p", "411p")
-) | {"nv12", "nv21", "nv16", "gray"}
-_FULL_RANGE = 2
-# Studio range to full range (ITU-R BT.601: black 16, white 235).
-_EXPAND = np.clip(np.round((np.arange(256) - 16.0) * (255.0 / 219.0)), 0, 255).astype(np.uint8)
-
-
-def _grey(frame: VideoFrame) -> Image:
-    """The luma plane (a copy-free view where possible), 0 black to 255 white."""
-    name = frame.format.name
-    if name not in _LUMA_FORMATS:
-        return np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)
-    plane = frame.planes[0]
-    luma = np.asarray(memoryview(plane), dtype=np.uint8).reshape(-1, plane.line_size)[
-        : frame.height, : frame.width
-    ]
-    if name.startswith(("yuvj", "gray")) or frame.color_range == _FULL_RANGE:
-        return luma
-    return np.asarray(_EXPAND[luma], dtype=np.uint8)
-
-
-def _rgb(frame: VideoFrame) -> Image:
-    return np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
-
-
-def _resized(image: Image, video: VideoFile, size: tuple[int, int]) -> Image:
-    """Turn upright and shrink to (width, height); an own, contiguous array."""
-    import cv2
-
-    upright = turn_upright(image, video.orientation)
-    if (upright.shape[1], upright.shape[0]) == size:
-        return np.array(upright, order="C")
-    # Averaging over the source pixels keeps edges where they are and aliases least.
-    return np.asarray(cv2.resize(np.ascontiguousarray(upright), size, interpolation=cv2.INTER_AREA))

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bodycap_batch.arrays import IntArray
 from bodycap_batch.errors import CaptureError
@@ -18,6 +17,9 @@ if TYPE_CHECKING:
     from av.container import InputContainer
     from av.video.frame import VideoFrame
     from av.video.stream import VideoStream
+
+Orientation = tuple[tuple[int, int], tuple[int, int]]
+"""Signed permutation matrix, shown = orientation · stored, x right and y down."""
 
 COPY_AGAIN = "copy it again from the camera's card, or leave this camera out"
 
@@ -49,7 +51,7 @@ class VideoFile:
     fps: float
     duration_ns: int
     stored_size: tuple[int, int]
-    orientation: tuple[tuple[int, int], tuple[int, int]]
+    orientation: Orientation
     created_s: float | None = None
     focal_35mm: float | None = None
     counted: bool = False
@@ -119,7 +121,7 @@ def reason_of(error: Exception) -> str:
     return str(getattr(error, "strerror", "") or error)
 
 
-def orientation_of(frame: VideoFrame) -> tuple[tuple[int, int], tuple[int, int]]:
+def orientation_of(frame: VideoFrame) -> Orientation:
     """Round the display matrix to a quarter turn or mirror: shown = matrix · stored, y down."""
     side_data: Any = frame.side_data.get("DISPLAYMATRIX")
     if side_data is None:
@@ -132,15 +134,3 @@ def orientation_of(frame: VideoFrame) -> tuple[tuple[int, int], tuple[int, int]]
 
 def _sign(value: int) -> int:
     return -1 if value < 0 else 1
-
-
-def turn_upright(
-    image: npt.NDArray[np.uint8], orientation: tuple[tuple[int, int], tuple[int, int]]
-) -> npt.NDArray[np.uint8]:
-    """Turn a stored image (H,W) or (H,W,3) the way a player shows it."""
-    (m00, m01), (m10, m11) = orientation
-    if m00:
-        sign_x, sign_y = m00, m11
-    else:
-        image, sign_x, sign_y = image.swapaxes(0, 1), m01, m10
-    return image[::sign_y, ::sign_x]

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from bodycap_batch.capture import CaptureCamera, decoding, open_camera
+from bodycap_batch.capture.images import turn_upright
 from bodycap_batch.capture.indexing import index_video
 from bodycap_batch.capture.prefetch import prefetched
-from bodycap_batch.capture.video import turn_upright
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.errors import CaptureError
 from tests.videos import textured_frame, write_tone, write_video
