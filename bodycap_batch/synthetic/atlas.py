@@ -69,19 +69,21 @@ class Atlas:
         out = np.empty((at.shape[1], 3), np.uint8)
         for value in np.flatnonzero(np.bincount(key, minlength=1)):
             chosen = np.flatnonzero(key == value)
-            batch = [_batched(part[chosen]) for part in (*at, *along, lod)]
-            out[chosen] = self._look_up(batch, int(value) // 16, int(value) % 16)[: len(chosen)]
+            level, count = int(value) // 16, int(value) % 16
+            parts = (*at, lod) if count == 1 else (*at, lod, *along)
+            batch = [_batched(part.take(chosen)) for part in parts]
+            out[chosen] = self._look_up(batch, level, count)[: len(chosen)]
         return out
 
     def _look_up(self, batch: list[Float32], level: int, taps: int) -> Bytes:
         """Blend of two levels, averaged over taps along the footprint's longer axis."""
-        x, y, along_x, along_y, lod = batch
+        x, y, lod, *along = batch
         share = lod - np.float32(level)
         rest = np.float32(1) - share
         total = None if taps == 1 else np.zeros((*x.shape, 3), np.float32)
         for tap in range(taps):
             shift = np.float32((tap + 0.5) / taps - 0.5)
-            place = (x, y) if taps == 1 else (x + shift * along_x, y + shift * along_y)
+            place = (x, y) if taps == 1 else (x + shift * along[0], y + shift * along[1])
             finer = self._bilinear(level, *place)
             blend = cv2.blendLinear(finer, self._bilinear(level + 1, *place), rest, share)
             if total is None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.context import StageContext
-from bodycap_batch.errors import JobError
+from bodycap_batch.errors import JobError, StoreError
 from bodycap_batch.formats.files import store_error
 from bodycap_batch.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
@@ -264,6 +264,11 @@ def _appearing(out_dir: Path) -> Iterator[Path]:
         folder.rename(out_dir)
     except OSError as error:
         raise store_error(error, out_dir) from error
+    except StoreError as error:
+        # Speak of the folder that was asked for, not of the one that is gone by now.
+        path = Path(error.path or out_dir)
+        named = out_dir / path.relative_to(folder) if path.is_relative_to(folder) else path
+        raise StoreError(error.message, path=named, hint=error.hint) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)

@@ -200,7 +200,7 @@ class View:
         """(N,3) filtered texture where the rays (and their derivatives) meet their triangles."""
         found = np.maximum(faces, 0)
         entry = found if pose_of is None else pose_of * len(self._triangles.faces) + found
-        rows = tables[:, entry]
+        rows = np.take(tables, entry, axis=1, mode="clip")
         rays, right, down = lens
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             inverse = np.float32(1) / _dot(rows[6:], rays)

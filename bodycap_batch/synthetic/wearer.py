@@ -29,6 +29,7 @@ _RADII = {
     "ToeBase": (0.03, 0.02),
 }
 _SKIN = ("Hand", "Neck", "Head")
+_TROUSERS = ("Hips", "UpLeg", "Leg")
 _AROUND = 14
 _CAP_RINGS = 3
 _TEXELS_PER_M = 300.0
@@ -54,11 +55,16 @@ class Wearer:
     def __init__(self, skeleton: SkeletonModel, seed: np.random.SeedSequence) -> None:
         self._bones = _bones(skeleton)
         self.images: list[UINT8] = []
+        dyes = np.random.default_rng(seed.spawn(1)[0])
+        shirt, trousers = (textures.colour(dyes, 0.5, (0.3, 0.6)) for _ in range(2))
         for _, start, end, radii, part in self._bones:
             rng = np.random.default_rng(seed.spawn(1)[0])
             size = float(np.linalg.norm(end - start)) + sum(radii), 2 * np.pi * max(radii)
             height, width = (max(16, round(side * _TEXELS_PER_M)) for side in size)
-            self.images.append(_skin(height, width, rng) if part in _SKIN else _cloth(height, width, rng))
+            dye = trousers if part in _TROUSERS else shirt
+            self.images.append(
+                _skin(height, width, rng) if part in _SKIN else _cloth(height, width, dye, rng)
+            )
         self._limbs: list[_Limb] = []
 
     def place_textures(self, origins: FloatArray) -> None:
@@ -206,7 +212,7 @@ def _skin(height: int, width: int, rng: np.random.Generator) -> UINT8:
     return textures.tinted(shade, np.array([222, 170, 140], np.float32))
 
 
-def _cloth(height: int, width: int, rng: np.random.Generator) -> UINT8:
+def _cloth(height: int, width: int, dye: textures.Grey, rng: np.random.Generator) -> UINT8:
     folds = 0.9 + 0.12 * textures.fractal(height, width, 40.0, rng, 4)
     weave = 0.05 * rng.standard_normal((height, width), dtype=np.float32)
-    return textures.tinted(folds + weave, textures.colour(rng, 0.4, (0.25, 0.6)))
+    return textures.tinted(folds + weave, dye)

@@ -1,5 +1,6 @@
 """Whole synthetic captures, small ones: layout, clocks, determinism, failures."""
 
+import errno
 import hashlib
 import json
 
@@ -12,6 +13,7 @@ from bodycap_batch.config.job import load_job
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import Cancelled, JobError, StoreError
 from bodycap_batch.formats.bvh import read_bvh
+from bodycap_batch.formats.files import store_error
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.geometry import interpolate_pose, invert, rotation_angle_rad
 from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount, rest_positions
@@ -244,3 +246,25 @@ def test_frames_lie_between_their_neighbours(capture):
     middle = interpolate_pose(truth[:-2], truth[2:], 0.5)
     # Accelerations stay below 10 m/s²: half of that times (1/30 s)² is 6 mm.
     assert np.abs(middle[:, :3, 3] - truth[1:-1, :3, 3]).max() < 0.006
+
+
+def test_a_disk_that_fills_up_is_named_and_nothing_stays(tmp_path, monkeypatch):
+    class Full:
+        def __init__(self, *arguments):
+            self.path = arguments[0]
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            return None
+
+        def add(self, image):
+            raise store_error(OSError(errno.ENOSPC, "No space left on device"), self.path)
+
+    monkeypatch.setattr("bodycap_batch.synthetic.making.VideoWriter", Full)
+    with pytest.raises(StoreError, match="No space left") as caught:
+        _make(tmp_path / "c", seconds=0.1)
+    assert caught.value.path == str(tmp_path / "c" / "torso.mp4")
+    assert "free some space" in caught.value.hint
+    assert not list(tmp_path.iterdir())
