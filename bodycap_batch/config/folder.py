@@ -51,9 +51,12 @@ def chapters_in(folder: Path) -> tuple[Path, ...]:
     """Videos of one camera's folder in recording order.
 
     Raises:
-        CaptureError: There are none.
+        CaptureError: There are none, or the folder cannot be read.
     """
-    chapters = sorted((path for path in folder.iterdir() if is_video(path)), key=natural_key)
+    try:
+        chapters = sorted((path for path in folder.iterdir() if is_video(path)), key=natural_key)
+    except OSError as error:
+        raise CaptureError(f"cannot read the folder ({error})", path=folder, hint="check the path") from error
     if not chapters:
         raise CaptureError(
             "no video in this camera's folder",

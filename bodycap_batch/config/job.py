@@ -186,24 +186,24 @@ def _resolved_camera(camera: CameraConfig, index: int, capture: CaptureConfig, b
 
 
 def _chapters(camera: CameraConfig, base: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
-    """Video files in order, and the sidecars that lie beside them."""
+    """Video files in order, and the sidecars that lie beside them.
+
+    ``<video>.timestamps.txt`` (of every chapter, or of the folder of chapters) goes before
+    ``<camera>.timestamps.txt``.
+    """
     videos: list[Path] = []
-    whole: list[Path] = []
-    for video in camera.video:
-        full = (base / video).resolve()
-        if full.is_dir():
-            videos.extend(chapters_in(full))
-            whole.extend(_existing(full.with_name(f"{full.name}.timestamps.txt")))
-        else:
-            videos.append(full)
-    if whole and len(camera.video) == 1:
-        return tuple(videos), tuple(whole)
-    beside = [sidecar for video in videos for sidecar in sidecars_of(video)]
-    return tuple(videos), tuple(beside)
+    beside: list[Path] = []
+    places = [(base / video).resolve() for video in camera.video]
+    for place in places:
+        chapters = chapters_in(place) if place.is_dir() else (place,)
+        whole = sidecars_of(place) if place.is_dir() and len(places) == 1 else []
+        videos.extend(chapters)
+        beside.extend(whole or [sidecar for chapter in chapters for sidecar in sidecars_of(chapter)])
+    return tuple(videos), tuple(beside or _existing(places[0].with_name(f"{camera.name}.timestamps.txt")))
 
 
 def sidecars_of(video: Path) -> list[Path]:
-    """The sidecar beside a video, if any: ``torso.timestamps.txt`` or ``torso.mp4.timestamps.txt``."""
+    """The sidecar beside a video or folder: ``torso.timestamps.txt`` or ``torso.mp4.timestamps.txt``."""
     names = (f"{video.stem}.timestamps.txt", f"{video.name}.timestamps.txt")
     return [found for name in names for found in _existing(video.with_name(name))][:1]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from bodycap_batch.config.mounts import MOUNT_NAMES, ROLES
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._\-]*")
 _UNFILLED = re.compile(r"<[^<>]*>")
+_MAX_NAME_BYTES = 255
 # Rounding a rotation to three decimals leaves it this close to orthonormal.
 _ROTATION_TOLERANCE = 5e-3
 
@@ -87,11 +89,27 @@ def _paths(camera: CameraConfig) -> Iterator[Problem]:
     for video in camera.video:
         if _UNFILLED.search(str(video)):
             yield Problem(("video",), f"still to be filled in: {video}", "put the path of your video here")
+        yield from _unusable("video", video)
+    for path in camera.timestamps:
+        yield from _unusable("timestamps", path)
+    if isinstance(camera.calibration, Path):
+        yield from _unusable("calibration", camera.calibration)
     if len(set(camera.video)) < len(camera.video):
         yield Problem(("video",), "a chapter is listed twice", "list each file once")
 
 
+def _unusable(field: str, path: Path) -> Iterator[Problem]:
+    """Texts that no file system takes as a path."""
+    if "\0" in str(path) or any(len(part.encode(errors="replace")) > _MAX_NAME_BYTES for part in path.parts):
+        yield Problem((field,), f"{str(path)[:40]!r} is no path", "check the path")
+
+
 def _job_names(job: Job) -> Iterator[Problem]:
+    if job.out is not None:
+        yield from _unusable("out", job.out)
+    if isinstance(job.capture.calibration, Path):
+        for found in _unusable("calibration", job.capture.calibration):
+            yield found._replace(location=("capture", *found.location))
     if job.name and not _NAME.fullmatch(job.name):
         yield Problem(("name",), f"{job.name!r} is no name for a folder", "letters, digits, ., _ and - only")
 
@@ -101,6 +119,8 @@ def _skeleton(job: Job) -> Iterator[Problem]:
     if value is not None and value not in SKELETON_PRESETS and not value.lower().endswith(".bvh"):
         hint = _nearest(value, SKELETON_PRESETS)
         yield Problem(("skeleton",), f"unknown skeleton {value!r}", f"{hint}; or the path of a .bvh file")
+    elif value is not None:
+        yield from _unusable("skeleton", Path(value))
     roles = {camera.role for camera in job.capture.cameras}
     if skeleton_of(job) != NO_SKELETON and len(roles) == 1 and None not in roles:
         yield Problem(

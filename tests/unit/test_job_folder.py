@@ -141,3 +141,23 @@ def test_sidecars_of_some_chapters_only(tmp_path: Path) -> None:
     )
     with pytest.raises(CaptureError, match="2 timestamp files for 3 chapters"):
         load_job(root)
+
+
+@pytest.mark.parametrize(
+    ("sidecars", "found"),
+    [
+        (("GX01.timestamps.txt",), "GX01.timestamps.txt"),
+        (("GX01.MP4.timestamps.txt",), "GX01.MP4.timestamps.txt"),
+        (("torso.timestamps.txt",), "torso.timestamps.txt"),
+        (("torso.timestamps.txt", "GX01.timestamps.txt"), "GX01.timestamps.txt"),
+        (("head.timestamps.txt",), None),
+    ],
+)
+def test_sidecars_are_named_after_the_video_or_the_camera(
+    tmp_path: Path, sidecars: tuple[str, ...], found: str | None
+) -> None:
+    folder(tmp_path, "GX01.MP4", *sidecars)
+    path = tmp_path / "job.yaml"
+    path.write_text("capture: {cameras: [{name: torso, video: GX01.MP4}]}")
+    timestamps = load_job(path).capture.cameras[0].timestamps
+    assert timestamps == (() if found is None else (tmp_path / found,))

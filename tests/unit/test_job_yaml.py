@@ -114,6 +114,12 @@ def test_yaml_words_are_not_turned_into_other_things(tmp_path: Path) -> None:
         (MINIMAL.replace("torso.mp4", '"<yours>.mp4"'), 4, "capture.cameras.0.video", "filled in", "path"),
         (MINIMAL.replace("      video: torso.mp4\n", ""), 3, "capture.cameras.0.video", "missing", "video"),
         (MINIMAL + "  start_s: 5\n  end_s: 5\n", 8, "capture.end_s", "not after", None),
+        (MINIMAL.replace("torso.mp4", '"a\\0.mp4"'), 4, "capture.cameras.0.video", "no path", "check"),
+        (MINIMAL.replace("torso.mp4", "a" * 300), 4, "capture.cameras.0.video", "no path", "check"),
+        (MINIMAL + "      timestamps: " + "a" * 300, 7, "capture.cameras.1.timestamps", "no path", "check"),
+        (MINIMAL + "  calibration: " + "a" * 300, 7, "capture.calibration", "no path", "check"),
+        (MINIMAL + "skeleton: " + "a" * 300 + ".bvh", 7, "skeleton", "no path", "check"),
+        (MINIMAL + "out: " + "a" * 300, 7, "out", "no path", "check"),
         ("height_m: 1.8\n", 1, "capture", "missing", "capture"),
         ("capture: {cameras: []}\n", 1, "capture.cameras", "at least 1", None),
         (MINIMAL + "skeleton: none\nskeleton: none\n", 8, "skeleton", "twice, first on line 7", "one"),
@@ -257,7 +263,7 @@ yaml_bits = st.sampled_from(
 )  # fmt: skip
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(st.lists(yaml_bits, max_size=40).map("".join) | st.text(max_size=60))
 def test_any_text_is_a_job_or_a_job_error(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
     path = tmp_path_factory.getbasetemp() / "fuzz.yaml"
@@ -271,7 +277,7 @@ def test_any_text_is_a_job_or_a_job_error(tmp_path_factory: pytest.TempPathFacto
     assert named == str(path.resolve())
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(
     st.recursive(
         st.none() | st.booleans() | st.floats(-1e300, 1e300) | st.integers() | st.text(max_size=5),
