@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from bodycap_batch.cli.base import app
-from bodycap_batch.cli.display import Display, make_display
+from bodycap_batch.cli.display import Display, JsonLines, make_display
 from bodycap_batch.cli.stop import stoppable
+from bodycap_batch.errors import BodycapError
 
 if TYPE_CHECKING:
     from bodycap_batch.config.models import Job
@@ -79,7 +81,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
     from bodycap_batch.store import Store
 
     overrides = Overrides(out=out, skeleton=skeleton, height_m=height)
-    with stoppable() as stop, make_display(as_json=json_progress) as display:
+    with stoppable() as stop, make_display(as_json=json_progress) as display, _told_to(display):
 
         def settings(default_store: Path) -> Settings:
             return Settings(
@@ -98,6 +100,17 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
     _report(summary, resolved, display, verbose=verbose)
 
 
+@contextmanager
+def _told_to(display: Display) -> Iterator[None]:
+    """Tell a failure to a machine that follows the progress, too."""
+    try:
+        yield
+    except BodycapError as error:
+        if isinstance(display, JsonLines):
+            sys.stdout.write(json.dumps({"kind": "error", **error.to_dict()}) + "\n")
+        raise
+
+
 def cores() -> int:
     """Cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -114,8 +127,6 @@ def _default_store(out_dir: Path) -> Path:
 
 
 def _report(summary: RunSummary, job: Job, display: Display, *, verbose: bool) -> None:
-    from bodycap_batch.cli.display import JsonLines
-
     if isinstance(display, JsonLines):
         last = {"kind": "done", "out_dir": str(summary.out_dir), "files": list(summary.files)}
         sys.stdout.write(json.dumps({**last, "executed": summary.executed}) + "\n")

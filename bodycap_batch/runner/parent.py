@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import bodycap_batch
 from bodycap_batch.errors import BodycapError, Cancelled, StoreError, error_from_dict
@@ -81,7 +81,9 @@ class Runner:
             self._logs.mkdir(parents=True, exist_ok=True)
             order = log.with_suffix(".task.json")
             order.write_text(json.dumps(task.to_json(self.store.root), indent=1), encoding="utf-8")
-        child = _Child((*self._command, str(order)), log, task.threads)
+            stream = log.open("wb")
+        with stream:
+            child = _Child((*self._command, str(order)), stream, task.threads)
         failure = child.follow(self._cancelled, lambda message: self._forward(task, message))
         if self._cancelled():
             raise Cancelled("stopped on request; finished stages are kept", hint="run it again to go on")
@@ -117,16 +119,15 @@ class Runner:
 class _Child:
     """One child process in its own process group."""
 
-    def __init__(self, command: Sequence[str], log: Path, threads: int) -> None:
-        with log.open("wb") as stream:
-            self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=stream,
-                env=_environment(threads),
-                start_new_session=True,
-            )
+    def __init__(self, command: Sequence[str], log: BinaryIO, threads: int) -> None:
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            env=_environment(threads),
+            start_new_session=True,
+        )
 
     @property
     def returncode(self) -> int:

@@ -116,6 +116,16 @@ def test_progress_for_machines_is_json_on_every_line(bench: Bench) -> None:
     assert events[-1]["out_dir"] == str(bench.folder / "out" / "my_walk")
 
 
+def test_a_failure_is_told_to_machines_too(bench: Bench) -> None:
+    bench.order(fail="map")
+    code, out, err = bench.run("run", "my walk", "--json-progress")
+    last = json.loads(out.splitlines()[-1])
+    assert code == last["exit_code"] == 4
+    assert (last["kind"], last["type"]) == ("error", "EstimationError")
+    assert "map does not work out" in last["message"]
+    assert "map does not work out" in err
+
+
 def test_a_terminal_gets_bars(bench: Bench) -> None:
     ours, theirs = pty.openpty()
     bench.environment |= {"TERM": "xterm", "COLUMNS": "120"}
