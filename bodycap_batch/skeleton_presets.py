@@ -21,8 +21,8 @@ MEAN_HEIGHT_M = 1.70
 """Stature taken when none is given: between the means of adult women and men in Europe (1.64 and 1.78 m;
 NCD Risk Factor Collaboration, "A century of trends in adult human height", eLife 2016)."""
 
-NOMINAL_SIGMA_RAD = float(np.radians(10.0))
-NOMINAL_SIGMA_M = 0.03
+NOMINAL_SIGMA_RAD = float(np.radians(15.0))
+NOMINAL_SIGMA_M = 0.04
 """Per axis, of a mount known by its name only: straps turn, and bodies differ."""
 
 _UP, _FORWARD, _LEFT = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])

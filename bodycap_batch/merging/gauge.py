@@ -135,11 +135,11 @@ def heading(forward: FloatArray, centre_m: FloatArray, fps: float) -> float:
         centre_m: (T,3) where it is.
         fps: Ticks per second.
     """
-    window = max(round(fps), 1)
+    window, stride = max(round(fps), 1), max(round(0.25 * fps), 1)
     start = 0
-    if len(centre_m) > window:
-        travelled = np.linalg.norm(centre_m[window:, :2] - centre_m[:-window, :2], axis=1)
-        moving = np.flatnonzero(travelled > MOVING_M_PER_S * window / fps)
+    if len(centre_m) > stride:
+        travelled = np.linalg.norm(centre_m[stride:, :2] - centre_m[:-stride, :2], axis=1)
+        moving = np.flatnonzero(travelled > MOVING_M_PER_S * stride / fps)
         start = int(moving[0]) if len(moving) else 0
     mean = forward[start : start + window, :2].sum(axis=0)
     return float(np.arctan2(mean[1], mean[0]))

@@ -1,0 +1,245 @@
+"""The skeleton stage on a simulated walk: accuracy, clocks, gauges, gaps, gross errors, refusals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from bodycap_batch.body import CameraClock, MergeResult
+from bodycap_batch.config.options import MergeOptions
+from bodycap_batch.context import StageContext
+from bodycap_batch.errors import Cancelled, EstimationError
+from bodycap_batch.geometry import Similarity, align_points
+from bodycap_batch.merging import merge_trajectories
+from tests.stages.walker import FPS, ROLES, Walk, make_inputs, make_walk, record
+
+GAUGE = Similarity(0.37, Rotation.from_rotvec([1.0, -0.7, 0.4]).as_matrix(), np.array([2.0, -1.0, 0.5]))
+
+TWIN = {"LeftForeArm": "RightForeArm", "LeftHand": "RightHand", "RightArm": "LeftArm", "Spine1": "Spine1"}
+
+
+@pytest.fixture(scope="module")
+def context(tmp_path_factory) -> StageContext:
+    return StageContext(work_dir=tmp_path_factory.mktemp("merging"))
+
+
+@pytest.fixture(scope="module")
+def walk() -> Walk:
+    return make_walk(np.random.default_rng(1), off_deg=6.0, off_m=0.015)
+
+
+@pytest.fixture(scope="module")
+def base(walk, context) -> MergeResult:
+    return merge_trajectories(make_inputs(walk, _recorded(walk)), MergeOptions(), context)
+
+
+def _recorded(walk: Walk, gauge: Similarity = GAUGE, **changes: dict) -> list:
+    rng = np.random.default_rng(7)
+    return [record(walk, name, rng, gauge=gauge, **changes.get(name, {})) for name in ROLES]
+
+
+def _known(walk: Walk) -> dict:
+    mounts = tuple(replace(mount, sigma_rad=np.radians(0.5), sigma_m=0.003) for mount in walk.mounts.values())
+    return {"mounts": mounts}
+
+
+def _relative(result: MergeResult, camera: str) -> np.ndarray:
+    """(T,3) a hand's camera in the torso camera's frame, from the solved joints and mounts."""
+    mounts = {mount.camera: mount for mount in result.mounts}
+    roles = result.skeleton.roles
+    torso, palm = (
+        result.world_from_joint[:, roles.index(ROLES[name])] @ mounts[name].joint_from_cam
+        for name in ("torso", camera)
+    )
+    return np.linalg.solve(torso, palm)[:, :3, 3]
+
+
+def _true_relative(walk: Walk, result: MergeResult, camera: str) -> np.ndarray:
+    seconds = result.times_ns() * 1e-9
+    return np.linalg.solve(walk.camera("torso", seconds), walk.camera(camera, seconds))[:, :3, 3]
+
+
+def _palm_error_m(walk: Walk, result: MergeResult, camera: str = "left_palm") -> np.ndarray:
+    return np.linalg.norm(_relative(result, camera) - _true_relative(walk, result, camera), axis=1)
+
+
+def test_known_mounts_give_scale_and_palms(walk, context):
+    result = merge_trajectories(make_inputs(walk, _recorded(walk), **_known(walk)), MergeOptions(), context)
+    # It states 3 % for so short a walk; a palm is 0.6 m from the chest, joints have 5 mm of slack.
+    sigma = result.report["scale"]["relative_sigma"]
+    assert 0.005 < sigma < 0.05
+    assert result.world_from_map["map-0"].scale == pytest.approx(1.0 / GAUGE.scale, rel=2.0 * sigma)
+    for camera in ("left_palm", "right_palm"):
+        assert _palm_error_m(walk, result, camera).mean() < 0.6 * 2.0 * sigma + 0.005
+    elbow = result.skeleton.roles.index("LeftForeArm")
+    moved = align_points(
+        result.world_from_joint[:, 0, :3, 3],
+        walk.joints(result.times_ns() * 1e-9)[:, 0, :3, 3],
+        with_scale=False,
+    )
+    assert moved.rotation[2, 2] > np.cos(np.radians(10.0))
+    assert result.solved[elbow]
+    assert not result.solved[0]
+
+
+def test_nominal_mounts_are_solved_towards_the_truth(walk, base):
+    for mount in base.mounts:
+        truth = walk.mounts[mount.camera].joint_from_cam
+        off = np.linalg.norm(mount.joint_from_cam[:3, 3] - truth[:3, 3])
+        # Three sigma of what the solution itself states, over three axes.
+        assert off < 3.0 * np.sqrt(3.0) * mount.sigma_m
+        assert 0.005 < mount.sigma_m <= 0.08
+    sigma = base.report["scale"]["relative_sigma"]
+    assert 0.02 < sigma < 0.15
+    assert base.world_from_map["map-0"].scale == pytest.approx(1.0 / GAUGE.scale, rel=2.0 * sigma)
+
+
+def test_world_is_upright_on_the_floor_and_faces_the_first_second(base):
+    hips = base.world_from_joint[:, 0]
+    assert_allclose(hips[0, :2, 3], 0.0, atol=1e-9)
+    # Without a map's floor the hips walk at 0.97 of their standing height, 0.53 of 1.75 m.
+    assert np.median(hips[:, 2, 3]) == pytest.approx(0.97 * 0.53 * 1.75, abs=1e-6)
+    forward = -hips[: int(FPS), :3, 1].mean(axis=0)
+    assert forward[1] < -0.9
+    head, foot = (base.skeleton.roles.index(role) for role in ("Head", "LeftFoot"))
+    assert (base.world_from_joint[:, head, 2, 3] > 1.3).all()
+    assert (np.abs(base.world_from_joint[:, foot, 2, 3]) < 0.2).all()
+
+
+def test_another_gauge_gives_the_same_motion(walk, base, context):
+    other = Similarity(8.0, Rotation.from_rotvec([-2.0, 0.3, 1.0]).as_matrix(), np.array([-30.0, 5.0, 1.0]))
+    result = merge_trajectories(make_inputs(walk, _recorded(walk, gauge=other)), MergeOptions(), context)
+    # Only rounding differs; the optimiser stops at a relative decrease of 1e-5.
+    assert_allclose(result.world_from_joint[..., :3, 3], base.world_from_joint[..., :3, 3], atol=2e-3)
+    ratio = result.world_from_map["map-0"].scale / base.world_from_map["map-0"].scale
+    assert ratio == pytest.approx(GAUGE.scale / other.scale, rel=2e-3)
+
+
+def test_a_mirrored_walk_gives_the_mirrored_motion(walk, base, context):
+    flip = np.diag([-1.0, 1.0, 1.0, 1.0])
+    swap = {"torso": "torso", "left_palm": "right_palm", "right_palm": "left_palm"}
+    mirrored = [
+        replace(
+            each,
+            camera=swap[each.camera],
+            gauge_from_cam=flip @ each.gauge_from_cam @ flip,
+        )
+        for each in _recorded(walk)
+    ]
+    result = merge_trajectories(make_inputs(walk, mirrored), MergeOptions(), context)
+    roles = result.skeleton.roles
+    for role, other in TWIN.items():
+        mine = result.world_from_joint[:, roles.index(role), :3, 3]
+        twin = base.world_from_joint[:, roles.index(other), :3, 3]
+        # Rounding and the stopping rule again.
+        assert_allclose(mine * [-1.0, 1.0, 1.0], twin, atol=3e-3)
+
+
+@pytest.mark.parametrize(("offset_s", "right"), [(0.12, True), (-0.12, False)])
+def test_a_clock_offset_has_the_documented_sign(walk, context, offset_s, right):
+    # The left palm's own clock runs 0.12 s behind: common time = camera time + 0.12.
+    recorded = _recorded(walk, left_palm={"shift_s": 0.12})
+    clocks = {name: CameraClock(nominal_fps=FPS) for name in ROLES}
+    clocks["left_palm"] = CameraClock(nominal_fps=FPS, offset_s=offset_s)
+    result = merge_trajectories(
+        make_inputs(walk, recorded, clocks=clocks, **_known(walk)), MergeOptions(), context
+    )
+    error = float(_palm_error_m(walk, result)[10:75].mean())
+    # Right: as with no offset at all. Wrong: the hand is taken 0.24 s away, at 1 m/s in the room.
+    assert (error < 0.03) is right
+    assert right or error > 0.1
+
+
+def test_frames_between_ticks_are_not_moved_onto_them(walk, base, context):
+    # 11 ms late, as webcams without genlock: at 2 m/s a frame pulled to its tick would be 2 cm off.
+    recorded = _recorded(walk, left_palm={"shift_s": 0.011})
+    clocks = {
+        name: CameraClock(nominal_fps=FPS, offset_s=0.011 if name == "left_palm" else 0.0) for name in ROLES
+    }
+    result = merge_trajectories(make_inputs(walk, recorded, clocks=clocks), MergeOptions(), context)
+    assert_allclose(_relative(result, "left_palm")[5:-5], _relative(base, "left_palm")[5:-5], atol=0.012)
+
+
+def test_a_short_gap_is_filled_and_a_long_one_marked(walk, context):
+    recorded = _recorded(walk, left_palm={"lost": (1.0, 1.4)}, right_palm={"lost": (1.0, 2.4)})
+    result = merge_trajectories(make_inputs(walk, recorded, **_known(walk)), MergeOptions(), context)
+    roles = result.skeleton.roles
+    seconds = result.times_ns() * 1e-9
+    short, long = (seconds > 1.02) & (seconds < 1.38), (seconds > 1.02) & (seconds < 2.38)
+    assert result.observed[short, roles.index("LeftHand")].all()
+    assert not result.observed[long, roles.index("RightHand")].any()
+    assert result.observed[seconds < 1.0, roles.index("RightHand")].all()
+    assert result.observed[:, roles.index("Spine1")].all()
+    assert not result.observed[:, roles.index("LeftLeg")].any()
+    # Half a swing is lost: the arm cannot be further off than the swing is wide.
+    assert _palm_error_m(walk, result)[short].max() < 0.25
+
+
+def test_gross_errors_do_not_move_the_body(walk, base, context):
+    rng = np.random.default_rng(3)
+    recorded = []
+    for each in _recorded(walk):
+        poses = each.gauge_from_cam.copy()
+        for start in (17, 43, 70):
+            burst = slice(start, start + 2)
+            poses[burst, :3, 3] += GAUGE.scale * rng.uniform(0.3, 1.0) * np.array([1.0, -1.0, 0.5])
+        recorded.append(replace(each, gauge_from_cam=poses))
+    result = merge_trajectories(make_inputs(walk, recorded), MergeOptions(), context)
+    # 18 of 270 poses, 7 %, are wrong by 0.45 to 1.5 m; the rest must carry the answer to a fraction of that.
+    assert np.abs(_relative(result, "left_palm") - _relative(base, "left_palm")).max() < 0.04
+    dropped = [camera["dropped_as_gross_errors"] for camera in result.report["cameras"].values()]
+    assert all(6 <= count <= 10 for count in dropped)
+
+
+def test_world_trajectories_carry_poses_and_metric_covariance(walk, base):
+    place = base.world_from_map["map-0"]
+    for before, after in zip(
+        _recorded(walk), sorted(base.trajectories, key=lambda e: list(ROLES).index(e.camera)), strict=True
+    ):
+        assert after.gauge == "world"
+        assert_allclose(after.gauge_from_cam, place.apply_to_poses(before.gauge_from_cam))
+        assert_allclose(after.covariance[:, :3, :3], before.covariance[:, :3, :3])
+        assert_allclose(after.covariance[:, 3:, 3:], place.scale**2 * before.covariance[:, 3:, 3:])
+
+
+def test_a_camera_of_another_map_is_named_not_used(walk, context):
+    recorded = _recorded(walk)
+    recorded[2] = replace(recorded[2], gauge="map-1")
+    result = merge_trajectories(make_inputs(walk, recorded), MergeOptions(), context)
+    assert list(result.unused_cameras) == ["right_palm"]
+    assert "map-1" in result.unused_cameras["right_palm"]
+    assert {each.camera for each in result.trajectories} == {"torso", "left_palm"}
+    assert not result.solved[result.skeleton.roles.index("RightHand")]
+
+
+def test_a_lost_torso_is_refused_with_numbers(walk, context):
+    recorded = _recorded(walk, torso={"lost": (0.2, 9.0)})
+    with pytest.raises(EstimationError, match=r"'torso'.* 6 localised frames of 90"):
+        merge_trajectories(make_inputs(walk, recorded), MergeOptions(), context)
+
+
+def test_one_camera_has_no_scale(walk, context):
+    with pytest.raises(EstimationError, match="no two cameras"):
+        merge_trajectories(make_inputs(walk, _recorded(walk)[:1]), MergeOptions(), context)
+
+
+def test_stops_between_iterations(walk, tmp_path):
+    steps = []
+    context = StageContext(
+        work_dir=tmp_path,
+        progress=lambda done, total, what: steps.append((done, total)),
+        cancelled=lambda: len(steps) > 3,
+    )
+    with pytest.raises(Cancelled):
+        merge_trajectories(make_inputs(walk, _recorded(walk)), MergeOptions(), context)
+    assert len(steps) == 4
+
+
+def test_same_inputs_same_result(walk, base, context):
+    again = merge_trajectories(make_inputs(walk, _recorded(walk)), MergeOptions(), context)
+    assert (again.world_from_joint == base.world_from_joint).all()
+    assert again.report == base.report

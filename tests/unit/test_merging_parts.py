@@ -1,0 +1,317 @@
+"""The skeleton stage's parts: clocks, bones, cleaning, mounts as points, planes, floor, the whole body."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import accumulate
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from bodycap_batch.body import CameraClock
+from bodycap_batch.errors import EstimationError
+from bodycap_batch.geometry import invert, make_transform, so3_exp
+from bodycap_batch.merging.bones import graph_bones, hinges, proper_axes
+from bodycap_batch.merging.complete import complete_body, observed_joints
+from bodycap_batch.merging.gauge import Direction, find_floor, heading, place, standing_height, upright
+from bodycap_batch.merging.graph import MountPoints, add_mount_prior, insert_mount, mount_sigmas, read_mount
+from bodycap_batch.merging.initial import fill_gaps, pose_bones, provisional_scale
+from bodycap_batch.merging.planes import find_planes, vertical
+from bodycap_batch.merging.scale import ScaleEstimate, weigh_floor
+from bodycap_batch.merging.tracks import Track, adapt_psd, clean
+from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount, rest_positions
+
+SECOND = 1_000_000_000
+PAPER = ("Spine1", "LeftHand", "RightHand")
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def _track(
+    centres: np.ndarray, bone: int = 0, *, rotation: np.ndarray | None = None, fps: float = 30.0
+) -> Track:
+    count = len(centres)
+    turns = np.tile(np.eye(3), (count, 1, 1)) if rotation is None else rotation
+    return Track(
+        camera=f"cam{bone}",
+        bone=bone,
+        frames=np.arange(count),
+        times_ns=np.round(np.arange(count) * SECOND / fps).astype(np.int64),
+        map_from_cam=make_transform(turns, centres),
+        sigma_rad=np.full(count, 0.003),
+        sigma_map=np.full(count, 0.003),
+    )
+
+
+def test_common_time_is_camera_time_plus_offset():
+    clock = CameraClock(nominal_fps=30.0, offset_s=0.12)
+    assert clock.common_times_ns(np.array([5 * SECOND])).tolist() == [5_120_000_000]
+
+
+def test_lower_rows_are_exposed_later():
+    # Row r of h at frame time + (r/h − ½) · 20 ms: the last row 10 ms late, the first 10 ms early.
+    clock = CameraClock(nominal_fps=30.0, rolling_shutter_s=0.020)
+    times = clock.common_times_ns(np.array([SECOND] * 3), np.array([1.0, 0.5, 0.0]))
+    assert times.tolist() == [1_010_000_000, SECOND, 990_000_000]
+    assert clock.common_times_ns(np.array([SECOND])).tolist() == [SECOND]
+
+
+def test_paper_set_up_solves_nine_bones():
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = graph_bones(skeleton, PAPER)
+    assert [bone.role for bone in bones] == [
+        "Spine1", "LeftShoulder", "LeftArm", "LeftForeArm", "LeftHand",
+        "RightShoulder", "RightArm", "RightForeArm", "RightHand",
+    ]  # fmt: skip
+    assert [bone.parent for bone in bones] == [-1, 0, 1, 2, 3, 0, 5, 6, 7]
+
+
+def test_bones_meet_where_the_branches_meet():
+    skeleton = load_skeleton("full_body", 1.75)
+    roles = {bone.role for bone in graph_bones(skeleton, ("Head", "LeftFoot"))}
+    assert roles == {"Hips", "Spine", "Spine1", "Neck", "Head", "LeftUpLeg", "LeftLeg", "LeftFoot"}
+    assert [bone.role for bone in graph_bones(skeleton, ("LeftArm", "LeftHand"))] == [
+        "LeftArm",
+        "LeftForeArm",
+        "LeftHand",
+    ]
+
+
+@pytest.mark.parametrize("side", ["Left", "Right"])
+def test_a_body_at_ease_hangs_its_arms_and_bends_elbows_forward(side):
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = graph_bones(skeleton, PAPER)
+    poses = pose_bones(skeleton, bones, {0: np.eye(4)[None]})[0]
+    index = {bone.role: i for i, bone in enumerate(bones)}
+    shoulder, elbow, wrist = (poses[index[side + part], :3, 3] for part in ("Arm", "ForeArm", "Hand"))
+    assert elbow[2] < shoulder[2] - 0.3
+    assert wrist[2] < elbow[2] - 0.2
+    assert wrist[1] < elbow[1] - 0.05
+    assert (elbow[0] > shoulder[0]) == (side == "Left")
+
+
+def test_hinge_ranges_allow_flexion_and_twist_but_no_sideways_bend():
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = graph_bones(skeleton, ("LeftArm", "LeftHand"))
+    hinge = hinges(skeleton, bones)[0]
+    axes = proper_axes(skeleton, "LeftArm")
+    length = 0.146 * 1.75
+
+    def misfit(bend: np.ndarray) -> float:
+        wrist = bones[1].offset_m + length * (axes @ so3_exp(bend) @ [1.0, 0.0, 0.0])
+        return float(np.abs(np.linalg.norm(hinge.anchors_m - wrist, axis=1) - hinge.range_m).max())
+
+    assert misfit(np.array([0.0, 0.0, 1.2])) < 1e-12
+    assert misfit(np.array([0.0, 0.5, 0.0])) > 0.05
+
+
+@pytest.mark.parametrize("side", ["Left", "Right"])
+def test_two_bone_reach_puts_the_wrist_where_it_was_measured(side):
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = graph_bones(skeleton, ("Spine1", side + "Hand"))
+    hand = make_transform(np.eye(3)[None], np.array([[0.25 if side == "Left" else -0.25, -0.3, 0.0]]))
+    poses = pose_bones(skeleton, bones, {0: np.eye(4)[None], 4: hand})[0]
+    elbow = poses[3]
+    reached = elbow[:3, :3] @ bones[4].offset_m + elbow[:3, 3]
+    assert_allclose(reached, hand[0, :3, 3], atol=1e-9)
+    # The elbow points out and back, not through the chest.
+    line = 0.5 * (poses[2, :3, 3] + hand[0, :3, 3])
+    assert elbow[1, 3] > line[1]
+
+
+def test_provisional_scale_from_the_reach_of_the_arms():
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = graph_bones(skeleton, PAPER)
+    mounts = {f"cam{bone}": nominal_mount(f"cam{bone}", bones[bone].role, skeleton) for bone in (0, 4, 8)}
+    swing = so3_exp(np.outer(0.5 * np.sin(np.arange(60) / 5.0), [1.0, 0.0, 0.0]))
+    still = np.tile(np.eye(4), (60, 1, 1))
+    at_ease = pose_bones(skeleton, bones, {0: still})
+    tracks = []
+    for bone, arm in ((0, None), (4, 2), (8, 6)):
+        pose = at_ease[:, bone].copy()
+        if arm is not None:
+            shoulder = at_ease[:, arm, :3, 3]
+            centre = np.einsum("tij,tj->ti", swing, pose[:, :3, 3] - shoulder) + shoulder
+            pose = make_transform(swing @ pose[:, :3, :3], centre)
+        camera = pose @ mounts[f"cam{bone}"].joint_from_cam
+        tracks.append(_track(camera[:, :3, 3] / 3.0, bone, rotation=camera[:, :3, :3]))
+    # The largest extension stands for 0.96 of the arm's length; at 25° of flexion it is 0.98.
+    assert provisional_scale(bones, tracks, mounts) == pytest.approx(3.0, rel=0.04)
+
+
+def test_provisional_scale_needs_two_places_on_the_body():
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = graph_bones(skeleton, ("Spine1",))
+    mounts = {"cam0": nominal_mount("cam0", "Spine1", skeleton)}
+    with pytest.raises(EstimationError, match="no two cameras"):
+        provisional_scale(bones, [_track(np.zeros((30, 3)))], mounts)
+
+
+def test_cleaning_drops_bursts_and_keeps_a_throw():
+    seconds = np.arange(90) / 30.0
+    # 2 Hz at 0.25 m is a violent arm: 3 m/s, 40 m/s².
+    throw = np.stack([0.25 * np.sin(4.0 * np.pi * seconds), seconds, 0.0 * seconds], axis=1)
+    kept, dropped = clean(_track(throw), 1.0, 30.0)
+    assert dropped == 0
+    wrong = throw.copy()
+    wrong[[20, 21, 50]] += [0.4, -0.4, 0.2]
+    kept, dropped = clean(_track(wrong / 5.0), 5.0, 30.0)
+    assert dropped == 3
+    assert not {20, 21, 50} & set(kept.frames.tolist())
+
+
+def test_interpolation_of_a_track_knows_its_holes():
+    track = _track(np.stack([np.arange(10.0), np.zeros(10), np.zeros(10)], axis=1))
+    holed = track.keep(np.array([True] * 3 + [False] * 4 + [True] * 3))
+    times = np.round(np.array([0.5, 1.0, 4.5, 9.0, 12.0]) * SECOND / 30).astype(np.int64)
+    poses, valid = holed.at(times, reach_ns=SECOND // 10)
+    assert valid.tolist() == [True, True, False, True, False]
+    assert_allclose(poses[:, 0, 3], [0.5, 1.0, 4.5, 9.0, 9.0], atol=1e-6)
+
+
+def test_gaps_are_filled_on_se3_and_ends_held():
+    poses = make_transform(
+        so3_exp(np.outer(np.arange(5.0), [0, 0, 0.2])), np.outer(np.arange(5.0), [1.0, 0, 0])
+    )
+    valid = np.array([False, True, False, True, False])
+    filled = fill_gaps(np.where(valid[:, None, None], poses, np.nan), valid)
+    assert_allclose(filled[2], poses[2], atol=1e-12)
+    assert_allclose(filled[[0, 4]], poses[[1, 3]], atol=1e-12)
+
+
+def test_wild_motion_loosens_the_limb_above_the_camera():
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = graph_bones(skeleton, PAPER)
+    rng = np.random.default_rng(0)
+    turns = so3_exp(np.cumsum(rng.normal(scale=0.06, size=(90, 3)), axis=0))
+    spin = np.array(list(accumulate(turns, np.matmul)))
+    tracks = [
+        _track(np.zeros((90, 3)), 0),
+        _track(np.zeros((90, 3)), 4, rotation=spin),
+        _track(np.zeros((90, 3)), 8),
+    ]
+    ratio = [
+        after.psd[0] / before.psd[0] for before, after in zip(bones, adapt_psd(bones, tracks), strict=True)
+    ]
+    # Increments of 0.06 rad a frame: 0.0036 / (2/3 · (1/30)³) = 146 rad²/s³ against the table's 30.
+    assert ratio[4] == pytest.approx(146 / 30, rel=0.3)
+    assert ratio[3] == ratio[2] == ratio[4]
+    assert ratio[0] == ratio[7] == ratio[8] == 1.0
+
+
+def test_mount_points_carry_exactly_the_pose_they_stand_for():
+    gtsam = pytest.importorskip("gtsam")
+    points, mount = MountPoints(0.01, 0.005), make_transform(so3_exp([0.3, -0.2, 1.0]), [0.1, 0.02, -0.05])
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    add_mount_prior(graph, 0, mount, points, (0.2, 0.03))
+    insert_mount(values, 0, mount, points)
+    assert_allclose(read_mount(values, 0, points), mount, atol=1e-12)
+    keys = gtsam.KeyVector([gtsam.symbol("m", i) for i in range(4)])
+    covariance = gtsam.Marginals(graph, values).jointMarginalCovariance(keys).fullMatrix()
+    assert mount_sigmas(covariance, mount, points) == pytest.approx((0.2, 0.03))
+
+
+def test_walls_and_floor_give_the_vertical_and_the_floor():
+    rng = np.random.default_rng(4)
+    wall = rng.uniform([0, 0, 0], [4, 0, 2.5], (150, 3))
+    side = rng.uniform([0, 0, 0], [0, 3, 2.5], (120, 3))
+    floor = rng.uniform([0, 0, 0], [4, 3, 0], (80, 3))
+    clutter = rng.uniform([0, 0, 0.1], [4, 3, 2.5], (150, 3))
+    room = np.concatenate([wall, side, floor, clutter]) + rng.normal(scale=0.005, size=(500, 3))
+    turn = so3_exp([0.4, -0.9, 0.3])
+    planes = find_planes(room @ turn.T, np.random.default_rng(0))
+    found = vertical(planes, so3_exp([0.15, 0.1, 0.0]) @ turn @ UP)
+    assert found is not None
+    # Planes 3 m wide with 5 mm of noise tilt by a fraction of a degree.
+    assert np.degrees(np.arccos(found[0] @ turn @ UP)) < 0.5
+    floor_found = find_floor(room @ UP, Direction(UP, "map", 0.0, 1.0), 0.08, 1.2)
+    assert floor_found.source == "map"
+    assert floor_found.height_m == pytest.approx(0.0, abs=0.01)
+    assert find_floor(room @ UP, Direction(UP, "body", None, 0.0), 0.08, 1.2).height_m == 0.08
+
+
+def test_one_wall_does_not_fix_the_vertical():
+    rng = np.random.default_rng(4)
+    wall = rng.uniform([0, 0, 0], [4, 0.005, 2.5], (300, 3))
+    assert vertical(find_planes(wall, np.random.default_rng(0)), UP) is None
+    assert vertical([], UP) is None
+    assert find_planes(wall[:50], np.random.default_rng(0)) == []
+
+
+def test_the_floor_corrects_the_scale_by_its_share_and_is_not_believed_when_far_off():
+    body = ScaleEstimate(scale=1.0, sigma_log=0.06, costs=(), mount_slope={})
+    factor, sigma, believed = weigh_floor(body, 0.97 * 1.2 / 1.06, 1.2)
+    # Equal sigmas: halfway.
+    assert believed
+    assert factor == pytest.approx(np.sqrt(1.06), rel=1e-6)
+    assert sigma == pytest.approx(0.06 / np.sqrt(2.0))
+    assert weigh_floor(body, 0.8, 1.2) == (1.0, 0.06, False)
+    assert weigh_floor(body, -0.1, 1.2) == (1.0, 0.06, False)
+
+
+def test_world_has_hips_over_the_origin_and_faces_minus_y():
+    up = np.array([0.6, 0.0, 0.8])
+    rotation = upright(up)
+    assert_allclose(rotation @ up, UP, atol=1e-12)
+    world = place(rotation, np.array([3.0, 2.0, 1.4]), 0.5, np.radians(30.0))
+    assert_allclose(world.apply(np.array([3.0, 2.0, 1.4]) @ rotation), [0.0, 0.0, 0.9], atol=1e-12)
+    facing = np.array([np.cos(np.radians(30.0)), np.sin(np.radians(30.0)), 0.0]) @ rotation
+    assert_allclose(world.rotation @ facing, [0.0, -1.0, 0.0], atol=1e-12)
+    assert_allclose(upright(-UP) @ -UP, UP, atol=1e-12)
+
+
+def test_heading_waits_for_the_first_step():
+    forward = np.concatenate([np.tile([1.0, 0.0, 0.0], (60, 1)), np.tile([0.0, 1.0, 0.0], (60, 1))])
+    centre = np.zeros((120, 3))
+    centre[60:, 1] = np.arange(60) / 30.0
+    # The step is seen up to a quarter of a second early: 7 ticks of 30 face the other way.
+    assert heading(forward, centre, 30.0) == pytest.approx(np.pi / 2, abs=np.arctan(7 / 23) + 1e-9)
+    assert heading(forward[:60], centre[:60], 30.0) == 0.0
+
+
+def test_standing_height_adds_the_legs_up():
+    skeleton = load_skeleton("full_body", 1.75)
+    assert standing_height(skeleton, 0) == pytest.approx(0.530 * 1.75, abs=0.005)
+    spread = np.array(skeleton.offsets_m)
+    spread[0] = 0.0
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        knee = skeleton.roles.index(f"{side}Leg")
+        spread[knee] = so3_exp([0.0, sign * -0.4, 0.0]) @ spread[knee]
+    lying = replace(skeleton, offsets_m=spread)
+    assert standing_height(lying, 0) == pytest.approx(0.530 * 1.75, abs=0.005)
+
+
+def test_the_rest_of_the_body_stands_under_a_leaning_chest():
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = graph_bones(skeleton, ("Spine1",))
+    lean = make_transform(so3_exp([[0.3, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.225]]))
+    joints, solved = complete_body(skeleton, bones, lean[:, None])
+    assert solved.sum() == 1
+    hips, foot = skeleton.roles.index("Hips"), skeleton.roles.index("LeftFoot")
+    assert_allclose(joints[0, hips, :3, :3], np.eye(3), atol=1e-12)
+    assert joints[0, foot, 2, 3] == pytest.approx(joints[0, hips, 2, 3] - 0.491 * 1.75)
+    # Rigid everywhere: each joint keeps its offset from its parent.
+    parents, rest = skeleton.parents, rest_positions(skeleton)
+    for joint in range(1, len(rest)):
+        offset = (invert(joints[0, parents[joint]]) @ joints[0, joint])[:3, 3]
+        assert_allclose(offset, skeleton.offsets_m[joint], atol=1e-9)
+
+
+def test_observed_needs_a_camera_or_cameras_on_both_sides():
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = graph_bones(skeleton, PAPER)
+    ticks = np.round(np.arange(90) * SECOND / 30).astype(np.int64)
+    torso, left, right = (_track(np.zeros((90, 3)), bone) for bone in (0, 4, 8))
+    left = left.keep((np.arange(90) < 30) | (np.arange(90) > 45))
+    right = right.keep(np.arange(90) < 20)
+    observed = observed_joints(skeleton, bones, [torso, left, right], ticks, 0.4)
+    role = skeleton.roles.index
+    assert observed[:, role("Spine1")].all()
+    assert observed[:30, role("LeftForeArm")].all()
+    assert not observed[31:45, role("LeftForeArm")].any()
+    assert observed[47:, role("LeftHand")].all()
+    assert observed[:20, role("RightHand")].all()
+    assert not observed[21:, role("RightHand")].any()
+    assert not observed[21:, role("RightArm")].any()
+    assert not observed[:, role("Head")].any()
+    assert observed_joints(skeleton, bones, [torso, left, right], ticks, 1.0)[:, role("LeftHand")].all()
