@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-Kind = Literal["started", "progress", "finished", "reused", "failed", "note"]
+Kind = Literal["started", "progress", "finished", "reused", "failed", "stopped", "note"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -14,8 +14,8 @@ class Event:
     """One step of a job.
 
     Attributes:
-        kind: What happened: a stage started, moved on, finished, was answered by the store or failed;
-            or a note for the reader.
+        kind: What happened: a stage started, moved on, finished, was answered by the store, failed or
+            was stopped; or a note for the reader.
         stage: Stage name.
         camera: Camera name; "" when the stage concerns all cameras.
         done: Units done, of `total`.

@@ -150,8 +150,9 @@ class Bars:
             "reused": "already done",
             "finished": f"done in {_duration(event.seconds)}",
             "failed": "failed",
+            "stopped": "stopped",
         }
-        if event.kind != "failed":
+        if event.kind not in ("failed", "stopped"):
             self._progress.update(bar, completed=total, total=total)
         self._progress.update(bar, what=words[event.kind])
         self._progress.stop_task(bar)
@@ -197,6 +198,7 @@ def _sentence(event: Event) -> str:
         "reused": "already done, taken from the store",
         "finished": f"done in {_duration(event.seconds)}",
         "failed": "failed",
+        "stopped": "stopped",
     }
     return f"{event.label}: {words[event.kind]}"
 

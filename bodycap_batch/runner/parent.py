@@ -69,8 +69,9 @@ class Runner:
         self._tell(task, "started")
         try:
             artefact = self._make(task)
-        except BodycapError:
-            self._tell(task, "failed")
+        except BodycapError as error:
+            self.store.sweep()
+            self._tell(task, "stopped" if isinstance(error, Cancelled) else "failed")
             raise
         self._tell(task, "finished", seconds=float(artefact.made["seconds"]))
         return artefact, True
