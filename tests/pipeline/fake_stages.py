@@ -16,7 +16,7 @@ from bodycap_batch.runner.child import main
 
 Json = Mapping[str, Any]
 ORDERS = "BODYCAP_FAKE_ORDERS"
-"""Path of a JSON file: {"fail": stage, "hang": stage, "wanted": [per round], "localised": [per round]}."""
+"""Path of a JSON file: {"fail" | "hang" | "fill": stage, "wanted" | "localised": [a value per round]}."""
 
 
 def orders() -> dict[str, Any]:
@@ -44,6 +44,10 @@ def stage(name: str) -> Any:
                 time.sleep(0.05)
         if orders().get("fail") == name:
             raise EstimationError(f"{name} does not work out", hint="film more")
+        if orders().get("fill") == name:
+            with (files / "big.bin").open("wb") as stream:
+                for _ in range(1000):
+                    stream.write(bytes(1 << 20))
         content = [name, dict(options), made_of(arguments), videos(arguments)]
         (files / "made_of.txt").write_text(json.dumps(content, sort_keys=True))
         EXTRA.get(name, summary)(options, arguments, files)

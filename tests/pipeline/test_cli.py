@@ -186,6 +186,18 @@ def test_kill_9_at_any_stage_costs_that_stage_only(bench: Bench) -> None:
     assert _results(bench.folder / "out" / "my_walk") == expected
 
 
+def test_the_same_job_run_twice_at_the_same_time_comes_out_right(bench: Bench) -> None:
+    both = [bench.start("run", "my walk") for _ in range(2)]
+    ends = [process.communicate(timeout=90) for process in both]
+    assert [process.returncode for process in both] == [0, 0], ends
+    results = _results(bench.folder / "out" / "my_walk")
+    assert "nothing to do" in bench.run("run", "my walk")[1]
+    assert _results(bench.folder / "out" / "my_walk") == results
+    assert not any(name.endswith(".part") for name in results)
+    assert list((bench.folder / "out" / ".store" / "tmp").iterdir()) == []
+    assert list((bench.folder / "out" / ".store" / "corrupt").iterdir()) == []
+
+
 def _made(folder: Path) -> Path:
     folder.mkdir()
     return folder
@@ -197,6 +209,42 @@ def _results(folder: Path) -> dict[str, bytes]:
         for path in folder.rglob("*")
         if path.is_file() and "logs" not in path.parts and path.name not in ("run.json", "job.yaml")
     }
+
+
+_ON_A_SMALL_DISK = """
+import sys
+from pathlib import Path
+from tests.pipeline.test_cli import Bench, _results
+bench = Bench(Path(sys.argv[1]))
+out = bench.folder / "out" / "my_walk"
+assert bench.run("run", "my walk")[0] == 0
+before = _results(out)
+bench.order(fill="map")
+(bench.capture / "torso.mp4").write_text("other frames")
+code, _, err = bench.run("run", "my walk")
+assert code == 5, err
+assert "space" in err and "--store" in err and "Traceback" not in err, err
+assert _results(out) == before
+bench.order()
+code, _, err = bench.run("run", "my walk")
+assert code == 0 and "keyframes torso: already done" in err, err
+assert _results(out) != before
+"""
+
+
+def test_a_disk_that_fills_up_leaves_earlier_results_intact(tmp_path: Path) -> None:
+    mount = ["unshare", "--mount", "--propagation", "private", "sh", "-c"]
+    if subprocess.run([*mount, "mount -t tmpfs none /mnt"], capture_output=True, check=False).returncode:
+        pytest.skip("needs the right to mount a tmpfs in a mount namespace of its own (root)")
+    command = 'mount -t tmpfs -o size=32m none "$1" && exec "$2" -c "$3" "$1"'
+    done = subprocess.run(
+        [*mount, command, "sh", str(tmp_path), sys.executable, _ON_A_SMALL_DISK],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_no_answer_from_the_data_is_exit_code_4_with_partial_results(bench: Bench) -> None:
