@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.arrays import BoolArray, FloatArray
 from bodycap_batch.geometry import Similarity, so3_exp
 from bodycap_batch.merging.bones import Bone, proper_axes
 from bodycap_batch.merging.planes import find_planes, vertical
@@ -105,14 +105,21 @@ def find_floor(heights_m: FloatArray, up: Direction, expected_m: float, standing
     return Floor(expected_m, "standing hip height", 0)
 
 
-def standing_height(skeleton: SkeletonModel, joint: int) -> float:
-    """Height of a trunk joint over the soles with straight legs.
+def feet_floor(skeleton: SkeletonModel, world_from_joint: FloatArray, solved: BoolArray) -> Floor | None:
+    """Find the lowest height of the soles (Z up) where a foot was solved: the ankles' 2nd percentile."""
+    ankles = [skeleton.index_of_role(side + "Foot") for side in ("Left", "Right")]
+    heights = [world_from_joint[:, ankle, 2, 3] for ankle in ankles if ankle is not None and solved[ankle]]
+    legs = leg_lengths(skeleton)
+    if not heights or not legs:
+        return None
+    lowest = float(np.percentile(np.min(heights, axis=0), 2.0))
+    return Floor(lowest - float(np.mean([ankle for _, _, ankle in legs])), "feet", 0)
 
-    A rig's zero pose may spread its legs and put its root anywhere: the bones' lengths are added up.
-    """
-    heights = []
+
+def leg_lengths(skeleton: SkeletonModel) -> list[tuple[float, float, float]]:
+    """Per leg: the root over the hip joint at zero pose, thigh and shin together, the ankle over the sole."""
+    out = []
     rest = rest_positions(skeleton)
-    above_root = float(rest[joint][2] - rest[0][2])
     for side in ("Left", "Right"):
         chain = [skeleton.index_of_role(side + part) for part in ("UpLeg", "Leg", "Foot")]
         if None in chain:
@@ -121,9 +128,20 @@ def standing_height(skeleton: SkeletonModel, joint: int) -> float:
         leg = float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
         toe = skeleton.index_of_role(side + "ToeBase")
         drop = float(ankle[2] - rest[toe][2]) if toe is not None else 0.0
-        heights.append(float(rest[0][2] - hip[2]) + leg + max(drop, _ANKLE_OVER_LEG * leg))
-    if heights:
-        return above_root + float(np.mean(heights))
+        out.append((float(rest[0][2] - hip[2]), leg, max(drop, _ANKLE_OVER_LEG * leg)))
+    return out
+
+
+def standing_height(skeleton: SkeletonModel, joint: int) -> float:
+    """Height of a trunk joint over the soles with straight legs.
+
+    A rig's zero pose may spread its legs and put its root anywhere: the bones' lengths are added up.
+    """
+    rest = rest_positions(skeleton)
+    above_root = float(rest[joint][2] - rest[0][2])
+    legs = leg_lengths(skeleton)
+    if legs:
+        return above_root + float(np.mean([sum(leg) for leg in legs]))
     return above_root + (float(rest[0][2]) if rest[0][2] > 0.3 else _LEGLESS_HIP_M)
 
 

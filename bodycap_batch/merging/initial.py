@@ -31,8 +31,8 @@ def provisional_scale(bones: Sequence[Bone], tracks: Sequence[Track], mounts: Ma
     pairs = [pair for pair in _pairs(bones, tracks, mounts) if pair is not None]
     if not pairs:
         raise EstimationError(
-            "no two cameras on different places of the body were localised at the same time",
-            hint="metric scale comes from the distances between cameras on one body",
+            "no two cameras whose distance the body knows were localised at the same time",
+            hint="metric scale comes from a camera on the trunk and one on a limb (or the head) in one map",
         )
     typical = [
         (reach + np.linalg.norm(fixed, axis=1).mean())
@@ -77,7 +77,10 @@ def _pairs(
 def _pair(
     bones: Sequence[Bone], track: Track, other: Track, mounts: Mapping[str, Mount]
 ) -> tuple[FloatArray, FloatArray, float] | None:
-    anchor, reach = _anchor_and_reach(bones, track.bone, other.bone)
+    geometry = anchor_and_reach(bones, track.bone, other.bone)
+    if geometry is None:
+        return None
+    anchor, reach = geometry
     poses, valid = other.at(track.times_ns, reach_ns=200_000_000)
     if valid.sum() < 10:
         return None
@@ -89,22 +92,31 @@ def _pair(
     return mine[:, :3, 3] - theirs[:, :3, 3], tip - base, reach
 
 
-def _anchor_and_reach(bones: Sequence[Bone], bone: int, other: int) -> tuple[FloatArray, float]:
-    """Point in the other bone's frame from which `bone`'s joint is at most `reach` away."""
-    anchor, reach = np.zeros(3), 0.0
-    current = bone
-    while current >= 0 and current != other:
-        if split_side(bones[bones[current].parent].role)[1] in LIMB_LINKS and bones[current].parent != other:
-            reach += float(np.linalg.norm(bones[current].offset_m))
+def anchor_and_reach(bones: Sequence[Bone], bone: int, other: int) -> tuple[FloatArray, float] | None:
+    """Point in the other bone's frame from which `bone`'s joint is at most `reach` away.
+
+    None where a second limb lies between them: then the distance says nothing about either's length.
+    """
+    up, down = _ancestry(bones, other), _ancestry(bones, bone)
+    shared = next(index for index in down if index in up)
+    above = up[: up.index(shared)]
+    if any(split_side(bones[bones[index].parent].role)[1] in LIMB_LINKS for index in above):
+        return None
+    anchor, reach = -np.sum([bones[index].offset_m for index in above], axis=0) + np.zeros(3), 0.0
+    for index in down[: down.index(shared)]:
+        parent = bones[index].parent
+        if split_side(bones[parent].role)[1] in LIMB_LINKS and parent != other:
+            reach += float(np.linalg.norm(bones[index].offset_m))
         else:
-            anchor += bones[current].offset_m
-        current = bones[current].parent
-    if current < 0:
-        raise EstimationError(
-            f"no bone links {bones[bone].role} with {bones[other].role}",
-            hint="mount a camera on the trunk, or on the limb's upper segment",
-        )
+            anchor += bones[index].offset_m
     return anchor, reach
+
+
+def _ancestry(bones: Sequence[Bone], bone: int) -> list[int]:
+    chain = [bone]
+    while bones[chain[-1]].parent >= 0:
+        chain.append(bones[chain[-1]].parent)
+    return chain
 
 
 def fill_gaps(poses: FloatArray, valid: BoolArray) -> FloatArray:

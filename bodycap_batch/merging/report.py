@@ -31,7 +31,8 @@ def build_report(
         calibrated: Scale, mounts and up.
         solution: The solved motion.
         tracks: The tracks that were used.
-        notes: ``dropped`` frames by camera, the ``floor`` and the ``unused`` cameras.
+        notes: ``dropped`` frames by camera, the ``floor``, the ``unused`` cameras, ``joint_gap_m`` by role
+            and how often the activity's ``rules`` were active.
     """
     floor = notes["floor"]
     return {
@@ -57,6 +58,8 @@ def build_report(
             for track in tracks
         },
         "unused_cameras": dict(notes["unused"]),
+        "joint_gap_m": {role: _percentiles(gap) for role, gap in notes["joint_gap_m"].items()},
+        "activity": {"name": inputs.activity, "rules_active": notes["rules"]},
         "solver": {
             "ticks": len(solution.world_from_bone),
             "bones": solution.world_from_bone.shape[1],

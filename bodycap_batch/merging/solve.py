@@ -23,6 +23,7 @@ from bodycap_batch.merging.graph import (
     velocity_key,
 )
 from bodycap_batch.merging.initial import fill_gaps, pose_bones
+from bodycap_batch.merging.rules import Rule
 from bodycap_batch.merging.tracks import MIN_SIGMA_M, MIN_SIGMA_RAD, Track
 from bodycap_batch.skeleton import SkeletonModel
 
@@ -30,7 +31,9 @@ ON_TICK_NS = 1_000_000
 """A measurement this close to a tick counts there: at 3 m/s the hand moves 3 mm in a millisecond."""
 
 _VELOCITY_SIGMA = np.array([8.0, 8.0, 8.0, 3.0, 3.0, 3.0])
-"""Weak prior that keeps velocities of unmeasured stretches finite (rad/s, m/s)."""
+"""Weak prior on the first and last velocity, where the motion model has one neighbour only (rad/s, m/s)."""
+_CALM_SIGMA = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
+"""Before the first and after the last measurement of all cameras the body rests instead of flying on."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +69,7 @@ class MotionGraph:
         tick_times_ns: (T,) the timeline.
         tracks: Cleaned tracks, poses in metres.
         mounts: joint_from_cam (4,4) by camera.
+        rules: Soft rules of the activity.
     """
 
     def __init__(
@@ -75,9 +79,10 @@ class MotionGraph:
         tick_times_ns: IntArray,
         tracks: Sequence[Track],
         mounts: Mapping[str, FloatArray],
+        rules: Sequence[Rule] = (),
     ) -> None:
         self._skeleton, self._bones, self._times = skeleton, bones, tick_times_ns
-        self._tracks, self._mounts = tracks, mounts
+        self._tracks, self._mounts, self._rules = tracks, mounts, rules
         self._graph = gtsam.NonlinearFactorGraph()
         self._sizes: dict[str, int] = {}
         self._measured_keys: dict[str, list[int]] = {}
@@ -85,6 +90,7 @@ class MotionGraph:
         self._add_measurements()
         self._add_motion()
         self._add_joints()
+        self._add_rules()
 
     def solve(self, iterations: int, step: Callable[[], None]) -> Solution:
         """Optimise and read the result off."""
@@ -134,14 +140,20 @@ class MotionGraph:
         before = self._graph.size()
         start = int(self._times[0])
         weak = gtsam.noiseModel.Diagonal.Sigmas(_VELOCITY_SIGMA)
+        calm = gtsam.noiseModel.Diagonal.Sigmas(_CALM_SIGMA)
+        seen_from = min(int(track.times_ns[0]) for track in self._tracks)
+        seen_to = max(int(track.times_ns[-1]) for track in self._tracks)
         for bone, chain in zip(self._bones, self._chains, strict=True):
             states = [
                 gtsam.StateData(pose, velocity, 1e-9 * (time - start)) for time, pose, velocity in chain
             ]
             for first, second in pairwise(states):
                 self._graph.add(gtsam.WnoaMotionFactorPose3(first, second, bone.psd))
-            for _, _, velocity in (chain[0], chain[-1]):
-                self._graph.add(gtsam.PriorFactorVector(velocity, np.zeros(6), weak))
+            for time, _, velocity in chain:
+                outside = time < seen_from or time > seen_to
+                if outside or time in (chain[0][0], chain[-1][0]):
+                    noise = calm if outside else weak
+                    self._graph.add(gtsam.PriorFactorVector(velocity, np.zeros(6), noise))
         self._sizes["smoothness"] = int(self._graph.size() - before)
 
     def _add_joints(self) -> None:
@@ -150,6 +162,13 @@ class MotionGraph:
         for tick in range(len(self._times)):
             joints.add(self._graph, tick)
         self._sizes["joints"] = int(self._graph.size() - before)
+
+    def _add_rules(self) -> None:
+        before = self._graph.size()
+        for tick in range(len(self._times)):
+            for rule in self._rules:
+                rule.add(self._graph, tick)
+        self._sizes["rules"] = int(self._graph.size() - before)
 
     def _start(self) -> Any:
         measured = {}
@@ -228,3 +247,13 @@ def _states(poses: FloatArray, seconds: FloatArray, times: FloatArray) -> tuple[
     alpha = np.clip((times - seconds[first]) / span, 0.0, 1.0)
     step = invert(poses[first]) @ poses[first + 1]
     return interpolate_pose(poses[first], poses[first + 1], alpha), _log(step) / span[:, None]
+
+
+def joint_gaps(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, FloatArray]:
+    """How far each bone's joint lies from where its parent has it, by role: (T,) metres."""
+    out = {}
+    for index, bone in enumerate(bones):
+        if bone.parent >= 0:
+            expected = world_from_bone[:, bone.parent] @ np.append(bone.offset_m, 1.0)
+            out[bone.role] = np.linalg.norm(world_from_bone[:, index, :3, 3] - expected[:, :3], axis=1)
+    return out

@@ -20,8 +20,9 @@ from bodycap_batch.merging.calibrate import Calibration, Samples, take_samples
 from bodycap_batch.merging.complete import complete_body, observed_joints
 from bodycap_batch.merging.initial import provisional_scale
 from bodycap_batch.merging.report import build_report
+from bodycap_batch.merging.rules import activity_rules
 from bodycap_batch.merging.scale import ScaleEstimate, find_scale, weigh_floor
-from bodycap_batch.merging.solve import MotionGraph, Solution
+from bodycap_batch.merging.solve import MotionGraph, Solution, joint_gaps
 from bodycap_batch.merging.tracks import Track, adapt_psd, clean, make_track
 from bodycap_batch.scene import Trajectory
 from bodycap_batch.skeleton import Mount
@@ -76,12 +77,14 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
     calibrated = _calibrate(inputs, bones, tracks, provisional, step)
     step.what = "solving"
     metric = [_in_metres(track, calibrated.scale) for track in tracks]
+    rules = activity_rules(inputs.skeleton, bones, inputs.activity)
     graph = MotionGraph(
         inputs.skeleton,
         adapt_psd(bones, metric),
         tick_times,
         metric,
         {mount.camera: mount.joint_from_cam for mount in calibrated.mounts},
+        rules,
     )
     solution = graph.solve(_ITERATIONS, step)
     world_from_solved, joints, solved, floor = _place(inputs, bones, solution, calibrated, fps)
@@ -99,7 +102,17 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         mounts=calibrated.mounts,
         unused_cameras=unused,
         report=build_report(
-            inputs, calibrated, solution, tracks, {"dropped": dropped, "floor": floor, "unused": unused}
+            inputs,
+            calibrated,
+            solution,
+            tracks,
+            {
+                "dropped": dropped,
+                "floor": floor,
+                "unused": unused,
+                "joint_gap_m": joint_gaps(bones, solution.world_from_bone),
+                "rules": {rule.name: rule.active(solution.world_from_bone) for rule in rules},
+            },
         ),
     )
 
@@ -230,6 +243,8 @@ def _place(
     heights = calibrated.scale * points @ rotation[2]
     expected = float(np.median(hips[:, 2])) - gauge.WALKING_HEIGHT * standing
     floor = gauge.find_floor(heights, calibrated.up, expected, standing)
+    if floor.source != "map":
+        floor = gauge.feet_floor(inputs.skeleton, joints, solved) or floor
     forward = -joints[:, 0, :3, 1]
     placed = gauge.place(rotation, hips[0], floor.height_m, gauge.heading(forward, hips, fps))
     to_world = Similarity(1.0, placed.rotation @ rotation.T, placed.translation)

@@ -14,10 +14,26 @@ from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import invert, make_transform, so3_exp
 from bodycap_batch.merging.bones import graph_bones, hinges, proper_axes
 from bodycap_batch.merging.complete import complete_body, observed_joints
-from bodycap_batch.merging.gauge import Direction, find_floor, heading, place, standing_height, upright
-from bodycap_batch.merging.graph import MountPoints, add_mount_prior, insert_mount, mount_sigmas, read_mount
-from bodycap_batch.merging.initial import fill_gaps, pose_bones, provisional_scale
+from bodycap_batch.merging.gauge import (
+    Direction,
+    feet_floor,
+    find_floor,
+    heading,
+    place,
+    standing_height,
+    upright,
+)
+from bodycap_batch.merging.graph import (
+    MountPoints,
+    add_mount_prior,
+    bone_key,
+    insert_mount,
+    mount_sigmas,
+    read_mount,
+)
+from bodycap_batch.merging.initial import anchor_and_reach, fill_gaps, pose_bones, provisional_scale
 from bodycap_batch.merging.planes import find_planes, vertical
+from bodycap_batch.merging.rules import activity_rules
 from bodycap_batch.merging.scale import ScaleEstimate, weigh_floor
 from bodycap_batch.merging.tracks import Track, adapt_psd, clean
 from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount, rest_positions
@@ -315,3 +331,63 @@ def test_observed_needs_a_camera_or_cameras_on_both_sides():
     assert not observed[21:, role("RightArm")].any()
     assert not observed[:, role("Head")].any()
     assert observed_joints(skeleton, bones, [torso, left, right], ticks, 1.0)[:, role("LeftHand")].all()
+
+
+def test_solved_feet_give_the_floor():
+    skeleton = load_skeleton("full_body", 1.75)
+    joints = np.tile(make_transform(np.eye(3), rest_positions(skeleton))[None], (50, 1, 1, 1))
+    joints[:, :, 2, 3] += 0.3
+    solved = np.zeros(len(skeleton.joints), dtype=bool)
+    assert feet_floor(skeleton, joints, solved) is None
+    solved[skeleton.roles.index("LeftFoot")] = True
+    floor = feet_floor(skeleton, joints, solved)
+    assert floor is not None
+    assert floor.source == "feet"
+    assert floor.height_m == pytest.approx(0.3, abs=1e-9)
+
+
+def test_walking_palms_stay_low_and_on_their_side():
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = graph_bones(skeleton, PAPER)
+    assert activity_rules(skeleton, bones, "generic") == ()
+    rules = {rule.name: rule for rule in activity_rules(skeleton, bones, "walk")}
+    poses = pose_bones(skeleton, bones, {0: np.eye(4)[None]})
+    assert {rule.active(poses) for rule in rules.values()} == {0.0}
+    poses[0, 4, :3, 3] = [0.2, -0.3, 0.5]
+    assert rules["Left palm below the shoulder"].active(poses) == 1.0
+    poses[0, 4, :3, 3] = [-0.35, -0.3, -0.1]
+    assert rules["Left palm on its side"].active(poses) == 1.0
+    assert rules["Left palm below the shoulder"].active(poses) == 0.0
+
+
+def test_a_rule_pulls_only_outside_its_bounds():
+    gtsam = pytest.importorskip("gtsam")
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = graph_bones(skeleton, PAPER)
+    rule = activity_rules(skeleton, bones, "walk")[0]
+    poses = pose_bones(skeleton, bones, {0: np.eye(4)[None]})
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    rule.add(graph, 0)
+    values.insert(bone_key(0, 0), gtsam.Pose3(np.eye(4)))
+    values.insert(bone_key(0, 4), gtsam.Pose3(poses[0, 4]))
+    assert graph.error(values) == pytest.approx(0.0, abs=1e-12)
+    raised = poses[0, 4].copy()
+    raised[2, 3] = 0.6
+    values.update(bone_key(0, 4), gtsam.Pose3(raised))
+    distance = np.linalg.norm(raised[:3, 3] - rule.anchor_m)
+    # A spring of 5 cm sigma on what is missing to the bound.
+    assert graph.error(values) == pytest.approx(0.5 * ((rule.low_m - distance) / 0.05) ** 2)
+
+
+def test_a_head_camera_reaches_the_palms_through_the_chest():
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = graph_bones(skeleton, ("Head", "LeftHand"))
+    index = {bone.role: i for i, bone in enumerate(bones)}
+    found = anchor_and_reach(bones, index["LeftHand"], index["Head"])
+    assert found is not None
+    rest = rest_positions(skeleton)
+    shoulder = rest[skeleton.roles.index("LeftArm")] - rest[skeleton.roles.index("Head")]
+    assert_allclose(found[0], shoulder, atol=1e-12)
+    assert found[1] == pytest.approx((0.186 + 0.146) * 1.75)
+    palms = graph_bones(skeleton, ("LeftHand", "RightHand"))
+    assert anchor_and_reach(palms, 4, len(palms) - 1) is None
