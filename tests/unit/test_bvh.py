@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -230,7 +231,10 @@ def test_a_files_hierarchy_offsets_and_channels_are_kept(tmp_path: Path) -> None
 
 
 def test_default_layout(tmp_path: Path, rng: np.random.Generator) -> None:
-    moving = motion(skeleton([-1, 0], rng), np.broadcast_to(np.eye(3), (3, 2, 3, 3)), rng)
+    model = skeleton([-1, 0], rng)
+    # a standing position must not be added to the root's path by readers that do so
+    model = replace(model, offsets_m=np.array([[0.0, 0.0, 0.9], [0.1, 0.0, 0.2]]))
+    moving = motion(model, np.broadcast_to(np.eye(3), (3, 2, 3, 3)), rng)
     write_bvh(tmp_path / "a.bvh", moving)
     rows = (tmp_path / "a.bvh").read_text().splitlines()
     assert rows[3:5] == [

@@ -189,6 +189,14 @@ def test_truth_is_interpolated_and_long_gaps_are_refused() -> None:
     assert score.total.rotation_deg.max < 1e-6
 
 
+def test_nearest_association_keeps_to_its_limit() -> None:
+    truth = TimedPoses(times_ns=np.array([0, 100]) * 1_000_000, world_from_cam=walk(0, 2).world_from_cam)
+    at = np.array([-30, -20, 19, 60, 81, 120, 121]) * 1_000_000
+    estimate = TimedPoses(times_ns=at, world_from_cam=walk(0, 7).world_from_cam)
+    options = TrajectoryOptions(align="none", association="nearest", max_diff_s=0.02)
+    assert score_trajectories({"a": estimate}, {"a": truth}, options).total.scored == 4
+
+
 def test_a_time_a_hair_outside_the_truth_still_counts() -> None:
     truth = walk(0, 10)
     late = TimedPoses(times_ns=truth.times_ns + 50_000, world_from_cam=truth.world_from_cam)

@@ -127,8 +127,11 @@ def test_gradient_and_optimum() -> None:
     for joint in range(1, len(truth.skeleton.joints)):
         local[:, joint] = np.swapaxes(rotation[:, truth.skeleton.parents[joint]], -1, -2) @ rotation[:, joint]
     start = Correction(root=truth.root_in_world_m.copy(), local=local)
-    _, _, gradient = _normal_equations(problem, start, problem.reach())
     rng = np.random.default_rng(1)
+    # away from the graph, so that the change of the correction over time takes part
+    away = 3e-3 * rng.normal(size=(6, 3 + 3 * len(problem.solved)))
+    start = _moved(problem, start, away)
+    _, _, gradient = _normal_equations(problem, start, problem.reach())
     for _ in range(5):
         step = rng.normal(size=gradient.shape)
         change = _cost(problem, _moved(problem, start, 1e-6 * step)) - _cost(
