@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,9 +11,8 @@ from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.context import StageContext
-from bodycap_batch.geometry import invert
 from bodycap_batch.registration.growth import wanted_keyframes
-from bodycap_batch.registration.pose import FramePose, PoseLimits, judge_pose, solve_pose
+from bodycap_batch.registration.pose import FramePose, PoseLimits, solve_pose
 from bodycap_batch.registration.tracks import Anchor, Tracks, anchors_of, track_scale, track_stretch
 from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 
@@ -35,8 +34,8 @@ def register_frames(
 ) -> Registration:
     """Solve the pose of every frame of one camera against the map.
 
-    The map's points are tracked from both neighbouring keyframes; where both reach a frame, the
-    observation that travelled less is kept. No new points are made.
+    The map's points are tracked from both neighbouring keyframes, into them too, and every observation
+    counts: two tracks of one point start from two keyframes' independent errors. No new points are made.
 
     Args:
         camera: The camera's video.
@@ -150,17 +149,16 @@ def _reuse(previous: Registration, stretches: list[tuple[int | None, int | None]
     old = Tracks(previous.obs_frame, previous.obs_keyframe, previous.obs_feature, previous.obs_px)
     inside = np.zeros(count, dtype=bool)
     for first, last in stretches:
-        inside[(0 if first is None else first + 1) : (count if last is None else last)] = True
+        inside[(0 if first is None else first) : (count if last is None else last + 1)] = True
     return old.select(inside[old.frame])
 
 
 @dataclass(frozen=True, slots=True)
 class _PointLookup:
-    """From (keyframe, feature) to the map's point, and each keyframe's own observations."""
+    """From (keyframe, feature) to the map's point."""
 
     key: IntArray
     point: IntArray
-    pose_of: dict[int, FloatArray]
 
     _STRIDE = 1 << 24
 
@@ -170,11 +168,7 @@ class _PointLookup:
         frame = scene_map.keyframe_frame[scene_map.obs_keyframe[mine]]
         key = frame * _PointLookup._STRIDE + scene_map.obs_feature[mine]
         order = np.argsort(key, kind="stable")
-        poses = {
-            int(scene_map.keyframe_frame[row]): scene_map.map_from_cam[row]
-            for row in scene_map.keyframes_of(camera)
-        }
-        return _PointLookup(key[order], scene_map.obs_point[mine][order], poses)
+        return _PointLookup(key[order], scene_map.obs_point[mine][order])
 
     def points(self, keyframe: IntArray, feature: IntArray) -> IntArray:
         """Point index of each (keyframe, feature); −1 where the map has none."""
@@ -197,7 +191,6 @@ def _solve_all(
     count = len(camera.times_ns)
     bounds = np.searchsorted(tracks.frame, np.arange(count + 1))
     point = lookup.points(tracks.keyframe, tracks.feature)
-    hops = np.abs(tracks.frame - tracks.keyframe)
     keyframe_row = {
         int(scene_map.keyframe_frame[row]): int(row) for row in scene_map.keyframes_of(camera.name)
     }
@@ -206,41 +199,20 @@ def _solve_all(
         if frame % 30 == 0:
             context.check_cancelled()
             context.progress(frame, count, "poses solved")
-        row = keyframe_row.get(frame)
-        if row is not None:
-            poses.append(_keyframe_pose(scene_map, row, limits))
-            continue
         rows = np.arange(bounds[frame], bounds[frame + 1])
         rows = rows[point[rows] >= 0]
-        rows = rows[np.lexsort((hops[rows], point[rows]))]
-        _, first = np.unique(point[rows], return_index=True)
-        rows = rows[first]
-        seen = scene_map.points[point[rows]]
-        poses.append(solve_pose(lens, seen, tracks.px[rows].astype(np.float64), limits))
+        seen, px = scene_map.points[point[rows]], tracks.px[rows].astype(np.float64)
+        own = keyframe_row.get(frame)
+        if own is not None:
+            mine = scene_map.obs_keyframe == own
+            seen = np.concatenate([scene_map.points[scene_map.obs_point[mine]], seen])
+            px = np.concatenate([scene_map.obs_px[mine], px])
+        solved = solve_pose(lens, seen, px, limits)
+        if own is not None and solved.status is FrameStatus.REGISTERED:
+            solved = replace(solved, status=FrameStatus.KEYFRAME)
+        poses.append(solved)
     context.progress(count, count, "poses solved")
     return poses
-
-
-def _keyframe_pose(scene_map: Map, row: int, limits: PoseLimits) -> FramePose:
-    """The map's own pose of a keyframe, with the covariance its observations support."""
-    mine = scene_map.obs_keyframe == row
-    points = scene_map.points[scene_map.obs_point[mine]]
-    cam_from_map = invert(scene_map.map_from_cam[row])
-    judged = judge_pose(
-        scene_map.cameras[scene_map.keyframe_camera[row]],
-        cam_from_map,
-        points,
-        scene_map.obs_px[mine],
-        limits,
-    )
-    status = FrameStatus.KEYFRAME if judged.status is FrameStatus.REGISTERED else judged.status
-    return FramePose(
-        status=status,
-        gauge_from_cam=judged.gauge_from_cam,
-        covariance=judged.covariance,
-        inliers=judged.inliers,
-        error_px=judged.error_px,
-    )
 
 
 def _trajectory(

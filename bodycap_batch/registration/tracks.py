@@ -140,19 +140,18 @@ def track_stretch(
     buffer: deque[tuple[int, GreyImage]] = deque(maxlen=_MAX_BUFFER)
     for index, grey in camera.grey_frames(start, stop):
         context.check_cancelled()
+        if forward is not None and previous is not None:
+            forward.step(previous, grey)
+            if len(forward.feature) < _MIN_TRACKS:
+                forward = None
+            else:
+                yield forward.observe(index)
         anchor = anchors.get(index)
         if anchor is not None:
             yield from _track_back(index, grey, anchor, buffer)
             buffer.clear()
             forward = _Active(index, anchor.feature, anchor.px)
-        else:
-            if forward is not None and previous is not None:
-                forward.step(previous, grey)
-                if len(forward.feature) < _MIN_TRACKS:
-                    forward = None
-                else:
-                    yield forward.observe(index)
-            buffer.append((index, grey))
+        buffer.append((index, grey))
         previous = grey
 
 

@@ -51,8 +51,12 @@ def test_every_lit_frame_is_localised_to_a_centimetre(estimated: Estimated) -> N
         known = item.trajectory.localised
         poses = world_from_map.apply_to_poses(item.trajectory.gauge_from_cam[known])
         truth = estimated.truth[item.trajectory.camera][known]
-        turn = rotation_angle_rad(np.swapaxes(poses[:, :3, :3], 1, 2) @ truth[:, :3, :3])
-        assert np.degrees(np.median(turn)) < 0.3
+        turn = poses[:, :3, :3] @ np.swapaxes(truth[:, :3, :3], 1, 2)
+        # A common turn is the alignment's: millimetres over a stroll of a metre. What is left is the frames'.
+        u, _, vt = np.linalg.svd(turn.mean(axis=0))
+        own = rotation_angle_rad(turn @ (u @ vt).T)
+        assert np.degrees(np.median(own)) < 0.2
+        assert np.degrees(own.max()) < 1.0
 
 
 def test_dark_frames_say_why_and_ask_for_keyframes(estimated: Estimated) -> None:
