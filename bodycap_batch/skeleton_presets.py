@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -24,6 +25,10 @@ NCD Risk Factor Collaboration, "A century of trends in adult human height", eLif
 NOMINAL_SIGMA_RAD = float(np.radians(15.0))
 NOMINAL_SIGMA_M = 0.04
 """Per axis, of a mount known by its name only: straps turn, and bodies differ."""
+
+STATED_SIGMA_RAD = float(np.radians(5.0))
+STATED_SIGMA_M = 0.015
+"""Per axis, of a mount whose pose the job states without saying how well: 15° and 4.5 cm are three sigma."""
 
 _UP, _FORWARD, _LEFT = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])
 _NEXT_ROLE = {
@@ -147,6 +152,8 @@ def segment_axes(skeleton: SkeletonModel, role: str) -> FloatArray:
 def nominal_mount(camera: str, role: str, skeleton: SkeletonModel) -> Mount:
     """Where a camera on the bone of `role` usually sits.
 
+    A trunk's or head's camera whose name holds the word "back" (``torso_back``) sits and looks backwards.
+
     Raises:
         JobError: The skeleton has no joint of that role.
     """
@@ -161,7 +168,9 @@ def nominal_mount(camera: str, role: str, skeleton: SkeletonModel) -> Mount:
     bone = bone_vector(skeleton, role)
     length = 0.0 if bone is None else float(np.linalg.norm(bone))
     centre = np.array(entry["centre_m"]) + np.array([entry.get("along", 0.0) * length, 0.0, 0.0])
-    view, down = axes @ np.array(entry["view"], float), axes @ np.array(entry["down"], float)
+    facing = np.array([1.0, -1.0 if _faces_back(camera, role) else 1.0, 1.0])
+    centre, view = facing * centre, facing * np.array(entry["view"], float)
+    view, down = axes @ view, axes @ np.array(entry["down"], float)
     view, down = view / np.linalg.norm(view), down / np.linalg.norm(down)
     rotation = np.stack([np.cross(down, view), down, view], axis=1)
     return Mount(
@@ -171,3 +180,7 @@ def nominal_mount(camera: str, role: str, skeleton: SkeletonModel) -> Mount:
         sigma_rad=NOMINAL_SIGMA_RAD,
         sigma_m=NOMINAL_SIGMA_M,
     )
+
+
+def _faces_back(camera: str, role: str) -> bool:
+    return not split_side(role)[0] and "back" in re.split(r"[_\-. ]", camera.lower())

@@ -147,6 +147,17 @@ def test_torso_camera_looks_forward_with_the_image_upright():
     assert mount[1, 3] < -0.05
 
 
+def test_a_camera_on_the_back_looks_backwards():
+    skeleton = load_skeleton("upper_body", 1.75)
+    mount = nominal_mount("torso_back", "Spine1", skeleton).joint_from_cam
+    assert_allclose(mount[:3, 2], [0.0, 1.0, 0.0], atol=1e-12)
+    assert_allclose(mount[:3, 1], [0.0, 0.0, -1.0], atol=1e-12)
+    assert mount[1, 3] > 0.05
+    assert np.linalg.det(mount[:3, :3]) == pytest.approx(1.0)
+    forward = nominal_mount("left_hand_back", "LeftHand", skeleton).joint_from_cam
+    assert_allclose(forward[:3, 2], [0.0, -1.0, 0.0], atol=1e-12)
+
+
 def test_palm_camera_sits_on_the_back_of_the_hand_fingers_down():
     mount = nominal_mount("left_palm", "LeftHand", load_skeleton("upper_body", 1.75)).joint_from_cam
     assert_allclose(mount[:3, 1], [1.0, 0.0, 0.0], atol=1e-12)
