@@ -183,9 +183,12 @@ def _trajectories(estimate: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
     if estimate.is_file() and truth.is_file():
         both = estimate.suffix in TUM_SUFFIXES and truth.suffix in TUM_SUFFIXES
         return {estimate.stem: (estimate, truth)} if both else {}
-    if not (estimate.is_dir() and truth.is_dir()):
+    if not estimate.is_dir():
         return {}
     mine = _by_stem([*estimate.glob("*.tum"), *(estimate / "trajectories").glob("*.tum")])
+    if truth.is_file():
+        single = truth.suffix in TUM_SUFFIXES and len(mine) == 1
+        return {name: (path, truth) for name, path in mine.items()} if single else {}
     theirs = _by_stem([*truth.glob("*.tum"), *(truth / "gt").glob("*.tum")])
     return {name: (mine[name], theirs[name]) for name in sorted(mine.keys() & theirs.keys())}
 

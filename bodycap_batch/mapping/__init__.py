@@ -67,7 +67,7 @@ def build_map(
     scale = _scale(capture)
     pairs = choose_pairs(workspace, refs, _common_ns(capture), options)
     match_pairs(workspace, pairs, options, context, scale)
-    settings = mapper_options(options, _constant(capture, cameras), scale, context.threads)
+    settings = mapper_options(options, _constant(capture, cameras), scale)
     models, ladder = reconstruct(workspace, settings, context, len(refs))
     log = {"keyframes": len(refs), "pairs": len(pairs), "initial_pair_ladder": ladder}
     _require_coverage(models, len(refs), ladder, options)
@@ -120,7 +120,7 @@ def extend_map(
     constant = _constant(capture, cameras)
     models = []
     for number in range(len(previous.maps)):
-        settings = mapper_options(options, constant, scale, context.threads)
+        settings = mapper_options(options, constant, scale)
         source = workspace / MODELS_NAME / str(number)
         model = extend(workspace, source, settings, context, len(known) + len(new))
         if model is None:

@@ -28,7 +28,7 @@ _MAX_EXTRA_PARAM = 1e3
 
 
 def mapper_options(
-    options: MapOptions, constant_cameras: Collection[int], scale: float, threads: int
+    options: MapOptions, constant_cameras: Collection[int], scale: float
 ) -> pycolmap.IncrementalPipelineOptions:
     """Settings of the mapper: seeded, reproducible, given intrinsics held fixed.
 
@@ -36,14 +36,14 @@ def mapper_options(
         options: The stage's options.
         constant_cameras: Ids of calibrated cameras.
         scale: Factor on pixel thresholds.
-        threads: Threads for matching and triangulation; bundle adjustment uses one, because several
-            add up residuals in an order that changes from run to run.
+
+    One thread: several add up residuals in an order that changes from run to run, and so does the map.
     """
     import pycolmap
 
     settings = pycolmap.IncrementalPipelineOptions()
     settings.random_seed = options.seed
-    settings.num_threads = threads
+    settings.num_threads = 1
     settings.ba_min_num_residuals_for_cpu_multi_threading = 2**31 - 1
     settings.extract_colors = False
     settings.min_model_size = _MIN_MODEL_KEYFRAMES

@@ -121,7 +121,7 @@ def lines_of(result: dict[str, Any]) -> list[str]:
         share = f"{score['registered']}/{score['frames']}"
         text.append(f"    {camera:16} {share:>9}  ATE {100 * score['ate_m']['rmse']:.2f} cm")
     for name, relative in result["report"].items():
-        if name not in ("trajectories", "motion"):
+        if "vector_m" in relative:
             vector = relative["vector_m"]
             text.append(f"    {name}: mean {100 * vector['mean']:.2f} cm, p95 {100 * vector['p95']:.2f} cm")
     seconds = result["seconds"]
