@@ -265,30 +265,18 @@ def _mount(block: Json, skeleton: SkeletonModel) -> Mount:
     import numpy as np
 
     from bodycap_batch.skeleton import Mount
-    from bodycap_batch.skeleton_presets import nominal_mount
+    from bodycap_batch.skeleton_presets import STATED_SIGMA_M, STATED_SIGMA_RAD, nominal_mount
 
-    nominal = nominal_mount(block["camera"], block["role"], skeleton)
-    pose = block["joint_from_cam"]
-    sigma_deg, sigma_m = block["sigma_deg"], block["sigma_m"]
+    nominal = nominal_mount(block["place"], block["role"], skeleton)
+    pose, sigma_deg, sigma_m = (block[name] for name in ("joint_from_cam", "sigma_deg", "sigma_m"))
+    usual = (nominal.sigma_rad, nominal.sigma_m) if pose is None else (STATED_SIGMA_RAD, STATED_SIGMA_M)
     return Mount(
         camera=block["camera"],
         role=block["role"],
-        joint_from_cam=nominal.joint_from_cam if pose is None else _pose(pose),
-        sigma_rad=nominal.sigma_rad if sigma_deg is None else float(np.radians(sigma_deg)),
-        sigma_m=nominal.sigma_m if sigma_m is None else sigma_m,
+        joint_from_cam=nominal.joint_from_cam if pose is None else np.array(pose, dtype=np.float64),
+        sigma_rad=usual[0] if sigma_deg is None else float(np.radians(sigma_deg)),
+        sigma_m=usual[1] if sigma_m is None else sigma_m,
     )
-
-
-def _pose(block: Json | list[list[float]]) -> FloatArray:
-    """4×4 from a job's matrix, or from its translation and quaternion."""
-    import numpy as np
-
-    from bodycap_batch.geometry import make_transform, rotation_from_quat_xyzw
-
-    if isinstance(block, list):
-        return np.array(block, dtype=np.float64)
-    rotation = rotation_from_quat_xyzw(np.array(block["quat_xyzw"]))
-    return make_transform(rotation, np.array(block["translation_m"]))
 
 
 def _row_fraction(found: Registration, camera: Camera) -> FloatArray:

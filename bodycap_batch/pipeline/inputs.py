@@ -107,5 +107,12 @@ def _mount_block(camera: CameraConfig) -> dict[str, Any]:
             field=f"capture.cameras.{camera.name}.mount",
             hint="name its mount, e.g. `mount: torso`, or set `skeleton: none`",
         )
-    block = camera.model_dump(mode="json", include={"joint_from_cam", "sigma_deg", "sigma_m"})
-    return {"camera": camera.name, "role": camera.role, **block}
+    stated = camera.mount_matrix()
+    return {
+        "camera": camera.name,
+        "role": camera.role,
+        "place": camera.mount or camera.name,
+        "joint_from_cam": None if stated is None else stated.tolist(),
+        "sigma_deg": camera.sigma_deg,
+        "sigma_m": camera.sigma_m,
+    }

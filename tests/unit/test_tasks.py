@@ -1,0 +1,136 @@
+"""What the tasks hand to the stages: mounts, rows, capture digests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bodycap_batch.camera import Camera
+from bodycap_batch.config.models import Job
+from bodycap_batch.digests import FileDigests
+from bodycap_batch.errors import CaptureError, JobError
+from bodycap_batch.pipeline.inputs import body_arguments, camera_digest
+from bodycap_batch.scene import FrameStatus, Registration, Trajectory
+from bodycap_batch.skeleton import Mount
+from bodycap_batch.skeleton_presets import (
+    NOMINAL_SIGMA_RAD,
+    STATED_SIGMA_M,
+    STATED_SIGMA_RAD,
+    load_skeleton,
+    nominal_mount,
+)
+from bodycap_batch.tasks import _mount, _row_fraction
+
+QUARTER_TURN = {"translation_m": [0.1, 0.2, 0.3], "quat_xyzw": [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]}
+
+
+def a_job(folder: Path, **camera: Any) -> Job:
+    video = folder / "torso.mp4"
+    video.write_text("frames")
+    fields = {"name": "torso", "video": [str(video)], "calibration": "auto", **camera}
+    return Job.model_validate({"capture": {"cameras": [fields]}, "skeleton": "upper_body", "height_m": 1.75})
+
+
+def mount(folder: Path, **camera: Any) -> Mount:
+    block = body_arguments(a_job(folder, **camera))["mounts"][0]
+    return _mount(block, load_skeleton("upper_body", 1.75))
+
+
+def test_a_mount_known_by_name_is_the_nominal_one(tmp_path: Path) -> None:
+    found = mount(tmp_path)
+    nominal = nominal_mount("torso", "Spine1", load_skeleton("upper_body", 1.75))
+    assert np.array_equal(found.joint_from_cam, nominal.joint_from_cam)
+    assert found.sigma_rad == NOMINAL_SIGMA_RAD
+
+
+def test_a_stated_mount_is_trusted_more(tmp_path: Path) -> None:
+    found = mount(tmp_path, joint_from_cam=QUARTER_TURN)
+    assert np.allclose(found.joint_from_cam[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    assert found.joint_from_cam[:3, 3].tolist() == [0.1, 0.2, 0.3]
+    assert (found.sigma_rad, found.sigma_m) == (STATED_SIGMA_RAD, STATED_SIGMA_M)
+
+
+def test_stated_sigmas_win(tmp_path: Path) -> None:
+    found = mount(tmp_path, joint_from_cam=QUARTER_TURN, sigma_deg=1.0, sigma_m=0.002)
+    assert found.sigma_rad == pytest.approx(np.radians(1.0))
+    assert found.sigma_m == 0.002
+
+
+def test_the_mount_says_where_it_sits_and_the_name_only_names(tmp_path: Path) -> None:
+    front, back = mount(tmp_path), mount(tmp_path, name="seven", mount="torso_back")
+    assert back.camera == "seven"
+    assert back.role == "Spine1"
+    assert front.joint_from_cam[1, 2] < 0 < back.joint_from_cam[1, 2], "the body faces −Y"
+
+
+def test_a_camera_of_no_known_place_is_named(tmp_path: Path) -> None:
+    with pytest.raises(JobError, match="seven"):
+        mount(tmp_path, name="seven")
+
+
+def test_the_mean_row_follows_the_observations() -> None:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[2] = np.nan
+    found = Registration(
+        trajectory=Trajectory(
+            camera="torso",
+            gauge="g",
+            frame_numbers=np.arange(4),
+            times_ns=np.arange(4),
+            gauge_from_cam=poses,
+            covariance=np.full((4, 6, 6), np.nan),
+            status=(
+                FrameStatus.REGISTERED,
+                FrameStatus.KEYFRAME,
+                FrameStatus.BLUR,
+                FrameStatus.REGISTERED,
+            ),
+            inliers=np.zeros(4, np.int64),
+            error_px=np.full(4, np.nan),
+        ),
+        obs_frame=np.array([0, 0, 2, 3]),
+        obs_keyframe=np.array([1, 1, 1, 1]),
+        obs_feature=np.arange(4),
+        obs_px=np.array([[5, 10], [5, 20], [5, 48], [5, 36]], dtype=np.float32),
+        wanted_keyframes=np.zeros(0, np.int64),
+        tried_keyframes=np.zeros(0, np.int64),
+    )
+    camera = Camera(model="PINHOLE", width_px=64, height_px=48, params=np.array([50, 50, 32, 24]))
+    # frame 1 has no observation of its own: the middle row; frame 2 has no pose
+    expected = [15 / 48, 0.5, np.nan, 36 / 48]
+    assert np.array_equal(_row_fraction(found, camera), expected, equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("change", "counts"),
+    [
+        ({"offset_s": 0.1}, True),
+        ({"rolling_shutter_s": 0.02}, True),
+        ({"fov_deg": 90.0}, True),
+        ({"mount": "head"}, False),
+        ({"joint_from_cam": QUARTER_TURN}, False),
+        ({"sigma_deg": 2.0}, False),
+    ],
+)
+def test_what_a_cameras_frames_depend_on(tmp_path: Path, change: dict[str, Any], counts: bool) -> None:
+    digests = FileDigests(tmp_path / "digests")
+    jobs = [a_job(tmp_path), a_job(tmp_path, **change)]
+    found = {camera_digest(job.capture, job.capture.cameras[0], digests) for job in jobs}
+    assert (len(found) == 2) is counts
+
+
+def test_a_sidecars_content_counts_and_a_missing_one_is_named(tmp_path: Path) -> None:
+    digests = FileDigests(tmp_path / "digests")
+    sidecar = tmp_path / "torso.timestamps.txt"
+    job = a_job(tmp_path, timestamps=[str(sidecar)])
+    sidecar.write_text("0.0\n0.1\n")
+    first = camera_digest(job.capture, job.capture.cameras[0], digests)
+    sidecar.write_text("0.0\n0.2\n")
+    assert camera_digest(job.capture, job.capture.cameras[0], digests) != first
+    sidecar.unlink()
+    with pytest.raises(CaptureError, match="no such file") as caught:
+        camera_digest(job.capture, job.capture.cameras[0], digests)
+    assert caught.value.path == str(sidecar)
