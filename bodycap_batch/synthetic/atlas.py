@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -10,14 +11,32 @@ import numpy.typing as npt
 
 from bodycap_batch.arrays import FloatArray
 
-LEVELS = 6
-_CELL = 2 ** (LEVELS - 1)
+_OCTAVES = 5
+_STEPS = 2
+"""Degrees of blur per octave: a pyramid level, and the mean of two of them."""
+_BORDER = 2**_OCTAVES
+"""Texels around an image: one of the coarsest level. Images lie on multiples of it: no box spans two."""
 _BATCH_COLUMNS = 1024
 """Look-ups go through cv2.remap as an image of this width: it refuses more than 32,767 rows."""
 _MAX_TAPS = 6
+_SPREAD = np.float32(1.4)
+"""A lens and its pixels see a little more than a pixel; without it sharp edges shift by up to 0.1 px."""
 
 Float32 = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Filter:
+    """How to average the texture under each of N pixels.
+
+    Attributes:
+        kind: (N,) 16 · degree of blur (half octaves) + number of look-ups.
+        along: (2,N) the footprint's longer axis in texels of level 0; look-ups are spread over it.
+    """
+
+    kind: Bytes
+    along: Float32
 
 
 class Atlas:
@@ -28,76 +47,82 @@ class Atlas:
 
     Attributes:
         origins: (N,2) texel (x, y) of each image's top left corner at level 0.
-        levels: The pyramid, level 0 first.
     """
 
-    def __init__(self, images: Sequence[npt.NDArray[np.uint8]]) -> None:
-        sizes = [tuple(-(-side // _CELL) * _CELL + 2 * _CELL for side in image.shape[:2]) for image in images]
+    def __init__(self, images: Sequence[Bytes]) -> None:
+        sizes = [tuple((-(-side // _BORDER) + 2) * _BORDER for side in image.shape[:2]) for image in images]
         origins, width, height = _shelves(sizes)
         base = np.zeros((height, width, 3), np.uint8)
         for image, (tall, wide), (x, y) in zip(images, sizes, origins, strict=True):
-            bottom, right = tall - _CELL - image.shape[0], wide - _CELL - image.shape[1]
+            bottom, right = tall - _BORDER - image.shape[0], wide - _BORDER - image.shape[1]
             base[y : y + tall, x : x + wide] = cv2.copyMakeBorder(
-                image, _CELL, bottom, _CELL, right, cv2.BORDER_REPLICATE
+                image, _BORDER, bottom, _BORDER, right, cv2.BORDER_REPLICATE
             )
-        self.origins: FloatArray = np.array(origins, dtype=np.float64) + _CELL
-        self.levels = [base]
-        while len(self.levels) < LEVELS:
-            finer = self.levels[-1]
-            half = (finer.shape[1] // 2, finer.shape[0] // 2)
-            self.levels.append(cv2.resize(finer, half, interpolation=cv2.INTER_AREA))
+        self.origins: FloatArray = np.array(origins, dtype=np.float64) + _BORDER
+        # Halved by boxes: any other ratio shifts sharp edges by a fraction of a texel.
+        self._levels = [base]
+        for _ in range(_OCTAVES):
+            half = self._levels[-1].shape[1] // 2, self._levels[-1].shape[0] // 2
+            self._levels.append(cv2.resize(self._levels[-1], half, interpolation=cv2.INTER_AREA))
 
-    def sample(self, at: Float32, footprint: Float32) -> Bytes:
+    def sample(self, at: Float32, chosen: Filter, cell: npt.NDArray[np.int64] | None = None) -> Bytes:
         """Average the texture under pixels.
 
         Args:
             at: (2,N) texel coordinates (x, y) at level 0 (the first texel's centre is 0.5, 0.5).
-            footprint: (4,N) derivatives: of x and y to the right, of x and y downwards.
+            chosen: How, for each pixel or each cell of pixels.
+            cell: (N,) which of the filters is each pixel's; None where there is one for each.
 
         Returns:
             (N,3) RGB.
-
-        Source: elongated footprints are averaged from several look-ups along their longer axis, as in
-            McCormack et al., "Feline: fast elliptical lines for anisotropic texture mapping", 1999.
         """
-        along, major, minor = _axes(footprint)
-        np.maximum(minor, 1.0, out=minor)
-        taps = np.clip(np.rint(major / minor), 1, _MAX_TAPS)
-        lod = np.log2(np.maximum(np.maximum(minor, major / taps), 1.0))
-        np.minimum(lod, LEVELS - 1.001, out=lod)
-        key = lod.astype(np.uint8) * 16 + taps.astype(np.uint8)
+        kinds = chosen.kind if cell is None else chosen.kind[cell]
         out = np.empty((at.shape[1], 3), np.uint8)
-        for value in np.flatnonzero(np.bincount(key, minlength=1)):
-            chosen = np.flatnonzero(key == value)
-            level, count = int(value) // 16, int(value) % 16
-            parts = (*at, lod) if count == 1 else (*at, lod, *along)
-            batch = [_batched(part.take(chosen)) for part in parts]
-            out[chosen] = self._look_up(batch, level, count)[: len(chosen)]
+        for kind in np.flatnonzero(np.bincount(kinds, minlength=1)).tolist():
+            pixels = np.flatnonzero(kinds == kind)
+            parts = [at[0].take(pixels), at[1].take(pixels)]
+            if kind % 16 > 1:
+                owner = pixels if cell is None else cell.take(pixels)
+                parts += [chosen.along[0].take(owner), chosen.along[1].take(owner)]
+            batch = [_batched(part) for part in parts]
+            out[pixels] = self._look_up(batch, kind // 16, kind % 16)[: len(pixels)]
         return out
 
-    def _look_up(self, batch: list[Float32], level: int, taps: int) -> Bytes:
-        """Blend of two levels, averaged over taps along the footprint's longer axis."""
-        x, y, lod, *along = batch
-        share = lod - np.float32(level)
-        rest = np.float32(1) - share
-        total = None if taps == 1 else np.zeros((*x.shape, 3), np.float32)
+    def _look_up(self, batch: list[Float32], degree: int, taps: int) -> Bytes:
+        """Mean of taps along the footprint's longer axis, in one level or in two."""
+        levels = range(degree // _STEPS, degree // _STEPS + 1 + degree % _STEPS)
+        if taps == 1 and len(levels) == 1:
+            return np.asarray(self._bilinear(levels[0], batch[0], batch[1]).reshape(-1, 3))
+        total = np.zeros((*batch[0].shape, 3), np.float32)
         for tap in range(taps):
             shift = np.float32((tap + 0.5) / taps - 0.5)
-            place = (x, y) if taps == 1 else (x + shift * along[0], y + shift * along[1])
-            finer = self._bilinear(level, *place)
-            blend = cv2.blendLinear(finer, self._bilinear(level + 1, *place), rest, share)
-            if total is None:
-                return np.asarray(blend.reshape(-1, 3))
-            cv2.accumulate(blend, total)
-        return np.asarray(cv2.convertScaleAbs(total, alpha=1.0 / taps).reshape(-1, 3))
+            place = batch[:2] if taps == 1 else [batch[0] + shift * batch[2], batch[1] + shift * batch[3]]
+            for level in levels:
+                cv2.accumulate(self._bilinear(level, place[0], place[1]), total)
+        return np.asarray(cv2.convertScaleAbs(total, alpha=1.0 / (taps * len(levels))).reshape(-1, 3))
 
     def _bilinear(self, level: int, x: Float32, y: Float32) -> Bytes:
         scale, half = np.float32(0.5**level), np.float32(0.5)
-        image = self.levels[level]
-        looked = cv2.remap(
-            image, x * scale - half, y * scale - half, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
-        return np.asarray(looked)
+        there = x * scale - half, y * scale - half
+        found = cv2.remap(self._levels[level], *there, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(found)
+
+
+def filter_for(footprint: Float32) -> Filter:
+    """Choose level and look-ups for pixels.
+
+    Args:
+        footprint: (4,N) derivatives of texel coordinates: of x and y one pixel to the right, then down.
+
+    Source: elongated footprints are averaged from several look-ups along their longer axis, as in
+        McCormack et al., "Feline: fast elliptical lines for anisotropic texture mapping", 1999.
+    """
+    along, major, minor = _axes(_SPREAD * footprint)
+    np.maximum(minor, 1.0, out=minor)
+    taps = np.clip(np.rint(major / minor), 1, _MAX_TAPS)
+    octave = np.log2(np.maximum(np.maximum(minor, major / taps), 1.0))
+    degree = np.minimum(np.rint(octave * _STEPS), _OCTAVES * _STEPS)
+    return Filter(kind=(degree * 16 + taps).astype(np.uint8), along=along)
 
 
 def _batched(values: Float32) -> Float32:
@@ -128,7 +153,7 @@ def _shelves(sizes: Sequence[tuple[int, ...]]) -> tuple[list[tuple[int, int]], i
         (x, y) of each, and the width and height of the whole.
     """
     area = sum(tall * wide for tall, wide in sizes)
-    width = max(*(wide for _, wide in sizes), -(-int(np.sqrt(area)) // _CELL) * _CELL)
+    width = max(*(wide for _, wide in sizes), -(-int(np.sqrt(area)) // _BORDER) * _BORDER)
     origins = [(0, 0)] * len(sizes)
     x = y = shelf = 0
     for index in sorted(range(len(sizes)), key=lambda i: -sizes[i][0]):

@@ -43,7 +43,7 @@ from bodycap_batch.synthetic.wearer import Wearer
 
 _TEXELS_PER_PIXEL_M = 0.85
 """Texture detail: at 1 m a texel covers a little more than a pixel."""
-_MAX_TEXELS_PER_M = 700.0
+_MAX_TEXELS_PER_M = 500.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

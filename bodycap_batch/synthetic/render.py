@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import FloatArray, IntArray
-from bodycap_batch.synthetic.atlas import Atlas, Bytes, Float32
+from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.synthetic.atlas import Atlas, Bytes, Filter, Float32, filter_for
 from bodycap_batch.synthetic.lens import RayGrid
 from bodycap_batch.synthetic.raycast import NOTHING, RayScene
 from bodycap_batch.synthetic.surfaces import Surface
@@ -99,6 +99,49 @@ def _dot(first: Float32, second: Float32) -> Float32:
     return np.asarray(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Texels:
+    """Where N rays meet the atlas.
+
+    Attributes:
+        faces: (N,) the triangles, or `NOTHING`.
+        rows: (9,N) their homographies.
+        inverse: (N,) one over the homographies' third component.
+        at: (2,N) texel coordinates.
+    """
+
+    faces: IntArray
+    rows: Float32
+    inverse: Float32
+    at: Float32
+
+    def footprint(self, right: Float32, down: Float32, only: IntArray | None = None) -> Float32:
+        """(4,M) derivatives of `at` for steps (3,M) of the rays, for all rays or `only` some (M,)."""
+        rows, inverse, at = self.rows, self.inverse, self.at
+        if only is not None:
+            rows, inverse, at = rows[:, only], inverse[only], at[:, only]
+        out = np.empty((4, len(inverse)), np.float32)
+        with np.errstate(invalid="ignore", over="ignore"):
+            for index, step in enumerate((right, down)):
+                change = _dot(rows[6:], step)
+                out[2 * index] = (_dot(rows[:3], step) - at[0] * change) * inverse
+                out[2 * index + 1] = (_dot(rows[3:6], step) - at[1] * change) * inverse
+        return out
+
+
+def _shared_filters(
+    texels: _Texels, lens: Sequence[Float32], size: tuple[int, ...], alike: BoolArray
+) -> tuple[Filter, IntArray]:
+    """One filter for 2×2 pixels in one plane, one each for the others; and (N,) which is whose."""
+    index = np.arange(size[0] * size[1]).reshape(size)
+    corners = index[::2, ::2].ravel()
+    cell = (index // size[1] // 2 * -(-size[1] // 2) + index % size[1] // 2).ravel()
+    single = np.flatnonzero(~alike)
+    cell[single] = len(corners) + np.arange(len(single))
+    only = np.concatenate([corners, single])
+    return filter_for(texels.footprint(lens[1][:, only], lens[2][:, only], only)), cell
+
+
 class View:
     """Triangles ready to be looked at.
 
@@ -126,23 +169,26 @@ class View:
         """
         poses = world_from_cam.reshape(-1, 4, 4)
         lens = [_components(part[rows]) for part in (grid.in_cam, grid.per_px_x, grid.per_px_y)]
-        height, width = grid.valid[rows].shape
-        pose_of = np.repeat(np.arange(height), width) if len(poses) > 1 else None
+        size = grid.valid[rows].shape
+        pose_of = np.repeat(np.arange(size[0]), size[1]) if len(poses) > 1 else None
         tables = self._homographies(poses)
-        faces = self._hit_grid(lens[0], (height, width), poses, pose_of)
-        colours = self._colours(faces, pose_of, tables, lens)
-        edge = np.flatnonzero(self._edges(faces.reshape(height, width)))
+        faces, alike = self._hit_grid(lens[0], size, poses, pose_of)
+        texels = self._texels(faces, pose_of, tables, lens[0])
+        colours = self._colours(texels, *_shared_filters(texels, lens, size, alike))
+        edge = np.flatnonzero(self._edges(faces.reshape(size)))
         if len(edge):
             rays, right, down = (part[:, edge] for part in lens)
             near = [rays + np.float32(x) * right + np.float32(y) * down for x, y in _SUBPIXELS]
             again = len(_SUBPIXELS)
-            fine = [np.concatenate(near, axis=1), np.tile(right, again), np.tile(down, again)]
-            fine_pose_of = None if pose_of is None else np.tile(pose_of[edge], again)
-            hits = self._hit(fine[0], poses, fine_pose_of)
-            samples = self._colours(hits, fine_pose_of, tables, fine)
+            fine, fine_pose_of = np.concatenate(near, axis=1), None
+            if pose_of is not None:
+                fine_pose_of = np.tile(pose_of[edge], again)
+            texels = self._texels(self._hit(fine, poses, fine_pose_of), fine_pose_of, tables, fine)
+            steps = np.tile(right, again), np.tile(down, again)
+            samples = self._colours(texels, filter_for(texels.footprint(*steps)), None)
             colours[edge] = samples.reshape(again, -1, 3).mean(axis=0)
         colours[~grid.valid[rows].reshape(-1)] = 0
-        return np.asarray(colours.reshape(height, width, 3))
+        return np.asarray(colours.reshape(*size, 3))
 
     def _homographies(self, poses: FloatArray) -> Float32:
         """(9,B·F): direction in the camera -> (u·w, v·w, w), row by row, for each pose and triangle."""
@@ -160,8 +206,11 @@ class View:
 
     def _hit_grid(
         self, rays: Float32, size: tuple[int, int], poses: FloatArray, pose_of: IntArray | None
-    ) -> IntArray:
-        """(H·W,) first triangles of a whole grid of rays (3,H·W), most of them without a ray of their own."""
+    ) -> tuple[IntArray, BoolArray]:
+        """First triangles (H·W,) of a whole grid of rays (3,H·W), most of them without a ray of their own.
+
+        Also returns (H·W,) True where a pixel lies between four rays that met one plane.
+        """
         faces = np.full(size[0] * size[1], NOTHING, np.int64)
         index = np.arange(len(faces)).reshape(size)
 
@@ -178,9 +227,10 @@ class View:
         known[: inside.shape[0], : inside.shape[1]] = inside
         copied = np.repeat(np.repeat(faces[coarse], 2, axis=0), 2, axis=1)[: size[0], : size[1]]
         faces[known.ravel()] = copied[known]
-        known[::2, ::2] = True
-        shoot(index[~known])
-        return faces
+        sampled = known.copy()
+        sampled[::2, ::2] = True
+        shoot(index[~sampled])
+        return faces, known.ravel()
 
     def _hit(self, rays: Float32, poses: FloatArray, pose_of: IntArray | None) -> IntArray:
         """(N,) the triangle each ray (3,N) meets first, or −1."""
@@ -194,30 +244,26 @@ class View:
         origin_and_ray[:, :3] = (start + np.float32(_NEAR_M) * turned).T
         return self._scene.first_face(origin_and_ray)
 
-    def _colours(
-        self, faces: IntArray, pose_of: IntArray | None, tables: Float32, lens: Sequence[Float32]
-    ) -> Bytes:
-        """(N,3) filtered texture where the rays (and their derivatives) meet their triangles."""
+    def _texels(self, faces: IntArray, pose_of: IntArray | None, tables: Float32, rays: Float32) -> _Texels:
+        """Where rays (3,N) meet their triangles (N,) in the atlas."""
         found = np.maximum(faces, 0)
         entry = found if pose_of is None else pose_of * len(self._triangles.faces) + found
         rows = np.take(tables, entry, axis=1, mode="clip")
-        rays, right, down = lens
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             inverse = np.float32(1) / _dot(rows[6:], rays)
             at = np.stack([_dot(rows[:3], rays), _dot(rows[3:6], rays)]) * inverse
-            footprint = np.empty((4, len(faces)), np.float32)
-            for index, step in enumerate((right, down)):
-                change = _dot(rows[6:], step)
-                footprint[2 * index] = (_dot(rows[:3], step) - at[0] * change) * inverse
-                footprint[2 * index + 1] = (_dot(rows[3:6], step) - at[1] * change) * inverse
         missed = faces < 0
         if missed.any():
-            at[:, missed], footprint[:, missed] = 0.0, 0.0
-        colours = self._atlas.sample(at, footprint)
+            at[:, missed], inverse[missed] = 0.0, 0.0
+        return _Texels(faces=faces, rows=rows, inverse=inverse, at=at)
+
+    def _colours(self, texels: _Texels, chosen: Filter, cell: IntArray | None) -> Bytes:
+        """(N,3) filtered texture, shaded; black where a ray met nothing."""
+        colours = self._atlas.sample(texels.at, chosen, cell)
         if self._shaded:
-            gain = self._triangles.gain[found]
+            gain = self._triangles.gain[np.maximum(texels.faces, 0)]
             colours = np.clip(colours * gain[:, None], 0, 255).astype(np.uint8)
-        colours[missed] = 0
+        colours[texels.faces < 0] = 0
         return colours
 
     def _edges(self, faces: IntArray) -> npt.NDArray[np.bool_]:

@@ -10,7 +10,7 @@ from bodycap_batch.camera import Camera
 from bodycap_batch.geometry import invert, make_transform, so3_exp
 from bodycap_batch.skeleton import Mount
 from bodycap_batch.skeleton_presets import load_skeleton
-from bodycap_batch.synthetic.atlas import Atlas
+from bodycap_batch.synthetic.atlas import Atlas, filter_for
 from bodycap_batch.synthetic.filming import Film, Sensor, camera_at
 from bodycap_batch.synthetic.lens import ray_grid
 from bodycap_batch.synthetic.render import View, triangles_of
@@ -224,9 +224,9 @@ def test_atlas_images_do_not_bleed_into_each_other():
     for image, origin in zip(images, atlas.origins, strict=True):
         corners = np.array([[0.0, 0.0], [image.shape[1], 0], [0, image.shape[0]], image.shape[1::-1]])
         at = np.ascontiguousarray((origin + corners).T, dtype=np.float32)
-        for size in (0.3, 2.0, 11.0):
+        for size in (0.3, 2.0, 11.0, 32.0):
             footprint = np.tile(np.array([[size], [0], [0], [size]], np.float32), (1, 4))
-            assert (atlas.sample(at, footprint) == image[0, 0]).all()
+            assert (atlas.sample(at, filter_for(footprint)) == image[0, 0]).all()
 
 
 def test_noise_has_the_strength_asked_for_and_differs_between_frames():
