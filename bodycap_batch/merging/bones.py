@@ -38,7 +38,7 @@ _PRIORS = {
     "Spine1": _JointPrior(0.0, (8.0, 8.0, 10.0), 2.4, 1.5),
     "Neck": _JointPrior(0.0, (12.0, 10.0, 12.0), 3.0, 2.0),
     "Head": _JointPrior(0.0, (25.0, 12.0, 15.0), 3.0, 2.0),
-    "Shoulder": _JointPrior(0.0, (5.0, 8.0, 8.0), 5.0, 2.0),
+    "Shoulder": _JointPrior(0.0, (4.0, 6.0, 6.0), 5.0, 2.0),
     "Arm": _JointPrior(0.0, (45.0, 30.0, 40.0), 18.0, 2.4),
     "ForeArm": _JointPrior(25.0, (40.0, 40.0, 40.0), 24.0, 6.0),
     "Hand": _JointPrior(0.0, (10.0, 15.0, 25.0), 30.0, 12.0),

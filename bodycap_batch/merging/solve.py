@@ -114,17 +114,24 @@ class MotionGraph:
     def _add_measurements(self) -> None:
         nodes = self._node_keys()
         extra = [0] * len(self._bones)
+        taken: list[dict[int, int]] = [{} for _ in self._bones]
         for track in self._tracks:
             keys = []
             noises = _measurement_noises(track, self._mounts[track.camera])
             poses = track.map_from_cam @ invert(self._mounts[track.camera])
             for time, pose, noise in zip(track.times_ns.tolist(), poses, noises, strict=True):
-                near = self._nearest_tick(time)
-                if abs(near - time) > ON_TICK_NS and time not in nodes[track.bone]:
-                    index = extra[track.bone] * MAX_BONES + track.bone
-                    nodes[track.bone][time] = (int(gtsam.symbol("e", index)), int(gtsam.symbol("w", index)))
-                    extra[track.bone] += 1
-                key = nodes[track.bone][near if abs(near - time) <= ON_TICK_NS else time][0]
+                node = self._nearest_tick(time)
+                if abs(node - time) > ON_TICK_NS:
+                    # Cameras of one bone share a state: two states closer than this are singular.
+                    node = _shared_time(taken[track.bone], time)
+                    if node not in nodes[track.bone]:
+                        index = extra[track.bone] * MAX_BONES + track.bone
+                        nodes[track.bone][node] = (
+                            int(gtsam.symbol("e", index)),
+                            int(gtsam.symbol("w", index)),
+                        )
+                        extra[track.bone] += 1
+                key = nodes[track.bone][node][0]
                 self._graph.add(gtsam.PriorFactorPose3(key, gtsam.Pose3(pose), robust(noise)))
                 keys.append(key)
             self._measured_keys[track.camera] = keys
@@ -209,6 +216,14 @@ class MotionGraph:
             iterations=count,
             errors=errors,
         )
+
+
+def _shared_time(taken: dict[int, int], time_ns: int) -> int:
+    """Time of the state off the ticks that is within `ON_TICK_NS`, or the given one, then remembered."""
+    place = time_ns // ON_TICK_NS
+    near = [taken[cell] for cell in (place - 1, place, place + 1) if cell in taken]
+    found = next((time for time in near if abs(time - time_ns) <= ON_TICK_NS), time_ns)
+    return taken.setdefault(found // ON_TICK_NS, found)
 
 
 def camera_covariance(track: Track) -> FloatArray:

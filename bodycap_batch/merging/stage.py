@@ -17,6 +17,7 @@ from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging import gauge
 from bodycap_batch.merging.bones import Bone, graph_bones
 from bodycap_batch.merging.calibrate import Calibration, Samples, take_samples
+from bodycap_batch.merging.chunks import MAX_ITERATIONS, solve_motion
 from bodycap_batch.merging.complete import complete_body, observed_joints
 from bodycap_batch.merging.initial import provisional_scale
 from bodycap_batch.merging.report import build_report
@@ -32,7 +33,6 @@ MIN_FRAMES = 15
 """Localised frames below which a camera tells nothing about a motion: half a second at 30 fps."""
 _TRUNK = ("Spine1", "Spine", "Hips", "Neck", "Head")
 _CALIBRATION_TICKS = 80
-_ITERATIONS = 20
 
 
 class _Progress:
@@ -45,7 +45,7 @@ class _Progress:
     def __call__(self) -> None:
         self._context.check_cancelled()
         self._done += 1
-        self._total = max(self._total, self._done + _ITERATIONS)
+        self._total = max(self._total, self._done + MAX_ITERATIONS)
         self._context.progress(self._done, self._total, self.what)
 
     def finish(self) -> None:
@@ -78,15 +78,14 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
     step.what = "solving"
     metric = [_in_metres(track, calibrated.scale) for track in tracks]
     rules = activity_rules(inputs.skeleton, bones, inputs.activity)
-    graph = MotionGraph(
-        inputs.skeleton,
-        adapt_psd(bones, metric),
+    psd_bones = adapt_psd(bones, metric)
+    mounts = {mount.camera: mount.joint_from_cam for mount in calibrated.mounts}
+    solution = solve_motion(
+        lambda ticks, seen: MotionGraph(inputs.skeleton, psd_bones, ticks, seen, mounts, rules),
         tick_times,
         metric,
-        {mount.camera: mount.joint_from_cam for mount in calibrated.mounts},
-        rules,
+        step,
     )
-    solution = graph.solve(_ITERATIONS, step)
     world_from_solved, joints, solved, floor = _place(inputs, bones, solution, calibrated, fps)
     place = Similarity(calibrated.scale, world_from_solved.rotation, world_from_solved.translation)
     step.finish()

@@ -15,6 +15,10 @@ from bodycap_batch.context import StageContext
 from bodycap_batch.errors import Cancelled, EstimationError
 from bodycap_batch.geometry import Similarity, align_points
 from bodycap_batch.merging import merge_trajectories
+from bodycap_batch.merging.bones import graph_bones
+from bodycap_batch.merging.chunks import solve_motion, stretches
+from bodycap_batch.merging.solve import MotionGraph, Solution
+from bodycap_batch.merging.tracks import make_track
 from tests.stages.walker import FPS, ROLES, Walk, make_inputs, make_walk, record
 
 GAUGE = Similarity(0.37, Rotation.from_rotvec([1.0, -0.7, 0.4]).as_matrix(), np.array([2.0, -1.0, 0.5]))
@@ -243,3 +247,52 @@ def test_same_inputs_same_result(walk, base, context):
     again = merge_trajectories(make_inputs(walk, _recorded(walk)), MergeOptions(), context)
     assert (again.world_from_joint == base.world_from_joint).all()
     assert again.report == base.report
+
+
+def test_two_cameras_a_hair_apart_share_a_state(walk, context):
+    # Two torso cameras 12.0 and 12.4 ms behind the ticks: two states that close would be singular.
+    recorded = _recorded(walk, torso={"shift_s": 0.0120}, left_palm={"shift_s": 0.0})
+    twin = replace(
+        record(walk, "torso", np.random.default_rng(9), gauge=GAUGE, shift_s=0.0124), camera="torso_2"
+    )
+    mounts = (*make_inputs(walk, recorded).mounts, replace(walk.mounts["torso"], camera="torso_2"))
+    clocks = {name: CameraClock(nominal_fps=FPS) for name in ROLES}
+    clocks["torso"] = CameraClock(nominal_fps=FPS, offset_s=0.0120)
+    clocks["torso_2"] = CameraClock(nominal_fps=FPS, offset_s=0.0124)
+    result = merge_trajectories(
+        make_inputs(walk, [*recorded, twin], mounts=mounts, clocks=clocks), MergeOptions(), context
+    )
+    assert np.isfinite(result.world_from_joint).all()
+    assert result.report["cameras"]["torso_2"]["residual_m"]["p50"] < 0.01
+
+
+def test_stretches_of_a_long_capture_join_without_a_seam(walk):
+    recorded = _recorded(walk, **{name: {"seconds": 7.0} for name in ROLES})
+    bones = graph_bones(walk.skeleton, set(ROLES.values()))
+    index = {bone.role: position for position, bone in enumerate(bones)}
+    inputs = make_inputs(walk, recorded)
+    tracks = []
+    for each in recorded:
+        track = make_track(inputs, each, index[ROLES[each.camera]])
+        poses = track.map_from_cam.copy()
+        poses[:, :3, 3] /= GAUGE.scale
+        tracks.append(replace(track, map_from_cam=poses, sigma_map=track.sigma_map / GAUGE.scale))
+    ticks = tracks[0].times_ns
+    mounts = {name: mount.joint_from_cam for name, mount in walk.mounts.items()}
+
+    def solve(chunk_ticks: int) -> Solution:
+        return solve_motion(
+            lambda times, seen: MotionGraph(walk.skeleton, bones, times, seen, mounts),
+            ticks,
+            tracks,
+            lambda: None,
+            chunk_ticks=chunk_ticks,
+        )
+
+    whole, pieces = solve(1000), solve(70)
+    # Three stretches; measurements 3 s away weigh nothing: the stopping rule's millimetre.
+    assert_allclose(pieces.world_from_bone[..., :3, 3], whole.world_from_bone[..., :3, 3], atol=1e-3)
+    for camera, residual in whole.residual_m.items():
+        assert_allclose(pieces.residual_m[camera], residual, atol=1e-3)
+    assert stretches(ticks, tracks, 70) == [(0, 70), (70, 140), (140, 210)]
+    assert stretches(ticks, [tracks[0].keep(np.arange(210) < 20)], 70) == [(0, 210)]

@@ -144,7 +144,9 @@ def make_inputs(walk: Walk, trajectories: list[Trajectory], **changes: object) -
         "clocks": {each.camera: CameraClock(nominal_fps=FPS) for each in trajectories},
         "skeleton": walk.skeleton,
         "mounts": tuple(
-            nominal_mount(each.camera, ROLES[each.camera], walk.skeleton) for each in trajectories
+            nominal_mount(each.camera, ROLES[each.camera], walk.skeleton)
+            for each in trajectories
+            if each.camera in ROLES
         ),
         "skeleton_is_measured": True,
         "height_m": HEIGHT_M,
