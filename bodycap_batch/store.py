@@ -167,10 +167,11 @@ class Store:
 
     def sweep(self) -> int:
         """Remove what killed processes left in the temporary folder; returns how many folders."""
-        removed = 0
-        for folder in self._temporary.iterdir():
-            removed += _remove_if_abandoned(folder)
-        return removed
+        try:
+            folders = list(self._temporary.iterdir())
+        except OSError:  # the next draft says what is wrong with the folder
+            return 0
+        return sum(_remove_if_abandoned(folder) for folder in folders)
 
     def free_bytes(self) -> int:
         """Room left on the store's disk."""
@@ -285,7 +286,7 @@ def _remove_if_abandoned(folder: Path) -> bool:
         if folder.name.startswith(_UNLOCKED) and time.time() - folder.stat().st_mtime < _STALE_S:
             return False
         lock = os.open(folder, os.O_RDONLY)
-    except FileNotFoundError:
+    except OSError:
         return False
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
