@@ -139,5 +139,6 @@ class Sensor:
         if len(self._normal):
             start = int(np.random.default_rng([frame, *self._seed]).integers(0, _NOISE_SURPLUS))
             normal = self._normal[start : start + self._count].reshape(image.shape)
-            mean += cv2.multiply(cv2.LUT(image, self._sigma), normal)
-        return np.asarray(cv2.convertScaleAbs(np.maximum(mean, 0.0)))
+            noise = cv2.multiply(cv2.LUT(image, self._sigma), normal)
+            return np.asarray(cv2.add(mean, noise, dtype=cv2.CV_8U))
+        return np.asarray(cv2.convertScaleAbs(mean))

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from bodycap_batch.arrays import BoolArray, FloatArray
 from bodycap_batch.camera import Camera
@@ -32,12 +33,14 @@ class RayGrid:
         per_px_x: (H,W,3) change of the direction one pixel to the right.
         per_px_y: (H,W,3) change of the direction one pixel down.
         valid: (H,W) False where the lens shows nothing (the distortion has no inverse).
+        planes: (9,H,W) components of the three vectors, float32, for the renderer.
     """
 
     in_cam: FloatArray
     per_px_x: FloatArray
     per_px_y: FloatArray
     valid: BoolArray
+    planes: npt.NDArray[np.float32]
 
 
 def is_fisheye(model: str) -> bool:
@@ -173,9 +176,14 @@ def ray_grid(camera: Camera) -> RayGrid:
         direction = np.concatenate([plane, np.ones((len(plane), 1))], axis=-1)
         direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     direction = np.where(valid[:, None], direction, [0.0, 0.0, 1.0]).reshape(*x.shape, 3)
+    in_cam = direction[1:-1, 1:-1]
+    per_px_x = (direction[1:-1, 2:] - direction[1:-1, :-2]) / 2
+    per_px_y = (direction[2:, 1:-1] - direction[:-2, 1:-1]) / 2
+    planes = np.concatenate([part.transpose(2, 0, 1) for part in (in_cam, per_px_x, per_px_y)])
     return RayGrid(
-        in_cam=direction[1:-1, 1:-1],
-        per_px_x=(direction[1:-1, 2:] - direction[1:-1, :-2]) / 2,
-        per_px_y=(direction[2:, 1:-1] - direction[:-2, 1:-1]) / 2,
+        in_cam=in_cam,
+        per_px_x=per_px_x,
+        per_px_y=per_px_y,
         valid=valid.reshape(x.shape)[1:-1, 1:-1],
+        planes=np.ascontiguousarray(planes, dtype=np.float32),
     )

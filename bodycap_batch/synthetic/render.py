@@ -89,11 +89,6 @@ def joined(first: Triangles, second: Triangles) -> Triangles:
     )
 
 
-def _components(vectors: FloatArray) -> Float32:
-    """(H,W,3) vectors as (3,H·W), each component contiguous."""
-    return np.ascontiguousarray(vectors.reshape(-1, 3).T, dtype=np.float32)
-
-
 def _dot(first: Float32, second: Float32) -> Float32:
     """Scalar products (N,) of (3,N) vectors."""
     return np.asarray(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
@@ -168,8 +163,9 @@ class View:
             (rows,W,3) RGB, 0 … 255, no noise.
         """
         poses = world_from_cam.reshape(-1, 4, 4)
-        lens = [_components(part[rows]) for part in (grid.in_cam, grid.per_px_x, grid.per_px_y)]
         size = grid.valid[rows].shape
+        vectors = grid.planes[:, rows].reshape(9, -1)
+        lens = [vectors[:3], vectors[3:6], vectors[6:]]
         pose_of = np.repeat(np.arange(size[0]), size[1]) if len(poses) > 1 else None
         tables = self._homographies(poses)
         faces, alike = self._hit_grid(lens[0], size, poses, pose_of)

@@ -13,7 +13,7 @@ from bodycap_batch.synthetic.atlas import Bytes
 
 _TIME_BASE = 15360
 _OPTIONS = {
-    "high": {"crf": "16", "preset": "veryfast"},
+    "high": {"crf": "16", "preset": "superfast"},
     "lossless": {"crf": "0", "preset": "ultrafast"},
 }
 
