@@ -16,7 +16,7 @@ from bodycap_batch.context import StageContext
 from bodycap_batch.scene import Map
 from bodycap_batch.tracking import GreyImage, Pixels, pixel_scale, track_points
 
-_MAX_TRACKS = 160
+_MAX_TRACKS = 250
 _CELLS = 8
 _MAX_BUFFER = 90
 """Frames held in memory for the way back from a keyframe; bounds memory where keyframes are far apart."""
