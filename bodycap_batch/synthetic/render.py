@@ -233,7 +233,8 @@ class View:
         rotation, centre = poses[:, :3, :3].astype(np.float32), poses[:, :3, 3].astype(np.float32)
         origin_and_ray = np.empty((rays.shape[1], 6), np.float32)
         if pose_of is None:
-            turned, start = rotation[0] @ rays, centre[0][:, None]
+            # Not a matrix product: BLAS would wake its own threads in every one of ours.
+            turned, start = np.einsum("ij,jn->in", rotation[0], rays), centre[0][:, None]
         else:
             turned, start = np.einsum("nij,jn->in", rotation[pose_of], rays), centre[pose_of].T
         origin_and_ray[:, 3:] = turned.T
