@@ -12,6 +12,7 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.registration.growth import wanted_keyframes
+from bodycap_batch.registration.jumps import pose_jumps
 from bodycap_batch.registration.pose import FramePose, PoseLimits, solve_pose
 from bodycap_batch.registration.tracks import Anchor, Tracks, anchors_of, track_scale, track_stretch
 from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
@@ -212,7 +213,23 @@ def _solve_all(
             solved = replace(solved, status=FrameStatus.KEYFRAME)
         poses.append(solved)
     context.progress(count, count, "poses solved")
-    return poses
+    return _without_jumps(poses)
+
+
+def _without_jumps(poses: list[FramePose]) -> list[FramePose]:
+    """Refuse the poses that jump away from both neighbours and back."""
+    centres = np.full((len(poses), 3), np.nan)
+    sigma = np.full(len(poses), np.nan)
+    for frame, pose in enumerate(poses):
+        if pose.gauge_from_cam is not None and pose.covariance is not None:
+            centres[frame] = pose.gauge_from_cam[:3, 3]
+            sigma[frame] = np.sqrt(np.trace(pose.covariance[3:, 3:]))
+    jump = pose_jumps(centres, sigma)
+    refused = FramePose(status=FrameStatus.POSE_JUMP)
+    return [
+        replace(refused, inliers=pose.inliers, error_px=pose.error_px) if jump[frame] else pose
+        for frame, pose in enumerate(poses)
+    ]
 
 
 def _trajectory(

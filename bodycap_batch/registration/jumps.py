@@ -1,0 +1,44 @@
+"""Poses that jump away from both neighbours and back: wrong, however many inliers they have."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodycap_batch.arrays import BoolArray, FloatArray
+
+_SIGMAS = 8.0
+_TIMES_USUAL = 10.0
+"""A jump stands out of the bends of the path around it, whatever the scale and the speed."""
+_AROUND = 12
+
+
+def pose_jumps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
+    """Frames whose centre leaves the line between its neighbours as nothing around it does.
+
+    The bend of a frame is its distance from the middle of the frames before and after it. A jump bends
+    itself by its full height and its neighbours by half of it, so only the largest of three is blamed.
+
+    Args:
+        centres: (N,3) camera centres; NaN where there is no pose.
+        sigma: (N,) standard deviation of the centre, same unit; NaN likewise.
+
+    Returns:
+        (N,) True where the pose is to be refused. Scaling the map changes nothing.
+    """
+    count = len(centres)
+    bend = np.full(count, np.nan)
+    noise = np.full(count, np.nan)
+    if count >= 3:
+        bend[1:-1] = np.linalg.norm(centres[1:-1] - 0.5 * (centres[:-2] + centres[2:]), axis=1)
+        noise[1:-1] = np.sqrt(sigma[1:-1] ** 2 + 0.25 * (sigma[:-2] ** 2 + sigma[2:] ** 2))
+    out = np.zeros(count, dtype=bool)
+    for frame in np.flatnonzero(np.isfinite(bend) & (bend > _SIGMAS * noise)).tolist():
+        three = bend[max(0, frame - 1) : frame + 2]
+        # Without both neighbours' own bends the wrong one of the three could be blamed.
+        if not np.isfinite(three).all() or bend[frame] < three.max():
+            continue
+        before = bend[max(0, frame - _AROUND) : frame - 1]
+        near = np.concatenate([before, bend[frame + 2 : frame + _AROUND + 1]])
+        if np.isfinite(near).sum() >= _AROUND // 2:
+            out[frame] = bend[frame] > _TIMES_USUAL * np.nanmedian(near)
+    return out

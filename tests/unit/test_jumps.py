@@ -1,0 +1,45 @@
+"""Jumping poses are found, quick motion is not blamed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodycap_batch.registration.jumps import pose_jumps
+
+SIGMA = np.full(60, 0.004)
+
+
+def _swing(hz: float) -> np.ndarray:
+    t = np.arange(60) / 30.0
+    return np.stack([0.3 * np.sin(2 * np.pi * hz * t), 1.2 * t, 0.1 * np.cos(2 * np.pi * hz * t)], axis=1)
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+def test_one_wrong_pose_is_found_at_any_scale(scale: float) -> None:
+    rng = np.random.default_rng(0)
+    centres = _swing(1.0) + rng.normal(0, 0.004, (60, 3))
+    centres[31] += [0.0, 0.35, -0.2]
+    assert np.flatnonzero(pose_jumps(scale * centres, scale * SIGMA)).tolist() == [31]
+
+
+def test_a_violent_swing_is_no_jump() -> None:
+    rng = np.random.default_rng(1)
+    for hz in (0.5, 2.0, 4.0):
+        assert not pose_jumps(_swing(hz) + rng.normal(0, 0.004, (60, 3)), SIGMA).any()
+
+
+def test_a_sudden_stop_is_no_jump() -> None:
+    centres = np.cumsum(np.where(np.arange(60) < 30, 0.05, 0.0))[:, None] * np.array([1.0, 0.2, 0.0])
+    noisy = centres + np.random.default_rng(2).normal(0, 0.004, (60, 3))
+    assert not pose_jumps(noisy, SIGMA).any()
+
+
+def test_wide_covariance_and_gaps_are_no_evidence() -> None:
+    rng = np.random.default_rng(3)
+    centres = _swing(1.0) + rng.normal(0, 0.004, (60, 3))
+    centres[31] += 0.2
+    assert not pose_jumps(centres, np.where(np.arange(60) == 31, 0.1, SIGMA)).any()
+    centres[30] = np.nan
+    assert not pose_jumps(centres, SIGMA).any()
+    assert pose_jumps(centres[:2], SIGMA[:2]).tolist() == [False, False]
