@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.body import MergeInputs
 from bodycap_batch.geometry import rotation_angle_rad
+from bodycap_batch.merging.scale import Calibrated
 from bodycap_batch.merging.solve import Solution
 from bodycap_batch.merging.tracks import Track
-
-if TYPE_CHECKING:
-    from bodycap_batch.merging.stage import Calibrated
 
 
 def build_report(

@@ -9,7 +9,8 @@ import numpy as np
 
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.merging.calibrate import Calibration
-from bodycap_batch.merging.gauge import WALKING_HEIGHT
+from bodycap_batch.merging.gauge import WALKING_HEIGHT, Direction
+from bodycap_batch.skeleton import Mount
 
 _COARSE = 0.16
 _FINE = 0.05
@@ -36,6 +37,19 @@ class ScaleEstimate:
     sigma_log: float
     costs: tuple[tuple[float, float], ...]
     mount_slope: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibrated:
+    """What is constant over the capture."""
+
+    scale: float
+    sigma_log: float
+    estimate: ScaleEstimate
+    mounts: tuple[Mount, ...]
+    up: Direction
+    floor_believed: bool
+    height_over_floor_m: float | None
 
 
 def find_scale(calibration: Calibration, provisional: float) -> ScaleEstimate:

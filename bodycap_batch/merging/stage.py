@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,11 +22,10 @@ from bodycap_batch.merging.complete import complete_body, observed_joints
 from bodycap_batch.merging.initial import provisional_scale
 from bodycap_batch.merging.report import build_report
 from bodycap_batch.merging.rules import activity_rules
-from bodycap_batch.merging.scale import ScaleEstimate, find_scale, weigh_floor
+from bodycap_batch.merging.scale import Calibrated, find_scale, weigh_floor
 from bodycap_batch.merging.solve import MotionGraph, Solution, joint_gaps
 from bodycap_batch.merging.tracks import Track, adapt_psd, clean, make_track
 from bodycap_batch.scene import Trajectory
-from bodycap_batch.skeleton import Mount
 from bodycap_batch.skeleton_presets import split_side
 
 MIN_FRAMES = 15
@@ -51,19 +50,6 @@ class _Progress:
     def finish(self) -> None:
         """Report the whole as done."""
         self._context.progress(self._total, self._total, "merged")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Calibrated:
-    """What is constant over the capture."""
-
-    scale: float
-    sigma_log: float
-    estimate: ScaleEstimate
-    mounts: tuple[Mount, ...]
-    up: gauge.Direction
-    floor_believed: bool
-    height_over_floor_m: float | None
 
 
 def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> MergeResult:
