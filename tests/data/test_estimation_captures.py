@@ -1,0 +1,57 @@
+"""The first three stages on a rendered capture with exact camera poses."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bodycap_batch.capture import open_capture
+from bodycap_batch.config import KeyframeOptions, MapOptions, RegistrationOptions
+from bodycap_batch.config.job import load_job
+from bodycap_batch.context import StageContext
+from bodycap_batch.formats.tum import read_tum
+from bodycap_batch.geometry import align_points
+from bodycap_batch.keyframes import select_keyframes
+from bodycap_batch.mapping import build_map
+from bodycap_batch.registration import register_frames
+
+pytestmark = [pytest.mark.data, pytest.mark.slow]
+
+# A pixel is 7 mm at the 3 m of this room; a plain implementation reaches 0.4 cm, the project asks for 0.6.
+# Below 0.1 cm the truth would have leaked into the estimate.
+MAX_ATE_M, MIN_ATE_M = 0.006, 0.001
+
+
+def test_walk12_is_registered_whole_and_to_six_millimetres(data_root: Path, tmp_path: Path) -> None:
+    capture = open_capture(load_job(data_root / "walk12").capture)
+    context = StageContext(work_dir=tmp_path, threads=2)
+    with ThreadPoolExecutor(2) as pool:
+        selections = list(
+            pool.map(lambda camera: select_keyframes(camera, KeyframeOptions(), context), capture.cameras)
+        )
+        scene = build_map(capture, selections, MapOptions(), context)
+        registrations = list(
+            pool.map(
+                lambda three: register_frames(*three, RegistrationOptions(), context),
+                [
+                    (camera, scene.maps, chosen)
+                    for camera, chosen in zip(capture.cameras, selections, strict=True)
+                ],
+            )
+        )
+    mine, theirs, frames = [], [], 0
+    for item in registrations:
+        truth = read_tum(data_root / "walk12" / "gt" / f"{item.trajectory.camera}.tum")
+        known = item.trajectory.localised
+        frames += len(known)
+        # The truth has one pose per frame, in order.
+        assert np.abs(truth.times_ns - item.trajectory.times_ns).max() < 2_000_000
+        mine.append(item.trajectory.gauge_from_cam[known][:, :3, 3])
+        theirs.append(truth.world_from_cam[known][:, :3, 3])
+    estimate, exact = np.concatenate(mine), np.concatenate(theirs)
+    assert len(estimate) >= 0.99 * frames
+    error = np.linalg.norm(align_points(estimate, exact).apply(estimate) - exact, axis=1)
+    assert MIN_ATE_M < np.sqrt((error**2).mean()) < MAX_ATE_M
