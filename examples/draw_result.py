@@ -45,7 +45,9 @@ def draw(results: Path, picture: Path) -> None:
     cloud = o3d.io.read_point_cloud(str(results / "map.ply"))
     points, colours = np.asarray(cloud.points), np.asarray(cloud.colors)
     paths = {path.stem: read_tum(path) for path in sorted((results / "trajectories").glob("*.tum"))}
-    centres = np.concatenate([path.world_from_cam[:, :3, 3] for path in paths.values() if len(path.world_from_cam)])
+    centres = np.concatenate(
+        [path.world_from_cam[:, :3, 3] for path in paths.values() if len(path.world_from_cam)]
+    )
     low, high = np.percentile(points, [3, 97], axis=0)
     low, high = np.minimum(low, centres.min(axis=0)), np.maximum(high, centres.max(axis=0))
     inside = ((points > low) & (points < high)).all(axis=1)
