@@ -6,11 +6,13 @@ Every capture is run from nothing in a store of its own, through the command lin
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,9 +84,11 @@ def run(row: Row, work: Path) -> dict[str, Any]:
     """Run one job and score it; the outcome as plain values."""
     out = work / "out"
     command = [*BODYCAP, "run", str(row.capture), "--out", str(out), "--store", str(work / "store")]
+    started = time.monotonic()
     done = subprocess.run(
         [*command, *row.arguments], cwd=REPOSITORY, capture_output=True, text=True, check=False
     )
+    wall_s = time.monotonic() - started
     if not (out / "run.json").exists():
         return {"name": row.name, "exit": done.returncode, "error": done.stderr.strip().splitlines()[-3:]}
     record = json.loads((out / "run.json").read_text(encoding="utf-8"))
@@ -100,11 +104,22 @@ def run(row: Row, work: Path) -> dict[str, Any]:
     return {
         "name": row.name,
         "exit": done.returncode,
+        "wall_s": wall_s,
         "seconds": dict(seconds),
+        "camera_seconds": camera_seconds(out / "frames.csv"),
         "peak_memory_mb": record["peak_memory_mb"],
         "report": report,
         "metrics": metrics,
     }
+
+
+def camera_seconds(frames: Path) -> float:
+    """Length of all cameras' videos together, from a job's frames.csv."""
+    with frames.open(newline="", encoding="utf-8") as stream:
+        times: dict[str, list[float]] = defaultdict(list)
+        for line in csv.DictReader(row for row in stream if not row.startswith("#")):
+            times[line["camera"]].append(float(line["time"]))
+    return sum(max(values) - min(values) for values in times.values())
 
 
 def lines_of(result: dict[str, Any]) -> list[str]:
@@ -126,7 +141,11 @@ def lines_of(result: dict[str, Any]) -> list[str]:
             text.append(f"    {name}: mean {100 * vector['mean']:.2f} cm, p95 {100 * vector['p95']:.2f} cm")
     seconds = result["seconds"]
     text.append("    seconds: " + ", ".join(f"{name} {value:.1f}" for name, value in seconds.items()))
-    text.append(f"    in all {sum(seconds.values()):.1f} s, peak memory {result['peak_memory_mb']:.0f} MB")
+    wall_s = result["wall_s"]
+    text.append(
+        f"    whole job {wall_s:.1f} s, {wall_s / result['camera_seconds']:.2f} s per camera-second, "
+        f"peak memory {result['peak_memory_mb']:.0f} MB"
+    )
     return text
 
 
