@@ -54,7 +54,7 @@ def draw(results: Path, picture: Path) -> None:
 
     figure = plt.figure(figsize=(12, 7), dpi=110)
     axes = figure.add_subplot(projection="3d", computed_zorder=False)
-    axes.scatter(*points[inside].T, c=colours[inside], s=2.5, linewidths=0, alpha=0.75)
+    axes.scatter(*points[inside].T, c=colours[inside], s=7, linewidths=0, alpha=0.85)
     for tone, (name, path) in zip(TONES, paths.items(), strict=False):
         axes.plot(*path.world_from_cam[:, :3, 3].T, color=tone, linewidth=1.6, label=name.replace("_", " "))
     _, motion = read_bvh(results / "motion.bvh")
@@ -63,7 +63,7 @@ def draw(results: Path, picture: Path) -> None:
         for shade, tick in zip(np.linspace(0.35, 1.0, BODY_TIMES), ticks, strict=True):
             for bone in body_at(motion, tick):
                 axes.plot(*bone.T, color="black", linewidth=2.4, alpha=shade, solid_capstyle="round")
-    axes.set_box_aspect(np.maximum(high - low, 0.1))
+    axes.set_box_aspect(np.maximum(high - low, 0.1), zoom=1.35)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(min(low[2], 0.0), high[2]))
     axes.view_init(elev=24, azim=-62)
     axes.set(xlabel="x, m", ylabel="y, m", zlabel="z, m")

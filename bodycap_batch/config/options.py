@@ -20,7 +20,7 @@ class KeyframeOptions(Options):
         60.0, gt=0, description="rotation-free parallax that asks for a keyframe, at 640 px width"
     )
     min_survival: float = Field(0.5, gt=0, lt=1, description="share of tracks left that asks for a keyframe")
-    max_gap_s: float = Field(0.7, gt=0, description="largest time between two keyframes")
+    max_gap_s: float = Field(0.5, gt=0, description="largest time between two keyframes")
     min_gap_s: float = Field(0.05, ge=0, description="smallest time between two keyframes")
     window: int = Field(4, ge=1, description="frames among which the sharpest becomes the keyframe")
 
