@@ -17,7 +17,7 @@ class KeyframeOptions(Options):
     """Stage 1, keyframe selection."""
 
     parallax_px: float = Field(
-        60.0, gt=0, description="rotation-free parallax that asks for a keyframe, at 640 px width"
+        15.0, gt=0, description="rotation-free parallax that asks for a keyframe, at 640 px width"
     )
     min_survival: float = Field(0.5, gt=0, lt=1, description="share of tracks left that asks for a keyframe")
     max_gap_s: float = Field(0.5, gt=0, description="largest time between two keyframes")
