@@ -52,7 +52,9 @@ def rows_in(data: Path, lab: Path, work: Path) -> list[Row]:
     true_mounts = work / "cpl_lab_true_mounts.yaml"
     if (lab / "gt" / "mounts.json").exists():
         _write_true_mounts(lab, true_mounts)
+        body = ("--skeleton", str(lab / "skeleton.bvh"))
         rows.append(Row("cpl_lab_true_mounts", true_mounts, lab / "gt", (), "torso"))
+        rows.append(Row("cpl_lab_true_mounts_and_bones", true_mounts, lab / "gt", body, "torso"))
     return [row for row in rows if row.capture.exists()]
 
 
