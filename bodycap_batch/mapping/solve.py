@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
+from bodycap_batch.errors import EstimationError
 from bodycap_batch.mapping.database import DATABASE_NAME
 
 if TYPE_CHECKING:
@@ -153,7 +154,10 @@ def refine(
 ) -> None:
     """One bundle adjustment over the whole model, every pose free; the gauge moves.
 
-    Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999; robust loss, then outliers out.
+    Raises:
+        EstimationError: The adjustment failed.
+
+    Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999; outliers are taken out after it.
     """
     import pycolmap
 
@@ -166,7 +170,12 @@ def refine(
             config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     summary = pycolmap.create_default_bundle_adjuster(adjust, config, model).solve()
-    del summary
+    if not summary.is_solution_usable():
+        raise EstimationError(
+            f"the grown map of {model.num_reg_images()} keyframes could not be refined: "
+            f"{summary.brief_report()}",
+            hint="set registration: {rounds: 0} to keep the map as it was first built",
+        )
     pycolmap.ObservationManager(model).filter_all_points3D(
         settings.mapper.filter_max_reproj_error, settings.mapper.filter_min_tri_angle
     )

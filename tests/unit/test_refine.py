@@ -1,0 +1,34 @@
+"""A final adjustment that fails is an error, never a map."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pycolmap
+import pytest
+
+from bodycap_batch.config import MapOptions
+from bodycap_batch.errors import EstimationError
+from bodycap_batch.mapping.solve import mapper_options, refine
+
+
+class _Failing:
+    """An adjuster, and its summary, that found nothing usable."""
+
+    def solve(self) -> _Failing:
+        return self
+
+    def is_solution_usable(self) -> bool:
+        return False
+
+    def brief_report(self) -> str:
+        return "no convergence"
+
+
+def test_an_adjustment_that_fails_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(*_: Any) -> _Failing:
+        return _Failing()
+
+    monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", failing)
+    with pytest.raises(EstimationError, match="0 keyframes could not be refined: no convergence"):
+        refine(pycolmap.Reconstruction(), mapper_options(MapOptions(), [], 1.0), [])
