@@ -36,11 +36,13 @@ class Stage:
         function: Called in the child with options, arguments, context and the artefact's folder.
         rooms: The module that holds the algorithm, and what the task itself computes or writes with.
         libraries: Distributions the result depends on (``a|b``: either).
+        modules: What takes long to load; a child may load it ahead.
     """
 
     function: Callable[[Json, Json, StageContext, Path], None]
     rooms: tuple[str, ...]
     libraries: tuple[str, ...]
+    modules: tuple[str, ...] = ()
 
 
 def functions() -> dict[str, Callable[[Json, Json, StageContext, Path], None]]:
@@ -296,22 +298,40 @@ def _write_summary(files: Path, **values: Any) -> None:
 
 
 _VISION = ("numpy", "av", "opencv-python-headless|opencv-python")
+_SEEING = ("bodycap_batch.capture", "bodycap_batch.config.models", "cv2", "av")
 _KEPT = ("formats.bundle", "scene")
 STAGES = {
     "synth": Stage(function=_synth, rooms=("synthetic",), libraries=("numpy", "av", "open3d-cpu|open3d")),
-    "check": Stage(function=_check, rooms=("check",), libraries=_VISION),
-    "keyframes": Stage(function=_keyframes, rooms=("keyframes", *_KEPT), libraries=_VISION),
-    "map": Stage(function=_map, rooms=("mapping", *_KEPT), libraries=(*_VISION, "pycolmap")),
-    "extend": Stage(function=_extend, rooms=("mapping", *_KEPT), libraries=(*_VISION, "pycolmap")),
+    "check": Stage(function=_check, rooms=("check",), libraries=_VISION, modules=_SEEING),
+    "keyframes": Stage(function=_keyframes, rooms=("keyframes", *_KEPT), libraries=_VISION, modules=_SEEING),
+    "map": Stage(
+        function=_map,
+        rooms=("mapping", *_KEPT),
+        libraries=(*_VISION, "pycolmap"),
+        modules=(*_SEEING, "pycolmap"),
+    ),
+    "extend": Stage(
+        function=_extend,
+        rooms=("mapping", *_KEPT),
+        libraries=(*_VISION, "pycolmap"),
+        modules=(*_SEEING, "pycolmap"),
+    ),
     "registration": Stage(
-        function=_registration, rooms=("registration", "body", *_KEPT), libraries=(*_VISION, "pycolmap")
+        function=_registration,
+        rooms=("registration", "body", *_KEPT),
+        libraries=(*_VISION, "pycolmap"),
+        modules=(*_SEEING, "pycolmap"),
     ),
     "merge": Stage(
         function=_merge,
         rooms=("merging", "skeleton_presets", "formats.bvh", *_KEPT),
         libraries=("numpy", "scipy", "gtsam"),
+        modules=("bodycap_batch.merging", "gtsam", "scipy.optimize", "scipy.spatial.transform"),
     ),
     "export": Stage(
-        function=_export, rooms=("export", *_KEPT), libraries=("numpy", "scipy", "open3d-cpu|open3d")
+        function=_export,
+        rooms=("export", *_KEPT),
+        libraries=("numpy", "scipy", "open3d-cpu|open3d"),
+        modules=("bodycap_batch.export", "open3d", "scipy.spatial.transform"),
     ),
 }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from bodycap_batch.progress import Event, Listener
 from bodycap_batch.runner import Runner, Task
 from bodycap_batch.runner.parent import CHILD
 from bodycap_batch.store import Artefact, Store
-from bodycap_batch.tasks import read_summary
+from bodycap_batch.tasks import STAGES, read_summary
 
 ByCamera = Mapping[str, Artefact]
 
@@ -93,9 +93,10 @@ class Flow:
         self._digests = self._camera_digests()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, failed: object, *_: object) -> None:
         self._abort.set()
         self._pool.shutdown(wait=True, cancel_futures=True)
+        self._runner.close()
 
     def check(self) -> None:
         """Refuse what cannot work before hours are spent on it; tell what is worth knowing.
@@ -105,7 +106,9 @@ class Flow:
         """
         body = body_digest(self._job, self._settings.store.digests) if has_body(self._job) else None
         key = key_of("check", {}, {"cameras": self._digests, "body": body})
-        artefact = self._one(Task(key=key, arguments={"job": self._job.model_dump(mode="json")}))
+        task = Task(key=key, arguments={"job": self._job.model_dump(mode="json")})
+        side_by_side = min(self._settings.threads, len(self._job.capture.cameras))
+        artefact = self._one(task, [STAGES["keyframes"].modules] * (side_by_side - 1))
         for note in read_summary(artefact.path)["notes"]:
             self._settings.listener(Event(kind="note", stage="check", what=f"note: {note}"))
 
@@ -130,7 +133,11 @@ class Flow:
             "capture": all_cameras(self._job.capture),
             "selections": [str(artefact.path) for artefact in keyframes.values()],
         }
-        return self._one(Task(key=key, arguments=arguments, threads=self._settings.threads))
+        later = [name for name in ("merge", "export") if name == "export" or has_body(self._job)]
+        # The mapper keeps one core busy; on another the libraries of the last stages load.
+        meanwhile = [[module for name in later for module in STAGES[name].modules]]
+        task = Task(key=key, arguments=arguments, threads=self._settings.threads)
+        return self._one(task, meanwhile if self._settings.threads > 1 else [])
 
     def registrations(
         self,
@@ -250,8 +257,9 @@ class Flow:
         key = key_of("extend", self._map_options(), inputs)
         return self._one(Task(key=key, arguments=arguments, round=map_round, threads=self._settings.threads))
 
-    def _one(self, task: Task) -> Artefact:
-        artefact, made = self._runner.run(task)
+    def _one(self, task: Task, meanwhile: Sequence[Sequence[str]] = ()) -> Artefact:
+        task = replace(task, modules=STAGES[task.key.stage].modules)
+        artefact, made = self._runner.run(task, meanwhile)
         self.libraries.update(task.key.libraries)
         self.records.append(
             StageRecord(

@@ -39,7 +39,8 @@ def prepare_capture(options: Mapping[str, Any], folder: Path, settings: Settings
     if _is_complete(folder, key):
         return
     logs = folder / "logs"
-    artefact, _ = settings.runner(logs).run(Task(key=key, threads=settings.threads))
+    with settings.runner(logs) as runner:
+        artefact, _ = runner.run(Task(key=key, threads=settings.threads))
     files = {
         Path(name).relative_to(CAPTURE).as_posix(): artefact.path / name
         for name in artefact.files

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import json
 import os
+import queue
 import resource
 import signal
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -26,19 +29,37 @@ FULL_DISK_BYTES = 8 << 20
 
 
 def main(arguments: Sequence[str], table: Mapping[str, TaskFunction] | None = None) -> int:
-    """Run the task described in a JSON file.
+    """Run the task file named on the command line; without one, take orders until standard input closes.
+
+    An order is one JSON line: ``{"task": file, "log": file}`` runs a task and sends its prints to the log;
+    ``{"import": [modules]}`` loads libraries while there is nothing else to do. Taking orders saves every
+    task but the first the seconds in which libraries load.
 
     Args:
-        arguments: The path of the task file.
+        arguments: The path of the task file, or nothing.
         table: What to call for each stage; the project's own stages by default.
 
     Returns:
         The exit code: 0, that of a typed error, or 70.
     """
     speak = _Speaker()
-    stopped = threading.Event()
-    threading.Thread(target=_follow_parent, args=(stopped,), daemon=True).start()
-    task, root = task_from_json(json.loads(Path(arguments[0]).read_text(encoding="utf-8")))
+    orders = _Orders()
+    if arguments:
+        return _perform(Path(arguments[0]), table, speak, orders.closed)
+    for order in orders:
+        if "import" in order:
+            _import(order["import"])
+            continue
+        _send_prints_to(Path(order["log"]))
+        if _perform(Path(order["task"]), table, speak, orders.closed) == EXIT_BUG:
+            return EXIT_BUG
+    return 0
+
+
+def _perform(
+    order: Path, table: Mapping[str, TaskFunction] | None, speak: _Speaker, stopped: threading.Event
+) -> int:
+    task, root = task_from_json(json.loads(order.read_text(encoding="utf-8")))
     try:
         store = Store(root)
         _run(task, store, _function(task.key.stage, table), (speak, stopped))
@@ -50,9 +71,27 @@ def main(arguments: Sequence[str], table: Mapping[str, TaskFunction] | None = No
     return 0
 
 
+def _import(modules: Sequence[str]) -> None:
+    """Load libraries ahead of their use; what is missing is told by the stage that needs it."""
+    for name in modules:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            sys.stderr.write(f"{name}: {error}\n")
+
+
+def _send_prints_to(log: Path) -> None:
+    """Let standard output and error, the native libraries' too, go to a file from here on."""
+    with log.open("ab") as stream:
+        for number in (1, 2):
+            os.dup2(stream.fileno(), number)
+
+
 def _run(task: Task, store: Store, function: TaskFunction, link: tuple[_Speaker, threading.Event]) -> None:
     speak, stopped = link
     started = time.monotonic()
+    _pin_opencv(task.threads)
+    _forget_peak_memory()
     with store.draft(task.key) as draft, _DiskWatch(store):
         context = StageContext(
             work_dir=draft.work, threads=task.threads, progress=speak.progress, cancelled=stopped.is_set
@@ -101,17 +140,34 @@ def disk_full(root: Path) -> StoreError:
 def _report_unexpected(error: Exception, root: Path, speak: _Speaker) -> int:
     if isinstance(error, MemoryError):
         full = BodycapError("out of memory", hint="close other programs, or lower work_px in the job")
-        speak.say("error", error=full.to_dict())
-        return full.exit_code
+        speak.say("error", error=full.to_dict(), ends=True)
+        return EXIT_BUG
     text = traceback.format_exc()
     sys.stderr.write(text)
     bug = BodycapError(f"{type(error).__name__}: {error}", path=root if isinstance(error, OSError) else None)
-    speak.say("error", error=bug.to_dict(), traceback=text)
+    speak.say("error", error=bug.to_dict(), traceback=text, ends=True)
     return EXIT_BUG
 
 
+def _pin_opencv(threads: int) -> None:
+    """OpenCV's pool follows the task; the other libraries' pools are off, their threads are a stage's own."""
+    os.environ["OPENCV_FOR_THREADS_NUM"] = str(threads)
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(threads)
+
+
+def _forget_peak_memory() -> None:
+    """Count a task's peak memory from its own beginning, where the system can (Linux)."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+
+
 def peak_memory_mb() -> float:
-    """Largest resident memory of this process so far."""
+    """Largest resident memory of this process since `_forget_peak_memory`, or ever."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 1024.0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1 << 20) if sys.platform == "darwin" else peak / (1 << 10)
 
@@ -141,10 +197,26 @@ class _Speaker:
         self.say("progress", done=int(done), total=int(total), what=what)
 
 
-def _follow_parent(stopped: threading.Event) -> None:
-    """Stop when standard input closes: the parent asked for it, or is gone."""
-    while os.read(sys.stdin.fileno(), 1024):
-        pass
-    stopped.set()
-    time.sleep(_GRACE_S)
-    os.kill(os.getpid(), signal.SIGKILL)
+class _Orders:
+    """The lines of standard input; when it closes the parent asks to stop, or is gone."""
+
+    def __init__(self) -> None:
+        self.closed = threading.Event()
+        self._queue: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        """Yield orders until there are no more."""
+        while (order := self._queue.get()) is not None:
+            yield order
+
+    def _read(self) -> None:
+        rest = b""
+        while data := os.read(sys.stdin.fileno(), 1 << 12):
+            *lines, rest = (rest + data).split(b"\n")
+            for line in lines:
+                self._queue.put(json.loads(line))
+        self.closed.set()
+        self._queue.put(None)
+        time.sleep(_GRACE_S)
+        os.kill(os.getpid(), signal.SIGKILL)

@@ -25,6 +25,7 @@ class Task:
         camera: The camera it concerns, or "".
         round: Which round of growing the map, from 0.
         threads: Threads it may keep busy; no part of the key.
+        modules: What its child loads for it, to choose a child that has; no part of the key.
     """
 
     key: ArtefactKey
@@ -32,6 +33,7 @@ class Task:
     camera: str = ""
     round: int = 0
     threads: int = 1
+    modules: tuple[str, ...] = ()
 
     @property
     def label(self) -> str:

@@ -21,7 +21,9 @@ Json = Mapping[str, Any]
 def work(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
     for step in range(3):
         context.progress(step + 1, 3, "steps")
-    (files / "threads.txt").write_text(f"{context.threads} {os.environ['OMP_NUM_THREADS']}")
+    loaded = [name for name in ("wave", "colorsys") if name in sys.modules]
+    process = [context.threads, os.environ["OMP_NUM_THREADS"], os.getpid(), *loaded]
+    (files / "process.txt").write_text(" ".join(map(str, process)))
     (files / "result.txt").write_text(f"{options['value']} {arguments.get('say', '')}")
 
 

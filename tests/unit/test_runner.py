@@ -9,7 +9,8 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,8 +51,10 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Bench:
-    return Bench(tmp_path)
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    bench = Bench(tmp_path)
+    with bench.runner:
+        yield bench
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> None:
@@ -80,9 +83,56 @@ def test_a_task_makes_its_artefact_once(bench: Bench) -> None:
     assert bench.kinds()[-2:] == ["finished", "reused"]
 
 
-def test_threads_are_pinned_before_libraries_load(bench: Bench) -> None:
+def test_the_libraries_own_pools_are_off_before_they_load(bench: Bench) -> None:
     made, _ = bench.runner.run(a_task("work"))
-    assert (made.path / "threads.txt").read_text() == "2 2"
+    threads, omp, *_ = (made.path / "process.txt").read_text().split()
+    assert (threads, omp) == ("2", "1")
+
+
+def pid_of(bench: Bench, stage: str, value: int = 1) -> int:
+    made, _ = bench.runner.run(a_task(stage, value))
+    return int((made.path / "process.txt").read_text().split()[2])
+
+
+def test_a_child_does_one_task_after_another_and_ends_with_its_runner(bench: Bench) -> None:
+    first = pid_of(bench, "work", 1)
+    assert pid_of(bench, "work", 2) == first
+    with pytest.raises(EstimationError):
+        bench.runner.run(a_task("refuse"))
+    assert pid_of(bench, "work", 3) == first
+    assert alive(first)
+    bench.runner.close()
+    assert not alive(first)
+    assert not (bench.logs / "children.log").exists(), "it had nothing to say"
+
+
+@pytest.mark.parametrize("stage", ["bug", "crash"])
+def test_a_child_that_failed_unexpectedly_is_not_used_again(bench: Bench, stage: str) -> None:
+    first = pid_of(bench, "work", 1)
+    with pytest.raises(BodycapError):
+        bench.runner.run(a_task(stage))
+    assert not alive(first)
+    assert pid_of(bench, "work", 2) != first
+
+
+def test_each_task_has_a_log_of_its_own_though_they_share_a_child(bench: Bench) -> None:
+    bench.runner.run(a_task("noisy", 1))
+    bench.runner.run(a_task("work", 2))
+    assert "a native library prints" in (bench.logs / "noisy_torso.log").read_text()
+    assert (bench.logs / "work_torso.log").read_text() == ""
+
+
+def test_libraries_load_ahead_in_the_child_that_will_need_them(bench: Bench) -> None:
+    bench.runner.prepare(["wave"], ["colorsys"])
+    made, _ = bench.runner.run(replace(a_task("work"), modules=("colorsys",)))
+    loaded = (made.path / "process.txt").read_text().split()[3:]
+    assert loaded == ["colorsys"]
+
+
+def test_what_cannot_be_loaded_ahead_is_left_to_the_stage(bench: Bench) -> None:
+    bench.runner.prepare(["no_such_module_anywhere"])
+    assert bench.runner.run(a_task("work"))[1]
+    assert "no_such_module_anywhere" in (bench.logs / "children.log").read_text()
 
 
 def test_progress_arrives_with_stage_and_camera(bench: Bench) -> None:
