@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.skeleton import SkeletonModel, forward_kinematics
+from bodycap_batch.synthetic.pressing import ArmAngles, Press
 
 _LAP_S = 13.0
 # One lap: seconds, x, y (m, room's middle = 0), direction of the face (degrees from +x, counter-clockwise).
@@ -93,21 +94,38 @@ def _about(axis: str, degrees: FloatArray) -> Rotation:
     return Rotation.from_euler(axis, degrees.reshape(-1, len(axis)), degrees=True)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Habits:
+    """What the walker does beside walking.
+
+    Attributes:
+        t_pose_s: The walker first stands with arms stretched out until then, at most.
+        arms_ahead: 1 holds both forearms up before the chest, 0 lets them hang.
+        presses: Hands laid against the chest.
+    """
+
+    t_pose_s: float = 0.0
+    arms_ahead: float = 0.0
+    presses: tuple[Press, ...] = ()
+
+
 class Walk:
     """The built-in walker: poses of every joint at any time.
 
     Args:
         skeleton: A body with HumanIK names.
         length_s: Time to be covered, from a few seconds before 0.
-        t_pose_s: The walker stands with arms stretched out until then, at most.
-        rng: Source of the individual's habits.
+        habits: What it does beside walking.
+        rng: Source of the individual's gait.
     """
 
     def __init__(
-        self, skeleton: SkeletonModel, length_s: float, t_pose_s: float, rng: np.random.Generator
+        self, skeleton: SkeletonModel, length_s: float, habits: Habits, rng: np.random.Generator
     ) -> None:
         self.skeleton = skeleton
-        self._t_pose_s = t_pose_s
+        self._t_pose_s = habits.t_pose_s
+        self._arms_ahead = habits.arms_ahead
+        self._presses = habits.presses
         # Streams of their own: a longer capture is the same walk, continued.
         for_path, for_reaches, rng = rng.spawn(3)
         self._way = _draw_path(length_s, for_path)
@@ -121,7 +139,7 @@ class Walk:
                 ("Turn", 3.0), ("Look", 9.0), ("Nod", 4.0),
             )
         }  # fmt: skip
-        self._reaches = _draw_reaches(length_s, t_pose_s, for_reaches)
+        self._reaches = _draw_reaches(length_s, habits.t_pose_s, for_reaches)
         lattice = np.arange(-_MARGIN_S, length_s + _MARGIN_S, 1.0 / _LATTICE_HZ)
         speed = np.linalg.norm(self._path(lattice, 1)[:, :2], axis=1)
         cycles = np.cumsum(0.32 * np.tanh(speed / 0.1) + 0.45 * speed) / _LATTICE_HZ
@@ -226,6 +244,7 @@ class Walk:
         abduction = 10.0 + wave[f"{side}Out"](t_s)
         elbow = 24.0 + 7.0 * forth + wave[f"{side}Elbow"](t_s)
         pronation = 8.0 + wave[f"{side}Twist"](t_s)
+        flexion, elbow = flexion + 25.0 * self._arms_ahead, elbow + 60.0 * self._arms_ahead
         lift = np.zeros_like(t_s)
         for reach in self._reaches:
             if reach.side == side:
@@ -233,13 +252,20 @@ class Walk:
                 flexion, abduction = flexion + weight * reach.flexion, abduction + weight * reach.abduction
                 elbow, pronation = elbow + weight * reach.elbow, pronation + weight * reach.pronation
                 lift = lift + weight * 5.0
-        hang = alive * (90.0 - abduction)
+        angles = ArmAngles(
+            flexion=flexion,
+            abduction=abduction,
+            elbow=elbow,
+            pronation=pronation,
+            spin=np.zeros_like(t_s),
+            wrist=wave[f"{side}Wrist"](t_s),
+            radial=wave[f"{side}Radial"](t_s),
+        )
+        for press in self._presses:
+            if press.side == side:
+                angles, lift = press.blended(angles, t_s), lift * (1.0 - press.weight(t_s))
         out[f"{side}Shoulder"] = _about("Y", -outward * alive * lift)
-        out[f"{side}Arm"] = _about("X", -alive * flexion) * _about("Y", outward * hang)
-        # The hand's thumb side turns from ahead towards the body: about the bone, left positive.
-        out[f"{side}ForeArm"] = _about("Z", -outward * alive * elbow) * _about("X", alive * pronation)
-        wrist = [alive * wave[f"{side}Wrist"](t_s), -outward * alive * wave[f"{side}Radial"](t_s)]
-        out[f"{side}Hand"] = _about("YZ", np.column_stack(wrist))
+        out.update(angles.rotations(side, alive))
 
 
 def _draw_path(length_s: float, rng: np.random.Generator) -> CubicSpline:

@@ -22,11 +22,12 @@ from bodycap_batch.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
 from bodycap_batch.synthetic.clip import load_clip
 from bodycap_batch.synthetic.filming import Film, Moving, Sensor, camera_at
-from bodycap_batch.synthetic.gait import Walk
+from bodycap_batch.synthetic.gait import Habits, Walk
 from bodycap_batch.synthetic.lens import focal_and_centre, ray_grid
 from bodycap_batch.synthetic.measured import measure
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.person import draw_body, draw_mounts
+from bodycap_batch.synthetic.pressing import press_of
 from bodycap_batch.synthetic.render import View, triangles_of
 from bodycap_batch.synthetic.room import build_room
 from bodycap_batch.synthetic.truth import (
@@ -71,16 +72,27 @@ def draw_subject(options: SynthOptions) -> Subject:
     children = np.random.SeedSequence(options.seed).spawn(len(names))
     seeds = dict(zip(names, children, strict=True))
     length_s = options.seconds + max(0.0, *options.offsets_s.values(), 0.0)
+    sigmas = options.mount_sigma_deg, options.mount_sigma_m
+    mount_rng = np.random.default_rng(seeds["mounts"])
     motion: Moving
     if options.motion is not None:
         motion = load_clip(options.motion, options.motion_start_s, length_s - 1.0 / options.fps)
+        mounts = draw_mounts(options.cameras, motion.skeleton, sigmas, mount_rng)
     else:
         body = draw_body(
             options.subject_height_m, options.proportion_range, np.random.default_rng(seeds["body"])
         )
-        motion = Walk(body, length_s, options.t_pose_s, np.random.default_rng(seeds["walk"]))
-    sigmas = options.mount_sigma_deg, options.mount_sigma_m
-    mounts = draw_mounts(options.cameras, motion.skeleton, sigmas, np.random.default_rng(seeds["mounts"]))
+        mounts = draw_mounts(options.cameras, body, sigmas, mount_rng)
+        habits = Habits(
+            t_pose_s=options.t_pose_s,
+            arms_ahead=options.arms_ahead,
+            presses=tuple(
+                press_of(mount, body, *options.pressed_s[mount.camera])
+                for mount in mounts
+                if mount.camera in options.pressed_s
+            ),
+        )
+        motion = Walk(body, length_s, habits, np.random.default_rng(seeds["walk"]))
     return Subject(motion=motion, mounts=mounts, seeds=seeds)
 
 
@@ -178,7 +190,11 @@ def build_films(options: SynthOptions, subject: Subject) -> list[Film]:
     travelled = subject.motion.pose(in_seconds(common_ticks_ns(options)))[0][:, :2]
     extent_x, extent_y = np.abs(travelled).max(axis=0).tolist()
     surfaces = build_room(
-        (extent_x, extent_y), texels_per_m, subject.seeds["room"], repeated_posters=options.repeated_posters
+        (extent_x, extent_y),
+        texels_per_m,
+        subject.seeds["room"],
+        furnished=options.furnished,
+        repeated_posters=options.repeated_posters,
     )
     images = [surface.image for surface in surfaces]
     wearer = Wearer(subject.motion.skeleton, subject.seeds["clothes"]) if options.body_in_view else None

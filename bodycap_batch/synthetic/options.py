@@ -52,7 +52,18 @@ class SynthOptions(Options):
         0.0, ge=0, lt=0.5, description="share of frames lost; writes <camera>.timestamps.txt"
     )
     body_in_view: bool = Field(False, description="render the wearer's own body")
+    arms_ahead: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="how far both forearms are held up ahead; 1 brings them into the torso's view",
+    )
+    furnished: bool = Field(True, description="False: a bare room, with nothing but what hangs on its walls")
     repeated_posters: bool = Field(False, description="hang one and the same poster in several places")
+    pressed_s: Mapping[str, tuple[float, float]] = Field(
+        default_factory=dict,
+        description="by camera on a hand: from when to when (s) it lies against the wearer's chest",
+    )
     poses_only: bool = Field(False, description="write noisy camera poses, no video")
     pose_sigma_m: float = Field(0.005, ge=0, description="poses only: noise of each position, per axis")
     pose_sigma_deg: float = Field(0.3, ge=0, description="poses only: noise of each rotation, per axis")
@@ -80,7 +91,21 @@ class SynthOptions(Options):
             raise ValueError("exposure_s and rolling_shutter_s cannot exceed the frame interval")
         if self.motion is not None and self.t_pose_s > 0:
             raise ValueError("t_pose_s: a BVH motion is followed as it is")
+        self._check_pressed()
         return self
+
+    def _check_pressed(self) -> None:
+        """Only the built-in walker's hands can be led to the chest, and it has to be there."""
+        for name, (start_s, end_s) in self.pressed_s.items():
+            place = mount_of(name)
+            if name not in self.cameras or place is None or not place[1].endswith("Hand"):
+                raise ValueError(f"pressed_s: no camera {name} on a hand")
+            if end_s <= start_s:
+                raise ValueError(f"pressed_s: {name} leaves the chest before it gets there")
+        if self.pressed_s and not self.body_in_view:
+            raise ValueError("pressed_s: needs body_in_view, else there is no chest to see")
+        if self.pressed_s and self.motion is not None:
+            raise ValueError("pressed_s: a BVH motion is followed as it is")
 
     @property
     def frame_count(self) -> int:

@@ -84,6 +84,7 @@ def build_room(
     texels_per_m: float,
     seed: np.random.SeedSequence,
     *,
+    furnished: bool = True,
     repeated_posters: bool = False,
 ) -> list[Surface]:
     """Furnish and light a room around a walk.
@@ -92,16 +93,18 @@ def build_room(
         half_extent_m: How far the walk goes from the room's middle along x and y.
         texels_per_m: Detail of the textures.
         seed: Source of all textures and placements.
+        furnished: False leaves it bare: plain walls, floor and ceiling, and what hangs on the walls.
         repeated_posters: Hang the same three pictures again and again.
     """
     half = [max(low, extent + MARGIN_M) for low, extent in zip(_MIN_HALF_M, half_extent_m, strict=True)]
     build = _Builder(seed, texels_per_m)
-    walls = _shell(build, half)
+    walls = _shell(build, half, bare=not furnished)
     furnish = (_shelves, _desk, _cupboards, _sofa)
-    for wall, furniture in zip(walls, furnish, strict=True):
+    for wall, furniture in zip(walls, furnish if furnished else (), strict=furnished):
         furniture(build, wall)
     _pictures(build, walls, repeated_posters)
-    _ceiling(build, half)
+    if furnished:
+        _ceiling(build, half)
     rng = build.rng()
     count = max(2, round(half[0] / 1.7)), max(2, round(half[1] / 1.7))
     grid = np.meshgrid(*(np.linspace(-0.6, 0.6, n) * side for n, side in zip(count, half, strict=True)))
@@ -110,20 +113,25 @@ def build_room(
     return light_surfaces(build.surfaces, lamps, rng)
 
 
-def _shell(build: _Builder, half: list[float]) -> list[_Wall]:
-    """Floor with carpets, ceiling and four walls, each of its own material."""
+def _shell(build: _Builder, half: list[float], *, bare: bool) -> list[_Wall]:
+    """Floor with carpets, ceiling and four walls, each of its own material; bare: all of them plain."""
     up = np.array([0.0, 0.0, 1.0])
     floor, ceiling = box_faces([0, 0, HEIGHT_M / 2], [2 * half[0], 2 * half[1], HEIGHT_M], 0.0)[4:][::-1]
-    build.textured(_flipped(floor), textures.planks)
-    build.textured(_flipped(ceiling), textures.ceiling_panels)
+    build.textured(_flipped(floor), textures.plaster if bare else textures.planks)
+    build.textured(_flipped(ceiling), textures.plaster if bare else textures.ceiling_panels)
     rng = build.rng()
-    for x, y in ((-0.38, -0.35), (0.42, 0.30), (-0.25, 0.45), (0.4, -0.5)):
+    for x, y in () if bare else ((-0.38, -0.35), (0.42, 0.30), (-0.25, 0.45), (0.4, -0.5)):
         size = (rng.uniform(1.3, 2.2), rng.uniform(1.0, 1.6), 0.012)
         centre = np.array([x * half[0], y * half[1], size[2] / 2])
         texture = textures.carpet if rng.uniform() < 0.75 else textures.tiles
         build.textured(box_faces(centre, size, float(rng.uniform(-25, 25)))[4], texture)
     walls = []
-    materials = (textures.plaster, textures.bricks, textures.plaster, textures.plaster)
+    materials = (
+        textures.plaster,
+        textures.plaster if bare else textures.bricks,
+        textures.plaster,
+        textures.plaster,
+    )
     for angle, texture in zip((90, 0, 270, 180), materials, strict=True):
         # The wall stands in this direction and faces the middle.
         outward = np.round([np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0.0], 12)

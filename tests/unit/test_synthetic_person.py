@@ -10,14 +10,14 @@ from bodycap_batch.skeleton import Motion, forward_kinematics
 from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount, rest_positions
 from bodycap_batch.synthetic.clip import load_clip
 from bodycap_batch.synthetic.filming import camera_at
-from bodycap_batch.synthetic.gait import Walk
+from bodycap_batch.synthetic.gait import Habits, Walk
 from bodycap_batch.synthetic.person import draw_body, draw_mounts
 
 
 @pytest.fixture(scope="module")
 def walk():
     body = draw_body(1.75, 0.05, np.random.default_rng(3))
-    return Walk(body, 12.0, 0.0, np.random.default_rng(4))
+    return Walk(body, 12.0, Habits(), np.random.default_rng(4))
 
 
 def _poses(walk, t_s):
@@ -121,7 +121,7 @@ def test_the_motion_is_smooth(walk):
 def test_a_longer_capture_continues_the_same_walk():
     body = draw_body(1.75, 0.05, np.random.default_rng(3))
     t_s = np.linspace(0, 5, 20)
-    short, long = (Walk(body, s, 0.0, np.random.default_rng(4)).pose(t_s) for s in (6.0, 60.0))
+    short, long = (Walk(body, s, Habits(), np.random.default_rng(4)).pose(t_s) for s in (6.0, 60.0))
     # The spline through more places differs by what reaches back over a lap: well below a millimetre.
     assert np.abs(short[0] - long[0]).max() < 1e-3
     assert np.abs(short[1] - long[1]).max() < 1e-3
@@ -129,7 +129,7 @@ def test_a_longer_capture_continues_the_same_walk():
 
 def test_a_t_pose_first():
     body = draw_body(1.75, 0.05, np.random.default_rng(3))
-    walk = Walk(body, 8.0, 2.0, np.random.default_rng(4))
+    walk = Walk(body, 8.0, Habits(t_pose_s=2.0), np.random.default_rng(4))
     still = _poses(walk, np.linspace(0, 1.9, 10))
     left, right = (body.joints.index(f"{side}Hand") for side in ("Left", "Right"))
     span = still[:, left, :3, 3] - still[:, right, :3, 3]
