@@ -1,0 +1,140 @@
+"""Run a whole job through the command line a user types, score it and tell its figures."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import time
+from collections import defaultdict
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from tests.bench.rows import BODYCAP, REPOSITORY, Row
+
+MAPPING = ("map", "registration")
+"""Stages that do what the peers do: pose every frame."""
+
+
+def run(row: Row, work: Path) -> dict[str, Any]:
+    """Run one job from nothing in a store of its own and score it; the outcome as plain values."""
+    out = work / "out"
+    work.mkdir(parents=True, exist_ok=True)
+    command = [*BODYCAP, "run", str(row.capture), "--out", str(out), "--store", str(work / "store")]
+    started = time.monotonic()
+    with (work / "stderr.txt").open("w+", encoding="utf-8") as errors:
+        job = subprocess.Popen(
+            [*command, *row.arguments, "--json-progress"],
+            cwd=REPOSITORY,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+        )
+        with job:
+            wall = _wall_seconds(job.stdout or ())
+        wall_s = time.monotonic() - started
+        errors.seek(0)
+        complaint = errors.read().strip().splitlines()[-3:]
+    if not (out / "run.json").exists():
+        return {"name": row.name, "exit": job.returncode, "error": complaint}
+    record = json.loads((out / "run.json").read_text(encoding="utf-8"))
+    metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
+    stages: dict[str, float] = defaultdict(float)
+    for stage in record["stages"]:
+        stages[stage["stage"]] += stage["seconds"]
+    return {
+        "name": row.name,
+        "exit": job.returncode,
+        "wall_s": wall_s,
+        "wall_seconds": wall,
+        "stage_seconds": dict(stages),
+        "camera_seconds": camera_seconds(out / "frames.csv"),
+        "peak_memory_mb": record["peak_memory_mb"],
+        "report": score(out, row),
+        "metrics": metrics,
+    }
+
+
+def score(results: Path, row: Row) -> dict[str, Any]:
+    """Figures of `bodycap evaluate`, or why there are none."""
+    command = [*BODYCAP, "evaluate", str(results), str(row.truth), "--json"]
+    if row.reference:
+        command += ["--reference", row.reference]
+    scored = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    return dict(json.loads(scored.stdout)) if scored.returncode == 0 else {"error": scored.stderr.strip()}
+
+
+def _wall_seconds(lines: Iterable[str]) -> dict[str, float]:
+    """Seconds during which each stage ran on any camera, from the events of ``--json-progress``."""
+    out: dict[str, float] = defaultdict(float)
+    running: dict[str, int] = defaultdict(int)
+    since: dict[str, float] = {}
+    for line in lines:
+        if not line.startswith("{"):
+            continue
+        event, now = json.loads(line), time.monotonic()
+        stage = event.get("stage", "")
+        if event.get("kind") == "started":
+            since.setdefault(stage, now)
+            running[stage] += 1
+        elif event.get("kind") in ("finished", "failed", "stopped") and running[stage]:
+            running[stage] -= 1
+            if not running[stage]:
+                out[stage] += now - since.pop(stage)
+    return dict(out)
+
+
+def camera_seconds(frames: Path) -> float:
+    """Length of all cameras' videos together, from a job's frames.csv."""
+    with frames.open(newline="", encoding="utf-8") as stream:
+        times: dict[str, list[float]] = defaultdict(list)
+        for line in csv.DictReader(row for row in stream if not row.startswith("#")):
+            times[line["camera"]].append(float(line["time"]))
+    return sum(max(values) - min(values) for values in times.values())
+
+
+def mapping_seconds(result: dict[str, Any]) -> float:
+    """Wall seconds of map and registration."""
+    return sum(result["wall_seconds"].get(stage, 0.0) for stage in MAPPING)
+
+
+def lines_of(result: dict[str, Any]) -> list[str]:
+    """The outcome as a person reads it."""
+    if "report" not in result or "trajectories" not in result["report"]:
+        return [f"{result['name']}: failed, exit {result['exit']}: {result.get('error') or result['report']}"]
+    trajectories = result["report"]["trajectories"]
+    text = [f"{result['name']}: {frames_and_error(trajectories)}"]
+    for camera, figures in sorted(trajectories["cameras"].items()):
+        share = f"{figures['registered']}/{figures['frames']}"
+        text.append(f"    {camera:16} {share:>9}  ATE {_centimetres(figures)}")
+    for name, relative in result["report"].items():
+        if "vector_m" in relative:
+            vector = relative["vector_m"]
+            text.append(f"    {name}: mean {100 * vector['mean']:.2f} cm, p95 {100 * vector['p95']:.2f} cm")
+    text.append("    seconds: " + stage_text(result["wall_seconds"]))
+    frames = trajectories["total"]["frames"]
+    each_ms = 1000 * result["stage_seconds"].get("registration", 0.0) / max(frames, 1)
+    text.append(f"    registration {each_ms:.1f} ms a frame (all rounds, one core each)")
+    wall_s = result["wall_s"]
+    text.append(
+        f"    whole job {wall_s:.1f} s, {wall_s / result['camera_seconds']:.2f} s per camera-second, "
+        f"peak memory {result['peak_memory_mb']:.0f} MB"
+    )
+    return text
+
+
+def frames_and_error(trajectories: dict[str, Any]) -> str:
+    """Coverage and error of all cameras together."""
+    total = trajectories["total"]
+    text = f"{total['registered']}/{total['frames']} frames, ATE {_centimetres(total)}"
+    return text + (f" (max {100 * total['ate_m']['max']:.1f})" if total["ate_m"] else "")
+
+
+def _centimetres(figures: dict[str, Any]) -> str:
+    return f"{100 * figures['ate_m']['rmse']:.2f} cm" if figures["ate_m"] else "unknown"
+
+
+def stage_text(seconds: dict[str, float]) -> str:
+    """Seconds of each stage in one line."""
+    return ", ".join(f"{name} {value:.1f}" for name, value in seconds.items())

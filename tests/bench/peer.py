@@ -1,0 +1,175 @@
+"""The child process of a peer: COLMAP on every frame, with the features and retrieval the product uses.
+
+``python -m tests.bench.peer TASK.json``: what the parent, `tests.bench.peers`, writes. ``database`` extracts
+and matches, ``incremental`` and ``global`` map a copy of that database. Figures go to the task's ``report``
+after each step, so that what a stopped child had done is known.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import shutil
+import sys
+import time
+import zlib  # noqa: F401 - before pycolmap, else compression breaks in the process
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from bodycap_batch.capture import Capture, open_capture
+from bodycap_batch.config import MapOptions
+from bodycap_batch.config.job import load_job
+from bodycap_batch.context import StageContext
+from bodycap_batch.formats.tum import TimedPoses, write_tum
+from bodycap_batch.mapping.database import (
+    DATABASE_NAME,
+    ImageRef,
+    add_camera,
+    add_keyframes,
+    image_ids,
+)
+from bodycap_batch.mapping.pairs import match_pairs
+from bodycap_batch.mapping.retrieval import similarity
+from bodycap_batch.tracking import pixel_scale
+from tests.bench.peer_pairs import pairs_of
+
+_FEATURES = 2048
+_MAX_EXTRA_PARAM = 1e3
+"""COLMAP's own limit of 1 drops lenses with k3 > 1 silently; the calibration is given, so it is trusted."""
+
+
+class Report:
+    """Figures of a child, written anew after each step."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.values: dict[str, Any] = {"seconds": {}}
+
+    def timed(self, step: str, work: Callable[[], Any]) -> Any:
+        """Do a step and note how long it took."""
+        started = time.monotonic()
+        self.values["running"] = step
+        self.write()
+        outcome = work()
+        self.values["seconds"][step] = time.monotonic() - started
+        self.values.pop("running")
+        self.write()
+        return outcome
+
+    def write(self) -> None:
+        usage = resource.getrusage(resource.RUSAGE_SELF)
+        self.values["peak_memory_mb"] = usage.ru_maxrss / 1024
+        self._path.write_text(json.dumps(self.values), encoding="utf-8")
+
+
+def prepare(capture: Capture, workspace: Path, threads: int, report: Report) -> None:
+    """Features of every frame, and the matches of one list of pairs for both mappers."""
+    context = StageContext(work_dir=workspace, threads=threads)
+    options = MapOptions(features=_FEATURES)
+    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+        ids = {camera.name: add_camera(database, camera) for camera in capture.cameras}
+    every = [
+        (camera, ids[camera.name], np.arange(len(camera.times_ns), dtype=np.int64))
+        for camera in capture.cameras
+    ]
+    report.timed("features", lambda: add_keyframes(workspace, every, options, context))
+    pairs = report.timed("pairs", lambda: _pairs(capture, workspace))
+    report.values["pairs"] = len(pairs)
+    scale = max(pixel_scale(c.camera.width_px, c.camera.height_px) for c in capture.cameras)
+    report.timed("matching", lambda: match_pairs(workspace, pairs, options, context, scale))
+
+
+def _pairs(capture: Capture, workspace: Path) -> list[tuple[ImageRef, ImageRef]]:
+    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+        ids = image_ids(database)
+        images = sorted(ids)
+        descriptors = [np.asarray(database.read_descriptors(ids[ref]).data) for ref in images]
+    alike = similarity(descriptors, 0)
+    common = {camera.name: camera.common_times_ns() for camera in capture.cameras}
+    times = np.array([common[ref.camera][ref.frame] for ref in images])
+    cameras = np.array([ref.camera for ref in images])
+    return [(images[a], images[b]) for a, b in pairs_of(cameras, times, alike)]
+
+
+def incremental(workspace: Path, threads: int) -> list[Any]:
+    """COLMAP's incremental mapper as it comes, given intrinsics held."""
+    settings = pycolmap.IncrementalPipelineOptions()
+    settings.random_seed = 0
+    settings.num_threads = threads
+    settings.extract_colors = False
+    settings.ba_refine_focal_length = False
+    settings.ba_refine_principal_point = False
+    settings.ba_refine_extra_params = False
+    for part in (settings, settings.mapper, settings.triangulation):
+        part.max_extra_param = _MAX_EXTRA_PARAM
+    found = pycolmap.incremental_mapping(*_folders(workspace), settings)
+    return list(found.values())
+
+
+def globally(workspace: Path, threads: int) -> list[Any]:
+    """COLMAP's global mapper as it comes, given intrinsics held."""
+    settings = pycolmap.GlobalPipelineOptions()
+    settings.random_seed = 0
+    settings.num_threads = threads
+    settings.mapper.bundle_adjustment.refine_focal_length = False
+    settings.mapper.bundle_adjustment.refine_extra_params = False
+    settings.mapper.retriangulation.max_extra_param = _MAX_EXTRA_PARAM
+    found = pycolmap.global_mapping(*_folders(workspace), settings)
+    return list(found.values())
+
+
+def _folders(workspace: Path) -> tuple[str, str, str]:
+    images, models = workspace / "images", workspace / "models"
+    for folder in (images, models):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+    return str(workspace / DATABASE_NAME), str(images), str(models)
+
+
+def write_results(capture: Capture, models: list[Any], out: Path, report: Report) -> None:
+    """Paths of the largest model's cameras, and frames.csv with every frame, as a job leaves them."""
+    sizes = sorted((int(model.num_reg_images()) for model in models), reverse=True)
+    report.values["models"] = sizes
+    out.mkdir(parents=True)
+    lines = ["camera"] + [camera.name for camera in capture.cameras for _ in camera.times_ns]
+    (out / "frames.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    if not models:
+        return
+    largest = max(models, key=lambda model: int(model.num_reg_images()))
+    posed: dict[ImageRef, np.ndarray] = {}
+    for image_id in largest.reg_image_ids():
+        image = largest.image(image_id)
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().inverse().matrix()
+        posed[ImageRef.parse(image.name)] = pose
+    counts = Counter(ref.camera for ref in posed)
+    for camera in capture.cameras:
+        if counts[camera.name]:
+            frames = sorted(ref.frame for ref in posed if ref.camera == camera.name)
+            poses = np.array([posed[ImageRef(camera.name, frame)] for frame in frames])
+            timed = TimedPoses(times_ns=camera.times_ns[frames], world_from_cam=poses)
+            write_tum(out / "trajectories" / f"{camera.name}.tum", timed, ("the mapper's own gauge",))
+
+
+def main(task_path: str) -> None:
+    """Do the task of a file."""
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
+    task = json.loads(Path(task_path).read_text(encoding="utf-8"))
+    report, workspace = Report(Path(task["report"])), Path(task["workspace"])
+    capture = open_capture(load_job(Path(task["capture"])).capture)
+    if task["step"] == "database":
+        prepare(capture, workspace, task["threads"], report)
+        return
+    mapper = {"incremental": incremental, "global": globally}[task["step"]]
+    models = report.timed("mapper", lambda: mapper(workspace, task["threads"]))
+    write_results(capture, models, Path(task["out"]), report)
+    report.write()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,103 @@
+"""The benchmark's own parts: the peers' pairs, stopping them, reading a job's events."""
+
+import numpy as np
+
+from tests.bench import ours, peers, scaling
+from tests.bench.peer_pairs import AWAY_NS, FROM_OTHER, OWN_AGAIN, STEPS, pairs_of
+from tests.bench.rows import Row, row_of
+
+
+def _frames(count, cameras=("a", "b")):
+    names = np.repeat(np.array(cameras), count)
+    return names, np.tile(np.arange(count, dtype=np.int64) * 33_000_000, len(cameras))
+
+
+def test_peer_pairs_hold_neighbours_and_the_same_instant():
+    names, times = _frames(100)
+    pairs = set(pairs_of(names, times, np.zeros((200, 200))))
+    assert {(0, step) for step in STEPS} <= pairs
+    assert {(row, row + 100) for row in range(100)} <= pairs
+    assert all(first < second for first, second in pairs)
+
+
+def test_peer_pairs_follow_the_retrieval_but_not_to_neighbours():
+    names, times = _frames(200, ("a",))
+    alike = np.zeros((200, 200))
+    alike[10, 150] = 1.0
+    alike[10, 40] = 2.0
+    assert abs(times[40] - times[10]) < AWAY_NS
+    pairs = set(pairs_of(names, times, alike))
+    assert (10, 150) in pairs
+    assert (10, 40) not in pairs
+
+
+def test_peer_pairs_grow_with_the_frames_not_their_square():
+    rng = np.random.default_rng(0)
+    counts = []
+    for length in (200, 400):
+        names, times = _frames(length)
+        counts.append(len(pairs_of(names, times, rng.uniform(size=(2 * length, 2 * length)))))
+    most = len(STEPS) + OWN_AGAIN + FROM_OTHER + 1
+    assert counts[1] <= most * 800
+    # Twice the frames, twice the pairs; pairs found from both sides vary by some percent.
+    assert 1.9 < counts[1] / counts[0] < 2.2
+
+
+def test_a_peer_over_its_limit_is_stopped_and_told(tmp_path):
+    row = Row("nothing", tmp_path, tmp_path)
+    results = peers.run_peers(row, tmp_path / "work", 0.0)
+    assert [result["peer"] for result in results] == list(peers.PEERS)
+    assert all(result["stopped"] for result in results)
+    assert "stopped after 0 minutes" in peers.lines_of(results[0], None)[0]
+
+
+def test_a_peer_that_fails_is_told_with_its_last_words(tmp_path):
+    result = peers._child("database", Row("nothing", tmp_path / "missing", tmp_path), tmp_path, 60.0)
+    assert result["exit"] != 0
+    assert not result["stopped"]
+    lines = peers.lines_of({"name": "nothing", "peer": "global", "limit_s": 60.0, **result}, None)
+    assert "no model" in lines[0]
+    assert "missing" in lines[0]
+
+
+def test_a_stage_on_two_cameras_at_once_counts_once(monkeypatch):
+    clock = iter(range(10))
+    monkeypatch.setattr(ours.time, "monotonic", lambda: float(next(clock)))
+    events = ["started", "started", "finished", "progress", "finished", "started", "finished"]
+    lines = [f'{{"kind": "{kind}", "stage": "registration"}}' for kind in events]
+    assert ours._wall_seconds(["no event", '{"exit": 0}', *lines]) == {"registration": 5.0}
+
+
+def test_the_ratio_is_that_of_map_and_registration():
+    own = {"wall_seconds": {"keyframes": 9.0, "map": 3.0, "registration": 1.0}}
+    total = {"registered": 9, "frames": 10, "ate_m": {"rmse": 0.01, "max": 0.02}}
+    peer = {
+        "peer": "global", "seconds": {"features": 4.0, "mapper": 8.0}, "peak_memory_mb": 1.0,
+        "stopped": False, "models": [9, 1], "report": {"trajectories": {"total": total}},
+    }  # fmt: skip
+    text = "\n".join(peers.lines_of(peer, own))
+    assert "9/10 frames, ATE 1.00 cm" in text
+    assert "split into 2 models" in text
+    assert "3.0 times as long" in text
+
+
+def test_scaling_is_told_relative_to_its_base():
+    def case(seconds, cameras, wall_s):
+        return {
+            "scaling_seconds": seconds, "scaling_cameras": cameras, "wall_s": wall_s, "peak_memory_mb": 100.0,
+            "wall_seconds": {"map": wall_s / 2}, "metrics": {"mapping": {"pairs": 10 * seconds}},
+        }  # fmt: skip
+
+    lines = scaling.summary([case(6, 3, 10.0), case(24, 3, 42.0), {}])
+    assert "whole job 4.20, map and registration 4.20, pairs 4.00" in lines[-1]
+    assert "did not run" in scaling.summary([])[0]
+
+
+def test_a_folder_is_a_row(tmp_path):
+    (tmp_path / "groundtruth.txt").touch()
+    assert row_of(tmp_path).truth == tmp_path / "groundtruth.txt"
+    (tmp_path / "skeleton.bvh").touch()
+    (tmp_path / "torso.mp4").touch()
+    row = row_of(tmp_path)
+    assert row.truth == tmp_path / "gt"
+    assert row.reference == "torso"
