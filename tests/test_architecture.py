@@ -20,6 +20,7 @@ TYPES = GROUND | {"camera", "scene", "skeleton", "body"}
 MATERIAL = TYPES | {"capture", "config", "formats", "skeleton_presets", "tracking"}
 STAGES = {
     "keyframes", "mapping", "registration", "merging", "export", "report", "evaluate", "synthetic", "check",
+    "calibration",
 }  # fmt: skip
 KEEPING = {"errors", "digests", "identity", "progress"}
 MAY_IMPORT: dict[str, set[str]] = {

@@ -1,0 +1,241 @@
+"""Read a clip of a board: look at sharp pictures, keep views that differ, fit the lens."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.calibration.boards import Board, GreyImage, View
+from bodycap_batch.calibration.solve import Fit, Size, fit_lens
+from bodycap_batch.capture import CaptureCamera, open_camera
+from bodycap_batch.config.models import CameraConfig, CaptureConfig
+from bodycap_batch.context import StageContext
+from bodycap_batch.errors import CaptureError, EstimationError
+
+LensChoice = Literal["auto", "pinhole", "opencv", "fisheye"]
+_MODELS: dict[str, tuple[str, ...]] = {
+    "auto": ("OPENCV", "OPENCV_FISHEYE"),
+    "pinhole": ("PINHOLE",),
+    "opencv": ("OPENCV",),
+    "fisheye": ("OPENCV_FISHEYE",),
+}
+_MAX_LOOKS = 160
+"""Pictures the board is looked for in: a minute of film, some seconds of work."""
+_LOOKS_PER_S = 5.0
+_KEEP = 40
+MIN_VIEWS = 8
+_WORTH_FISHEYE = 0.9
+"""The fisheye model is taken where its error is that much smaller; else the commoner one."""
+_GRID = (8, 6)
+_POOR_COVERAGE = 0.5
+_POOR_SIGMA = 0.005
+_POOR_RMS_PX = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationResult:
+    """A lens with its error.
+
+    Attributes:
+        board: What was filmed.
+        fit: The lens.
+        size: Width and height of the pictures, upright.
+        looked_at: Pictures the board was looked for in.
+        found: Pictures it was found in.
+        coverage: Share of the picture (8×6 cells) in which a corner was seen.
+        notes: What makes the result less trustworthy, and what to do.
+        preview: Picture (H,W) of the sharpest view kept, for `write_preview`.
+    """
+
+    board: Board
+    fit: Fit
+    size: Size
+    looked_at: int
+    found: int
+    coverage: float
+    notes: tuple[str, ...]
+    preview: GreyImage
+
+    def lines(self) -> list[str]:
+        """The result as a person reads it."""
+        fit, (width, height) = self.fit, self.size
+        sigma = ", ".join(f"{value:.2f}" for value in fit.focal_sigma_px)
+        worst = max(fit.view_rms_px)
+        return [
+            f"{self.board}: found in {self.found} of {self.looked_at} pictures, {len(fit.kept)} views used",
+            f"{fit.model} at {width}×{height}: focal length {fit.matrix[0, 0]:.2f}, "
+            f"{fit.matrix[1, 1]:.2f} px (±{sigma})",
+            f"reprojection error {fit.rms_px:.3f} px, worst view {worst:.3f} px; corners seen in "
+            f"{100 * self.coverage:.0f} % of the picture",
+            *(f"note: {note}" for note in self.notes),
+        ]
+
+
+def calibrate_clip(video: Path, board: Board, lens: LensChoice, context: StageContext) -> CalibrationResult:
+    """Calibrate a camera from a clip of a board.
+
+    Args:
+        video: The clip, filmed in the mode that will be used (size, zoom, lens mode, stabilisation off).
+        board: What is seen in it.
+        lens: The model to fit; ``auto`` takes OPENCV unless OPENCV_FISHEYE fits better.
+        context: Progress and cancelling.
+
+    Raises:
+        CaptureError: The video cannot be used, or the board was found in too few of its pictures.
+        EstimationError: No lens fits the views.
+    """
+    camera = open_camera(
+        CaptureConfig(cameras=(CameraConfig(name="camera", video=(video,)),), work_px=8192),
+        CameraConfig(name="camera", video=(video,)),
+    )
+    size = (camera.camera.width_px, camera.camera.height_px)
+    found: list[tuple[int, View]] = []
+    looked_at = 0
+    wanted = _look_at(camera)
+    for frame, image in _sharpest(camera, wanted):
+        context.check_cancelled()
+        looked_at += 1
+        context.progress(looked_at, len(wanted), "pictures")
+        view = board.find(image)
+        if view is not None:
+            found.append((frame, view))
+    if len(found) < MIN_VIEWS:
+        raise _too_few(video, board, len(found), looked_at)
+    kept = spread([view for _, view in found], size, _KEEP)
+    fit = _best([found[index][1] for index in kept], size, lens, video)
+    frames = [found[kept[index]][0] for index in fit.kept]
+    views = [found[kept[index]][1] for index in fit.kept]
+    shown = frames[int(np.argmax([len(view.px) for view in views]))]
+    _, preview = next(iter(camera.read([shown])))
+    covered = coverage([view.px for view in views], size)
+    return CalibrationResult(
+        board=board,
+        fit=fit,
+        size=size,
+        looked_at=looked_at,
+        found=len(found),
+        coverage=covered,
+        notes=tuple(_notes(fit, size, covered)),
+        preview=preview,
+    )
+
+
+def _look_at(camera: CaptureCamera) -> list[tuple[int, int]]:
+    """Stretches of frames, first and one past the last; the sharpest picture of each is looked at."""
+    count = len(camera.times_ns)
+    seconds = (int(camera.times_ns[-1]) - int(camera.times_ns[0])) / 1e9 * count / max(count - 1, 1)
+    looks = int(np.clip(round(seconds * _LOOKS_PER_S), 1, min(_MAX_LOOKS, count)))
+    edges = np.linspace(0, count, looks + 1).round().astype(int).tolist()
+    return list(itertools.pairwise(edges))
+
+
+def _sharpest(camera: CaptureCamera, stretches: Sequence[tuple[int, int]]) -> Iterator[tuple[int, GreyImage]]:
+    """The sharpest picture of each stretch: a board held in the hand is still for moments only."""
+    ends = iter(stretches)
+    end = next(ends)[1]
+    best: tuple[float, int, GreyImage] | None = None
+    for frame, image in camera.grey_frames():
+        if frame >= end and best is not None:
+            yield best[1], best[2]
+            best, end = None, next(ends)[1]
+        small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        sharpness = float(cv2.Laplacian(small, cv2.CV_32F).var())
+        if best is None or sharpness > best[0]:
+            best = sharpness, frame, image
+    if best is not None:
+        yield best[1], best[2]
+
+
+def _best(views: Sequence[View], size: Size, lens: LensChoice, video: Path) -> Fit:
+    """The lens that fits best, the commoner model where there is little between them."""
+    fits = [fit for model in _MODELS[lens] if (fit := fit_lens(model, views, size)) is not None]
+    if not fits:
+        raise EstimationError(
+            f"no lens fits the {len(views)} views of the board",
+            path=video,
+            hint="film the board tilted to all sides and in all corners of the picture, and keep it flat",
+        )
+    best = fits[0]
+    for other in fits[1:]:
+        if other.rms_px < _WORTH_FISHEYE * best.rms_px:
+            best = other
+    return best
+
+
+def spread(views: Sequence[View], size: Size, count: int) -> list[int]:
+    """Choose views that differ: the one with most corners first, then always the one farthest from all.
+
+    A view is described by where the board's corners lie in the picture and how large and tilted it is.
+
+    Source: T. Gonzalez, "Clustering to minimize the maximum intercluster distance", 1985.
+    """
+    described = np.array([_description(view, size) for view in views])
+    chosen = [int(np.argmax([len(view.px) for view in views]))]
+    distance = np.linalg.norm(described - described[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(views)):
+        farthest = int(np.argmax(distance))
+        if distance[farthest] == 0.0:
+            break
+        chosen.append(farthest)
+        distance = np.minimum(distance, np.linalg.norm(described - described[farthest], axis=1))
+    return sorted(chosen)
+
+
+def _description(view: View, size: Size) -> FloatArray:
+    """Centre, size and perspective of the board in the picture, each about 0 … 1."""
+    homography, _ = cv2.findHomography(view.board_m[:, :2], view.px / max(size))
+    centre = view.px.mean(axis=0) / max(size)
+    scale = np.log(np.sqrt(np.linalg.det(np.cov((view.px / max(size)).T))) + 1e-6)
+    tilt = np.zeros(2) if homography is None else homography[2, :2] / homography[2, 2]
+    extent = np.ptp(view.board_m[:, :2], axis=0).max()
+    return np.concatenate([centre, [0.3 * scale], np.clip(2.0 * extent * tilt, -1, 1)])
+
+
+def coverage(pixels: Sequence[FloatArray], size: Size) -> float:
+    """Share of the picture's cells in which a corner was seen."""
+    cells = np.zeros(_GRID, dtype=bool)
+    for px in pixels:
+        cell = np.floor((px + 0.5) / np.array(size) * np.array(_GRID)).astype(int)
+        column, row = np.clip(cell, 0, np.array(_GRID) - 1).T
+        cells[column, row] = True
+    return float(cells.mean())
+
+
+def _notes(fit: Fit, size: Size, covered: float) -> list[str]:
+    notes = []
+    if covered < _POOR_COVERAGE:
+        notes.append(
+            f"corners were seen in {100 * covered:.0f} % of the picture: the lens is a guess elsewhere; "
+            "film the board in all corners, too"
+        )
+    sigma = max(fit.focal_sigma_px) / fit.matrix[0, 0]
+    if sigma > _POOR_SIGMA:
+        notes.append(
+            f"the focal length is known to {100 * sigma:.1f} % only: tilt the board more, to all sides, "
+            "and film it nearer"
+        )
+    if fit.rms_px > _POOR_RMS_PX * max(size) / 640.0:
+        notes.append(
+            f"an error of {fit.rms_px:.1f} px is large: is the board flat, its size right, the focus fixed "
+            "and stabilisation off?"
+        )
+    return notes
+
+
+def _too_few(video: Path, board: Board, found: int, looked_at: int) -> CaptureError:
+    size = "count squares, not corners"
+    if board.kind == "chessboard":
+        size = "count inner corners, not squares; all of it has to be in the picture, with white around it"
+    return CaptureError(
+        f"the {board} was found in {found} of {looked_at} pictures looked at; it takes {MIN_VIEWS}",
+        path=video,
+        hint=f"check the board's size ({size}) and kind, light it evenly, fill a third of the picture with "
+        "it, hold it still for a moment in each of twenty places",
+    )

@@ -1,0 +1,189 @@
+"""Fit a lens to views of a board. Pixels here have OpenCV's origin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.calibration.boards import View
+
+Size = tuple[int, int]
+_FISHEYE_STARTS = (0.5, 0.35, 0.7)
+"""Focal lengths over the long side from which the fisheye model is tried, best first."""
+_BAD_VIEW = 3.0
+"""A view whose error is that many times the median's was blurred, or found wrongly."""
+_BAD_VIEW_AT_LEAST_PX = 0.3
+_LEAST_VIEWS = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fit:
+    """A lens fitted to views.
+
+    Attributes:
+        model: COLMAP's name: PINHOLE, OPENCV or OPENCV_FISHEYE.
+        matrix: (3,3) focal lengths and principal point.
+        distortion: Coefficients in OpenCV's order, those of the model.
+        rms_px: Error over all corners.
+        view_rms_px: Error of each view kept.
+        focal_sigma_px: Standard deviation of both focal lengths.
+        kept: Which of the given views were used.
+    """
+
+    model: str
+    matrix: FloatArray
+    distortion: FloatArray
+    rms_px: float
+    view_rms_px: tuple[float, ...]
+    focal_sigma_px: tuple[float, float]
+    kept: tuple[int, ...]
+
+    @property
+    def params(self) -> list[float]:
+        """COLMAP's parameters in COLMAP's pixel origin."""
+        fx, fy = self.matrix[0, 0], self.matrix[1, 1]
+        centre = self.matrix[:2, 2] + 0.5
+        return [float(value) for value in (fx, fy, *centre, *self.distortion)]
+
+
+def fit_lens(model: str, views: Sequence[View], size: Size) -> Fit | None:
+    """Fit a lens, leave out views that do not fit, and fit again.
+
+    Args:
+        model: PINHOLE, OPENCV or OPENCV_FISHEYE.
+        views: Corners of the board.
+        size: Width and height of the pictures.
+
+    Returns:
+        The lens, or None where the model cannot be fitted to these views.
+
+    Source: Z. Zhang, "A flexible new technique for camera calibration", PAMI 2000; the fisheye model is
+        Kannala, Brandt, "A generic camera model and calibration method", PAMI 2006; both as in OpenCV.
+    """
+    kept = list(range(len(views)))
+    fit = None
+    for _ in range(3):
+        chosen = [views[index] for index in kept]
+        fit = _fisheye(chosen, size) if model == "OPENCV_FISHEYE" else _pinhole(model, chosen, size)
+        if fit is None:
+            return None
+        errors = np.array(fit.view_rms_px)
+        limit = max(_BAD_VIEW * float(np.median(errors)), _BAD_VIEW_AT_LEAST_PX * max(size) / 640.0)
+        good = [index for index, error in zip(kept, errors, strict=True) if error <= limit]
+        fit = _numbered(fit, kept)
+        if len(good) == len(kept) or len(good) < _LEAST_VIEWS:
+            return fit
+        kept = good
+    return fit
+
+
+def _numbered(fit: Fit, kept: Sequence[int]) -> Fit:
+    return Fit(
+        model=fit.model,
+        matrix=fit.matrix,
+        distortion=fit.distortion,
+        rms_px=fit.rms_px,
+        view_rms_px=fit.view_rms_px,
+        focal_sigma_px=fit.focal_sigma_px,
+        kept=tuple(kept),
+    )
+
+
+def _points(views: Sequence[View], *, wide: bool) -> tuple[list[Any], list[Any]]:
+    """Corner lists as OpenCV takes them: single precision, or (1,N,·) double for the fisheye functions."""
+    if wide:
+        return [view.board_m[None] for view in views], [view.px[None] for view in views]
+    return [view.board_m.astype(np.float32) for view in views], [view.px.astype(np.float32) for view in views]
+
+
+def _pinhole(model: str, views: Sequence[View], size: Size) -> Fit | None:
+    flags = cv2.CALIB_FIX_K3
+    if model == "PINHOLE":
+        flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_ZERO_TANGENT_DIST
+    on_board, px = _points(views, wide=False)
+    try:
+        rms, matrix, distortion, _, _, sigmas, _, each = cv2.calibrateCameraExtended(
+            on_board, px, size, None, None, flags=flags
+        )
+    except cv2.error:
+        return None
+    if not _plausible(matrix, size):
+        return None
+    count = 0 if model == "PINHOLE" else 4
+    deviation = np.asarray(sigmas).ravel()
+    return Fit(
+        model=model,
+        matrix=np.asarray(matrix, dtype=np.float64),
+        distortion=np.asarray(distortion, dtype=np.float64).ravel()[:count],
+        rms_px=float(rms),
+        view_rms_px=tuple(float(value) for value in np.asarray(each).ravel()),
+        focal_sigma_px=(float(deviation[0]), float(deviation[1])),
+        kept=(),
+    )
+
+
+def _fisheye(views: Sequence[View], size: Size) -> Fit | None:
+    """The best of several starts: the model's own start is for half a sphere along the long side."""
+    tries = [_fisheye_from(start * max(size), views, size) for start in _FISHEYE_STARTS]
+    found = [fit for fit in tries if fit is not None]
+    return min(found, key=lambda fit: fit.rms_px) if found else None
+
+
+def _fisheye_from(focal_px: float, views: Sequence[View], size: Size) -> Fit | None:
+    on_board, px = _points(views, wide=True)
+    matrix = np.array([[focal_px, 0, 0.5 * size[0] - 0.5], [0, focal_px, 0.5 * size[1] - 0.5], [0, 0, 1]])
+    flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW | cv2.CALIB_USE_INTRINSIC_GUESS
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+    try:
+        _, matrix, distortion, turns, shifts = cv2.fisheye.calibrate(
+            on_board, px, size, matrix, np.zeros(4), flags=flags, criteria=criteria
+        )
+    except cv2.error:
+        return None
+    if not _plausible(matrix, size) or not np.isfinite(distortion).all():
+        return None
+    return _fisheye_figures(views, matrix, distortion, list(zip(turns, shifts, strict=True)))
+
+
+def _fisheye_figures(
+    views: Sequence[View], matrix: FloatArray, distortion: FloatArray, poses: Sequence[tuple[Any, Any]]
+) -> Fit:
+    """Errors of a fisheye fit, and its focal sigma from the normal equations with the poses taken out.
+
+    Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999 (the Schur complement).
+    """
+    errors, reduced, total, count = [], np.zeros((8, 8)), 0.0, 0
+    for view, (turn, shift) in zip(views, poses, strict=True):
+        projected, jacobian = cv2.fisheye.projectPoints(view.board_m[None], turn, shift, matrix, distortion)
+        difference = projected.reshape(-1, 2) - view.px
+        errors.append(float(np.sqrt((difference**2).sum(axis=1).mean())))
+        total, count = total + float((difference**2).sum()), count + len(difference)
+        lens, pose = jacobian[:, :8], jacobian[:, 8:14]
+        mixed = pose.T @ lens
+        reduced += lens.T @ lens - mixed.T @ np.linalg.pinv(pose.T @ pose) @ mixed
+    freedom = max(1, 2 * count - 8 - 6 * len(views))
+    covariance = np.linalg.pinv(reduced) * total / freedom
+    return Fit(
+        model="OPENCV_FISHEYE",
+        matrix=np.asarray(matrix, dtype=np.float64),
+        distortion=np.asarray(distortion, dtype=np.float64).ravel(),
+        rms_px=float(np.sqrt(total / max(count, 1))),
+        view_rms_px=tuple(errors),
+        focal_sigma_px=(float(np.sqrt(covariance[0, 0])), float(np.sqrt(covariance[1, 1]))),
+        kept=(),
+    )
+
+
+def _plausible(matrix: Any, size: Size) -> bool:
+    """A focal length between a 170° and a 5° lens, equal in both directions, and a centre in the picture."""
+    focal = np.array([matrix[0, 0], matrix[1, 1]])
+    centre = np.array([matrix[0, 2], matrix[1, 2]]) / np.array(size)
+    sane = np.isfinite(matrix).all() and (focal > 0.1 * max(size)).all() and (focal < 12 * max(size)).all()
+    return bool(
+        sane and abs(focal[0] / focal[1] - 1) < 0.2 and (centre > 0.15).all() and (centre < 0.85).all()
+    )

@@ -1,0 +1,113 @@
+"""`bodycap calibrate`."""
+
+from __future__ import annotations
+
+import re
+import sys
+import tempfile
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from bodycap_batch.cli.base import app
+from bodycap_batch.cli.display import make_display
+from bodycap_batch.cli.stop import stoppable
+from bodycap_batch.errors import JobError
+from bodycap_batch.progress import Event
+
+
+class Lens(StrEnum):
+    """Which camera model is fitted."""
+
+    AUTO = "auto"
+    PINHOLE = "pinhole"
+    OPENCV = "opencv"
+    FISHEYE = "fisheye"
+
+
+@app.command()
+def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
+    video: Annotated[Path, typer.Argument(metavar="VIDEO", help="A clip of the board.")],
+    chessboard: Annotated[
+        str | None, typer.Option(metavar="CxR", help="A chessboard with that many inner corners: 9x6.")
+    ] = None,
+    charuco: Annotated[
+        str | None, typer.Option(metavar="CxR", help="A ChArUco board with that many squares: 7x5.")
+    ] = None,
+    dictionary: Annotated[str, typer.Option(help="ChArUco: the family of its markers.")] = "4X4_50",
+    marker: Annotated[
+        float, typer.Option(help="ChArUco: side of a marker over the side of a square.")
+    ] = 0.75,
+    legacy: Annotated[
+        bool, typer.Option("--legacy", help="ChArUco: drawn by an OpenCV older than 4.6.")
+    ] = False,
+    lens: Annotated[
+        Lens, typer.Option(help="The camera model; auto: opencv, or fisheye if it fits better.")
+    ] = (Lens.AUTO),
+    camera: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Add it to the file under this camera (default: for all cameras)."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="The file (default: calib.json beside the video)."),
+    ] = None,
+    json_progress: Annotated[bool, typer.Option("--json-progress", help="Progress as JSON lines.")] = False,
+) -> None:
+    """Calibrate a camera from a clip of a board.
+
+    Print a board, glue it on something flat, film it with the camera in the mode you will film in:
+    stabilisation off, the same size, zoom and lens mode. Move it slowly to every corner of the picture, near
+    and far, tilted to all sides; half a minute is enough. Writes calib.json and a preview of the picture
+    without distortion.
+
+    \b
+    Examples:
+      bodycap calibrate my_walk/board.mp4 --charuco 7x5
+      bodycap calibrate board.mp4 --chessboard 9x6 --camera torso --out my_walk/calib.json
+      bodycap calibrate wide.mp4 --chessboard 9x6 --lens fisheye
+    """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.calibration import Board, calibrate_clip, write_calibration, write_preview
+    from bodycap_batch.context import StageContext
+
+    kind, columns, rows = _board_size(chessboard, charuco)
+    printed = {"dictionary": dictionary, "marker": marker, "legacy": legacy}
+    board = Board(kind=kind, columns=columns, rows=rows, **printed)  # type: ignore[arg-type]
+    target = out or video.parent / "calib.json"
+    with (
+        stoppable() as stop,
+        make_display(as_json=json_progress) as display,
+        tempfile.TemporaryDirectory() as work,
+    ):
+
+        def progress(done: int, total: int, what: str = "") -> None:
+            display(Event(kind="progress", stage="calibrate", done=done, total=total, what=what))
+
+        context = StageContext(work_dir=Path(work), progress=progress, cancelled=stop.is_set)
+        result = calibrate_clip(video, board, lens.value, context)
+    preview = target.with_name(f"{target.stem}{f'_{camera}' if camera else ''}.png")
+    write_calibration(result, target, camera)
+    write_preview(result, preview)
+    if not json_progress:
+        lines = [*result.lines(), f"calibration: {target.resolve()}", f"preview: {preview.resolve()}"]
+        sys.stdout.write("\n".join(lines) + "\n")
+
+
+def _board_size(
+    chessboard: str | None, charuco: str | None
+) -> tuple[Literal["chessboard", "charuco"], int, int]:
+    """Kind, columns and rows of the one board that is named."""
+    if charuco is not None and chessboard is None:
+        return ("charuco", *_grid(charuco, "--charuco"))
+    if chessboard is not None and charuco is None:
+        return ("chessboard", *_grid(chessboard, "--chessboard"))
+    raise JobError("which board?", field="--charuco or --chessboard", hint="--charuco 7x5")
+
+
+def _grid(text: str, flag: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d{1,3})[xX×](\d{1,3})", text.strip())
+    if found is None:
+        raise JobError(f"no board size: {text!r}", field=flag, hint="columns x rows, for example 7x5")
+    return int(found[1]), int(found[2])

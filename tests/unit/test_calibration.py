@@ -1,0 +1,211 @@
+"""Lenses from clips of boards: boards drawn through a known lens must give that lens back."""
+
+import json
+
+import av
+import numpy as np
+import pytest
+
+from bodycap_batch import cli
+from bodycap_batch.calibration import Board, calibrate_clip, write_calibration, write_preview
+from bodycap_batch.calibration.boards import View
+from bodycap_batch.calibration.clip import coverage, spread
+from bodycap_batch.calibration.solve import fit_lens
+from bodycap_batch.camera import CV2_PIXEL_OFFSET_PX
+from bodycap_batch.capture import open_camera
+from bodycap_batch.config.calibration import read_calibration
+from bodycap_batch.config.models import CameraConfig, CaptureConfig
+from bodycap_batch.context import StageContext
+from bodycap_batch.errors import CaptureError, JobError
+from bodycap_batch.geometry import so3_exp
+from tests.boards import (
+    FISHEYE_LENS,
+    PINHOLE_LENS,
+    SQUARE_TEXELS,
+    board_clip,
+    chessboard_picture,
+    with_margin,
+)
+from tests.videos import write_video
+
+CHARUCO = Board(kind="charuco", columns=9, rows=6)
+CHESSBOARD = Board(kind="chessboard", columns=9, rows=6)
+
+
+def _clip(folder, lens, board, views=16):
+    """A clip of five pictures a second, each of the board elsewhere."""
+    plain = board.kind == "chessboard"
+    picture = chessboard_picture(9, 6) if plain else board.picture(SQUARE_TEXELS)
+    images = board_clip(lens, with_margin(picture), views, np.random.default_rng(1), whole=plain)
+    return write_video(folder / f"{board.kind}.mp4", images, fps=5)
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    return _clip(tmp_path_factory.mktemp("boards"), PINHOLE_LENS, CHARUCO)
+
+
+@pytest.fixture(scope="module")
+def result(clip):
+    return calibrate_clip(clip, CHARUCO, "auto", StageContext(work_dir=clip.parent))
+
+
+def _close(result, lens):
+    focal, centre = np.array(result.fit.params[:2]), np.array(result.fit.params[2:4])
+    assert np.abs(focal / lens.params[:2] - 1).max() < 0.005
+    # Corners are good to 0.1 px, 600 of them; tilt and centre trade off, a factor of 100.
+    assert np.abs(centre - lens.params[2:4]).max() < 1.0
+    rays = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(-0.35, 0.35, 5)), axis=-1).reshape(
+        -1, 2
+    )
+    points = np.column_stack([rays, np.ones(len(rays))])
+    found = type(lens)(
+        model=result.fit.model, width_px=640, height_px=480, params=np.array(result.fit.params)
+    )
+    # All of the lens together: half a pixel anywhere in the picture.
+    assert np.abs(found.project(points) - lens.project(points)).max() < 0.5
+
+
+def test_a_charuco_clip_gives_the_lens_back(result):
+    assert result.fit.model == "OPENCV"
+    assert result.found >= 15
+    assert result.coverage > 0.8
+    _close(result, PINHOLE_LENS)
+    # Noise of two grey levels and H.264 move a corner by hundredths of a pixel: not nothing, not more.
+    assert 0.01 < result.fit.rms_px < 0.2
+    assert not result.notes
+
+
+def test_the_stated_sigma_is_about_the_error(result):
+    errors = np.abs(np.array(result.fit.params[:2]) - PINHOLE_LENS.params[:2])
+    sigmas = np.array(result.fit.focal_sigma_px)
+    assert (sigmas > 0).all()
+    assert (sigmas < 0.005 * 430).all()
+    # Corner errors are not quite independent: four sigma rather than three.
+    assert (errors < 4 * sigmas).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("lens", "board"), [(PINHOLE_LENS, CHESSBOARD), (FISHEYE_LENS, CHARUCO), (FISHEYE_LENS, CHESSBOARD)]
+)
+def test_other_boards_and_lenses_too(tmp_path, lens, board):
+    clip = _clip(tmp_path, lens, board, views=30)
+    found = calibrate_clip(clip, board, "auto", StageContext(work_dir=tmp_path))
+    assert found.fit.model == lens.model
+    _close(found, lens)
+
+
+def test_a_job_reads_the_file_that_is_written(result, clip, tmp_path):
+    write_calibration(result, tmp_path / "calib.json", None)
+    entry = read_calibration(tmp_path / "calib.json", "torso")
+    assert entry.calibration.camera().params.tolist() == result.fit.params
+    config = CameraConfig(name="torso", video=(clip,), calibration=entry.calibration)
+    camera = open_camera(CaptureConfig(cameras=(config,)), config)
+    assert camera.calibrated
+    assert camera.camera.params.tolist() == result.fit.params
+    told = json.loads((tmp_path / "calib.json").read_text())["calibrated_with"]
+    assert told["rms_px"] == pytest.approx(result.fit.rms_px, abs=1e-4)
+    assert len(told["view_rms_px"]) == told["views"]
+
+
+def test_cameras_are_added_to_one_file(result, tmp_path):
+    path = tmp_path / "calib.json"
+    for camera in ("torso", "left_palm", "torso"):
+        write_calibration(result, path, camera)
+    assert sorted(json.loads(path.read_text())["cameras"]) == ["left_palm", "torso"]
+    assert read_calibration(path, "left_palm").calibration.params == tuple(result.fit.params)
+    write_calibration(result, path, None)
+    with pytest.raises(JobError, match="one calibration for all"):
+        write_calibration(result, path, "torso")
+
+
+def test_the_preview_straightens_the_board(result, tmp_path):
+    write_preview(result, tmp_path / "calib.png")
+    with av.open(str(tmp_path / "calib.png")) as picture:
+        image = next(picture.decode(video=0)).to_ndarray(format="gray")
+    assert image.shape == (480, 1280)
+    # Corners of a straight row lie on a line; in the picture as filmed they do not.
+    bends = []
+    for half in (image[:, :640], image[:, 640:]):
+        view = CHARUCO.find(np.ascontiguousarray(half))
+        rows = [view.px[view.board_m[:, 1] == y] for y in np.unique(view.board_m[:, 1])]
+        rows = [row - row.mean(axis=0) for row in rows if len(row) >= 6]
+        bends.append(max(np.linalg.svd(row, compute_uv=False)[1] for row in rows))
+    assert bends[1] < 0.5 < bends[0]
+
+
+def test_a_clip_without_the_board_is_refused_with_numbers(clip):
+    with pytest.raises(CaptureError, match=r"found in 0 of 16 pictures looked at; it takes 8") as refused:
+        calibrate_clip(clip, CHESSBOARD, "auto", StageContext(work_dir=clip.parent))
+    assert "inner corners" in refused.value.hint
+
+
+def test_the_command_writes_calibration_and_preview(clip, tmp_path, capsys):
+    out = tmp_path / "lens.json"
+    assert cli.main(["calibrate", str(clip), "--charuco", "9x6", "--lens", "opencv", "--out", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert "found in 16 of 16 pictures" in told
+    assert "reprojection error" in told
+    assert read_calibration(out, "any").calibration.model == "OPENCV"
+    assert (tmp_path / "lens.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "which board?"),
+        (["--charuco", "9x6", "--chessboard", "9x6"], "which board?"),
+        (["--charuco", "nine"], "no board size"),
+        (["--charuco", "2x2"], "too small"),
+        (["--charuco", "9x6", "--dictionary", "9X9"], "unknown markers"),
+        (["--charuco", "9x6", "--marker", "1.5"], "cannot be 1.5 of a square"),
+    ],
+)
+def test_wrong_words_are_refused(clip, tmp_path, capsys, words, message):
+    assert cli.main(["calibrate", str(clip), *words, "--out", str(tmp_path / "calib.json")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "calib.json").exists()
+
+
+def _exact_views(lens, rng, count, noise_px=0.0):
+    x, y = np.meshgrid(np.arange(9.0), np.arange(6.0))
+    board = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    views = []
+    for _ in range(count):
+        turn = so3_exp(rng.uniform(-0.5, 0.5, 3))
+        centre = np.append(rng.uniform(-2, 2, 2), rng.uniform(9, 13))
+        px = lens.project((board - [4.0, 2.5, 0.0]) @ turn.T + centre) - CV2_PIXEL_OFFSET_PX
+        views.append(View(board_m=board, px=px + rng.normal(0, noise_px, px.shape)))
+    return views
+
+
+@pytest.mark.parametrize("lens", [PINHOLE_LENS, FISHEYE_LENS])
+def test_exact_corners_give_the_exact_lens_and_pixel_origin(lens):
+    fit = fit_lens(lens.model, _exact_views(lens, np.random.default_rng(0), 12), (640, 480))
+    # Single precision corners of the pinhole solver: 3e-5 px.
+    assert np.abs(np.array(fit.params[:4]) - lens.params[:4]).max() < 0.01
+    assert fit.rms_px < 1e-3
+
+
+def test_a_view_that_does_not_fit_is_left_out():
+    rng = np.random.default_rng(0)
+    views = _exact_views(PINHOLE_LENS, rng, 12, noise_px=0.05)
+    views[5] = View(board_m=views[5].board_m, px=views[5].px + rng.normal(0, 4.0, views[5].px.shape))
+    fit = fit_lens("OPENCV", views, (640, 480))
+    assert fit.kept == tuple(index for index in range(12) if index != 5)
+    assert fit.rms_px < 0.1
+
+
+def test_views_are_chosen_to_differ():
+    rng = np.random.default_rng(0)
+    near = _exact_views(PINHOLE_LENS, np.random.default_rng(1), 1)
+    same = [View(board_m=near[0].board_m, px=near[0].px + rng.normal(0, 0.1, (54, 2))) for _ in range(30)]
+    others = _exact_views(PINHOLE_LENS, rng, 5)
+    chosen = spread(same + others, (640, 480), 6)
+    assert set(range(30, 35)) <= set(chosen)
+
+
+def test_coverage_counts_cells():
+    assert coverage([np.array([[0.0, 0.0], [1.0, 1.0]])], (640, 480)) == 1 / 48
+    assert coverage([np.array([[-0.5, -0.5], [639.5, 479.5]])], (640, 480)) == 2 / 48
