@@ -18,11 +18,17 @@ REFERENCE_WIDTH_PX = 640.0
 
 _WINDOW_PX = 21
 _LEVELS = 4
-_GUIDED_LEVELS = 2
-"""With a guess the coarse levels only add ways to go wrong."""
+_GUIDED_LEVELS = 0
+"""With a guess the coarse levels only add cost and ways to go wrong."""
 _ITERATIONS = 20
 _EPSILON_PX = 0.02
 _MAX_ROUND_TRIP_PX = 1.0
+_COARSE_WIDTH_PX = 320.0
+_COARSE_WINDOW_PX = 15
+_COARSE_LEVELS = 3
+_COARSE_POINTS = 48
+_MIN_COARSE_POINTS = 12
+_COARSE_ERROR_PX = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +51,15 @@ def pixel_scale(width_px: int, height_px: int) -> float:
     return max(width_px, height_px) / REFERENCE_WIDTH_PX
 
 
-def track_points(first: GreyImage, second: GreyImage, px: Pixels, guess_px: Pixels | None = None) -> Flow:
+def track_points(
+    first: GreyImage,
+    second: GreyImage,
+    px: Pixels,
+    guess_px: Pixels | None = None,
+    *,
+    and_back: bool = True,
+    window_px: int = _WINDOW_PX,
+) -> Flow:
     """Follow points from one image to the next by pyramidal Lucas–Kanade, there and back.
 
     Args:
@@ -53,42 +67,92 @@ def track_points(first: GreyImage, second: GreyImage, px: Pixels, guess_px: Pixe
         second: (H,W) uint8 image.
         px: (N,2) float32 points in the first image.
         guess_px: (N,2) where to start looking in the second image.
+        and_back: Follow them back too and refuse those that do not return; doubles the cost.
+        window_px: Side of the square around a point that is compared.
 
     Source: Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2000; the check is
         Kalal, Mikolajczyk, Matas, "Forward-backward error", ICPR 2010.
     """
-    import cv2
-
     if len(px) == 0:
         return Flow(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0, np.float32))
     start = np.ascontiguousarray(px - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ITERATIONS, _EPSILON_PX)
-    window = (_WINDOW_PX, _WINDOW_PX)
-    flags = 0
-    levels = _LEVELS if guess_px is None else _GUIDED_LEVELS
-    there_guess: npt.NDArray[np.float32] | None = None
-    if guess_px is not None:
-        there_guess = np.ascontiguousarray(guess_px - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
-        flags = cv2.OPTFLOW_USE_INITIAL_FLOW
-    there_start = None if there_guess is None else there_guess.copy()
-    there, found, _ = cv2.calcOpticalFlowPyrLK(
-        first, second, start, there_start, None, None, window, levels, criteria, flags
-    )
+    guess = None if guess_px is None else np.asarray(guess_px - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
+    levels = _LEVELS if guess is None else _GUIDED_LEVELS
+    there, alive = _lucas_kanade(first, second, start, guess, (window_px, levels))
     height, width = second.shape
-    inside = ((there >= 0) & (there <= (width - 1, height - 1))).all(axis=1)
-    alive = np.asarray(found).ravel().astype(bool) & inside
+    alive &= ((there >= 0) & (there <= (width - 1, height - 1))).all(axis=1)
+    found_px = (there + CV2_PIXEL_OFFSET_PX).astype(np.float32)
+    if not and_back:
+        return Flow(found_px, alive, np.zeros(len(px), np.float32))
     back = np.full_like(there, np.inf)
     if alive.any():
         # The way back starts from the guess's own shift, so that it does not know the answer.
-        back_start = None if there_guess is None else there[alive] - (there_guess - start)[alive]
-        returned, refound, _ = cv2.calcOpticalFlowPyrLK(
-            second, first, there[alive], back_start, None, None, window, levels, criteria, flags
-        )
-        returned[~np.asarray(refound).ravel().astype(bool)] = np.inf
+        back_guess = None if guess is None else there[alive] - (guess - start)[alive]
+        returned, refound = _lucas_kanade(second, first, there[alive], back_guess, (window_px, levels))
+        returned[~refound] = np.inf
         back[alive] = returned
     round_trip = np.linalg.norm(back - start, axis=1).astype(np.float32)
     limit = _MAX_ROUND_TRIP_PX * pixel_scale(width, height)
-    return Flow((there + CV2_PIXEL_OFFSET_PX).astype(np.float32), alive & (round_trip < limit), round_trip)
+    return Flow(found_px, alive & (round_trip < limit), round_trip)
+
+
+def _lucas_kanade(
+    first: GreyImage, second: GreyImage, start: Pixels, guess: Pixels | None, size: tuple[int, int]
+) -> tuple[Pixels, BoolArray]:
+    """OpenCV's tracker, in OpenCV's pixels; `size` is the window's width and the number of coarse levels."""
+    import cv2
+
+    window, levels = size
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ITERATIONS, _EPSILON_PX)
+    flags = 0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW
+    guess = None if guess is None else guess.copy()
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        first, second, start, guess, None, None, (window, window), levels, criteria, flags
+    )
+    return there, np.asarray(found).ravel().astype(bool)
+
+
+def coarse_image(grey: GreyImage) -> GreyImage:
+    """The image reduced for `coarse_motion`, whatever its size."""
+    import cv2
+
+    scale = min(1.0, _COARSE_WIDTH_PX / max(grey.shape))
+    return np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def coarse_motion(first: GreyImage, second: GreyImage, px: Pixels, width_px: int) -> FloatArray | None:
+    """Homography (3,3) from the first image to the second, near enough to start tracking from.
+
+    Args:
+        first: `coarse_image` of the first image.
+        second: The same of the second.
+        px: (N,2) points of the first image at full size; some of them are followed.
+        width_px: Width of the full-size images.
+
+    Returns:
+        It, in full-size pixels of COLMAP's origin; None where too few points agree.
+    """
+    import cv2
+
+    if len(px) < _MIN_COARSE_POINTS:
+        return None
+    scale = first.shape[1] / width_px
+    some = px[np.linspace(0, len(px) - 1, min(len(px), _COARSE_POINTS)).astype(int)]
+    start = np.ascontiguousarray(some * scale - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
+    there, found = _lucas_kanade(first, second, start, None, (_COARSE_WINDOW_PX, _COARSE_LEVELS))
+    if found.sum() < _MIN_COARSE_POINTS:
+        return None
+    target = (there[found] + CV2_PIXEL_OFFSET_PX) / scale
+    homography, agreed = cv2.findHomography(some[found], target, cv2.RANSAC, _COARSE_ERROR_PX / scale / 2)
+    if homography is None or int(agreed.sum()) < _MIN_COARSE_POINTS:
+        return None
+    return np.asarray(homography, dtype=np.float64)
+
+
+def moved(px: Pixels, homography: FloatArray) -> Pixels:
+    """Points (N,2) under a homography (3,3)."""
+    ahead = px @ homography[:, :2].T + homography[:, 2]
+    return np.asarray(ahead[:, :2] / ahead[:, 2:], dtype=np.float32)
 
 
 def detect_corners(grey: GreyImage, count: int, spacing_px: float) -> Pixels:

@@ -11,9 +11,11 @@ from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.context import StageContext
+from bodycap_batch.geometry import interpolate_pose, invert
+from bodycap_batch.registration.batch import make_views
 from bodycap_batch.registration.growth import wanted_keyframes
 from bodycap_batch.registration.jumps import pose_jumps
-from bodycap_batch.registration.pose import FramePose, PoseLimits, solve_pose
+from bodycap_batch.registration.pose import FramePose, PoseLimits, solve_poses
 from bodycap_batch.registration.tracks import Anchor, Tracks, anchors_of, track_scale, track_stretch
 from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 
@@ -57,7 +59,7 @@ def register_frames(
     anchors = anchors_of(scene_map, camera.name)
     tracks = _all_tracks(camera, anchors, previous, context)
     lookup = _PointLookup.of(scene_map, camera.name)
-    poses = _solve_all(camera, scene_map, lookup, tracks, _limits(camera, selection, options), context)
+    poses = _solve_all(camera, scene_map, lookup, tracks, _limits(camera, selection, options))
     trajectory = _trajectory(camera, scene_map.gauge, poses, selection.sharpness)
     return Registration(
         trajectory=trajectory,
@@ -181,39 +183,39 @@ class _PointLookup:
 
 
 def _solve_all(
-    camera: CaptureCamera,
-    scene_map: Map,
-    lookup: _PointLookup,
-    tracks: Tracks,
-    limits: PoseLimits,
-    context: StageContext,
+    camera: CaptureCamera, scene_map: Map, lookup: _PointLookup, tracks: Tracks, limits: PoseLimits
 ) -> list[FramePose]:
-    lens = scene_map.cameras[camera.name]
-    count = len(camera.times_ns)
-    bounds = np.searchsorted(tracks.frame, np.arange(count + 1))
+    """Solve every frame from its tracks and, in a keyframe, from the map's own observations."""
     point = lookup.points(tracks.keyframe, tracks.feature)
-    keyframe_row = {
-        int(scene_map.keyframe_frame[row]): int(row) for row in scene_map.keyframes_of(camera.name)
-    }
-    poses = []
-    for frame in range(count):
-        if frame % 30 == 0:
-            context.check_cancelled()
-            context.progress(frame, count, "poses solved")
-        rows = np.arange(bounds[frame], bounds[frame + 1])
-        rows = rows[point[rows] >= 0]
-        seen, px = scene_map.points[point[rows]], tracks.px[rows].astype(np.float64)
-        own = keyframe_row.get(frame)
-        if own is not None:
-            mine = scene_map.obs_keyframe == own
-            seen = np.concatenate([scene_map.points[scene_map.obs_point[mine]], seen])
-            px = np.concatenate([scene_map.obs_px[mine], px])
-        solved = solve_pose(lens, seen, px, limits)
-        if own is not None and solved.status is FrameStatus.REGISTERED:
-            solved = replace(solved, status=FrameStatus.KEYFRAME)
-        poses.append(solved)
-    context.progress(count, count, "poses solved")
+    tracked = point >= 0
+    rows = scene_map.keyframes_of(camera.name)
+    mine = np.isin(scene_map.obs_keyframe, rows)
+    own_frame = scene_map.keyframe_frame[scene_map.obs_keyframe[mine]]
+    frame = np.concatenate([own_frame, tracks.frame[tracked]])
+    order = np.argsort(frame, kind="stable")
+    point = np.concatenate([scene_map.obs_point[mine], point[tracked]])[order]
+    px = np.concatenate([scene_map.obs_px[mine], tracks.px[tracked].astype(np.float64)])[order]
+    count = len(camera.times_ns)
+    lens = scene_map.cameras[camera.name]
+    views = make_views(lens, np.searchsorted(frame[order], np.arange(count + 1)), scene_map.points[point], px)
+    keyframes = scene_map.keyframe_frame[rows]
+    start = _between(keyframes, scene_map.map_from_cam[rows], count)
+    poses = solve_poses(lens, views, px, start, limits)
+    for index in keyframes.tolist():
+        if poses[index].status is FrameStatus.REGISTERED:
+            poses[index] = replace(poses[index], status=FrameStatus.KEYFRAME)
     return _without_jumps(poses)
+
+
+def _between(keyframes: IntArray, map_from_cam: FloatArray, count: int) -> FloatArray:
+    """Poses cam_from_map (count,4,4) interpolated between keyframes; the nearest one's outside them."""
+    frames = np.arange(count)
+    after = np.clip(np.searchsorted(keyframes, frames), 1, max(1, len(keyframes) - 1))
+    after = np.minimum(after, len(keyframes) - 1)
+    before = np.maximum(after - 1, 0)
+    span = np.maximum(keyframes[after] - keyframes[before], 1)
+    alpha = np.clip((frames - keyframes[before]) / span, 0.0, 1.0)
+    return invert(interpolate_pose(map_from_cam[before], map_from_cam[after], alpha))
 
 
 def _without_jumps(poses: list[FramePose]) -> list[FramePose]:

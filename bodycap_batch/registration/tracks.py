@@ -10,17 +10,28 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import IntArray
+from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.context import StageContext
 from bodycap_batch.scene import Map
-from bodycap_batch.tracking import GreyImage, Pixels, pixel_scale, track_points
+from bodycap_batch.tracking import (
+    GreyImage,
+    Pixels,
+    coarse_image,
+    coarse_motion,
+    detect_corners,
+    moved,
+    pixel_scale,
+    track_points,
+)
 
 _MAX_TRACKS = 250
 _CELLS = 8
 _MAX_BUFFER = 90
 """Frames held in memory for the way back from a keyframe; bounds memory where keyframes are far apart."""
 _MIN_TRACKS = 6
+_MIN_GUIDES = 48
+_GUIDE_SPACING_PX = 12.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +109,15 @@ def _spread(cell: IntArray, value: IntArray) -> IntArray:
     return np.asarray(order[turn[:_MAX_TRACKS]])
 
 
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    """A frame at full size and reduced."""
+
+    index: int
+    grey: GreyImage
+    coarse: GreyImage
+
+
 @dataclass(slots=True)
 class _Active:
     """Tracks alive in the newest frame."""
@@ -106,11 +126,16 @@ class _Active:
     feature: IntArray
     px: Pixels
 
-    def step(self, first: GreyImage, second: GreyImage) -> None:
-        flow = track_points(first, second, self.px)
+    def step(self, first: _Picture, second: _Picture, motion: FloatArray | None) -> bool:
+        """Follow the tracks into a frame; False once too few are left."""
+        guess = None if motion is None else moved(self.px, motion)
+        # A track that slips disagrees with the pose; checking the way back would cost as much again.
+        flow = track_points(first.grey, second.grey, self.px, guess, and_back=False)
         self.feature, self.px = self.feature[flow.ok], flow.px[flow.ok]
+        return len(self.feature) >= _MIN_TRACKS
 
     def observe(self, frame: int) -> Tracks:
+        """What the tracks see in the frame they are in."""
         count = len(self.feature)
         return Tracks(
             np.full(count, frame, np.int64), np.full(count, self.keyframe, np.int64), self.feature, self.px
@@ -136,35 +161,46 @@ def track_stretch(
         context: Cancellation.
     """
     forward: _Active | None = None
-    previous: GreyImage | None = None
-    buffer: deque[tuple[int, GreyImage]] = deque(maxlen=_MAX_BUFFER)
+    previous: _Picture | None = None
+    buffer: deque[tuple[_Picture, FloatArray | None]] = deque(maxlen=_MAX_BUFFER)
     for index, grey in camera.grey_frames(start, stop):
         context.check_cancelled()
+        picture = _Picture(index, grey, coarse_image(grey))
+        motion = None
+        if previous is not None:
+            motion = _motion(previous, picture, forward)
+            buffer.append((previous, None if motion is None else np.asarray(np.linalg.inv(motion))))
         if forward is not None and previous is not None:
-            forward.step(previous, grey)
-            if len(forward.feature) < _MIN_TRACKS:
-                forward = None
-            else:
+            if forward.step(previous, picture, motion):
                 yield forward.observe(index)
+            else:
+                forward = None
         anchor = anchors.get(index)
         if anchor is not None:
-            yield from _track_back(index, grey, anchor, buffer)
+            yield from _track_back(picture, anchor, buffer)
             buffer.clear()
             forward = _Active(index, anchor.feature, anchor.px)
-        buffer.append((index, grey))
-        previous = grey
+        previous = picture
+
+
+def _motion(first: _Picture, second: _Picture, active: _Active | None) -> FloatArray | None:
+    if active is not None and len(active.px) >= _MIN_GUIDES:
+        guides = active.px
+    else:
+        scale = first.grey.shape[1] / first.coarse.shape[1]
+        guides = detect_corners(first.coarse, _MIN_GUIDES, _GUIDE_SPACING_PX) * np.float32(scale)
+    return coarse_motion(first.coarse, second.coarse, guides, first.grey.shape[1])
 
 
 def _track_back(
-    keyframe: int, grey: GreyImage, anchor: Anchor, buffer: deque[tuple[int, GreyImage]]
+    picture: _Picture, anchor: Anchor, buffer: deque[tuple[_Picture, FloatArray | None]]
 ) -> Iterator[Tracks]:
-    active = _Active(keyframe, anchor.feature, anchor.px)
-    later = grey
-    for index, earlier in reversed(buffer):
-        active.step(later, earlier)
-        if len(active.feature) < _MIN_TRACKS:
+    active = _Active(picture.index, anchor.feature, anchor.px)
+    later = picture
+    for earlier, motion in reversed(buffer):
+        if not active.step(later, earlier, motion):
             return
-        yield active.observe(index)
+        yield active.observe(earlier.index)
         later = earlier
 
 

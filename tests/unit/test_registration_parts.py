@@ -7,8 +7,9 @@ import pytest
 
 from bodycap_batch.camera import Camera
 from bodycap_batch.geometry import invert, make_transform, so3_exp, so3_log
+from bodycap_batch.registration.batch import make_views
 from bodycap_batch.registration.growth import lost_runs, wanted_keyframes
-from bodycap_batch.registration.pose import PoseLimits, solve_pose
+from bodycap_batch.registration.pose import FramePose, PoseLimits, solve_poses
 from bodycap_batch.scene import FrameStatus
 
 CAMERA = Camera(
@@ -35,12 +36,19 @@ def _scene(rng: np.random.Generator, count: int, patch_px: float | None = None) 
     return points, CAMERA.project(x_in_cam), gauge_from_cam
 
 
+def _solve(points: np.ndarray, px: np.ndarray, start: np.ndarray | None = None) -> FramePose:
+    """One frame alone, from a starting cam_from_gauge or from none."""
+    views = make_views(CAMERA, np.array([0, len(px)]), points, px)
+    first = np.full((4, 4), np.nan) if start is None else start
+    return solve_poses(CAMERA, views, px, first[None], LIMITS)[0]
+
+
 def test_pose_survives_a_third_of_wrong_points() -> None:
     rng = np.random.default_rng(0)
     points, px, truth = _scene(rng, 120)
     seen = px + rng.normal(0, 0.5, px.shape)
     seen[:40] += rng.uniform(10, 60, (40, 2))
-    found = solve_pose(CAMERA, points, seen, LIMITS)
+    found = _solve(points, seen)
     assert found.status is FrameStatus.REGISTERED
     assert 75 <= found.inliers <= 82
     assert found.gauge_from_cam is not None
@@ -48,12 +56,44 @@ def test_pose_survives_a_third_of_wrong_points() -> None:
     assert np.linalg.norm(found.gauge_from_cam[:3, 3] - truth[:3, 3]) < 0.006
 
 
+@pytest.mark.parametrize(("degrees", "metres"), [(3.0, 0.05), (20.0, 0.3)])
+def test_a_start_that_is_off_leads_to_the_same_pose(degrees: float, metres: float) -> None:
+    rng = np.random.default_rng(4)
+    points, px, truth = _scene(rng, 120)
+    seen = px + rng.normal(0, 0.5, px.shape)
+    seen[:30] += rng.uniform(10, 60, (30, 2))
+    off = make_transform(so3_exp(np.radians(degrees) * np.array([0.6, 0.0, 0.8])), [metres, 0.0, 0.0])
+    sampled, started = _solve(points, seen), _solve(points, seen, off @ invert(truth))
+    assert sampled.gauge_from_cam is not None
+    assert started.gauge_from_cam is not None
+    # Both end where the step is below 2e-3 px: 3.5 m · 2e-3/420 · 6, and one inlier more or less.
+    assert np.linalg.norm(started.gauge_from_cam[:3, 3] - sampled.gauge_from_cam[:3, 3]) < 5e-4
+
+
+def test_frames_solved_together_do_not_influence_each_other() -> None:
+    rng = np.random.default_rng(5)
+    scenes = [_scene(rng, count) for count in (90, 4, 60, 2, 120)]
+    px = [scene[1] + rng.normal(0, 0.5, scene[1].shape) for scene in scenes]
+    start = np.stack([invert(scene[2]) for scene in scenes])
+    bounds = np.concatenate([[0], np.cumsum([len(part) for part in px])])
+    points, pixels = np.concatenate([scene[0] for scene in scenes]), np.concatenate(px)
+    together = solve_poses(CAMERA, make_views(CAMERA, bounds, points, pixels), pixels, start, LIMITS)
+    assert [pose.status for pose in together] == [
+        FrameStatus.REGISTERED if len(part) > 50 else FrameStatus.FEW_TRACKS for part in px
+    ]
+    for index in (0, 2, 4):
+        alone = _solve(scenes[index][0], px[index], start[index])
+        assert together[index].gauge_from_cam is not None
+        np.testing.assert_allclose(together[index].gauge_from_cam, alone.gauge_from_cam, atol=1e-12)
+        np.testing.assert_allclose(together[index].covariance, alone.covariance, rtol=1e-9)
+
+
 def test_normalised_error_of_the_covariance_is_near_one() -> None:
     errors = []
     for seed in range(60):
         rng = np.random.default_rng(seed)
         points, px, truth = _scene(rng, 80)
-        found = solve_pose(CAMERA, points, px + rng.normal(0, 0.5, px.shape), LIMITS)
+        found = _solve(points, px + rng.normal(0, 0.5, px.shape))
         assert found.gauge_from_cam is not None
         assert found.covariance is not None
         delta = invert(truth) @ found.gauge_from_cam
@@ -66,7 +106,7 @@ def test_normalised_error_of_the_covariance_is_near_one() -> None:
 def test_a_small_patch_of_perfect_inliers_is_refused() -> None:
     rng = np.random.default_rng(1)
     points, px, _ = _scene(rng, 25, patch_px=42.0)
-    found = solve_pose(CAMERA, points, px + rng.normal(0, 0.5, px.shape), LIMITS)
+    found = _solve(points, px + rng.normal(0, 0.5, px.shape))
     assert found.status is FrameStatus.UNCONSTRAINED
     assert found.gauge_from_cam is None
 
@@ -75,7 +115,7 @@ def test_a_small_patch_of_perfect_inliers_is_refused() -> None:
 def test_too_little_evidence_names_its_reason(count: int, status: FrameStatus) -> None:
     rng = np.random.default_rng(2)
     points, px, _ = _scene(rng, count)
-    found = solve_pose(CAMERA, points, rng.permutation(px), LIMITS)
+    found = _solve(points, rng.permutation(px))
     assert found.status is status
     assert found.gauge_from_cam is None
 

@@ -1,0 +1,240 @@
+"""Poses of many frames at once from map points seen in them: robust Gauss–Newton, batched in numpy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.camera import Camera
+from bodycap_batch.geometry import make_transform, transform_points
+
+_RAY_STEP = 1e-4
+_CHUNK = 48
+"""Frames solved together: enough to hide numpy's overhead, few enough to stay in the cache."""
+_ROUNDS = 20
+_CONVERGED_PX = 2e-3
+_MAX_TURN_RAD = 0.5
+_WIDE = 3.0
+"""Medians beyond which a residual counts as wrong while the start is still bad."""
+_LOSS_SHARE = 0.5
+_DAMPING = 1e-10
+_TINY = 1e-300
+_FAR = 1e5
+"""Pixels and depths are cut off here where only their order counts."""
+_MIN_VIEWS = 3
+_UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Views:
+    """Map points seen in frames, ordered by frame.
+
+    Attributes:
+        bounds: (F+1,) the rows of frame f are [bounds[f], bounds[f+1]).
+        points: (M,3) in the gauge.
+        rays: (M,2) where they are seen, undistorted, at depth 1.
+        px_from_ray: (M,2,2) derivative of the pixel by the ray there.
+    """
+
+    bounds: IntArray
+    points: FloatArray
+    rays: FloatArray
+    px_from_ray: FloatArray
+
+    def rows(self, frame: int) -> slice:
+        """Rows of one frame."""
+        return slice(int(self.bounds[frame]), int(self.bounds[frame + 1]))
+
+    def of_frame(self, frame: int) -> Views:
+        """The views of one frame alone."""
+        rows = self.rows(frame)
+        return Views(
+            bounds=np.array([0, rows.stop - rows.start]),
+            points=self.points[rows],
+            rays=self.rays[rows],
+            px_from_ray=self.px_from_ray[rows],
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fits:
+    """What `assess_poses` finds.
+
+    Attributes:
+        inliers: (F,) views within the limit.
+        error_px: (F,) their mean residual.
+        noise_px: (F,) median of their absolute residuals along an axis.
+        depth: (F,) their median depth.
+        information: (F,6,6) Gauss–Newton information of a left perturbation for a noise of 1 px.
+    """
+
+    inliers: IntArray
+    error_px: FloatArray
+    noise_px: FloatArray
+    depth: FloatArray
+    information: FloatArray
+
+
+def make_views(camera: Camera, bounds: IntArray, points: FloatArray, px: FloatArray) -> Views:
+    """Undistort pixels (M,2) once, with the lens's derivative there: a pose then costs no lens model."""
+    rays = camera.unproject(px)
+    return Views(bounds=bounds, points=points, rays=rays, px_from_ray=lens_jacobian(camera, rays))
+
+
+def lens_jacobian(camera: Camera, rays: FloatArray) -> FloatArray:
+    """Derivative (N,2,2) of the pixel by the ray (x/z, y/z), by central differences."""
+    one = np.ones((len(rays), 1))
+    columns = []
+    for step in np.eye(2) * _RAY_STEP:
+        ahead, behind = (camera.project(np.hstack([rays + sign * step, one])) for sign in (1.0, -1.0))
+        columns.append((ahead - behind) / (2.0 * _RAY_STEP))
+    return np.stack(columns, axis=2)
+
+
+def refine_poses(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> FloatArray:
+    """Least reprojection error under a Cauchy loss cut off at `limit_px`, from starting poses (F,4,4).
+
+    The loss begins as wide as the residuals are and narrows with them, so a start that is off by more
+    than the limit still converges. Frames do not influence each other.
+
+    Returns:
+        (F,4,4) cam_from_gauge.
+
+    Source: Holland, Welsch, "Robust regression using iteratively reweighted least-squares", 1977.
+    """
+    poses = cam_from_gauge.copy()
+    for some in _chunks(views):
+        active = some
+        for _ in range(_ROUNDS):
+            poses[active], done = _step(views, active, poses[active], limit_px)
+            active = active[~done]
+            if len(active) == 0:
+                break
+    return poses
+
+
+def assess_poses(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> Fits:
+    """How well poses (F,4,4) explain what their frames see."""
+    frames = len(cam_from_gauge)
+    fits = Fits(
+        inliers=np.zeros(frames, np.int64),
+        error_px=np.full(frames, np.nan),
+        noise_px=np.full(frames, np.nan),
+        depth=np.full(frames, np.nan),
+        information=np.zeros((frames, 6, 6)),
+    )
+    for some in _chunks(views):
+        rows, starts, owner = _gather(views, some)
+        residual, jacobian, depth = linearise(views, rows, cam_from_gauge[some][owner])
+        size = np.hypot(residual[0], residual[1])
+        inlier = size < limit_px
+        count = np.add.reduceat(inlier, starts, dtype=np.int64)
+        fits.inliers[some] = count
+        fits.error_px[some] = np.add.reduceat(np.where(inlier, size, 0.0), starts) / np.maximum(count, 1)
+        spread = np.abs(np.where(inlier, residual, _FAR)).T.ravel()
+        fits.noise_px[some] = _medians(spread, np.repeat(owner, 2), 2 * starts, 2 * count)
+        fits.depth[some] = _medians(np.where(inlier, depth, np.inf), owner, starts, count)
+        fits.information[some] = _normal_equations(residual, jacobian, inlier.astype(np.float64), starts)[0]
+    return fits
+
+
+def _chunks(views: Views) -> Iterator[IntArray]:
+    """Frames with enough views to have a pose, some at a time."""
+    counts = np.diff(views.bounds)
+    usable = np.flatnonzero(counts >= _MIN_VIEWS)
+    for start in range(0, len(usable), _CHUNK):
+        yield usable[start : start + _CHUNK]
+
+
+def _step(views: Views, frames: IntArray, poses: FloatArray, limit_px: float) -> tuple[FloatArray, BoolArray]:
+    rows, starts, owner = _gather(views, frames)
+    residual, jacobian, _ = linearise(views, rows, poses[owner])
+    size = np.hypot(residual[0], residual[1])
+    median = _medians(size, owner, starts, views.bounds[frames + 1] - views.bounds[frames])
+    cut = np.maximum(limit_px, _WIDE * median)[owner]
+    weight = np.where(size < cut, 1.0 / (1.0 + (size / (_LOSS_SHARE * cut)) ** 2), 0.0)
+    hessian, gradient = _normal_equations(residual, jacobian, weight, starts)
+    damped = hessian + np.eye(6) * (_DAMPING * np.einsum("fii->f", hessian) + _TINY)[:, None, None]
+    step = -np.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
+    total = np.maximum(np.add.reduceat(weight, starts), 1.0)
+    moved_px = np.sqrt(np.einsum("fi,fij,fj->f", step, hessian, step) / total)
+    return _moved(poses, step), moved_px < _CONVERGED_PX
+
+
+def _medians(value: FloatArray, owner: IntArray, starts: IntArray, counts: IntArray) -> FloatArray:
+    """Lower median of each owner's `counts` smallest values: one sort, the owner in the leading digits."""
+    capped = np.minimum(value, _FAR)
+    base = owner * (2.0 * _FAR)
+    middle = starts + np.maximum(counts - 1, 0) // 2
+    return np.asarray(np.sort(base + capped)[middle] - base[starts])
+
+
+def _gather(views: Views, frames: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Rows of some frames, where each frame's begin among them, and whose each is."""
+    counts = views.bounds[frames + 1] - views.bounds[frames]
+    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    owner = np.repeat(np.arange(len(frames)), counts)
+    rows = np.arange(counts.sum()) + (views.bounds[frames] - starts)[owner]
+    return rows, starts, owner
+
+
+def linearise(
+    views: Views, rows: IntArray, cam_from_gauge: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Residuals (2,N) px, their derivative (2,6,N) by a left perturbation of cam_from_gauge, depths (N,).
+
+    Points behind the camera get a residual beyond any limit and no derivative.
+
+    Args:
+        views: Where points are seen.
+        rows: N of its rows.
+        cam_from_gauge: (N,4,4) a pose for each row.
+    """
+    x, y, z = transform_points(cam_from_gauge, views.points[rows]).T
+    front = z > 1e-9
+    inverse = 1.0 / np.where(front, z, 1.0)
+    a, b = x * inverse, y * inverse
+    zero = np.zeros_like(a)
+    by_a = np.stack([-a * b, 1.0 + a * a, -b, inverse, zero, -a * inverse])
+    by_b = np.stack([-(1.0 + b * b), a * b, a, zero, inverse, -b * inverse])
+    lens, seen = views.px_from_ray[rows], views.rays[rows]
+    off_a, off_b = a - seen[:, 0], b - seen[:, 1]
+    residual = np.stack([lens[:, k, 0] * off_a + lens[:, k, 1] * off_b for k in range(2)])
+    jacobian = np.stack([lens[:, k, 0] * by_a + lens[:, k, 1] * by_b for k in range(2)])
+    usable = front & np.isfinite(residual).all(axis=0)
+    return np.where(usable, residual, _FAR), np.where(usable, jacobian, 0.0), z
+
+
+def _normal_equations(
+    residual: FloatArray, jacobian: FloatArray, weight: FloatArray, starts: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    frames = len(starts)
+    hessian, gradient = np.empty((frames, 6, 6)), np.empty((frames, 6))
+    weighted = jacobian * weight
+    for i, j in _UPPER:
+        entry = np.add.reduceat(weighted[0, i] * jacobian[0, j] + weighted[1, i] * jacobian[1, j], starts)
+        hessian[:, i, j] = hessian[:, j, i] = entry
+    for i in range(6):
+        gradient[:, i] = np.add.reduceat(weighted[0, i] * residual[0] + weighted[1, i] * residual[1], starts)
+    return hessian, gradient
+
+
+def _moved(cam_from_gauge: FloatArray, step: FloatArray) -> FloatArray:
+    """Left perturbation (N,6) of poses (N,4,4), rotation first; a turn is held to what is sane."""
+    turn = step[:, :3]
+    angle = np.linalg.norm(turn, axis=1, keepdims=True)
+    held = np.minimum(1.0, _MAX_TURN_RAD / np.maximum(angle, 1e-12))
+    return make_transform(_rotation(turn * held), step[:, 3:] * held) @ cam_from_gauge
+
+
+def _rotation(turn_rad: FloatArray) -> FloatArray:
+    """Rodrigues' formula for (N,3)."""
+    angle = np.linalg.norm(turn_rad, axis=1)[:, None, None]
+    x, y, z = turn_rad.T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    half = np.sinc(angle / (2.0 * np.pi)) ** 2 / 2.0
+    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * cross + half * (cross @ cross))
