@@ -16,7 +16,8 @@ from bodycap_batch.registration.batch import make_views
 from bodycap_batch.registration.growth import wanted_keyframes
 from bodycap_batch.registration.jumps import pose_jumps
 from bodycap_batch.registration.pose import FramePose, PoseLimits, solve_poses
-from bodycap_batch.registration.tracks import Anchor, Tracks, anchors_of, track_scale, track_stretch
+from bodycap_batch.registration.stretches import all_tracks
+from bodycap_batch.registration.tracks import Tracks, anchors_of, track_scale
 from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 
 __all__ = ["register_frames"]
@@ -57,7 +58,7 @@ def register_frames(
     if scene_map is None:
         return _without_map(camera, tried)
     anchors = anchors_of(scene_map, camera.name)
-    tracks = _all_tracks(camera, anchors, previous, context)
+    tracks = all_tracks(camera, anchors, previous, context)
     lookup = _PointLookup.of(scene_map, camera.name)
     poses = _solve_all(camera, scene_map, lookup, tracks, _limits(camera, selection, options))
     trajectory = _trajectory(camera, scene_map.gauge, poses, selection.sharpness)
@@ -105,55 +106,6 @@ def _without_map(camera: CaptureCamera, tried: IntArray) -> Registration:
         wanted_keyframes=np.zeros(0, np.int64),
         tried_keyframes=tried,
     )
-
-
-def _all_tracks(
-    camera: CaptureCamera,
-    anchors: dict[int, Anchor],
-    previous: Registration | None,
-    context: StageContext,
-) -> Tracks:
-    """Track every stretch between neighbouring keyframes, or reuse what the last round tracked there."""
-    count = len(camera.times_ns)
-    frames = sorted(anchors)
-    stretches = list(zip([None, *frames], [*frames, None], strict=True))
-    known: set[tuple[int | None, int | None]] = set()
-    parts = []
-    if previous is not None:
-        status = previous.trajectory.status
-        before = [index for index, value in enumerate(status) if value is FrameStatus.KEYFRAME]
-        known = set(zip([None, *before], [*before, None], strict=True))
-        kept = [stretch for stretch in stretches if stretch in known]
-        parts.append(_reuse(previous, kept, count))
-    todo = _joined([stretch for stretch in stretches if stretch not in known], count)
-    total = sum(stop - start for start, stop in todo)
-    done = 0
-    for start, stop in todo:
-        for found in track_stretch(camera, anchors, start, stop, context):
-            parts.append(found)
-            context.progress(min(done + int(found.frame[0]) - start, total), total, "frames tracked")
-        done += stop - start
-    return Tracks.join(parts)
-
-
-def _joined(stretches: list[tuple[int | None, int | None]], count: int) -> list[tuple[int, int]]:
-    """Merge stretches that touch into ranges [start, stop) of frames, keyframes included."""
-    ranges: list[tuple[int, int]] = []
-    for first, last in stretches:
-        start, stop = first or 0, count if last is None else last + 1
-        if ranges and start < ranges[-1][1]:
-            ranges[-1] = (ranges[-1][0], stop)
-        else:
-            ranges.append((start, stop))
-    return ranges
-
-
-def _reuse(previous: Registration, stretches: list[tuple[int | None, int | None]], count: int) -> Tracks:
-    old = Tracks(previous.obs_frame, previous.obs_keyframe, previous.obs_feature, previous.obs_px)
-    inside = np.zeros(count, dtype=bool)
-    for first, last in stretches:
-        inside[(0 if first is None else first) : (count if last is None else last + 1)] = True
-    return old.select(inside[old.frame])
 
 
 @dataclass(frozen=True, slots=True)

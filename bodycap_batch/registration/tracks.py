@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import FloatArray, IntArray
+from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.context import StageContext
 from bodycap_batch.scene import Map
@@ -30,6 +30,7 @@ _CELLS = 8
 _MAX_BUFFER = 90
 """Frames held in memory for the way back from a keyframe; bounds memory where keyframes are far apart."""
 _MIN_TRACKS = 6
+_MAX_CLOSURE_PX = 2.0
 _MIN_GUIDES = 48
 _GUIDE_SPACING_PX = 12.0
 
@@ -40,11 +41,17 @@ class Anchor:
 
     Attributes:
         feature: (N,) feature index in the keyframe.
+        point: (N,) the map's points.
         px: (N,2) float32 where it sees them.
     """
 
     feature: IntArray
+    point: IntArray
     px: Pixels
+
+    def select(self, mask: npt.NDArray[Any]) -> Anchor:
+        """Keep the points under a mask."""
+        return Anchor(self.feature[mask], self.point[mask], self.px[mask])
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +102,11 @@ def anchors_of(scene_map: Map, camera: str) -> dict[int, Anchor]:
         picked = _spread(cell[:, 1] * _CELLS + cell[:, 0], seen[scene_map.obs_point[mine]])
         rows = np.sort(mine[picked])
         frame = int(scene_map.keyframe_frame[keyframe])
-        out[frame] = Anchor(scene_map.obs_feature[rows], scene_map.obs_px[rows].astype(np.float32))
+        out[frame] = Anchor(
+            scene_map.obs_feature[rows],
+            scene_map.obs_point[rows],
+            scene_map.obs_px[rows].astype(np.float32),
+        )
     return out
 
 
@@ -117,29 +128,66 @@ class _Picture:
     grey: GreyImage
     coarse: GreyImage
 
+    @property
+    def scale(self) -> float:
+        """Factor on pixel thresholds."""
+        return pixel_scale(self.grey.shape[1], self.grey.shape[0])
+
 
 @dataclass(slots=True)
 class _Active:
-    """Tracks alive in the newest frame."""
+    """Tracks alive in the newest frame.
+
+    Attributes:
+        keyframe: Frame index they come from.
+        anchor: What they began as.
+        slot: (N,) which of the anchor's points they are, increasing.
+        px: (N,2) where they are now.
+    """
 
     keyframe: int
-    feature: IntArray
+    anchor: Anchor
+    slot: IntArray
     px: Pixels
+
+    @staticmethod
+    def at(keyframe: int, anchor: Anchor) -> _Active:
+        """Begin in a keyframe."""
+        return _Active(keyframe, anchor, np.arange(len(anchor.px)), anchor.px)
 
     def step(self, first: _Picture, second: _Picture, motion: FloatArray | None) -> bool:
         """Follow the tracks into a frame; False once too few are left."""
         guess = None if motion is None else moved(self.px, motion)
         # A track that slips disagrees with the pose; checking the way back would cost as much again.
         flow = track_points(first.grey, second.grey, self.px, guess, and_back=False)
-        self.feature, self.px = self.feature[flow.ok], flow.px[flow.ok]
-        return len(self.feature) >= _MIN_TRACKS
+        self.slot, self.px = self.slot[flow.ok], flow.px[flow.ok]
+        return len(self.slot) >= _MIN_TRACKS
 
     def observe(self, frame: int) -> Tracks:
         """What the tracks see in the frame they are in."""
-        count = len(self.feature)
-        return Tracks(
-            np.full(count, frame, np.int64), np.full(count, self.keyframe, np.int64), self.feature, self.px
-        )
+        return _tracks(frame, self.keyframe, self.anchor.feature[self.slot], self.px)
+
+
+@dataclass(frozen=True, slots=True)
+class _Past:
+    """A frame on the way to the next keyframe.
+
+    Attributes:
+        picture: The frame.
+        motion: Homography from the next frame into it.
+        slot: (N,) forward tracks alive in it.
+        px: (N,2) where they were.
+    """
+
+    picture: _Picture
+    motion: FloatArray | None
+    slot: IntArray
+    px: Pixels
+
+
+def _tracks(frame: int, keyframe: int, feature: IntArray, px: Pixels) -> Tracks:
+    count = len(feature)
+    return Tracks(np.full(count, frame, np.int64), np.full(count, keyframe, np.int64), feature, px)
 
 
 def track_stretch(
@@ -162,25 +210,58 @@ def track_stretch(
     """
     forward: _Active | None = None
     previous: _Picture | None = None
-    buffer: deque[tuple[_Picture, FloatArray | None]] = deque(maxlen=_MAX_BUFFER)
+    past: deque[_Past] = deque(maxlen=_MAX_BUFFER)
     for index, grey in camera.grey_frames(start, stop):
         context.check_cancelled()
         picture = _Picture(index, grey, coarse_image(grey))
-        motion = None
         if previous is not None:
             motion = _motion(previous, picture, forward)
-            buffer.append((previous, None if motion is None else np.asarray(np.linalg.inv(motion))))
-        if forward is not None and previous is not None:
-            if forward.step(previous, picture, motion):
+            past.append(_remember(previous, motion, forward))
+            if forward is not None and forward.step(previous, picture, motion):
                 yield forward.observe(index)
             else:
                 forward = None
         anchor = anchors.get(index)
         if anchor is not None:
-            yield from _track_back(picture, anchor, buffer)
-            buffer.clear()
-            forward = _Active(index, anchor.feature, anchor.px)
+            arrived = np.zeros(len(anchor.px), dtype=bool)
+            if forward is not None:
+                arrived = yield from _closed(forward, index, anchor, past)
+            yield from _track_back(picture, anchor.select(~arrived), past)
+            past.clear()
+            forward = _Active.at(index, anchor)
         previous = picture
+
+
+def _remember(picture: _Picture, motion: FloatArray | None, active: _Active | None) -> _Past:
+    back = None if motion is None else np.asarray(np.linalg.inv(motion))
+    if active is None:
+        return _Past(picture, back, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
+    return _Past(picture, back, active.slot, active.px)
+
+
+def _closed(
+    active: _Active, keyframe: int, anchor: Anchor, past: deque[_Past]
+) -> Generator[Tracks, None, BoolArray]:
+    """Tracks that arrive where the next keyframe sees the same point, told from that keyframe's side.
+
+    Tracking such a point back would retrace the same path: it is moved to end in the keyframe's own
+    observation instead.
+
+    Returns:
+        (N,) which of the keyframe's points that covers.
+    """
+    _, here, there = np.intersect1d(active.anchor.point[active.slot], anchor.point, return_indices=True)
+    offset = anchor.px[there] - active.px[here]
+    close = np.linalg.norm(offset, axis=1) < _MAX_CLOSURE_PX * past[-1].picture.scale
+    here, there, offset = here[close], there[close], offset[close]
+    for item in past:
+        if len(here) == 0 or len(item.slot) == 0:
+            continue
+        at = np.searchsorted(item.slot, active.slot[here])
+        yield _tracks(item.picture.index, keyframe, anchor.feature[there], item.px[at] + offset)
+    arrived = np.zeros(len(anchor.px), dtype=bool)
+    arrived[there] = True
+    return arrived
 
 
 def _motion(first: _Picture, second: _Picture, active: _Active | None) -> FloatArray | None:
@@ -192,16 +273,14 @@ def _motion(first: _Picture, second: _Picture, active: _Active | None) -> FloatA
     return coarse_motion(first.coarse, second.coarse, guides, first.grey.shape[1])
 
 
-def _track_back(
-    picture: _Picture, anchor: Anchor, buffer: deque[tuple[_Picture, FloatArray | None]]
-) -> Iterator[Tracks]:
-    active = _Active(picture.index, anchor.feature, anchor.px)
+def _track_back(picture: _Picture, anchor: Anchor, past: deque[_Past]) -> Iterator[Tracks]:
+    active = _Active.at(picture.index, anchor)
     later = picture
-    for earlier, motion in reversed(buffer):
-        if not active.step(later, earlier, motion):
+    for item in reversed(past):
+        if not active.step(later, item.picture, item.motion):
             return
-        yield active.observe(earlier.index)
-        later = earlier
+        yield active.observe(item.picture.index)
+        later = item.picture
 
 
 def track_scale(camera: CaptureCamera) -> float:

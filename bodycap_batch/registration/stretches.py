@@ -1,0 +1,109 @@
+"""Which stretches of a video are tracked, and which are known from an earlier round."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from threading import Event, Lock
+
+import numpy as np
+
+from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.context import StageContext
+from bodycap_batch.registration.tracks import Anchor, Tracks, track_stretch
+from bodycap_batch.scene import FrameStatus, Registration
+
+_MIN_RANGE = 15
+"""A shorter rest is not worth a decoder of its own."""
+
+
+def all_tracks(
+    camera: CaptureCamera,
+    anchors: Mapping[int, Anchor],
+    previous: Registration | None,
+    context: StageContext,
+) -> Tracks:
+    """Track every stretch between neighbouring keyframes, or reuse what the last round tracked there."""
+    count = len(camera.times_ns)
+    frames = sorted(anchors)
+    stretches = list(zip([None, *frames], [*frames, None], strict=True))
+    known: set[tuple[int | None, int | None]] = set()
+    parts = []
+    if previous is not None:
+        status = previous.trajectory.status
+        before = [index for index, value in enumerate(status) if value is FrameStatus.KEYFRAME]
+        known = set(zip([None, *before], [*before, None], strict=True))
+        kept = [stretch for stretch in stretches if stretch in known]
+        parts.append(_reuse(previous, kept, count))
+    todo = _joined([stretch for stretch in stretches if stretch not in known], count)
+    return Tracks.join(parts + _track(camera, anchors, _shared_out(todo, frames, context.threads), context))
+
+
+def _track(
+    camera: CaptureCamera,
+    anchors: Mapping[int, Anchor],
+    ranges: list[tuple[int, int]],
+    context: StageContext,
+) -> list[Tracks]:
+    """Track ranges of frames, as many at a time as there are threads; what is found is the same."""
+    stopped, lock = Event(), Lock()
+    total = sum(stop - start for start, stop in ranges)
+    reached = [start for start, _ in ranges]
+
+    def work(index: int) -> list[Tracks]:
+        def told(frame: int) -> None:
+            with lock:
+                reached[index] = frame
+                done = sum(frame - start for frame, (start, _) in zip(reached, ranges, strict=True))
+                context.progress(done, total, "frames tracked")
+
+        halting = replace(context, cancelled=lambda: stopped.is_set() or context.cancelled())
+        found = []
+        for part in track_stretch(camera, anchors, *ranges[index], halting):
+            found.append(part)
+            if part.frame[0] > reached[index]:
+                told(int(part.frame[0]))
+        return found
+
+    with ThreadPoolExecutor(max_workers=max(1, context.threads), thread_name_prefix="track") as pool:
+        pending = [pool.submit(work, index) for index in range(len(ranges))]
+        try:
+            return [part for future in pending for part in future.result()]
+        finally:
+            stopped.set()
+
+
+def _shared_out(ranges: list[tuple[int, int]], keyframes: list[int], threads: int) -> list[tuple[int, int]]:
+    """Cut ranges at keyframes where they are longer than a thread's even share."""
+    total = sum(stop - start for start, stop in ranges)
+    share = -(-total // max(1, threads))
+    out = []
+    for start, stop in ranges:
+        begin = start
+        for keyframe in keyframes:
+            if begin + share <= keyframe < stop - 1 - _MIN_RANGE:
+                out.append((begin, keyframe + 1))
+                begin = keyframe
+        out.append((begin, stop))
+    return out
+
+
+def _joined(stretches: list[tuple[int | None, int | None]], count: int) -> list[tuple[int, int]]:
+    """Merge stretches that touch into ranges [start, stop) of frames, keyframes included."""
+    ranges: list[tuple[int, int]] = []
+    for first, last in stretches:
+        start, stop = first or 0, count if last is None else last + 1
+        if ranges and start < ranges[-1][1]:
+            ranges[-1] = (ranges[-1][0], stop)
+        else:
+            ranges.append((start, stop))
+    return ranges
+
+
+def _reuse(previous: Registration, stretches: list[tuple[int | None, int | None]], count: int) -> Tracks:
+    old = Tracks(previous.obs_frame, previous.obs_keyframe, previous.obs_feature, previous.obs_px)
+    inside = np.zeros(count, dtype=bool)
+    for first, last in stretches:
+        inside[(0 if first is None else first) : (count if last is None else last + 1)] = True
+    return old.select(inside[old.frame])

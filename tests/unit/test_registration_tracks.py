@@ -1,0 +1,105 @@
+"""Tracks between keyframes: told from both sides, the same whatever the number of threads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import cv2
+import numpy as np
+import pytest
+
+from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.context import StageContext
+from bodycap_batch.errors import Cancelled
+from bodycap_batch.registration.stretches import all_tracks
+from bodycap_batch.registration.tracks import Anchor, Tracks, track_stretch
+
+STEP_PX = np.array([3.5, -1.25])
+COUNT = 48
+CONTEXT = StageContext(work_dir=Path())
+
+
+def _video() -> CaptureCamera:
+    """A textured plane that slides by `STEP_PX` a frame."""
+    noise = np.random.default_rng(0).random((480, 640)).astype(np.float32)
+    texture = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.5), None, 0, 255, cv2.NORM_MINMAX)
+    images = [
+        cv2.warpAffine(texture, np.float32([[1, 0, dx], [0, 1, dy]]), (640, 480), borderMode=cv2.BORDER_WRAP)
+        for dx, dy in np.arange(COUNT)[:, None] * STEP_PX
+    ]
+
+    def grey_frames(start: int = 0, stop: int | None = None) -> Iterator[tuple[int, Any]]:
+        for index in range(*slice(start, stop).indices(COUNT)):
+            yield index, images[index].astype(np.uint8)
+
+    return cast("CaptureCamera", SimpleNamespace(times_ns=np.arange(COUNT), grey_frames=grey_frames))
+
+
+def _anchors(frames: list[int]) -> dict[int, Anchor]:
+    """A grid of points of the plane in each keyframe; a keyframe's detector is off by up to half a pixel."""
+    rng = np.random.default_rng(1)
+    grid = np.stack(np.meshgrid(np.arange(-120, 640, 40), np.arange(0, 600, 40)), axis=-1).reshape(-1, 2)
+    out = {}
+    for frame in frames:
+        px = grid + frame * STEP_PX
+        point = np.flatnonzero(((px > 25) & (px < (615, 455))).all(axis=1))
+        seen = px[point] + rng.uniform(-0.5, 0.5, (len(point), 2))
+        out[frame] = Anchor(np.arange(len(point)) * 2, point, seen.astype(np.float32))
+    return out
+
+
+def _shift_from_anchor(tracks: Tracks, anchors: dict[int, Anchor]) -> np.ndarray:
+    """(M,2) how much further each observation moved than the plane did."""
+    began = np.array(
+        [
+            anchors[k].px[f // 2]
+            for k, f in zip(tracks.keyframe.tolist(), tracks.feature.tolist(), strict=True)
+        ]
+    )
+    return tracks.px - began - (tracks.frame - tracks.keyframe)[:, None] * STEP_PX
+
+
+def test_points_are_followed_from_both_keyframes_and_end_in_their_observations() -> None:
+    anchors = _anchors([4, 20])
+    tracks = Tracks.join(list(track_stretch(_video(), anchors, 0, 30, CONTEXT)))
+    # Up to 16 steps of a few hundredths of a pixel each, and a wrapped border that enters some windows.
+    assert np.median(np.linalg.norm(_shift_from_anchor(tracks, anchors), axis=1)) < 0.15
+    for frame in (5, 12, 19):
+        for keyframe in (4, 20):
+            mine = (tracks.frame == frame) & (tracks.keyframe == keyframe)
+            assert mine.sum() > 0.7 * len(anchors[keyframe].px)
+            assert len(np.unique(tracks.feature[mine])) == mine.sum()
+    assert set(np.unique(tracks.frame[tracks.keyframe == 20])) == set(range(30)) - {20} - set(range(4))
+
+
+def test_a_point_seen_elsewhere_by_the_next_keyframe_is_followed_on_its_own() -> None:
+    anchors = _anchors([4, 12])
+    shared = np.isin(anchors[12].point, anchors[4].point)
+    other = np.roll(anchors[12].point, 1)
+    wrong = Anchor(anchors[12].feature, np.where(shared, other, anchors[12].point), anchors[12].px)
+    tracks = Tracks.join(list(track_stretch(_video(), {4: anchors[4], 12: wrong}, 4, 13, CONTEXT)))
+    # Were the neighbour's path taken for it, it would be off by the grid's 40 px.
+    assert np.linalg.norm(_shift_from_anchor(tracks, anchors), axis=1).max() < 5.0
+
+
+def test_threads_find_the_same_tracks_and_tell_growing_progress() -> None:
+    video, anchors = _video(), _anchors([2, 10, 17, 25, 33, 44])
+    told: list[int] = []
+    one = all_tracks(video, anchors, None, CONTEXT)
+    context = StageContext(
+        work_dir=Path(), threads=3, progress=lambda done, total, what="": told.append(done)
+    )
+    three = all_tracks(video, anchors, None, context)
+    for name in ("frame", "keyframe", "feature", "px"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
+    assert told == sorted(told)
+    assert len(told) > 20
+
+
+def test_cancelling_stops_all_threads() -> None:
+    context = StageContext(work_dir=Path(), threads=2, cancelled=lambda: True)
+    with pytest.raises(Cancelled):
+        all_tracks(_video(), _anchors([2, 20, 40]), None, context)
