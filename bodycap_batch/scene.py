@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,8 @@ import numpy as np
 
 from bodycap_batch.arrays import FloatArray, IntArray, set_array
 from bodycap_batch.camera import Camera
+
+_FEATURE_STRIDE = 1 << 24
 
 
 class FrameStatus(StrEnum):
@@ -76,6 +78,8 @@ class Map:
         obs_point: (M,) point index of each observation.
         obs_feature: (M,) feature index of each observation in its keyframe.
         obs_px: (M,2) observed pixel, COLMAP origin, work size.
+        readout_s: Time from the first row's exposure to the last's that the map was refined for, by
+            camera; its poses are those of the middle row's instant, `obs_px` is where the pixels were seen.
     """
 
     gauge: str
@@ -90,6 +94,7 @@ class Map:
     obs_point: IntArray
     obs_feature: IntArray
     obs_px: FloatArray
+    readout_s: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         keyframes, points, observations = len(self.keyframe_camera), len(self.points), len(self.obs_px)
@@ -107,6 +112,17 @@ class Map:
         """Indices (into this map's keyframes) of one camera's keyframes, by frame."""
         mine = np.flatnonzero(np.array([name == camera for name in self.keyframe_camera], dtype=bool))
         return np.asarray(mine[np.argsort(self.keyframe_frame[mine], kind="stable")], dtype=np.int64)
+
+    def points_of(self, camera: str, frame: IntArray, feature: IntArray) -> IntArray:
+        """Index of the point behind each (keyframe's frame, feature) of a camera; −1 where there is none."""
+        mine = np.isin(self.obs_keyframe, self.keyframes_of(camera))
+        known = self.keyframe_frame[self.obs_keyframe[mine]] * _FEATURE_STRIDE + self.obs_feature[mine]
+        if len(known) == 0:
+            return np.full(len(frame), -1, np.int64)
+        order = np.argsort(known, kind="stable")
+        wanted = frame * _FEATURE_STRIDE + feature
+        at = order[np.minimum(np.searchsorted(known, wanted, sorter=order), len(known) - 1)]
+        return np.asarray(np.where(known[at] == wanted, self.obs_point[mine][at], -1))
 
     def mean_error_px(self) -> float:
         """Mean reprojection error over observations' points."""

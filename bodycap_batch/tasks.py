@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from bodycap_batch.body import CameraClock, MergeInputs
     from bodycap_batch.camera import Camera
     from bodycap_batch.capture import Capture
-    from bodycap_batch.scene import MapResult, Registration, Trajectory
+    from bodycap_batch.scene import Map, MapResult, Registration, Trajectory
     from bodycap_batch.skeleton import Mount, SkeletonModel
 
 SUMMARY = "summary.json"
@@ -105,11 +105,22 @@ def _extend(options: Json, arguments: Json, context: StageContext, files: Path) 
     _save_map(extend_map(_capture(arguments), previous, extra, options_, context), files)
 
 
+def _refine(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    from bodycap_batch.config import MapOptions
+    from bodycap_batch.mapping import refine_map
+
+    paths = [_load_registration(path).trajectory for path in arguments["registrations"]]
+    previous = _load_map(arguments["previous"])
+    options_ = MapOptions.model_validate(options)
+    _save_map(refine_map(_capture(arguments), previous, paths, options_, context), files)
+
+
 def _registration(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
     from bodycap_batch.body import CameraClock
     from bodycap_batch.config import RegistrationOptions
     from bodycap_batch.formats.bundle import read_bundle, write_bundle
     from bodycap_batch.registration import register_frames
+    from bodycap_batch.rolling_shutter import looks_rolling
     from bodycap_batch.scene import KeyframeSelection
 
     camera = _capture(arguments).cameras[0]
@@ -118,6 +129,7 @@ def _registration(options: Json, arguments: Json, context: StageContext, files: 
     options_ = RegistrationOptions.model_validate(options)
     maps = _load_map(arguments["map"]).maps
     found = register_frames(camera, maps, selection, options_, context, previous)
+    known = camera.rolling_shutter_known
     write_bundle(found, files, "registration")
     clock = CameraClock(
         nominal_fps=camera.nominal_fps,
@@ -131,6 +143,7 @@ def _registration(options: Json, arguments: Json, context: StageContext, files: 
         frames=len(found.trajectory.status),
         localised=int(found.trajectory.localised.sum()),
         wanted=[int(frame) for frame in found.wanted_keyframes],
+        rolling=bool(camera.rolling_shutter_s) if known else looks_rolling(found, maps),
     )
 
 
@@ -153,7 +166,7 @@ def _export(options: Json, arguments: Json, context: StageContext, files: Path) 
     from bodycap_batch.scene import KeyframeSelection
 
     scene = _load_map(arguments["map"])
-    found = _Registered.load(arguments["registrations"])
+    found = _Registered.load(arguments["registrations"], scene.maps)
     merged = arguments["merge"]
     inputs = ExportInputs(
         out_dir=files / RESULTS,
@@ -206,7 +219,8 @@ def _load_registration(path: str) -> Registration:
 def _merge_inputs(arguments: Json) -> MergeInputs:
     from bodycap_batch.body import MergeInputs
 
-    found = _Registered.load(arguments["registrations"])
+    scene = _load_map(arguments["map"])
+    found = _Registered.load(arguments["registrations"], scene.maps)
     skeleton = _skeleton(arguments)
     return MergeInputs(
         trajectories=found.trajectories,
@@ -216,7 +230,7 @@ def _merge_inputs(arguments: Json) -> MergeInputs:
         skeleton_is_measured=arguments["skeleton_file"] is not None,
         height_m=arguments["height_m"],
         activity=arguments["activity"],
-        map_points={item.gauge: item.points for item in _load_map(arguments["map"]).maps},
+        map_points={item.gauge: item.points for item in scene.maps},
         row_fraction=found.row_fraction,
     )
 
@@ -230,13 +244,14 @@ class _Registered:
     row_fraction: Mapping[str, FloatArray]
 
     @staticmethod
-    def load(paths: Sequence[str]) -> _Registered:
-        """Read one artefact per camera; rows matter to cameras with a rolling shutter only."""
+    def load(paths: Sequence[str], maps: Sequence[Map]) -> _Registered:
+        """Read one artefact per camera; rows matter where a rolling shutter is still in the poses."""
         from bodycap_batch.body import CameraClock
         from bodycap_batch.camera import Camera
         from bodycap_batch.formats.bundle import read_bundle
 
         found = {path: _load_registration(path) for path in paths}
+        corrected = {name for each in maps for name in each.readout_s}
         clocks = {
             item.trajectory.camera: read_bundle(CameraClock, Path(path), "clock")
             for path, item in found.items()
@@ -248,6 +263,7 @@ class _Registered:
                 item.trajectory.camera: _row_fraction(item, read_bundle(Camera, Path(path), "camera"))
                 for path, item in found.items()
                 if clocks[item.trajectory.camera].rolling_shutter_s
+                and item.trajectory.camera not in corrected
             },
         )
 
@@ -312,6 +328,12 @@ STAGES = {
     ),
     "extend": Stage(
         function=_extend,
+        rooms=("mapping", *_KEPT),
+        libraries=(*_VISION, "pycolmap"),
+        modules=(*_SEEING, "pycolmap"),
+    ),
+    "refine": Stage(
+        function=_refine,
         rooms=("mapping", *_KEPT),
         libraries=(*_VISION, "pycolmap"),
         modules=(*_SEEING, "pycolmap"),

@@ -31,6 +31,7 @@ class CaptureCamera:
         nominal_fps: Frame rate the container states.
         offset_s: Common time = camera time + offset_s.
         rolling_shutter_s: Time from the first row's exposure to the last's.
+        rolling_shutter_known: False where the job does not state it: mapping looks for it in the data.
         notes: What opening found worth telling: gaps and overlaps of chapters, dropped frames.
         videos: Frame index of each chapter.
     """
@@ -44,6 +45,7 @@ class CaptureCamera:
     nominal_fps: float
     offset_s: float
     rolling_shutter_s: float
+    rolling_shutter_known: bool = True
     notes: tuple[str, ...] = ()
     videos: tuple[VideoFile, ...] = field(default=(), repr=False)
 

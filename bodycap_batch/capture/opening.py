@@ -60,6 +60,8 @@ def open_camera(spec: CaptureConfig, config: CameraConfig) -> CaptureCamera:
         nominal_fps=videos[0].fps,
         offset_s=offset_s,
         rolling_shutter_s=rolling_shutter_s,
+        # A quarter turn lets rows run along columns: nothing looks for a rolling shutter there.
+        rolling_shutter_known=config.rolling_shutter_s is not None or not videos[0].orientation[1][1],
         notes=(*timeline.notes, *rolling_notes),
         videos=videos,
     )

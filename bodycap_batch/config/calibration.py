@@ -78,7 +78,7 @@ class CalibrationEntry:
 
     calibration: Calibration
     offset_s: float
-    rolling_shutter_s: float
+    rolling_shutter_s: float | None
 
 
 def read_calibration(path: Path, camera: str) -> CalibrationEntry:
@@ -117,7 +117,9 @@ def read_calibration(path: Path, camera: str) -> CalibrationEntry:
     return CalibrationEntry(
         calibration=calibration,
         offset_s=_seconds(offset, path, f"{field}offsets_s"),
-        rolling_shutter_s=_seconds(data.get("rolling_shutter_s", 0.0), path, f"{field}rolling_shutter_s"),
+        rolling_shutter_s=None
+        if data.get("rolling_shutter_s") is None
+        else _seconds(data["rolling_shutter_s"], path, f"{field}rolling_shutter_s"),
     )
 
 

@@ -181,7 +181,7 @@ def _resolved_camera(camera: CameraConfig, index: int, capture: CaptureConfig, b
     if camera.offset_s is None:
         update["offset_s"] = entry.offset_s if entry else 0.0
     if camera.rolling_shutter_s is None:
-        update["rolling_shutter_s"] = entry.rolling_shutter_s if entry else 0.0
+        update["rolling_shutter_s"] = entry.rolling_shutter_s if entry else None
     return camera.model_copy(update=update)
 
 

@@ -90,7 +90,10 @@ class CameraConfig(_Block):
     )
     offset_s: Seconds | None = Field(None, description="common time = camera time + offset_s")
     rolling_shutter_s: float | None = Field(
-        None, ge=-1, le=1, description="time from the first row's exposure to the last's"
+        None,
+        ge=-1,
+        le=1,
+        description="time from the first row's exposure to the last's; default: found from the video",
     )
 
     @property

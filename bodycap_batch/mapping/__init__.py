@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from bodycap_batch.errors import EstimationError
 from bodycap_batch.mapping.convert import to_map
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, add_keyframes, image_ids
 from bodycap_batch.mapping.pairs import choose_pairs, match_pairs
+from bodycap_batch.mapping.rolling import RollingModel
 from bodycap_batch.mapping.solve import (
     MODELS_NAME,
     extend,
@@ -25,10 +27,13 @@ from bodycap_batch.mapping.solve import (
     refine,
     write_models,
 )
-from bodycap_batch.scene import KeyframeSelection, MapResult
+from bodycap_batch.scene import KeyframeSelection, MapResult, Trajectory
 from bodycap_batch.tracking import pixel_scale
 
-__all__ = ["build_map", "extend_map"]
+if TYPE_CHECKING:
+    import pycolmap
+
+__all__ = ["build_map", "extend_map", "refine_map"]
 
 
 def build_map(
@@ -130,6 +135,84 @@ def extend_map(
     write_models(workspace, models)
     log = {"keyframes": len(known) + len(new), "new_keyframes": len(new), "pairs": len(pairs)}
     return _result(models, workspace, log)
+
+
+def refine_map(
+    capture: Capture,
+    previous: MapResult,
+    trajectories: Sequence[Trajectory],
+    options: MapOptions,
+    context: StageContext,
+) -> MapResult:
+    """Take a rolling shutter's bending out of the map, with the motion that registration found.
+
+    Keypoints are moved to the instant of their image's middle row with the velocity that the neighbouring
+    frames' poses give, and all is adjusted once. A readout time that was not stated is estimated from the
+    keyframes themselves. Observations stay where they were found; `Map.readout_s` says how to move them.
+
+    Args:
+        capture: All cameras.
+        previous: The map so far; its workspace is copied, not changed.
+        trajectories: Every frame's pose in one of the previous map's gauges, by camera.
+        options: The stage's options.
+        context: Work folder.
+
+    Returns:
+        The refined models, each in a new gauge; those without a rolling shutter as they were.
+
+    Raises:
+        EstimationError: The adjustment failed.
+
+    Source: Hedborg et al., "Rolling shutter bundle adjustment", CVPR 2012, for the idea; velocities come
+        from the neighbouring frames instead of extra unknowns.
+    """
+    import pycolmap
+
+    workspace = context.work_dir / "workspace"
+    shutil.copytree(previous.workspace, workspace)
+    settings, constant = _settings(capture, workspace, options)
+    cameras = {camera.name: camera for camera in capture.cameras}
+    models, readouts = [], []
+    for number, scene_map in enumerate(previous.maps):
+        context.check_cancelled()
+        context.progress(number, len(previous.maps), "maps refined")
+        model = pycolmap.Reconstruction(str(workspace / MODELS_NAME / str(number)))
+        paths = {path.camera: path for path in trajectories if path.gauge == scene_map.gauge}
+        rolling = RollingModel(model, paths, cameras)
+        found = rolling.find(settings, constant)
+        readout_s = {name: each.seconds for name, each in found.items() if each.seconds}
+        if readout_s:
+            moved = rolling.moved(readout_s)
+            refine(moved, settings, constant)
+            rolling.move(moved, {})
+            model = moved
+        models.append(model)
+        readouts.append(found)
+    write_models(workspace, models)
+    log = {"rolling_shutter": [{name: asdict(each) for name, each in found.items()} for found in readouts]}
+    result = _result(models, workspace, {**previous.log, **log})
+    maps = [
+        replace(
+            item,
+            readout_s={name: each.seconds for name, each in found.items() if each.seconds},
+        )
+        for item, found in zip(result.maps, readouts, strict=True)
+    ]
+    return replace(result, maps=tuple(maps))
+
+
+def _settings(
+    capture: Capture, workspace: Path, options: MapOptions
+) -> tuple[pycolmap.IncrementalPipelineOptions, list[int]]:
+    """The mapper's settings for a workspace that exists, and the ids of its calibrated cameras."""
+    import pycolmap
+
+    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+        cameras = {
+            ImageRef.parse(image.name).camera: int(image.camera_id) for image in database.read_all_images()
+        }
+    constant = _constant(capture, cameras)
+    return mapper_options(options, constant, _scale(capture)), constant
 
 
 def _common_ns(capture: Capture) -> dict[str, IntArray]:

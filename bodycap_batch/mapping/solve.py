@@ -152,16 +152,44 @@ def write_models(workspace: Path, models: list[Any]) -> None:
 def refine(
     model: Any, settings: pycolmap.IncrementalPipelineOptions, constant_cameras: Collection[int]
 ) -> None:
+    """One bundle adjustment over the whole model, every pose free, outliers taken out; the gauge moves.
+
+    Raises:
+        EstimationError: The adjustment failed.
+    """
+    import pycolmap
+
+    adjust(model, settings, constant_cameras)
+    pycolmap.ObservationManager(model).filter_all_points3D(
+        settings.mapper.filter_max_reproj_error, settings.mapper.filter_min_tri_angle
+    )
+    model.update_point_3d_errors()
+
+
+def adjust(
+    model: Any,
+    settings: pycolmap.IncrementalPipelineOptions,
+    constant_cameras: Collection[int],
+    iterations: int | None = None,
+) -> None:
     """One bundle adjustment over the whole model, every pose free; the gauge moves.
+
+    Args:
+        model: A reconstruction, changed in place.
+        settings: The mapper's settings.
+        constant_cameras: Ids of calibrated cameras.
+        iterations: At most so many; the settings' own number by default.
 
     Raises:
         EstimationError: The adjustment failed.
 
-    Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999; outliers are taken out after it.
+    Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999.
     """
     import pycolmap
 
-    adjust = settings.get_global_bundle_adjustment()
+    adjustment = settings.get_global_bundle_adjustment()
+    if iterations is not None:
+        adjustment.ceres.solver_options.max_num_iterations = iterations
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
@@ -169,14 +197,9 @@ def refine(
         if model.exists_camera(camera_id):
             config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    summary = pycolmap.create_default_bundle_adjuster(adjust, config, model).solve()
+    summary = pycolmap.create_default_bundle_adjuster(adjustment, config, model).solve()
     if not summary.is_solution_usable():
         raise EstimationError(
-            f"the grown map of {model.num_reg_images()} keyframes could not be refined: "
-            f"{summary.brief_report()}",
+            f"the map of {model.num_reg_images()} keyframes could not be refined: {summary.brief_report()}",
             hint="set registration: {rounds: 0} to keep the map as it was first built",
         )
-    pycolmap.ObservationManager(model).filter_all_points3D(
-        settings.mapper.filter_max_reproj_error, settings.mapper.filter_min_tri_angle
-    )
-    model.update_point_3d_errors()

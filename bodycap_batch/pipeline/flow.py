@@ -168,6 +168,27 @@ class Flow:
             scene, registrations = grown, again
         return scene, registrations
 
+    def refine(
+        self, scene: Artefact, registrations: ByCamera, keyframes: ByCamera
+    ) -> tuple[Artefact, ByCamera]:
+        """Where a camera's shutter rolls: the map without its bending, and every pose solved again."""
+        if not any(read_summary(item.path)["rolling"] for item in registrations.values()):
+            return scene, registrations
+        inputs = {
+            "cameras": self._digests,
+            "map": scene.digest,
+            "registrations": _content(registrations),
+        }
+        arguments = {
+            "capture": all_cameras(self._job.capture),
+            "previous": str(scene.path),
+            "registrations": [str(item.path) for item in registrations.values()],
+        }
+        key = key_of("refine", self._map_options(), inputs)
+        refined = self._one(Task(key=key, arguments=arguments, threads=self._settings.threads))
+        last = self._job.registration.rounds + 1
+        return refined, self.registrations(refined, keyframes, registrations, last)
+
     def merge(self, scene: Artefact, registrations: ByCamera) -> Artefact:
         """The skeleton's motion, in the world."""
         options = self._job.merge.model_dump(mode="json")

@@ -70,6 +70,7 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
         scene = flow.map(keyframes)
         registrations = flow.registrations(scene, keyframes)
         scene, registrations = flow.grow(scene, registrations, keyframes)
+        scene, registrations = flow.refine(scene, registrations, keyframes)
         merged, failure = _merge(job, flow, scene, registrations)
         exported = flow.export(keyframes, scene, registrations, merged, failure)
     summary = RunSummary(

@@ -18,6 +18,7 @@ from bodycap_batch.registration.jumps import pose_jumps
 from bodycap_batch.registration.pose import FramePose, PoseLimits, solve_poses
 from bodycap_batch.registration.stretches import all_tracks
 from bodycap_batch.registration.tracks import Tracks, anchors_of, track_scale
+from bodycap_batch.rolling_shutter import at_mid_row, image_velocity
 from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 
 __all__ = ["register_frames"]
@@ -26,6 +27,8 @@ _MAP_NOISE_PX = 0.6
 _THRESHOLD_SIGMAS = 3.5
 _BLUR_RATIO = 0.6
 _BLUR_WINDOW = 15
+_ROLLING_PASSES = 2
+"""The velocity that moves pixels comes from the poses that the moved pixels give."""
 
 
 def register_frames(
@@ -59,8 +62,7 @@ def register_frames(
         return _without_map(camera, tried)
     anchors = anchors_of(scene_map, camera.name)
     tracks = all_tracks(camera, anchors, previous, context)
-    lookup = _PointLookup.of(scene_map, camera.name)
-    poses = _solve_all(camera, scene_map, lookup, tracks, _limits(camera, selection, options))
+    poses = _solve_all(camera, scene_map, tracks, _limits(camera, selection, options))
     trajectory = _trajectory(camera, scene_map.gauge, poses, selection.sharpness)
     return Registration(
         trajectory=trajectory,
@@ -108,55 +110,41 @@ def _without_map(camera: CaptureCamera, tried: IntArray) -> Registration:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _PointLookup:
-    """From (keyframe, feature) to the map's point."""
-
-    key: IntArray
-    point: IntArray
-
-    _STRIDE = 1 << 24
-
-    @staticmethod
-    def of(scene_map: Map, camera: str) -> _PointLookup:
-        mine = np.isin(scene_map.obs_keyframe, scene_map.keyframes_of(camera))
-        frame = scene_map.keyframe_frame[scene_map.obs_keyframe[mine]]
-        key = frame * _PointLookup._STRIDE + scene_map.obs_feature[mine]
-        order = np.argsort(key, kind="stable")
-        return _PointLookup(key[order], scene_map.obs_point[mine][order])
-
-    def points(self, keyframe: IntArray, feature: IntArray) -> IntArray:
-        """Point index of each (keyframe, feature); −1 where the map has none."""
-        if len(self.key) == 0:
-            return np.full(len(keyframe), -1, np.int64)
-        wanted = keyframe * _PointLookup._STRIDE + feature
-        at = np.minimum(np.searchsorted(self.key, wanted), len(self.key) - 1)
-        return np.where(self.key[at] == wanted, self.point[at], -1)
-
-
-def _solve_all(
-    camera: CaptureCamera, scene_map: Map, lookup: _PointLookup, tracks: Tracks, limits: PoseLimits
-) -> list[FramePose]:
+def _solve_all(camera: CaptureCamera, scene_map: Map, tracks: Tracks, limits: PoseLimits) -> list[FramePose]:
     """Solve every frame from its tracks and, in a keyframe, from the map's own observations."""
-    point = lookup.points(tracks.keyframe, tracks.feature)
+    point = scene_map.points_of(camera.name, tracks.keyframe, tracks.feature)
     tracked = point >= 0
     rows = scene_map.keyframes_of(camera.name)
     mine = np.isin(scene_map.obs_keyframe, rows)
     own_frame = scene_map.keyframe_frame[scene_map.obs_keyframe[mine]]
     frame = np.concatenate([own_frame, tracks.frame[tracked]])
     order = np.argsort(frame, kind="stable")
-    point = np.concatenate([scene_map.obs_point[mine], point[tracked]])[order]
+    points = scene_map.points[np.concatenate([scene_map.obs_point[mine], point[tracked]])[order]]
     px = np.concatenate([scene_map.obs_px[mine], tracks.px[tracked].astype(np.float64)])[order]
     count = len(camera.times_ns)
     lens = scene_map.cameras[camera.name]
-    views = make_views(lens, np.searchsorted(frame[order], np.arange(count + 1)), scene_map.points[point], px)
+    bounds = np.searchsorted(frame[order], np.arange(count + 1))
     keyframes = scene_map.keyframe_frame[rows]
     start = _between(keyframes, scene_map.map_from_cam[rows], count)
-    poses = solve_poses(lens, views, px, start, limits)
+    poses = solve_poses(lens, make_views(lens, bounds, points, px), px, start, limits)
+    readout_s = scene_map.readout_s.get(camera.name, 0.0)
+    for _ in range(_ROLLING_PASSES if readout_s else 0):
+        path = _matrices(poses)
+        velocity = image_velocity(lens, path, camera.times_ns, frame[order], points)
+        moved = at_mid_row(lens, px, velocity, readout_s)
+        start = np.where(np.isfinite(path), invert(path), start)
+        poses = solve_poses(lens, make_views(lens, bounds, points, moved), moved, start, limits)
     for index in keyframes.tolist():
         if poses[index].status is FrameStatus.REGISTERED:
             poses[index] = replace(poses[index], status=FrameStatus.KEYFRAME)
     return _without_jumps(poses)
+
+
+def _matrices(poses: Sequence[FramePose]) -> FloatArray:
+    """Poses gauge_from_cam (N,4,4), NaN where there is none."""
+    none = np.full((4, 4), np.nan)
+    found = [none if pose.gauge_from_cam is None else pose.gauge_from_cam for pose in poses]
+    return np.array(found).reshape(-1, 4, 4)
 
 
 def _between(keyframes: IntArray, map_from_cam: FloatArray, count: int) -> FloatArray:
@@ -189,15 +177,13 @@ def _without_jumps(poses: list[FramePose]) -> list[FramePose]:
 def _trajectory(
     camera: CaptureCamera, gauge: str, poses: Sequence[FramePose], sharpness: FloatArray
 ) -> Trajectory:
-    none4, none6 = np.full((4, 4), np.nan), np.full((6, 6), np.nan)
+    none6 = np.full((6, 6), np.nan)
     return Trajectory(
         camera=camera.name,
         gauge=gauge,
         frame_numbers=camera.frame_numbers,
         times_ns=camera.times_ns,
-        gauge_from_cam=np.array(
-            [none4 if pose.gauge_from_cam is None else pose.gauge_from_cam for pose in poses]
-        ).reshape(-1, 4, 4),
+        gauge_from_cam=_matrices(poses),
         covariance=np.array(
             [none6 if pose.covariance is None else pose.covariance for pose in poses]
         ).reshape(-1, 6, 6),

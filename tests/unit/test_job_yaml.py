@@ -52,7 +52,7 @@ def test_only_the_capture_is_needed(tmp_path: Path) -> None:
     assert palm.video == (tmp_path / "left/a.mp4", tmp_path / "left/b.mp4")
     assert (torso.role, palm.role) == ("Spine1", "LeftHand")
     assert torso.calibration == "auto"
-    assert (torso.offset_s, torso.rolling_shutter_s) == (0.0, 0.0)
+    assert (torso.offset_s, torso.rolling_shutter_s) == (0.0, None)
 
 
 def test_a_resolved_job_survives_json(tmp_path: Path) -> None:

@@ -1,0 +1,175 @@
+"""Rows exposed one after another: where pixels are at the middle row's instant, and the readout time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bodycap_batch.arrays import FloatArray, IntArray
+from bodycap_batch.camera import Camera
+from bodycap_batch.config import MapOptions
+from bodycap_batch.geometry import invert, make_transform, so3_exp
+from bodycap_batch.mapping.rolling import RollingModel
+from bodycap_batch.mapping.solve import mapper_options
+from bodycap_batch.rolling_shutter import apparent_readout, at_mid_row, image_velocity
+from bodycap_batch.scene import FrameStatus, Trajectory
+
+LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([400.0, 400.0, 320.0, 240.0]))
+FRAMES = 90
+FRAME_S = 1 / 30
+NOISE_PX = 0.3
+
+
+def poses_at(time_s: FloatArray) -> FloatArray:
+    """A hand-held wobble before a wall: map_from_cam (N,4,4)."""
+    phase = 2 * np.pi * time_s
+    centre = [0.5 * np.sin(0.7 * phase), 0.3 * np.cos(1.1 * phase), 0.2 * np.sin(0.9 * phase)]
+    turn = [0.25 * np.sin(0.8 * phase), 0.3 * np.cos(0.6 * phase), 0.2 * np.sin(phase)]
+    return make_transform(so3_exp(np.stack(turn, axis=1)), np.stack(centre, axis=1))
+
+
+@dataclass
+class Film:
+    """Points seen by a camera whose rows are exposed one after another."""
+
+    readout_s: float
+
+    def __post_init__(self) -> None:
+        self.rng = np.random.default_rng(5)
+        self.points = self.rng.uniform((-4, -3, 3), (4, 3, 6), (500, 3))
+        self.times_s = np.arange(FRAMES) * FRAME_S
+        self.map_from_cam = poses_at(self.times_s)
+
+    def seen(self, frame: int) -> tuple[IntArray, FloatArray]:
+        """Points in view and their pixels: each where it is when its own row is exposed."""
+        delay = np.zeros(len(self.points))
+        for _ in range(4):
+            cam_from_map = invert(poses_at(self.times_s[frame] + delay))
+            px = LENS.project(
+                np.einsum("mij,mj->mi", cam_from_map[:, :3, :3], self.points) + cam_from_map[:, :3, 3]
+            )
+            delay = (np.clip(px[:, 1] / 480.0, 0, 1) - 0.5) * self.readout_s
+        inside = ((px > 0) & (px < (640, 480))).all(axis=1)
+        return np.flatnonzero(inside), px[inside] + self.rng.normal(0, NOISE_PX, (int(inside.sum()), 2))
+
+    def trajectory(self) -> Trajectory:
+        return Trajectory(
+            camera="head",
+            gauge="a",
+            frame_numbers=np.arange(FRAMES),
+            times_ns=np.round(self.times_s * 1e9).astype(np.int64),
+            gauge_from_cam=self.map_from_cam,
+            covariance=np.broadcast_to(np.eye(6), (FRAMES, 6, 6)),
+            status=(FrameStatus.REGISTERED,) * FRAMES,
+            inliers=np.full(FRAMES, 100),
+            error_px=np.full(FRAMES, 0.5),
+        )
+
+
+def the_map(film: Film, keyframes: range) -> Any:
+    """COLMAP's model of some frames: their pixels as seen, poses and points of the truth."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    camera = LENS.to_pycolmap()
+    camera.camera_id = 1
+    model.add_camera_with_trivial_rig(camera)
+    tracks: dict[int, Any] = {}
+    for number, frame in enumerate(keyframes, start=1):
+        points, px = film.seen(frame)
+        image = pycolmap.Image(name=f"head/{frame:07d}", camera_id=1, image_id=number)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in px])
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(invert(film.map_from_cam[frame])[:3]))
+        for feature, point in enumerate(points.tolist()):
+            tracks.setdefault(point, pycolmap.Track()).add_element(number, feature)
+    for point, track in tracks.items():
+        if track.length() >= 2:
+            model.add_point3D(film.points[point], track)
+    return model
+
+
+def found(readout_s: float, *, known: bool = False, stated_s: float = 0.0) -> Any:
+    film = Film(readout_s)
+    camera = SimpleNamespace(
+        rolling_shutter_known=known, rolling_shutter_s=stated_s, times_ns=film.trajectory().times_ns
+    )
+    rolling = RollingModel(
+        the_map(film, range(1, FRAMES, 5)),
+        {"head": film.trajectory()},
+        {"head": camera},  # type: ignore[dict-item]
+    )
+    return rolling.find(mapper_options(MapOptions(), [1], 1.0), [1])["head"]
+
+
+@pytest.mark.parametrize("readout_s", [0.02, -0.012])
+def test_the_readout_time_is_found_in_the_keypoints_alone(readout_s: float) -> None:
+    readout = found(readout_s)
+    assert readout.source == "estimated"
+    # Velocities are differences over two frames, 67 ms: their curvature biases by a few per cent.
+    assert abs(readout.seconds - readout_s) < 0.1 * abs(readout_s)
+    assert 0 < readout.sigma_s < 0.001
+
+
+def test_a_global_shutter_is_left_alone() -> None:
+    readout = found(0.0)
+    assert (readout.seconds, readout.source) == (0.0, "none found")
+    assert abs(readout.best_s) < 5 * readout.sigma_s
+
+
+def test_a_stated_readout_time_is_not_looked_for() -> None:
+    readout = found(0.02, known=True, stated_s=0.017)
+    assert (readout.seconds, readout.source) == (0.017, "stated")
+
+
+def test_pixels_move_to_where_they_are_at_the_middle_row() -> None:
+    film = Film(0.02)
+    frame = 40
+    points, px = film.seen(frame)
+    velocity = image_velocity(
+        LENS,
+        film.map_from_cam,
+        film.trajectory().times_ns,
+        np.full(len(points), frame),
+        film.points[points],
+    )
+    cam_from_map = invert(film.map_from_cam[frame])
+    there = LENS.project(film.points[points] @ cam_from_map[:3, :3].T + cam_from_map[:3, 3])
+    moved = at_mid_row(LENS, px, velocity, 0.02)
+    before, after = (np.sqrt(((each - there) ** 2).sum(1).mean()) for each in (px, moved))
+    assert before > 2.0
+    assert after < 2.0 * NOISE_PX, "little but the pixels' own noise (√2 σ) is left"
+
+
+def test_velocity_is_zero_without_neighbours() -> None:
+    film = Film(0.0)
+    lonely = np.full_like(film.map_from_cam, np.nan)
+    lonely[40] = film.map_from_cam[40]
+    velocity = image_velocity(
+        LENS, lonely, film.trajectory().times_ns, np.full(3, 40), np.array([[0.0, 0.0, 5.0]] * 3)
+    )
+    assert (velocity == 0).all()
+
+
+@pytest.mark.parametrize(("readout_s", "shows"), [(0.02, True), (0.0, False)])
+def test_a_rolling_shutter_shows_in_the_residuals(readout_s: float, shows: bool) -> None:
+    film = Film(readout_s)
+    frames, pixels, residuals, seen = [], [], [], []
+    for frame in range(5, 60, 3):
+        points, px = film.seen(frame)
+        cam_from_map = invert(film.map_from_cam[frame])
+        projected = LENS.project(film.points[points] @ cam_from_map[:3, :3].T + cam_from_map[:3, 3])
+        frames.append(np.full(len(points), frame))
+        pixels.append(px)
+        residuals.append(px - projected)
+        seen.append(film.points[points])
+    frame_of, points_of = np.concatenate(frames), np.concatenate(seen)
+    velocity = image_velocity(LENS, film.map_from_cam, film.trajectory().times_ns, frame_of, points_of)
+    apparent_s, sigma_s = apparent_readout(
+        LENS, frame_of, np.concatenate(pixels), np.concatenate(residuals), velocity
+    )
+    assert (abs(apparent_s) > 8 * sigma_s) is shows
+    assert not shows or 0.001 < apparent_s < 0.021
