@@ -11,6 +11,7 @@ import numpy as np
 from bodycap_batch.capture import CaptureCamera, open_camera
 from bodycap_batch.check.pictures import look_at_frames
 from bodycap_batch.check.report import CameraFinding, CheckReport
+from bodycap_batch.check.settings import setting_notes
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, Job
 from bodycap_batch.errors import BodycapError, CaptureError, JobError, StoreError
@@ -85,6 +86,7 @@ def _finding(camera: CaptureCamera, config: CameraConfig, notes: list[str]) -> C
             *camera.notes,
             *notes,
             *_rate_notes(camera, usual),
+            *setting_notes(camera),
             *_lens_notes(camera),
             *_short(duration),
         ),

@@ -1,0 +1,134 @@
+"""Camera settings that spoil a capture, as far as the files tell: stabilisation, zoom, a varying rate."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from bodycap_batch.arrays import IntArray
+from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.capture.video import open_container
+
+_CONTAINERS = (b"moov", b"udta")
+_GOPRO = b"GPMF"
+_MAX_SETTINGS_BYTES = 1 << 20
+_UNSTABILISED = ("", "N", "N/A", "NA", "OFF", "NONE")
+_PHONES = {
+    "com.apple.quicktime.model": "com.apple.quicktime.make",
+    "com.android.model": "com.android.manufacturer",
+}
+"""Keys of a phone's model and of its maker."""
+_VARYING = 1.5
+"""The slowest of 20 frames takes so many times as long as the fastest: more than jitter."""
+_DROPPED = 1.75
+"""A step of so many usual ones has a lost frame in it ..."""
+_MOSTLY = 0.75
+"""... unless every fourth is like that."""
+
+
+def setting_notes(camera: CaptureCamera) -> list[str]:
+    """What the first chapter's metadata and the frame times say of the camera's settings."""
+    path = camera.chapters[0]
+    return [*_gopro_notes(gopro_settings(path)), *_phone_notes(path), *_rate_notes(camera.times_ns)]
+
+
+def gopro_settings(path: Path) -> dict[str, str]:
+    """A GoPro's settings by four-letter key, empty for another camera's file.
+
+    Source: the GPMF key-length-value format as GoPro publishes it; the box ``moov/udta/GPMF`` of an MP4.
+    """
+    with path.open("rb") as handle:
+        handle.seek(0, 2)
+        data = _find_box(handle, 0, handle.tell())
+    return dict(_values(data)) if data else {}
+
+
+def _find_box(handle: BinaryIO, start: int, end: int) -> bytes | None:
+    """Content of the first settings box between two places of an MP4, None where there is none."""
+    while start + 8 <= end:
+        handle.seek(start)
+        header = handle.read(16)
+        if len(header) < 8:
+            return None
+        size, kind = struct.unpack(">I4s", header[:8])
+        content = 8
+        if size == 1 and len(header) == 16:
+            size, content = struct.unpack(">Q", header[8:])[0], 16
+        size = end - start if size == 0 else size
+        if size < content:
+            return None
+        if kind == _GOPRO and size <= _MAX_SETTINGS_BYTES:
+            handle.seek(start + content)
+            return handle.read(size - content)
+        if kind in _CONTAINERS:
+            found = _find_box(handle, start + content, min(start + size, end))
+            if found is not None:
+                return found
+        start += size
+    return None
+
+
+def _values(data: bytes) -> Iterator[tuple[str, str]]:
+    """Texts among the key-length-value items, nested ones too; each is padded to four bytes."""
+    place = 0
+    while place + 8 <= len(data):
+        key, kind, size, repeat = struct.unpack(">4sBBH", data[place : place + 8])
+        length = size * repeat
+        content = data[place + 8 : place + 8 + length]
+        if kind == 0:
+            yield from _values(content)
+        elif kind == ord("c"):
+            yield key.decode("ascii", "replace"), content.decode("latin-1").strip("\0 ")
+        place += 8 + (length + 3) // 4 * 4
+
+
+def _gopro_notes(settings: dict[str, str]) -> list[str]:
+    notes = []
+    mode = settings.get("EISA", "")
+    if settings.get("EISE", mode).upper() not in _UNSTABILISED:
+        told = f" ({mode})" if mode.upper() not in (*_UNSTABILISED, "Y") else ""
+        notes.append(
+            f"stabilised in the camera{told}: the picture moves against the lens and no calibration fits it; "
+            "film again with HyperSmooth off"
+        )
+    if settings.get("DZOM", "N").upper() not in _UNSTABILISED:
+        notes.append(
+            "filmed with digital zoom: the calibration has to be of the same zoom; film without, "
+            "or calibrate with it"
+        )
+    return notes
+
+
+def _phone_notes(path: Path) -> list[str]:
+    with open_container(path) as container:
+        metadata = dict(container.metadata)
+    for model, maker in _PHONES.items():
+        if metadata.get(model):
+            name = " ".join(part for part in (metadata.get(maker, ""), metadata[model]) if part)
+            return [
+                f"filmed with a phone ({name}): its own app stabilises and refocuses; film with an app that "
+                "can switch stabilisation off and lock focus and zoom"
+            ]
+    return []
+
+
+def _rate_notes(times_ns: IntArray) -> list[str]:
+    """A rate that varies, beyond frames that were dropped."""
+    steps = np.diff(times_ns)
+    if len(steps) < 20:
+        return []
+    usual = float(np.median(steps))
+    single = steps[steps < _DROPPED * usual]
+    if len(single) < _MOSTLY * len(steps):
+        single = steps
+    fast, slow = np.percentile(single, [5, 95])
+    if slow < _VARYING * fast:
+        return []
+    return [
+        f"the frame rate varies between {1e9 / slow:.0f} and {1e9 / fast:.0f} per second, exposure "
+        "with it; set a fixed rate (in phones: automatic frame rate off)"
+    ]
