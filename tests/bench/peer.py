@@ -1,4 +1,4 @@
-"""The child process of a peer: COLMAP on every frame, with the features and retrieval the product uses.
+"""The child process of a peer: COLMAP on every frame, with its own features and matcher and our retrieval.
 
 ``python -m tests.bench.peer TASK.json``: what the parent, `tests.bench.peers`, writes. ``database`` extracts
 and matches, ``incremental`` and ``global`` map a copy of that database. Figures go to the task's ``report``
@@ -13,7 +13,6 @@ import shutil
 import sys
 import time
 import zlib  # noqa: F401 - before pycolmap, else compression breaks in the process
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,23 +21,11 @@ import numpy as np
 import pycolmap
 
 from bodycap_batch.capture import Capture, open_capture
-from bodycap_batch.config import MapOptions
 from bodycap_batch.config.job import load_job
-from bodycap_batch.context import StageContext
 from bodycap_batch.formats.tum import TimedPoses, write_tum
-from bodycap_batch.mapping.database import (
-    DATABASE_NAME,
-    ImageRef,
-    add_camera,
-    add_keyframes,
-    image_ids,
-)
-from bodycap_batch.mapping.pairs import match_pairs
-from bodycap_batch.mapping.retrieval import similarity
-from bodycap_batch.tracking import pixel_scale
-from tests.bench.peer_pairs import pairs_of
+from tests.bench import peer_database
+from tests.bench.peer_database import DATABASE_NAME
 
-_FEATURES = 2048
 _MAX_EXTRA_PARAM = 1e3
 """COLMAP's own limit of 1 drops lenses with k3 > 1 silently; the calibration is given, so it is trusted."""
 
@@ -69,31 +56,10 @@ class Report:
 
 def prepare(capture: Capture, workspace: Path, threads: int, report: Report) -> None:
     """Features of every frame, and the matches of one list of pairs for both mappers."""
-    context = StageContext(work_dir=workspace, threads=threads)
-    options = MapOptions(features=_FEATURES)
-    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
-        ids = {camera.name: add_camera(database, camera) for camera in capture.cameras}
-    every = [
-        (camera, ids[camera.name], np.arange(len(camera.times_ns), dtype=np.int64))
-        for camera in capture.cameras
-    ]
-    report.timed("features", lambda: add_keyframes(workspace, every, options, context))
-    pairs = report.timed("pairs", lambda: _pairs(capture, workspace))
+    report.timed("features", lambda: peer_database.write_features(capture, workspace, threads))
+    pairs = report.timed("pairs", lambda: peer_database.choose(capture, workspace))
     report.values["pairs"] = len(pairs)
-    scale = max(pixel_scale(c.camera.width_px, c.camera.height_px) for c in capture.cameras)
-    report.timed("matching", lambda: match_pairs(workspace, pairs, options, context, scale))
-
-
-def _pairs(capture: Capture, workspace: Path) -> list[tuple[ImageRef, ImageRef]]:
-    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
-        ids = image_ids(database)
-        images = sorted(ids)
-        descriptors = [np.asarray(database.read_descriptors(ids[ref]).data) for ref in images]
-    alike = similarity(descriptors, 0)
-    common = {camera.name: camera.common_times_ns() for camera in capture.cameras}
-    times = np.array([common[ref.camera][ref.frame] for ref in images])
-    cameras = np.array([ref.camera for ref in images])
-    return [(images[a], images[b]) for a, b in pairs_of(cameras, times, alike)]
+    report.timed("matching", lambda: peer_database.match(capture, workspace, pairs, threads))
 
 
 def incremental(workspace: Path, threads: int) -> list[Any]:
@@ -141,17 +107,17 @@ def write_results(capture: Capture, models: list[Any], out: Path, report: Report
     if not models:
         return
     largest = max(models, key=lambda model: int(model.num_reg_images()))
-    posed: dict[ImageRef, np.ndarray] = {}
+    posed: dict[str, dict[int, np.ndarray]] = {camera.name: {} for camera in capture.cameras}
     for image_id in largest.reg_image_ids():
         image = largest.image(image_id)
+        camera_name, _, frame = image.name.rpartition("/")
         pose = np.eye(4)
         pose[:3] = image.cam_from_world().inverse().matrix()
-        posed[ImageRef.parse(image.name)] = pose
-    counts = Counter(ref.camera for ref in posed)
+        posed[camera_name][int(frame)] = pose
     for camera in capture.cameras:
-        if counts[camera.name]:
-            frames = sorted(ref.frame for ref in posed if ref.camera == camera.name)
-            poses = np.array([posed[ImageRef(camera.name, frame)] for frame in frames])
+        frames = sorted(posed[camera.name])
+        if frames:
+            poses = np.array([posed[camera.name][frame] for frame in frames])
             timed = TimedPoses(times_ns=camera.times_ns[frames], world_from_cam=poses)
             write_tum(out / "trajectories" / f"{camera.name}.tum", timed, ("the mapper's own gauge",))
 
