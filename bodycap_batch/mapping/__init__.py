@@ -11,13 +11,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bodycap_batch.arrays import IntArray
+from bodycap_batch.camera import Camera
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.mapping.convert import to_map
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, add_keyframes, image_ids
-from bodycap_batch.mapping.pairs import choose_pairs, match_pairs
+from bodycap_batch.mapping.matching import match_pairs
+from bodycap_batch.mapping.pairs import choose_pairs
 from bodycap_batch.mapping.rolling import RollingModel
 from bodycap_batch.mapping.solve import (
     MODELS_NAME,
@@ -71,10 +73,10 @@ def build_map(
     refs = [ImageRef(item.camera, int(frame)) for item in selections for frame in item.frames]
     scale = _scale(capture)
     pairs = choose_pairs(workspace, refs, _common_ns(capture), options)
-    match_pairs(workspace, pairs, options, context, scale)
+    held = match_pairs(workspace, pairs, _lenses(capture), context)
     settings = mapper_options(options, _constant(capture, cameras), scale)
     models, ladder = reconstruct(workspace, settings, context, len(refs))
-    log = {"keyframes": len(refs), "pairs": len(pairs), "initial_pair_ladder": ladder}
+    log = {"keyframes": len(refs), "pairs": len(pairs), "verified_pairs": held, "initial_pair_ladder": ladder}
     _require_coverage(models, len(refs), ladder, options)
     write_models(workspace, models)
     return _result(models, workspace, log)
@@ -121,7 +123,7 @@ def extend_map(
     add_keyframes(workspace, wanted, options, context)
     scale = _scale(capture)
     pairs = choose_pairs(workspace, new, _common_ns(capture), options)
-    match_pairs(workspace, pairs, options, context, scale)
+    held = match_pairs(workspace, pairs, _lenses(capture), context)
     constant = _constant(capture, cameras)
     models = []
     for number in range(len(previous.maps)):
@@ -133,7 +135,8 @@ def extend_map(
         refine(model, settings, constant)
         models.append(model)
     write_models(workspace, models)
-    log = {"keyframes": len(known) + len(new), "new_keyframes": len(new), "pairs": len(pairs)}
+    log = {"keyframes": len(known) + len(new), "new_keyframes": len(new)}
+    log |= {"pairs": len(pairs), "verified_pairs": held}
     return _result(models, workspace, log)
 
 
@@ -217,6 +220,10 @@ def _settings(
 
 def _common_ns(capture: Capture) -> dict[str, IntArray]:
     return {camera.name: camera.common_times_ns() for camera in capture.cameras}
+
+
+def _lenses(capture: Capture) -> dict[str, tuple[Camera, bool]]:
+    return {item.name: (item.camera, item.calibrated) for item in capture.cameras}
 
 
 def _scale(capture: Capture) -> float:

@@ -42,6 +42,9 @@ class ImageRef:
         return ImageRef(camera, int(frame))
 
 
+Pair = tuple[ImageRef, ImageRef]
+
+
 def image_ids(database: pycolmap.Database) -> dict[ImageRef, int]:
     """Image id of every keyframe in the database."""
     return {ImageRef.parse(image.name): int(image.image_id) for image in database.read_all_images()}

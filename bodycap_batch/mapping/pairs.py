@@ -1,8 +1,8 @@
-"""Which keyframe pairs are matched, and their geometric verification."""
+"""Which keyframe pairs are matched."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from itertools import combinations
 from pathlib import Path
 
@@ -10,13 +10,9 @@ import numpy as np
 
 from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.config import MapOptions
-from bodycap_batch.context import StageContext
-from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, image_ids
+from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, Pair, image_ids
 from bodycap_batch.mapping.retrieval import similarity
 
-Pair = tuple[ImageRef, ImageRef]
-
-_BLOCK = 400
 _NEIGHBOURS = (1, 2, 3, 4, 6, 9)
 """Steps along a camera's own keyframes."""
 _OWN_AGAIN = 8
@@ -90,46 +86,3 @@ def _partners(row: int, alike: FloatArray, times: IntArray, cameras: np.ndarray)
 
 def _most_alike(alike: FloatArray, rows: IntArray, count: int) -> set[int]:
     return {int(item) for item in rows[np.argsort(-alike[rows], kind="stable")[:count]]}
-
-
-def match_pairs(
-    workspace: Path,
-    pairs: Sequence[Pair],
-    options: MapOptions,
-    context: StageContext,
-    scale: float,
-) -> None:
-    """Match and verify keyframe pairs into the database.
-
-    Args:
-        workspace: Folder of the database.
-        pairs: Pairs to match.
-        options: Seed.
-        context: Threads, progress, cancellation.
-        scale: Factor on pixel thresholds.
-    """
-    import pycolmap
-
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads = context.threads
-    matching.use_gpu = False
-    pairing = pycolmap.ImportedPairingOptions()
-    list_path = workspace / "pairs.txt"
-    pairing.match_list_path = str(list_path)
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = options.seed
-    verification.ransac.max_error *= scale
-    verification.filter_stationary_matches = False
-    for done in range(0, len(pairs), _BLOCK):
-        context.check_cancelled()
-        context.progress(done, len(pairs), "pairs")
-        _write_list(list_path, pairs[done : done + _BLOCK])
-        pycolmap.match_image_pairs(
-            str(workspace / DATABASE_NAME), matching, pairing, verification, pycolmap.Device.cpu
-        )
-    list_path.unlink(missing_ok=True)
-    context.progress(len(pairs), len(pairs), "pairs")
-
-
-def _write_list(path: Path, pairs: Iterable[Pair]) -> None:
-    path.write_text("".join(f"{a.name} {b.name}\n" for a, b in pairs), encoding="utf-8")
