@@ -176,7 +176,7 @@ def sharpness(grey: GreyImage) -> float:
     import cv2
 
     small = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return float(cv2.Laplacian(small, cv2.CV_16S, ksize=1).std())
+    return float(cv2.meanStdDev(cv2.Laplacian(small, cv2.CV_16S, ksize=1))[1][0, 0])
 
 
 def bearings(rays: FloatArray) -> FloatArray:
@@ -194,8 +194,13 @@ def fit_rotation(first: FloatArray, second: FloatArray, rounds: int = 4) -> Floa
     weight = np.ones(len(first))
     rotation = np.eye(3)
     for _ in range(rounds):
-        u, _, vt = np.linalg.svd((second * weight[:, None]).T @ first)
-        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
-        residual = np.linalg.norm(second - first @ rotation.T, axis=1)
-        weight = 1.0 / (1.0 + (residual / (np.median(residual) + 1e-9)) ** 2)
+        covariance = (second * weight[:, None]).T @ first
+        u, _, vt = np.linalg.svd(covariance)
+        if np.linalg.det(covariance) < 0.0:
+            u[:, 2] *= -1.0
+        rotation = u @ vt
+        residual = second - first @ rotation.T
+        squared = np.einsum("ni,ni->n", residual, residual)
+        middle = np.partition(squared, len(squared) // 2)[len(squared) // 2]
+        weight = 1.0 / (1.0 + squared / (middle + 1e-18))
     return np.asarray(rotation)
