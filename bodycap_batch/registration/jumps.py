@@ -20,7 +20,7 @@ def pose_jumps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
 
     Args:
         centres: (N,3) camera centres; NaN where there is no pose.
-        sigma: (N,) standard deviation of the centre, same unit; NaN likewise.
+        sigma: (N,) standard deviation of the centre beside its neighbours', same unit; NaN likewise.
 
     Returns:
         (N,) True where the pose is to be refused. Scaling the map changes nothing.
