@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.arrays import BoolArray, FloatArray
 from bodycap_batch.camera import Camera
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import KeyframeOptions
@@ -51,6 +51,7 @@ class _Tracker:
     """
 
     camera: Camera
+    mask: BoolArray | None = None
     start_rays: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     px: Pixels = field(default_factory=lambda: np.zeros((0, 2), np.float32))
     image: GreyImage | None = None
@@ -61,7 +62,7 @@ class _Tracker:
     def restart(self, image: GreyImage) -> None:
         """Begin at a new keyframe."""
         spacing = _CORNER_SPACING_PX * pixel_scale(image.shape[1], image.shape[0])
-        self.px = detect_corners(image, _CORNERS, spacing)
+        self.px = detect_corners(image, _CORNERS, spacing, self.mask)
         self.image = image
         self.start_rays = self._rays()
         self.started = len(self.px)
@@ -131,7 +132,7 @@ def select_keyframes(
     limit_px = options.parallax_px * pixel_scale(camera.camera.width_px, camera.camera.height_px)
     sharp = np.zeros(count)
     chosen: list[int] = []
-    tracker = _Tracker(camera.camera)
+    tracker = _Tracker(camera.camera, _coarse_mask(camera))
     recent: deque[_Candidate] = deque(maxlen=options.window)
     for index, grey in camera.grey_frames():
         context.check_cancelled()
@@ -163,6 +164,12 @@ def select_keyframes(
         sharpness=sharp,
         noise_px=tracker.noise_px(),
     )
+
+
+def _coarse_mask(camera: CaptureCamera) -> BoolArray | None:
+    if camera.mask is None:
+        return None
+    return np.asarray(coarse_image(np.where(camera.mask, 255, 0).astype(np.uint8)) > 127)
 
 
 def _take_sharpest(recent: deque[_Candidate], tracker: _Tracker) -> int:

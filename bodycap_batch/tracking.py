@@ -155,14 +155,15 @@ def moved(px: Pixels, homography: FloatArray) -> Pixels:
     return np.asarray(ahead[:, :2] / ahead[:, 2:], dtype=np.float32)
 
 
-def detect_corners(grey: GreyImage, count: int, spacing_px: float) -> Pixels:
-    """Corners (N,2) worth tracking, strongest first, at least `spacing_px` apart.
+def detect_corners(grey: GreyImage, count: int, spacing_px: float, mask: BoolArray | None = None) -> Pixels:
+    """Corners (N,2) worth tracking, strongest first, at least `spacing_px` apart, where a mask is True.
 
     Source: Shi, Tomasi, "Good features to track", CVPR 1994.
     """
     import cv2
 
-    corners = cv2.goodFeaturesToTrack(grey, count, 0.005, spacing_px)
+    allowed = None if mask is None else mask.astype(np.uint8)
+    corners = cv2.goodFeaturesToTrack(grey, count, 0.005, spacing_px, mask=allowed)
     if corners is None:
         return np.zeros((0, 2), np.float32)
     return np.asarray(corners.reshape(-1, 2) + CV2_PIXEL_OFFSET_PX, dtype=np.float32)

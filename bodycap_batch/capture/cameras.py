@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import FloatArray, IntArray, set_array
+from bodycap_batch.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.camera import Camera
 from bodycap_batch.capture.decoding import decode_frames
 from bodycap_batch.capture.images import Image, work_image
@@ -34,6 +35,7 @@ class CaptureCamera:
         rolling_shutter_known: False where the job does not state it: mapping looks for it in the data.
         notes: What opening found worth telling: gaps and overlaps of chapters, dropped frames.
         videos: Frame index of each chapter.
+        mask: (H,W) at the work size, True where the room is seen; None where that is everywhere.
     """
 
     name: str
@@ -48,6 +50,7 @@ class CaptureCamera:
     rolling_shutter_known: bool = True
     notes: tuple[str, ...] = ()
     videos: tuple[VideoFile, ...] = field(default=(), repr=False)
+    mask: BoolArray | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         count = len(self.frame_numbers)
@@ -59,6 +62,14 @@ class CaptureCamera:
     def common_times_ns(self) -> IntArray:
         """(N,) frame times on the common clock."""
         return np.asarray(self.times_ns + round(self.offset_s * 1e9), dtype=np.int64)
+
+    def sees_room(self, px: npt.NDArray[Any]) -> BoolArray:
+        """Which pixels (N,2), COLMAP origin, lie where the mask lets the room be seen."""
+        if self.mask is None:
+            return np.ones(len(px), dtype=bool)
+        column = np.clip(px[:, 0].astype(int), 0, self.mask.shape[1] - 1)
+        row = np.clip(px[:, 1].astype(int), 0, self.mask.shape[0] - 1)
+        return np.asarray(self.mask[row, column])
 
     def key_indices(self) -> IntArray:
         """Indices into `frame_numbers` of frames that decode without their neighbours."""

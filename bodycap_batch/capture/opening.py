@@ -8,6 +8,7 @@ from bodycap_batch.arrays import BoolArray, IntArray
 from bodycap_batch.camera import Camera, without_single_focal
 from bodycap_batch.capture.cameras import Capture, CaptureCamera
 from bodycap_batch.capture.indexing import index_video
+from bodycap_batch.capture.masks import read_mask
 from bodycap_batch.capture.timeline import join_chapters
 from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.config.calibration import Calibration
@@ -64,6 +65,7 @@ def open_camera(spec: CaptureConfig, config: CameraConfig) -> CaptureCamera:
         rolling_shutter_known=config.rolling_shutter_s is not None or not videos[0].orientation[1][1],
         notes=(*timeline.notes, *rolling_notes),
         videos=videos,
+        mask=None if config.mask is None else read_mask(config.mask, (camera.width_px, camera.height_px)),
     )
 
 

@@ -178,6 +178,8 @@ def _resolved_camera(camera: CameraConfig, index: int, capture: CaptureConfig, b
         entry = read_calibration((base / calibration).resolve(), camera.name)
         calibration = entry.calibration
     update: dict[str, Any] = {"video": videos, "timestamps": sidecars, "calibration": calibration or "auto"}
+    if camera.mask is not None:
+        update["mask"] = (base / camera.mask).resolve()
     if camera.offset_s is None:
         update["offset_s"] = entry.offset_s if entry else 0.0
     if camera.rolling_shutter_s is None:

@@ -88,6 +88,9 @@ class CameraConfig(_Block):
     timestamps: tuple[Path, ...] = Field(
         (), description="sidecar with one time in seconds per frame (of all chapters, or one per chapter)"
     )
+    mask: Path | None = Field(
+        None, description="PNG in the video's shape, white where the room is seen, black over the wearer"
+    )
     offset_s: Seconds | None = Field(None, description="common time = camera time + offset_s")
     rolling_shutter_s: float | None = Field(
         None,
@@ -113,7 +116,7 @@ class CameraConfig(_Block):
 
     def input_files(self) -> tuple[Path, ...]:
         """Files whose content the camera's frames and times depend on."""
-        return (*self.video, *self.timestamps)
+        return (*self.video, *self.timestamps, *(() if self.mask is None else (self.mask,)))
 
 
 class CaptureConfig(_Block):

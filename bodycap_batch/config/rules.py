@@ -94,6 +94,8 @@ def _paths(camera: CameraConfig) -> Iterator[Problem]:
         yield from _unusable("timestamps", path)
     if isinstance(camera.calibration, Path):
         yield from _unusable("calibration", camera.calibration)
+    if camera.mask is not None:
+        yield from _unusable("mask", camera.mask)
     if len(set(camera.video)) < len(camera.video):
         yield Problem(("video",), "a chapter is listed twice", "list each file once")
 

@@ -136,6 +136,10 @@ def _features(
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
         points, descriptors = extractors[slot].extract_from_uint8_array(grey)
         keypoints = np.asarray(pycolmap.keypoints_to_matrix(points), dtype=np.float32).reshape(-1, 4)
+        if camera.mask is not None:
+            seen = camera.sees_room(keypoints[:, :2])
+            keypoints = keypoints[seen]
+            descriptors = pycolmap.FeatureDescriptors(descriptors.type, descriptors.data[seen])
         column = np.clip(keypoints[:, 0].astype(int), 0, grey.shape[1] - 1)
         row = np.clip(keypoints[:, 1].astype(int), 0, grey.shape[0] - 1)
         return keypoints, descriptors, rgb[row, column]

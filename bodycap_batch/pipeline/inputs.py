@@ -13,7 +13,7 @@ from bodycap_batch.identity import algorithm_version, library_versions
 from bodycap_batch.store import ArtefactKey
 from bodycap_batch.tasks import STAGES
 
-_FILES = ("video", "timestamps")
+_FILES = ("video", "timestamps", "mask")
 _BODY = ("mount", "segment", "joint_from_cam", "sigma_deg", "sigma_m")
 """Fields about where a camera sits: they matter to the skeleton only."""
 
@@ -43,14 +43,22 @@ def camera_digest(
     """
     settings = camera.model_dump(mode="json", exclude=set(_FILES + _BODY))
     shared = capture.model_dump(mode="json", include={"start_s", "end_s", "work_px"})
-    files = [*camera.video, *camera.timestamps]
+    files = camera.input_files()
     try:
         content = [digests.sha256(path, on_bytes) for path in files]
     except FileNotFoundError as error:
         raise CaptureError("there is no such file", path=error.filename, hint="check the path") from error
     except OSError as error:
         raise CaptureError(f"cannot be read: {error.strerror}", path=error.filename) from error
-    return json_digest({**settings, **shared, "files": content, "chapters": len(camera.video)})
+    return json_digest(
+        {
+            **settings,
+            **shared,
+            "files": content,
+            "chapters": len(camera.video),
+            "mask": camera.mask is not None,
+        }
+    )
 
 
 def one_camera(capture: CaptureConfig, camera: CameraConfig) -> dict[str, Any]:

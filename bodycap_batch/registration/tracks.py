@@ -124,6 +124,7 @@ def _spread(cell: IntArray, value: IntArray) -> IntArray:
 class _Picture:
     """A frame at full size and reduced."""
 
+    camera: CaptureCamera
     index: int
     grey: GreyImage
     coarse: GreyImage
@@ -160,7 +161,8 @@ class _Active:
         guess = None if motion is None else moved(self.px, motion)
         # A track that slips disagrees with the pose; checking the way back would cost as much again.
         flow = track_points(first.grey, second.grey, self.px, guess, and_back=False)
-        self.slot, self.px = self.slot[flow.ok], flow.px[flow.ok]
+        keep = flow.ok & second.camera.sees_room(flow.px)
+        self.slot, self.px = self.slot[keep], flow.px[keep]
         return len(self.slot) >= _MIN_TRACKS
 
     def observe(self, frame: int) -> Tracks:
@@ -213,7 +215,7 @@ def track_stretch(
     past: deque[_Past] = deque(maxlen=_MAX_BUFFER)
     for index, grey in camera.grey_frames(start, stop):
         context.check_cancelled()
-        picture = _Picture(index, grey, coarse_image(grey))
+        picture = _Picture(camera, index, grey, coarse_image(grey))
         if previous is not None:
             motion = _motion(previous, picture, forward)
             past.append(_remember(previous, motion, forward))

@@ -22,8 +22,8 @@ COUNT = 48
 CONTEXT = StageContext(work_dir=Path())
 
 
-def _video() -> CaptureCamera:
-    """A textured plane that slides by `STEP_PX` a frame."""
+def _video(seen_to_px: float = 640.0) -> CaptureCamera:
+    """A textured plane that slides by `STEP_PX` a frame; a mask covers what is right of a column."""
     noise = np.random.default_rng(0).random((480, 640)).astype(np.float32)
     texture = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.5), None, 0, 255, cv2.NORM_MINMAX)
     images = [
@@ -35,7 +35,11 @@ def _video() -> CaptureCamera:
         for index in range(*slice(start, stop).indices(COUNT)):
             yield index, images[index].astype(np.uint8)
 
-    return cast("CaptureCamera", SimpleNamespace(times_ns=np.arange(COUNT), grey_frames=grey_frames))
+    def sees_room(px: np.ndarray) -> np.ndarray:
+        return px[:, 0] < seen_to_px
+
+    video = SimpleNamespace(times_ns=np.arange(COUNT), grey_frames=grey_frames, sees_room=sees_room)
+    return cast("CaptureCamera", video)
 
 
 def _anchors(frames: list[int]) -> dict[int, Anchor]:
@@ -83,6 +87,13 @@ def test_a_point_seen_elsewhere_by_the_next_keyframe_is_followed_on_its_own() ->
     tracks = Tracks.join(list(track_stretch(_video(), {4: anchors[4], 12: wrong}, 4, 13, CONTEXT)))
     # Were the neighbour's path taken for it, it would be off by the grid's 40 px.
     assert np.linalg.norm(_shift_from_anchor(tracks, anchors), axis=1).max() < 5.0
+
+
+def test_tracks_end_where_the_mask_begins() -> None:
+    tracks = Tracks.join(list(track_stretch(_video(400.0), _anchors([4, 20]), 0, 30, CONTEXT)))
+    moved = tracks.frame != tracks.keyframe
+    assert moved.sum() > 1000
+    assert tracks.px[moved, 0].max() < 400.0 + STEP_PX[0] * 16
 
 
 def test_threads_find_the_same_tracks_and_tell_growing_progress() -> None:

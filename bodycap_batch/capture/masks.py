@@ -1,0 +1,53 @@
+"""An image that says where in a camera's picture the room is seen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from bodycap_batch.arrays import BoolArray
+from bodycap_batch.errors import CaptureError
+
+_WHITE = 128
+_ASPECT_TOLERANCE = 0.01
+_MIN_SEEN = 0.05
+
+
+def read_mask(path: Path, size: tuple[int, int]) -> BoolArray:
+    """Read a mask image, white where the room is seen.
+
+    Args:
+        path: The image, of any size in the shape of the picture.
+        size: Width and height of the picture.
+
+    Returns:
+        (H,W), read-only.
+
+    Raises:
+        CaptureError: It is missing, no image, of another shape, or leaves next to nothing to see.
+    """
+    import cv2
+
+    def refused(why: str, hint: str) -> CaptureError:
+        return CaptureError(why, path=path, field="mask", hint=hint)
+
+    if not path.is_file():
+        raise refused("no such mask", "check the path in the job, relative to the job file")
+    image = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise refused("the mask is no image", "save it as PNG")
+    height, width = image.shape
+    if abs(width * size[1] / (height * size[0]) - 1.0) > _ASPECT_TOLERANCE:
+        raise refused(
+            f"the mask is {width}×{height}, the picture {size[0]}×{size[1]}: another shape",
+            "paint it over a frame as a player shows it",
+        )
+    mask: BoolArray = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA) >= _WHITE)
+    if mask.mean() < _MIN_SEEN:
+        raise refused(
+            f"the mask lets {100 * mask.mean():.1f} % of the picture be seen",
+            "white is the room, black the wearer: is it inverted?",
+        )
+    mask.flags.writeable = False
+    return mask
