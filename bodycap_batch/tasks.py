@@ -194,12 +194,19 @@ def _capture(arguments: Json) -> Capture:
 def _save_map(result: MapResult, files: Path) -> None:
     """Keep a map together with the workspace that is needed to extend it."""
     from bodycap_batch.formats.bundle import write_bundle
+    from bodycap_batch.mapping.lens import misfit_note
 
     workspace = files / "workspace"
     os.rename(result.workspace, workspace)
     write_bundle(dataclasses.replace(result, workspace=workspace), files, "map")
     largest = result.maps[0]
-    _write_summary(files, keyframes=len(largest.keyframe_camera), points=len(largest.points))
+    wrong: Mapping[str, float] = result.log.get("misfitting_lenses", {})
+    _write_summary(
+        files,
+        keyframes=len(largest.keyframe_camera),
+        points=len(largest.points),
+        notes=[misfit_note(camera, factor) for camera, factor in sorted(wrong.items())],
+    )
 
 
 def _load_map(path: str) -> MapResult:

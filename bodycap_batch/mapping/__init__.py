@@ -18,6 +18,7 @@ from bodycap_batch.context import StageContext
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.mapping.convert import to_map
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, add_keyframes, image_ids
+from bodycap_batch.mapping.lens import misfitting_lenses
 from bodycap_batch.mapping.matching import match_pairs
 from bodycap_batch.mapping.pairs import choose_pairs
 from bodycap_batch.mapping.rolling import RollingModel
@@ -79,6 +80,8 @@ def build_map(
     log = {"keyframes": len(refs), "pairs": len(pairs), "verified_pairs": held, "initial_pair_ladder": ladder}
     _require_coverage(models, len(refs), ladder, options)
     write_models(workspace, models)
+    given = {number: name for name, number in cameras.items() if capture.camera(name).calibrated}
+    log["misfitting_lenses"] = misfitting_lenses(models[0], settings, given)
     return _result(models, workspace, log)
 
 
@@ -137,6 +140,7 @@ def extend_map(
     write_models(workspace, models)
     log = {"keyframes": len(known) + len(new), "new_keyframes": len(new)}
     log |= {"pairs": len(pairs), "verified_pairs": held}
+    log["misfitting_lenses"] = previous.log.get("misfitting_lenses", {})
     return _result(models, workspace, log)
 
 

@@ -137,7 +137,10 @@ class Flow:
         # The mapper keeps one core busy; on another the libraries of the last stages load.
         meanwhile = [[module for name in later for module in STAGES[name].modules]]
         task = Task(key=key, arguments=arguments, threads=self._settings.threads)
-        return self._one(task, meanwhile if self._settings.threads > 1 else [])
+        artefact = self._one(task, meanwhile if self._settings.threads > 1 else [])
+        for note in read_summary(artefact.path).get("notes", []):
+            self._settings.listener(Event(kind="note", stage="map", what=f"note: {note}"))
+        return artefact
 
     def registrations(
         self,
