@@ -21,6 +21,7 @@ from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, 
 from bodycap_batch.mapping.lens import misfitting_lenses
 from bodycap_batch.mapping.matching import match_pairs
 from bodycap_batch.mapping.pairs import choose_pairs
+from bodycap_batch.mapping.repair import Workshop, repair
 from bodycap_batch.mapping.rolling import RollingModel
 from bodycap_batch.mapping.solve import (
     MODELS_NAME,
@@ -75,9 +76,18 @@ def build_map(
     scale = _scale(capture)
     pairs = choose_pairs(workspace, refs, _common_ns(capture), options)
     held = match_pairs(workspace, pairs, _lenses(capture), context)
-    settings = mapper_options(options, _constant(capture, cameras), scale)
-    models, ladder = reconstruct(workspace, settings, context, len(refs))
+    constant = _constant(capture, cameras)
+    models, ladder = reconstruct(workspace, mapper_options(options, constant, scale), context, len(refs))
     log = {"keyframes": len(refs), "pairs": len(pairs), "verified_pairs": held, "initial_pair_ladder": ladder}
+    if models:
+        shop = Workshop(
+            workspace=workspace,
+            lenses=_lenses(capture),
+            settings=lambda: mapper_options(options, constant, scale),
+            constant=constant,
+            context=context,
+        )
+        models[0], log["repair"] = repair(models[0], set(pairs), shop)
     _require_coverage(models, len(refs), ladder, options)
     write_models(workspace, models)
     given = {number: name for name, number in cameras.items() if capture.camera(name).calibrated}

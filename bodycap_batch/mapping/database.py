@@ -90,7 +90,7 @@ def add_keyframes(
         for camera, camera_id, frames in wanted:
             for index, keypoints, descriptors, rgb in _features(camera, frames, options, context):
                 ref = ImageRef(camera.name, index)
-                image_id = _write_image(database, ref, camera_id)
+                image_id = write_image(database, ref, camera_id)
                 database.write_keypoints(image_id, keypoints)
                 database.write_descriptors(image_id, descriptors)
                 np.save(colours / f"{image_id}.npy", rgb)
@@ -103,7 +103,8 @@ def keypoint_colours(workspace: Path, image_id: int) -> npt.NDArray[np.uint8]:
     return np.asarray(np.load(workspace / _COLOURS / f"{image_id}.npy"), dtype=np.uint8)
 
 
-def _write_image(database: pycolmap.Database, ref: ImageRef, camera_id: int) -> int:
+def write_image(database: pycolmap.Database, ref: ImageRef, camera_id: int) -> int:
+    """Write one keyframe as a frame of its camera's own rig; returns the image id."""
     import pycolmap
 
     image = pycolmap.Image(name=ref.name, camera_id=camera_id)

@@ -13,12 +13,11 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, Pair, image_ids
 from bodycap_batch.mapping.retrieval import similarity
 
-_NEIGHBOURS = (1, 2, 3, 4, 6, 9)
+_NEIGHBOURS = (1, 2, 3, 4, 6, 9, 14)
 """Steps along a camera's own keyframes."""
-_OWN_AGAIN = 8
-"""Retrieved from the same camera, at another time."""
-_FROM_OTHER = 6
-"""Retrieved from each other camera."""
+_RANKS = (0, 1, 2, 4, 8, 16, 32, 64)
+"""Places in the order of likeness at which partners are taken, from the same camera at another time and from
+each other camera. The most alike repeat each other: a wide choice ties a map better than the top 8."""
 _SAME_INSTANT = 2
 _AWAY_NS = 2_000_000_000
 """A keyframe's nearest looks are its own neighbours in time: they are matched anyway."""
@@ -48,7 +47,7 @@ def choose_pairs(
         ids = image_ids(database)
         images = sorted(ids)
         every = [(a, b) for a, b in combinations(images, 2) if a in fresh or b in fresh]
-        quota = 2 * len(_NEIGHBOURS) + _OWN_AGAIN + (_FROM_OTHER + _SAME_INSTANT) * (len(common_ns) - 1)
+        quota = 2 * len(_NEIGHBOURS) + len(_RANKS) + (len(_RANKS) + _SAME_INSTANT) * (len(common_ns) - 1)
         if options.pairs == "exhaustive" or len(every) <= quota * len(fresh):
             return every
         descriptors = [np.asarray(database.read_descriptors(ids[ref]).data) for ref in images]
@@ -74,15 +73,16 @@ def _partners(row: int, alike: FloatArray, times: IntArray, cameras: np.ndarray)
         if 0 <= place + step < len(own)
     }
     away = own[np.abs(times[own] - times[row]) > _AWAY_NS]
-    out |= _most_alike(alike, away, _OWN_AGAIN)
+    out |= _alike(alike, away)
     for camera in np.unique(cameras):
         if camera == cameras[row]:
             continue
         other = np.flatnonzero(cameras == camera)
         closest = other[np.argsort(np.abs(times[other] - times[row]), kind="stable")[:_SAME_INSTANT]]
-        out |= {int(item) for item in closest} | _most_alike(alike, other, _FROM_OTHER)
+        out |= {int(item) for item in closest} | _alike(alike, other)
     return out
 
 
-def _most_alike(alike: FloatArray, rows: IntArray, count: int) -> set[int]:
-    return {int(item) for item in rows[np.argsort(-alike[rows], kind="stable")[:count]]}
+def _alike(alike: FloatArray, rows: IntArray) -> set[int]:
+    order = rows[np.argsort(-alike[rows], kind="stable")]
+    return {int(order[rank]) for rank in _RANKS if rank < len(order)}

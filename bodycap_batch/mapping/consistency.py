@@ -1,0 +1,110 @@
+"""Verified pairs that a map contradicts: where a block of it stands in the wrong place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bodycap_batch.arrays import BoolArray, FloatArray
+from bodycap_batch.camera import Camera
+from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_MAX_ERROR_PX = 8.0
+"""Twice the error that verification allows: a map bends a little, its pairs do not."""
+_MIN_INLIERS = 30
+"""Pairs with fewer are now and then wrong themselves."""
+_MIN_AGREEING = 0.5
+"""Share of a pair's matches that the map's poses have to explain."""
+_MAX_CONTRADICTED = 0.25
+"""Share of a keyframe's matches in contradicted pairs above which its place is doubted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A verified pair and what the map makes of it."""
+
+    first: int
+    second: int
+    inliers: int
+    agreeing: float
+
+
+def links_of(
+    workspace: Path, model: pycolmap.Reconstruction, cameras: Mapping[str, tuple[Camera, bool]]
+) -> list[Link]:
+    """Hold every verified pair of registered keyframes against the map's poses.
+
+    Source: the symmetric epipolar distance of Hartley, Zisserman, "Multiple view geometry", 2004, 11.4.
+    """
+    import pycolmap
+
+    poses = {int(i): np.asarray(model.image(i).cam_from_world().matrix()) for i in model.reg_image_ids()}
+    rays, focal = {}, {}
+    out = []
+    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+        for image in database.read_all_images():
+            number = int(image.image_id)
+            if number in poses:
+                lens = cameras[ImageRef.parse(image.name).camera][0]
+                pixels = np.asarray(database.read_keypoints(number), dtype=np.float64)[:, :2]
+                rays[number] = np.column_stack([lens.unproject(pixels), np.ones(len(pixels))])
+                focal[number] = lens.focal_px
+        for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
+            a, b = map(int, pycolmap.pair_id_to_image_pair(pair))
+            matches = np.asarray(geometry.inlier_matches)
+            if a in poses and b in poses and len(matches) >= _MIN_INLIERS:
+                error = focal[a] * _epipolar(
+                    rays[a][matches[:, 0]], rays[b][matches[:, 1]], poses[a], poses[b]
+                )
+                out.append(Link(a, b, len(matches), float((error < _MAX_ERROR_PX).mean())))
+    return out
+
+
+def _epipolar(first: FloatArray, second: FloatArray, pose_a: Any, pose_b: Any) -> FloatArray:
+    """Sampson distance of rays (M,3) at depth 1 under two poses cam_from_map (3,4)."""
+    turn = pose_b[:, :3] @ pose_a[:, :3].T
+    shift = pose_b[:, 3] - turn @ pose_a[:, 3]
+    x, y, z = shift / max(float(np.linalg.norm(shift)), 1e-12)
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ turn
+    lines_b, lines_a = first @ essential.T, second @ essential
+    numerator = np.abs((second * lines_b).sum(axis=1))
+    slope = (lines_b[:, :2] ** 2).sum(axis=1) + (lines_a[:, :2] ** 2).sum(axis=1)
+    return np.asarray(numerator / np.sqrt(np.maximum(slope, 1e-18)))
+
+
+def doubtful(links: Sequence[Link]) -> set[int]:
+    """Keyframes in the wrong place: the fewest whose removal leaves no contradiction of weight.
+
+    Greedily takes out the keyframe with the largest share of its matches in contradicted pairs: a misplaced
+    block contradicts most of what it is tied to, each of its partners contradicts the block only.
+    """
+    total: dict[int, int] = {}
+    wrong: dict[int, dict[int, int]] = {}
+    for link in links:
+        for one, other in ((link.first, link.second), (link.second, link.first)):
+            total[one] = total.get(one, 0) + link.inliers
+            if link.agreeing < _MIN_AGREEING:
+                wrong.setdefault(one, {})[other] = link.inliers
+    out: set[int] = set()
+    while True:
+        share = {
+            image: sum(count for other, count in partners.items() if other not in out) / total[image]
+            for image, partners in wrong.items()
+            if image not in out
+        }
+        worst = max(sorted(share), key=lambda image: share[image], default=None)
+        if worst is None or share[worst] <= _MAX_CONTRADICTED:
+            return out
+        out.add(worst)
+
+
+def contradicted(links: Sequence[Link]) -> BoolArray:
+    """(L,) True where the map's poses do not explain a verified pair."""
+    return np.array([link.agreeing < _MIN_AGREEING for link in links], dtype=bool)

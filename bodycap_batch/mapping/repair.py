@@ -1,0 +1,111 @@
+"""Find keyframes in the wrong place or left out, match them with all others, and place them again."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bodycap_batch.camera import Camera
+from bodycap_batch.context import StageContext
+from bodycap_batch.mapping.consistency import doubtful, links_of
+from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, Pair, image_ids
+from bodycap_batch.mapping.matching import match_pairs
+from bodycap_batch.mapping.solve import extend, refine
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_ROUNDS = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Workshop:
+    """What a repair needs besides the map.
+
+    Attributes:
+        workspace: Folder of the database.
+        lenses: Lens of each camera, and whether it is known.
+        settings: Makes the mapper's settings.
+        constant: Ids of calibrated cameras.
+        context: Threads, progress, cancellation.
+    """
+
+    workspace: Path
+    lenses: Mapping[str, tuple[Camera, bool]]
+    settings: Callable[[], Any]
+    constant: Collection[int]
+    context: StageContext
+
+
+def repair(model: pycolmap.Reconstruction, tried: set[Pair], shop: Workshop) -> tuple[Any, dict[str, object]]:
+    """Take doubtful keyframes out, match them and the unregistered ones with all others, place them again.
+
+    Args:
+        model: The largest model; not changed.
+        tried: Pairs that were matched; those matched here are added.
+        shop: Workspace, lenses, settings.
+
+    Returns:
+        The better of the old and the new model, and an account for the log.
+    """
+    import pycolmap
+
+    log: list[dict[str, object]] = []
+    with pycolmap.Database.open(str(shop.workspace / DATABASE_NAME)) as database:
+        ids = image_ids(database)
+    suspects = doubtful(links_of(shop.workspace, model, shop.lenses))
+    for _ in range(_ROUNDS):
+        placed = set(map(int, model.reg_image_ids()))
+        again = suspects | (set(ids.values()) - placed)
+        if not again:
+            break
+        fresh = _untried(ids, again, tried)
+        held = match_pairs(shop.workspace, fresh, shop.lenses, shop.context)
+        entry: dict[str, object] = {
+            "doubtful": [ref.name for ref, number in sorted(ids.items()) if number in suspects],
+            "unregistered": len(set(ids.values()) - placed),
+            "pairs": len(fresh),
+            "verified_pairs": held,
+        }
+        log.append(entry)
+        if not held and not suspects:
+            break
+        other = _without(model, suspects, shop, len(ids))
+        left = doubtful(links_of(shop.workspace, other, shop.lenses))
+        sound_before = len(placed - suspects)
+        sound_after = len(set(map(int, other.reg_image_ids())) - left)
+        entry |= {"sound_before": sound_before, "sound_after": sound_after}
+        if sound_after < sound_before or (sound_after == sound_before and len(left) >= len(suspects)):
+            break
+        model, suspects = other, left
+    return model, {"rounds": log, "doubtful": len(suspects)}
+
+
+def _untried(ids: Mapping[ImageRef, int], images: set[int], tried: set[Pair]) -> list[Pair]:
+    refs: Sequence[ImageRef] = sorted(ids)
+    chosen = [ref for ref in refs if ids[ref] in images]
+    fresh = {(min(a, b), max(a, b)) for a in chosen for b in refs if a != b} - tried
+    tried |= fresh
+    return sorted(fresh)
+
+
+def _without(model: pycolmap.Reconstruction, suspects: Collection[int], shop: Workshop, total: int) -> Any:
+    """The model with suspects taken out and registered anew against what is left, all refined."""
+    import pycolmap
+
+    source = shop.workspace / "repair"
+    shutil.rmtree(source, ignore_errors=True)
+    source.mkdir()
+    model.write(str(source))
+    rest = pycolmap.Reconstruction(str(source))
+    for number in sorted(suspects):
+        rest.deregister_frame(rest.image(number).frame_id)
+    rest.write(str(source))
+    found = extend(shop.workspace, source, shop.settings(), shop.context, total)
+    shutil.rmtree(source, ignore_errors=True)
+    grown = found if found is not None else rest
+    refine(grown, shop.settings(), shop.constant)
+    return grown

@@ -1,0 +1,138 @@
+"""A block of keyframes in the wrong place is found through the pairs it contradicts, and put right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.camera import Camera
+from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.config import MapOptions
+from bodycap_batch.context import StageContext
+from bodycap_batch.geometry import align_points, invert, make_transform, so3_exp
+from bodycap_batch.mapping.consistency import Link, doubtful, links_of
+from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, image_ids, write_image
+from bodycap_batch.mapping.matching import match_pairs
+from bodycap_batch.mapping.repair import Workshop, repair
+from bodycap_batch.mapping.solve import mapper_options, reconstruct
+
+_LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
+_LENSES = {"cam": (_LENS, True)}
+_KEYFRAMES = 16
+_MOVED = (6, 7, 8)
+
+
+def test_the_misplaced_are_doubted_not_their_partners() -> None:
+    links = [Link(a, b, 100, 1.0) for a in range(10) for b in range(a)]
+    assert doubtful(links) == set()
+    wrong = [
+        Link(x.first, x.second, 100, 0.1 if (x.first in (4, 5)) != (x.second in (4, 5)) else 1.0)
+        for x in links
+    ]
+    assert doubtful(wrong) == {4, 5}
+
+
+def _poses() -> FloatArray:
+    """cam_from_map of keyframes that go sideways along a wall 4 ahead."""
+    out = []
+    for step in range(_KEYFRAMES):
+        turn = so3_exp(np.array([0.0, 0.1 * np.sin(step), 0.02 * step]))
+        out.append(invert(make_transform(turn, np.array([0.25 * step, 0.1 * np.cos(step), 0.0]))))
+    return np.array(out)
+
+
+def _workspace(folder: Path) -> FloatArray:
+    """Keyframes with features of a bumpy wall, half a pixel of noise; true poses."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-3, -3, 3), (7, 3, 5), (900, 3))
+    raw = rng.exponential(1.0, (len(points), 128))
+    descriptors = np.round(512 * np.sqrt(raw / raw.sum(axis=1, keepdims=True))).clip(0, 255).astype(np.uint8)
+    camera = CaptureCamera(
+        name="cam",
+        chapters=(),
+        camera=_LENS,
+        calibrated=True,
+        frame_numbers=np.arange(99),
+        times_ns=np.arange(99) * 10**8,
+        nominal_fps=10.0,
+        offset_s=0.0,
+        rolling_shutter_s=0.0,
+    )
+    poses = _poses()
+    with pycolmap.Database.open(str(folder / DATABASE_NAME)) as database:
+        camera_id = add_camera(database, camera)
+        for frame, pose in enumerate(poses):
+            pixels = _LENS.project(points @ pose[:3, :3].T + pose[:3, 3])
+            seen = np.flatnonzero(((pixels > 0) & (pixels < (640, 480))).all(axis=1))
+            image_id = write_image(database, ImageRef("cam", frame), camera_id)
+            noisy = pixels[seen] + rng.normal(0, 0.5, (len(seen), 2))
+            keypoints = np.column_stack([noisy, np.ones((len(seen), 2))])
+            database.write_keypoints(image_id, keypoints.astype(np.float32))
+            kind = pycolmap.FeatureExtractorType.SIFT
+            database.write_descriptors(image_id, pycolmap.FeatureDescriptors(kind, descriptors[seen]))
+    return poses
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, FloatArray, Workshop, set[Any]]:
+    folder = tmp_path_factory.mktemp("repair")
+    poses = _workspace(folder)
+    context = StageContext(work_dir=folder, threads=2)
+    refs = [ImageRef("cam", frame) for frame in range(_KEYFRAMES)]
+    pairs = [(a, b) for a in refs for b in refs if a < b and b.frame - a.frame <= 5]
+    assert match_pairs(folder, pairs, _LENSES, context) > 50
+    shop = Workshop(
+        workspace=folder,
+        lenses=_LENSES,
+        settings=lambda: mapper_options(MapOptions(), [1], 1.0),
+        constant=[1],
+        context=context,
+    )
+    models, _ = reconstruct(folder, shop.settings(), context, _KEYFRAMES)
+    return models[0], poses, shop, set(pairs)
+
+
+def _rms(model: Any, poses: FloatArray) -> float:
+    """Error of the keyframes' centres after alignment, in the scene's unit."""
+    refs = {ImageRef.parse(model.image(i).name).frame: i for i in model.reg_image_ids()}
+    found = np.array([model.image(refs[frame]).projection_center() for frame in sorted(refs)])
+    true = invert(poses)[sorted(refs), :3, 3]
+    return float(np.sqrt(((align_points(found, true).apply(found) - true) ** 2).sum(axis=1).mean()))
+
+
+def test_a_right_map_is_left_alone(built: tuple[Any, FloatArray, Workshop, set[Any]]) -> None:
+    model, poses, shop, pairs = built
+    assert model.num_reg_images() == _KEYFRAMES
+    # Half a pixel at depth 4 and 420 px is 5 mm a point; a pose has dozens.
+    assert _rms(model, poses) < 0.01
+    same, log = repair(model, set(pairs), shop)
+    assert same is model
+    assert log == {"rounds": [], "doubtful": 0}
+
+
+def test_a_misplaced_block_is_found_and_put_right(
+    built: tuple[Any, FloatArray, Workshop, set[Any]],
+) -> None:
+    model, poses, shop, pairs = built
+    wrong = pycolmap.Reconstruction(model)
+    ids = {ref.frame: number for ref, number in _ids(shop).items()}
+    shift = pycolmap.Rigid3d(pycolmap.Rotation3d(np.eye(3)), np.array([1.0, 0.6, 0.4]))
+    for frame in _MOVED:
+        image = wrong.image(ids[frame])
+        wrong.frame(image.frame_id).set_cam_from_world(image.camera_id, shift * image.cam_from_world())
+    assert _rms(wrong, poses) > 0.1
+    assert doubtful(links_of(shop.workspace, wrong, _LENSES)) == {ids[frame] for frame in _MOVED}
+    mended, log = repair(wrong, set(pairs), shop)
+    assert log["doubtful"] == 0
+    assert mended.num_reg_images() == _KEYFRAMES
+    assert _rms(mended, poses) < 0.01
+
+
+def _ids(shop: Workshop) -> dict[ImageRef, int]:
+    with pycolmap.Database.open(str(shop.workspace / DATABASE_NAME)) as database:
+        return image_ids(database)
