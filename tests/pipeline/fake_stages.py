@@ -16,7 +16,8 @@ from bodycap_batch.runner.child import main
 
 Json = Mapping[str, Any]
 ORDERS = "BODYCAP_FAKE_ORDERS"
-"""Path of a JSON file: {"fail" | "hang" | "fill": stage, "wanted" | "localised": [a value per round]}."""
+"""Path of a JSON file: {"fail" | "hang" | "fill": stage, "wanted" | "localised": [a value per round],
+"rolling": true}."""
 
 
 def orders() -> dict[str, Any]:
@@ -69,7 +70,8 @@ def registered(options: Json, arguments: Json, files: Path) -> None:
     again = json.loads((Path(before) / "summary.json").read_text())["round"] + 1 if before else 0
     wanted = [*orders().get("wanted", []), *[[]] * 9][again]
     localised = [*orders().get("localised", []), *[10] * 9][again]
-    values = {"round": again, "wanted": wanted, "localised": localised}
+    rolling = bool(orders().get("rolling"))
+    values = {"round": again, "wanted": wanted, "localised": localised, "rolling": rolling}
     (files / "summary.json").write_text(json.dumps(values))
 
 

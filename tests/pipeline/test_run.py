@@ -273,6 +273,16 @@ def test_rounds_limit_the_growth(bench: Bench) -> None:
     assert bench.executed(registration={"rounds": 1}).count("extend") == 1
 
 
+def test_a_rolling_shutter_is_taken_out_of_the_map_and_every_frame_solved_again(bench: Bench) -> None:
+    bench.order(rolling=True)
+    executed = bench.executed()
+    assert executed.count("refine") == 1
+    assert executed.count("registration torso") == 2
+    used = json.loads(json.loads((bench.out / "result.ply").read_text())["registrations"][0])
+    assert used[2]["previous"] is not None, "the tracks of the first pass are kept"
+    assert bench.executed() == []
+
+
 @pytest.mark.parametrize("stage", ["keyframes", "map", "merge", "export"])
 def test_a_stopped_run_goes_on_where_it_was(bench: Bench, stage: str) -> None:
     bench.order(hang=stage)
