@@ -93,7 +93,7 @@ def rendered(options: Json, arguments: Json, files: Path) -> None:
 
 
 EXTRA = {"registration": registered, "export": exported, "synth": rendered}
-NAMES = ("synth", "check", "keyframes", "map", "extend", "registration", "merge", "export")
+NAMES = ("synth", "check", "keyframes", "map", "extend", "refine", "registration", "merge", "export")
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:], {name: stage(name) for name in NAMES}))
