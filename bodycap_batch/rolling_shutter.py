@@ -17,6 +17,9 @@ from bodycap_batch.scene import Map, Registration
 _MIN_POINTS = 30
 _MAX_RESIDUAL_PX = 4.0
 _LOSS_PX = 0.5
+_PART = 200_000
+_SCREENED = 100_000
+"""About so many observations tell whether the shutter rolls, from frames spread over the video."""
 _MIN_APPARENT_S = 0.0005
 _MIN_SIGMAS = 8.0
 
@@ -42,13 +45,21 @@ def image_velocity(
     last = len(posed) - 1
     before = np.where(posed[np.maximum(frame - 1, 0)], np.maximum(frame - 1, 0), frame)
     after = np.where(posed[np.minimum(frame + 1, last)], np.minimum(frame + 1, last), frame)
-    pixels: list[FloatArray] = []
-    for index in (before, after):
-        pose = cam_from_map[index]
-        pixels.append(camera.project(np.einsum("mij,mj->mi", pose[:, :3, :3], points) + pose[:, :3, 3]))
     elapsed_s = (times_ns[after] - times_ns[before]) * 1e-9
-    velocity = (pixels[1] - pixels[0]) / np.where(elapsed_s > 0, elapsed_s, np.inf)[:, None]
+    shift = _projected(camera, cam_from_map, after, points) - _projected(camera, cam_from_map, before, points)
+    velocity = shift / np.where(elapsed_s > 0, elapsed_s, np.inf)[:, None]
     return np.asarray(np.nan_to_num(velocity, posinf=0.0, neginf=0.0))
+
+
+def _projected(camera: Camera, cam_from_map: FloatArray, frame: IntArray, points: FloatArray) -> FloatArray:
+    """Pixels (M,2) of points (M,3), each in a frame of its own; a long video is taken in parts."""
+    out = np.empty((len(frame), 2))
+    for start in range(0, len(frame), _PART):
+        part = slice(start, start + _PART)
+        pose = cam_from_map[frame[part]]
+        x_in_cam = np.einsum("mij,mj->mi", pose[:, :3, :3], points[part]) + pose[:, :3, 3]
+        out[part] = camera.project(x_in_cam)
+    return out
 
 
 def row_delay(camera: Camera, px: FloatArray) -> FloatArray:
@@ -70,15 +81,16 @@ def looks_rolling(found: Registration, maps: Sequence[Map]) -> bool:
     scene = next((each for each in maps if each.gauge == path.gauge), None)
     if scene is None:
         return False
-    point = scene.points_of(path.camera, found.obs_keyframe, found.obs_feature)
-    used = np.flatnonzero((point >= 0) & path.localised[found.obs_frame])
-    used = used[np.argsort(found.obs_frame[used], kind="stable")]
-    frame, px, points = found.obs_frame[used], found.obs_px[used].astype(float), scene.points[point[used]]
+    stride = max(1, len(found.obs_frame) // _SCREENED)
+    some = np.flatnonzero(path.localised[found.obs_frame] & (found.obs_frame % stride == 0))
+    point = scene.points_of(path.camera, found.obs_keyframe[some], found.obs_feature[some])
+    used = some[point >= 0][np.argsort(found.obs_frame[some[point >= 0]], kind="stable")]
+    points = scene.points[scene.points_of(path.camera, found.obs_keyframe[used], found.obs_feature[used])]
+    frame, px = found.obs_frame[used], found.obs_px[used].astype(float)
     lens = scene.cameras[path.camera]
     pose = np.full_like(path.gauge_from_cam, np.nan)
     pose[path.localised] = invert(path.gauge_from_cam[path.localised])
-    x_in_cam = np.einsum("mij,mj->mi", pose[frame][:, :3, :3], points) + pose[frame][:, :3, 3]
-    residual = np.nan_to_num(px - lens.project(x_in_cam), nan=np.inf)
+    residual = np.nan_to_num(px - _projected(lens, pose, frame, points), nan=np.inf)
     velocity = image_velocity(lens, path.gauge_from_cam, path.times_ns, frame, points)
     readout_s, sigma_s = apparent_readout(lens, frame, px, residual, velocity)
     return abs(readout_s) > max(_MIN_APPARENT_S, _MIN_SIGMAS * sigma_s)

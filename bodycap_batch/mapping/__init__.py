@@ -91,7 +91,7 @@ def build_map(
     _require_coverage(models, len(refs), ladder, options)
     write_models(workspace, models)
     given = {number: name for name, number in cameras.items() if capture.camera(name).calibrated}
-    log["misfitting_lenses"] = misfitting_lenses(models[0], settings, given)
+    log["misfitting_lenses"] = misfitting_lenses(models[0], mapper_options(options, constant, scale), given)
     return _result(models, workspace, log)
 
 
