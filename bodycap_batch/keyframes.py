@@ -30,6 +30,8 @@ _CORNERS = 120
 _CORNER_SPACING_PX = 12.0
 _WINDOW_PX = 11
 _MIN_TRACKS = 12
+_PASSING = 0.05
+"""What the mere passing of `max_gap_s` counts for beside what is seen, where a budget has to choose."""
 _NOISE_SAMPLES = 20_000
 
 
@@ -132,6 +134,7 @@ def select_keyframes(
     limit_px = options.parallax_px * pixel_scale(camera.camera.width_px, camera.camera.height_px)
     sharp = np.zeros(count)
     chosen: list[int] = []
+    novelty = [0.0]
     tracker = _Tracker(camera.camera, _coarse_mask(camera))
     recent: deque[_Candidate] = deque(maxlen=options.window)
     for index, grey in camera.grey_frames():
@@ -151,12 +154,18 @@ def select_keyframes(
                 or (gap_s >= options.min_gap_s and tracker.parallax_px() > limit_px)
             )
             if due:
+                seen = max(1.0 - tracker.survival(), tracker.parallax_px() / limit_px)
+                novelty.append(seen + _PASSING * gap_s / options.max_gap_s)
                 chosen.append(_take_sharpest(recent, tracker))
         if index % 30 == 0:
             context.progress(index, count, "frames")
     if chosen[-1] != count - 1:
         chosen.append(count - 1)
+        novelty.append(0.0)
     context.progress(count, count, "frames")
+    if options.max_per_min is not None:
+        minutes = (times_s[-1] - times_s[0]) / 60.0
+        chosen = _within_budget(chosen, novelty, max(2, int(np.ceil(options.max_per_min * minutes))))
     return KeyframeSelection(
         camera=camera.name,
         frames=np.array(chosen, dtype=np.int64),
@@ -164,6 +173,23 @@ def select_keyframes(
         sharpness=sharp,
         noise_px=tracker.noise_px(),
     )
+
+
+def _within_budget(chosen: list[int], novelty: list[float], most: int) -> list[int]:
+    """Leave out keyframes, never the first or last, until `most` are left.
+
+    Args:
+        chosen: Frame indices.
+        novelty: How much each shows that the one before it did not; it adds up where one is left out.
+        most: How many may stay.
+    """
+    kept, news = list(chosen), list(novelty)
+    while len(kept) > max(2, most):
+        step = [news[at] + news[at + 1] for at in range(1, len(kept) - 1)]
+        least = int(np.argmin(step)) + 1
+        news[least + 1] += news[least]
+        del kept[least], news[least]
+    return kept
 
 
 def _coarse_mask(camera: CaptureCamera) -> BoolArray | None:

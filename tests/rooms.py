@@ -88,6 +88,7 @@ def write_capture(
     paths: Mapping[str, np.ndarray],
     black: Mapping[str, range] | None = None,
     seed: int = 0,
+    fps: int = 30,
 ) -> Capture:
     """Render a folder capture and open it; frames in `black` are dark."""
     room = Room.make(seed)
@@ -100,7 +101,7 @@ def write_capture(
             if black and index in black.get(name, range(0)):
                 image[:] = 12.0
             frames.append(np.clip(image + rng.normal(0, 1.5, image.shape), 0, 255).astype(np.uint8))
-        write_video(folder / f"{name}.mp4", frames)
+        write_video(folder / f"{name}.mp4", frames, fps=fps)
     lens = str(LENS).replace("'", '"')
     (folder / "calib.json").write_text(lens.replace("}", ', "pixel_origin": "COLMAP"}'), encoding="utf-8")
     return open_capture(load_job(folder).capture)

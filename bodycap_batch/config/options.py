@@ -22,6 +22,9 @@ class KeyframeOptions(Options):
     min_survival: float = Field(0.5, gt=0, lt=1, description="share of tracks left that asks for a keyframe")
     max_gap_s: float = Field(0.5, gt=0, description="largest time between two keyframes")
     min_gap_s: float = Field(0.05, ge=0, description="smallest time between two keyframes")
+    max_per_min: float | None = Field(
+        None, gt=0, description="most keyframes a minute; those that show least new are left out"
+    )
     window: int = Field(4, ge=1, description="frames among which the sharpest becomes the keyframe")
 
 

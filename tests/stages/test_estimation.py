@@ -166,6 +166,34 @@ def test_turning_on_the_spot_asks_for_few_keyframes(tmp_path: Path) -> None:
     assert chosen["moving"] >= 3
 
 
+def test_motion_decides_on_keyframes_not_the_number_of_frames(tmp_path: Path) -> None:
+    counts = []
+    for fps in (30, 120):
+        metres = np.arange(fps) * 1.2 / fps
+        paths = {"torso": np.array([make_transform(look(0.0), [0, at - 0.6, 0]) for at in metres])}
+        capture = write_capture(tmp_path / str(fps), paths, fps=fps)
+        options = KeyframeOptions(max_gap_s=10.0, min_survival=0.05, parallax_px=3.0, window=1)
+        counts.append(len(select_keyframes(capture.cameras[0], options, context(tmp_path)).frames))
+    assert counts[0] >= 5
+    # A keyframe at 30 fps comes up to a frame later than it is due: one in five here.
+    assert counts[0] <= counts[1] <= 1.5 * counts[0]
+
+
+def test_a_budget_leaves_the_keyframes_that_show_most(tmp_path: Path) -> None:
+    # Still, then quick: the second half shows all that is new.
+    metres = np.concatenate([np.zeros(20), np.linspace(0.0, 1.2, 20)])
+    paths = {"torso": np.array([make_transform(look(0.0), [0, at - 0.6, 0]) for at in metres])}
+    camera = write_capture(tmp_path, paths).cameras[0]
+    free = select_keyframes(camera, KeyframeOptions(max_gap_s=0.15), context(tmp_path)).frames
+    options = KeyframeOptions(max_gap_s=0.15, max_per_min=60.0 * 6 / (39 / 30))
+    held = select_keyframes(camera, options, context(tmp_path)).frames
+    assert len(free) > 8
+    assert len(held) == 6
+    assert set(held) <= set(free)
+    assert {held[0], held[-1]} == {0, 39}
+    assert (held >= 20).sum() >= 4
+
+
 def test_keyframes_avoid_blurred_frames(tmp_path: Path) -> None:
     import cv2
 
