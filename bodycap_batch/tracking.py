@@ -18,7 +18,8 @@ REFERENCE_WIDTH_PX = 640.0
 
 _WINDOW_PX = 21
 _LEVELS = 4
-_GUIDED_LEVELS = 0
+_GUIDED_LEVELS = 2
+_SURE_LEVELS = 0
 """With a guess the coarse levels only add cost and ways to go wrong."""
 _ITERATIONS = 20
 _EPSILON_PX = 0.02
@@ -28,7 +29,15 @@ _COARSE_WINDOW_PX = 15
 _COARSE_LEVELS = 3
 _COARSE_POINTS = 48
 _MIN_COARSE_POINTS = 12
-_COARSE_ERROR_PX = 5.0
+_COARSE_ERROR_PX = 2.5
+_COARSE_TRIALS = 300
+_MIN_AGREED = 7
+"""Three more than a homography fits by itself."""
+_SURE_SHARE = 0.5
+_PIECE_SHARE = 0.35
+_PIECE_ROWS, _PIECE_COLUMNS = 2, 3
+_PIECES_TRIED = 2
+_MIN_CONTRAST = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +66,7 @@ def track_points(
     px: Pixels,
     guess_px: Pixels | None = None,
     *,
-    and_back: bool = True,
+    careful: bool = True,
     window_px: int = _WINDOW_PX,
 ) -> Flow:
     """Follow points from one image to the next by pyramidal Lucas–Kanade, there and back.
@@ -67,7 +76,8 @@ def track_points(
         second: (H,W) uint8 image.
         px: (N,2) float32 points in the first image.
         guess_px: (N,2) where to start looking in the second image.
-        and_back: Follow them back too and refuse those that do not return; doubles the cost.
+        careful: Look far around the guess, follow the points back too and refuse those that do not return.
+            Otherwise only the guess's surroundings are searched, for a quarter of the cost.
         window_px: Side of the square around a point that is compared.
 
     Source: Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2000; the check is
@@ -77,12 +87,12 @@ def track_points(
         return Flow(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0, np.float32))
     start = np.ascontiguousarray(px - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
     guess = None if guess_px is None else np.asarray(guess_px - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
-    levels = _LEVELS if guess is None else _GUIDED_LEVELS
+    levels = _LEVELS if guess is None else (_GUIDED_LEVELS if careful else _SURE_LEVELS)
     there, alive = _lucas_kanade(first, second, start, guess, (window_px, levels))
     height, width = second.shape
     alive &= ((there >= 0) & (there <= (width - 1, height - 1))).all(axis=1)
     found_px = (there + CV2_PIXEL_OFFSET_PX).astype(np.float32)
-    if not and_back:
+    if not careful:
         return Flow(found_px, alive, np.zeros(len(px), np.float32))
     back = np.full_like(there, np.inf)
     if alive.any():
@@ -120,8 +130,29 @@ def coarse_image(grey: GreyImage) -> GreyImage:
     return np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def coarse_motion(first: GreyImage, second: GreyImage, px: Pixels, width_px: int) -> FloatArray | None:
-    """Homography (3,3) from the first image to the second, near enough to start tracking from.
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """How the whole image moved.
+
+    Attributes:
+        homography: (3,3) second from first, full-size pixels of COLMAP's origin.
+        sure: True where most points agree with it.
+    """
+
+    homography: FloatArray
+    sure: bool
+
+    def inverse(self) -> Motion:
+        """The way back."""
+        return Motion(np.asarray(np.linalg.inv(self.homography)), self.sure)
+
+
+def coarse_motion(first: GreyImage, second: GreyImage, px: Pixels, width_px: int) -> Motion | None:
+    """Homography from one image to the next, near enough to start tracking from.
+
+    Some points are followed from where they were. Where few of them agree on a motion they are followed
+    again from where pieces of the image are found in the second one: a hand's camera turns by up to 35
+    degrees between two frames.
 
     Args:
         first: `coarse_image` of the first image.
@@ -130,23 +161,66 @@ def coarse_motion(first: GreyImage, second: GreyImage, px: Pixels, width_px: int
         width_px: Width of the full-size images.
 
     Returns:
-        It, in full-size pixels of COLMAP's origin; None where too few points agree.
+        It, or None where too few points agree.
+    """
+    scale = first.shape[1] / width_px
+    some = px[np.linspace(0, len(px) - 1, min(len(px), _COARSE_POINTS)).astype(int)] if len(px) else px
+    start = np.ascontiguousarray(some * scale - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
+    best, agreed = _followed(first, second, start, None)
+    if agreed < _SURE_SHARE * len(start):
+        for shift in _piece_shifts(first, second):
+            found, count = _followed(first, second, start, start + shift)
+            if count > agreed:
+                best, agreed = found, count
+    if best is None or agreed < _MIN_AGREED:
+        return None
+    # From OpenCV's pixels of the reduced images to COLMAP's of the full ones.
+    full = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, scale]])
+    return Motion(np.asarray(full @ best @ np.linalg.inv(full)), agreed >= _SURE_SHARE * len(start))
+
+
+def _followed(
+    first: GreyImage, second: GreyImage, start: Pixels, guess: Pixels | None
+) -> tuple[FloatArray | None, int]:
+    """Homography that most followed points agree on, and how many do."""
+    import cv2
+
+    if len(start) < _MIN_COARSE_POINTS:
+        return None, 0
+    levels = _COARSE_LEVELS if guess is None else _GUIDED_LEVELS
+    there, found = _lucas_kanade(first, second, start, guess, (_COARSE_WINDOW_PX, levels))
+    found &= ((there >= 0) & (there <= (second.shape[1] - 1, second.shape[0] - 1))).all(axis=1)
+    if found.sum() < _MIN_COARSE_POINTS:
+        return None, 0
+    homography, agreed = cv2.findHomography(
+        start[found], there[found], cv2.RANSAC, _COARSE_ERROR_PX, maxIters=_COARSE_TRIALS
+    )
+    return (None, 0) if homography is None else (homography, int(agreed.sum()))
+
+
+def _piece_shifts(first: GreyImage, second: GreyImage) -> list[Pixels]:
+    """Where pieces of the first image are found in the second: shifts (2,) of the best ones.
+
+    Source: Lewis, "Fast normalized cross-correlation", 1995.
     """
     import cv2
 
-    if len(px) < _MIN_COARSE_POINTS:
-        return None
-    scale = first.shape[1] / width_px
-    some = px[np.linspace(0, len(px) - 1, min(len(px), _COARSE_POINTS)).astype(int)]
-    start = np.ascontiguousarray(some * scale - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
-    there, found = _lucas_kanade(first, second, start, None, (_COARSE_WINDOW_PX, _COARSE_LEVELS))
-    if found.sum() < _MIN_COARSE_POINTS:
-        return None
-    target = (there[found] + CV2_PIXEL_OFFSET_PX) / scale
-    homography, agreed = cv2.findHomography(some[found], target, cv2.RANSAC, _COARSE_ERROR_PX / scale / 2)
-    if homography is None or int(agreed.sum()) < _MIN_COARSE_POINTS:
-        return None
-    return np.asarray(homography, dtype=np.float64)
+    halves = [
+        cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in (first, second)
+    ]
+    height, width = halves[0].shape
+    side = round(_PIECE_SHARE * max(height, width))
+    found: list[tuple[float, Pixels]] = []
+    for top in np.linspace(0, height - side, _PIECE_ROWS).astype(int):
+        for left in np.linspace(0, width - side, _PIECE_COLUMNS).astype(int):
+            piece = halves[0][top : top + side, left : left + side]
+            if piece.std() < _MIN_CONTRAST:
+                continue
+            scores = cv2.matchTemplate(halves[1], piece, cv2.TM_CCOEFF_NORMED)
+            _, score, _, (column, row) = cv2.minMaxLoc(scores)
+            found.append((score, np.array([column - left, row - top], np.float32) * np.float32(2.0)))
+    found.sort(key=lambda item: -item[0])
+    return [shift for _, shift in found[:_PIECES_TRIED]]
 
 
 def moved(px: Pixels, homography: FloatArray) -> Pixels:

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.arrays import BoolArray, IntArray
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.context import StageContext
 from bodycap_batch.scene import Map
 from bodycap_batch.tracking import (
     GreyImage,
+    Motion,
     Pixels,
     coarse_image,
     coarse_motion,
@@ -156,11 +157,12 @@ class _Active:
         """Begin in a keyframe."""
         return _Active(keyframe, anchor, np.arange(len(anchor.px)), anchor.px)
 
-    def step(self, first: _Picture, second: _Picture, motion: FloatArray | None) -> bool:
+    def step(self, first: _Picture, second: _Picture, motion: Motion | None) -> bool:
         """Follow the tracks into a frame; False once too few are left."""
-        guess = None if motion is None else moved(self.px, motion)
-        # A track that slips disagrees with the pose; checking the way back would cost as much again.
-        flow = track_points(first.grey, second.grey, self.px, guess, and_back=False)
+        guess = None if motion is None else moved(self.px, motion.homography)
+        # A track that slips disagrees with the pose: the way back is followed only where many would.
+        careful = motion is None or not motion.sure
+        flow = track_points(first.grey, second.grey, self.px, guess, careful=careful)
         keep = flow.ok & second.camera.sees_room(flow.px)
         self.slot, self.px = self.slot[keep], flow.px[keep]
         return len(self.slot) >= _MIN_TRACKS
@@ -176,13 +178,13 @@ class _Past:
 
     Attributes:
         picture: The frame.
-        motion: Homography from the next frame into it.
+        motion: From the next frame into it.
         slot: (N,) forward tracks alive in it.
         px: (N,2) where they were.
     """
 
     picture: _Picture
-    motion: FloatArray | None
+    motion: Motion | None
     slot: IntArray
     px: Pixels
 
@@ -234,8 +236,8 @@ def track_stretch(
         previous = picture
 
 
-def _remember(picture: _Picture, motion: FloatArray | None, active: _Active | None) -> _Past:
-    back = None if motion is None else np.asarray(np.linalg.inv(motion))
+def _remember(picture: _Picture, motion: Motion | None, active: _Active | None) -> _Past:
+    back = None if motion is None else motion.inverse()
     if active is None:
         return _Past(picture, back, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
     return _Past(picture, back, active.slot, active.px)
@@ -266,7 +268,7 @@ def _closed(
     return arrived
 
 
-def _motion(first: _Picture, second: _Picture, active: _Active | None) -> FloatArray | None:
+def _motion(first: _Picture, second: _Picture, active: _Active | None) -> Motion | None:
     if active is not None and len(active.px) >= _MIN_GUIDES:
         guides = active.px
     else:

@@ -80,19 +80,40 @@ def test_a_coarse_motion_starts_every_track_near_its_end() -> None:
     assert found is not None
     # warpAffine works in OpenCV's pixels.
     expected = (corners - 0.5) @ turn[:, :2].T + turn[:, 2] + 0.5
-    assert np.abs(moved(corners, found) - expected).max() < 2.0
+    assert np.abs(moved(corners, found.homography) - expected).max() < 2.0
     inside = ((expected > 25) & (expected < (615, 455))).all(axis=1)
-    flow = track_points(first, second, corners[inside], moved(corners, found)[inside], and_back=False)
+    flow = track_points(
+        first, second, corners[inside], moved(corners, found.homography)[inside], careful=False
+    )
     error = np.linalg.norm(flow.px - expected[inside], axis=1)[flow.ok]
     # A window of 21 px does not turn with the image: 3 degrees cost about a tenth of a pixel.
     assert np.median(error) < 0.2
 
 
-def test_no_coarse_motion_between_unrelated_images_or_without_points() -> None:
-    first, second = coarse_image(_texture(6, 640, 480)), coarse_image(_texture(7, 640, 480))
-    corners = detect_corners(_texture(6, 640, 480), 100, 12.0)
-    assert coarse_motion(first, second, corners[:5], 640) is None
-    assert coarse_motion(first, second, corners, 640) is None
+def test_a_third_of_the_picture_in_one_step_is_found_again() -> None:
+    wide = _texture(8, 1000, 600)
+    # The camera turns by 220 of 640 px, as a thrown hand's does between two frames.
+    first, second = wide[60:540, 100:740], wide[100:580, 320:960]
+    corners = detect_corners(first, 100, 12.0)
+    found = coarse_motion(coarse_image(first), coarse_image(second), corners, 640)
+    assert found is not None
+    shared = corners[(corners > (240, 60)).all(axis=1)]
+    # Half a pixel of the reduced images.
+    assert np.abs(moved(shared, found.homography) - shared + (220, 40)).max() < 1.5
+    flow = track_points(first, second, shared, moved(shared, found.homography))
+    assert flow.ok.mean() > 0.8
+    back = moved(moved(shared, found.homography), found.inverse().homography)
+    np.testing.assert_allclose(back, shared, atol=1e-2)
+
+
+def test_a_motion_between_unrelated_images_is_not_sure_and_carries_nothing() -> None:
+    first, second = _texture(6, 640, 480), _texture(7, 640, 480)
+    corners = detect_corners(first, 100, 12.0)
+    assert coarse_motion(coarse_image(first), coarse_image(second), corners[:5], 640) is None
+    found = coarse_motion(coarse_image(first), coarse_image(second), corners, 640)
+    assert found is None or not found.sure
+    guess = None if found is None else moved(corners, found.homography)
+    assert track_points(first, second, corners, guess).ok.mean() < 0.1
 
 
 def test_no_points_give_an_empty_flow() -> None:
