@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from functools import cache
 from importlib import resources
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -184,3 +186,59 @@ def nominal_mount(camera: str, role: str, skeleton: SkeletonModel) -> Mount:
 
 def _faces_back(camera: str, role: str) -> bool:
     return not split_side(role)[0] and "back" in re.split(r"[_\-. ]", camera.lower())
+
+
+_ARTICULATED = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase", "Neck", "Head")
+_REACH_SHARE = 0.15
+_REACH_M = 0.05
+_CLOSEST_M = 0.08
+"""Two cameras on different bones cannot come nearer: each stands off its own bone."""
+
+
+def camera_reach(skeleton: SkeletonModel, mounts: Sequence[Mount]) -> list[tuple[str, str, float, float]]:
+    """How near and how far two cameras on one body can be, whatever the pose.
+
+    Args:
+        skeleton: The body.
+        mounts: Where each camera sits.
+
+    Returns:
+        Rows (camera, camera, least, most), metres, to the centimetre. Bodies differ and straps slip: 15 % and
+        5 cm are allowed for.
+
+    Source: the reach of a chain of ball joints: all links in one line, or the longest against the others.
+    """
+    rest = rest_positions(skeleton)
+    rows = []
+    for first, second in combinations(sorted(mounts, key=lambda mount: mount.camera), 2):
+        ways = [_to_root(skeleton, mount) for mount in (first, second)]
+        shared = set(ways[0]) & set(ways[1])
+        ends = [
+            rest[way[0]] + mount.joint_from_cam[:3, 3]
+            for way, mount in zip(ways, (first, second), strict=True)
+        ]
+        limbs = [
+            [rest[joint] for joint in way if joint not in shared and _bends(skeleton, joint)] for way in ways
+        ]
+        chain = np.array([ends[0], *limbs[0], *limbs[1][::-1], ends[1]])
+        links = np.linalg.norm(np.diff(chain, axis=0), axis=1)
+        most = float(links.sum())
+        least = max(0.0, 2.0 * float(links.max()) - most)
+        low = max(_CLOSEST_M, (1 - _REACH_SHARE) * least - _REACH_M) if len(chain) > 2 else 0.5 * least
+        high = (1 + _REACH_SHARE) * most + _REACH_M
+        rows.append((first.camera, second.camera, round(low, 2), round(high, 2)))
+    return rows
+
+
+def _to_root(skeleton: SkeletonModel, mount: Mount) -> list[int]:
+    joint = skeleton.index_of_role(mount.role)
+    if joint is None:
+        raise JobError(f"no joint plays {mount.role}", field="capture.cameras")
+    way = [joint]
+    while skeleton.parents[way[-1]] >= 0:
+        way.append(int(skeleton.parents[way[-1]]))
+    return way
+
+
+def _bends(skeleton: SkeletonModel, joint: int) -> bool:
+    return split_side(skeleton.roles[joint])[1] in _ARTICULATED

@@ -89,7 +89,9 @@ def _map(options: Json, arguments: Json, context: StageContext, files: Path) -> 
     from bodycap_batch.scene import KeyframeSelection
 
     selections = [read_bundle(KeyframeSelection, Path(path), "keyframes") for path in arguments["selections"]]
-    result = build_map(_capture(arguments), selections, MapOptions.model_validate(options), context)
+    reach = {(first, second): (low, high) for first, second, low, high in arguments.get("reach", ())}
+    options_ = MapOptions.model_validate(options)
+    result = build_map(_capture(arguments), selections, options_, context, reach or None)
     _save_map(result, files)
 
 
@@ -283,6 +285,19 @@ def _skeleton(arguments: Json) -> SkeletonModel:
     from bodycap_batch.skeleton_presets import load_skeleton
 
     return load_skeleton(arguments["skeleton"], arguments["height_m"])
+
+
+def reach_rows(body: Json) -> list[tuple[str, str, float, float]]:
+    """How near and how far a job's cameras can be to each other: rows (camera, camera, least, most), metres.
+
+    Args:
+        body: Skeleton and mounts, as the merge task takes them.
+    """
+    from bodycap_batch.skeleton_presets import camera_reach
+
+    # A map has no scale, so only proportions matter to it: a stature stated later makes no other map.
+    skeleton = _skeleton({**body, "height_m": None})
+    return camera_reach(skeleton, [_mount(block, skeleton) for block in body["mounts"]])
 
 
 def _mount(block: Json, skeleton: SkeletonModel) -> Mount:

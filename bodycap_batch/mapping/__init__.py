@@ -16,11 +16,13 @@ from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import EstimationError
+from bodycap_batch.mapping.consistency import require_consistent
 from bodycap_batch.mapping.convert import to_map
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, add_keyframes, image_ids
 from bodycap_batch.mapping.lens import misfitting_lenses
 from bodycap_batch.mapping.matching import match_pairs
 from bodycap_batch.mapping.pairs import choose_pairs
+from bodycap_batch.mapping.reach import Reach, check_reach
 from bodycap_batch.mapping.repair import Workshop, repair
 from bodycap_batch.mapping.rolling import RollingModel
 from bodycap_batch.mapping.solve import (
@@ -45,6 +47,7 @@ def build_map(
     selections: Sequence[KeyframeSelection],
     options: MapOptions,
     context: StageContext,
+    reach: Reach | None = None,
 ) -> MapResult:
     """Reconstruct the room and the keyframes' poses by incremental structure from motion.
 
@@ -53,12 +56,13 @@ def build_map(
         selections: Keyframes of each camera.
         options: The stage's options.
         context: Work folder (holds the database and models afterwards), threads, progress.
+        reach: How near and how far two cameras can be on the body; without it that is not checked.
 
     Returns:
         The models, largest first, each in its own gauge.
 
     Raises:
-        EstimationError: No initial pair held, or too few keyframes were registered.
+        EstimationError: No initial pair held, too few keyframes were registered, or they contradict the map.
 
     Source: Schönberger, Frahm, "Structure-from-motion revisited", CVPR 2016 (COLMAP).
     """
@@ -78,7 +82,8 @@ def build_map(
     held = match_pairs(workspace, pairs, _lenses(capture), context)
     constant = _constant(capture, cameras)
     models, ladder = reconstruct(workspace, mapper_options(options, constant, scale), context, len(refs))
-    log = {"keyframes": len(refs), "pairs": len(pairs), "verified_pairs": held, "initial_pair_ladder": ladder}
+    log: dict[str, Any] = {"keyframes": len(refs), "pairs": len(pairs), "verified_pairs": held}
+    log["initial_pair_ladder"] = ladder
     if models:
         shop = Workshop(
             workspace=workspace,
@@ -91,8 +96,12 @@ def build_map(
     _require_coverage(models, len(refs), ladder, options)
     write_models(workspace, models)
     given = {number: name for name, number in cameras.items() if capture.camera(name).calibrated}
-    log["misfitting_lenses"] = misfitting_lenses(models[0], mapper_options(options, constant, scale), given)
-    return _result(models, workspace, log)
+    settings = mapper_options(options, constant, scale)
+    log["misfitting_lenses"] = misfitting_lenses(models[0], settings, given)
+    result = _result(models, workspace, log)
+    verdict = check_reach(result.maps[0], _common_ns(capture), reach).to_log() if reach else None
+    require_consistent(log["repair"]["contradicted_share"], verdict)
+    return replace(result, log={**result.log, "reach": verdict})
 
 
 def extend_map(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -162,26 +162,3 @@ def _runs(scene: Map, bad: BoolArray) -> BoolArray:
             if len(run) >= _MIN_RUN and bad[run[0]]:
                 out[run] = True
     return out
-
-
-def links_to_cut(
-    scene: Map, violating: BoolArray, common_ns: Mapping[str, IntArray]
-) -> list[tuple[tuple[str, int], tuple[str, int]]]:
-    """Keyframe pairs that may have put a block where the body cannot be.
-
-    Pairs of the block and the rest, but not neighbours in one camera's time: those hold by continuity.
-    """
-    keys = list(zip(scene.keyframe_camera, map(int, scene.keyframe_frame), strict=True))
-    times = [int(common_ns[camera][frame]) for camera, frame in keys]
-    out = []
-    for a in np.flatnonzero(violating):
-        for b in np.flatnonzero(~violating):
-            near = keys[a][0] == keys[b][0] and abs(times[a] - times[b]) <= _MAX_GAP_NS
-            if not near:
-                out.append((keys[a], keys[b]))
-    return out
-
-
-def reaches(blocks: Sequence[tuple[str, str, float, float]]) -> Reach:
-    """Reach by camera pair, from plain rows (camera, camera, least, most)."""
-    return {(min(a, b), max(a, b)): (low, high) for a, b, low, high in blocks}

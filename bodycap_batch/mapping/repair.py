@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from bodycap_batch.camera import Camera
 from bodycap_batch.context import StageContext
-from bodycap_batch.mapping.consistency import doubtful, links_of
+from bodycap_batch.mapping.consistency import contradicted_share, doubtful, links_of
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, Pair, image_ids
 from bodycap_batch.mapping.matching import match_pairs
 from bodycap_batch.mapping.solve import extend, refine
@@ -56,7 +56,8 @@ def repair(model: pycolmap.Reconstruction, tried: set[Pair], shop: Workshop) -> 
     log: list[dict[str, object]] = []
     with pycolmap.Database.open(str(shop.workspace / DATABASE_NAME)) as database:
         ids = image_ids(database)
-    suspects = doubtful(links_of(shop.workspace, model, shop.lenses))
+    links = links_of(shop.workspace, model, shop.lenses)
+    suspects = doubtful(links)
     for _ in range(_ROUNDS):
         placed = set(map(int, model.reg_image_ids()))
         again = suspects | (set(ids.values()) - placed)
@@ -74,14 +75,16 @@ def repair(model: pycolmap.Reconstruction, tried: set[Pair], shop: Workshop) -> 
         if not held and not suspects:
             break
         other = _without(model, suspects, shop, len(ids))
-        left = doubtful(links_of(shop.workspace, other, shop.lenses))
+        other_links = links_of(shop.workspace, other, shop.lenses)
+        left = doubtful(other_links)
         sound_before = len(placed - suspects)
         sound_after = len(set(map(int, other.reg_image_ids())) - left)
         entry |= {"sound_before": sound_before, "sound_after": sound_after}
         if sound_after < sound_before or (sound_after == sound_before and len(left) >= len(suspects)):
             break
-        model, suspects = other, left
-    return model, {"rounds": log, "doubtful": len(suspects)}
+        model, suspects, links = other, left, other_links
+    share = round(contradicted_share(links), 4)
+    return model, {"rounds": log, "doubtful": len(suspects), "contradicted_share": share}
 
 
 def _untried(ids: Mapping[ImageRef, int], images: set[int], tried: set[Pair]) -> list[Pair]:

@@ -24,7 +24,7 @@ from bodycap_batch.progress import Event, Listener
 from bodycap_batch.runner import Runner, Task
 from bodycap_batch.runner.parent import CHILD
 from bodycap_batch.store import Artefact, Store
-from bodycap_batch.tasks import STAGES, read_summary
+from bodycap_batch.tasks import STAGES, reach_rows, read_summary
 
 ByCamera = Mapping[str, Artefact]
 
@@ -128,10 +128,14 @@ class Flow:
 
     def map(self, keyframes: ByCamera) -> Artefact:
         """The map of all keyframes."""
-        key = key_of("map", self._map_options(), {"cameras": self._digests, "keyframes": _content(keyframes)})
+        # The distances, not the body: a mount stated a little better makes no other map.
+        reach = reach_rows(body_arguments(self._job)) if has_body(self._job) else []
+        inputs = {"cameras": self._digests, "keyframes": _content(keyframes), "reach": reach}
+        key = key_of("map", self._map_options(), inputs)
         arguments = {
             "capture": all_cameras(self._job.capture),
             "selections": [str(artefact.path) for artefact in keyframes.values()],
+            "reach": reach,
         }
         later = [name for name in ("merge", "export") if name == "export" or has_body(self._job)]
         # The mapper keeps one core busy; on another the libraries of the last stages load.

@@ -112,7 +112,7 @@ def test_a_right_map_is_left_alone(built: tuple[Any, FloatArray, Workshop, set[A
     assert _rms(model, poses) < 0.01
     same, log = repair(model, set(pairs), shop)
     assert same is model
-    assert log == {"rounds": [], "doubtful": 0}
+    assert log == {"rounds": [], "doubtful": 0, "contradicted_share": 0.0}
 
 
 def test_a_misplaced_block_is_found_and_put_right(

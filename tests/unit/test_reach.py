@@ -1,0 +1,102 @@
+"""The body's reach as a check of a map without scale."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bodycap_batch.camera import Camera
+from bodycap_batch.errors import EstimationError
+from bodycap_batch.mapping.consistency import Link, contradicted_share, require_consistent
+from bodycap_batch.mapping.reach import best_scale, check_reach
+from bodycap_batch.scene import Map
+from bodycap_batch.skeleton_presets import camera_reach, load_skeleton, nominal_mount
+
+_LENS = Camera(model="PINHOLE", width_px=64, height_px=48, params=np.array([50.0, 50.0, 32.0, 24.0]))
+_KEYFRAMES = 30
+_TIMES = {name: np.arange(_KEYFRAMES, dtype=np.int64) * 300_000_000 for name in ("hand", "torso")}
+_REACH = {("hand", "torso"): (0.1, 1.0)}
+
+
+def _walk(units_per_metre: float = 1.0, shift_m: float = 0.0, rows: slice = slice(0, 0)) -> Map:
+    """A torso that walks at 1 m/s and a hand that swings half a metre off; `rows` of it are moved."""
+    t = _TIMES["hand"] * 1e-9
+    torso = np.column_stack([t, 0 * t, 0 * t + 1.2])
+    hand = torso + np.column_stack([0.2 * np.sin(2 * t), 0 * t + 0.4, 0 * t - 0.3])
+    hand[rows] += (0.0, 0.0, shift_m)
+    poses = np.tile(np.eye(4), (2 * _KEYFRAMES, 1, 1))
+    poses[:, :3, 3] = units_per_metre * np.concatenate([hand, torso])
+    none = np.zeros(0, dtype=np.int64)
+    return Map(
+        gauge="g",
+        cameras={"hand": _LENS, "torso": _LENS},
+        keyframe_camera=("hand",) * _KEYFRAMES + ("torso",) * _KEYFRAMES,
+        keyframe_frame=np.tile(np.arange(_KEYFRAMES), 2),
+        map_from_cam=poses,
+        points=np.zeros((0, 3)),
+        colors=np.zeros((0, 3), np.uint8),
+        point_error_px=np.zeros(0),
+        obs_keyframe=none,
+        obs_point=none,
+        obs_feature=none,
+        obs_px=np.zeros((0, 2)),
+    )
+
+
+@pytest.mark.parametrize("units_per_metre", [0.1, 1.0, 10.0])
+def test_scale_changes_no_verdict(units_per_metre: float) -> None:
+    right = check_reach(_walk(units_per_metre), _TIMES, _REACH)
+    assert right.judged
+    assert right.explained == 1.0
+    assert not right.violating.any()
+    # A hand 15 m off for four keyframes: 0.5 m and 15 m cannot both lie within a factor of ten.
+    wrong = check_reach(_walk(units_per_metre, 15.0, slice(10, 14)), _TIMES, _REACH)
+    assert wrong.judged
+    assert np.flatnonzero(wrong.violating).tolist()[:4] == list(range(10, 14))
+    assert wrong.to_log() == check_reach(_walk(1.0, 15.0, slice(10, 14)), _TIMES, _REACH).to_log()
+
+
+def test_one_keyframe_off_is_noise_and_half_of_them_no_body() -> None:
+    assert not check_reach(_walk(1.0, 15.0, slice(12, 13)), _TIMES, _REACH).violating.any()
+    folded = _walk(1.0, 15.0, slice(0, 15))
+    verdict = check_reach(folded, _TIMES, _REACH)
+    assert not verdict.judged
+    assert not verdict.violating.any()
+    assert "no scale" in str(verdict.to_log()["reason"])
+
+
+def test_without_instants_in_common_nothing_is_said() -> None:
+    later = {"hand": _TIMES["hand"], "torso": _TIMES["torso"] + 10**12}
+    assert not check_reach(_walk(), later, _REACH).judged
+    assert not check_reach(replace(_walk(), gauge="h"), _TIMES, {}).judged
+
+
+def test_the_best_scale_lies_in_most_intervals() -> None:
+    low, high = np.array([0.0, 1.0, 2.0, 9.0]), np.array([3.0, 4.0, 5.0, 10.0])
+    middle, share = best_scale(low, high)
+    assert 2.0 <= middle <= 3.0
+    assert share == 0.75
+
+
+def test_reach_of_the_standard_body() -> None:
+    body = load_skeleton("full_body", 1.8)
+    roles = {"torso": "Spine1", "left_palm": "LeftHand", "right_palm": "RightHand", "left_arm": "LeftArm"}
+    rows = camera_reach(body, [nominal_mount(name, role, body) for name, role in roles.items()])
+    far = {(a, b): high for a, b, _, high in rows}
+    assert len(rows) == 6
+    assert all(0 < low < high for _, _, low, high in rows)
+    # Arm span is stature, wrists 11 % of it inside on either side; 15 % and 5 cm of slack, and the mounts.
+    assert 1.4 < far["left_palm", "right_palm"] < 2.4
+    assert far["left_arm", "torso"] < far["left_palm", "torso"] < far["left_palm", "right_palm"]
+
+
+def test_a_map_that_its_pairs_contradict_is_refused() -> None:
+    links = [Link(0, other, 50, 1.0) for other in range(1, 8)] + [
+        Link(0, other, 50, 0.1) for other in (8, 9, 10)
+    ]
+    assert contradicted_share(links) == pytest.approx(0.3)
+    require_consistent(0.05, None)
+    with pytest.raises(EstimationError, match=r"30% .* look the same .* no scale fits"):
+        require_consistent(contradicted_share(links), {"reason": "no scale fits"})
