@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -11,28 +10,19 @@ from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.context import StageContext
-from bodycap_batch.geometry import interpolate_pose, invert
-from bodycap_batch.registration.batch import make_views
 from bodycap_batch.registration.growth import wanted_keyframes
-from bodycap_batch.registration.jumps import pose_jumps
-from bodycap_batch.registration.pose import MAP_VARIANCE_RATIO, FramePose, PoseLimits, solve_poses
+from bodycap_batch.registration.pose import FramePose, PoseLimits
+from bodycap_batch.registration.solving import matrices, solve_frames
 from bodycap_batch.registration.stretches import all_tracks
 from bodycap_batch.registration.tracks import Tracks, anchors_of, track_scale
-from bodycap_batch.rolling_shutter import at_mid_row, image_velocity
 from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 
 __all__ = ["register_frames"]
 
 _MAP_NOISE_PX = 0.6
 _THRESHOLD_SIGMAS = 3.5
-_POINT_VARIANCE = 6.0
-"""Variance that a point seen by n keyframes adds to its projections, times n, in units of a track's own.
-Without it and with 3, 6, 9: walk131 0.65, 0.59, 0.55, 0.55 cm; room131 3.1, 3.0, 2.9, 2.9; walk12 0.38 for
-all; room12 0.55, 0.55, 0.56, 0.56."""
 _BLUR_RATIO = 0.6
 _BLUR_WINDOW = 15
-_ROLLING_PASSES = 2
-"""The velocity that moves pixels comes from the poses that the moved pixels give."""
 
 
 def register_frames(
@@ -66,7 +56,7 @@ def register_frames(
         return _without_map(camera, tried)
     anchors = anchors_of(scene_map, camera.name)
     tracks = all_tracks(camera, anchors, previous, context)
-    poses = _solve_all(camera, scene_map, tracks, _limits(camera, selection, options))
+    poses = solve_frames(camera, scene_map, tracks, _limits(camera, selection, options))
     trajectory = _trajectory(camera, scene_map.gauge, poses, selection.sharpness)
     return Registration(
         trajectory=trajectory,
@@ -114,78 +104,6 @@ def _without_map(camera: CaptureCamera, tried: IntArray) -> Registration:
     )
 
 
-def _solve_all(camera: CaptureCamera, scene_map: Map, tracks: Tracks, limits: PoseLimits) -> list[FramePose]:
-    """Solve every frame from its tracks and, in a keyframe, from the map's own observations."""
-    point = scene_map.points_of(camera.name, tracks.keyframe, tracks.feature)
-    tracked = point >= 0
-    rows = scene_map.keyframes_of(camera.name)
-    mine = np.isin(scene_map.obs_keyframe, rows)
-    own_frame = scene_map.keyframe_frame[scene_map.obs_keyframe[mine]]
-    frame = np.concatenate([own_frame, tracks.frame[tracked]])
-    order = np.argsort(frame, kind="stable")
-    seen = np.concatenate([scene_map.obs_point[mine], point[tracked]])[order]
-    points, weight = scene_map.points[seen], _point_weights(scene_map)[seen]
-    px = np.concatenate([scene_map.obs_px[mine], tracks.px[tracked].astype(np.float64)])[order]
-    count = len(camera.times_ns)
-    lens = scene_map.cameras[camera.name]
-    bounds = np.searchsorted(frame[order], np.arange(count + 1))
-    keyframes = scene_map.keyframe_frame[rows]
-    start = _between(keyframes, scene_map.map_from_cam[rows], count)
-    poses = solve_poses(lens, make_views(lens, bounds, points, px, weight), px, start, limits)
-    readout_s = scene_map.readout_s.get(camera.name, 0.0)
-    for _ in range(_ROLLING_PASSES if readout_s else 0):
-        path = _matrices(poses)
-        velocity = image_velocity(lens, path, camera.times_ns, frame[order], points)
-        moved = at_mid_row(lens, px, velocity, readout_s)
-        start = np.where(np.isfinite(path), invert(path), start)
-        poses = solve_poses(lens, make_views(lens, bounds, points, moved, weight), moved, start, limits)
-    for index in keyframes.tolist():
-        if poses[index].status is FrameStatus.REGISTERED:
-            poses[index] = replace(poses[index], status=FrameStatus.KEYFRAME)
-    return _without_jumps(poses)
-
-
-def _point_weights(scene_map: Map) -> FloatArray:
-    """(P,) weights of the map's points: where one stands is known the better the more keyframes see it."""
-    seen = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))
-    return np.asarray(seen / (seen + _POINT_VARIANCE))
-
-
-def _matrices(poses: Sequence[FramePose]) -> FloatArray:
-    """Poses gauge_from_cam (N,4,4), NaN where there is none."""
-    none = np.full((4, 4), np.nan)
-    found = [none if pose.gauge_from_cam is None else pose.gauge_from_cam for pose in poses]
-    return np.array(found).reshape(-1, 4, 4)
-
-
-def _between(keyframes: IntArray, map_from_cam: FloatArray, count: int) -> FloatArray:
-    """Poses cam_from_map (count,4,4) interpolated between keyframes; the nearest one's outside them."""
-    frames = np.arange(count)
-    after = np.clip(np.searchsorted(keyframes, frames), 1, max(1, len(keyframes) - 1))
-    after = np.minimum(after, len(keyframes) - 1)
-    before = np.maximum(after - 1, 0)
-    span = np.maximum(keyframes[after] - keyframes[before], 1)
-    alpha = np.clip((frames - keyframes[before]) / span, 0.0, 1.0)
-    return invert(interpolate_pose(map_from_cam[before], map_from_cam[after], alpha))
-
-
-def _without_jumps(poses: list[FramePose]) -> list[FramePose]:
-    """Refuse the poses that jump away from both neighbours and back."""
-    centres = np.full((len(poses), 3), np.nan)
-    sigma = np.full(len(poses), np.nan)
-    for frame, pose in enumerate(poses):
-        if pose.gauge_from_cam is not None and pose.covariance is not None:
-            centres[frame] = pose.gauge_from_cam[:3, 3]
-            # Neighbours share the map's error.
-            sigma[frame] = np.sqrt(np.trace(pose.covariance[3:, 3:]) / MAP_VARIANCE_RATIO)
-    jump = pose_jumps(centres, sigma)
-    refused = FramePose(status=FrameStatus.POSE_JUMP)
-    return [
-        replace(refused, inliers=pose.inliers, error_px=pose.error_px) if jump[frame] else pose
-        for frame, pose in enumerate(poses)
-    ]
-
-
 def _trajectory(
     camera: CaptureCamera, gauge: str, poses: Sequence[FramePose], sharpness: FloatArray
 ) -> Trajectory:
@@ -195,7 +113,7 @@ def _trajectory(
         gauge=gauge,
         frame_numbers=camera.frame_numbers,
         times_ns=camera.times_ns,
-        gauge_from_cam=_matrices(poses),
+        gauge_from_cam=matrices(poses),
         covariance=np.array(
             [none6 if pose.covariance is None else pose.covariance for pose in poses]
         ).reshape(-1, 6, 6),

@@ -154,6 +154,16 @@ def assess_poses(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> F
     return fits
 
 
+def inliers_of(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> BoolArray:
+    """Which views (M,) lie within a limit of what poses (F,4,4) predict; none where a pose is NaN."""
+    out = np.zeros(len(views.rays), dtype=bool)
+    for some in _chunks(views):
+        rows, _, owner = _gather(views, some)
+        residual, _, _ = linearise(views, rows, cam_from_gauge[some][owner])
+        out[rows] = np.hypot(residual[0], residual[1]) < limit_px
+    return out
+
+
 def _chunks(views: Views) -> Iterator[IntArray]:
     """Frames with enough views to have a pose, some at a time."""
     counts = np.diff(views.bounds)
