@@ -19,7 +19,7 @@ from bodycap_batch.errors import EstimationError
 from bodycap_batch.mapping.consistency import require_consistent
 from bodycap_batch.mapping.convert import to_map
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, add_keyframes, image_ids
-from bodycap_batch.mapping.lens import misfitting_lenses
+from bodycap_batch.mapping.lens import better_lenses, misfitting_lenses
 from bodycap_batch.mapping.matching import match_pairs
 from bodycap_batch.mapping.pairs import choose_pairs
 from bodycap_batch.mapping.reach import Reach, check_reach
@@ -84,6 +84,10 @@ def build_map(
     models, ladder = reconstruct(workspace, mapper_options(options, constant, scale), context, len(refs))
     log: dict[str, Any] = {"keyframes": len(refs), "pairs": len(pairs), "verified_pairs": held}
     log["initial_pair_ladder"] = ladder
+    guessed = {number: name for name, number in cameras.items() if number not in set(constant)}
+    if models and guessed:
+        settings = mapper_options(options, constant, scale)
+        models, log["better_lenses"] = _with_better_lenses(models, workspace, guessed, settings, context)
     if models:
         shop = Workshop(
             workspace=workspace,
@@ -102,6 +106,26 @@ def build_map(
     verdict = check_reach(result.maps[0], _common_ns(capture), reach).to_log() if reach else None
     require_consistent(log["repair"]["contradicted_share"], verdict)
     return replace(result, log={**result.log, "reach": verdict})
+
+
+def _with_better_lenses(
+    models: list[Any],
+    workspace: Path,
+    guessed: Mapping[int, str],
+    settings: pycolmap.IncrementalPipelineOptions,
+    context: StageContext,
+) -> tuple[list[Any], dict[str, str]]:
+    """Models built anew where guessed lenses (names by id) need another kind of camera; which one."""
+    import pycolmap
+
+    lenses = better_lenses(models[0], settings, guessed)
+    if lenses:
+        with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+            for lens in lenses.values():
+                database.update_camera(lens)
+            total = len(database.read_all_images())
+        models, _ = reconstruct(workspace, settings, context, total)
+    return models, {guessed[number]: lens.model_name for number, lens in sorted(lenses.items())}
 
 
 def extend_map(

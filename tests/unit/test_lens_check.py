@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 
 from bodycap_batch.config import MapOptions
-from bodycap_batch.mapping.lens import misfit_note, misfitting_lenses
+from bodycap_batch.mapping.lens import better_lenses, misfit_note, misfitting_lenses
 from bodycap_batch.mapping.solve import adjust, mapper_options
 
 
@@ -63,3 +63,9 @@ def test_the_note_says_what_to_do():
     assert "12 % longer" in misfit_note("torso", 1.12)
     assert "12 % shorter" in misfit_note("torso", 0.88)
     assert "stabilisation" in misfit_note("torso", 0.88)
+
+
+def test_a_guessed_lens_that_fits_keeps_its_model():
+    model, settings = _model(1.0)
+    assert better_lenses(model, settings, set(model.cameras)) == {}
+    assert better_lenses(model, settings, set()) == {}

@@ -74,3 +74,20 @@ def test_unrelated_views_do_not_hold() -> None:
     # Of 100 strays, one essential matrix picked among 400 explains a dozen or two; a hundred never.
     assert len(verified(matches[right:], a, b)) < 40
     assert len(verified(matches[:14], a, b)) == 0
+
+
+def test_a_known_lens_beside_an_unknown_one_is_verified_in_pixels() -> None:
+    a, _, matches, right = _two_views(np.random.default_rng(3), calibrated=True)
+    _, b, _, _ = _two_views(np.random.default_rng(3), calibrated=False)
+    kept = verified(matches, a, b)
+    assert set(range(right)) <= set(kept[:, 0].tolist())
+    assert len(kept) <= right + 12
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+@pytest.mark.parametrize("distinct", [1, 2, 4])
+def test_matches_that_fix_no_geometry_are_no_error(calibrated: bool, distinct: int) -> None:
+    rng = np.random.default_rng(5)
+    first, second = (rng.uniform((0, 0), (640, 480), (distinct, 2))[np.arange(60) % distinct] for _ in "ab")
+    kept = verified(np.column_stack([np.arange(60)] * 2), _view(first, calibrated), _view(second, calibrated))
+    assert kept.shape[1] == 2
