@@ -20,8 +20,7 @@ from bodycap_batch.mapping.consistency import require_consistent
 from bodycap_batch.mapping.convert import to_map
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, add_keyframes, image_ids
 from bodycap_batch.mapping.lens import better_lenses, misfitting_lenses
-from bodycap_batch.mapping.matching import match_pairs
-from bodycap_batch.mapping.pairs import choose_pairs
+from bodycap_batch.mapping.pairs import PairChooser, link_keyframes
 from bodycap_batch.mapping.reach import Reach, check_reach
 from bodycap_batch.mapping.repair import Workshop, repair
 from bodycap_batch.mapping.rolling import RollingModel
@@ -78,12 +77,11 @@ def build_map(
     add_keyframes(workspace, wanted, options, context)
     refs = [ImageRef(item.camera, int(frame)) for item in selections for frame in item.frames]
     scale = _scale(capture)
-    pairs = choose_pairs(workspace, refs, _common_ns(capture), options)
-    held = match_pairs(workspace, pairs, _lenses(capture), context)
+    chooser = PairChooser(workspace, refs, _common_ns(capture), options)
+    tried, linked = link_keyframes(chooser, workspace, _lenses(capture), context)
     constant = _constant(capture, cameras)
     models, ladder = reconstruct(workspace, mapper_options(options, constant, scale), context, len(refs))
-    log: dict[str, Any] = {"keyframes": len(refs), "pairs": len(pairs), "verified_pairs": held}
-    log["initial_pair_ladder"] = ladder
+    log: dict[str, Any] = {"keyframes": len(refs), **linked, "initial_pair_ladder": ladder}
     guessed = {number: name for name, number in cameras.items() if number not in set(constant)}
     if models and guessed:
         settings = mapper_options(options, constant, scale)
@@ -96,7 +94,7 @@ def build_map(
             constant=constant,
             context=context,
         )
-        models[0], log["repair"] = repair(models[0], set(pairs), shop)
+        models[0], log["repair"] = repair(models[0], tried, shop)
     _require_coverage(models, len(refs), ladder, options)
     write_models(workspace, models)
     given = {number: name for name, number in cameras.items() if capture.camera(name).calibrated}
@@ -168,8 +166,8 @@ def extend_map(
     ]
     add_keyframes(workspace, wanted, options, context)
     scale = _scale(capture)
-    pairs = choose_pairs(workspace, new, _common_ns(capture), options)
-    held = match_pairs(workspace, pairs, _lenses(capture), context)
+    chooser = PairChooser(workspace, new, _common_ns(capture), options)
+    _, linked = link_keyframes(chooser, workspace, _lenses(capture), context)
     constant = _constant(capture, cameras)
     models = []
     for number in range(len(previous.maps)):
@@ -181,8 +179,7 @@ def extend_map(
         refine(model, settings, constant)
         models.append(model)
     write_models(workspace, models)
-    log = {"keyframes": len(known) + len(new), "new_keyframes": len(new)}
-    log |= {"pairs": len(pairs), "verified_pairs": held}
+    log = {"keyframes": len(known) + len(new), "new_keyframes": len(new), **linked}
     log["misfitting_lenses"] = previous.log.get("misfitting_lenses", {})
     return _result(models, workspace, log)
 

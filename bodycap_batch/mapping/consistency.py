@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bodycap_batch.arrays import FloatArray
-from bodycap_batch.camera import Camera
 from bodycap_batch.errors import EstimationError
-from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef
+from bodycap_batch.mapping.database import DATABASE_NAME
 
 if TYPE_CHECKING:
     import pycolmap
@@ -41,9 +40,7 @@ class Link:
     agreeing: float
 
 
-def links_of(
-    workspace: Path, model: pycolmap.Reconstruction, cameras: Mapping[str, tuple[Camera, bool]]
-) -> list[Link]:
+def links_of(workspace: Path, model: pycolmap.Reconstruction) -> list[Link]:
     """Hold every verified pair of registered keyframes against the map's poses.
 
     Source: the symmetric epipolar distance of Hartley, Zisserman, "Multiple view geometry", 2004, 11.4.
@@ -57,10 +54,10 @@ def links_of(
         for image in database.read_all_images():
             number = int(image.image_id)
             if number in poses:
-                lens = cameras[ImageRef.parse(image.name).camera][0]
+                lens = model.image(number).camera  # a guessed one was refined
                 pixels = np.asarray(database.read_keypoints(number), dtype=np.float64)[:, :2]
-                rays[number] = np.column_stack([lens.unproject(pixels), np.ones(len(pixels))])
-                focal[number] = lens.focal_px
+                rays[number] = np.column_stack([lens.cam_from_img(pixels), np.ones(len(pixels))])
+                focal[number] = lens.mean_focal_length()
         for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
             a, b = map(int, pycolmap.pair_id_to_image_pair(pair))
             matches = np.asarray(geometry.inlier_matches)
@@ -132,5 +129,5 @@ def require_consistent(share: float, reach: Mapping[str, object] | None) -> None
     raise EstimationError(
         f"{share:.0%} of the matches between keyframes contradict the map: places that look the same "
         f"(repeated pictures, tiles, windows) were taken for one{body}",
-        hint="film what tells the places apart, or cover the repeated pictures",
+        hint="film what tells the places apart, or cover repeated pictures; check the calibration",
     )

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +14,7 @@ from bodycap_batch.arrays import IntArray
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
+from bodycap_batch.mapping.features import features_of
 
 if TYPE_CHECKING:
     import pycolmap
@@ -77,8 +77,8 @@ def add_keyframes(
         options: Number of features.
         context: Threads and progress.
 
-    Source: Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004, with
-        RootSIFT normalisation (Arandjelović, Zisserman, CVPR 2012), both as COLMAP implements them.
+    Source: Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004, as
+        OpenCV implements them.
     """
     import pycolmap
 
@@ -86,14 +86,18 @@ def add_keyframes(
     colours = workspace / _COLOURS
     colours.mkdir(exist_ok=True)
     done = 0
-    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+    sift = pycolmap.FeatureExtractorType.SIFT
+    with (
+        pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database,
+        pycolmap.DatabaseTransaction(database),
+    ):
         for camera, camera_id, frames in wanted:
-            for index, keypoints, descriptors, rgb in _features(camera, frames, options, context):
-                ref = ImageRef(camera.name, index)
-                image_id = write_image(database, ref, camera_id)
-                database.write_keypoints(image_id, keypoints)
+            for index, found in features_of(camera, frames, options.features, context):
+                image_id = write_image(database, ImageRef(camera.name, index), camera_id)
+                database.write_keypoints(image_id, found.keypoints)
+                descriptors = pycolmap.FeatureDescriptors(sift, found.descriptors)
                 database.write_descriptors(image_id, descriptors)
-                np.save(colours / f"{image_id}.npy", rgb)
+                np.save(colours / f"{image_id}.npy", found.rgb)
                 done += 1
                 context.progress(done, total, "features")
 
@@ -115,42 +119,3 @@ def write_image(database: pycolmap.Database, ref: ImageRef, camera_id: int) -> i
     frame.add_data_id(pycolmap.data_t(sensor, image_id))
     database.write_frame(frame)
     return image_id
-
-
-def _features(
-    camera: CaptureCamera, frames: IntArray, options: MapOptions, context: StageContext
-) -> Iterator[tuple[int, Any, Any, npt.NDArray[np.uint8]]]:
-    """Yield (frame, keypoints (N,4), descriptors, RGB (N,3)) in frame order, extracted in parallel."""
-    import cv2
-    import pycolmap
-
-    settings = pycolmap.FeatureExtractionOptions()
-    settings.num_threads = 1
-    settings.use_gpu = False
-    settings.sift.max_num_features = options.features
-    settings.sift.first_octave = 0
-    extractors = [
-        pycolmap.FeatureExtractor.create(settings, pycolmap.Device.cpu) for _ in range(context.threads)
-    ]
-
-    def extract(slot: int, rgb: npt.NDArray[np.uint8]) -> tuple[Any, Any, npt.NDArray[np.uint8]]:
-        grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-        points, descriptors = extractors[slot].extract_from_uint8_array(grey)
-        keypoints = np.asarray(pycolmap.keypoints_to_matrix(points), dtype=np.float32).reshape(-1, 4)
-        if camera.mask is not None:
-            seen = camera.sees_room(keypoints[:, :2])
-            keypoints = keypoints[seen]
-            descriptors = pycolmap.FeatureDescriptors(descriptors.type, descriptors.data[seen])
-        column = np.clip(keypoints[:, 0].astype(int), 0, grey.shape[1] - 1)
-        row = np.clip(keypoints[:, 1].astype(int), 0, grey.shape[0] - 1)
-        return keypoints, descriptors, rgb[row, column]
-
-    with ThreadPoolExecutor(len(extractors)) as pool:
-        batch: list[tuple[int, Any]] = []
-        for index, rgb in camera.read(frames, colour=True):
-            context.check_cancelled()
-            batch.append((index, pool.submit(extract, len(batch), rgb)))
-            if len(batch) == len(extractors):
-                yield from ((frame, *job.result()) for frame, job in batch)
-                batch = []
-        yield from ((frame, *job.result()) for frame, job in batch)

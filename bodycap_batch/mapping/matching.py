@@ -64,7 +64,7 @@ def match_pairs(
     pairs: Sequence[Pair],
     cameras: Mapping[str, tuple[Camera, bool]],
     context: StageContext,
-) -> int:
+) -> dict[Pair, int]:
     """Match and verify keyframe pairs into the database.
 
     Args:
@@ -74,14 +74,14 @@ def match_pairs(
         context: Threads, progress, cancellation.
 
     Returns:
-        How many pairs held.
+        Matches of each pair that held.
 
     Source: Lowe, IJCV 2004 (ratio test); Barath et al., "MAGSAC++", CVPR 2020 and Raguram et al., "USAC",
         PAMI 2013, as OpenCV has them, for the robust fit.
     """
     import pycolmap
 
-    held = 0
+    held: dict[Pair, int] = {}
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         ids = image_ids(database)
         views = _views(database, ids, {ref for pair in pairs for ref in pair}, cameras)
@@ -93,7 +93,7 @@ def match_pairs(
                     if len(matches) >= MIN_INLIERS:
                         calibrated = views[a].calibrated and views[b].calibrated
                         _write(database, ids[a], ids[b], matches, calibrated=calibrated)
-                        held += 1
+                        held[a, b] = len(matches)
     context.progress(len(pairs), len(pairs), "pairs")
     return held
 

@@ -56,7 +56,7 @@ def repair(model: pycolmap.Reconstruction, tried: set[Pair], shop: Workshop) -> 
     log: list[dict[str, object]] = []
     with pycolmap.Database.open(str(shop.workspace / DATABASE_NAME)) as database:
         ids = image_ids(database)
-    links = links_of(shop.workspace, model, shop.lenses)
+    links = links_of(shop.workspace, model)
     suspects = doubtful(links)
     for _ in range(_ROUNDS):
         placed = set(map(int, model.reg_image_ids()))
@@ -69,13 +69,13 @@ def repair(model: pycolmap.Reconstruction, tried: set[Pair], shop: Workshop) -> 
             "doubtful": [ref.name for ref, number in sorted(ids.items()) if number in suspects],
             "unregistered": len(set(ids.values()) - placed),
             "pairs": len(fresh),
-            "verified_pairs": held,
+            "verified_pairs": len(held),
         }
         log.append(entry)
         if not held and not suspects:
             break
         other = _without(model, suspects, shop, len(ids))
-        other_links = links_of(shop.workspace, other, shop.lenses)
+        other_links = links_of(shop.workspace, other)
         left = doubtful(other_links)
         sound_before = len(placed - suspects)
         sound_after = len(set(map(int, other.reg_image_ids())) - left)

@@ -10,7 +10,7 @@ import pytest
 
 from bodycap_batch.config import MapOptions
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef
-from bodycap_batch.mapping.pairs import choose_pairs
+from bodycap_batch.mapping.pairs import PairChooser
 from bodycap_batch.mapping.retrieval import similarity
 
 
@@ -50,19 +50,37 @@ def _database(folder: Path, keyframes: int) -> dict[str, np.ndarray]:
 def test_pairs_per_keyframe_are_bounded(tmp_path: Path, keyframes: int) -> None:
     times = _database(tmp_path, keyframes)
     refs = [ImageRef(camera, frame) for camera in times for frame in range(keyframes)]
-    pairs = choose_pairs(tmp_path, refs, times, MapOptions(pairs="retrieval"))
-    # Quota per keyframe: 12 neighbours, 8 of its own at another time, 8 of the other camera.
-    assert len(pairs) <= 28 * len(refs)
+    pairs = PairChooser(tmp_path, refs, times, MapOptions(pairs="retrieval")).first()
+    # Quota per keyframe: 14 neighbours, 8 of its own at another time, 10 of the other camera.
+    assert len(pairs) <= 32 * len(refs)
     assert len(set(pairs)) == len(pairs)
     assert (ImageRef("a", 7), ImageRef("b", 7)) in pairs
     assert (ImageRef("a", 7), ImageRef("a", 8)) in pairs
-    every = choose_pairs(tmp_path, refs, times, MapOptions(pairs="exhaustive"))
+    every = PairChooser(tmp_path, refs, times, MapOptions(pairs="exhaustive")).first()
     assert len(every) == len(refs) * (len(refs) - 1) // 2
 
 
 def test_growing_matches_new_keyframes_only(tmp_path: Path) -> None:
     times = _database(tmp_path, 60)
     new = [ImageRef("a", 5), ImageRef("b", 30)]
-    pairs = choose_pairs(tmp_path, new, times, MapOptions(pairs="retrieval"))
+    pairs = PairChooser(tmp_path, new, times, MapOptions(pairs="retrieval")).first()
     assert all(a in new or b in new for a, b in pairs)
-    assert len(pairs) <= 28 * len(new)
+    assert len(pairs) <= 32 * len(new)
+
+
+def test_what_hangs_by_few_links_gets_more(tmp_path: Path) -> None:
+    times = _database(tmp_path, 80)
+    refs = [ImageRef(camera, frame) for camera in times for frame in range(80)]
+    chooser = PairChooser(tmp_path, refs, times, MapOptions(pairs="retrieval"))
+    first = chooser.first()
+    weak = ImageRef("a", 40)
+    held = {pair: 50 for pair in first if weak not in pair}
+    degree = {ref: sum(ref in pair and pair[0].camera != pair[1].camera for pair in held) for ref in refs}
+    more = chooser.wider(held)
+    assert sum(weak in pair for pair in more) >= 100  # 64 of either camera, less what is near in time
+    well = [ref for ref in refs if degree[ref] >= 12]
+    assert all(a not in well or b not in well for a, b in more)
+    assert chooser.wider({(a, b): 50 for a in refs for b in refs if a < b}) == []
+    assert chooser.unlinked(held) == []
+    alone = chooser.unlinked({pair: 50 for pair in first if pair[0].camera == pair[1].camera})
+    assert len(alone) == 80 * 80

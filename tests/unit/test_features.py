@@ -1,0 +1,72 @@
+"""SIFT features of keyframes: where they are, in what order, and that threads change nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import cv2
+import numpy as np
+import pytest
+
+from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.context import StageContext
+from bodycap_batch.mapping.features import Features, features_of
+
+_CENTRES = np.array([(x, y) for y in range(40, 460, 70) for x in range(45, 620, 80)], dtype=np.float64)
+
+
+class _Blobs:
+    """A camera whose frames show dark blobs at whole pixels, each frame shifted by one more."""
+
+    def __init__(self, hidden_left_px: float = 0.0) -> None:
+        self.mask = object() if hidden_left_px else None
+        self._hidden = hidden_left_px
+
+    def sees_room(self, px: np.ndarray) -> np.ndarray:
+        return px[:, 0] >= self._hidden
+
+    def read(self, frames: np.ndarray, *, colour: bool) -> Iterator[tuple[int, np.ndarray]]:
+        assert colour
+        for frame in map(int, frames):
+            image = np.full((480, 640, 3), 200, np.uint8)
+            for x, y in _CENTRES + frame:
+                cv2.circle(image, (int(x), int(y)), 6, (20, 90, 160), -1, cv2.LINE_AA)
+            yield frame, cv2.GaussianBlur(image, (0, 0), 2.0)
+
+
+def _features(tmp_path: Path, frames: list[int], threads: int = 2, hidden: float = 0.0) -> list[Features]:
+    camera = cast(CaptureCamera, _Blobs(hidden))
+    found: list[Any] = list(
+        features_of(camera, np.array(frames), 2048, StageContext(work_dir=tmp_path, threads=threads))
+    )
+    assert [frame for frame, _ in found] == frames
+    return [item for _, item in found]
+
+
+@pytest.mark.parametrize("frame", [0, 3])
+def test_features_sit_on_the_blobs(tmp_path: Path, frame: int) -> None:
+    (found,) = _features(tmp_path, [frame])
+    true = _CENTRES + frame + 0.5  # OpenCV's pixel (0, 0) has its centre at (0.5, 0.5)
+    away = np.linalg.norm(found.keypoints[None, :, :2] - true[:, None], axis=2)
+    # A blob of noise-free pixels is found to a tenth of a pixel of the shrunk image.
+    assert away.min(axis=1).max() < 0.25
+    nearest = away.argmin(axis=1)
+    assert np.abs(found.rgb[nearest].astype(int) - (20, 90, 160)).max() < 60
+    assert np.abs(np.linalg.norm(found.descriptors.astype(float), axis=1) - 512).max() < 8
+
+
+def test_threads_and_company_change_nothing(tmp_path: Path) -> None:
+    many = _features(tmp_path, list(range(8)), threads=3)
+    for frame in (0, 5):
+        (alone,) = _features(tmp_path, [frame], threads=1)
+        assert (many[frame].keypoints == alone.keypoints).all()
+        assert (many[frame].descriptors == alone.descriptors).all()
+
+
+def test_nothing_is_found_under_a_mask(tmp_path: Path) -> None:
+    (found,) = _features(tmp_path, [0], hidden=300.0)
+    assert len(found.keypoints) > 0
+    assert len(found.keypoints) == len(found.descriptors) == len(found.rgb)
+    assert found.keypoints[:, 0].min() >= 300.0
