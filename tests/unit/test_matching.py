@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -85,9 +86,12 @@ def test_a_known_lens_beside_an_unknown_one_is_verified_in_pixels() -> None:
 
 
 @pytest.mark.parametrize("calibrated", [True, False])
-@pytest.mark.parametrize("distinct", [1, 2, 4])
-def test_matches_that_fix_no_geometry_are_no_error(calibrated: bool, distinct: int) -> None:
-    rng = np.random.default_rng(5)
-    first, second = (rng.uniform((0, 0), (640, 480), (distinct, 2))[np.arange(60) % distinct] for _ in "ab")
-    kept = verified(np.column_stack([np.arange(60)] * 2), _view(first, calibrated), _view(second, calibrated))
-    assert kept.shape[1] == 2
+def test_a_fit_that_fails_inside_opencv_does_not_hold(
+    calibrated: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: object) -> None:
+        raise cv2.error("(-215:Assertion failed) !model.empty() in function 'setModelParameters'")
+
+    a, b, matches, _ = _two_views(np.random.default_rng(3), calibrated=calibrated)
+    monkeypatch.setattr(cv2, "findEssentialMat" if calibrated else "findFundamentalMat", failing)
+    assert len(verified(matches, a, b)) == 0
