@@ -47,7 +47,7 @@ class RegistrationOptions(Options):
     rounds: int = Field(3, ge=0, description="how often the map may grow where frames were lost")
     min_inliers: int = Field(15, ge=4, description="PnP inliers below which a frame is refused")
     max_sigma_depth: float = Field(
-        0.05, gt=0, description="largest centre sigma as a share of the median depth"
+        0.015, gt=0, description="largest centre sigma as a share of the median depth"
     )
 
 
