@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+FrameName = Annotated[str, StringConstraints(pattern=r"^.+:\d+$")]
+"""One frame of one camera, ``camera:frame``."""
 
 
 class Options(BaseModel):
@@ -34,6 +37,9 @@ class MapOptions(Options):
     features: int = Field(2048, ge=128, description="SIFT features a keyframe")
     pairs: Literal["retrieval", "exhaustive"] = Field(
         "exhaustive", description="keyframe pairs to match: neighbours and look-alikes, or all"
+    )
+    init_frames: tuple[FrameName, FrameName] | None = Field(
+        None, description="two frames to start from, each camera:frame; default: found"
     )
     seed: int = Field(0, ge=0, description="seed of every random choice")
     min_coverage: float = Field(

@@ -19,6 +19,7 @@ from bodycap_batch.errors import EstimationError
 from bodycap_batch.mapping.consistency import require_consistent
 from bodycap_batch.mapping.convert import to_map
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, add_keyframes, image_ids
+from bodycap_batch.mapping.initial import Start, named_start, rank_starts
 from bodycap_batch.mapping.lens import better_lenses, misfitting_lenses
 from bodycap_batch.mapping.pairs import PairChooser, link_keyframes
 from bodycap_batch.mapping.reach import Reach, check_reach
@@ -39,6 +40,9 @@ if TYPE_CHECKING:
     import pycolmap
 
 __all__ = ["build_map", "extend_map", "refine_map"]
+
+_CANDIDATES_TOLD = 5
+"""Pairs told of, with what speaks against each, where the first start did not hold."""
 
 
 def build_map(
@@ -80,8 +84,13 @@ def build_map(
     chooser = PairChooser(workspace, refs, _common_ns(capture), options)
     tried, linked = link_keyframes(chooser, workspace, _lenses(capture), context)
     constant = _constant(capture, cameras)
-    models, ladder = reconstruct(workspace, mapper_options(options, constant, scale), context, len(refs))
-    log: dict[str, Any] = {"keyframes": len(refs), **linked, "initial_pair_ladder": ladder}
+    settings = mapper_options(options, constant, scale)
+    starts, named = _starts(workspace, options, _lenses(capture))
+    models, ladder = reconstruct(workspace, settings, context, len(refs), starts)
+    log: dict[str, Any] = {"keyframes": len(refs), **linked, **named, "initial_pair_ladder": ladder}
+    if len(ladder) > 1:
+        best = rank_starts(workspace, _lenses(capture))[:_CANDIDATES_TOLD]
+        log["initial_candidates"] = [{**start.to_log(), "doubt": start.doubt} for start in best]
     guessed = {number: name for name, number in cameras.items() if number not in set(constant)}
     if models and guessed:
         settings = mapper_options(options, constant, scale)
@@ -95,7 +104,7 @@ def build_map(
             context=context,
         )
         models[0], log["repair"] = repair(models[0], tried, shop)
-    _require_coverage(models, len(refs), ladder, options)
+    _require_coverage(models, len(refs), log.get("initial_candidates", ladder), options)
     write_models(workspace, models)
     given = {number: name for name, number in cameras.items() if capture.camera(name).calibrated}
     settings = mapper_options(options, constant, scale)
@@ -104,6 +113,17 @@ def build_map(
     verdict = check_reach(result.maps[0], _common_ns(capture), reach).to_log() if reach else None
     require_consistent(log["repair"]["contradicted_share"], verdict)
     return replace(result, log={**result.log, "reach": verdict})
+
+
+def _starts(
+    workspace: Path, options: MapOptions, lenses: Mapping[str, tuple[Camera, bool]]
+) -> tuple[list[Start], dict[str, object]]:
+    """The pair the user named, if it can be used, and what to tell of it."""
+    if options.init_frames is None:
+        return [], {}
+    start = named_start(workspace, options.init_frames, lenses)
+    told = {"failed": "no verified matches"} if start is None else start.to_log()
+    return [] if start is None else [start], {"named_initial_pair": told}
 
 
 def _with_better_lenses(
@@ -285,7 +305,7 @@ def _require_coverage(models: Sequence[Any], keyframes: int, ladder: object, opt
     if registered < max(2, options.min_coverage * keyframes):
         raise EstimationError(
             f"the map holds {registered} of {keyframes} keyframes, "
-            f"fewer than {options.min_coverage:.0%}; initial pairs tried: {ladder}",
+            f"fewer than {options.min_coverage:.0%}; initial pairs: {ladder}",
             hint="film sideways movement over textured, well lit surfaces; check the calibration",
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.mapping.database import DATABASE_NAME
+from bodycap_batch.mapping.initial import Start
 
 if TYPE_CHECKING:
     import pycolmap
@@ -24,6 +25,8 @@ _LADDER = (
 """Demands on the initial pair, relaxed step by step; the first are COLMAP's own."""
 
 _MIN_MODEL_KEYFRAMES = 3
+_MIN_STANDING = 0.25
+"""Share of the keyframes that a map from a chosen pair must reach; else the next pair is tried."""
 _ADJUSTMENT_TOLERANCE = 1e-5
 """Relative change of the cost that ends a bundle adjustment: COLMAP's 0 runs every one to its last
 iteration, which on 299 violent keyframes took 3.7 times as long (206 to 55 CPU seconds) for the same map."""
@@ -65,23 +68,40 @@ def mapper_options(
 
 
 def reconstruct(
-    workspace: Path, settings: pycolmap.IncrementalPipelineOptions, context: StageContext, total: int
+    workspace: Path,
+    settings: pycolmap.IncrementalPipelineOptions,
+    context: StageContext,
+    total: int,
+    starts: Sequence[Start] = (),
 ) -> tuple[list[Any], list[dict[str, object]]]:
     """Build models from nothing, easing the demands on the initial pair until one stands.
+
+    Args:
+        workspace: Folder of the database.
+        settings: The mapper's settings; changed.
+        context: Progress and cancellation.
+        total: Keyframes there are.
+        starts: Pairs to start from, the best first; COLMAP's own search where none of them holds.
 
     Returns:
         Reconstructions, largest first, and what each step of the ladder gave.
     """
     steps: list[dict[str, object]] = []
-    models: list[Any] = []
     for step in _LADDER:
         for name, value in step.items():
             setattr(settings.mapper, name, value)
-        models = _run(workspace, settings, context, total)
-        steps.append({**step, "models": [model.num_reg_images() for model in models]})
-        if models:
-            break
-    return models, steps
+        for start in (*starts, None):
+            settings.init_image_id1, settings.init_image_id2 = start.ids if start else (-1, -1)
+            models = _run(workspace, settings, context, total)
+            entry = {**step, "models": [model.num_reg_images() for model in models]}
+            steps.append({**entry, **start.to_log()} if start else entry)
+            if models and models[0].num_reg_images() >= _MIN_STANDING * total:
+                return models, steps
+            if start:
+                steps[-1]["failed"] = start.doubt if not models else "few keyframes followed"
+            elif models:
+                return models, steps
+    return [], steps
 
 
 def extend(
