@@ -42,7 +42,7 @@ def test_walk12_is_registered_whole_and_to_six_millimetres(data_root: Path, tmp_
                 ],
             )
         )
-    mine, theirs, frames = [], [], 0
+    mine, theirs, spreads, frames = [], [], [], 0
     for item in registrations:
         truth = read_tum(data_root / "walk12" / "gt" / f"{item.trajectory.camera}.tum")
         known = item.trajectory.localised
@@ -51,7 +51,16 @@ def test_walk12_is_registered_whole_and_to_six_millimetres(data_root: Path, tmp_
         assert np.abs(truth.times_ns - item.trajectory.times_ns).max() < 2_000_000
         mine.append(item.trajectory.gauge_from_cam[known][:, :3, 3])
         theirs.append(truth.world_from_cam[known][:, :3, 3])
+        turn = item.trajectory.gauge_from_cam[known][:, :3, :3]
+        spread = item.trajectory.covariance[known][:, 3:, 3:]
+        spreads.append(turn @ spread @ np.swapaxes(turn, 1, 2))
     estimate, exact = np.concatenate(mine), np.concatenate(theirs)
     assert len(estimate) >= 0.99 * frames
-    error = np.linalg.norm(align_points(estimate, exact).apply(estimate) - exact, axis=1)
+    similarity = align_points(estimate, exact)
+    error = np.linalg.norm(similarity.apply(estimate) - exact, axis=1)
     assert MIN_ATE_M < np.sqrt((error**2).mean()) < MAX_ATE_M
+    # Errors in the gauge, against the covariance there. χ²(3) has its median at 2.37. Frames share the map's
+    # errors, so that only some fifty keyframes are independent, and the map's part is a rule of thumb.
+    off = similarity.inverse().apply(exact) - estimate
+    normalised = np.einsum("ni,nij,nj->n", off, np.linalg.inv(np.concatenate(spreads)), off)
+    assert 0.33 < np.median(normalised) / 2.37 < 3.0

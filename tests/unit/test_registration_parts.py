@@ -66,8 +66,8 @@ def test_a_start_that_is_off_leads_to_the_same_pose(degrees: float, metres: floa
     sampled, started = _solve(points, seen), _solve(points, seen, off @ invert(truth))
     assert sampled.gauge_from_cam is not None
     assert started.gauge_from_cam is not None
-    # Both end where the step is below 2e-3 px: 3.5 m · 2e-3/420 · 6, and one inlier more or less.
-    assert np.linalg.norm(started.gauge_from_cam[:3, 3] - sampled.gauge_from_cam[:3, 3]) < 5e-4
+    # Both end where the step is below 1e-2 px: 3.5 m · 1e-2/420 · 6, and one inlier more or less.
+    assert np.linalg.norm(started.gauge_from_cam[:3, 3] - sampled.gauge_from_cam[:3, 3]) < 1e-3
 
 
 def test_frames_solved_together_do_not_influence_each_other() -> None:
