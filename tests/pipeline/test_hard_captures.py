@@ -24,12 +24,10 @@ PRESSED_S = (1.5, 2.7)
 CASES: dict[str, dict[str, Any]] = {
     "blurred": {"exposure_s": 0.008},
     "rolling": {"rolling_shutter_s": 0.02},
-    # The upper arms' cameras look ahead; with the forearms up, palms would see the ceiling alone.
-    "arms in view": {
-        "cameras": ("torso", "left_upper_arm", "right_upper_arm"), "body_in_view": True, "arms_ahead": 1.0,
-    },
+    # With the forearms held up, palms see the ceiling alone; chest and head see the arms before the room.
+    "arms in view": {"cameras": ("torso", "head"), "body_in_view": True, "arms_ahead": 1.0},
     "fisheye": FISHEYE,
-}  # fmt: skip
+}
 # What the project asks for on these: 95 % of the frames, 2 cm. A pixel is 1 cm at the 3 m of this room: half
 # a millimetre would mean that truth leaked.
 MIN_COVERAGE, MAX_ATE_M, MIN_ATE_M = 0.95, 0.02, 0.0005
