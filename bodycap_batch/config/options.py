@@ -34,7 +34,7 @@ class KeyframeOptions(Options):
 class MapOptions(Options):
     """Stage 2, the map."""
 
-    features: int = Field(2048, ge=128, description="SIFT features a keyframe")
+    features: int = Field(512, ge=128, description="SIFT features a keyframe, the strongest")
     pairs: Literal["retrieval", "exhaustive"] = Field(
         "exhaustive", description="keyframe pairs to match: neighbours and look-alikes, or all"
     )

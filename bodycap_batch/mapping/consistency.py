@@ -125,7 +125,10 @@ def require_consistent(share: float, reach: Mapping[str, object] | None) -> None
     """
     if share <= MAX_CONTRADICTED_SHARE:
         return
-    body = f"; the body's reach: {reach.get('reason', 'every camera within it')}" if reach else ""
+    body = ""
+    if reach is not None:
+        found = reach.get("reason", f"{reach.get('keyframes_out_of_reach')} keyframes out of it")
+        body = f"; the body's reach: {found}"
     raise EstimationError(
         f"{share:.0%} of the matches between keyframes contradict the map: places that look the same "
         f"(repeated pictures, tiles, windows) were taken for one{body}",
