@@ -24,9 +24,9 @@ half the time of a detector on the frame's own pixels, and the map's keyframes a
 _SMALLEST_PX = 384
 """Long side below which an image is not shrunk further."""
 _CONTRAST = 0.02
-"""Half of OpenCV's: blurred walls and ceilings have little else (room12 0.84 cm with the usual 0.04). Of what is
-found the strongest 512 make as exact a map as all (keyframes of walk12 0.49 and 0.55 cm, room12 0.70 and 0.69,
-tum_fr1_xyz 0.87 and 0.84), at half the matching."""
+"""Half of OpenCV's: blurred walls and ceilings have little else (room12 0.84 cm with the usual 0.04). The
+strongest 512 of what is found make as exact a map (keyframes of walk12 0.49 and 0.55 cm, room12 0.70 and
+0.69, tum_fr1_xyz 0.87 and 0.84), at half the matching."""
 _NORM = 512.0
 
 
