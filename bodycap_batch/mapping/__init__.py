@@ -246,7 +246,7 @@ def refine_map(
         model = pycolmap.Reconstruction(str(workspace / MODELS_NAME / str(number)))
         paths = {path.camera: path for path in trajectories if path.gauge == scene_map.gauge}
         rolling = RollingModel(model, paths, cameras)
-        found = rolling.find(settings, constant)
+        found = rolling.fastest().find(settings, constant)
         readout_s = {name: each.seconds for name, each in found.items() if each.seconds}
         if readout_s:
             moved = rolling.moved(readout_s)

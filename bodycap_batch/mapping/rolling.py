@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     import pycolmap
 
 _PROBE_S = 0.01
-_PROBE_ITERATIONS = 8
+_PROBE_ITERATIONS = 40
+_PROBE_KEYFRAMES = 24
+"""The readout time is looked for in so many successive keyframes, those that move most."""
 _PROBES = 4
 _CLOSE_S = 0.001
 _MAX_FRAMES = 1.1
@@ -30,6 +32,7 @@ _MAX_FRAMES = 1.1
 _MIN_READOUT_S = 0.002
 _MIN_SIGMAS = 5.0
 _LOSS_PX = 1.0
+_SANE_PX = 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +87,7 @@ class RollingModel:
         cameras: Mapping[str, CaptureCamera],
     ) -> None:
         self._model = model
+        self._trajectories = trajectories
         self._cameras = cameras
         self._lenses = {
             ImageRef.parse(model.image(image_id).name).camera: _lens(model.image(image_id).camera)
@@ -108,6 +112,25 @@ class RollingModel:
             points = model.image(item.image_id).points2D
             for feature, xy in zip(item.feature.tolist(), px, strict=True):
                 points[feature].xy = xy
+
+    def fastest(self) -> RollingModel:
+        """A model of each camera's successive keyframes that move most, without all others."""
+        import pycolmap
+
+        kept: set[int] = set()
+        for name in self._lenses:
+            mine = [item for item in self._keypoints if item.camera == name]
+            mine.sort(key=lambda item: ImageRef.parse(self._model.image(item.image_id).name).frame)
+            speed = [float(np.median(np.abs(item.velocity))) if len(item.velocity) else 0.0 for item in mine]
+            total = np.concatenate([[0.0], np.cumsum(speed)])
+            size = min(_PROBE_KEYFRAMES, len(mine))
+            start = int(np.argmax(total[size:] - total[: len(total) - size]))
+            kept |= {item.image_id for item in mine[start : start + size]}
+        part = pycolmap.Reconstruction(self._model)
+        for image_id in part.reg_image_ids():
+            if image_id not in kept:
+                part.deregister_frame(part.image(image_id).frame_id)
+        return RollingModel(part, self._trajectories, self._cameras)
 
     def find(
         self, settings: pycolmap.IncrementalPipelineOptions, constant: Sequence[int]
@@ -203,7 +226,9 @@ class _Slope:
     def of(before: FloatArray, after: FloatArray, step_s: float) -> _Slope:
         """From the residuals of two adjustments, `step_s` apart; taken at the second."""
         change = (after - before) / (step_s if step_s else np.inf)
-        weight = 1.0 / (1.0 + (after / _LOSS_PX) ** 2)
+        # A point that an adjustment throws far away says nothing of the shutter.
+        sane = np.maximum(np.abs(after), np.abs(before)) < _SANE_PX
+        weight = np.where(sane, 1.0 / (1.0 + (after / _LOSS_PX) ** 2), 0.0)
         information = float((weight * change * change).sum())
         correlation = float((weight * change * after).sum())
         best = after - change * (correlation / information if information else 0.0)
