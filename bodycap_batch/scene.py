@@ -26,6 +26,7 @@ class FrameStatus(StrEnum):
     FEW_INLIERS = "FEW_INLIERS"
     UNCONSTRAINED = "UNCONSTRAINED"
     POSE_JUMP = "POSE_JUMP"
+    UNCONFIRMED = "UNCONFIRMED"
     NO_MAP = "NO_MAP"
 
     @property

@@ -1,15 +1,17 @@
-"""Poses that jump away from both neighbours and back: wrong, however many inliers they have."""
+"""Poses that their neighbours speak against, or that nothing confirms."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray, FloatArray
+from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
 
 _SIGMAS = 8.0
 _TIMES_USUAL = 10.0
 """A jump stands out of the bends of the path around it, whatever the scale and the speed."""
 _AROUND = 12
+_LONE_RUN = 2
+_LONE_GAP = 3
 
 
 def pose_jumps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
@@ -41,4 +43,26 @@ def pose_jumps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
         near = np.concatenate([before, bend[frame + 2 : frame + _AROUND + 1]])
         if np.isfinite(near).sum() >= _AROUND // 2:
             out[frame] = bend[frame] > _TIMES_USUAL * np.nanmedian(near)
+    return out
+
+
+def lone_poses(localised: BoolArray, inliers: IntArray, enough: int) -> BoolArray:
+    """Frames of which nothing but their own few inliers speaks: no neighbouring frame confirms them.
+
+    Args:
+        localised: (N,) frames with a pose.
+        inliers: (N,) of each pose.
+        enough: Inliers with which a pose stands by itself.
+
+    Returns:
+        (N,) True in runs of one or two poses amid at least three lost frames on either side.
+    """
+    out = np.zeros(len(localised), dtype=bool)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], localised, [False]]).astype(int)))
+    for start, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        around = np.concatenate(
+            [localised[max(0, start - _LONE_GAP) : start], localised[stop : stop + _LONE_GAP]]
+        )
+        if stop - start <= _LONE_RUN and not around.any():
+            out[start:stop] = inliers[start:stop] < enough
     return out

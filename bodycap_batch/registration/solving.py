@@ -11,7 +11,7 @@ from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.geometry import interpolate_pose, invert
 from bodycap_batch.registration.batch import inliers_of, make_views
-from bodycap_batch.registration.jumps import pose_jumps
+from bodycap_batch.registration.jumps import lone_poses, pose_jumps
 from bodycap_batch.registration.pose import MAP_VARIANCE_RATIO, FramePose, PoseLimits, solve_poses
 from bodycap_batch.registration.tracks import Tracks
 from bodycap_batch.rolling_shutter import at_mid_row, image_velocity
@@ -21,6 +21,8 @@ _POINT_VARIANCE = 6.0
 """Variance that a point seen by n keyframes adds to its projections, times n, in units of a track's own.
 Without it and with 3, 6, 9: walk131 0.65, 0.59, 0.55, 0.55 cm; room131 3.1, 3.0, 2.9, 2.9; walk12 0.38 for
 all; room12 0.55, 0.55, 0.56, 0.56."""
+_LONE_EVIDENCE = 4
+"""A pose that no neighbouring frame confirms needs so many times the usual inliers."""
 _MIN_JUDGED = 4
 _AGAIN = 1
 _AGAIN_ROLLING = 2
@@ -89,7 +91,7 @@ def solve_frames(
     for index in keyframes.tolist():
         if poses[index].status is FrameStatus.REGISTERED:
             poses[index] = replace(poses[index], status=FrameStatus.KEYFRAME)
-    return _without_jumps(poses)
+    return _without_doubtful(poses, limits)
 
 
 def _point_weights(scene_map: Map) -> FloatArray:
@@ -132,8 +134,8 @@ def _between(keyframes: IntArray, map_from_cam: FloatArray, count: int) -> Float
     return invert(interpolate_pose(map_from_cam[before], map_from_cam[after], alpha))
 
 
-def _without_jumps(poses: list[FramePose]) -> list[FramePose]:
-    """Refuse the poses that jump away from both neighbours and back."""
+def _without_doubtful(poses: list[FramePose], limits: PoseLimits) -> list[FramePose]:
+    """Refuse the poses that jump away from both neighbours and back, and weak ones that stand alone."""
     centres = np.full((len(poses), 3), np.nan)
     sigma = np.full(len(poses), np.nan)
     for frame, pose in enumerate(poses):
@@ -141,9 +143,15 @@ def _without_jumps(poses: list[FramePose]) -> list[FramePose]:
             centres[frame] = pose.gauge_from_cam[:3, 3]
             # Neighbours share the map's error.
             sigma[frame] = np.sqrt(np.trace(pose.covariance[3:, 3:]) / MAP_VARIANCE_RATIO)
-    jump = pose_jumps(centres, sigma)
-    refused = FramePose(status=FrameStatus.POSE_JUMP)
+    out = _refused(poses, pose_jumps(centres, sigma), FrameStatus.POSE_JUMP)
+    localised = np.array([pose.gauge_from_cam is not None for pose in out], dtype=bool)
+    inliers = np.array([pose.inliers for pose in out], dtype=np.int64)
+    lone = lone_poses(localised, inliers, _LONE_EVIDENCE * limits.min_inliers)
+    return _refused(out, lone, FrameStatus.UNCONFIRMED)
+
+
+def _refused(poses: list[FramePose], which: BoolArray, status: FrameStatus) -> list[FramePose]:
     return [
-        replace(refused, inliers=pose.inliers, error_px=pose.error_px) if jump[frame] else pose
+        FramePose(status=status, inliers=pose.inliers, error_px=pose.error_px) if which[frame] else pose
         for frame, pose in enumerate(poses)
     ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodycap_batch.registration.jumps import pose_jumps
+from bodycap_batch.registration.jumps import lone_poses, pose_jumps
 
 SIGMA = np.full(60, 0.004)
 
@@ -43,3 +43,21 @@ def test_wide_covariance_and_gaps_are_no_evidence() -> None:
     centres[30] = np.nan
     assert not pose_jumps(centres, SIGMA).any()
     assert pose_jumps(centres[:2], SIGMA[:2]).tolist() == [False, False]
+
+
+@pytest.mark.parametrize(
+    ("seen", "refused"),
+    [
+        ("....#....", [4]),
+        ("....##....", [4, 5]),
+        ("...###....", []),
+        ("..#..#....", []),
+        ("#....", [0]),
+        ("#########", []),
+    ],
+)
+def test_a_weak_pose_that_no_neighbour_confirms_is_doubtful(seen: str, refused: list[int]) -> None:
+    localised = np.array([letter == "#" for letter in seen])
+    inliers = np.where(localised, 40, 0)
+    assert np.flatnonzero(lone_poses(localised, inliers, 60)).tolist() == refused
+    assert not lone_poses(localised, inliers, 40).any(), "strong evidence stands alone"
