@@ -83,9 +83,9 @@ def looks_rolling(found: Registration, maps: Sequence[Map]) -> bool:
         return False
     stride = max(1, len(found.obs_frame) // _SCREENED)
     some = np.flatnonzero(path.localised[found.obs_frame] & (found.obs_frame % stride == 0))
+    some = some[np.argsort(found.obs_frame[some], kind="stable")]
     point = scene.points_of(path.camera, found.obs_keyframe[some], found.obs_feature[some])
-    used = some[point >= 0][np.argsort(found.obs_frame[some[point >= 0]], kind="stable")]
-    points = scene.points[scene.points_of(path.camera, found.obs_keyframe[used], found.obs_feature[used])]
+    used, points = some[point >= 0], scene.points[point[point >= 0]]
     frame, px = found.obs_frame[used], found.obs_px[used].astype(float)
     lens = scene.cameras[path.camera]
     pose = np.full_like(path.gauge_from_cam, np.nan)

@@ -13,6 +13,7 @@ from bodycap_batch.arrays import FloatArray
 from bodycap_batch.export.inputs import ExportInputs
 from bodycap_batch.export.placed import WORLD, main_frame, place_maps, place_trajectories
 from bodycap_batch.geometry import invert, transform_points
+from bodycap_batch.rolling_shutter import at_mid_row, image_velocity
 from bodycap_batch.scene import Map, Trajectory
 from bodycap_batch.skeleton import Motion
 
@@ -25,7 +26,7 @@ def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[st
         motion: The motion as exported, or None.
         gap: How far it is from the graph and the cameras.
     """
-    errors = [_observation_errors(scene) for scene in inputs.maps]
+    errors = [observation_errors(scene, inputs.trajectories) for scene in inputs.maps]
     trajectories = place_trajectories(inputs)
     cameras = {item.camera: _camera(inputs, item, errors) for item in trajectories}
     out: dict[str, Any] = {
@@ -60,8 +61,16 @@ def _index(maps: Sequence[Map], scene: Map) -> int:
     return next(index for index, item in enumerate(maps) if item is scene)
 
 
-def _observation_errors(scene: Map) -> FloatArray:
-    """Reprojection error (M,) of every observation, pixels at the work size."""
+def observation_errors(scene: Map, trajectories: Sequence[Trajectory]) -> FloatArray:
+    """Reprojection error (M,) of every observation, pixels at the work size.
+
+    Pixels of a camera whose rolling shutter was taken out are moved to the instant its poses hold for.
+
+    Args:
+        scene: The map.
+        trajectories: The frames' poses; those in the map's gauge tell how its keyframes move.
+    """
+    paths = {path.camera: path for path in trajectories if path.gauge == scene.gauge}
     out = np.full(len(scene.obs_px), np.nan)
     order = np.argsort(scene.obs_keyframe, kind="stable")
     bounds = np.searchsorted(scene.obs_keyframe[order], np.arange(len(scene.keyframe_camera) + 1))
@@ -70,10 +79,13 @@ def _observation_errors(scene: Map) -> FloatArray:
         if len(mine) == 0:
             continue
         points = scene.points[scene.obs_point[mine]]
-        projected = scene.cameras[camera].project(
-            transform_points(invert(scene.map_from_cam[keyframe]), points)
-        )
-        out[mine] = np.linalg.norm(projected - scene.obs_px[mine], axis=1)
+        lens, px = scene.cameras[camera], scene.obs_px[mine]
+        if camera in paths and camera in scene.readout_s:
+            path, frame = paths[camera], np.full(len(mine), scene.keyframe_frame[keyframe])
+            velocity = image_velocity(lens, path.gauge_from_cam, path.times_ns, frame, points)
+            px = at_mid_row(lens, px, velocity, scene.readout_s[camera])
+        projected = lens.project(transform_points(invert(scene.map_from_cam[keyframe]), points))
+        out[mine] = np.linalg.norm(projected - px, axis=1)
     return out
 
 

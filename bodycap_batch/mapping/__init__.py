@@ -24,7 +24,7 @@ from bodycap_batch.mapping.lens import better_lenses, misfitting_lenses
 from bodycap_batch.mapping.pairs import PairChooser, link_keyframes
 from bodycap_batch.mapping.reach import Reach, check_reach
 from bodycap_batch.mapping.repair import Workshop, repair
-from bodycap_batch.mapping.rolling import RollingModel
+from bodycap_batch.mapping.rolling import Readout, RollingModel
 from bodycap_batch.mapping.solve import (
     MODELS_NAME,
     extend,
@@ -171,9 +171,7 @@ def extend_map(
     shutil.copytree(previous.workspace, workspace)
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         known = image_ids(database)
-        cameras = {
-            ImageRef.parse(image.name).camera: int(image.camera_id) for image in database.read_all_images()
-        }
+    cameras = _camera_ids(workspace)
     new = [
         ImageRef(name, int(frame))
         for name, frames in sorted(extra_frames.items())
@@ -199,8 +197,8 @@ def extend_map(
         refine(model, settings, constant)
         models.append(model)
     write_models(workspace, models)
-    log = {"keyframes": len(known) + len(new), "new_keyframes": len(new), **linked}
-    log["misfitting_lenses"] = previous.log.get("misfitting_lenses", {})
+    growth = [*previous.log.get("growth", []), {"new_keyframes": len(new), **linked}]
+    log = {**previous.log, "keyframes": len(known) + len(new), "growth": growth}
     return _result(models, workspace, log)
 
 
@@ -246,7 +244,7 @@ def refine_map(
         model = pycolmap.Reconstruction(str(workspace / MODELS_NAME / str(number)))
         paths = {path.camera: path for path in trajectories if path.gauge == scene_map.gauge}
         rolling = RollingModel(model, paths, cameras)
-        found = rolling.fastest().find(settings, constant)
+        found = _readouts(rolling, settings, constant)
         readout_s = {name: each.seconds for name, each in found.items() if each.seconds}
         if readout_s:
             moved = rolling.moved(readout_s)
@@ -268,18 +266,31 @@ def refine_map(
     return replace(result, maps=tuple(maps))
 
 
+def _readouts(
+    rolling: RollingModel, settings: pycolmap.IncrementalPipelineOptions, constant: Sequence[int]
+) -> dict[str, Readout]:
+    """Readout times by camera; where trial adjustments fail none is used, and the log says so."""
+    try:
+        return rolling.fastest().find(settings, constant)
+    except EstimationError as error:
+        return rolling.undetermined(error.message)
+
+
 def _settings(
     capture: Capture, workspace: Path, options: MapOptions
 ) -> tuple[pycolmap.IncrementalPipelineOptions, list[int]]:
     """The mapper's settings for a workspace that exists, and the ids of its calibrated cameras."""
+    constant = _constant(capture, _camera_ids(workspace))
+    return mapper_options(options, constant, _scale(capture)), constant
+
+
+def _camera_ids(workspace: Path) -> dict[str, int]:
+    """Database id of each camera that has keyframes."""
     import pycolmap
 
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
-        cameras = {
-            ImageRef.parse(image.name).camera: int(image.camera_id) for image in database.read_all_images()
-        }
-    constant = _constant(capture, cameras)
-    return mapper_options(options, constant, _scale(capture)), constant
+        images = database.read_all_images()
+    return {ImageRef.parse(image.name).camera: int(image.camera_id) for image in images}
 
 
 def _common_ns(capture: Capture) -> dict[str, IntArray]:

@@ -44,7 +44,7 @@ def to_map(model: pycolmap.Reconstruction, workspace: Path) -> Map:
     map_from_cam = invert(np.array(poses))
     return Map(
         gauge=_gauge(map_from_cam),
-        cameras={ref.camera: _camera(model.image(image_id).camera) for ref, image_id in images},
+        cameras={ref.camera: lens_of(model.image(image_id).camera) for ref, image_id in images},
         keyframe_camera=tuple(ref.camera for ref, _ in images),
         keyframe_frame=np.array([ref.frame for ref, _ in images], dtype=np.int64),
         map_from_cam=map_from_cam,
@@ -63,7 +63,8 @@ def _gauge(map_from_cam: FloatArray) -> str:
     return hashlib.sha256(np.ascontiguousarray(map_from_cam).tobytes()).hexdigest()[:12]
 
 
-def _camera(camera: Any) -> Camera:
+def lens_of(camera: Any) -> Camera:
+    """A reconstruction's camera as ours."""
     return Camera(
         model=camera.model.name,
         width_px=int(camera.width),

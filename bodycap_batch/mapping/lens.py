@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bodycap_batch.mapping.solve import part_of
+
 if TYPE_CHECKING:
     import pycolmap
 
@@ -124,14 +126,9 @@ def misfit_note(camera: str, factor: float) -> str:
 
 def _part(model: Any) -> Any:
     """A copy of the model with at most so many keyframes, evenly spread."""
-    part = copy.deepcopy(model)
-    images = sorted(part.reg_image_ids())
+    images = sorted(model.reg_image_ids())
     rows = np.linspace(0, len(images) - 1, min(_KEYFRAMES, len(images))).round().astype(int)
-    keep = {images[row] for row in rows}
-    for image_id in images:
-        if image_id not in keep:
-            part.deregister_frame(part.image(image_id).frame_id)
-    return part
+    return part_of(model, {images[row] for row in rows})
 
 
 def _cost(

@@ -40,6 +40,7 @@ _MAX_TANGENT = 2.5
 _BLOCK = 512
 _CALIBRATED = 2
 _UNCALIBRATED = 3
+_CV_ASSERTION_FAILED = -215
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,17 +178,20 @@ def verified(matches: IntArray, a: View, b: View) -> IntArray:
     if len(matches) < MIN_INLIERS:
         return none
     first, second = a.rays[matches[:, 0]], b.rays[matches[:, 1]]
+    method = cv2.USAC_ACCURATE
     try:
         if a.calibrated and b.calibrated:
-            limit, method = 0.5 * (a.error + b.error), cv2.USAC_ACCURATE
+            limit = 0.5 * (a.error + b.error)
             _, kept = cv2.findEssentialMat(first, second, np.eye(3), method, _CONFIDENCE, limit, _ROUNDS)
         else:
             # A known lens beside an unknown one: its undistorted image, in pixels.
             first, second = first * (_pixel_error(a) / a.error), second * (_pixel_error(b) / b.error)
             limit = 0.5 * (_pixel_error(a) + _pixel_error(b))
-            _, kept = cv2.findFundamentalMat(first, second, cv2.USAC_ACCURATE, limit, _CONFIDENCE, _ROUNDS)
-    except cv2.error:
+            _, kept = cv2.findFundamentalMat(first, second, method, limit, _CONFIDENCE, _ROUNDS)
+    except cv2.error as error:
         # Where no sample gives a model, OpenCV's local optimisation fails an assertion instead of saying so.
+        if error.code != _CV_ASSERTION_FAILED:
+            raise
         return none
     return none if kept is None else matches[kept.ravel().astype(bool)]
 

@@ -13,7 +13,7 @@ from bodycap_batch.context import StageContext
 from bodycap_batch.mapping.consistency import contradicted_share, doubtful, links_of
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, Pair, image_ids
 from bodycap_batch.mapping.matching import match_pairs
-from bodycap_batch.mapping.solve import extend, refine
+from bodycap_batch.mapping.solve import extend, part_of, refine
 
 if TYPE_CHECKING:
     import pycolmap
@@ -97,15 +97,10 @@ def _untried(ids: Mapping[ImageRef, int], images: set[int], tried: set[Pair]) ->
 
 def _without(model: pycolmap.Reconstruction, suspects: Collection[int], shop: Workshop, total: int) -> Any:
     """The model with suspects taken out and registered anew against what is left, all refined."""
-    import pycolmap
-
     source = shop.workspace / "repair"
     shutil.rmtree(source, ignore_errors=True)
     source.mkdir()
-    model.write(str(source))
-    rest = pycolmap.Reconstruction(str(source))
-    for number in sorted(suspects):
-        rest.deregister_frame(rest.image(number).frame_id)
+    rest = part_of(model, set(model.reg_image_ids()) - set(suspects))
     rest.write(str(source))
     found = extend(shop.workspace, source, shop.settings(), shop.context, total)
     shutil.rmtree(source, ignore_errors=True)

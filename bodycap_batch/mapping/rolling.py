@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bodycap_batch.arrays import FloatArray, IntArray
-from bodycap_batch.camera import Camera
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.geometry import make_transform
+from bodycap_batch.mapping.convert import lens_of
 from bodycap_batch.mapping.database import ImageRef
-from bodycap_batch.mapping.solve import adjust
+from bodycap_batch.mapping.solve import adjust, part_of
 from bodycap_batch.rolling_shutter import at_mid_row, image_velocity
 from bodycap_batch.scene import Trajectory
 
@@ -42,7 +42,7 @@ class Readout:
     Attributes:
         seconds: From the first row's exposure to the last's; 0 for a global shutter.
         sigma_s: Standard deviation; 0 where it was stated.
-        source: "stated", "estimated" or "none found".
+        source: "stated", "estimated", "none found", or why it could not be determined.
         best_s: Where the residuals are smallest, found or not.
     """
 
@@ -76,7 +76,8 @@ class RollingModel:
 
     Args:
         model: COLMAP's reconstruction, left as it is.
-        trajectories: Every frame's pose in the model's gauge, by camera.
+        trajectories: Every frame's pose in the model's gauge, by camera; a camera whose frames were solved in
+            another map has none here, and its keypoints stay.
         cameras: The capture's cameras, by name.
     """
 
@@ -90,7 +91,7 @@ class RollingModel:
         self._trajectories = trajectories
         self._cameras = cameras
         self._lenses = {
-            ImageRef.parse(model.image(image_id).name).camera: _lens(model.image(image_id).camera)
+            ImageRef.parse(model.image(image_id).name).camera: lens_of(model.image(image_id).camera)
             for image_id in model.reg_image_ids()
         }
         self._keypoints = [
@@ -115,8 +116,6 @@ class RollingModel:
 
     def fastest(self) -> RollingModel:
         """A model of each camera's successive keyframes that move most, without all others."""
-        import pycolmap
-
         kept: set[int] = set()
         for name in self._lenses:
             mine = [item for item in self._keypoints if item.camera == name]
@@ -126,10 +125,7 @@ class RollingModel:
             size = min(_PROBE_KEYFRAMES, len(mine))
             start = int(np.argmax(total[size:] - total[: len(total) - size]))
             kept |= {item.image_id for item in mine[start : start + size]}
-        part = pycolmap.Reconstruction(self._model)
-        for image_id in part.reg_image_ids():
-            if image_id not in kept:
-                part.deregister_frame(part.image(image_id).frame_id)
+        part = part_of(self._model, kept)
         return RollingModel(part, self._trajectories, self._cameras)
 
     def find(
@@ -140,15 +136,15 @@ class RollingModel:
         After poses and points are adjusted, the residuals are close to linear in the readout time: their
         change from one trial to the next says how far to go.
 
+        Raises:
+            EstimationError: An adjustment failed.
+
         Source: secant steps on the reduced functional of Golub, Pereyra, "The differentiation of
             pseudo-inverses and nonlinear least squares problems whose variables separate", 1973.
         """
-        wanted = [name for name in self._lenses if not self._cameras[name].rolling_shutter_known]
-        out = {
-            name: _stated(self._cameras[name].rolling_shutter_s)
-            for name in self._lenses
-            if name not in wanted
-        }
+        moving = [name for name in self._lenses if name in self._trajectories]
+        wanted = [name for name in moving if not self._cameras[name].rolling_shutter_known]
+        out = {name: _stated(self._cameras[name].rolling_shutter_s) for name in moving if name not in wanted}
         if not wanted:
             return out
         frame_s = {name: float(np.median(np.diff(self._cameras[name].times_ns))) * 1e-9 for name in wanted}
@@ -171,13 +167,26 @@ class RollingModel:
             before = after
         return out
 
+    def undetermined(self, reason: str) -> dict[str, Readout]:
+        """The stated readout times alone; the others are not known for a reason."""
+        out = {}
+        for name in self._lenses:
+            camera = self._cameras[name]
+            if camera.rolling_shutter_known:
+                out[name] = _stated(camera.rolling_shutter_s)
+            else:
+                out[name] = Readout(0.0, 0.0, f"not determined: {reason}", 0.0)
+        return out
+
     def _keypoints_of(self, image_id: int, trajectories: Mapping[str, Trajectory]) -> _Keypoints:
         image = self._model.image(image_id)
         ref = ImageRef.parse(image.name)
         feature = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
         px = np.array([image.points2D[index].xy for index in feature.tolist()]).reshape(-1, 2)
         x_in_map = self._points(image, feature)
-        path = trajectories[ref.camera]
+        path = trajectories.get(ref.camera)
+        if path is None:  # registered against another map: how it moves is not known in this gauge
+            return _Keypoints(image_id, ref.camera, feature, px, np.zeros_like(px))
         velocity = image_velocity(
             self._lenses[ref.camera],
             path.gauge_from_cam,
@@ -203,7 +212,7 @@ class RollingModel:
             cam_from_map = make_transform(pose[:, :3], pose[:, 3])
             x_in_cam = self._points(image, item.feature, model) @ cam_from_map[:3, :3].T + cam_from_map[:3, 3]
             observed = np.array([image.points2D[index].xy for index in item.feature.tolist()]).reshape(-1, 2)
-            projected = _lens(image.camera).project(x_in_cam)
+            projected = lens_of(image.camera).project(x_in_cam)
             out[item.camera].append(np.nan_to_num(observed - projected, nan=1e3).ravel())
         return {name: np.concatenate([np.zeros(0), *parts]) for name, parts in out.items()}
 
@@ -246,12 +255,3 @@ class _Slope:
 
 def _stated(readout_s: float) -> Readout:
     return Readout(readout_s, 0.0, "stated", readout_s)
-
-
-def _lens(camera: Any) -> Camera:
-    return Camera(
-        model=camera.model.name,
-        width_px=int(camera.width),
-        height_px=int(camera.height),
-        params=np.asarray(camera.params),
-    )

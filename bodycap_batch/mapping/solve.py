@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import shutil
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
@@ -194,6 +195,15 @@ def refine(
         settings.mapper.filter_max_reproj_error, settings.mapper.filter_min_tri_angle
     )
     model.update_point_3d_errors()
+
+
+def part_of(model: Any, image_ids: Collection[int]) -> Any:
+    """A copy of a model with only these of its registered images."""
+    part = copy.deepcopy(model)
+    for image_id in part.reg_image_ids():
+        if image_id not in image_ids:
+            part.deregister_frame(part.image(image_id).frame_id)
+    return part
 
 
 def adjust(

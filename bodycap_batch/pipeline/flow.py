@@ -193,8 +193,8 @@ class Flow:
         }
         key = key_of("refine", self._map_options(), inputs)
         refined = self._one(Task(key=key, arguments=arguments, threads=self._settings.threads))
-        last = self._job.registration.rounds + 1
-        return refined, self.registrations(refined, keyframes, registrations, last)
+        after = 1 + max(record.round for record in self.records)
+        return refined, self.registrations(refined, keyframes, registrations, after)
 
     def merge(self, scene: Artefact, registrations: ByCamera) -> Artefact:
         """The skeleton's motion, in the world."""

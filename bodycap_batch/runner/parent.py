@@ -143,8 +143,8 @@ class Runner:
             order = log.with_suffix(".task.json")
             order.write_text(json.dumps(task.to_json(self.store.root), indent=1), encoding="utf-8")
             log.write_bytes(b"")
-        child.order({"task": str(order), "log": str(log)})
         self.prepare(*meanwhile)
+        child.order({"task": str(order), "log": str(log)})
         last = child.follow(self._cancelled, lambda message: self._forward(task, message))
         if last is not None and "ends" not in last and not self._cancelled():
             with self._lock:

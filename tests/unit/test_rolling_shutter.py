@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,11 +12,12 @@ import pytest
 from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.camera import Camera
 from bodycap_batch.config import MapOptions
+from bodycap_batch.export.metrics import observation_errors
 from bodycap_batch.geometry import invert, make_transform, so3_exp
 from bodycap_batch.mapping.rolling import RollingModel
 from bodycap_batch.mapping.solve import mapper_options
 from bodycap_batch.rolling_shutter import apparent_readout, at_mid_row, image_velocity
-from bodycap_batch.scene import FrameStatus, Trajectory
+from bodycap_batch.scene import FrameStatus, Map, Trajectory
 
 LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([400.0, 400.0, 320.0, 240.0]))
 FRAMES = 90
@@ -92,16 +93,16 @@ def the_map(film: Film, keyframes: range) -> Any:
     return model
 
 
-def found(readout_s: float, *, known: bool = False, stated_s: float = 0.0) -> Any:
-    film = Film(readout_s)
+def rolling_model(film: Film, *, known: bool = False, stated_s: float = 0.0, posed: bool = True) -> Any:
     camera = SimpleNamespace(
         rolling_shutter_known=known, rolling_shutter_s=stated_s, times_ns=film.trajectory().times_ns
     )
-    rolling = RollingModel(
-        the_map(film, range(1, FRAMES, 5)),
-        {"head": film.trajectory()},
-        {"head": camera},  # type: ignore[dict-item]
-    )
+    paths = {"head": film.trajectory()} if posed else {}
+    return RollingModel(the_map(film, range(1, FRAMES, 5)), paths, {"head": camera})  # type: ignore[dict-item]
+
+
+def found(readout_s: float, *, known: bool = False, stated_s: float = 0.0) -> Any:
+    rolling = rolling_model(Film(readout_s), known=known, stated_s=stated_s)
     return rolling.find(mapper_options(MapOptions(), [1], 1.0), [1])["head"]
 
 
@@ -123,6 +124,61 @@ def test_a_global_shutter_is_left_alone() -> None:
 def test_a_stated_readout_time_is_not_looked_for() -> None:
     readout = found(0.02, known=True, stated_s=0.017)
     assert (readout.seconds, readout.source) == (0.017, "stated")
+
+
+def test_a_camera_whose_frames_lie_in_another_map_is_left_alone() -> None:
+    rolling = rolling_model(Film(0.02), posed=False)
+    assert rolling.fastest().find(mapper_options(MapOptions(), [1], 1.0), [1]) == {}
+    before, after = the_map(Film(0.02), range(1, FRAMES, 5)), rolling.moved({"head": 0.02})
+    for image_id in before.reg_image_ids():
+        pairs = zip(before.image(image_id).points2D, after.image(image_id).points2D, strict=True)
+        assert all((one.xy == other.xy).all() for one, other in pairs)
+
+
+def test_what_could_not_be_determined_says_why_and_keeps_what_was_stated() -> None:
+    unknown = rolling_model(Film(0.02)).undetermined("no convergence")["head"]
+    assert (unknown.seconds, unknown.source) == (0.0, "not determined: no convergence")
+    stated = rolling_model(Film(0.02), known=True, stated_s=0.017).undetermined("no convergence")["head"]
+    assert (stated.seconds, stated.source) == (0.017, "stated")
+
+
+def test_the_fastest_keyframes_are_looked_at() -> None:
+    film = Film(0.0)
+    rolling = RollingModel(
+        the_map(film, range(1, FRAMES, 2)),
+        {"head": film.trajectory()},
+        {"head": SimpleNamespace(rolling_shutter_known=False, rolling_shutter_s=0.0)},  # type: ignore[dict-item]
+    )
+    part = rolling.fastest()._model
+    frames = sorted(int(part.image(number).name[-7:]) for number in part.reg_image_ids())
+    assert len(frames) == 24
+    assert set(np.diff(frames)) == {2}, "one run of successive keyframes"
+
+
+def test_errors_are_told_where_the_poses_hold() -> None:
+    film = Film(0.02)
+    frame = 40
+    points, px = film.seen(frame)
+    count = len(points)
+    scene = Map(
+        gauge="a",
+        cameras={"head": LENS},
+        keyframe_camera=("head",),
+        keyframe_frame=np.array([frame]),
+        map_from_cam=film.map_from_cam[frame : frame + 1],
+        points=film.points[points],
+        colors=np.zeros((count, 3), np.uint8),
+        point_error_px=np.zeros(count),
+        obs_keyframe=np.zeros(count, np.int64),
+        obs_point=np.arange(count),
+        obs_feature=np.arange(count),
+        obs_px=px,
+    )
+    bent = observation_errors(scene, [film.trajectory()]).mean()
+    right = observation_errors(replace(scene, readout_s={"head": 0.02}), [film.trajectory()]).mean()
+    assert bent > 1.5
+    # The mean length of noise of 0.3 px along two axes is 0.38 px; velocities are differences of two frames.
+    assert right < 0.5
 
 
 def test_pixels_move_to_where_they_are_at_the_middle_row() -> None:
