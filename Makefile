@@ -7,12 +7,13 @@ SHELL := /bin/bash
 JOB ?= jobs/cpl_lab.yaml
 ARGS ?=
 VENV := .venv
+BLENDER := .venv-blender
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 # More than one test at a time; each of them in one thread.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 8
-LOCK := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --fork-strategy fewest \
-	--generate-hashes --no-emit-index-url --custom-compile-command "make lock" pyproject.toml
+COMPILE := $(BIN)/uv pip compile --quiet --generate-hashes --no-emit-index-url --custom-compile-command "make lock"
+LOCK := $(COMPILE) --universal --python-version 3.11 --fork-strategy fewest pyproject.toml --group build
 
 .PHONY: help
 help: ## list the targets
@@ -52,13 +53,23 @@ test-fresh: ## run `make job` and `make test` in a new, minimal Debian 12 (root;
 	.ci/test-fresh $(ARGS)
 
 .PHONY: lock
-lock: $(VENV)/.dev ## resolve the dependencies anew into the two locks
-	$(LOCK) --group build --output-file requirements.lock
-	$(LOCK) --group build --group dev --constraints requirements.lock --output-file requirements-dev.lock
+lock: $(VENV)/.dev ## resolve the dependencies anew into the locks
+	$(LOCK) --output-file requirements.lock
+	$(LOCK) --extra formats --extra cluster --extra web --extra viewer --constraints requirements.lock \
+		--output-file requirements-extras.lock
+	$(LOCK) --group dev --extra formats --extra cluster --extra web --constraints requirements-extras.lock \
+		--output-file requirements-dev.lock
+	$(COMPILE) --universal --python-version 3.11 --group blender --output-file requirements-blender.lock
+
+.PHONY: extras
+extras: $(VENV)/.extras ## install what USD, C3D, the cluster, the live page and Rerun need
+
+.PHONY: blender
+blender: $(BLENDER)/.ready ## install Blender as a Python module (for FBX files; Python 3.11 only)
 
 .PHONY: clean
 clean: ## delete the environment, caches and results
-	rm -rf $(VENV) build dist out .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(BLENDER) build dist out .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find bodycap_batch tests examples -name __pycache__ -prune -exec rm -rf {} +
 
 # Stamps: a re-run with nothing changed does nothing. The project itself cannot be part of a hash-checked
@@ -74,6 +85,15 @@ $(VENV)/.run: $(VENV)/.created requirements.lock
 
 $(VENV)/.project: $(VENV)/.run pyproject.toml
 	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	touch $@
+
+$(VENV)/.extras: $(VENV)/.project requirements-extras.lock
+	$(PIP) install --quiet --require-hashes -r requirements-extras.lock
+	touch $@
+
+$(BLENDER)/.ready: $(VENV)/.created requirements-blender.lock
+	"$$(PYTHON=$${PYTHON:-python3.11} .ci/system-packages --python)" -m venv $(BLENDER)
+	$(BLENDER)/bin/python -m pip --disable-pip-version-check --no-input install --quiet --require-hashes -r requirements-blender.lock
 	touch $@
 
 $(VENV)/.dev: $(VENV)/.project requirements-dev.lock
