@@ -18,16 +18,16 @@ _SKIPPED_SUFFIXES = (".pyc", ".pyo")
 
 
 @cache
-def algorithm_version(rooms: tuple[str, ...]) -> str:
-    """Version of a stage's algorithm: a digest of its own source files and of all they import from here.
+def algorithm_version(module: str) -> str:
+    """Version of a stage's algorithm: a digest of a module's source and of all it imports from here.
 
     Derived rather than counted by hand, so that changed code can never be answered with an old result.
 
     Args:
-        rooms: Modules below this package: the stage's own (``mapping``) and what its task calls besides.
+        module: Below this package: the stage's task (``tasks.keyframes``), which imports the algorithm.
     """
     digest = hashlib.sha256()
-    for path in sorted(_closure((*rooms, "tasks"))):
+    for path in sorted(_closure(module)):
         digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")
         digest.update(path.read_bytes() + b"\0")
     return digest.hexdigest()[:16]
@@ -48,15 +48,13 @@ def _installed(alternatives: Iterable[str]) -> str:
     return "none"
 
 
-def _closure(modules: Iterable[str]) -> set[Path]:
-    """Files of the modules and of what they import from here; `tasks` imports all, so is not followed."""
-    waiting, found = list(modules), set[Path]()
+def _closure(module: str) -> set[Path]:
+    """Files of the module and of what it imports from here."""
+    waiting, found = [module], set[Path]()
     while waiting:
-        name = waiting.pop()
-        new = set(_files(name)) - found
+        new = set(_files(waiting.pop())) - found
         found |= new
-        if name != "tasks":
-            waiting.extend(part for path in new if path.suffix == ".py" for part in _imports(path))
+        waiting.extend(part for path in new if path.suffix == ".py" for part in _imports(path))
     return found
 
 

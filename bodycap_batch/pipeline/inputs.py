@@ -23,7 +23,7 @@ def key_of(stage: str, options: Mapping[str, Any], inputs: Mapping[str, Any]) ->
     entry = STAGES[stage]
     return ArtefactKey(
         stage=stage,
-        algorithm=algorithm_version(entry.rooms),
+        algorithm=algorithm_version(entry.code),
         options=dict(options),
         inputs=dict(inputs),
         libraries=library_versions(entry.libraries),

@@ -108,9 +108,9 @@ def _run(task: Task, store: Store, function: TaskFunction, link: tuple[_Speaker,
 
 def _function(stage: str, table: Mapping[str, TaskFunction] | None) -> TaskFunction:
     if table is None:
-        from bodycap_batch.tasks import functions
+        from bodycap_batch.tasks import STAGES
 
-        table = functions()
+        return STAGES[stage].function
     return table[stage]
 
 

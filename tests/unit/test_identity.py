@@ -29,7 +29,7 @@ def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def versions() -> dict[str, str]:
     identity.algorithm_version.cache_clear()
-    return {name: identity.algorithm_version(stage.rooms) for name, stage in STAGES.items()}
+    return {name: identity.algorithm_version(stage.code) for name, stage in STAGES.items()}
 
 
 def changed_by(path: Path, text: str = "\nANOTHER = 1\n") -> set[str]:
@@ -48,16 +48,23 @@ def imported_rooms(path: Path) -> Iterator[str]:
 
 def test_the_same_sources_have_the_same_version(copied: Path) -> None:
     assert versions() == versions()
-    assert len(set(versions().values())) == len({stage.rooms for stage in STAGES.values()})
+    assert len(set(versions().values())) == len({stage.code for stage in STAGES.values()})
 
 
 @pytest.mark.parametrize("stage", sorted(STAGES))
 def test_everything_a_stage_imports_counts(copied: Path, stage: str) -> None:
-    found = identity._closure(STAGES[stage].rooms)
+    found = identity._closure(STAGES[stage].code)
     rooms = {path.relative_to(copied).parts[0].removesuffix(".py") for path in found}
     wanted = {room for path in found if path.suffix == ".py" for room in imported_rooms(path)}
     assert wanted - rooms - IGNORED - {"config"} == set()
-    assert STAGES[stage].rooms[0] in rooms
+    room = {
+        "map": "mapping",
+        "extend": "mapping",
+        "refine": "mapping",
+        "merge": "merging",
+        "synth": "synthetic",
+    }
+    assert room.get(stage, stage) in rooms
 
 
 def test_a_stage_is_changed_by_its_own_code_and_no_other_stage_is(copied: Path) -> None:
@@ -69,8 +76,14 @@ def test_shared_geometry_changes_what_computes_with_it(copied: Path) -> None:
     assert changed_by(copied / "geometry.py") >= {"map", "registration", "merge", "export"}
 
 
-def test_the_glue_of_the_tasks_counts_for_all(copied: Path) -> None:
-    assert changed_by(copied / "tasks.py") == set(STAGES)
+def test_the_glue_of_a_task_counts_for_its_stages(copied: Path) -> None:
+    assert changed_by(copied / "tasks" / "export.py") == {"export"}
+    assert changed_by(copied / "tasks" / "mapping.py") == {"map", "extend", "refine"}
+    assert changed_by(copied / "tasks" / "stage.py") == set(STAGES)
+
+
+def test_a_further_stage_changes_no_other(copied: Path) -> None:
+    assert changed_by(copied / "tasks" / "__init__.py") == set()
 
 
 @pytest.mark.parametrize("name", ["humanoid.yaml", "mounts.yaml"])

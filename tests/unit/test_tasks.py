@@ -22,7 +22,8 @@ from bodycap_batch.skeleton_presets import (
     load_skeleton,
     nominal_mount,
 )
-from bodycap_batch.tasks import _mount, _row_fraction
+from bodycap_batch.tasks.body import mount_prior
+from bodycap_batch.tasks.registered import row_fraction
 
 QUARTER_TURN = {"translation_m": [0.1, 0.2, 0.3], "quat_xyzw": [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]}
 
@@ -36,7 +37,7 @@ def a_job(folder: Path, **camera: Any) -> Job:
 
 def mount(folder: Path, **camera: Any) -> Mount:
     block = body_arguments(a_job(folder, **camera))["mounts"][0]
-    return _mount(block, load_skeleton("upper_body", 1.75))
+    return mount_prior(block, load_skeleton("upper_body", 1.75))
 
 
 def test_a_mount_known_by_name_is_the_nominal_one(tmp_path: Path) -> None:
@@ -101,7 +102,7 @@ def test_the_mean_row_follows_the_observations() -> None:
     camera = Camera(model="PINHOLE", width_px=64, height_px=48, params=np.array([50, 50, 32, 24]))
     # frame 1 has no observation of its own: the middle row; frame 2 has no pose
     expected = [15 / 48, 0.5, np.nan, 36 / 48]
-    assert np.array_equal(_row_fraction(found, camera), expected, equal_nan=True)
+    assert np.array_equal(row_fraction(found, camera), expected, equal_nan=True)
 
 
 @pytest.mark.parametrize(

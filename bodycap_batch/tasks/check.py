@@ -1,0 +1,21 @@
+"""The task that refuses a job that cannot work."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bodycap_batch.context import StageContext
+from bodycap_batch.tasks.stage import SEEING, VISION, Json, Stage, write_summary
+
+
+def _check(_: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    from bodycap_batch.check import require_ready
+    from bodycap_batch.config.models import Job
+
+    context.check_cancelled()
+    report = require_ready(Job.model_validate(arguments["job"]))
+    notes = [f"{camera.name}: {note}" for camera in report.cameras for note in camera.notes]
+    write_summary(files, notes=[*notes, *report.notes])
+
+
+CHECK = Stage(function=_check, libraries=VISION, modules=SEEING)

@@ -1,0 +1,40 @@
+"""The task that writes the results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bodycap_batch.context import StageContext
+from bodycap_batch.tasks.loading import load_keyframes, load_map
+from bodycap_batch.tasks.registered import Registered
+from bodycap_batch.tasks.stage import RESULTS, Json, Stage
+
+
+def _export(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    from bodycap_batch.body import MergeResult
+    from bodycap_batch.config import ExportOptions
+    from bodycap_batch.export import ExportInputs, export_results
+    from bodycap_batch.formats.bundle import read_bundle
+
+    scene = load_map(arguments["map"])
+    found = Registered.load(arguments["registrations"], scene.maps)
+    merged = arguments["merge"]
+    inputs = ExportInputs(
+        out_dir=files / RESULTS,
+        maps=scene.maps,
+        trajectories=found.trajectories,
+        clocks=found.clocks,
+        selections=tuple(load_keyframes(path) for path in arguments["keyframes"]),
+        merge=None if merged is None else read_bundle(MergeResult, Path(merged), "merge"),
+        partial_reason=arguments["failure"],
+        row_fraction=found.row_fraction,
+        log=scene.log,
+    )
+    export_results(inputs, ExportOptions.model_validate(options), context)
+
+
+EXPORT = Stage(
+    function=_export,
+    libraries=("numpy", "scipy", "open3d-cpu|open3d"),
+    modules=("bodycap_batch.export", "open3d", "scipy.spatial.transform"),
+)

@@ -1,0 +1,23 @@
+"""The task that selects a camera's keyframes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bodycap_batch.context import StageContext
+from bodycap_batch.tasks.loading import load_capture
+from bodycap_batch.tasks.stage import SEEING, VISION, Json, Stage, write_summary
+
+
+def _keyframes(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    from bodycap_batch.config import KeyframeOptions
+    from bodycap_batch.formats.bundle import write_bundle
+    from bodycap_batch.keyframes import select_keyframes
+
+    camera = load_capture(arguments).cameras[0]
+    selection = select_keyframes(camera, KeyframeOptions.model_validate(options), context)
+    write_bundle(selection, files, "keyframes")
+    write_summary(files, frames=selection.frame_count, keyframes=len(selection.frames))
+
+
+KEYFRAMES = Stage(function=_keyframes, libraries=VISION, modules=SEEING)

@@ -1,0 +1,44 @@
+"""Inputs of the stages, from what the stages before them saved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bodycap_batch.tasks.stage import Json
+
+if TYPE_CHECKING:
+    from bodycap_batch.capture import Capture
+    from bodycap_batch.scene import KeyframeSelection, MapResult, Registration
+
+
+def load_capture(arguments: Json) -> Capture:
+    """Open the capture block of a task's arguments."""
+    from bodycap_batch.capture import open_capture
+    from bodycap_batch.config.models import CaptureConfig
+
+    return open_capture(CaptureConfig.model_validate(arguments["capture"]))
+
+
+def load_keyframes(path: str) -> KeyframeSelection:
+    """Read a camera's keyframes."""
+    from bodycap_batch.formats.bundle import read_bundle
+    from bodycap_batch.scene import KeyframeSelection
+
+    return read_bundle(KeyframeSelection, Path(path), "keyframes")
+
+
+def load_map(path: str) -> MapResult:
+    """Read a map with its workspace."""
+    from bodycap_batch.formats.bundle import read_bundle
+    from bodycap_batch.scene import MapResult
+
+    return read_bundle(MapResult, Path(path), "map")
+
+
+def load_registration(path: str) -> Registration:
+    """Read a camera's poses."""
+    from bodycap_batch.formats.bundle import read_bundle
+    from bodycap_batch.scene import Registration
+
+    return read_bundle(Registration, Path(path), "registration")

@@ -1,0 +1,67 @@
+"""What registration left of all cameras, as the stages after it take it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bodycap_batch.tasks.loading import load_registration
+
+if TYPE_CHECKING:
+    from bodycap_batch.arrays import FloatArray
+    from bodycap_batch.body import CameraClock
+    from bodycap_batch.camera import Camera
+    from bodycap_batch.scene import Map, Registration, Trajectory
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Registered:
+    """What registration left of all cameras.
+
+    Attributes:
+        trajectories: One per camera.
+        clocks: By camera.
+        row_fraction: By camera whose rolling shutter is still in its poses: see `row_fraction`.
+    """
+
+    trajectories: tuple[Trajectory, ...]
+    clocks: Mapping[str, CameraClock]
+    row_fraction: Mapping[str, FloatArray]
+
+    @staticmethod
+    def load(paths: Sequence[str], maps: Sequence[Map]) -> Registered:
+        """Read one artefact per camera; rows matter where a rolling shutter is still in the poses."""
+        from bodycap_batch.body import CameraClock
+        from bodycap_batch.camera import Camera
+        from bodycap_batch.formats.bundle import read_bundle
+
+        found = {path: load_registration(path) for path in paths}
+        corrected = {name for each in maps for name in each.readout_s}
+        clocks = {
+            item.trajectory.camera: read_bundle(CameraClock, Path(path), "clock")
+            for path, item in found.items()
+        }
+        return Registered(
+            trajectories=tuple(item.trajectory for item in found.values()),
+            clocks=clocks,
+            row_fraction={
+                item.trajectory.camera: row_fraction(item, read_bundle(Camera, Path(path), "camera"))
+                for path, item in found.items()
+                if clocks[item.trajectory.camera].rolling_shutter_s
+                and item.trajectory.camera not in corrected
+            },
+        )
+
+
+def row_fraction(found: Registration, camera: Camera) -> FloatArray:
+    """(N,) mean row of the observations behind each pose over the image height; NaN without a pose."""
+    import numpy as np
+
+    count = len(found.trajectory.status)
+    seen = np.bincount(found.obs_frame, minlength=count)
+    rows = np.bincount(found.obs_frame, weights=found.obs_px[:, 1].astype(np.float64), minlength=count)
+    mean = np.full(count, 0.5)
+    np.divide(rows, seen * camera.height_px, out=mean, where=seen > 0)
+    return np.where(found.trajectory.localised, mean, np.nan)

@@ -1,0 +1,43 @@
+"""The task that registers a camera's frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bodycap_batch.context import StageContext
+from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
+from bodycap_batch.tasks.stage import SEEING, VISION, Json, Stage, write_summary
+
+
+def _registration(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    from bodycap_batch.body import CameraClock
+    from bodycap_batch.config import RegistrationOptions
+    from bodycap_batch.formats.bundle import write_bundle
+    from bodycap_batch.registration import register_frames
+    from bodycap_batch.rolling_shutter import looks_rolling
+
+    camera = load_capture(arguments).cameras[0]
+    selection = load_keyframes(arguments["selection"])
+    previous = load_registration(arguments["previous"]) if arguments.get("previous") else None
+    options_ = RegistrationOptions.model_validate(options)
+    maps = load_map(arguments["map"]).maps
+    found = register_frames(camera, maps, selection, options_, context, previous)
+    known = camera.rolling_shutter_known
+    write_bundle(found, files, "registration")
+    clock = CameraClock(
+        nominal_fps=camera.nominal_fps,
+        offset_s=camera.offset_s,
+        rolling_shutter_s=camera.rolling_shutter_s,
+    )
+    write_bundle(clock, files, "clock")
+    write_bundle(camera.camera, files, "camera")
+    write_summary(
+        files,
+        frames=len(found.trajectory.status),
+        localised=int(found.trajectory.localised.sum()),
+        wanted=[int(frame) for frame in found.wanted_keyframes],
+        rolling=bool(camera.rolling_shutter_s) if known else looks_rolling(found, maps),
+    )
+
+
+REGISTRATION = Stage(function=_registration, libraries=(*VISION, "pycolmap"), modules=(*SEEING, "pycolmap"))
