@@ -17,7 +17,9 @@ PACKAGE = Path(__file__).resolve().parent.parent / "bodycap_batch"
 # A room is a module or package directly below bodycap_batch. Each may import the rooms named and no other.
 GROUND = {"errors", "arrays", "context", "geometry"}
 TYPES = GROUND | {"camera", "scene", "skeleton", "body"}
-MATERIAL = TYPES | {"capture", "config", "formats", "skeleton_presets", "tracking", "rolling_shutter"}
+MATERIAL = TYPES | {
+    "capture", "config", "formats", "skeleton_presets", "tracking", "rolling_shutter", "overlay",
+}  # fmt: skip
 STAGES = {
     "keyframes", "mapping", "registration", "merging", "export", "report", "evaluate", "synthetic", "check",
     "calibration",
@@ -35,6 +37,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "skeleton_presets": GROUND | {"skeleton"},
     "tracking": GROUND | {"camera"},
     "rolling_shutter": GROUND | {"camera", "scene"},
+    "overlay": TYPES | {"skeleton_presets"},
     "formats": TYPES,
     "config": TYPES | {"formats", "skeleton_presets"},
     "capture": TYPES | {"config", "formats"},

@@ -1,0 +1,97 @@
+"""Overlays drawn into an RGB picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.camera import CV2_PIXEL_OFFSET_PX
+from bodycap_batch.overlay.projection import BoneLine
+from bodycap_batch.overlay.views import SeenPoints
+
+Picture = npt.NDArray[np.uint8]
+Colour = tuple[int, int, int]
+
+LEFT, RIGHT, MIDDLE = (86, 180, 233), (240, 150, 20), (250, 250, 250)
+"""Sky blue, orange and white: told apart by the colour-blind (M. Okabe, K. Ito, Color Universal Design)."""
+_OUTLINE = (20, 20, 20)
+_GOOD, _BAD = np.array([60.0, 220.0, 120.0]), np.array([235.0, 60.0, 60.0])
+_BAD_PX = 3.0
+"""Error at 640 px width that is drawn fully red."""
+_SUBPIXEL = 4
+_BONE_M = 0.012
+"""Half the drawn width of a bone: a thick pencil at its true size."""
+
+
+def side_colour(side: str) -> Colour:
+    """The colour of a bone: left, right, or the middle of the body."""
+    return {"Left": LEFT, "Right": RIGHT}.get(side, MIDDLE)
+
+
+def draw_overlay(
+    image: Picture,
+    width_px: int,
+    points: SeenPoints | None,
+    lines: Sequence[BoneLine],
+    sides: Sequence[str],
+) -> Picture:
+    """Draw into a copy of a picture.
+
+    Points stand where the solved pose projects them, green where that is right and red where it is off,
+    with a hair to where the picture shows them. Measured bones are solid, inferred ones dashed and thinner.
+
+    Args:
+        image: (H,W,3) RGB, any size.
+        width_px: Width of the pictures that `points` and `lines` speak of (the lens's).
+        points: From `CameraView.points_at`.
+        lines: From `bone_lines`.
+        sides: Side of each bone, as `Body.side`.
+    """
+    out = np.ascontiguousarray(image).copy()
+    scale = image.shape[1] / width_px
+    if points is not None:
+        _draw_points(out, points, scale, _BAD_PX * width_px / 640.0)
+    thin = max(1, round(image.shape[1] / 420))
+    for outline in (True, False):
+        for line in lines:
+            colour = _OUTLINE if outline else side_colour(sides[line.bone])
+            _draw_bone(out, line, scale, colour, thin + (2 if outline else 0))
+    return out
+
+
+def _draw_points(image: Picture, points: SeenPoints, scale: float, bad_px: float) -> None:
+    import cv2
+
+    share = np.clip(points.error_px / bad_px, 0.0, 1.0)[:, None]
+    colours = np.round((1.0 - share) * _GOOD + share * _BAD).astype(int).tolist()
+    there, seen = _fixed(points.px, scale), _fixed(points.observed_px, scale)
+    radius = max(1, round(image.shape[1] / 480)) << _SUBPIXEL
+    for at, shown, colour in zip(there, seen, colours, strict=True):
+        cv2.line(image, at, shown, colour, 1, cv2.LINE_AA, _SUBPIXEL)
+        cv2.circle(image, at, radius, colour, -1, cv2.LINE_AA, _SUBPIXEL)
+
+
+def _draw_bone(image: Picture, line: BoneLine, scale: float, colour: Colour, thickness: int) -> None:
+    import cv2
+
+    at = _fixed(line.px, scale)
+    if line.observed:
+        thickness += 1
+        pieces = [at]
+    else:
+        pieces = [at[start : start + 2] for start in range(0, len(at) - 1, 2)]
+    for piece in pieces:
+        cv2.polylines(image, [np.array(piece)], False, colour, thickness, cv2.LINE_AA, _SUBPIXEL)
+    if line.observed:
+        for end in (at[0], at[-1]):
+            cv2.circle(image, end, (thickness + 1) << (_SUBPIXEL - 1), colour, -1, cv2.LINE_AA, _SUBPIXEL)
+
+
+def _fixed(px: FloatArray, scale: float) -> list[list[int]]:
+    """COLMAP pixels of another size as OpenCV's fixed-point coordinates."""
+    at = np.round((px * scale - CV2_PIXEL_OFFSET_PX) * (1 << _SUBPIXEL)).astype(np.int64)
+    rows: list[list[int]] = at.tolist()
+    return rows
