@@ -50,6 +50,14 @@ def quat_xyzw_from_rotation(rotation: FloatArray) -> FloatArray:
     return np.asarray(quat.reshape(*rotation.shape[:-2], 4))
 
 
+def continuous_quat_xyzw(rotation: FloatArray) -> FloatArray:
+    """Convert rotations over time (T,...,3,3) to quaternions (T,...,4) whose sign never jumps."""
+    quat = quat_xyzw_from_rotation(rotation)
+    flips = np.where((quat[1:] * quat[:-1]).sum(axis=-1) < 0.0, -1.0, 1.0)
+    quat[1:] *= np.cumprod(flips, axis=0)[..., None]
+    return quat
+
+
 def rotation_from_quat_xyzw(quat_xyzw: npt.ArrayLike) -> FloatArray:
     """Convert quaternions (...,4) (any norm but zero) to (...,3,3) rotations."""
     from scipy.spatial.transform import Rotation

@@ -27,6 +27,7 @@ class SkeletonModel:
         end_offsets_m: (J,3) the bone's far end in the joint's frame; NaN where it has children.
         roles: (J,) the anatomical (HumanIK) name of each joint, "" where it has none.
         bvh_channels: (J,) channel names as a file gave them, or () for the default order.
+        tpose_rotation: (J,3,3) parent_from_joint rotations of the T-pose, where the zero pose is another one.
     """
 
     name: str
@@ -36,12 +37,15 @@ class SkeletonModel:
     end_offsets_m: FloatArray
     roles: tuple[str, ...]
     bvh_channels: tuple[tuple[str, ...], ...]
+    tpose_rotation: FloatArray | None = None
 
     def __post_init__(self) -> None:
         count = len(self.joints)
         set_array(self, "parents", (count,), np.int64)
         set_array(self, "offsets_m", (count, 3))
         set_array(self, "end_offsets_m", (count, 3), finite=False)
+        if self.tpose_rotation is not None:
+            set_array(self, "tpose_rotation", (count, 3, 3))
         if len(self.roles) != count or len(self.bvh_channels) != count:
             raise ValueError("roles and bvh_channels need one entry per joint")
         if count == 0 or self.parents[0] != -1 or (self.parents[1:] >= np.arange(1, count)).any():
@@ -88,6 +92,8 @@ class Motion:
         local_rotation: (T,J,3,3) parent_from_joint rotations (zero pose = identity; the root's is
             world_from_root).
         observed: (T,J) True where cameras measured the joint rather than a prior.
+        hips_in_root_m: (T,3) position of the root's first child in the root's frame where it travels on its
+            own (a root on the floor that carries the hips); None where every bone keeps its length.
     """
 
     skeleton: SkeletonModel
@@ -96,12 +102,25 @@ class Motion:
     root_in_world_m: FloatArray
     local_rotation: FloatArray
     observed: BoolArray
+    hips_in_root_m: FloatArray | None = None
 
     def __post_init__(self) -> None:
         ticks, count = len(self.root_in_world_m), len(self.skeleton.joints)
         set_array(self, "root_in_world_m", (ticks, 3))
         set_array(self, "local_rotation", (ticks, count, 3, 3))
         set_array(self, "observed", (ticks, count), np.bool_)
+        if self.hips_in_root_m is not None:
+            set_array(self, "hips_in_root_m", (ticks, 3))
+            if count < 2:
+                raise ValueError("hips_in_root_m: the root has no child")
+
+    def local_position_m(self) -> FloatArray:
+        """(T,J,3) joint centres in their parent's frame; the root's in the world."""
+        out = np.tile(self.skeleton.offsets_m, (len(self.root_in_world_m), 1, 1))
+        out[:, 0] = self.root_in_world_m
+        if self.hips_in_root_m is not None:
+            out[:, 1] = self.hips_in_root_m
+        return out
 
     def times_ns(self) -> IntArray:
         """(T,) common time of each tick."""
@@ -110,17 +129,42 @@ class Motion:
 
     def world_from_joint(self) -> FloatArray:
         """(T,J,4,4) joint poses."""
-        return forward_kinematics(self.skeleton, self.root_in_world_m, self.local_rotation)
+        local = make_transform(self.local_rotation, self.local_position_m())
+        return _chained(self.skeleton, local)
 
 
 def forward_kinematics(
     skeleton: SkeletonModel, root_in_world_m: FloatArray, local_rotation: FloatArray
 ) -> FloatArray:
     """Joint poses (T,J,4,4) from root positions (T,3) and local rotations (T,J,3,3)."""
-    out = np.zeros((len(root_in_world_m), len(skeleton.joints), 4, 4))
-    out[:, 0] = make_transform(local_rotation[:, 0], root_in_world_m)
+    local = make_transform(local_rotation, skeleton.offsets_m)
+    local[:, 0, :3, 3] = root_in_world_m
+    return _chained(skeleton, local)
+
+
+def rest_pose(skeleton: SkeletonModel) -> FloatArray:
+    """Joint poses (J,4,4) of the skeleton standing at the origin in its T-pose (without one, its zero pose).
+
+    Its root stands as high as the skeleton says; where that says nothing, so that the lowest point of the
+    body touches the floor.
+    """
+    count = len(skeleton.joints)
+    local = skeleton.tpose_rotation
+    rotation = np.tile(np.eye(3), (count, 1, 1)) if local is None else local
+    pose: FloatArray = forward_kinematics(skeleton, np.zeros((1, 3)), rotation[None])[0]
+    height = float(skeleton.offsets_m[0, 2])
+    if height <= 0.0:
+        tips = pose[:, :3, 3] + np.einsum(
+            "jab,jb->ja", pose[:, :3, :3], np.nan_to_num(skeleton.end_offsets_m)
+        )
+        height = -float(min(tips[:, 2].min(), pose[:, 2, 3].min()))
+    pose[:, 2, 3] += height
+    return pose
+
+
+def _chained(skeleton: SkeletonModel, parent_from_joint: FloatArray) -> FloatArray:
+    """Joint poses (T,J,4,4) from poses in the parents (T,J,4,4), the root's in the world."""
+    out: FloatArray = parent_from_joint.copy()
     for joint in range(1, len(skeleton.joints)):
-        parent = out[:, skeleton.parents[joint]]
-        parent_from_joint = make_transform(local_rotation[:, joint], skeleton.offsets_m[joint])
-        out[:, joint] = parent @ parent_from_joint
+        out[:, joint] = out[:, skeleton.parents[joint]] @ parent_from_joint[:, joint]
     return out

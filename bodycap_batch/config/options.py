@@ -67,9 +67,10 @@ class MergeOptions(Options):
 class ExportOptions(Options):
     """Stage 5, the files."""
 
-    formats: tuple[Literal["ply", "bvh", "tum", "csv", "colmap"], ...] = (
+    formats: tuple[Literal["ply", "bvh", "glb", "tum", "csv", "colmap"], ...] = (
         "ply",
         "bvh",
+        "glb",
         "tum",
         "csv",
         "colmap",

@@ -1,7 +1,8 @@
-"""The motion as a file: whole or reduced hierarchy, written, read back and compared."""
+"""The motion as files: whole or reduced hierarchy, written, read back and compared."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,8 +10,9 @@ import numpy as np
 
 from bodycap_batch.arrays import BoolArray
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.errors import StoreError
+from bodycap_batch.errors import JobError, StoreError
 from bodycap_batch.formats.bvh import read_bvh, write_bvh
+from bodycap_batch.formats.gltf import read_glb, write_glb
 from bodycap_batch.geometry import rotation_angle_rad
 from bodycap_batch.skeleton import Motion, SkeletonModel
 
@@ -25,7 +27,24 @@ def write_motion(path: Path, motion: Motion, options: ExportOptions) -> Path:
         StoreError: The file cannot be written, or differs by more than 0.1 mm or 0.01° when read back.
     """
     write_bvh(path, motion, units=options.units, euler_order=options.euler_order)
-    position_m, angle_deg = read_back_difference(path, motion, options.units)
+    _verify(path, motion, lambda file: read_bvh(file, units=options.units)[1])
+    return path
+
+
+def write_figure(path: Path, motion: Motion) -> Path:
+    """Write a GLB, verify that it holds the motion, return its path. Raises as `write_motion`."""
+    write_glb(path, motion)
+    _verify(path, motion, read_glb)
+    return path
+
+
+def _verify(path: Path, motion: Motion, read: Callable[[Path], Motion | None]) -> None:
+    """Remove and refuse a file that does not hold the motion."""
+    try:
+        position_m, angle_deg = motion_difference(read(path), motion)
+    except JobError as error:
+        path.unlink(missing_ok=True)
+        raise StoreError(f"cannot be read back: {error.message}", path=path, hint="check the disk") from error
     if not (position_m <= POSITION_TOLERANCE_M and angle_deg <= ANGLE_TOLERANCE_DEG):
         path.unlink(missing_ok=True)
         raise StoreError(
@@ -33,18 +52,16 @@ def write_motion(path: Path, motion: Motion, options: ExportOptions) -> Path:
             path=path,
             hint="check the disk; if it is sound, this is a bug worth reporting",
         )
-    return path
 
 
-def read_back_difference(path: Path, motion: Motion, units: str) -> tuple[float, float]:
-    """Largest difference of joint centres (m) and orientations (deg) between a file and a motion."""
-    skeleton, back = read_bvh(path, units=units)
-    same = back is not None and sorted(skeleton.joints) == sorted(motion.skeleton.joints)
+def motion_difference(back: Motion | None, motion: Motion) -> tuple[float, float]:
+    """Largest difference of joint centres (m) and orientations (deg); infinite where they cannot match."""
+    same = back is not None and sorted(back.skeleton.joints) == sorted(motion.skeleton.joints)
     if back is None or not same or len(back.root_in_world_m) != len(motion.root_in_world_m):
         return np.inf, np.inf
     if abs(back.fps / motion.fps - 1.0) > 1e-6:
         return np.inf, np.inf
-    order = [skeleton.joints.index(name) for name in motion.skeleton.joints]
+    order = [back.skeleton.joints.index(name) for name in motion.skeleton.joints]
     written, found = motion.world_from_joint(), back.world_from_joint()[:, order]
     position = np.linalg.norm(written[..., :3, 3] - found[..., :3, 3], axis=-1)
     turned = np.swapaxes(written[..., :3, :3], -1, -2) @ found[..., :3, :3]

@@ -11,7 +11,7 @@ from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.export.inputs import ExportInputs
 from bodycap_batch.export.metrics import collect_metrics
-from bodycap_batch.export.motion import only_solved, write_motion
+from bodycap_batch.export.motion import only_solved, write_figure, write_motion
 from bodycap_batch.export.projection import project_motion
 from bodycap_batch.export.scene_files import write_colmap, write_maps, write_trajectories
 from bodycap_batch.export.tables import write_frames
@@ -22,8 +22,9 @@ from bodycap_batch.skeleton import Motion
 def export_results(inputs: ExportInputs, options: ExportOptions, context: StageContext) -> tuple[Path, ...]:
     """Write a job's results into ``inputs.out_dir``, each file whole or not at all, and verify them.
 
-    ``map.ply``, ``trajectories/<camera>.tum``, ``colmap/<n>/``, ``frames.csv``, ``motion.bvh`` (as the
-    options ask) and always ``metrics.json``. Everything is in the world where there is one.
+    ``map.ply``, ``trajectories/<camera>.tum``, ``colmap/<n>/``, ``frames.csv``, ``motion.bvh`` and
+    ``motion.glb`` (as the options ask) and always ``metrics.json``. Everything is in the world where there is
+    one.
 
     Args:
         inputs: Maps, trajectories and the merged body.
@@ -43,6 +44,7 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
     steps["csv"] = lambda: [write_frames(inputs.out_dir / "frames.csv", inputs)]
     if motion is not None:
         steps["bvh"] = lambda: [write_motion(inputs.out_dir / "motion.bvh", motion, options)]
+        steps["glb"] = lambda: [write_figure(inputs.out_dir / "motion.glb", motion)]
     steps = {name: write for name, write in steps.items() if name in options.formats}
     steps["metrics"] = lambda: [_write_metrics(inputs, motion, gap)]
     written: list[Path] = []

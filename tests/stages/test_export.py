@@ -15,7 +15,7 @@ from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import Cancelled, StoreError
 from bodycap_batch.export import ExportInputs, export_results
-from bodycap_batch.export.motion import only_solved, read_back_difference
+from bodycap_batch.export.motion import motion_difference, only_solved
 from bodycap_batch.export.projection import project_motion
 from bodycap_batch.formats.bvh import read_bvh, write_bvh
 from bodycap_batch.formats.ply import read_ply
@@ -63,7 +63,7 @@ def run(inputs: ExportInputs, **options: Any) -> dict[str, Any]:
 def test_all_files_are_there(tmp_path: Path) -> None:
     inputs = inputs_of(tmp_path)
     files = export_results(inputs, ExportOptions(), StageContext(work_dir=tmp_path))
-    expected = {"map.ply", "map_1.ply", "motion.bvh", "frames.csv", "metrics.json"}
+    expected = {"map.ply", "map_1.ply", "motion.bvh", "motion.glb", "frames.csv", "metrics.json"}
     expected |= {f"trajectories/{camera}.tum" for camera in CAMERAS}
     expected |= {f"colmap/{n}/{name}.bin" for n in (0, 1) for name in ("cameras", "images", "points3D")}
     assert {str(file) for file in files} == expected
@@ -162,7 +162,7 @@ def test_motion_file_is_the_projected_motion(tmp_path: Path) -> None:
     model, back = read_bvh(inputs.out_dir / "motion.bvh")
     assert back is not None
     assert model.joints == motion.skeleton.joints
-    position_m, angle_deg = read_back_difference(inputs.out_dir / "motion.bvh", motion, "cm")
+    position_m, angle_deg = motion_difference(back, motion)
     # six decimals of a centimetre and of a degree, along a chain of seven joints of 2 m in all
     assert position_m < 1e-6
     assert angle_deg < 1e-4

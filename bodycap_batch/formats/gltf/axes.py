@@ -1,0 +1,36 @@
+"""World axes against file axes, and the numbers of the format."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray, frozen_array
+from bodycap_batch.geometry import make_transform
+
+FILE_FROM_WORLD: FloatArray = frozen_array(
+    [[1, 0, 0], [0, 0, 1], [0, -1, 0]], name="file_from_world", shape=(3, 3)
+)
+"""File (Y up, facing +Z) from world (Z up, facing −Y) axes."""
+
+FLOAT, UINT16, UINT32 = 5126, 5123, 5125
+DTYPES: dict[int, np.dtype[Any]] = {FLOAT: np.dtype("<f4"), UINT16: np.dtype("<u2"), UINT32: np.dtype("<u4")}
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+ELEMENTS, VERTICES = 34963, 34962
+
+
+def poses_in_file_axes(world_from_joint: FloatArray, scale: float = 1.0) -> FloatArray:
+    """Poses (...,4,4) with both frames turned from world axes to the file's, lengths scaled."""
+    rotation = rotations_in_file_axes(world_from_joint[..., :3, :3])
+    return make_transform(rotation, scale * world_from_joint[..., :3, 3] @ FILE_FROM_WORLD.T)
+
+
+def rotations_in_file_axes(rotation: FloatArray) -> FloatArray:
+    """Local rotations (...,3,3) from world axes to the file's."""
+    return np.asarray(FILE_FROM_WORLD @ rotation @ FILE_FROM_WORLD.T)
+
+
+def rotations_in_world_axes(rotation: FloatArray) -> FloatArray:
+    """Local rotations (...,3,3) from the file's axes to the world's."""
+    return np.asarray(FILE_FROM_WORLD.T @ rotation @ FILE_FROM_WORLD)

@@ -1,0 +1,94 @@
+"""Reading back what the writer wrote; other GLB files only as far as they look the same."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.errors import JobError
+from bodycap_batch.formats.gltf.axes import DTYPES, FILE_FROM_WORLD, WIDTHS, rotations_in_world_axes
+from bodycap_batch.geometry import rotation_from_quat_xyzw
+from bodycap_batch.skeleton import Motion, SkeletonModel
+
+
+def read_glb(path: Path | str) -> Motion:
+    """Read the animated skeleton of a file of ours.
+
+    Its zero pose has all rotations zero, its T-pose is the rest pose of the nodes; end points of bones and
+    BVH channels are not in the file.
+
+    Raises:
+        JobError: The file is no GLB with one skin and one animation.
+    """
+    import pygltflib as gl
+
+    try:
+        document = gl.GLTF2.load_binary(str(path))
+        if document is None or len(document.skins) != 1 or len(document.animations) != 1:
+            raise JobError("holds no single skin with a single animation", path=path)
+        return _motion(document, Path(path).stem)
+    except (OSError, struct.error, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise JobError(f"cannot be read as GLB: {error}", path=path) from error
+
+
+def _motion(document: Any, name: str) -> Motion:
+    skin, animation = document.skins[0], document.animations[0]
+    place = {node: joint for joint, node in enumerate(skin.joints)}
+    skeleton = _skeleton(document, name, place)
+    times = _array(document, animation.samplers[0].input)[:, 0]
+    shape = (len(times), len(place))
+    local = np.tile(np.eye(3), (*shape, 1, 1))
+    position: dict[int, FloatArray] = {}
+    for channel in animation.channels:
+        values = _array(document, animation.samplers[channel.sampler].output)
+        joint = place[channel.target.node]
+        if channel.target.path == "rotation":
+            local[:, joint] = rotations_in_world_axes(rotation_from_quat_xyzw(values))
+        else:
+            position[joint] = values @ FILE_FROM_WORLD
+    return Motion(
+        skeleton=skeleton,
+        fps=float(document.extras["fps"]),
+        start_ns=round(float(document.extras["start_s"]) * 1e9),
+        root_in_world_m=position[0],
+        local_rotation=local,
+        observed=np.ones(shape, dtype=bool),
+        hips_in_root_m=position.get(1),
+    )
+
+
+def _skeleton(document: Any, name: str, place: dict[int, int]) -> SkeletonModel:
+    nodes = [document.nodes[node] for node in place]
+    parents = np.full(len(nodes), -1)
+    for joint, node in enumerate(nodes):
+        for child in node.children or ():
+            parents[place[child]] = joint
+    offsets = np.array([node.translation for node in nodes]) @ FILE_FROM_WORLD
+    rest = rotation_from_quat_xyzw([node.rotation for node in nodes])
+    return SkeletonModel(
+        name=name,
+        joints=tuple(node.name for node in nodes),
+        parents=parents,
+        offsets_m=offsets,
+        end_offsets_m=np.full((len(nodes), 3), np.nan),
+        roles=tuple((node.extras or {}).get("role", "") for node in nodes),
+        bvh_channels=((),) * len(nodes),
+        tpose_rotation=rotations_in_world_axes(rest),
+    )
+
+
+def _array(document: Any, accessor: int) -> FloatArray:
+    """The values (N, width) of an accessor."""
+    wanted = document.accessors[accessor]
+    view = document.bufferViews[wanted.bufferView]
+    values = np.frombuffer(
+        document.binary_blob(),
+        dtype=DTYPES[wanted.componentType],
+        count=wanted.count * WIDTHS[wanted.type],
+        offset=view.byteOffset + wanted.byteOffset,
+    )
+    return np.asarray(values.reshape(wanted.count, WIDTHS[wanted.type]), dtype=np.float64)

@@ -1,0 +1,182 @@
+"""Writing GLB files that Blender, game engines and web viewers open."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.formats.figure import stick_figure
+from bodycap_batch.formats.files import replacing
+from bodycap_batch.formats.gltf.axes import (
+    DTYPES,
+    ELEMENTS,
+    FILE_FROM_WORLD,
+    FLOAT,
+    UINT16,
+    UINT32,
+    VERTICES,
+    poses_in_file_axes,
+    rotations_in_file_axes,
+)
+from bodycap_batch.geometry import continuous_quat_xyzw, invert, quat_xyzw_from_rotation
+from bodycap_batch.skeleton import Motion, SkeletonModel, rest_pose
+
+_COLOR = (0.86, 0.39, 0.10, 1.0)
+
+
+def write_glb(path: Path | str, motion: Motion, *, units_per_metre: float = 1.0) -> None:
+    """Write a motion as a skinned, animated stick figure.
+
+    Joints are nodes under one node ``Armature``; bones bind at the T-pose. Every joint has a LINEAR rotation
+    channel, the root (and hips that travel in it) a translation too. Frame k is at k / fps seconds.
+
+    Args:
+        path: The file; replaced in one step.
+        motion: What to write; world axes, metres.
+        units_per_metre: 1 as the format wants it; 100 for a converter that takes the numbers for centimetres.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
+    import pygltflib as gl
+
+    buffer = _Buffer()
+    figure = _figure(motion.skeleton, units_per_metre, buffer)
+    animation = _animation(motion, units_per_metre, buffer)
+    rest = poses_in_file_axes(rest_pose(motion.skeleton), units_per_metre)
+    binds = buffer.add(np.swapaxes(invert(rest), -1, -2).reshape(-1, 16), "MAT4")
+    joints = len(motion.skeleton.joints)
+    document = gl.GLTF2(
+        asset=gl.Asset(version="2.0", generator="bodycap_batch"),
+        scene=0,
+        scenes=[gl.Scene(nodes=[joints + 1])],
+        nodes=[
+            *_joint_nodes(motion.skeleton, rest),
+            gl.Node(name="Figure", mesh=0, skin=0),
+            gl.Node(name="Armature", children=[0, joints]),
+        ],
+        skins=[
+            gl.Skin(
+                name="Armature",
+                joints=list(range(joints)),
+                skeleton=0,
+                inverseBindMatrices=binds,
+            )
+        ],
+        meshes=[gl.Mesh(name="Figure", primitives=[figure])],
+        materials=[
+            gl.Material(
+                name="Figure",
+                pbrMetallicRoughness=gl.PbrMetallicRoughness(
+                    baseColorFactor=list(_COLOR), metallicFactor=0.0, roughnessFactor=0.7
+                ),
+            )
+        ],
+        animations=[animation],
+        accessors=buffer.accessors,
+        bufferViews=buffer.views,
+        buffers=[gl.Buffer(byteLength=len(buffer.data))],
+        extras={"fps": motion.fps, "start_s": motion.start_ns / 1e9},
+    )
+    document.set_binary_blob(bytes(buffer.data))
+    with replacing(Path(path)) as temporary:
+        document.save_binary(str(temporary))
+
+
+class _Buffer:
+    """The binary part: arrays one after the other, each with its view and accessor."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self.views: list[Any] = []
+        self.accessors: list[Any] = []
+
+    def add(
+        self, array: npt.NDArray[Any], kind: str, *, target: int | None = None, component: int = FLOAT
+    ) -> int:
+        """Append an array (N, …) and return its accessor's index."""
+        import pygltflib as gl
+
+        values = np.ascontiguousarray(array, dtype=DTYPES[component])
+        self.data += bytes(-len(self.data) % 4)
+        view = gl.BufferView(buffer=0, byteOffset=len(self.data), byteLength=values.nbytes, target=target)
+        self.views.append(view)
+        flat = values.reshape(len(values), -1)
+        self.accessors.append(
+            gl.Accessor(
+                bufferView=len(self.views) - 1,
+                byteOffset=0,
+                componentType=component,
+                count=len(values),
+                type=kind,
+                min=flat.min(axis=0).tolist(),
+                max=flat.max(axis=0).tolist(),
+            )
+        )
+        self.data += values.tobytes()
+        return len(self.accessors) - 1
+
+
+def _joint_nodes(skeleton: SkeletonModel, rest: FloatArray) -> list[Any]:
+    """One node a joint, at rest in the bind pose."""
+    import pygltflib as gl
+
+    parents = skeleton.parents.tolist()
+    local = np.array([rest[j] if p < 0 else invert(rest[p]) @ rest[j] for j, p in enumerate(parents)])
+    quats = quat_xyzw_from_rotation(local[:, :3, :3])
+    return [
+        gl.Node(
+            name=name,
+            translation=local[joint, :3, 3].tolist(),
+            rotation=quats[joint].tolist(),
+            children=[child for child, parent in enumerate(parents) if parent == joint],
+            extras={"role": skeleton.roles[joint]} if skeleton.roles[joint] else {},
+        )
+        for joint, name in enumerate(skeleton.joints)
+    ]
+
+
+def _figure(skeleton: SkeletonModel, scale: float, buffer: _Buffer) -> Any:
+    """The stick figure as a primitive: every vertex follows one joint with weight 1."""
+    import pygltflib as gl
+
+    figure = stick_figure(skeleton)
+    count = len(figure.vertices_m)
+    joints = np.zeros((count, 4))
+    joints[:, 0] = figure.joints
+    weights = np.zeros((count, 4))
+    weights[:, 0] = 1.0
+    attributes = gl.Attributes(
+        POSITION=buffer.add(scale * figure.vertices_m @ FILE_FROM_WORLD.T, "VEC3", target=VERTICES),
+        NORMAL=buffer.add(figure.normals @ FILE_FROM_WORLD.T, "VEC3", target=VERTICES),
+        JOINTS_0=buffer.add(joints, "VEC4", target=VERTICES, component=UINT16),
+        WEIGHTS_0=buffer.add(weights, "VEC4", target=VERTICES),
+    )
+    faces = buffer.add(figure.faces.reshape(-1), "SCALAR", target=ELEMENTS, component=UINT32)
+    return gl.Primitive(attributes=attributes, indices=faces, material=0)
+
+
+def _animation(motion: Motion, scale: float, buffer: _Buffer) -> Any:
+    """Rotations of all joints, translations of those that travel."""
+    import pygltflib as gl
+
+    times = buffer.add(np.arange(len(motion.root_in_world_m)) / motion.fps, "SCALAR")
+    quats = continuous_quat_xyzw(rotations_in_file_axes(motion.local_rotation))
+    position = scale * motion.local_position_m() @ FILE_FROM_WORLD.T
+    curves = [(joint, "rotation", buffer.add(quats[:, joint], "VEC4")) for joint in range(quats.shape[1])]
+    travelling = range(1 if motion.hips_in_root_m is None else 2)
+    curves += [(joint, "translation", buffer.add(position[:, joint], "VEC3")) for joint in travelling]
+    return gl.Animation(
+        name="Motion",
+        samplers=[
+            gl.AnimationSampler(input=times, output=out, interpolation="LINEAR") for _, _, out in curves
+        ],
+        channels=[
+            gl.AnimationChannel(sampler=index, target=gl.AnimationChannelTarget(node=joint, path=path))
+            for index, (joint, path, _) in enumerate(curves)
+        ],
+    )
