@@ -116,22 +116,25 @@ def _kept_frames(options: SynthOptions, subject: Subject) -> dict[str, BoolArray
     rng = np.random.default_rng(subject.seeds["drops"])
     out = {}
     for camera in options.cameras:
-        kept = rng.uniform(size=options.frame_count) >= options.drop_frames
+        kept = rng.uniform(size=len(frame_times_ns(options, camera))) >= options.drop_frames
         kept[[0, -1]] = True
         out[camera] = kept
     return out
 
 
-def frame_times_ns(options: SynthOptions) -> IntArray:
+def frame_times_ns(options: SynthOptions, camera: str) -> IntArray:
     """A camera's own time of each frame."""
-    return np.asarray(np.round(np.arange(options.frame_count) * (1e9 / options.fps)), dtype=np.int64)
+    rate = options.rate_fps(camera)
+    count = max(1, round(options.seconds * rate))
+    return np.asarray(np.round(np.arange(count) * (1e9 / rate)), dtype=np.int64)
 
 
 def _write_camera_truth(
     folder: Path, options: SynthOptions, subject: Subject, mount: Mount, kept: BoolArray
 ) -> None:
     """The camera's true path, its timestamps where frames are lost, and its measured poses."""
-    times_ns, camera = frame_times_ns(options)[kept], mount.camera
+    camera = mount.camera
+    times_ns = frame_times_ns(options, camera)[kept]
     poses = camera_at(subject.motion, mount, in_seconds(times_ns) + options.offsets_s.get(camera, 0.0))
     write_path(folder / "gt" / f"{camera}.tum", times_ns, poses, "world_from_camera, the camera's own clock")
     if not kept.all():
@@ -172,7 +175,7 @@ def _film(
             shoot = _Shooting(
                 film=film,
                 sensor=Sensor(options.noise, 3 * options.width * options.height, seed),
-                times_s=in_seconds(frame_times_ns(options)) + options.offsets_s.get(camera, 0.0),
+                times_s=in_seconds(frame_times_ns(options, camera)) + options.offsets_s.get(camera, 0.0),
             )
             size = (options.width, options.height)
             with VideoWriter(folder / f"{camera}.mp4", options.fps, size, options.quality) as video:

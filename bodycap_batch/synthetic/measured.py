@@ -11,7 +11,6 @@ from bodycap_batch.geometry import make_transform, so3_exp
 from bodycap_batch.synthetic.options import SynthOptions
 
 _BURST_FRAMES = (2, 7)
-_GAP_FRAMES = (10, 61)
 _GROSS_M = 0.4
 _GROSS_RAD = 0.5
 
@@ -43,10 +42,9 @@ def measure(world_from_cam: FloatArray, options: SynthOptions, rng: np.random.Ge
     shift = shift + outlier[:, None] * rng.normal(0.0, _GROSS_M, (count, 3))
     poses = make_transform(world_from_cam[:, :3, :3] @ turn, world_from_cam[:, :3, 3] + shift)
     present = np.ones(count, dtype=bool)
-    for _ in range(round(options.gaps * count / 1000)):
-        length = int(rng.integers(*_GAP_FRAMES))
-        start = int(rng.integers(1, max(2, count - length - 1)))
-        present[start : min(start + length, count - 1)] = False
+    # The ends stay; the last gap is cut to reach the wanted share exactly.
+    shortest, longest = options.gap_frames
+    present[1:-1] = ~_stretches(max(count - 2, 0), round(options.lost * count), (shortest, longest + 1), rng)
     return MeasuredPoses(world_from_cam=poses, present=present, outlier=outlier)
 
 

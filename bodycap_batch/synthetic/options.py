@@ -68,7 +68,11 @@ class SynthOptions(Options):
     pose_sigma_m: float = Field(0.005, ge=0, description="poses only: noise of each position, per axis")
     pose_sigma_deg: float = Field(0.3, ge=0, description="poses only: noise of each rotation, per axis")
     outliers: float = Field(0.02, ge=0, lt=0.5, description="poses only: share of gross outliers, in bursts")
-    gaps: int = Field(6, ge=0, description="poses only: gaps of 10 to 60 frames per 1,000 frames and camera")
+    lost: float = Field(0.02, ge=0, lt=0.9, description="poses only: share of frames lost, in gaps")
+    gap_frames: tuple[int, int] = Field((10, 20), description="poses only: shortest and longest gap")
+    rates_fps: Mapping[str, float] = Field(
+        default_factory=dict, description="poses only: by camera, its own frame rate"
+    )
     quality: Literal["high", "lossless"] = Field("high", description="H.264 at CRF 16, or lossless")
 
     @model_validator(mode="after")
@@ -82,9 +86,7 @@ class SynthOptions(Options):
             raise ValueError(f"lens: unknown model {self.lens!r}; known: {', '.join(CAMERA_MODELS)}")
         if self.lens_params is not None and len(self.lens_params) != param_count(self.lens):
             raise ValueError(f"lens_params: {self.lens} takes {param_count(self.lens)} parameters")
-        unknown = sorted(set(self.offsets_s) - set(self.cameras))
-        if unknown:
-            raise ValueError(f"offsets_s: no camera {', '.join(unknown)}")
+        self._check_cameras_named()
         if min(self.offsets_s.values(), default=0.0) < -_EARLIEST_S:
             raise ValueError(f"offsets_s: no earlier than -{_EARLIEST_S:g} s")
         if self.exposure_s > 1.0 / self.fps or self.rolling_shutter_s > 1.0 / self.fps:
@@ -93,6 +95,19 @@ class SynthOptions(Options):
             raise ValueError("t_pose_s: a BVH motion is followed as it is")
         self._check_pressed()
         return self
+
+    def _check_cameras_named(self) -> None:
+        """What is said by camera speaks of cameras that are there, and of poses where videos have none."""
+        for key, named in (("offsets_s", self.offsets_s), ("rates_fps", self.rates_fps)):
+            unknown = sorted(set(named) - set(self.cameras))
+            if unknown:
+                raise ValueError(f"{key}: no camera {', '.join(unknown)}")
+        if self.rates_fps and not self.poses_only:
+            raise ValueError("rates_fps: videos have one rate; set poses_only")
+        if min(self.rates_fps.values(), default=self.fps) <= 0.0:
+            raise ValueError("rates_fps: a rate is positive")
+        if not 1 <= self.gap_frames[0] <= self.gap_frames[1]:
+            raise ValueError("gap_frames: shortest first, one frame or more")
 
     def _check_pressed(self) -> None:
         """Only the built-in walker's hands can be led to the chest, and it has to be there."""
@@ -109,8 +124,12 @@ class SynthOptions(Options):
 
     @property
     def frame_count(self) -> int:
-        """Frames each camera exposes (dropped ones included)."""
+        """Frames a camera at the common rate exposes (dropped ones included)."""
         return max(1, round(self.seconds * self.fps))
+
+    def rate_fps(self, camera: str) -> float:
+        """Frames per second of one camera."""
+        return self.rates_fps.get(camera, self.fps)
 
     def camera(self) -> Camera:
         """The lens that every camera of the capture has."""

@@ -51,6 +51,7 @@ def write_calibration(folder: Path, options: SynthOptions) -> None:
         "model": options.lens,
         "params": options.camera().params.tolist(),
         "rolling_shutter_s": options.rolling_shutter_s,
+        **({"rates_fps": dict(options.rates_fps)} if options.rates_fps else {}),
         "offsets_s": {name: options.offsets_s.get(name, 0.0) for name in options.cameras},
         "exposure_s": options.exposure_s,
         "timestamp": "middle of the exposure",

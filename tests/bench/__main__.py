@@ -15,15 +15,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.bench import ours, peers, scaling
+from tests.bench import ours, peers, scaling, simulation
 from tests.bench.rows import DATA, LAB, Row, row_of, rows_in
 
 
 def main() -> int:
     """Run the chosen benchmarks; the exit code says whether every job of ours ran."""
+    if sys.argv[1:2] == ["simulation"]:
+        return simulation.main(sys.argv[2:])
     parser = argparse.ArgumentParser(prog="make bench ARGS=...", description=__doc__)
     parser.add_argument(
-        "only", nargs="*", help="rows to run, or folders of captures with truth (default: all), or `scaling`"
+        "only",
+        nargs="*",
+        help="rows to run, or folders of captures with truth (default: all), or `scaling`; `simulation` "
+        "first runs the skeleton stage on simulated poses, with options of its own",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)
