@@ -9,6 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 FrameName = Annotated[str, StringConstraints(pattern=r"^.+:\d+$")]
 """One frame of one camera, ``camera:frame``."""
 
+NamePreset = Literal["hik", "mixamo", "biped", "unreal"]
+RootMode = Literal["hips", "ground", "in_place"]
+
 
 class Options(BaseModel):
     """Base of all option blocks: frozen, unknown keys refused."""
@@ -76,6 +79,17 @@ class ExportOptions(Options):
         "colmap",
     )
     units: Literal["cm", "m"] = Field("cm", description="unit of the BVH")
+    names: NamePreset = Field("hik", description="joint names and spine count of the files for animation")
+    root: RootMode = Field(
+        "hips", description="travel on the hips, on an extra root on the ground, or none at all"
+    )
+    fps: float | None = Field(
+        None, gt=0, le=1000, description="rate of the files for animation; default the motion's own"
+    )
+    tpose: bool = Field(False, description="a T-pose as frame 0 of the files for animation")
+    smoothing_hz: float | None = Field(
+        None, gt=0, description="low-pass for the files for animation, 6 is usual; default none"
+    )
     euler_order: Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"] = Field(
         "ZXY", description="rotation channels"
     )

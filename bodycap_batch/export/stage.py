@@ -10,6 +10,7 @@ from typing import Any
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.export.inputs import ExportInputs
+from bodycap_batch.export.layout import lay_out
 from bodycap_batch.export.metrics import collect_metrics
 from bodycap_batch.export.motion import only_solved, write_figure, write_motion
 from bodycap_batch.export.projection import project_motion
@@ -43,8 +44,9 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
         steps |= {"ply": lambda: write_maps(inputs), "colmap": lambda: write_colmap(inputs)}
     steps["csv"] = lambda: [write_frames(inputs.out_dir / "frames.csv", inputs)]
     if motion is not None:
-        steps["bvh"] = lambda: [write_motion(inputs.out_dir / "motion.bvh", motion, options)]
-        steps["glb"] = lambda: [write_figure(inputs.out_dir / "motion.glb", motion)]
+        animated = lay_out(motion, options)
+        steps["bvh"] = lambda: [write_motion(inputs.out_dir / "motion.bvh", animated, options)]
+        steps["glb"] = lambda: [write_figure(inputs.out_dir / "motion.glb", animated)]
     steps = {name: write for name, write in steps.items() if name in options.formats}
     steps["metrics"] = lambda: [_write_metrics(inputs, motion, gap)]
     written: list[Path] = []

@@ -19,6 +19,9 @@ logger = logging.getLogger(__name__)
 _METRES_BELOW = 10.0
 """A body's zero pose spans 100-200 cm or 1-2 m: a file below this many units is in metres."""
 
+_MOVES = 1e-3
+"""Joint translation, in file units, below which a joint holds still."""
+
 _STRETCH_WARNING = 1.0
 """Joint translation, in file units, that is worth a warning."""
 
@@ -27,8 +30,8 @@ def read_bvh(path: Path | str, *, units: str = "auto") -> tuple[SkeletonModel, M
     """Read a BVH file into world axes and metres.
 
     Position channels are absolute, as Blender and MotionBuilder take them (they replace the OFFSET).
-    Only the root travels: where other joints have position channels that hold still, they are the bone;
-    where they change, the OFFSET is kept.
+    Only the root travels, and hips that are its first child: where other joints have position channels that
+    hold still, they are the bone; where they change, the OFFSET is kept.
 
     Args:
         path: The file.
@@ -51,7 +54,11 @@ def read_bvh(path: Path | str, *, units: str = "auto") -> tuple[SkeletonModel, M
     skeleton = _skeleton(path.stem, joints, offsets, units)
     if values is None:
         return skeleton, None
-    root = world_from_file_points(_positions(joints[0], values, offsets[0]), units)
+    columns = _columns(joints)
+    root = world_from_file_points(_positions(joints[0], values[:, columns[0]], offsets[0]), units)
+    hips = None
+    if _hips_travel(joints, values):
+        hips = world_from_file_points(_positions(joints[1], values[:, columns[1]], offsets[1]), units)
     return skeleton, Motion(
         skeleton=skeleton,
         fps=rate_from_frame_time(text.frame_time),
@@ -59,6 +66,7 @@ def read_bvh(path: Path | str, *, units: str = "auto") -> tuple[SkeletonModel, M
         root_in_world_m=root,
         local_rotation=world_from_file_rotations(_rotations(joints, values)),
         observed=np.ones((len(values), len(joints)), dtype=bool),
+        hips_in_root_m=hips,
     )
 
 
@@ -87,17 +95,28 @@ def _columns(joints: list[FileJoint]) -> list[slice]:
     return [slice(end - len(joint.channels), end) for end, joint in zip(ends, joints, strict=True)]
 
 
+def _hips_travel(joints: list[FileJoint], values: FloatArray) -> bool:
+    """True where the root carries hips with a moving position of their own."""
+    parents = [joint.parent for joint in joints]
+    if len(joints) < 2 or assign_roles([joint.name for joint in joints], parents)[:2] != ("", "Hips"):
+        return False
+    moving = [name.endswith("position") for name in joints[1].channels]
+    return any(moving) and bool(np.ptp(values[:, _columns(joints)[1]][:, moving], axis=0).max() > _MOVES)
+
+
 def _held_offsets(path: Path, joints: list[FileJoint], offsets: FloatArray, values: FloatArray) -> FloatArray:
     """Bones (J,3), taken from position channels that hold one value other than zero."""
     out = offsets.copy()
     for index, (joint, columns) in enumerate(zip(joints, _columns(joints), strict=True)):
         if index == 0 or not any(name.endswith("position") for name in joint.channels):
             continue
+        if index == 1 and _hips_travel(joints, values):
+            continue
         positions = _positions(joint, values[:, columns], offsets[index])
         spread = float(np.ptp(positions, axis=0).max())
         if spread > _STRETCH_WARNING:
             logger.warning("%s: joint %s stretches by %.3g; its OFFSET is kept", path, joint.name, spread)
-        if spread < 1e-3 and positions.any() and not np.allclose(positions[0], offsets[index], atol=1e-3):
+        if spread < _MOVES and positions.any() and not np.allclose(positions[0], offsets[index], atol=1e-3):
             out[index] = positions[0]
     return out
 

@@ -32,13 +32,13 @@ def write_bvh(path: Path | str, motion: Motion, *, units: str = "cm", euler_orde
         StoreError: The file cannot be written.
     """
     skeleton = motion.skeleton
-    channels = _all_channels(skeleton, euler_order)
+    channels = _all_channels(skeleton, euler_order, 1 if motion.hips_in_root_m is None else 2)
     order = _depth_first(skeleton)
     values = _values(motion, channels, order, units)
     row = " ".join(["%.6f" if units == "cm" else "%.8f"] * values.shape[1]) + "\n"
     with replacing(Path(path)) as temporary, open(temporary, "w", encoding="utf-8", newline="\n") as handle:
         handle.write("HIERARCHY\n")
-        handle.writelines(_hierarchy(skeleton, channels, order, units))
+        handle.writelines(_hierarchy(motion, channels, order, units))
         handle.write(f"MOTION\nFrames: {len(values)}\nFrame Time: {1.0 / motion.fps:.10f}\n")
         handle.writelines(row % tuple(frame) for frame in values)
 
@@ -55,8 +55,8 @@ def _depth_first(skeleton: SkeletonModel) -> list[int]:
     return order
 
 
-def _all_channels(skeleton: SkeletonModel, euler_order: str) -> list[tuple[str, ...]]:
-    """Channel names of each joint."""
+def _all_channels(skeleton: SkeletonModel, euler_order: str, travelling: int) -> list[tuple[str, ...]]:
+    """Channel names of each joint; the first `travelling` joints have a position."""
     out = []
     for index, given in enumerate(skeleton.bvh_channels):
         names = given or tuple(f"{axis}rotation" for axis in euler_order)
@@ -66,7 +66,7 @@ def _all_channels(skeleton: SkeletonModel, euler_order: str) -> list[tuple[str, 
             unique = tuple(dict.fromkeys(rotations))
             rotations = unique + tuple(f"{axis}rotation" for axis in "ZXY" if f"{axis}rotation" not in unique)
             names = positions + rotations
-        if index == 0 and len(positions) != 3:
+        if index < travelling and len(positions) != 3:
             names = _POSITIONS + rotations
         out.append(names)
     return out
@@ -76,27 +76,26 @@ def _values(motion: Motion, channels: list[tuple[str, ...]], order: list[int], u
     """Frames (T, channels) in file axes and units, degrees."""
     orders = tuple("".join(name[0] for name in names if name.endswith("rotation")) for names in channels)
     angles = np.rad2deg(continuous_angles(orders, file_from_world_rotations(motion.local_rotation)))
-    root = file_from_world_points(motion.root_in_world_m, units)
-    bones = file_from_world_points(motion.skeleton.offsets_m, units)
+    position = file_from_world_points(motion.local_position_m(), units)
     columns = []
     for joint in order:
         for name in channels[joint]:
             if name.endswith("rotation"):
                 columns.append(angles[:, joint, orders[joint].index(name[0])])
             else:
-                axis = "XYZ".index(name[0])
-                columns.append(root[:, axis] if joint == 0 else np.full(len(root), bones[joint, axis]))
+                columns.append(position[:, joint, "XYZ".index(name[0])])
     return np.stack(columns, axis=1) + 0.0
 
 
-def _hierarchy(
-    skeleton: SkeletonModel, channels: list[tuple[str, ...]], order: list[int], units: str
-) -> list[str]:
+def _hierarchy(motion: Motion, channels: list[tuple[str, ...]], order: list[int], units: str) -> list[str]:
     """The text of the HIERARCHY block."""
+    skeleton = motion.skeleton
     offsets = file_from_world_points(skeleton.offsets_m, units)
     ends = file_from_world_points(np.nan_to_num(skeleton.end_offsets_m), units)
     if not any(skeleton.bvh_channels):
         offsets[0] = 0.0  # readers disagree whether the root's channels add to its OFFSET
+    if motion.hips_in_root_m is not None:
+        offsets[1] = 0.0
     has_child = set(skeleton.parents.tolist())
     lines: list[str] = []
     open_joints: list[int] = []

@@ -1,0 +1,105 @@
+"""Joint names and spine counts of other rigs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from importlib import resources
+from typing import Any
+
+import numpy as np
+import yaml
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.geometry import quat_xyzw_from_rotation, so3_exp
+from bodycap_batch.skeleton import Motion, SkeletonModel
+from bodycap_batch.skeleton_presets import split_side
+
+
+@cache
+def naming(preset: str) -> dict[str, Any]:
+    """The entry of a preset in ``names.yaml``."""
+    text = resources.files("bodycap_batch.presets").joinpath("names.yaml").read_text(encoding="utf-8")
+    return dict(yaml.safe_load(text)[preset])
+
+
+def rename(motion: Motion, preset: str) -> Motion:
+    """Give joints a preset's names, spine and neck its number of joints.
+
+    Joints that are added lie on the bone they divide and turn about it only, each by an equal share of the
+    twist of the joint above: so no other joint moves or turns in the world.
+    """
+    chosen = naming(preset)
+    prefix, spine, neck = chosen.get("prefix", ""), chosen["spine"], chosen["neck"]
+    titles = {"Spine": spine[0], "Spine1": spine[-1], "Neck": neck[0]}
+    skeleton = motion.skeleton
+    joints = tuple(
+        prefix + (titles.get(role) or _title(role, chosen) if role else name)
+        for name, role in zip(skeleton.joints, skeleton.roles, strict=True)
+    )
+    motion = replace(motion, skeleton=replace(skeleton, joints=joints))
+    motion = _divide(motion, "Spine", "Spine1", [prefix + name for name in spine[1:-1]])
+    return _divide(motion, "Neck", "Head", [prefix + name for name in neck[1:]])
+
+
+def _title(role: str, chosen: dict[str, Any]) -> str:
+    """A role's name in the preset."""
+    side, part = split_side(role)
+    name = chosen.get("names", {}).get(part, part)
+    return f"{name}{chosen['sides'][side]}" if side and "sides" in chosen else f"{side}{name}"
+
+
+def _divide(motion: Motion, lower: str, upper: str, names: list[str]) -> Motion:
+    """Put joints of these names between two joints that follow each other."""
+    skeleton = motion.skeleton
+    start, end = skeleton.index_of_role(lower), skeleton.index_of_role(upper)
+    if not names or start is None or end is None or skeleton.parents[end] != start:
+        return motion
+    parts = len(names) + 1
+    bone = skeleton.offsets_m[end]
+    share = so3_exp(_twist_rad(motion.local_rotation[:, end], bone)[:, None] / parts * _unit(bone))
+    back = np.linalg.matrix_power(np.swapaxes(share, -1, -2), parts - 1)
+    local = motion.local_rotation.copy()
+    local[:, end] = back @ local[:, end]
+    added = np.repeat(share[:, None], len(names), axis=1)
+    observed = np.repeat(motion.observed[:, end, None], len(names), axis=1)
+    return replace(
+        motion,
+        skeleton=_divided(skeleton, end, names),
+        local_rotation=np.concatenate([local[:, :end], added, local[:, end:]], axis=1),
+        observed=np.concatenate([motion.observed[:, :end], observed, motion.observed[:, end:]], axis=1),
+    )
+
+
+def _divided(skeleton: SkeletonModel, end: int, names: list[str]) -> SkeletonModel:
+    """The zero pose with joints of these names before the joint `end`, evenly along its bone."""
+    count = len(names)
+    moved = np.where(skeleton.parents >= end, skeleton.parents + count, skeleton.parents)
+    chain = [int(skeleton.parents[end]), *range(end, end + count)]
+    moved[end] = chain[-1]
+    parents = np.concatenate([moved[:end], chain[:-1], moved[end:]])
+    bones = np.array(skeleton.offsets_m)
+    bones[end] /= count + 1
+    tpose = skeleton.tpose_rotation
+    return SkeletonModel(
+        name=skeleton.name,
+        joints=(*skeleton.joints[:end], *names, *skeleton.joints[end:]),
+        parents=parents,
+        offsets_m=np.insert(bones, [end] * count, bones[end], axis=0),
+        end_offsets_m=np.insert(skeleton.end_offsets_m, [end] * count, np.nan, axis=0),
+        roles=(*skeleton.roles[:end], *("",) * count, *skeleton.roles[end:]),
+        bvh_channels=(*skeleton.bvh_channels[:end], *((),) * count, *skeleton.bvh_channels[end:]),
+        tpose_rotation=None if tpose is None else np.insert(tpose, [end] * count, np.eye(3), axis=0),
+    )
+
+
+def _twist_rad(rotation: FloatArray, axis: FloatArray) -> FloatArray:
+    """Angle (T,) of the turn about an axis that comes last in each rotation (T,3,3); continuous."""
+    quat = quat_xyzw_from_rotation(rotation)
+    half = np.arctan2(quat[:, :3] @ _unit(axis), quat[:, 3])
+    return np.asarray(np.unwrap(2.0 * half))
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    """The direction; zero for a bone without length."""
+    return np.asarray(vector / (np.linalg.norm(vector) or 1.0))
