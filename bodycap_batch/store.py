@@ -8,6 +8,7 @@ and a process may be killed at any moment.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import json
@@ -15,7 +16,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -145,8 +146,23 @@ class Store:
             shutil.rmtree(folder, ignore_errors=True)
             os.close(lock)
 
-    def commit(self, draft: Draft, key: ArtefactKey, made: Mapping[str, Any]) -> Artefact:
+    def commit(
+        self,
+        draft: Draft,
+        key: ArtefactKey,
+        made: Mapping[str, Any],
+        *,
+        before: Callable[[], None] = lambda: None,
+        replace: bool = False,
+    ) -> Artefact:
         """Make a draft's files the artefact of `key`, or return the one somebody else committed first.
+
+        Args:
+            draft: Its files are synced to the disk.
+            key: What they were made from.
+            made: How they were made.
+            before: Called when nothing but the last, atomic step is left; may raise to prevent it.
+            replace: The draft takes the place of an artefact that is there already.
 
         Raises:
             StoreError: The disk is full or fails.
@@ -163,6 +179,10 @@ class Store:
             manifest = {"seal": json_digest(body), **body}
             write_atomically(draft.files / MANIFEST, json.dumps(manifest, indent=1).encode())
             _sync_folders(draft.files)
+            before()
+            if replace:
+                with contextlib.suppress(FileNotFoundError):
+                    os.replace(self._path(key), draft.work.with_name("replaced"))
             return self._move_in(draft.files, key)
 
     def sweep(self) -> int:
@@ -189,7 +209,7 @@ class Store:
             except OSError as error:
                 if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                     raise
-            _sync_folder(path.parent)
+            sync_folder(path.parent)
             if (artefact := self.find(key)) is not None:
                 return artefact
             if not files.is_dir():
@@ -269,10 +289,11 @@ def _sync_files(folder: Path) -> dict[str, str]:
 
 def _sync_folders(folder: Path) -> None:
     for path in (*(path for path in folder.rglob("*") if path.is_dir()), folder):
-        _sync_folder(path)
+        sync_folder(path)
 
 
-def _sync_folder(path: Path) -> None:
+def sync_folder(path: Path) -> None:
+    """Make sure that the names in a folder survive a power cut."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -47,12 +47,13 @@ MAY_IMPORT: dict[str, set[str]] = {
     "identity": set(),
     "presets": set(),
     "store": KEEPING,
+    "references": KEEPING | {"store"},
     "tasks": MATERIAL | STAGES | KEEPING | {"store"},
     "runner": KEEPING | {"context", "store", "tasks"},
     "cluster": KEEPING | {"context", "store", "runner"},
-    "pipeline": MATERIAL | STAGES | KEEPING | {"store", "tasks", "runner"},
+    "pipeline": MATERIAL | STAGES | KEEPING | {"store", "references", "tasks", "runner"},
     "watch": MATERIAL | KEEPING | {"store", "runner", "cluster", "pipeline"},
-    "cli": MATERIAL | STAGES | KEEPING | {"store", "runner", "cluster", "pipeline", "watch"},
+    "cli": MATERIAL | STAGES | KEEPING | {"store", "references", "runner", "cluster", "pipeline", "watch"},
 }
 # Libraries that only these rooms may import.
 LIBRARY_ROOMS = {

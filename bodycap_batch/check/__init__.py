@@ -2,5 +2,6 @@
 
 from bodycap_batch.check.preflight import check_job, check_path, require_ready
 from bodycap_batch.check.report import CameraFinding, CheckReport
+from bodycap_batch.check.room import require_room
 
-__all__ = ["CameraFinding", "CheckReport", "check_job", "check_path", "require_ready"]
+__all__ = ["CameraFinding", "CheckReport", "check_job", "check_path", "require_ready", "require_room"]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import shutil
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +10,11 @@ import numpy as np
 from bodycap_batch.capture import CaptureCamera, open_camera
 from bodycap_batch.check.pictures import look_at_frames
 from bodycap_batch.check.report import CameraFinding, CheckReport
+from bodycap_batch.check.room import require_room
 from bodycap_batch.check.settings import setting_notes
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, Job
-from bodycap_batch.errors import BodycapError, CaptureError, JobError, StoreError
+from bodycap_batch.errors import BodycapError, CaptureError, JobError
 from bodycap_batch.formats.bvh import read_bvh
 
 # Frames whose distance differs by more than this share from the usual one make a variable rate.
@@ -37,8 +37,11 @@ def check_path(path: Path, overrides: Overrides | None = None) -> CheckReport:
 
 
 def require_ready(job: Job) -> CheckReport:
-    """Check a resolved job and raise its first error, if any (before hours of work)."""
-    report = check_job(job)
+    """Check a resolved job and raise its first error, if any (before hours of work).
+
+    The room on the disk is left out: it is another one at any moment.
+    """
+    report = _checked(job, (_check_clocks, _check_skeleton))
     if report.errors:
         raise report.errors[0]
     return report
@@ -46,6 +49,10 @@ def require_ready(job: Job) -> CheckReport:
 
 def check_job(job: Job) -> CheckReport:
     """Check a resolved job: every video opened and looked at, calibration, clocks, skeleton, disk."""
+    return _checked(job, (_check_clocks, _check_skeleton, _check_disk))
+
+
+def _checked(job: Job, checks: Iterable[Callable[[Job, list[CameraFinding]], list[str]]]) -> CheckReport:
     errors: list[BodycapError] = []
     findings: list[CameraFinding] = []
     for config in job.capture.cameras:
@@ -55,7 +62,7 @@ def check_job(job: Job) -> CheckReport:
         except CaptureError as error:
             errors.append(error)
     notes = _body_notes(job)
-    for check in (_check_clocks, _check_skeleton, _check_disk):
+    for check in checks:
         try:
             notes += check(job, findings)
         except BodycapError as error:
@@ -199,30 +206,6 @@ def _check_skeleton(job: Job, _findings: list[CameraFinding]) -> list[str]:
     return [f"skeleton {path.name}: {len(skeleton.joints)} joints"]
 
 
-# A job of 354 frames kept 17 MB of intermediate files and results: 48 kB a frame. Hard captures
-# have four times the keyframes.
-_BYTES_PER_FRAME = 50_000
-_HARD_TIMES = 4
-_BYTES_AT_LEAST = 50_000_000
-
-
 def _check_disk(job: Job, findings: list[CameraFinding]) -> list[str]:
     """Room for the job's results and intermediate files, and the right to write them."""
-    folder = job.out or Path("out").resolve()
-    while not folder.exists():
-        folder = folder.parent
-    if not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise StoreError(
-            "results cannot be written here", path=folder, hint="choose another folder with --out"
-        )
-    need = _BYTES_AT_LEAST + _BYTES_PER_FRAME * sum(camera.used_frames for camera in findings)
-    free = shutil.disk_usage(folder).free
-    if free < need:
-        raise StoreError(
-            f"{free / 1e6:.0f} MB free, the job needs about {need / 1e6:.0f} MB",
-            path=folder,
-            hint="make room, or choose another disk with --out",
-        )
-    if free < _HARD_TIMES * need:
-        return [f"{free / 1e6:.0f} MB free on the disk of {folder}: enough for an easy capture only"]
-    return []
+    return require_room(job.out or Path("out").resolve(), sum(camera.used_frames for camera in findings))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from bodycap_batch.check import require_room
 from bodycap_batch.config.models import CameraConfig, Job
 from bodycap_batch.errors import Cancelled, EstimationError
 from bodycap_batch.pipeline.inputs import (
@@ -20,54 +22,14 @@ from bodycap_batch.pipeline.inputs import (
     key_of,
     one_camera,
 )
-from bodycap_batch.progress import Event, Listener
-from bodycap_batch.runner import Runner, Task
-from bodycap_batch.runner.parent import CHILD
-from bodycap_batch.store import Artefact, Store
+from bodycap_batch.pipeline.settings import Settings, StageRecord
+from bodycap_batch.progress import Event
+from bodycap_batch.references import References, in_use
+from bodycap_batch.runner import NotStored, Task
+from bodycap_batch.store import Artefact
 from bodycap_batch.tasks import STAGES, reach_rows, read_summary
 
 ByCamera = Mapping[str, Artefact]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """How a job is run; nothing here changes a result.
-
-    Attributes:
-        store: Where artefacts are kept.
-        threads: Cores the job may keep busy.
-        listener: Told what happens.
-        cancelled: Asked several times a second whether to stop.
-        command: The children's command line.
-    """
-
-    store: Store
-    threads: int
-    listener: Listener
-    cancelled: Callable[[], bool]
-    command: Sequence[str] = CHILD
-
-    def runner(self, logs: Path, also: Callable[[], bool] = lambda: False) -> Runner:
-        """A runner that stops when the user asks for it, or when `also` says so."""
-        return Runner(
-            self.store,
-            logs=logs,
-            listener=self.listener,
-            cancelled=lambda: self.cancelled() or also(),
-            command=self.command,
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StageRecord:
-    """One stage of a run: what it cost when it was computed, and whether that was now."""
-
-    stage: str
-    camera: str
-    round: int
-    reused: bool
-    seconds: float
-    peak_memory_mb: float
 
 
 class Flow:
@@ -85,18 +47,27 @@ class Flow:
         self._job = job
         self._settings = settings
         self._abort = threading.Event()
-        self._runner = settings.runner(logs, self._abort.is_set)
-        self._pool = ThreadPoolExecutor(max_workers=max(1, settings.threads))
+        self._folders = (settings.store.root, logs.parent)
+        self._runner = settings.runner(logs, self._abort.is_set, self._require_room)
+        self._pool = ThreadPoolExecutor(max_workers=self._side_by_side)
         self._digests: dict[str, str] = {}
+        self._open = ExitStack()
+        self._references = References(settings.store, logs.parent)
+        self._frames = 0
+        self._told: set[str] = set()
 
     def __enter__(self) -> Flow:
-        self._digests = self._camera_digests()
+        with ExitStack() as opened:
+            opened.enter_context(in_use(self._settings.store))
+            opened.callback(self._runner.close)
+            self._digests = self._camera_digests()
+            opened.callback(self._pool.shutdown, wait=True, cancel_futures=True)
+            opened.callback(self._abort.set)
+            self._open = opened.pop_all()
         return self
 
     def __exit__(self, failed: object, *_: object) -> None:
-        self._abort.set()
-        self._pool.shutdown(wait=True, cancel_futures=True)
-        self._runner.close()
+        self._open.close()
 
     def check(self) -> None:
         """Refuse what cannot work before hours are spent on it; tell what is worth knowing.
@@ -107,10 +78,10 @@ class Flow:
         body = body_digest(self._job, self._settings.store.digests) if has_body(self._job) else None
         key = key_of("check", {}, {"cameras": self._digests, "body": body})
         task = Task(key=key, arguments={"job": self._job.model_dump(mode="json")})
-        side_by_side = min(self._settings.threads, len(self._job.capture.cameras))
-        artefact = self._one(task, [STAGES["keyframes"].modules] * (side_by_side - 1))
+        artefact = self._one(task, [STAGES["keyframes"].modules] * (self._side_by_side - 1))
+        self._frames = int(read_summary(artefact.path)["frames"])
         for note in read_summary(artefact.path)["notes"]:
-            self._settings.listener(Event(kind="note", stage="check", what=f"note: {note}"))
+            self._note(note, "check")
 
     def keyframes(self) -> ByCamera:
         """Keyframes of every camera."""
@@ -143,7 +114,7 @@ class Flow:
         task = Task(key=key, arguments=arguments, threads=self._settings.threads)
         artefact = self._one(task, meanwhile if self._settings.threads > 1 else [])
         for note in read_summary(artefact.path).get("notes", []):
-            self._settings.listener(Event(kind="note", stage="map", what=f"note: {note}"))
+            self._note(note, "map")
         return artefact
 
     def registrations(
@@ -240,10 +211,31 @@ class Flow:
         key = key_of("export", options, inputs)
         return self._one(Task(key=key, arguments=arguments, threads=self._settings.threads))
 
+    def keep_only_this(self) -> None:
+        """Let go of the artefacts that earlier runs with other options referred to."""
+        self._references.keep_only(record.artefact for record in self.records)
+
     @property
     def _share(self) -> int:
         """Threads for each of the tasks that run side by side, one per camera."""
+        if self._settings.executor is not None:
+            return self._settings.threads
         return max(1, self._settings.threads // len(self._job.capture.cameras))
+
+    @property
+    def _side_by_side(self) -> int:
+        """How many tasks of this job are asked for at once."""
+        cameras = len(self._job.capture.cameras)
+        return (
+            cameras if self._settings.executor is not None else max(1, min(self._settings.threads, cameras))
+        )
+
+    def _require_room(self, task: Task) -> None:
+        """Refuse to begin what will not fit on the disk; the space may have gone since the check was made."""
+        if task.key.stage != "check":
+            for folder in self._folders:
+                for note in require_room(folder, self._frames):
+                    self._note(note)
 
     def _map_options(self) -> dict[str, Any]:
         return self._job.map.model_dump(mode="json")
@@ -286,8 +278,11 @@ class Flow:
         return self._one(Task(key=key, arguments=arguments, round=map_round, threads=self._settings.threads))
 
     def _one(self, task: Task, meanwhile: Sequence[Sequence[str]] = ()) -> Artefact:
-        task = replace(task, modules=STAGES[task.key.stage].modules)
+        stage = STAGES[task.key.stage]
+        priority = self._settings.priority
+        task = replace(task, modules=stage.modules, memory_mb=stage.memory_mb, priority=priority)
         artefact, made = self._runner.run(task, meanwhile)
+        self._references.add(artefact.path)
         self.libraries.update(task.key.libraries)
         self.records.append(
             StageRecord(
@@ -297,16 +292,25 @@ class Flow:
                 reused=not made,
                 seconds=float(artefact.made["seconds"]),
                 peak_memory_mb=float(artefact.made["peak_memory_mb"]),
+                artefact=artefact.path.relative_to(self._settings.store.root).as_posix(),
             )
         )
         return artefact
+
+    def _note(self, text: str, stage: str = "") -> None:
+        """Tell something worth knowing, once."""
+        if text not in self._told:
+            self._told.add(text)
+            self._settings.listener(Event(kind="note", stage=stage, what=f"note: {text}"))
 
     def _all(self, tasks: Iterable[Task]) -> dict[str, Artefact]:
         """Run one task per camera side by side; the first failure stops the others."""
         ordered = list(tasks)
         futures = [self._pool.submit(self._one, task) for task in ordered]
-        wait(futures, return_when=FIRST_EXCEPTION)
+        wait(futures, return_when=FIRST_EXCEPTION if self._settings.compute else ALL_COMPLETED)
         failures = [error for future in futures if future.done() and (error := future.exception())]
+        if missing := [error for error in failures if isinstance(error, NotStored)]:
+            raise NotStored([task for error in missing for task in error.tasks], self._settings.store.root)
         if failures:
             self._abort.set()
             raise next((error for error in failures if not isinstance(error, Cancelled)), failures[0])

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.digests import write_atomically
-from bodycap_batch.store import disk_errors
+from bodycap_batch.store import disk_errors, sync_folder
 
 RUN_FILE = "run.json"
 PARTIAL = "partial"
@@ -26,12 +26,16 @@ def publish(files: Mapping[str, Path], folder: Path) -> None:
     Raises:
         StoreError: The folder cannot be written.
     """
+    placed = set[Path]()
     with disk_errors(folder):
         for name, source in files.items():
             target = folder / name
             target.parent.mkdir(parents=True, exist_ok=True)
             if not (target.exists() and target.samefile(source)):
                 _place(source, target)
+                placed.add(target.parent)
+        for changed in placed:
+            sync_folder(changed)
 
 
 def write_results_file(folder: Path, name: str, text: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -12,8 +12,8 @@ import yaml
 
 import bodycap_batch
 from bodycap_batch.config.models import Job
-from bodycap_batch.errors import BodycapError, EstimationError
-from bodycap_batch.pipeline.flow import Flow, Settings, StageRecord
+from bodycap_batch.errors import EstimationError
+from bodycap_batch.pipeline.flow import Flow
 from bodycap_batch.pipeline.inputs import has_body
 from bodycap_batch.pipeline.results import (
     PARTIAL,
@@ -23,6 +23,7 @@ from bodycap_batch.pipeline.results import (
     remove_outdated,
     write_results_file,
 )
+from bodycap_batch.pipeline.settings import Settings, StageRecord
 from bodycap_batch.store import Artefact
 from bodycap_batch.tasks import RESULTS
 
@@ -35,7 +36,7 @@ class RunSummary:
 
     Attributes:
         out_dir: Folder of the results.
-        files: Their names, relative to it.
+        files: Their names, relative to it; none where the run ended before.
         stages: Every stage that went into them, executed or reused.
         versions: Python, this program and the libraries that computed.
     """
@@ -64,24 +65,61 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
             and the frames are in ``<out_dir>/partial``.
     """
     settings.store.sweep()
+    settings.require_owner()
+    made = _Made()
     with Flow(job, settings, logs=out_dir / "logs") as flow:
-        flow.check()
-        keyframes = flow.keyframes()
-        scene = flow.map(keyframes)
-        registrations = flow.registrations(scene, keyframes)
-        scene, registrations = flow.grow(scene, registrations, keyframes)
-        scene, registrations = flow.refine(scene, registrations, keyframes)
-        merged, failure = _merge(job, flow, scene, registrations)
-        exported = flow.export(keyframes, scene, registrations, merged, failure)
-    summary = RunSummary(
-        out_dir=out_dir, files=_names(exported), stages=tuple(flow.records), versions=_versions(flow)
-    )
-    if failure is not None:
-        _finish(job, exported, replace(summary, out_dir=out_dir / PARTIAL), settings)
-        raise _with_partial_results(failure, out_dir / PARTIAL)
-    _finish(job, exported, summary, settings)
-    clear_partial(out_dir)
+        for stage in _stages(job, flow, made):
+            if stage == settings.until:
+                break
+        summary = RunSummary(out_dir=out_dir, files=(), stages=tuple(flow.records), versions=_versions(flow))
+        if made.exported is not None:
+            summary = replace(summary, files=_names(made.exported))
+            settings.require_owner()
+            _hand_over(job, made, summary, settings)
+            if made.failure is None:
+                flow.keep_only_this()
+    if made.failure is not None:
+        raise made.failure
     return summary
+
+
+@dataclass(slots=True)
+class _Made:
+    """What the stages gave: the results, and why there is no skeleton among them."""
+
+    exported: Artefact | None = None
+    failure: EstimationError | None = None
+
+
+def _stages(job: Job, flow: Flow, made: _Made) -> Iterator[str]:
+    """Run one stage after another; yields the name of each when it is done."""
+    flow.check()
+    yield "check"
+    keyframes = flow.keyframes()
+    yield "keyframes"
+    scene = flow.map(keyframes)
+    yield "map"
+    registrations = flow.registrations(scene, keyframes)
+    scene, registrations = flow.grow(scene, registrations, keyframes)
+    scene, registrations = flow.refine(scene, registrations, keyframes)
+    yield "registration"
+    merged, made.failure = _merge(job, flow, scene, registrations)
+    yield "merge"
+    made.exported = flow.export(keyframes, scene, registrations, merged, made.failure)
+    yield "export"
+
+
+def _hand_over(job: Job, made: _Made, summary: RunSummary, settings: Settings) -> None:
+    """Publish the results; those without a skeleton are set apart and called partial."""
+    assert made.exported is not None
+    if made.failure is None:
+        _finish(job, made.exported, summary, settings)
+        clear_partial(summary.out_dir)
+        return
+    partial = summary.out_dir / PARTIAL
+    _finish(job, made.exported, replace(summary, out_dir=partial), settings)
+    kept = f"the map, the cameras' paths and the frames are in {partial}"
+    made.failure.hint = f"{made.failure.hint}; {kept}" if made.failure.hint else kept
 
 
 def _merge(
@@ -119,12 +157,6 @@ def _finish(job: Job, exported: Artefact, summary: RunSummary, settings: Setting
 def _versions(flow: Flow) -> dict[str, str]:
     own = {"bodycap_batch": bodycap_batch.__version__, "python": platform.python_version()}
     return {**own, **dict(sorted(flow.libraries.items()))}
-
-
-def _with_partial_results(error: EstimationError, folder: Path) -> BodycapError:
-    kept = f"the map, the cameras' paths and the frames are in {folder}"
-    error.hint = f"{error.hint}; {kept}" if error.hint else kept
-    return error
 
 
 def _exported(artefact: Artefact) -> list[tuple[str, Path]]:

@@ -13,9 +13,10 @@ from pydantic import ValidationError
 from bodycap_batch.config.explain import job_error, problems_of
 from bodycap_batch.digests import FileDigests
 from bodycap_batch.errors import JobError
-from bodycap_batch.pipeline.flow import Settings
 from bodycap_batch.pipeline.inputs import key_of
 from bodycap_batch.pipeline.results import publish, write_results_file
+from bodycap_batch.pipeline.settings import Settings
+from bodycap_batch.references import References, in_use
 from bodycap_batch.runner import Task
 from bodycap_batch.store import ArtefactKey
 from bodycap_batch.synthetic.options import SynthOptions
@@ -39,8 +40,9 @@ def prepare_capture(options: Mapping[str, Any], folder: Path, settings: Settings
     if _is_complete(folder, key):
         return
     logs = folder / "logs"
-    with settings.runner(logs) as runner:
+    with in_use(settings.store), settings.runner(logs) as runner:
         artefact, _ = runner.run(Task(key=key, threads=settings.threads))
+        References(settings.store, folder).add(artefact.path)
     files = {
         Path(name).relative_to(CAPTURE).as_posix(): artefact.path / name
         for name in artefact.files

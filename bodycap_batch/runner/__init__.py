@@ -1,6 +1,8 @@
 """One task, one child process: ``python -m bodycap_batch.runner task.json``."""
 
-from bodycap_batch.runner.parent import Runner
+from bodycap_batch.runner.children import Children, Executor, Making
+from bodycap_batch.runner.parent import NotStored, Rules, Runner
+from bodycap_batch.runner.process import CHILD
 from bodycap_batch.runner.task import Task
 
-__all__ = ["Runner", "Task"]
+__all__ = ["CHILD", "Children", "Executor", "Making", "NotStored", "Rules", "Runner", "Task"]

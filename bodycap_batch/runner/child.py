@@ -13,12 +13,13 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
 from bodycap_batch.context import StageContext
-from bodycap_batch.errors import EXIT_BUG, BodycapError, StoreError
+from bodycap_batch.errors import EXIT_BUG, BodycapError, Cancelled, StoreError
 from bodycap_batch.runner.task import Task, TaskFunction, task_from_json
 from bodycap_batch.store import DISK_ERRORS, Store, store_error
 
@@ -45,29 +46,45 @@ def main(arguments: Sequence[str], table: Mapping[str, TaskFunction] | None = No
     speak = _Speaker()
     orders = _Orders()
     if arguments:
-        return _perform(Path(arguments[0]), table, speak, orders.closed)
-    for order in orders:
+        return _perform(Path(arguments[0]), table, _Link(speak, orders, asks=False))
+    for order in iter(orders.next, None):
         if "import" in order:
             _import(order["import"])
             continue
         _send_prints_to(Path(order["log"]))
-        if _perform(Path(order["task"]), table, speak, orders.closed) == EXIT_BUG:
+        if _perform(Path(order["task"]), table, _Link(speak, orders, asks=True)) == EXIT_BUG:
             return EXIT_BUG
     return 0
 
 
-def _perform(
-    order: Path, table: Mapping[str, TaskFunction] | None, speak: _Speaker, stopped: threading.Event
-) -> int:
+@dataclass(frozen=True, slots=True)
+class _Link:
+    """The parent, as one task talks to it; `asks`: whether it wants to be asked before a commit."""
+
+    speak: _Speaker
+    orders: _Orders
+    asks: bool
+
+    def before_commit(self) -> None:
+        """Wait until the parent lets the artefact be committed; raise `Cancelled` if it does not."""
+        if not self.asks:
+            return
+        self.speak.say("ready")
+        answer = self.orders.next()
+        if answer is None or not answer["commit"]:
+            raise Cancelled("not committed: the job was stopped or taken over", hint="run it again to go on")
+
+
+def _perform(order: Path, table: Mapping[str, TaskFunction] | None, link: _Link) -> int:
     task, root = task_from_json(json.loads(order.read_text(encoding="utf-8")))
     try:
         store = Store(root)
-        _run(task, store, _function(task.key.stage, table), (speak, stopped))
+        _run(task, store, _function(task.key.stage, table), link)
     except BodycapError as error:
-        speak.say("error", error=error.to_dict())
+        link.speak.say("error", error=error.to_dict())
         return error.exit_code
     except Exception as error:  # noqa: BLE001 - the one place where a task's bugs are caught
-        return _report_unexpected(error, root, speak)
+        return _report_unexpected(error, root, link.speak)
     return 0
 
 
@@ -87,14 +104,16 @@ def _send_prints_to(log: Path) -> None:
             os.dup2(stream.fileno(), number)
 
 
-def _run(task: Task, store: Store, function: TaskFunction, link: tuple[_Speaker, threading.Event]) -> None:
-    speak, stopped = link
+def _run(task: Task, store: Store, function: TaskFunction, link: _Link) -> None:
     started = time.monotonic()
     _pin_opencv(task.threads)
     _forget_peak_memory()
     with store.draft(task.key) as draft, _DiskWatch(store):
         context = StageContext(
-            work_dir=draft.work, threads=task.threads, progress=speak.progress, cancelled=stopped.is_set
+            work_dir=draft.work,
+            threads=task.threads,
+            progress=link.speak.progress,
+            cancelled=link.orders.closed.is_set,
         )
         function(task.key.options, task.arguments, context, draft.files)
         made = {
@@ -102,8 +121,8 @@ def _run(task: Task, store: Store, function: TaskFunction, link: tuple[_Speaker,
             "peak_memory_mb": round(peak_memory_mb(), 1),
             "threads": task.threads,
         }
-        store.commit(draft, task.key, made)
-    speak.say("done", **made)
+        store.commit(draft, task.key, made, before=link.before_commit, replace=task.again)
+    link.speak.say("done", **made)
 
 
 def _function(stage: str, table: Mapping[str, TaskFunction] | None) -> TaskFunction:
@@ -205,10 +224,9 @@ class _Orders:
         self._queue: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         threading.Thread(target=self._read, daemon=True).start()
 
-    def __iter__(self) -> Iterator[dict[str, Any]]:
-        """Yield orders until there are no more."""
-        while (order := self._queue.get()) is not None:
-            yield order
+    def next(self) -> dict[str, Any] | None:
+        """Wait for the next order; None when there are no more."""
+        return self._queue.get()
 
     def _read(self) -> None:
         rest = b""

@@ -26,6 +26,9 @@ class Task:
         round: Which round of growing the map, from 0.
         threads: Threads it may keep busy; no part of the key.
         modules: What its child loads for it, to choose a child that has; no part of the key.
+        memory_mb: Memory it may need; no part of the key.
+        priority: Higher goes first where tasks wait; no part of the key.
+        again: Replaces an artefact that is stored already; no part of the key.
     """
 
     key: ArtefactKey
@@ -34,6 +37,9 @@ class Task:
     round: int = 0
     threads: int = 1
     modules: tuple[str, ...] = ()
+    memory_mb: int = 0
+    priority: int = 0
+    again: bool = False
 
     @property
     def label(self) -> str:
@@ -53,5 +59,5 @@ class Task:
 
 def task_from_json(data: Mapping[str, Any]) -> tuple[Task, Path]:
     """Rebuild a task and the store's folder from `Task.to_json`."""
-    fields = {name: data[name] for name in ("arguments", "camera", "round", "threads")}
+    fields = {name: data[name] for name in ("arguments", "camera", "round", "threads", "again")}
     return Task(key=ArtefactKey(**data["key"]), **fields), Path(data["store"])

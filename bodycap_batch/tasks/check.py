@@ -15,7 +15,8 @@ def _check(_: Json, arguments: Json, context: StageContext, files: Path) -> None
     context.check_cancelled()
     report = require_ready(Job.model_validate(arguments["job"]))
     notes = [f"{camera.name}: {note}" for camera in report.cameras for note in camera.notes]
-    write_summary(files, notes=[*notes, *report.notes])
+    frames = sum(camera.used_frames for camera in report.cameras)
+    write_summary(files, notes=[*notes, *report.notes], frames=frames)
 
 
 CHECK = Stage(function=_check, libraries=VISION, modules=SEEING)

@@ -69,6 +69,8 @@ def _save_map(result: MapResult, files: Path) -> None:
 
 _LIBRARIES = (*VISION, "pycolmap")
 _MODULES = (*SEEING, "pycolmap")
-MAP = Stage(function=_map, libraries=_LIBRARIES, modules=_MODULES)
-EXTEND = Stage(function=_extend, libraries=_LIBRARIES, modules=_MODULES)
-REFINE = Stage(function=_refine, libraries=_LIBRARIES, modules=_MODULES)
+# 1,080 frames of an easy walk took 341 MB, a violent one has four times the keyframes.
+_MEMORY_MB = 1500
+MAP = Stage(function=_map, libraries=_LIBRARIES, modules=_MODULES, memory_mb=_MEMORY_MB)
+EXTEND = Stage(function=_extend, libraries=_LIBRARIES, modules=_MODULES, memory_mb=_MEMORY_MB)
+REFINE = Stage(function=_refine, libraries=_LIBRARIES, modules=_MODULES, memory_mb=_MEMORY_MB)

@@ -32,11 +32,13 @@ class Stage:
             the store's keys.
         libraries: Distributions the result depends on (``a|b``: either).
         modules: What takes long to load; a child may load it ahead.
+        memory_mb: Memory to keep free for one task, so that two large ones don't meet on a small machine.
     """
 
     function: Callable[[Json, Json, StageContext, Path], None]
     libraries: tuple[str, ...]
     modules: tuple[str, ...] = ()
+    memory_mb: int = 500
 
     @property
     def code(self) -> str:

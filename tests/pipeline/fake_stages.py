@@ -62,7 +62,7 @@ def videos(arguments: Json) -> list[str]:
 
 
 def summary(options: Json, arguments: Json, files: Path) -> None:
-    (files / "summary.json").write_text(json.dumps({"notes": ["a note"]}))
+    (files / "summary.json").write_text(json.dumps({"notes": ["a note"], "frames": 20}))
 
 
 def registered(options: Json, arguments: Json, files: Path) -> None:

@@ -18,7 +18,7 @@ import pytest
 
 from bodycap_batch.errors import BodycapError, Cancelled, EstimationError, StoreError
 from bodycap_batch.progress import Event
-from bodycap_batch.runner import Runner, Task
+from bodycap_batch.runner import Children, NotStored, Rules, Runner, Task
 from bodycap_batch.store import ArtefactKey, Store
 
 ROOT = Path(__file__).parents[2]
@@ -38,12 +38,17 @@ class Bench:
         self.logs = folder / "logs"
         self.events: list[Event] = []
         self.stop = threading.Event()
-        self.runner = Runner(
+        self.children = Children(FAKE)
+        self.owner = True
+        self.runner = self.with_rules()
+
+    def with_rules(self, **rules: Any) -> Runner:
+        return Runner(
             self.store,
+            self.children,
             logs=self.logs,
             listener=self.events.append,
-            cancelled=self.stop.is_set,
-            command=FAKE,
+            rules=Rules(cancelled=self.stop.is_set, may_commit=lambda: self.owner, **rules),
         )
 
     def kinds(self) -> list[str]:
@@ -123,14 +128,14 @@ def test_each_task_has_a_log_of_its_own_though_they_share_a_child(bench: Bench) 
 
 
 def test_libraries_load_ahead_in_the_child_that_will_need_them(bench: Bench) -> None:
-    bench.runner.prepare(["wave"], ["colorsys"])
+    bench.children.prepare(bench.logs, [["wave"], ["colorsys"]])
     made, _ = bench.runner.run(replace(a_task("work"), modules=("colorsys",)))
     loaded = (made.path / "process.txt").read_text().split()[3:]
     assert loaded == ["colorsys"]
 
 
 def test_what_cannot_be_loaded_ahead_is_left_to_the_stage(bench: Bench) -> None:
-    bench.runner.prepare(["no_such_module_anywhere"])
+    bench.children.prepare(bench.logs, [["no_such_module_anywhere"]])
     assert bench.runner.run(a_task("work"))[1]
     assert "no_such_module_anywhere" in (bench.logs / "children.log").read_text()
 
@@ -243,6 +248,44 @@ def test_children_do_not_outlive_a_killed_parent(tmp_path: Path) -> None:
     parent.kill()
     parent.wait()
     wait_for(lambda: not alive(child))
+
+
+def test_nothing_is_committed_for_a_job_that_belongs_to_another(bench: Bench) -> None:
+    bench.owner = False
+    with pytest.raises(Cancelled, match="taken over"):
+        bench.runner.run(a_task("work"))
+    assert bench.store.find(a_task("work").key) is None
+    assert bench.kinds()[-1] == "stopped"
+    bench.owner = True
+    assert bench.runner.run(a_task("work"))[1]
+
+
+def test_what_is_not_stored_is_not_computed_when_nothing_may_be(bench: Bench) -> None:
+    bench.runner.run(a_task("work", 1))
+    looking = bench.with_rules(compute=False)
+    assert not looking.run(a_task("work", 1))[1]
+    with pytest.raises(NotStored, match="work torso: not computed yet") as caught:
+        looking.run(a_task("work", 2))
+    assert caught.value.tasks == (a_task("work", 2),)
+
+
+def test_a_stage_to_be_done_again_replaces_what_is_stored(bench: Bench) -> None:
+    before, _ = bench.runner.run(a_task("work", say="first"))
+    again = bench.with_rules(redo=frozenset({"work"}))
+    after, executed = again.run(a_task("work", say="second"))
+    assert executed
+    assert after.path == before.path
+    assert (after.path / "result.txt").read_text() == "1 second"
+    assert list((bench.store.root / "tmp").iterdir()) == []
+
+
+def test_a_task_may_be_forbidden_before_it_begins(bench: Bench) -> None:
+    def forbid(task: Task) -> None:
+        raise StoreError("no room")
+
+    with pytest.raises(StoreError, match="no room"):
+        bench.with_rules(before=forbid).run(a_task("work"))
+    assert bench.events == []
 
 
 _FULL_DISK = """

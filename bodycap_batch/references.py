@@ -1,0 +1,153 @@
+"""Which artefacts the jobs still refer to, and the removal of the others."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import shutil
+import threading
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from bodycap_batch.digests import json_digest, write_atomically
+from bodycap_batch.errors import StoreError
+from bodycap_batch.store import Store, disk_errors
+
+_FOLDER = "references"
+_LOCK = "in-use"
+
+
+class References:
+    """The artefacts one folder of results was made from.
+
+    Args:
+        store: Where the artefacts are.
+        owner: The folder of results. When it is gone, so is its claim.
+    """
+
+    def __init__(self, store: Store, owner: Path) -> None:
+        self._root = store.root
+        self._owner = owner.resolve()
+        self._lock = threading.Lock()
+        self._named = set(_read(self._path)[1])
+
+    @property
+    def _path(self) -> Path:
+        return self._root / _FOLDER / f"{json_digest(str(self._owner))[:32]}.json"
+
+    def add(self, artefact: Path) -> None:
+        """Keep one artefact more. Raises `StoreError`."""
+        name = artefact.relative_to(self._root).as_posix()
+        with self._lock:
+            if name not in self._named:
+                self._named.add(name)
+                self._write()
+
+    def keep_only(self, artefacts: Iterable[str]) -> None:
+        """Keep these (folders relative to the store) and no other. Raises `StoreError`."""
+        with self._lock:
+            before, self._named = self._named, set(artefacts)
+            if before != self._named:
+                self._write()
+
+    def _write(self) -> None:
+        content = {"owner": str(self._owner), "artefacts": sorted(self._named)}
+        with disk_errors(self._root):
+            self._path.parent.mkdir(exist_ok=True)
+            write_atomically(self._path, json.dumps(content, indent=1).encode())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Garbage:
+    """What no job refers to.
+
+    Attributes:
+        artefacts: Folders relative to the store.
+        corrupt: Damaged artefacts that were set aside.
+        gone: Folders of results that no longer exist.
+        kept: How many artefacts are referred to.
+        freed_bytes: What removing frees; a file that is also linked from a folder of results frees nothing.
+    """
+
+    artefacts: tuple[str, ...]
+    corrupt: tuple[str, ...]
+    gone: tuple[str, ...]
+    kept: int
+    freed_bytes: int
+
+
+@contextlib.contextmanager
+def in_use(store: Store) -> Iterator[None]:
+    """Keep `collect_garbage` from this store meanwhile. Raises `StoreError` while it is at work."""
+    with _locked(
+        store, fcntl.LOCK_SH, "the store is being cleaned", "start again when `bodycap gc` has ended"
+    ):
+        yield
+
+
+def collect_garbage(store: Store, *, delete: bool) -> Garbage:
+    """Find, and on request remove, what no job refers to.
+
+    Raises:
+        StoreError: A job is using the store, or the disk fails.
+    """
+    busy = "a job is running on this store", "wait until it has ended"
+    with _locked(store, fcntl.LOCK_EX, *busy), disk_errors(store.root):
+        lists = {path: _read(path) for path in sorted((store.root / _FOLDER).glob("*.json"))}
+        gone = {path: owner for path, (owner, _) in lists.items() if not Path(owner).is_dir()}
+        wanted = {name for path, (_, names) in lists.items() if path not in gone for name in names}
+        found = [path for path in sorted((store.root / "artefacts").glob("*/*")) if path.is_dir()]
+        unused = [path for path in found if path.relative_to(store.root).as_posix() not in wanted]
+        corrupt = sorted((store.root / "corrupt").iterdir())
+        garbage = Garbage(
+            artefacts=tuple(path.relative_to(store.root).as_posix() for path in unused),
+            corrupt=tuple(path.name for path in corrupt),
+            gone=tuple(gone.values()),
+            kept=len(found) - len(unused),
+            freed_bytes=sum(_freed_bytes(path) for path in (*unused, *corrupt)),
+        )
+        if delete:
+            _remove((*unused, *corrupt), store.root / "tmp")
+            for path in gone:
+                path.unlink()
+            store.sweep()
+    return garbage
+
+
+@contextlib.contextmanager
+def _locked(store: Store, kind: int, refusal: str, hint: str) -> Iterator[None]:
+    with disk_errors(store.root):
+        handle = os.open(store.root / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        try:
+            fcntl.flock(handle, kind | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise StoreError(refusal, path=store.root, hint=hint) from None
+        yield
+    finally:
+        os.close(handle)
+
+
+def _read(path: Path) -> tuple[str, list[str]]:
+    """Owner and artefacts of a list; a list that cannot be read claims nothing."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return str(content["owner"]), [str(name) for name in content["artefacts"]]
+    except (FileNotFoundError, ValueError, KeyError, TypeError):
+        return "", []
+
+
+def _freed_bytes(folder: Path) -> int:
+    stats = (path.lstat() for path in folder.rglob("*") if path.is_file())
+    return sum(stat.st_size for stat in stats if stat.st_nlink == 1)
+
+
+def _remove(folders: Iterable[Path], trash: Path) -> None:
+    """Out of sight in one step each, so that a kill leaves no half artefact, then away."""
+    for folder in folders:
+        moved = trash / f"removed-{folder.name}"
+        os.replace(folder, moved)
+        shutil.rmtree(moved, ignore_errors=True)

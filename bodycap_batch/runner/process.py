@@ -1,0 +1,138 @@
+"""A child process: started, given orders, followed, ended."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import bodycap_batch
+
+CHILD = (sys.executable, "-P", "-m", "bodycap_batch.runner")
+KILL_AFTER_S = 3.0
+_POLL_S = 0.2
+_THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+)
+
+
+class Child:
+    """One child process in its own process group.
+
+    Attributes:
+        loaded: Modules it was asked to load.
+    """
+
+    def __init__(self, command: Sequence[str], log: BinaryIO) -> None:
+        self.loaded: set[str] = set()
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            env=_environment(),
+            start_new_session=True,
+        )
+        self._rest = b""
+
+    @property
+    def returncode(self) -> int:
+        """Exit code once it has ended; negative for a signal."""
+        return self._process.returncode
+
+    def order(self, order: Mapping[str, Any]) -> None:
+        """Send one order; a child that is gone is noticed by `follow`."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.write(json.dumps(order).encode() + b"\n")
+            self._process.stdin.flush()
+
+    def follow(
+        self, cancelled: Callable[[], bool], on_message: Callable[[dict[str, Any]], None]
+    ) -> dict[str, Any] | None:
+        """Read the child's lines until its task ends: its last message, None if it died or was cancelled.
+
+        Args:
+            cancelled: Asked several times a second whether to stop.
+            on_message: Called with every other message.
+        """
+        assert self._process.stdout is not None
+        pipe = self._process.stdout.fileno()
+        while not cancelled():
+            if not select.select([pipe], [], [], _POLL_S)[0]:
+                continue
+            if not (data := os.read(pipe, 1 << 16)):
+                return None
+            *lines, self._rest = (self._rest + data).split(b"\n")
+            for message in map(json.loads, lines):
+                if message["event"] in ("done", "error"):
+                    return dict(message)
+                on_message(message)
+        return None
+
+    def end(self, *, at_once: bool) -> None:
+        """Wait for the child, or stop its process group: SIGTERM, and SIGKILL after 3 s."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
+        if at_once:
+            self._signal(signal.SIGTERM)
+        try:
+            self._process.wait(KILL_AFTER_S)
+        except subprocess.TimeoutExpired:
+            self._signal(signal.SIGKILL)
+            self._process.wait()
+        self._process.stdout.close()
+
+    def kill(self) -> None:
+        """End a child that waits, or loads libraries: there is nothing to lose."""
+        self._signal(signal.SIGKILL)
+        self.end(at_once=False)
+
+    def _signal(self, number: signal.Signals) -> None:
+        try:
+            os.killpg(self._process.pid, number)
+        except ProcessLookupError:
+            return
+
+
+def _environment() -> dict[str, str]:
+    """The child's environment: the libraries' own pools off before they load, this package found.
+
+    A stage's threads are its own: a pool's sums would depend on the machine's cores.
+    """
+    package = str(Path(bodycap_batch.__file__).parent.parent)
+    path = os.pathsep.join(part for part in (package, os.environ.get("PYTHONPATH")) if part)
+    pinned = dict.fromkeys(_THREAD_VARIABLES, "1")
+    return {**os.environ, **pinned, "PYTHONPATH": path, "PYTHONUNBUFFERED": "1"}
+
+
+def death(returncode: int) -> str:
+    """How a child ended that said nothing."""
+    if returncode >= 0:
+        return f"the stage's process ended with code {returncode} and no message"
+    try:
+        name = signal.Signals(-returncode).name
+    except ValueError:
+        name = f"signal {-returncode}"
+    return f"the stage's process was ended by {name}"
+
+
+def crash_hint(returncode: int) -> str:
+    """What to do about it."""
+    if returncode == -signal.SIGKILL:
+        return (
+            "probably out of memory: close other programs, or lower work_px in the job; run it again to go on"
+        )
+    return "a native library crashed; run it again, and if it stays, please report it with this log"
