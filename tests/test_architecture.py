@@ -53,7 +53,10 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cluster": KEEPING | {"context", "store", "runner"},
     "pipeline": MATERIAL | STAGES | KEEPING | {"store", "references", "tasks", "runner"},
     "watch": MATERIAL | KEEPING | {"store", "runner", "cluster", "pipeline"},
-    "cli": MATERIAL | STAGES | KEEPING | {"store", "references", "runner", "cluster", "pipeline", "watch"},
+    "cli": MATERIAL
+    | STAGES
+    | KEEPING
+    | {"store", "references", "tasks", "runner", "cluster", "pipeline", "watch"},
 }
 # Libraries that only these rooms may import.
 LIBRARY_ROOMS = {

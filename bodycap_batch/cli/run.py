@@ -15,7 +15,8 @@ import typer
 from bodycap_batch.cli.base import app
 from bodycap_batch.cli.display import Display, JsonLines, make_display
 from bodycap_batch.cli.stop import stoppable
-from bodycap_batch.errors import BodycapError
+from bodycap_batch.errors import BodycapError, JobError
+from bodycap_batch.tasks import StageName, stages_from
 
 if TYPE_CHECKING:
     from bodycap_batch.config.models import Job
@@ -57,6 +58,13 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
     height: HeightOption = None,
     threads: ThreadsOption = None,
     store: StoreOption = None,
+    from_: Annotated[
+        StageName | None, typer.Option("--from", help="Do this stage and all after it again.")
+    ] = None,
+    until: Annotated[
+        StageName | None, typer.Option(help="Stop after this stage; no results are written.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Do every stage again.")] = False,
     json_progress: Annotated[
         bool, typer.Option("--json-progress", help="Progress as JSON lines on standard output.")
     ] = False,
@@ -75,11 +83,16 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap run my_walk/ --skeleton subject.bvh --out results/my_walk
       bodycap run single_camera/ --skeleton none
       bodycap run jobs/cpl_lab.yaml
+      bodycap run my_walk/ --from merge
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.config.job import Overrides, load_job
     from bodycap_batch.pipeline import Settings, prepare_capture, run_job
     from bodycap_batch.store import Store
 
+    if force and from_ is not None:
+        raise JobError("--force does every stage again, --from some of them", hint="leave one of them out")
+    first: StageName | None = "check" if force else from_
+    redo = frozenset[str]() if first is None else stages_from(first)
     overrides = Overrides(out=out, skeleton=skeleton, height_m=height)
     with stoppable() as stop, make_display(as_json=json_progress) as display, _told_to(display):
 
@@ -89,14 +102,16 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
                 threads=threads or cores(),
                 listener=display,
                 cancelled=stop.is_set,
+                redo=redo,
+                until=until or "",
             )
 
         def prepare(options: Mapping[str, Any], folder: Path) -> None:
-            prepare_capture(options, folder, settings(_default_store(out or _default_out())))
+            prepare_capture(options, folder, settings(default_store(out or default_out())))
 
         resolved = load_job(job, overrides, prepare=prepare)
-        out_dir = resolved.out or _default_out() / resolved.name
-        summary = run_job(resolved, out_dir=out_dir, settings=settings(_default_store(out_dir)))
+        out_dir = results_folder(resolved)
+        summary = run_job(resolved, out_dir=out_dir, settings=settings(default_store(out_dir)))
     _report(summary, resolved, display, verbose=verbose)
 
 
@@ -116,13 +131,19 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _default_out() -> Path:
+def default_out() -> Path:
+    """Folder of all results that are not put elsewhere."""
     return Path.cwd() / "out"
 
 
-def _default_store(out_dir: Path) -> Path:
+def results_folder(job: Job) -> Path:
+    """Where a job's results go."""
+    return job.out or default_out() / job.name
+
+
+def default_store(out_dir: Path) -> Path:
     """One store for all of ``out/``; results put elsewhere have their own."""
-    shared = _default_out()
+    shared = default_out()
     return (shared if out_dir in (shared, shared / out_dir.name) else out_dir) / ".store"
 
 
@@ -135,6 +156,11 @@ def _report(summary: RunSummary, job: Job, display: Display, *, verbose: bool) -
         for stage in summary.stages:
             cost = f"{stage.seconds:8.1f} s {stage.peak_memory_mb:7.0f} MB"
             typer.echo(f"{cost}  {stage.stage} {stage.camera}{' (kept)' if stage.reused else ''}".rstrip())
+    if not summary.files:
+        typer.echo(
+            f"{job.name}: stopped after {summary.stages[-1].stage}, as asked; run it again for the rest"
+        )
+        return
     if summary.executed == 0:
         typer.echo(f"{job.name}: nothing to do, all {len(summary.stages)} stages were done before")
     typer.echo(f"results: {summary.out_dir}")

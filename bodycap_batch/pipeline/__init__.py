@@ -3,5 +3,14 @@
 from bodycap_batch.pipeline.run import RunSummary, run_job
 from bodycap_batch.pipeline.sample import prepare_capture
 from bodycap_batch.pipeline.settings import Settings, StageRecord
+from bodycap_batch.pipeline.why import Step, explain_job
 
-__all__ = ["RunSummary", "Settings", "StageRecord", "prepare_capture", "run_job"]
+__all__ = [
+    "RunSummary",
+    "Settings",
+    "StageRecord",
+    "Step",
+    "explain_job",
+    "prepare_capture",
+    "run_job",
+]

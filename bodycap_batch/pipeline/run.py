@@ -66,9 +66,9 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
     """
     settings.store.sweep()
     settings.require_owner()
-    made = _Made()
+    made = Made()
     with Flow(job, settings, logs=out_dir / "logs") as flow:
-        for stage in _stages(job, flow, made):
+        for stage in run_stages(job, flow, made):
             if stage == settings.until:
                 break
         summary = RunSummary(out_dir=out_dir, files=(), stages=tuple(flow.records), versions=_versions(flow))
@@ -84,14 +84,14 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
 
 
 @dataclass(slots=True)
-class _Made:
+class Made:
     """What the stages gave: the results, and why there is no skeleton among them."""
 
     exported: Artefact | None = None
     failure: EstimationError | None = None
 
 
-def _stages(job: Job, flow: Flow, made: _Made) -> Iterator[str]:
+def run_stages(job: Job, flow: Flow, made: Made) -> Iterator[str]:
     """Run one stage after another; yields the name of each when it is done."""
     flow.check()
     yield "check"
@@ -109,7 +109,7 @@ def _stages(job: Job, flow: Flow, made: _Made) -> Iterator[str]:
     yield "export"
 
 
-def _hand_over(job: Job, made: _Made, summary: RunSummary, settings: Settings) -> None:
+def _hand_over(job: Job, made: Made, summary: RunSummary, settings: Settings) -> None:
     """Publish the results; those without a skeleton are set apart and called partial."""
     assert made.exported is not None
     if made.failure is None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal, get_args
+
 from bodycap_batch.tasks.body import reach_rows
 from bodycap_batch.tasks.check import CHECK
 from bodycap_batch.tasks.export import EXPORT
@@ -12,7 +14,18 @@ from bodycap_batch.tasks.registration import REGISTRATION
 from bodycap_batch.tasks.stage import CAPTURE, RESULTS, SUMMARY, Stage, read_summary
 from bodycap_batch.tasks.synth import SYNTH
 
-__all__ = ["CAPTURE", "RESULTS", "STAGES", "SUMMARY", "Stage", "reach_rows", "read_summary"]
+__all__ = [
+    "CAPTURE",
+    "ORDER",
+    "RESULTS",
+    "STAGES",
+    "SUMMARY",
+    "Stage",
+    "StageName",
+    "reach_rows",
+    "read_summary",
+    "stages_from",
+]
 
 STAGES = {
     "synth": SYNTH,
@@ -25,3 +38,14 @@ STAGES = {
     "merge": MERGE,
     "export": EXPORT,
 }
+
+StageName = Literal["check", "keyframes", "map", "registration", "merge", "export"]
+ORDER: tuple[StageName, ...] = get_args(StageName)
+"""A job's stages one after another. While frames are registered the map may be extended and refined."""
+_DURING_REGISTRATION = {"extend", "refine"}
+
+
+def stages_from(stage: StageName) -> frozenset[str]:
+    """A stage of `ORDER` and all that come after it."""
+    later = set[str](ORDER[ORDER.index(stage) :])
+    return frozenset(later | (_DURING_REGISTRATION if "registration" in later else set()))

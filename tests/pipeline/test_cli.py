@@ -107,6 +107,31 @@ def test_the_store_can_be_named_by_option_or_variable(bench: Bench) -> None:
     assert "nothing to do" in bench.run("run", "my walk", "--out", "elsewhere")[1]
 
 
+def test_stages_are_done_again_left_out_explained_and_cleaned_away(bench: Bench) -> None:
+    code, out, _ = bench.run("run", "my walk", "--until", "keyframes")
+    assert (code, out) == (0, "my_walk: stopped after keyframes, as asked; run it again for the rest\n")
+    code, out, _ = bench.run("why", "my walk")
+    assert code == 0
+    assert "map                 would run: not computed before" in out
+    assert "merge               would run: after map" in out
+    bench.run("run", "my walk")
+    assert bench.run("why", "my walk")[1].splitlines()[-1] == "nothing to do"
+    _, _, err = bench.run("run", "my walk", "--from", "merge")
+    assert "registration torso: already done" in err
+    assert "merge: done" in err
+    assert "check: done" in bench.run("run", "my walk", "--force")[2]
+    code, _, err = bench.run("run", "my walk", "--force", "--from", "merge")
+    assert code == 2
+    assert "leave one of them out" in err
+    bench.run("run", "my walk", "--skeleton", "none")
+    code, out, _ = bench.run("gc")
+    assert code == 0
+    assert "would remove" in out
+    assert "(--delete does it)" in out
+    assert out.replace("would remove", "removed").partition(" (")[0] in bench.run("gc", "--delete")[1]
+    assert json.loads(bench.run("gc", "--json")[1])["artefacts"] == []
+
+
 def test_progress_for_machines_is_json_on_every_line(bench: Bench) -> None:
     code, out, err = bench.run("run", "my walk", "--json-progress")
     assert code == 0, err

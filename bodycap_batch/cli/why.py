@@ -1,0 +1,106 @@
+"""`bodycap why` and `bodycap gc`: what the store holds for a job, and what for none."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bodycap_batch.cli.base import app
+from bodycap_batch.cli.run import (
+    HeightOption,
+    JobArgument,
+    OutOption,
+    SkeletonOption,
+    StoreOption,
+    default_out,
+    default_store,
+    results_folder,
+)
+from bodycap_batch.errors import StoreError
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print it as JSON.")]
+
+
+@app.command()
+def why(
+    job: JobArgument,
+    out: OutOption = None,
+    skeleton: SkeletonOption = None,
+    height: HeightOption = None,
+    store: StoreOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Say which stages of a job would run, and why.
+
+    A stage runs when its own options, one of its inputs, the program or a library is another than before.
+    Nothing is computed.
+
+    \b
+    Example:
+      bodycap why my_walk/ --height 1.75
+    """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.config.job import Overrides, load_job
+    from bodycap_batch.pipeline import Settings, explain_job
+    from bodycap_batch.store import Store
+
+    resolved = load_job(job, Overrides(out=out, skeleton=skeleton, height_m=height))
+    out_dir = results_folder(resolved)
+    settings = Settings(
+        store=Store(store or default_store(out_dir)),
+        threads=1,
+        listener=lambda _: None,
+        cancelled=lambda: False,
+    )
+    steps = explain_job(resolved, out_dir=out_dir, settings=settings)
+    if as_json:
+        typer.echo(json.dumps([step.to_dict() for step in steps], indent=1))
+        return
+    width = max(len(step.stage) for step in steps)
+    for step in steps:
+        typer.echo(f"{step.stage:{width}}  {'stored' if step.stored else f'would run: {step.reason}'}")
+    if all(step.stored for step in steps):
+        typer.echo("nothing to do")
+
+
+@app.command()
+def gc(
+    store: Annotated[
+        Path | None,
+        typer.Argument(metavar="STORE", help="The store (default: BODYCAP_STORE, else out/.store)."),
+    ] = None,
+    delete: Annotated[bool, typer.Option("--delete", help="Really remove it.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """List what the store holds for no job; with --delete, remove it.
+
+    Kept is what the last run of each job used, as long as its folder of results exists. Results are never
+    touched.
+
+    \b
+    Example:
+      bodycap gc out/.store --delete
+    """  # noqa: D301 - \b keeps lines as they are
+    import os
+
+    from bodycap_batch.cli.run import STORE_VARIABLE
+    from bodycap_batch.references import collect_garbage
+    from bodycap_batch.store import Store
+
+    named = store or Path(os.environ.get(STORE_VARIABLE) or default_store(default_out()))
+    if not (named / "artefacts").is_dir():
+        raise StoreError("there is no store", path=named, hint="name it: bodycap gc FOLDER")
+    garbage = collect_garbage(Store(named), delete=delete)
+    if as_json:
+        typer.echo(json.dumps({**asdict(garbage), "deleted": delete}, indent=1))
+        return
+    for name in (*garbage.artefacts, *(f"corrupt/{name}" for name in garbage.corrupt)):
+        typer.echo(name)
+    for owner in garbage.gone:
+        typer.echo(f"its results are gone: {owner or 'an unreadable list'}")
+    count, size = len(garbage.artefacts) + len(garbage.corrupt), f"{garbage.freed_bytes / 1e6:.1f} MB"
+    verb = "removed" if delete else "would remove"
+    typer.echo(f"{verb} {count} of {count + garbage.kept}, {size}{'' if delete else ' (--delete does it)'}")

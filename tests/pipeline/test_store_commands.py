@@ -1,0 +1,227 @@
+"""`--from`, `--until`, `--force`, `why`, `gc`, and the disk space of a job whose check is stored."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from bodycap_batch.errors import Cancelled, StoreError
+from bodycap_batch.pipeline import Settings, explain_job, run_job
+from bodycap_batch.references import collect_garbage, in_use
+from bodycap_batch.store import Store
+from bodycap_batch.tasks import StageName, stages_from
+from tests.pipeline.test_run import ALL, CHILD, PER_CAMERA, REGISTERED, Bench, bench, done, done_once
+
+__all__ = ["bench", "done", "done_once"]
+
+
+def settings(bench: Bench, **values: Any) -> Settings:
+    return Settings(
+        store=Store(bench.folder / "store"),
+        threads=2,
+        listener=bench.events.append,
+        cancelled=bench.stop.is_set,
+        command=CHILD,
+        **values,
+    )
+
+
+def executed(bench: Bench, changes: dict[str, Any] | None = None, **values: Any) -> list[str]:
+    job = bench.job(**(changes or {}))
+    summary = run_job(job, out_dir=bench.out, settings=settings(bench, **values))
+    return sorted(f"{s.stage} {s.camera}".strip() for s in summary.stages if not s.reused)
+
+
+def steps(bench: Bench, **changes: Any) -> dict[str, str]:
+    """What `why` says of each stage: "" where it is stored."""
+    found = explain_job(bench.job(**changes), out_dir=bench.out, settings=settings(bench))
+    return {step.stage: step.reason for step in found}
+
+
+def artefacts(bench: Bench) -> set[str]:
+    root = bench.folder / "store" / "artefacts"
+    return {path.relative_to(root).as_posix() for path in root.glob("*/*")}
+
+
+@pytest.mark.parametrize(
+    ("stage", "expected"),
+    [
+        ("check", ALL),
+        ("keyframes", sorted(set(ALL) - {"check"})),
+        ("registration", ["export", "merge", *REGISTERED]),
+        ("export", ["export"]),
+    ],
+)
+def test_from_a_stage_it_and_all_after_it_are_done_again(
+    done: Bench, stage: StageName, expected: list[str]
+) -> None:
+    before, kept = done.results(), artefacts(done)
+    assert executed(done, redo=stages_from(stage)) == sorted(expected)
+    assert done.results() == before
+    assert artefacts(done) == kept
+    assert done.executed() == []
+
+
+def test_until_a_stage_nothing_after_it_is_done_and_no_result_is_written(bench: Bench) -> None:
+    assert executed(bench, until="map") == sorted(["check", *PER_CAMERA, "map"])
+    assert bench.results() == {}
+    assert bench.executed() == sorted(["export", "merge", *REGISTERED])
+
+
+def test_a_job_taken_over_publishes_nothing(done: Bench) -> None:
+    before = done.results()
+    with pytest.raises(Cancelled, match="taken over"):
+        run_job(
+            done.job(map={"features": 1024}),
+            out_dir=done.out,
+            settings=settings(done, may_commit=lambda: False),
+        )
+    assert done.results() == before
+
+
+def test_a_job_is_taken_over_while_it_runs(bench: Bench) -> None:
+    def until_the_map() -> bool:
+        return not any(event.stage == "map" for event in bench.events)
+
+    with pytest.raises(Cancelled, match="taken over"):
+        executed(bench, may_commit=until_the_map)
+    assert {name.split("/")[0] for name in artefacts(bench)} == {"check", "keyframes"}
+    assert bench.results() == {}
+
+
+def test_why_a_finished_job_would_do_nothing(done: Bench) -> None:
+    assert steps(done) == dict.fromkeys(ALL, "")
+
+
+@pytest.mark.parametrize(
+    ("changes", "stage", "reason", "later"),
+    [
+        ({"map": {"features": 1024}}, "map", "features: 512 -> 1024", ["registration", "merge", "export"]),
+        ({"height_m": 1.8}, "check", "the body: height_m changed", None),
+        ({"export": {"units": "m"}}, "export", 'units: "cm" -> "m"', []),
+        ({"torso": {"offset_s": 0.1}}, "check", "the video, calibration, clock or window of torso", None),
+    ],
+)
+def test_why_names_the_change_and_what_follows(
+    done: Bench, changes: dict[str, Any], stage: str, reason: str, later: list[str] | None
+) -> None:
+    found = steps(done, **changes)
+    assert reason in found[stage]
+    if later is not None:
+        assert [name for name, why in found.items() if why.startswith("after ")] == later
+    assert done.executed() == [], "asking computes nothing"
+
+
+def test_why_of_a_job_never_run_and_of_a_damaged_artefact(bench: Bench) -> None:
+    assert steps(bench) == {
+        "check": "not computed before",
+        **dict.fromkeys(("keyframes", "map", "registration", "merge", "export"), "after check"),
+    }
+    bench.run()
+    victim = next((bench.folder / "store" / "artefacts" / "merge").glob("*/made_of.txt"))
+    victim.write_text("something else")
+    assert steps(bench)["merge"] == "its stored result was damaged"
+
+
+def test_why_says_that_the_program_has_changed(done: Bench) -> None:
+    path = next((done.folder / "store" / "artefacts" / "keyframes").glob("*"))
+    manifest = json.loads((path / "manifest.json").read_text())
+    manifest["key"]["algorithm"] = manifest["key"]["libraries"]["numpy"] = "1"
+    for other in path.parent.iterdir():
+        shutil.rmtree(other)
+    other = path.with_name("0" * 32)
+    other.mkdir()
+    (other / "manifest.json").write_text(json.dumps(manifest))
+    reasons = [why for name, why in steps(done).items() if name.startswith("keyframes")]
+    assert len(reasons) == 2
+    assert all("the program has changed" in why and 'numpy "1" -> "' in why for why in reasons)
+
+
+@pytest.fixture
+def alone(done: Bench) -> Bench:
+    """The job has been run, and no other job refers to its store."""
+    shutil.rmtree(done.folder / "store" / "references")
+    done.run()
+    return done
+
+
+def test_garbage_is_what_no_finished_job_used(alone: Bench) -> None:
+    kept = artefacts(alone)
+    alone.run(map={"features": 1024})
+    store = Store(alone.folder / "store")
+    dry = collect_garbage(store, delete=False)
+    assert {name.split("/")[1] for name in dry.artefacts} == {"map", "registration", "merge", "export"}
+    assert dry.freed_bytes > 0
+    assert artefacts(alone) > kept, "a dry run removes nothing"
+    assert collect_garbage(store, delete=True) == dry
+    assert alone.executed(map={"features": 1024}) == []
+    assert "map" in alone.executed()
+
+
+def test_what_an_unfinished_job_has_done_is_no_garbage(bench: Bench) -> None:
+    bench.order(fail="map")
+    with pytest.raises(Exception, match="does not work out"):
+        bench.run()
+    assert collect_garbage(Store(bench.folder / "store"), delete=True).artefacts == ()
+    bench.order()
+    assert "keyframes torso" not in bench.executed()
+
+
+def test_a_removed_folder_of_results_claims_nothing(alone: Bench) -> None:
+    shutil.rmtree(alone.out)
+    garbage = collect_garbage(Store(alone.folder / "store"), delete=True)
+    assert (garbage.kept, len(garbage.gone)) == (0, 1)
+    assert artefacts(alone) == set()
+
+
+def test_no_garbage_is_collected_under_a_running_job(done: Bench) -> None:
+    store = Store(done.folder / "store")
+    with in_use(store), pytest.raises(StoreError, match="a job is running"):
+        collect_garbage(store, delete=True)
+
+
+def space(free: int) -> Callable[[object], SimpleNamespace]:
+    return lambda path: SimpleNamespace(total=10**9, used=10**9 - free, free=free)
+
+
+def test_a_stored_check_does_not_answer_for_the_disk(done: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", space(20_000_000))
+    assert done.executed() == [], "what is finished needs no room"
+    with pytest.raises(StoreError, match="20 MB free, the job needs about") as caught:
+        done.run(map={"features": 1024})
+    assert caught.value.hint
+    monkeypatch.setattr(shutil, "disk_usage", space(10**9))
+    assert "map" in done.executed(map={"features": 1024})
+
+
+def test_results_on_another_disk_are_copied(done: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(source: object, target: object) -> None:
+        raise OSError(18, "Invalid cross-device link")
+
+    before = done.results()
+    shutil.rmtree(done.out)
+    monkeypatch.setattr(os, "link", refuse)
+    assert done.executed() == []
+    assert done.results() == before
+    assert (done.out / "metrics.json").stat().st_nlink == 1
+
+
+def test_results_are_hard_links(done: Bench) -> None:
+    shutil.rmtree(done.out)
+    done.run()
+    assert (done.out / "metrics.json").stat().st_nlink == 2
+
+
+def test_no_store_no_garbage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from bodycap_batch.cli import main
+
+    assert main(["gc", str(tmp_path)]) == 5
+    assert "there is no store" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
