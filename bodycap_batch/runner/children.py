@@ -98,6 +98,7 @@ class Children:
         child = self._take(task.modules, making.logs)
         child.loaded |= set(task.modules)
         with disk_errors(making.logs):
+            making.logs.mkdir(parents=True, exist_ok=True)
             order = log.with_suffix(".task.json")
             order.write_text(json.dumps(task.to_json(making.store.root), indent=1), encoding="utf-8")
             log.write_bytes(b"")
