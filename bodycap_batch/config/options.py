@@ -39,7 +39,7 @@ class MapOptions(Options):
 
     features: int = Field(512, ge=128, description="SIFT features a keyframe, the strongest")
     pairs: Literal["retrieval", "exhaustive"] = Field(
-        "exhaustive", description="keyframe pairs to match: neighbours and look-alikes, or all"
+        "retrieval", description="keyframe pairs to match: neighbours and look-alikes, or all"
     )
     init_frames: tuple[FrameName, FrameName] | None = Field(
         None, description="two frames to start from, each camera:frame; default: found"

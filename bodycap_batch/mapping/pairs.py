@@ -1,10 +1,9 @@
-"""Which keyframe pairs are matched."""
+"""Which keyframe pairs are matched: a number for each keyframe that does not grow with their number."""
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,21 +13,25 @@ from bodycap_batch.camera import Camera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, Pair, image_ids
+from bodycap_batch.mapping.likeness import CHANCE, largest, likeness
 from bodycap_batch.mapping.matching import match_pairs
-from bodycap_batch.mapping.retrieval import similarity
 
 _NEIGHBOURS = (1, 2, 3, 4, 6, 9, 14)
 """Steps along a camera's own keyframes."""
-_RANKS = (0, 1, 2, 4, 8, 16, 32, 64)
-"""Places in the order of likeness at which partners are taken, from the same camera at another time and from
-each other camera. The most alike repeat each other: a wide choice ties a map better than the top 8."""
-_ENOUGH = 12
-"""Links to another camera or another time that tie a keyframe well, and the matches each must have."""
-_STRONG = 20
-_WIDE = 64
 _SAME_INSTANT = 2
+_LOOK_ALIKES = 48
+"""Most alike partners of a keyframe, shared out to its own camera at other times and to each other one."""
+_FEWEST_LOOK_ALIKES = 8
+"""Of each camera, however many there are."""
+_ENOUGH = 24
+"""Links to another camera or another time that tie a keyframe well, and the matches each must have: one with
+fewer is matched with the neighbours of what it was matched with. With 12 instead of 24 a keyframe of walk131
+stood 15 cm off."""
+_STRONG = 20
 _AWAY_NS = 2_000_000_000
 """A keyframe's nearest looks are its own neighbours in time: they are matched anyway."""
+_FEW = 120
+"""Keyframes up to which every pair is matched."""
 
 
 class PairChooser:
@@ -53,60 +56,81 @@ class PairChooser:
         with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
             ids = image_ids(database)
             self._images = sorted(ids)
-            self._new = [row for row, ref in enumerate(self._images) if ref in set(new)]
-            cameras = len(common_ns)
-            quota = 2 * len(_NEIGHBOURS) + len(_RANKS) + (len(_RANKS) + _SAME_INSTANT) * (cameras - 1)
-            few = self._count_all() <= quota * len(self._new)
-            self.exhaustive = options.pairs == "exhaustive" or few
+            wanted = set(new)
+            self._new = [row for row, ref in enumerate(self._images) if ref in wanted]
+            self.exhaustive = options.pairs == "exhaustive" or len(self._images) <= _FEW
             if not self.exhaustive:
-                read = (np.asarray(database.read_descriptors(ids[ref]).data) for ref in self._images)
-                self._alike = similarity(list(read), options.seed)
+                images = [
+                    largest(
+                        np.asarray(database.read_descriptors(ids[ref]).data),
+                        np.asarray(database.read_keypoints(ids[ref])),
+                    )
+                    for ref in self._images
+                ]
+                self._alike = dict(zip(self._new, likeness(images, self._new), strict=True))
         self._times = np.array([common_ns[ref.camera][ref.frame] for ref in self._images], dtype=np.int64)
         self._cameras = np.array([ref.camera for ref in self._images])
+        self._row = {ref: row for row, ref in enumerate(self._images)}
 
     def first(self) -> list[Pair]:
-        """Neighbours in time, the same instant of other cameras, and what looks alike near and far."""
+        """Neighbours in time, the same instant of other cameras, and what looks most alike."""
         if self.exhaustive:
             return self._sorted({(row, other) for row in self._new for other in range(len(self._images))})
         return self._sorted({(row, other) for row in self._new for other in self._partners(row)})
 
-    def wider(self, held: Mapping[Pair, int]) -> list[Pair]:
-        """More partners for keyframes that hang by few links: a block that does can stand metres off.
+    def wider(self, held: Mapping[Pair, int], tried: Collection[Pair]) -> list[Pair]:
+        """Neighbours of pairs that hold well, for keyframes that hang by few links.
+
+        Two places that share a view do so over some time on both sides: from one pair that was found the
+        others follow. A block that hangs by few links can stand metres off.
 
         Args:
             held: Matches of every pair that was verified.
+            tried: Pairs that were matched.
         """
-        far = dict.fromkeys(self._images, 0)
-        for pair, count in held.items():
-            if count >= _STRONG and self._is_far(*pair):
-                for ref in pair:
-                    far[ref] = far.get(ref, 0) + 1
-        weak = [row for row in self._new if far[self._images[row]] < _ENOUGH]
         if self.exhaustive:
             return []
-        return self._sorted({(row, other) for row in weak for other in self._looks_like(row, range(_WIDE))})
+        far: Counter[int] = Counter()
+        strong = [(self._row[a], self._row[b]) for (a, b), count in sorted(held.items()) if count >= _STRONG]
+        for a, b in strong:
+            if self._is_far(a, b):
+                far.update((a, b))
+        new = set(self._new)
+        beside = {
+            (min(pair), max(pair))
+            for a, b in strong
+            for pair in self._beside(a, b)
+            if not new.isdisjoint(pair) and min(far[pair[0]], far[pair[1]]) < _ENOUGH
+        }
+        return [pair for pair in self._sorted(beside) if pair not in tried]
 
-    def unlinked(self, held: Mapping[Pair, int]) -> list[Pair]:
+    def unlinked(self, held: Mapping[Pair, int], tried: Collection[Pair]) -> list[Pair]:
         """Every pair of a camera that has no link to any other camera."""
         tied = {ref.camera for a, b in held if a.camera != b.camera for ref in (a, b)}
         alone = [row for row in self._new if self._images[row].camera not in tied]
         if self.exhaustive or len(set(self._cameras)) == 1:
             return []
-        return self._sorted(
-            {
-                (row, int(other))
-                for row in alone
-                for other in np.flatnonzero(self._cameras != self._cameras[row])
-            }
-        )
+        every = {
+            (row, int(other))
+            for row in alone
+            for other in np.flatnonzero(self._cameras != self._cameras[row])
+        }
+        return [pair for pair in self._sorted(every) if pair not in tried]
 
-    def _is_far(self, a: ImageRef, b: ImageRef) -> bool:
-        rows = [bisect_left(self._images, ref) for ref in (a, b)]
-        return a.camera != b.camera or abs(int(np.diff(self._times[rows])[0])) > _AWAY_NS
+    def _beside(self, a: int, b: int) -> Iterator[tuple[int, int]]:
+        for x, y in ((a - 1, b), (a + 1, b), (a, b - 1), (a, b + 1)):
+            inside = min(x, y) >= 0 and max(x, y) < len(self._images)
+            if (
+                inside
+                and x != y
+                and self._cameras[x] == self._cameras[a]
+                and self._cameras[y] == self._cameras[b]
+            ):
+                yield x, y
 
-    def _count_all(self) -> int:
-        new, old = len(self._new), len(self._images) - len(self._new)
-        return new * (new - 1) // 2 + new * old
+    def _is_far(self, a: int, b: int) -> bool:
+        apart = abs(int(self._times[a] - self._times[b]))
+        return bool(self._cameras[a] != self._cameras[b]) or apart > _AWAY_NS
 
     def _sorted(self, rows: Collection[tuple[int, int]]) -> list[Pair]:
         ordered = sorted({(min(pair), max(pair)) for pair in rows if pair[0] != pair[1]})
@@ -118,21 +142,18 @@ class PairChooser:
         place = int(np.searchsorted(own, row))
         steps = [step * sign for step in _NEIGHBOURS for sign in (-1, 1)]
         out = {int(own[place + step]) for step in steps if 0 <= place + step < len(own)}
-        for camera in np.unique(self._cameras[self._cameras != self._cameras[row]]):
-            other = np.flatnonzero(self._cameras == camera)
-            apart = np.abs(self._times[other] - self._times[row])
-            out |= {int(item) for item in other[np.argsort(apart, kind="stable")[:_SAME_INSTANT]]}
-        return out | self._looks_like(row, _RANKS)
-
-    def _looks_like(self, row: int, ranks: Iterable[int]) -> set[int]:
-        """Partners at these places in likeness: of its own camera at another time, of each other."""
-        out = set()
-        for camera in np.unique(self._cameras):
+        cameras = np.unique(self._cameras)
+        quota = max(_FEWEST_LOOK_ALIKES, _LOOK_ALIKES // len(cameras))
+        for camera in cameras:
             rows = np.flatnonzero(self._cameras == camera)
+            apart = np.abs(self._times[rows] - self._times[row])
             if camera == self._cameras[row]:
-                rows = rows[np.abs(self._times[rows] - self._times[row]) > _AWAY_NS]
-            order = rows[np.argsort(-self._alike[row][rows], kind="stable")]
-            out |= {int(order[rank]) for rank in ranks if rank < len(order)}
+                rows = rows[apart > _AWAY_NS]
+            else:
+                out |= set(rows[np.argsort(apart, kind="stable")[:_SAME_INSTANT]].tolist())
+            alike = self._alike[row][rows]
+            order = np.argsort(-alike, kind="stable")[:quota]
+            out |= set(rows[order[alike[order] >= CHANCE]].tolist())
         return out
 
 
@@ -150,16 +171,13 @@ def link_keyframes(
     pairs = chooser.first()
     held = match_pairs(workspace, pairs, lenses, context)
     tried = set(pairs)
-    widened = 0
-    for more in (chooser.wider, chooser.unlinked):
-        fresh = [pair for pair in more(held) if pair not in tried]
-        widened += len(fresh)
+    while fresh := chooser.wider(held, tried) or chooser.unlinked(held, tried):
         held |= match_pairs(workspace, fresh, lenses, context)
         tried |= set(fresh)
     between = Counter(f"{a.camera} - {b.camera}" for a, b in held if a.camera != b.camera)
     log = {
         "pairs": len(tried),
-        "widened_pairs": widened,
+        "widened_pairs": len(tried) - len(pairs),
         "verified_pairs": len(held),
         "linked_cameras": dict(sorted(between.items())),
     }

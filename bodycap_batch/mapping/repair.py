@@ -1,4 +1,4 @@
-"""Find keyframes in the wrong place or left out, match them with all others, and place them again."""
+"""Find keyframes in the wrong place or left out, match them again, place them again, or cut them out."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 _ROUNDS = 2
+_LEAST_BUDGET = 2000
+"""Pairs that may be matched again, where fewer were matched in the first place."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,7 +43,7 @@ class Workshop:
 
 
 def repair(model: pycolmap.Reconstruction, tried: set[Pair], shop: Workshop) -> tuple[Any, dict[str, object]]:
-    """Take doubtful keyframes out, match them and the unregistered ones with all others, place them again.
+    """Take doubtful keyframes out, match them and the unregistered ones again, place them again or cut them.
 
     Args:
         model: The largest model; not changed.
@@ -49,7 +51,7 @@ def repair(model: pycolmap.Reconstruction, tried: set[Pair], shop: Workshop) -> 
         shop: Workspace, lenses, settings.
 
     Returns:
-        The better of the old and the new model, and an account for the log.
+        The better of the old and the new model without what is doubtful still, and an account for the log.
     """
     import pycolmap
 
@@ -60,14 +62,18 @@ def repair(model: pycolmap.Reconstruction, tried: set[Pair], shop: Workshop) -> 
     suspects = doubtful(links)
     for _ in range(_ROUNDS):
         placed = set(map(int, model.reg_image_ids()))
-        again = suspects | (set(ids.values()) - placed)
-        if not again:
+        missing = set(ids.values()) - placed
+        if not suspects | missing:
             break
-        fresh = _untried(ids, again, tried)
+        fresh = _untried(ids, suspects | missing, tried)
+        if len(fresh) > max(_LEAST_BUDGET, len(tried)):
+            # Where many are missing they saw too little: matching them with all would cost the most.
+            fresh = _untried(ids, suspects, tried)
+        tried |= set(fresh)
         held = match_pairs(shop.workspace, fresh, shop.lenses, shop.context)
         entry: dict[str, object] = {
             "doubtful": [ref.name for ref, number in sorted(ids.items()) if number in suspects],
-            "unregistered": len(set(ids.values()) - placed),
+            "unregistered": len(missing),
             "pairs": len(fresh),
             "verified_pairs": len(held),
         }
@@ -84,15 +90,18 @@ def repair(model: pycolmap.Reconstruction, tried: set[Pair], shop: Workshop) -> 
             break
         model, suspects, links = other, left, other_links
     share = round(contradicted_share(links), 4)
-    return model, {"rounds": log, "doubtful": len(suspects), "contradicted_share": share}
+    cut = [ref.name for ref, number in sorted(ids.items()) if number in suspects]
+    if suspects:
+        # Points that only they see go with them; tracking finds their frames' poses from what is left.
+        model = part_of(model, set(map(int, model.reg_image_ids())) - suspects)
+        refine(model, shop.settings(), shop.constant)
+    return model, {"rounds": log, "cut": cut, "contradicted_share": share}
 
 
 def _untried(ids: Mapping[ImageRef, int], images: set[int], tried: set[Pair]) -> list[Pair]:
     refs: Sequence[ImageRef] = sorted(ids)
     chosen = [ref for ref in refs if ids[ref] in images]
-    fresh = {(min(a, b), max(a, b)) for a in chosen for b in refs if a != b} - tried
-    tried |= fresh
-    return sorted(fresh)
+    return sorted({(min(a, b), max(a, b)) for a in chosen for b in refs if a != b} - tried)
 
 
 def _without(model: pycolmap.Reconstruction, suspects: Collection[int], shop: Workshop, total: int) -> Any:

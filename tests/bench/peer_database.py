@@ -13,9 +13,9 @@ import numpy.typing as npt
 import pycolmap
 
 from bodycap_batch.capture import Capture, CaptureCamera
-from bodycap_batch.mapping.retrieval import similarity
 from bodycap_batch.tracking import pixel_scale
 from tests.bench.peer_pairs import pairs_of
+from tests.bench.retrieval import similarity
 
 DATABASE_NAME = "database.db"
 FEATURES = 2048

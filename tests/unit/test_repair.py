@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -115,25 +116,46 @@ def test_a_right_map_is_left_alone(built: tuple[Any, FloatArray, Workshop, set[A
     assert _rms(model, poses) < 0.01
     same, log = repair(model, set(pairs), shop)
     assert same is model
-    assert log == {"rounds": [], "doubtful": 0, "contradicted_share": 0.0}
+    assert log == {"rounds": [], "cut": [], "contradicted_share": 0.0}
 
 
 def test_a_misplaced_block_is_found_and_put_right(
     built: tuple[Any, FloatArray, Workshop, set[Any]],
 ) -> None:
     model, poses, shop, pairs = built
-    wrong = pycolmap.Reconstruction(model)
     ids = {ref.frame: number for ref, number in _ids(shop).items()}
+    wrong = _with_moved_block(model, ids)
+    assert _rms(wrong, poses) > 0.1
+    assert doubtful(links_of(shop.workspace, wrong)) == {ids[frame] for frame in _MOVED}
+    mended, log = repair(wrong, set(pairs), shop)
+    assert log["cut"] == []
+    assert mended.num_reg_images() == _KEYFRAMES
+    assert _rms(mended, poses) < 0.01
+
+
+def test_what_cannot_be_put_right_is_cut_out(
+    built: tuple[Any, FloatArray, Workshop, set[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, poses, shop, pairs = built
+    wrong = _with_moved_block(model, {ref.frame: number for ref, number in _ids(shop).items()})
+    # The mapper places it in the same wrong place again.
+    module = sys.modules[repair.__module__]
+    monkeypatch.setattr(module, "extend", lambda *_: pycolmap.Reconstruction(wrong))
+    monkeypatch.setattr(module, "refine", lambda *_: None)
+    refs = sorted(_ids(shop))
+    cut, log = repair(wrong, pairs | {(a, b) for a in refs for b in refs if a < b}, shop)
+    assert log["cut"] == [f"cam/{frame:07d}" for frame in _MOVED]
+    assert cut.num_reg_images() == _KEYFRAMES - len(_MOVED)
+    assert _rms(cut, poses) < 0.01
+
+
+def _with_moved_block(model: Any, ids: dict[int, int]) -> Any:
+    wrong = pycolmap.Reconstruction(model)
     shift = pycolmap.Rigid3d(pycolmap.Rotation3d(np.eye(3)), np.array([1.0, 0.6, 0.4]))
     for frame in _MOVED:
         image = wrong.image(ids[frame])
         wrong.frame(image.frame_id).set_cam_from_world(image.camera_id, shift * image.cam_from_world())
-    assert _rms(wrong, poses) > 0.1
-    assert doubtful(links_of(shop.workspace, wrong)) == {ids[frame] for frame in _MOVED}
-    mended, log = repair(wrong, set(pairs), shop)
-    assert log["doubtful"] == 0
-    assert mended.num_reg_images() == _KEYFRAMES
-    assert _rms(mended, poses) < 0.01
+    return wrong
 
 
 def _ids(shop: Workshop) -> dict[ImageRef, int]:
