@@ -12,8 +12,9 @@ from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.registration.growth import wanted_keyframes
 from bodycap_batch.registration.pose import FramePose, PoseLimits
+from bodycap_batch.registration.seams import misplaced, without_keyframes
 from bodycap_batch.registration.solving import matrices, solve_frames
-from bodycap_batch.registration.stretches import all_tracks
+from bodycap_batch.registration.stretches import Known, all_tracks
 from bodycap_batch.registration.tracks import Tracks, anchors_of, track_scale
 from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 
@@ -54,19 +55,39 @@ def register_frames(
     scene_map = _own_map(maps, camera.name)
     if scene_map is None:
         return _without_map(camera, tried)
-    anchors = anchors_of(scene_map, camera.name)
-    tracks = all_tracks(camera, anchors, previous, context)
-    poses = solve_frames(camera, scene_map, tracks, _limits(camera, selection, options))
+    limits = _limits(camera, selection, options)
+    tracks = all_tracks(camera, anchors_of(scene_map, camera.name), Known.of(previous), context)
+    scene_map, tracks, doubtful = _without_misplaced(camera, scene_map, tracks, limits, context)
+    poses = solve_frames(camera, scene_map, tracks, limits)
     trajectory = _trajectory(camera, scene_map.gauge, poses, selection.sharpness)
+    asked = np.zeros(0, np.int64) if previous is None else previous.wanted_keyframes
+    lost = wanted_keyframes(trajectory.localised, selection.sharpness, tried)
     return Registration(
         trajectory=trajectory,
         obs_frame=tracks.frame,
         obs_keyframe=tracks.keyframe,
         obs_feature=tracks.feature,
         obs_px=tracks.px,
-        wanted_keyframes=wanted_keyframes(trajectory.localised, selection.sharpness, tried),
+        wanted_keyframes=np.union1d(lost, np.setdiff1d(doubtful, asked)),
         tried_keyframes=tried,
     )
+
+
+def _without_misplaced(
+    camera: CaptureCamera, scene_map: Map, tracks: Tracks, limits: PoseLimits, context: StageContext
+) -> tuple[Map, Tracks, IntArray]:
+    """The map without keyframes that the video contradicts, the others' tracks, and the frames left out.
+
+    Frames around a misplaced keyframe are tracked from the next ones that are in their place.
+    """
+    none = np.zeros(0, np.int64)
+    wrong = misplaced(camera.name, scene_map, tracks, limits.max_error_px)
+    if len(wrong) == 0:
+        return scene_map, tracks, none
+    known = Known(tracks, sorted(anchors_of(scene_map, camera.name)))
+    rest = without_keyframes(scene_map, wrong)
+    tracks = all_tracks(camera, anchors_of(rest, camera.name), known, context)
+    return rest, tracks, scene_map.keyframe_frame[wrong]
 
 
 def _tried(selection: KeyframeSelection, previous: Registration | None) -> IntArray:

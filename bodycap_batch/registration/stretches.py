@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from threading import Event, Lock
 
 import numpy as np
@@ -18,25 +18,45 @@ _MIN_RANGE = 15
 """A shorter rest is not worth a decoder of its own."""
 
 
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What was tracked before.
+
+    Attributes:
+        tracks: The observations.
+        keyframes: The frames they were tracked from and between, increasing.
+    """
+
+    tracks: Tracks
+    keyframes: list[int]
+
+    @staticmethod
+    def of(previous: Registration | None) -> Known | None:
+        """What an earlier registration tracked."""
+        if previous is None:
+            return None
+        status = previous.trajectory.status
+        frames = [index for index, value in enumerate(status) if value is FrameStatus.KEYFRAME]
+        tracks = Tracks(previous.obs_frame, previous.obs_keyframe, previous.obs_feature, previous.obs_px)
+        return Known(tracks, frames)
+
+
 def all_tracks(
     camera: CaptureCamera,
     anchors: Mapping[int, Anchor],
-    previous: Registration | None,
+    known: Known | None,
     context: StageContext,
 ) -> Tracks:
-    """Track every stretch between neighbouring keyframes, or reuse what the last round tracked there."""
+    """Track every stretch between neighbouring keyframes, or reuse what was tracked there before."""
     count = len(camera.times_ns)
     frames = sorted(anchors)
     stretches = list(zip([None, *frames], [*frames, None], strict=True))
-    known: set[tuple[int | None, int | None]] = set()
+    done: set[tuple[int | None, int | None]] = set()
     parts = []
-    if previous is not None:
-        status = previous.trajectory.status
-        before = [index for index, value in enumerate(status) if value is FrameStatus.KEYFRAME]
-        known = set(zip([None, *before], [*before, None], strict=True))
-        kept = [stretch for stretch in stretches if stretch in known]
-        parts.append(_reuse(previous, kept, count))
-    todo = _joined([stretch for stretch in stretches if stretch not in known], count)
+    if known is not None:
+        done = set(zip([None, *known.keyframes], [*known.keyframes, None], strict=True))
+        parts.append(_inside(known.tracks, [stretch for stretch in stretches if stretch in done], count))
+    todo = _joined([stretch for stretch in stretches if stretch not in done], count)
     return Tracks.join(parts + _track(camera, anchors, _shared_out(todo, frames, context.threads), context))
 
 
@@ -101,9 +121,8 @@ def _joined(stretches: list[tuple[int | None, int | None]], count: int) -> list[
     return ranges
 
 
-def _reuse(previous: Registration, stretches: list[tuple[int | None, int | None]], count: int) -> Tracks:
-    old = Tracks(previous.obs_frame, previous.obs_keyframe, previous.obs_feature, previous.obs_px)
+def _inside(tracks: Tracks, stretches: list[tuple[int | None, int | None]], count: int) -> Tracks:
     inside = np.zeros(count, dtype=bool)
     for first, last in stretches:
         inside[(0 if first is None else first) : (count if last is None else last + 1)] = True
-    return old.select(inside[old.frame])
+    return tracks.select(inside[tracks.frame])

@@ -1,0 +1,93 @@
+"""Keyframes that tracks contradict are found, and the right side of the gap is blamed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodycap_batch.arrays import FloatArray, IntArray
+from bodycap_batch.camera import Camera
+from bodycap_batch.geometry import invert, make_transform, transform_points
+from bodycap_batch.registration.seams import misplaced, without_keyframes
+from bodycap_batch.registration.tracks import Tracks
+from bodycap_batch.scene import Map
+
+_LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([400.0, 400.0, 320.0, 240.0]))
+_KEYFRAMES = 12
+_STEP = 5
+_POINTS = 120
+_LIMIT_PX = 2.0
+
+
+def _walk() -> FloatArray:
+    """map_from_cam of keyframes that go sideways along a wall 3 m ahead."""
+    return np.array([make_transform(np.eye(3), np.array([0.1 * k, 0.0, 0.0])) for k in range(_KEYFRAMES)])
+
+
+def _points() -> FloatArray:
+    return np.random.default_rng(0).uniform((-1.0, -1.0, 2.5), (2.0, 1.0, 3.5), (_POINTS, 3))
+
+
+def _map(moved: IntArray, shift_m: float) -> tuple[Map, Tracks]:
+    """A map in which some keyframes stand elsewhere, with their own points; tracks of the true walk."""
+    poses, points = _walk(), _points()
+    true_px = np.array([_LENS.project(transform_points(pose, points)) for pose in invert(poses)])
+    shift = np.array([0.0, shift_m, 0.0])
+    wrong = np.isin(np.arange(_KEYFRAMES), moved)
+    poses[wrong, :3, 3] += shift
+    keyframe, feature = np.repeat(np.arange(_KEYFRAMES), _POINTS), np.tile(np.arange(_POINTS), _KEYFRAMES)
+    scene_map = Map(
+        gauge="g",
+        cameras={"cam": _LENS},
+        keyframe_camera=("cam",) * _KEYFRAMES,
+        keyframe_frame=np.arange(_KEYFRAMES) * _STEP,
+        map_from_cam=poses,
+        points=np.concatenate([points, points + shift]),
+        colors=np.zeros((2 * _POINTS, 3), np.uint8),
+        point_error_px=np.zeros(2 * _POINTS),
+        obs_keyframe=keyframe,
+        obs_point=feature + _POINTS * wrong[keyframe],
+        obs_feature=feature,
+        obs_px=true_px.reshape(-1, 2),
+    )
+    parts = []
+    for first, second in zip(range(_KEYFRAMES - 1), range(1, _KEYFRAMES), strict=True):
+        for source, to in ((first, second), (second, first)):
+            frame, origin = (np.full(_POINTS, number * _STEP) for number in (to, source))
+            parts.append(Tracks(frame, origin, np.arange(_POINTS), true_px[to].astype(np.float32)))
+    return scene_map, Tracks.join(parts)
+
+
+@pytest.mark.parametrize("moved", [[5], [4, 5, 6], [0, 1], [10, 11]])
+def test_a_block_in_the_wrong_place_is_blamed(moved: list[int]) -> None:
+    # 0.2 m at 3 m and 400 px are 27 px: far beyond four limits of 2 px.
+    scene_map, tracks = _map(np.array(moved), 0.2)
+    assert misplaced("cam", scene_map, tracks, _LIMIT_PX).tolist() == moved
+
+
+def test_a_bent_but_whole_map_is_left_alone() -> None:
+    # 0.03 m are 4 px, two limits.
+    scene_map, tracks = _map(np.array([4, 5, 6]), 0.03)
+    assert len(misplaced("cam", scene_map, tracks, _LIMIT_PX)) == 0
+    assert len(misplaced("cam", scene_map, Tracks.join([]), _LIMIT_PX)) == 0
+    assert len(misplaced("other", scene_map, tracks, _LIMIT_PX)) == 0
+
+
+def test_the_scale_of_a_map_changes_no_verdict() -> None:
+    scene_map, tracks = _map(np.array([4, 5, 6]), 0.2)
+    for factor in (0.1, 10.0):
+        poses = scene_map.map_from_cam.copy()
+        poses[:, :3, 3] *= factor
+        fields = {name: getattr(scene_map, name) for name in scene_map.__dataclass_fields__}
+        scaled = Map(**{**fields, "map_from_cam": poses, "points": factor * scene_map.points})
+        assert misplaced("cam", scaled, tracks, _LIMIT_PX).tolist() == [4, 5, 6]
+
+
+def test_the_rest_keeps_its_observations() -> None:
+    scene_map, _ = _map(np.array([5]), 0.2)
+    rest = without_keyframes(scene_map, np.array([5]))
+    assert rest.gauge == scene_map.gauge
+    assert rest.keyframe_frame.tolist() == [k * _STEP for k in range(_KEYFRAMES) if k != 5]
+    assert len(rest.obs_px) == (_KEYFRAMES - 1) * _POINTS
+    kept = rest.points_of("cam", np.array([6 * _STEP, 5 * _STEP]), np.array([7, 7]))
+    assert kept.tolist() == [7, -1]
