@@ -1,7 +1,16 @@
 """Pre-flight: open everything a job needs, compute nothing."""
 
+from bodycap_batch.check.limits import require_within
 from bodycap_batch.check.preflight import check_job, check_path, require_ready
 from bodycap_batch.check.report import CameraFinding, CheckReport
 from bodycap_batch.check.room import require_room
 
-__all__ = ["CameraFinding", "CheckReport", "check_job", "check_path", "require_ready", "require_room"]
+__all__ = [
+    "CameraFinding",
+    "CheckReport",
+    "check_job",
+    "check_path",
+    "require_ready",
+    "require_room",
+    "require_within",
+]

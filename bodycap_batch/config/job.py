@@ -14,13 +14,17 @@ from pydantic import ValidationError
 from bodycap_batch.config.calibration import CalibrationEntry, read_calibration
 from bodycap_batch.config.explain import Problem, job_error, problems_of
 from bodycap_batch.config.folder import chapters_in, folder_capture
+from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.models import SKELETON_PRESETS, CameraConfig, CaptureConfig, Job
 from bodycap_batch.config.rules import problems_in, skeleton_of
+from bodycap_batch.config.trust import PathPolicy
 from bodycap_batch.config.yaml_source import YamlSource, read_yaml
 from bodycap_batch.errors import CaptureError, JobError
 
 _HEIGHT_M = (0.4, 2.6)
 _LISTS = ("video", "timestamps")
+_NAME_LENGTH = 100
+"""What a job's name may have; a folder's may be longer."""
 
 Prepare = Callable[[Mapping[str, Any], Path], None]
 """Called with the options of `capture.synthetic` and the folder its videos belong into."""
@@ -35,13 +39,22 @@ class Overrides:
     height_m: float | None = None
 
 
-def load_job(path: Path, overrides: Overrides | None = None, *, prepare: Prepare | None = None) -> Job:
+def load_job(
+    path: Path,
+    overrides: Overrides | None = None,
+    *,
+    prepare: Prepare | None = None,
+    policy: PathPolicy | None = None,
+    limits: Limits | None = None,
+) -> Job:
     """Load a job and resolve it: absolute paths, chapters and sidecars listed, calibrations read.
 
     Args:
         path: A YAML file (paths in it are relative to it), or a folder of videos.
         overrides: Values of the command line.
         prepare: Makes the videos of a job with `capture.synthetic` before they are looked for.
+        policy: Which files the job may name; any, where it is the user's own.
+        limits: How large the YAML file may be.
 
     Returns:
         The job; `Job.model_validate(job.model_dump(mode="json"))` gives it back.
@@ -54,15 +67,20 @@ def load_job(path: Path, overrides: Overrides | None = None, *, prepare: Prepare
     if full.is_dir():
         source, data, base = None, {"capture": folder_capture(full)}, full
     else:
-        source = read_yaml(full)
+        source = _read(full, limits or Limits())
         data, base = _mapping(source), full.parent
     job = _with_overrides(_validated(data, full, source), overrides or Overrides())
     problems = problems_in(job)
     if problems:
         raise job_error(problems, full, source)
+    if policy is not None:
+        policy.require_named(job, base)
     if job.capture.synthetic is not None:
         _prepare_synthetic(job, base, full, prepare)
-    return _resolved(job, base, _safe_name(full.name if full.is_dir() else full.stem), full, source)
+    resolved = _resolved(job, base, safe_name(full.name if full.is_dir() else full.stem), full, source)
+    if policy is not None:
+        policy.require_resolved(resolved)
+    return resolved
 
 
 def synthetic_folder(job: Job, base: Path) -> Path:
@@ -75,6 +93,10 @@ def synthetic_folder(job: Job, base: Path) -> Path:
             hint="bodycap synth writes <folder>/<camera>.mp4",
         )
     return folders.pop()
+
+
+def _read(path: Path, limits: Limits) -> YamlSource:
+    return read_yaml(path, max_bytes=int(1024 * limits.yaml_kb), max_depth=int(limits.yaml_depth))
 
 
 def _mapping(source: YamlSource) -> dict[str, Any]:
@@ -214,5 +236,6 @@ def _existing(path: Path) -> list[Path]:
     return [path] if path.is_file() else []
 
 
-def _safe_name(text: str) -> str:
-    return re.sub(r"[^A-Za-z0-9._\-]+", "_", text).strip("._-") or "job"
+def safe_name(text: str) -> str:
+    """A text as a name for files: letters, digits, ``.``, ``_`` and ``-``."""
+    return re.sub(r"[^A-Za-z0-9._\-]+", "_", text)[:_NAME_LENGTH].strip("._-") or "job"

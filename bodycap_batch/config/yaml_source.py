@@ -51,14 +51,14 @@ class YamlSource:
         return self.lines[location]
 
 
-def read_yaml(path: Path) -> YamlSource:
-    """Read a YAML file.
+def read_yaml(path: Path, *, max_bytes: int = MAX_BYTES, max_depth: int = MAX_DEPTH) -> YamlSource:
+    """Read a YAML file of at most `max_bytes`, nested at most `max_depth` levels deep.
 
     Raises:
         JobError: Unreadable, no YAML, a key twice, anchors, or too large or deep; names the line.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
+        if path.stat().st_size > max_bytes:
             raise JobError("far too large for a job", path=path, hint="give the job's YAML file")
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
@@ -70,7 +70,7 @@ def read_yaml(path: Path) -> YamlSource:
             f"cannot read the job ({error})", path=path, hint="a YAML file, saved as UTF-8"
         ) from error
     try:
-        _refuse_traps(text, path)
+        _refuse_traps(text, path, max_depth)
         node = yaml.compose(text, Loader=yaml.SafeLoader)
     except yaml.MarkedYAMLError as error:
         raise _syntax_error(error, text, path) from error
@@ -83,15 +83,15 @@ def read_yaml(path: Path) -> YamlSource:
     return YamlSource(path=path, data=data, lines=lines)
 
 
-def _refuse_traps(text: str, path: Path) -> None:
+def _refuse_traps(text: str, path: Path, max_depth: int) -> None:
     """Bound the depth before anything recurses, and refuse anchors, aliases and tags."""
     depth = 0
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         line = 0 if event.start_mark is None else event.start_mark.line + 1
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
-            if depth > MAX_DEPTH:
-                message = f"nested deeper than {MAX_DEPTH} levels"
+            if depth > max_depth:
+                message = f"nested deeper than {max_depth} levels"
                 raise JobError(message, path=path, line=line, hint="no job is that deep")
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1

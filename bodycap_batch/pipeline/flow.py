@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,8 +76,10 @@ class Flow:
             BodycapError: The job, a video or a calibration cannot be used.
         """
         body = body_digest(self._job, self._settings.store.digests) if has_body(self._job) else None
-        key = key_of("check", {}, {"cameras": self._digests, "body": body})
-        task = Task(key=key, arguments={"job": self._job.model_dump(mode="json")})
+        limits = self._settings.limits
+        bounds = {} if limits is None else {"limits": asdict(limits)}
+        key = key_of("check", {}, {"cameras": self._digests, "body": body, **bounds})
+        task = Task(key=key, arguments={"job": self._job.model_dump(mode="json"), **bounds})
         artefact = self._one(task, [STAGES["keyframes"].modules] * (self._side_by_side - 1))
         self._frames = int(read_summary(artefact.path)["frames"])
         for note in read_summary(artefact.path)["notes"]:

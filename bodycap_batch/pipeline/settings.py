@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from bodycap_batch.config.limits import Limits
 from bodycap_batch.errors import Cancelled
 from bodycap_batch.progress import Listener
 from bodycap_batch.runner import CHILD, Children, Executor, Rules, Runner, Task
@@ -41,6 +42,7 @@ class Settings:
         redo: Stages that are computed anew although they are stored.
         until: Last stage to run; then there are no results. "" runs all.
         priority: Higher goes first where several jobs wait.
+        limits: How large the videos may be; None where they are the user's own.
     """
 
     store: Store
@@ -54,6 +56,7 @@ class Settings:
     redo: frozenset[str] = frozenset()
     until: str = ""
     priority: int = 0
+    limits: Limits | None = None
 
     def runner(
         self, logs: Path, also: Callable[[], bool] = _no, before: Callable[[Task], None] = _nothing

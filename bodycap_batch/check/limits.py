@@ -1,0 +1,43 @@
+"""Refuse a video beyond the operator's limits before any of it is decoded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bodycap_batch.capture.video import open_container, video_stream
+from bodycap_batch.config.limits import Limits
+from bodycap_batch.config.models import Job
+from bodycap_batch.errors import CaptureError
+
+
+def require_within(job: Job, limits: Limits) -> None:
+    """Look at what every video's container says of its size and duration.
+
+    Raises:
+        CaptureError: One of them is larger or longer than allowed, or no readable video.
+    """
+    for index, camera in enumerate(job.capture.cameras):
+        for path in camera.video:
+            _require(path, limits, f"capture.cameras.{index}.video")
+
+
+def _require(path: Path, limits: Limits, field: str) -> None:
+    with open_container(path) as container:
+        stream = video_stream(container, path)
+        side = max(stream.codec_context.width, stream.codec_context.height)
+        seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else 0.0
+        seconds = max(seconds, container.duration / 1e6 if container.duration else 0.0)
+    if side > limits.video_px:
+        raise CaptureError(
+            f"{side} pixels wide or high, the limit is {limits.video_px:g}",
+            path=path,
+            field=field,
+            hint="film or convert it smaller, or ask the operator to raise --limit video_px",
+        )
+    if seconds > 3600 * limits.video_hours:
+        raise CaptureError(
+            f"{seconds / 3600:.2f} hours, the limit is {limits.video_hours:g}",
+            path=path,
+            field=field,
+            hint="cut the recording, or ask the operator to raise --limit video_hours",
+        )

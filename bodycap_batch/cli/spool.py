@@ -1,0 +1,118 @@
+"""`bodycap status`, `retry` and `cancel`: the jobs of a watched folder."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from bodycap_batch.cli.base import app
+
+if TYPE_CHECKING:
+    from bodycap_batch.watch import JobRow, Spool
+
+SpoolArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="[DIR]", help="The watched folder, or the one that holds inbox/, running/, done/."
+    ),
+]
+NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="The job, as `bodycap status` lists it.")]
+_UNITS = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
+_CAUSE_CHARACTERS = 200
+
+
+@app.command()
+def status(
+    spool: SpoolArgument = Path("jobs"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print the rows as JSON.")] = False,
+) -> None:
+    """List the jobs of a watched folder: state, stage, progress, age, cause of failure.
+
+    \b
+    Examples:
+      bodycap status
+      bodycap status /mnt/nas/jobs --json
+    """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.watch import rows_of
+
+    rows = rows_of(_spool(spool))
+    if as_json:
+        _print(json.dumps([row.to_dict() for row in rows], indent=1))
+        return
+    for line in _table(rows):
+        _print(line)
+
+
+@app.command()
+def retry(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
+    """Put a failed or cancelled job back into the inbox.
+
+    Its folder may be mended first (failed/NAME/input/). Stages that were finished are not computed again.
+
+    \b
+    Example:
+      bodycap retry kitchen_walk
+    """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.watch import retry_job
+
+    _print(f"back in the inbox: {retry_job(_spool(spool), name)}")
+
+
+@app.command()
+def cancel(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
+    """Cancel a job that waits or runs, within five seconds. Its finished stages are kept for a retry.
+
+    \b
+    Example:
+      bodycap cancel kitchen_walk
+    """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.watch import cancel_job
+
+    place = cancel_job(_spool(spool), name)
+    if place is None:
+        _print(f"{name}: no watcher has stopped it yet; it is cancelled when one looks")
+    else:
+        _print(f"cancelled: {place.path}")
+
+
+def _spool(path: Path) -> Spool:
+    from bodycap_batch.errors import JobError
+    from bodycap_batch.watch import spool_at
+
+    if not path.is_dir():
+        raise JobError("no such folder", path=path, hint="name the watched folder, for example jobs/inbox")
+    return spool_at(path)
+
+
+def _table(rows: list[JobRow]) -> list[str]:
+    if not rows:
+        return ["no jobs"]
+    cells = [("JOB", "STATE", "STAGE", "PROGRESS", "AGE", "")]
+    for row in rows:
+        share = "" if row.progress is None else f"{row.progress:.0%}"
+        cause = " ".join(row.cause.split())
+        cause = cause if len(cause) <= _CAUSE_CHARACTERS else f"{cause[: _CAUSE_CHARACTERS - 1]}…"
+        cells.append((row.name, row.state, row.stage, share, _age(row.age_s), cause))
+    widths = [max(len(line[column]) for line in cells) for column in range(5)]
+    lines = [
+        "  ".join(f"{part:{width}}" for part, width in zip(line, widths, strict=False)) for line in cells
+    ]
+    return [f"{line}  {cell[5]}".rstrip() for line, cell in zip(lines, cells, strict=True)]
+
+
+def _age(seconds: float | None) -> str:
+    if seconds is None:
+        return ""
+    for size, unit in _UNITS:
+        if seconds >= size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{max(seconds, 0.0):.0f} s"
+
+
+def _print(text: str) -> None:
+    encoding = sys.stdout.encoding or "utf-8"
+    typer.echo(text.encode(encoding, "backslashreplace").decode(encoding))

@@ -1,0 +1,125 @@
+"""`bodycap watch`."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from bodycap_batch.cli.base import app
+from bodycap_batch.cli.run import ThreadsOption, cores
+from bodycap_batch.cli.stop import exit_code_of_stop, stoppable
+
+if TYPE_CHECKING:
+    from bodycap_batch.watch import Watcher
+
+
+RootOption = Annotated[
+    list[Path] | None,
+    typer.Option(metavar="DIR", help="A folder whose files any job may name; may be given several times."),
+]
+LimitOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=VALUE",
+        help="How large a job may be (default: video_gb=64 video_hours=4 video_px=8192 files=10000 "
+        "yaml_kb=1024 yaml_depth=20); may be given several times.",
+    ),
+]
+
+
+@app.command()
+def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
+    inbox: Annotated[
+        Path, typer.Argument(metavar="[INBOX]", help="The folder to watch.", show_default=True)
+    ] = Path("jobs/inbox"),
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Jobs worked on side by side.")] = 1,
+    threads: ThreadsOption = None,
+    store: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Where finished stages are kept (default: .store beside INBOX)."),
+    ] = None,
+    root: RootOption = None,
+    limit: LimitOption = None,
+    settle: Annotated[
+        float, typer.Option(min=0.0, metavar="SECONDS", help="A drop is complete when unchanged for so long.")
+    ] = 10.0,
+    poll: Annotated[
+        bool | None,
+        typer.Option("--poll/--no-poll", help="Look for changes by polling (default: on network disks)."),
+    ] = None,
+    stale: Annotated[
+        float,
+        typer.Option(
+            min=1.0, metavar="SECONDS", help="Take jobs over whose watcher gave no sign for so long."
+        ),
+    ] = 60.0,
+    once: Annotated[bool, typer.Option("--once", help="Leave when nothing is left to do.")] = False,
+) -> None:
+    """Work on every folder of videos, or job file, that is dropped into INBOX.
+
+    A folder is taken when nothing in it has changed for a while and no *.part or hidden file is left, or at
+    once when it holds a file READY. Jobs move from inbox/ to running/ and then to done/ or failed/ beside it;
+    done/NAME/result/ holds the results, done/NAME/input/ what was dropped. Stop it with Ctrl-C at any time:
+    it goes on where it was. Several watchers, also on several machines, may share the folders.
+
+    A dropped job may name files of its own folder and below --root, nothing else.
+
+    \b
+    Examples:
+      bodycap watch jobs/inbox
+      bodycap watch /mnt/nas/jobs/inbox --root /mnt/nas/footage --jobs 2 --poll
+      bodycap watch jobs/inbox --once          work off what is there, then leave
+      bodycap status jobs                      how the jobs are
+    """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.config.limits import limits_from
+    from bodycap_batch.watch import Terms, Watcher, WatchOptions, spool_at
+
+    spool = spool_at(inbox)
+    options = WatchOptions(
+        terms=Terms(roots=tuple(map(_folder, root or ())), limits=limits_from(limit or ())),
+        store=store,
+        jobs=jobs,
+        threads=threads or cores(),
+        settle_s=settle,
+        stale_s=stale,
+        poll=poll,
+        once=once,
+    )
+    with stoppable() as stop:
+        watcher = Watcher(spool, options, _say)
+        _say(f"watching {spool.inbox}; results go to {spool.done}")
+        worst = _run(watcher, stop)
+    if stop.is_set():
+        _say("stopped; running jobs go on at the next start")
+        raise typer.Exit(exit_code_of_stop())
+    raise typer.Exit(worst)
+
+
+def _run(watcher: Watcher, stop: threading.Event) -> int:
+    """Run the watcher until it ends or the user stops it."""
+
+    def end() -> None:
+        stop.wait()
+        watcher.stop()
+
+    threading.Thread(target=end, name="stop", daemon=True).start()
+    return watcher.run()
+
+
+def _folder(path: Path) -> Path:
+    from bodycap_batch.errors import JobError
+
+    if not path.is_dir():
+        raise JobError("no such folder", path=path, field="--root", hint="name a folder that exists")
+    return path.resolve()
+
+
+def _say(text: str) -> None:
+    line = f"{time.strftime('%H:%M:%S')} {text}\n"
+    sys.stderr.write(line.encode(errors="backslashreplace").decode())
+    sys.stderr.flush()

@@ -1,0 +1,130 @@
+"""From the inbox into `running`, where the rename is the claim; and back into the inbox."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import uuid
+from pathlib import Path
+
+from bodycap_batch.config.models import Job
+from bodycap_batch.errors import BodycapError
+from bodycap_batch.store import store_error
+from bodycap_batch.watch.claim import Claim, first_claim
+from bodycap_batch.watch.drops import Drop, Look, look_at
+from bodycap_batch.watch.intake import Terms, other_job_files, read_drop, write_job
+from bodycap_batch.watch.spool import CLAIM_PREFIX, RETRY_PREFIX, JobDir, Spool, move, spool_name
+from bodycap_batch.watch.status import StatusFile, read_status
+
+
+def claim_drop(
+    spool: Spool, drop: Drop, look: Look, terms: Terms
+) -> tuple[Claim, BodycapError | None] | None:
+    """Take a complete drop out of the inbox.
+
+    The job is read where it was dropped and written into a folder that nobody sees. Renaming the drop into
+    that folder is the claim: of two watchers one finds nothing left to rename. Then the folder gets its name
+    in `running`.
+
+    Returns:
+        The claim and what is wrong with the job, if anything; None where another watcher was quicker, or
+        the drop is still being written to after all.
+
+    Raises:
+        StoreError: The drop cannot be moved.
+    """
+    place = JobDir(spool.running / f"{CLAIM_PREFIX}{uuid.uuid4().hex}")
+    place.path.mkdir()
+    claim = first_claim(place)
+    try:
+        error = _prepare(place, drop, look, terms)
+        if not _take(place, drop, look, terms):
+            shutil.rmtree(place.path)
+            return None
+    except OSError as failed:
+        shutil.rmtree(place.path, ignore_errors=True)
+        raise store_error(failed, drop.path) from failed
+    settle_claim(spool, claim)
+    return claim, error
+
+
+def settle_claim(spool: Spool, claim: Claim) -> None:
+    """Give a claimed folder its name in `running`."""
+    before = read_status(claim.job)
+    status = StatusFile(claim.job, before)
+    dropped = str(before.get("dropped") or "job")
+    wanted = spool_name(Path(dropped).stem if before.get("kind") == "file" else dropped)
+
+    def rename(target: Path) -> None:
+        status.change(name=target.name)
+
+    claim.moved_to(JobDir(move(claim.job.path, spool.running, spool.free_name(wanted), rename)))
+
+
+def has_input(place: JobDir) -> bool:
+    """True once something of the user's is in a claimed folder."""
+    return os.path.lexists(dropped_in(place))
+
+
+def dropped_in(place: JobDir) -> Path:
+    """What was dropped: the folder, or the job file that came alone."""
+    document = read_status(place)
+    return place.input / str(document.get("dropped")) if document.get("kind") == "file" else place.input
+
+
+def give_back(spool: Spool, place: JobDir) -> Path | None:
+    """Put what was dropped back into the inbox and remove the rest; returns where it lies now."""
+    dropped, target = dropped_in(place), None
+    if os.path.lexists(dropped):
+        name = str(read_status(place).get("dropped") or place.name)
+        target = move(dropped, spool.inbox, name, suffix=dropped.suffix if dropped != place.input else "")
+    shutil.rmtree(place.path, ignore_errors=True)
+    return target
+
+
+def finish_retries(spool: Spool) -> None:
+    """Finish moves back into the inbox that a killed `retry` began."""
+    for path in sorted(spool.failed.glob(f"{RETRY_PREFIX}*")):
+        with contextlib.suppress(FileNotFoundError):  # it is just being done
+            give_back(spool, JobDir(path))
+
+
+def _prepare(place: JobDir, drop: Drop, look: Look, terms: Terms) -> BodycapError | None:
+    """Read the job and write all but its input; returns what is wrong with it."""
+    job, error = _read(drop, look, terms)
+    if job is not None:
+        write_job(job, place, drop.path.parent / drop.path.name if not drop.is_file else place.input)
+    status = StatusFile(place)
+    for name in [] if drop.is_file else other_job_files(drop.path):
+        status.note(f"{name} was not read: a job file in a folder is called job.yaml")
+    status.change(kind="file" if drop.is_file else "folder", dropped=drop.path.name)
+    return error
+
+
+def _take(place: JobDir, drop: Drop, look: Look, terms: Terms) -> bool:
+    """Rename the drop into the claimed folder; False where it is gone, or changes still."""
+    if drop.is_file:
+        place.input.mkdir()
+    target = place.input / drop.path.name if drop.is_file else place.input
+    leads_to = os.path.realpath(drop.path) if drop.path.is_symlink() else ""
+    try:
+        os.rename(drop.path, target)
+    except FileNotFoundError:
+        return False
+    if leads_to:  # a relative link would lead elsewhere from its new place
+        whole = place.path / "link"
+        whole.symlink_to(leads_to)
+        os.replace(whole, target)
+        return True
+    if look_at(Drop(target), int(terms.limits.files)).digest == look.digest:
+        return True
+    move(target, drop.path.parent, drop.path.name)
+    return False
+
+
+def _read(drop: Drop, look: Look, terms: Terms) -> tuple[Job | None, BodycapError | None]:
+    try:
+        return read_drop(drop, look, terms), None
+    except BodycapError as error:
+        return None, error

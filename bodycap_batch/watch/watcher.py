@@ -1,0 +1,162 @@
+"""Watch a folder: claim what is complete, work on it, take over what was left behind."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+
+from bodycap_batch.errors import BodycapError, StoreError
+from bodycap_batch.watch.changes import Changes
+from bodycap_batch.watch.claim import Claim, Onlooker, take_over
+from bodycap_batch.watch.claiming import claim_drop, finish_retries, has_input, settle_claim
+from bodycap_batch.watch.drops import Drop, Look, Settling, drops_in
+from bodycap_batch.watch.options import WatchOptions
+from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir, Spool, visible
+from bodycap_batch.watch.work import Outcome, Worker
+
+Teller = Callable[[str], None]
+_LOOK_S = 1.0
+_IDLE_LOOK_S = 5.0
+"""A look at the folder although nobody told a change, with and without something being copied."""
+_ORPHANS_S = 2.0
+
+
+class Watcher:
+    """One process that works on a spool; others may work on the same one.
+
+    Args:
+        spool: The folders.
+        options: How they are watched.
+        tell: Called with a line for the operator.
+
+    Raises:
+        StoreError: The folders cannot be written, or do not lie on one file system.
+    """
+
+    def __init__(self, spool: Spool, options: WatchOptions, tell: Teller) -> None:
+        spool.make()
+        finish_retries(spool)
+        self._spool = spool
+        self._options = options
+        self._tell = tell
+        self._stop = threading.Event()
+        self._woken = threading.Event()
+        self._settling = Settling(options.settle_s, int(options.terms.limits.files))
+        self._onlooker = Onlooker(options.stale_s)
+        self._worker = Worker(spool, options, self._stop)
+        self._running: dict[Future[Outcome], Claim] = {}
+        self._refused: dict[str, str] = {}
+        self._orphans_at = 0.0
+        self._worst = 0
+
+    def stop(self) -> None:
+        """End: running jobs stop and are left for the next start. May be called from anywhere."""
+        self._stop.set()
+        self._woken.set()
+
+    def run(self) -> int:
+        """Watch until stopped, or with `once` until nothing is left to do.
+
+        Returns:
+            The worst exit code of the jobs that ended.
+        """
+        heart = threading.Thread(target=self._beat, name="heartbeat")
+        with (
+            Changes(self._spool.inbox, self._woken, poll=self._options.poll),
+            ThreadPoolExecutor(max_workers=self._options.jobs, thread_name_prefix="job") as pool,
+        ):
+            heart.start()
+            try:
+                while not self._stop.is_set():
+                    self._woken.clear()
+                    self._collect()
+                    if not self._fill(pool) and self._options.once:
+                        break
+                    self._woken.wait(_LOOK_S if self._settling.waiting or self._running else _IDLE_LOOK_S)
+            finally:
+                self._stop.set()
+                heart.join()
+        self._collect()
+        return self._worst
+
+    def _beat(self) -> None:
+        while not self._stop.wait(self._options.beat_s):
+            for claim in list(self._running.values()):
+                claim.beat()
+
+    def _collect(self) -> None:
+        """Tell how the jobs ended that have."""
+        for future in [future for future in self._running if future.done()]:
+            del self._running[future]
+            outcome = future.result()
+            if outcome.state not in ("lost", "stopped"):
+                self._worst = max(self._worst, outcome.exit_code)
+            where = f" -> {outcome.place}" if outcome.place is not None else ""
+            self._tell(
+                f"{outcome.name}: {outcome.state}{where}"
+                + (f": {outcome.message}" if outcome.message else "")
+            )
+
+    def _fill(self, pool: ThreadPoolExecutor) -> bool:
+        """Start jobs while there is room; False where nothing runs and nothing is to come."""
+        free = self._options.jobs - len(self._running)
+        for claim in self._orphans(free):
+            self._start(pool, claim, None)
+            free -= 1
+        drops = drops_in(self._spool.inbox)
+        complete = self._settling.complete(drops)
+        for drop, look in complete:
+            if free <= 0:
+                break
+            if (claimed := self._claim(drop, look)) is not None:
+                self._start(pool, *claimed)
+                free -= 1
+        return bool(self._running) or any(str(drop.path) not in self._refused for drop in drops)
+
+    def _start(self, pool: ThreadPoolExecutor, claim: Claim, refused: BodycapError | None) -> None:
+        if refused is None:
+            self._tell(f"{claim.job.name}: started")
+        future = pool.submit(self._worker.work, claim, refused)
+        self._running[future] = claim
+        future.add_done_callback(lambda _: self._woken.set())
+
+    def _claim(self, drop: Drop, look: Look) -> tuple[Claim, BodycapError | None] | None:
+        """Claim a drop; one that cannot be moved is told once, and tried again when it changes."""
+        if self._refused.get(str(drop.path)) == look.digest:
+            return None
+        try:
+            return claim_drop(self._spool, drop, look, self._options.terms)
+        except StoreError as error:
+            self._refused[str(drop.path)] = look.digest
+            self._worst = max(self._worst, error.exit_code)
+            self._tell(f"{drop.name}: cannot be taken out of the inbox: {error}")
+            return None
+
+    def _orphans(self, most: int) -> list[Claim]:
+        """Take over jobs whose watcher is gone."""
+        now = time.monotonic()
+        if most <= 0 or now < self._orphans_at:
+            return []
+        self._orphans_at = now + _ORPHANS_S
+        mine = {claim.job.path for claim in self._running.values()}
+        half_claimed = [JobDir(path) for path in sorted(self._spool.running.glob(f"{CLAIM_PREFIX}*"))]
+        jobs = [*half_claimed, *(JobDir(path) for path in visible(self._spool.running) if path.is_dir())]
+        found: list[Claim] = []
+        for job in self._onlooker.abandoned([job for job in jobs if job.path not in mine]):
+            if len(found) < most and (claim := self._adopt(job)) is not None:
+                found.append(claim)
+        return found
+
+    def _adopt(self, job: JobDir) -> Claim | None:
+        claim = take_over(job)
+        if claim is None:
+            return None
+        if job.path.name.startswith(CLAIM_PREFIX):
+            if not has_input(job):  # ended before it had claimed anything
+                shutil.rmtree(job.path, ignore_errors=True)
+                return None
+            settle_claim(self._spool, claim)
+        return claim

@@ -1,0 +1,174 @@
+"""One claimed job: run it, say how it ended, file it away."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+
+from bodycap_batch.errors import BodycapError, Cancelled, JobError, StoreError, error_from_dict
+from bodycap_batch.pipeline import Settings, run_job
+from bodycap_batch.store import Store
+from bodycap_batch.watch.claim import Claim, clear_claim
+from bodycap_batch.watch.intake import read_job, rewrite_results
+from bodycap_batch.watch.options import WatchOptions
+from bodycap_batch.watch.spool import JobDir, Spool, move
+from bodycap_batch.watch.status import FINAL, State, StatusFile, append_log, read_status, time_text
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """How a job ended.
+
+    Attributes:
+        name: The job.
+        state: As in `status.json`; "lost" where another watcher has it now.
+        exit_code: 0, that of the error, or 70.
+        message: One line for the operator.
+        place: Where the job lies now.
+    """
+
+    name: str
+    state: str
+    exit_code: int = 0
+    message: str = ""
+    place: Path | None = None
+
+
+class Worker:
+    """Works on claimed jobs; one instance for all of them.
+
+    Args:
+        spool: The spool.
+        options: How it is watched.
+        stop: Set when the watcher is to end.
+    """
+
+    def __init__(self, spool: Spool, options: WatchOptions, stop: threading.Event) -> None:
+        self._spool = spool
+        self._options = options
+        self._stop = stop
+        self._store = Store(options.store or spool.root / ".store")
+
+    def work(self, claim: Claim, refused: BodycapError | None = None) -> Outcome:
+        """Take a claimed job to its end: filed away, or left for the next watcher.
+
+        Args:
+            claim: The hold on the job.
+            refused: What was found wrong with it when it was read.
+        """
+        try:
+            return self._work(claim, refused)
+        except (BodycapError, OSError) as error:  # the spool's own disk; tried again once the claim is stale
+            claim.end()
+            return Outcome(
+                name=claim.job.name, state="stuck", exit_code=StoreError.exit_code, message=str(error)
+            )
+
+    def _work(self, claim: Claim, refused: BodycapError | None) -> Outcome:
+        before = read_status(claim.job)
+        if before.get("state") in FINAL:  # all was said before its watcher ended, but for the move
+            return self._file(claim, before["state"], _told(before), None)
+        status = StatusFile(claim.job, before)
+        try:
+            if refused is not None:
+                raise refused
+            self._run(claim, status)
+        except Cancelled as error:
+            return self._interrupted(claim, status, error)
+        except BodycapError as error:
+            return self._end(claim, status, "failed", error)
+        except Exception as error:  # noqa: BLE001 - the one place where a job's bugs are caught
+            append_log(claim.job, traceback.format_exc())
+            hint = "this is a bug in bodycap; please report it with this log and the job"
+            bug = BodycapError(f"{type(error).__name__}: {error}", path=claim.job.log, hint=hint)
+            return self._end(claim, status, "failed", bug)
+        return self._end(claim, status, "done", None)
+
+    def _run(self, claim: Claim, status: StatusFile) -> None:
+        place = claim.job
+        self._check_cancelled(claim)
+        status.change(
+            state="running",
+            started_at=time_text(),
+            attempts=status.document["attempts"] + 1,
+            host=socket.gethostname(),
+            generation=claim.generation,
+        )
+        if not place.job.is_file():  # its watcher ended before the job was written down
+            raise JobError("the job was never read", path=place.input, hint="retry it: it is read anew")
+        job = read_job(place, self._options.terms)
+        settings = Settings(
+            store=self._store,
+            threads=max(1, self._options.threads // self._options.jobs),
+            listener=status,
+            cancelled=lambda: self._is_cancelled(claim),
+            command=self._options.command,
+            may_commit=claim.guard.holds,
+            limits=self._options.terms.limits,
+        )
+        try:
+            run_job(job, out_dir=place.result, settings=settings)
+        finally:
+            if claim.guard.holds():
+                rewrite_results(place)
+
+    def _is_cancelled(self, claim: Claim) -> bool:
+        return self._stop.is_set() or claim.lost.is_set() or claim.job.cancel.exists()
+
+    def _check_cancelled(self, claim: Claim) -> None:
+        if self._is_cancelled(claim):
+            raise Cancelled("stopped before it was started", hint="retry it")
+
+    def _interrupted(self, claim: Claim, status: StatusFile, error: Cancelled) -> Outcome:
+        """The user cancelled the job, the watcher ends, or another watcher has the job."""
+        name = claim.job.name
+        if not claim.guard.holds():
+            claim.lost.set()
+            return Outcome(name=name, state="lost", message="another watcher has taken it over")
+        if claim.job.cancel.exists():
+            error = Cancelled("cancelled; finished stages are kept", hint=f"`bodycap retry {name}` goes on")
+            return self._end(claim, status, "cancelled", error)
+        status.change(state="stopped", active={})
+        claim.release()
+        return Outcome(
+            name=name, state="stopped", exit_code=error.exit_code, message="goes on at the next start"
+        )
+
+    def _end(self, claim: Claim, status: StatusFile, state: State, error: BodycapError | None) -> Outcome:
+        if error is not None:
+            append_log(claim.job, f"{state}: {error}")
+        return self._file(claim, state, error, status)
+
+    def _file(
+        self, claim: Claim, state: State, error: BodycapError | None, status: StatusFile | None
+    ) -> Outcome:
+        """Say the last word and move the job where it belongs."""
+        claim.end()
+        if not claim.guard.holds():
+            return Outcome(name=claim.job.name, state="lost", message="another watcher has taken it over")
+        folder = self._spool.done if state == "done" else self._spool.failed
+
+        def last_word(target: Path) -> None:
+            if status is not None:
+                status.finish(state, error, target, self._spool.inbox)
+
+        target = move(claim.job.path, folder, claim.job.name, last_word)
+        clear_claim(JobDir(target))
+        return Outcome(
+            name=target.name,
+            state=state,
+            exit_code=0 if error is None else error.exit_code,
+            message="" if error is None else error.message,
+            place=target,
+        )
+
+
+def _told(document: dict[str, object]) -> BodycapError | None:
+    """The error that a status tells, as far as its exit code and message matter."""
+    error = document.get("error")
+    if not isinstance(error, dict):
+        return None
+    return error_from_dict(error)

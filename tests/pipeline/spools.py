@@ -1,0 +1,97 @@
+"""A spool with stand-in stages for tests."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from bodycap_batch.watch import Spool, Terms, Watcher, WatchOptions
+from bodycap_batch.watch.spool import JobDir
+from tests.pipeline.fake_stages import ORDERS
+
+ROOT = Path(__file__).parents[2]
+CHILD = (sys.executable, str(Path(__file__).with_name("fake_stages.py")))
+BODYCAP = (sys.executable, str(Path(__file__).with_name("fake_bodycap.py")))
+CAMERAS = ("torso", "left_palm")
+
+
+class SpoolBench:
+    """An empty spool, ways to drop into it, and a watcher that works it off."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.orders = folder / "orders.json"
+        self.spool = Spool(inbox=folder / "jobs" / "inbox", root=folder / "jobs")
+        self.spool.make()
+        self.told: list[str] = []
+        self.order()
+
+    def order(self, **orders: Any) -> None:
+        started = str(self.folder / "started")
+        self.orders.write_text(json.dumps({"started": started, **orders}))
+
+    def drop(self, name: str, job: str | None = None, *, ready: bool = True) -> Path:
+        """Drop a folder of two videos, with a job file where a text is given."""
+        folder = self.folder / "outside"
+        folder.mkdir(exist_ok=True)
+        capture = folder / name
+        capture.mkdir()
+        for camera in CAMERAS:
+            (capture / f"{camera}.mp4").write_text(f"frames of {camera} in {name}")
+        if job is not None:
+            (capture / "job.yaml").write_text(job)
+        if ready:
+            (capture / "READY").touch()
+        return capture.rename(self.spool.inbox / name)
+
+    def options(self, **changes: Any) -> WatchOptions:
+        terms = Terms(**{key: changes.pop(key) for key in ("roots", "limits") if key in changes})
+        usual: dict[str, Any] = {"settle_s": 0.0, "once": True, "threads": 1, "command": CHILD}
+        return WatchOptions(terms=terms, **{**usual, **changes})
+
+    def watcher(self, **changes: Any) -> Watcher:
+        return Watcher(self.spool, self.options(**changes), self.told.append)
+
+    def work_off(self, **changes: Any) -> int:
+        """Watch until nothing is left to do; returns the exit code."""
+        return self.watcher(**changes).run()
+
+    def job(self, name: str) -> JobDir:
+        found = self.spool.find(name)
+        assert found is not None, self.told
+        return found
+
+    def status(self, name: str) -> dict[str, Any]:
+        return dict(json.loads(self.job(name).status.read_text()))
+
+    def start(self, *arguments: str) -> subprocess.Popen[str]:
+        """Start the command with stand-in stages in a process of its own."""
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), ORDERS: str(self.orders)}
+        environment.pop("BODYCAP_STORE", None)
+        return subprocess.Popen(
+            [*BODYCAP, *arguments],
+            cwd=self.folder,
+            env=environment,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+
+    def hanging(self) -> int:
+        """Wait until a stage that was ordered to hang does; returns its process id."""
+        started = self.folder / "started"
+        wait_for(lambda: started.exists() and bool(started.read_text()))
+        return int(started.read_text())
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 30.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.02)

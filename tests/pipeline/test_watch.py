@@ -1,0 +1,488 @@
+"""A watched folder with stand-in stages: claims, results, refusals, resume, cancelling."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from bodycap_batch.cli import main
+from bodycap_batch.config.limits import Limits
+from bodycap_batch.errors import JobError
+from bodycap_batch.watch import cancel_job, retry_job, rows_of
+from bodycap_batch.watch.claim import first_claim, take_over
+from bodycap_batch.watch.spool import JobDir
+from tests.pipeline.fake_stages import ORDERS
+from tests.pipeline.spools import SpoolBench, wait_for
+from tests.pipeline.test_cli import gone
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SpoolBench:
+    bench = SpoolBench(tmp_path)
+    monkeypatch.setenv(ORDERS, str(bench.orders))
+    monkeypatch.chdir(tmp_path)
+    return bench
+
+
+def leftovers(bench: SpoolBench) -> list[str]:
+    """What is neither waiting nor filed away, hidden folders included."""
+    return sorted(path.name for path in bench.spool.running.iterdir())
+
+
+def test_a_dropped_folder_ends_in_done_with_results_footage_and_a_status(bench: SpoolBench) -> None:
+    bench.drop("küchen gang 1")
+    assert bench.work_off() == 0, bench.told
+    job = bench.job("küchen gang 1")
+    assert job.path.parent == bench.spool.done
+    assert (job.result / "metrics.json").is_file()
+    assert (job.result / "result.bvh").is_file()
+    assert (job.input / "torso.mp4").read_text() == "frames of torso in küchen gang 1"
+    assert "map: finished" in job.log.read_text()
+    status = bench.status("küchen gang 1")
+    assert (status["state"], status["exit_code"], status["error"]) == ("done", 0, None)
+    assert {"stage": "export", "reused": False}.items() <= status["finished_stages"][-1].items()
+    assert status["claimed_at"] <= status["started_at"] <= status["finished_at"]
+    assert leftovers(bench) == []
+    assert sorted(path.name for path in job.path.iterdir()) == ["input", "job.yaml", "result", "status.json"]
+
+
+@pytest.mark.slow
+def test_the_job_of_the_results_runs_again_from_where_it_lies(bench: SpoolBench) -> None:
+    bench.drop("walk")
+    bench.work_off()
+    for file in (bench.job("walk").result / "job.yaml", bench.job("walk").job):
+        videos = [camera["video"] for camera in yaml.safe_load(file.read_text())["capture"]["cameras"]]
+        assert all((file.parent / path).is_file() for paths in videos for path in paths)
+        assert main(["check", str(file), "--json"]) in (0, 3)  # the stand-in videos are no videos
+    process = bench.start("run", "jobs/done/walk/result/job.yaml", "--store", "jobs/.store")
+    out, err = process.communicate(timeout=60)
+    assert "map: already done" in err
+    assert "export: already done" in err
+    assert "results:" in out
+
+
+def test_a_job_file_in_the_folder_decides_and_is_resolved_where_it_lay(bench: SpoolBench) -> None:
+    dropped = bench.spool.inbox / "walk"
+    torso, palm = "{name: torso, video: torso.mp4}", f"{{name: left_palm, video: {dropped}/left_palm.mp4}}"
+    job = (
+        "height_m: 1.7\nout: somewhere/else\nskeleton: none\ncapture:\n  cameras:\n"
+        f"    - {torso}\n    - {palm}\n"
+    )
+    bench.drop("walk", job)
+    assert bench.work_off() == 0, bench.told
+    resolved = yaml.safe_load(bench.job("walk").job.read_text())
+    assert resolved["name"] == "walk"
+    assert resolved["height_m"] == 1.7
+    assert [camera["video"] for camera in resolved["capture"]["cameras"]] == [
+        ["input/torso.mp4"],
+        ["input/left_palm.mp4"],
+    ]
+    assert not (bench.folder / "somewhere").exists()
+
+
+def test_a_job_file_alone_names_footage_below_an_opened_folder(bench: SpoolBench) -> None:
+    footage = bench.drop("walk").rename(bench.folder / "footage")
+    text = f"capture: {{cameras: [{{name: torso, video: {footage}/torso.mp4}}]}}"
+    (bench.spool.inbox / "evening.yaml").write_text(text)
+    assert bench.work_off(roots=(footage,)) == 0, bench.told
+    job = bench.job("evening")
+    assert [path.name for path in job.input.iterdir()] == ["evening.yaml"]
+    assert (footage / "torso.mp4").is_file()
+    (bench.spool.inbox / "evening.yaml").write_text(text)
+    assert bench.work_off() == 2
+    error = bench.status("evening-2")["error"]
+    assert str(footage / "torso.mp4") in error["message"]
+    assert "--root" in error["hint"]
+
+
+ONE = "capture: {{cameras: [{{name: torso, video: {}}}]}}"
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (ONE.format("../secret.mp4"), "climbs out"),
+        (ONE.format("torso/../../secret.mp4"), "climbs out"),
+        (ONE.format("/etc/passwd"), "outside"),
+        (ONE.format("link.mp4"), "link"),
+        (ONE.format("torso.mp4, calibration: /etc/passwd"), "outside"),
+        (ONE.format("torso.mp4, mask: link.mp4"), "outside"),
+        (ONE.format("torso.mp4, timestamps: link.mp4"), "outside"),
+        (ONE.format("loop.mp4"), ""),
+        (
+            "skeleton: ../secret.bvh\n" + ONE.format("torso.mp4}, {name: head, video: left_palm.mp4"),
+            "climbs out",
+        ),
+        (
+            "skeleton: /etc/secret.bvh\n" + ONE.format("torso.mp4}, {name: head, video: left_palm.mp4"),
+            "outside",
+        ),
+        (ONE.format("torso.mp4") + "\nnope: 1", "nope"),
+        ("a: " + "[" * 30 + "]" * 30, "nested"),
+        ("# " + "x" * (2 << 20), "large"),
+        ("capture: {cameras: [{name: torso, video: !!python/name:os.system torso.mp4}]}", "tag"),
+    ],
+    ids=lambda value: value[:60],
+)
+def test_a_job_that_names_what_it_may_not_is_refused_with_the_reason(
+    bench: SpoolBench, make: str, words: str
+) -> None:
+    (bench.folder / "secret.mp4").write_text("not yours")
+    dropped = bench.drop("walk", make)
+    (dropped / "link.mp4").symlink_to(bench.folder / "secret.mp4")
+    (dropped / "loop.mp4").symlink_to("loop.mp4")
+    assert bench.work_off() in (2, 3)
+    job = bench.job("walk")
+    assert job.path.parent == bench.spool.failed
+    error = bench.status("walk")["error"]
+    assert words in error["message"], error
+    assert error["hint"]
+    assert "not yours" not in job.status.read_text()
+    if error["path"] is not None and error["path"].startswith(str(bench.folder)):
+        assert os.path.lexists(error["path"])
+    assert (job.input / "torso.mp4").is_file()
+
+
+def test_a_video_that_is_a_link_outside_is_refused_in_a_folder_without_a_job(bench: SpoolBench) -> None:
+    (bench.folder / "secret.mp4").write_text("not yours")
+    (bench.drop("walk") / "head.mp4").symlink_to(bench.folder / "secret.mp4")
+    assert bench.work_off() == 2
+    assert "secret.mp4, which is outside" in bench.status("walk")["error"]["message"]
+
+
+@pytest.mark.slow
+def test_a_link_to_an_opened_folder_is_worked_on_where_it_leads(bench: SpoolBench) -> None:
+    footage = bench.drop("walk").rename(bench.folder / "footage")
+    (bench.spool.inbox / "linked").symlink_to(Path("../../footage"))
+    assert bench.work_off(roots=(bench.folder / "footage",)) == 0, bench.told
+    assert (footage / "torso.mp4").is_file()
+    (bench.spool.inbox / "linked").symlink_to(Path("../../footage"))
+    assert bench.work_off() == 2
+    assert bench.job("linked-2").path.parent == bench.spool.failed
+
+
+def test_limits_hold_back_what_is_too_large(bench: SpoolBench) -> None:
+    (bench.drop("large") / "head.mp4").write_bytes(bytes(3000))
+    many = bench.drop("many")
+    for number in range(20):
+        (many / f"{number}.txt").touch()
+    (bench.drop("odd") / "pipe.mp4").unlink(missing_ok=True)
+    os.mkfifo(bench.spool.inbox / "odd" / "pipe.mp4")
+    assert bench.work_off(limits=Limits(video_gb=2e-6, files=10)) == 3
+    assert "the limit is 2e-06" in bench.status("large")["error"]["message"]
+    assert "more than 10 files" in bench.status("many")["error"]["message"]
+    assert "pipe.mp4 is neither" in bench.status("odd")["error"]["message"]
+
+
+def test_names_that_come_again_get_a_number_and_no_job_is_lost(bench: SpoolBench) -> None:
+    for _ in range(3):
+        bench.drop("walk")
+        bench.work_off()
+    (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
+    bench.work_off()
+    assert sorted(job.name for job in bench.spool.jobs()) == ["walk", "walk-2", "walk-3", "walk-4"]
+    assert bench.job("walk-4").path.parent == bench.spool.failed
+
+
+@pytest.mark.parametrize("name", ["a\nb", "-rf", "n" * 250, "ü" * 120, "e\u0301te", " lead"])
+def test_odd_names_are_worked_on(bench: SpoolBench, name: str, capfd: pytest.CaptureFixture[str]) -> None:
+    capture = bench.drop("walk").rename(bench.spool.inbox / name)
+    assert bench.work_off() == 0, bench.told
+    assert not capture.exists()
+    (job,) = bench.spool.jobs()
+    assert job.path.parent == bench.spool.done
+    job.name.encode()
+    assert main(["status", "jobs"]) == 0
+    assert "done" in capfd.readouterr().out
+
+
+def test_names_that_are_no_text_are_refused(bench: SpoolBench) -> None:
+    bench.drop("walk").rename(bench.spool.inbox / os.fsdecode(b"walk \xff"))
+    torso = bench.drop("other") / "torso.mp4"
+    torso.rename(torso.with_name(os.fsdecode(b"torso \xfe.mp4")))
+    assert bench.work_off() == 2
+    assert "walk \\udcff is no UTF-8 text" in bench.status("walk _")["error"]["message"]
+    assert "torso \\udcfe.mp4 is no UTF-8 text" in bench.status("other")["error"]["message"]
+    assert main(["status"]) == 0
+    assert os.path.lexists(retry_job(bench.spool, "walk _"))
+
+
+def test_what_is_no_job_stays_in_the_inbox_and_is_told(bench: SpoolBench) -> None:
+    (bench.spool.inbox / "torso.mp4").write_text("a video without a folder")
+    (bench.spool.inbox / ".hidden").mkdir()
+    (bench.spool.inbox / "copying.part").mkdir()
+    assert bench.work_off() == 0
+    states = {row.name: row.state for row in rows_of(bench.spool)}
+    assert states == {"torso.mp4": "ignored", "copying.part": "ignored"}
+
+
+def test_a_failed_job_says_why_keeps_what_there_is_and_can_be_retried(bench: SpoolBench) -> None:
+    bench.order(fail="merge")
+    bench.drop("walk")
+    assert bench.work_off() == 4
+    job = bench.job("walk")
+    assert job.path.parent == bench.spool.failed
+    status = bench.status("walk")
+    assert (status["state"], status["exit_code"]) == ("failed", 4)
+    assert status["error"]["message"] == "merge does not work out"
+    assert str(job.path / "result" / "partial") in status["error"]["hint"]
+    partial = yaml.safe_load((job.result / "partial" / "job.yaml").read_text())
+    video = job.result / "partial" / partial["capture"]["cameras"][0]["video"][0]
+    assert video.is_file()
+    bench.order()
+    assert retry_job(bench.spool, "walk") == bench.spool.inbox / "walk"
+    assert bench.work_off() == 0
+    status = bench.status("walk")
+    fresh = {stage["stage"] for stage in status["finished_stages"] if not stage["reused"]}
+    assert fresh == {"merge", "export"}
+
+
+def test_a_job_file_comes_back_as_a_file_when_it_is_retried(bench: SpoolBench) -> None:
+    (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
+    assert bench.work_off() == 2
+    assert retry_job(bench.spool, "walk") == bench.spool.inbox / "walk.yaml"
+    assert (bench.spool.inbox / "walk.yaml").read_text() == "capture: {}"
+    assert list(bench.spool.jobs()) == []
+
+
+def test_a_bug_fails_its_job_alone(bench: SpoolBench) -> None:
+    bench.orders.write_text("no JSON")
+    bench.drop("first")
+    assert bench.work_off() == 70
+    assert "Traceback" in "".join(path.read_text() for path in bench.job("first").result.glob("logs/*.log"))
+    bench.order()
+    bench.drop("second")
+    assert bench.work_off() == 0
+
+
+def test_a_copy_in_progress_is_left_alone_until_it_is_complete(bench: SpoolBench) -> None:
+    dropped = bench.drop("walk", ready=False)
+    (dropped / "head.mp4.part").write_text("half")
+    watcher = bench.watcher(once=False)
+    thread = threading.Thread(target=watcher.run)
+    thread.start()
+    try:
+        wait_for(lambda: rows_of(bench.spool)[0].cause == "head.mp4.part is being copied")
+        time.sleep(0.3)
+        assert dropped.is_dir()
+        (dropped / "head.mp4.part").rename(dropped / "head.mp4")
+        wait_for(lambda: bench.spool.find("walk") is not None)
+    finally:
+        watcher.stop()
+        thread.join(30)
+    assert not thread.is_alive()
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow)]
+)
+def test_a_stopped_watcher_leaves_its_job_and_the_next_one_goes_on(
+    bench: SpoolBench, number: signal.Signals, code: int
+) -> None:
+    bench.drop("walk")
+    bench.order(hang="map")
+    process = bench.start("watch", "jobs/inbox", "--threads", "1")
+    child = bench.hanging()
+    process.send_signal(number)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == code, err
+    assert "Traceback" not in err
+    assert gone(child)
+    job = bench.job("walk")
+    assert job.path.parent == bench.spool.running
+    assert bench.status("walk")["state"] == "stopped"
+    bench.order()
+    assert bench.work_off() == 0
+    status = bench.status("walk")
+    assert status["attempts"] == 2
+    reused = [stage["stage"] for stage in status["finished_stages"] if stage["reused"]]
+    assert reused == ["check", "keyframes torso", "keyframes left_palm"] or sorted(reused) == sorted(
+        ["check", "keyframes torso", "keyframes left_palm"]
+    )
+
+
+@pytest.mark.slow
+def test_a_killed_watcher_is_replaced_at_once_on_the_same_machine(bench: SpoolBench) -> None:
+    bench.drop("walk")
+    bench.order(hang="map")
+    process = bench.start("watch", "jobs/inbox", "--threads", "1")
+    bench.hanging()
+    process.kill()
+    process.wait()
+    (row,) = rows_of(bench.spool)
+    assert row.state == "interrupted"
+    bench.order()
+    assert bench.work_off(stale_s=1000.0) == 0
+    assert bench.job("walk").path.parent == bench.spool.done
+
+
+@pytest.mark.slow
+def test_a_job_is_cancelled_within_five_seconds_and_goes_on_when_retried(bench: SpoolBench) -> None:
+    bench.drop("walk")
+    bench.order(hang="map")
+    process = bench.start("watch", "jobs/inbox", "--threads", "1")
+    child = bench.hanging()
+    assert cancel_job(bench.spool, "walk", wait_s=5.0) is not None
+    assert gone(child)
+    assert bench.status("walk")["state"] == "cancelled"
+    assert process.poll() is None
+    bench.order()
+    retry_job(bench.spool, "walk")
+    wait_for((bench.spool.done / "walk").is_dir)
+    process.terminate()
+    assert process.wait(30) == 143
+    assert {"stage": "check", "reused": True}.items() <= bench.status("walk")["finished_stages"][0].items()
+
+
+def test_a_waiting_job_is_cancelled_where_it_lies(bench: SpoolBench) -> None:
+    bench.drop("walk")
+    job = cancel_job(bench.spool, "walk")
+    assert job is not None
+    assert job.path == bench.spool.failed / "walk"
+    assert bench.status("walk")["state"] == "cancelled"
+    assert retry_job(bench.spool, "walk") == bench.spool.inbox / "walk"
+    assert bench.work_off() == 0
+    for action in (retry_job, cancel_job):
+        with pytest.raises(JobError, match="done"):
+            action(bench.spool, "walk")
+
+
+@pytest.mark.slow
+def test_two_watchers_share_the_work_and_never_a_job(bench: SpoolBench) -> None:
+    names = [f"walk {number}" for number in range(6)]
+    for name in names:
+        bench.drop(name)
+    watchers = [bench.watcher() for _ in range(3)]
+    threads = [threading.Thread(target=watcher.run) for watcher in watchers]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(120)
+    assert sorted(job.name for job in bench.spool.jobs()) == sorted(names)
+    assert all((bench.spool.done / name / "result" / "metrics.json").is_file() for name in names)
+    assert all(bench.status(name)["attempts"] == 1 for name in names)
+    assert leftovers(bench) == []
+
+
+@pytest.mark.slow
+def test_a_watcher_that_was_suspended_gives_up_when_it_wakes(bench: SpoolBench) -> None:
+    bench.drop("walk")
+    bench.order(hang="map")
+    process = bench.start("watch", "jobs/inbox", "--threads", "1")
+    child = bench.hanging()
+    process.send_signal(signal.SIGSTOP)
+    bench.order()
+    try:
+        # Another machine, to which the suspended process is but a heartbeat that stands still.
+        owner = bench.job("walk").owner
+        owner.write_text(json.dumps({**json.loads(owner.read_text()), "machine": "elsewhere"}))
+        watcher = bench.watcher(stale_s=1.0, once=False)
+        thread = threading.Thread(target=watcher.run)
+        thread.start()
+        wait_for((bench.spool.done / "walk").is_dir)
+        watcher.stop()
+        thread.join()
+        assert bench.status("walk")["generation"] == 2
+        before = {path: path.stat().st_mtime_ns for path in bench.spool.done.rglob("*")}
+    finally:
+        process.send_signal(signal.SIGCONT)
+    wait_for(lambda: gone(child))
+    process.terminate()
+    _, err = process.communicate(timeout=30)
+    assert "another watcher has taken it over" in err
+    assert {path: path.stat().st_mtime_ns for path in bench.spool.done.rglob("*")} == before
+    assert leftovers(bench) == []
+
+
+def test_only_one_takes_a_job_over(bench: SpoolBench) -> None:
+    job = JobDir(bench.drop("walk").rename(bench.spool.running / "walk"))
+    first = first_claim(job)
+    claims: list[object] = []
+    barrier = threading.Barrier(8)
+
+    def contend() -> None:
+        barrier.wait()
+        claims.append(take_over(job))
+
+    threads = [threading.Thread(target=contend) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    held = [claim for claim in claims if claim is not None]
+    # Each that came too late for a number may still get the next one; the last of them alone holds the job.
+    assert sum(claim.guard.holds() for claim in held) == 1  # type: ignore[attr-defined]
+    assert not first.guard.holds()
+    first.beat()
+    assert first.lost.is_set()
+
+
+def test_a_watcher_that_ends_between_the_last_word_and_the_move_is_finished_by_the_next(
+    bench: SpoolBench,
+) -> None:
+    bench.drop("walk")
+    bench.work_off()
+    job = bench.job("walk")
+    metrics = (job.result / "metrics.json").stat().st_mtime_ns
+    place = JobDir(Path(shutil.move(job.path, bench.spool.running / "walk")))
+    first_claim(place).release()
+    assert bench.work_off() == 0
+    assert (bench.job("walk").result / "metrics.json").stat().st_mtime_ns == metrics
+    assert bench.job("walk").path.parent == bench.spool.done
+
+
+def test_folders_on_different_disks_are_refused_with_the_remedy(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = Path("/dev/shm") / f"bodycap-{os.getpid()}"  # noqa: S108
+    if not other.parent.is_dir() or other.parent.stat().st_dev == bench.folder.stat().st_dev:
+        pytest.skip("needs a second file system at /dev/shm")
+    other.mkdir()
+    try:
+        shutil.rmtree(bench.spool.done)
+        bench.spool.done.symlink_to(other)
+        process = bench.start("watch", "jobs/inbox", "--once")
+        _, err = process.communicate(timeout=30)
+        assert process.returncode == 5
+        assert "different file systems" in err
+        assert "hint:" in err
+        assert [path.name for path in bench.spool.running.iterdir()] == []
+    finally:
+        shutil.rmtree(other)
+
+
+def test_the_table_of_jobs_is_for_people_and_for_programs(
+    bench: SpoolBench, capfd: pytest.CaptureFixture[str]
+) -> None:
+    bench.drop("good")
+    bench.work_off()
+    bench.order(fail="map")
+    bench.drop("bad")
+    bench.work_off()
+    bench.drop("next")
+    (bench.spool.inbox / "empty").mkdir()
+    for place in ("jobs", "jobs/inbox"):
+        assert main(["status", place]) == 0
+        lines = capfd.readouterr().out.splitlines()
+        words = {line.split()[0]: line for line in lines}
+        assert words["good"].split()[1] == "done"
+        assert "map does not work out" in words["bad"]
+        assert words["next"].split()[1] == "waiting"
+        assert "the folder is empty" in words["empty"]
+    assert main(["status", "--json"]) == 0
+    rows = {row["name"]: row for row in json.loads(capfd.readouterr().out)}
+    assert rows["bad"]["hint"] == "film more"
+    assert rows["good"]["path"] == str(bench.spool.done / "good")
+    assert main(["retry", "bda"]) == 2
+    assert "did you mean 'bad'" in capfd.readouterr().err
+    assert main(["cancel", "next"]) == 0
+    assert main(["cancel", "good"]) == 2
+    assert main(["status", "nowhere"]) == 2
