@@ -35,6 +35,10 @@ test: $(VENV)/.dev ## run the fast tests
 test-slow: $(VENV)/.dev ## run the slow tests and those on real captures
 	$(PYTEST) --dist loadfile -m "slow or data" --durations=20 $(ARGS)
 
+.PHONY: test-cluster
+test-cluster: $(VENV)/.dev ## run jobs on a Dask scheduler and workers of this machine, killing some
+	$(BIN)/python -m pytest -m cluster tests/cluster $(ARGS)
+
 .PHONY: lint
 lint: $(VENV)/.dev ## check format, lint and types
 	$(BIN)/ruff format --check .

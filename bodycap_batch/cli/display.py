@@ -80,7 +80,7 @@ class Lines:
                 if (text := pace.line(event)) is not None:
                     self._write(text)
             else:
-                self._write(_sentence(event))
+                self._write(sentence(event))
 
     def _write(self, text: str) -> None:
         sys.stderr.write(f"{time.strftime('%H:%M:%S')} {text}\n")
@@ -190,7 +190,8 @@ def _progress() -> Progress:
     )
 
 
-def _sentence(event: Event) -> str:
+def sentence(event: Event) -> str:
+    """An event as one reads it."""
     if event.kind == "note":
         return event.what
     words = {

@@ -1,11 +1,15 @@
 """A job from its videos to its results: the stages in order."""
 
+from bodycap_batch.pipeline.batch import Batch, BatchJob, Outcome
 from bodycap_batch.pipeline.run import RunSummary, run_job
 from bodycap_batch.pipeline.sample import prepare_capture
 from bodycap_batch.pipeline.settings import Settings, StageRecord
 from bodycap_batch.pipeline.why import Step, explain_job
 
 __all__ = [
+    "Batch",
+    "BatchJob",
+    "Outcome",
     "RunSummary",
     "Settings",
     "StageRecord",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -59,5 +59,6 @@ class Task:
 
 def task_from_json(data: Mapping[str, Any]) -> tuple[Task, Path]:
     """Rebuild a task and the store's folder from `Task.to_json`."""
-    fields = {name: data[name] for name in ("arguments", "camera", "round", "threads", "again")}
-    return Task(key=ArtefactKey(**data["key"]), **fields), Path(data["store"])
+    values = {each.name: data[each.name] for each in fields(Task)}
+    values |= {"key": ArtefactKey(**data["key"]), "modules": tuple(data["modules"])}
+    return Task(**values), Path(data["store"])

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.bench import ours, peers, scaling, simulation
+from tests.bench import batch, ours, peers, scaling, simulation
 from tests.bench.rows import DATA, LAB, Row, row_of, rows_in
 
 
@@ -27,8 +27,8 @@ def main() -> int:
     parser.add_argument(
         "only",
         nargs="*",
-        help="rows to run, or folders of captures with truth (default: all), or `scaling`; `simulation` "
-        "first runs the skeleton stage on simulated poses, with options of its own",
+        help="rows to run, or folders of captures with truth (default: all), `scaling`, `batch`; "
+        "`simulation` first runs the skeleton stage on simulated poses, with options of its own",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)
@@ -56,6 +56,9 @@ def main() -> int:
                 own = ours.run(case.row, work / case.row.name)
                 _tell(results, {**own, **case.size()}, scaling.lines_of(own, case))
             _tell(results, {}, scaling.summary(results))
+        if "batch" in options.only:
+            done = batch.run(work / "batch")
+            _tell(results, done, list(batch.lines_of(done)))
     if options.json:
         options.json.write_text(json.dumps([each for each in results if each], indent=1), encoding="utf-8")
     jobs = [result for result in results if result and "peer" not in result]
@@ -74,7 +77,7 @@ def _chosen(options: argparse.Namespace, work: Path) -> list[Row]:
     if not options.only:
         return known
     rows = [row for row in known if row.name in options.only]
-    names = {row.name for row in rows} | {"scaling"}
+    names = {row.name for row in rows} | {"scaling", "batch"}
     rows += [
         row_of(Path(name).resolve()) for name in options.only if name not in names and Path(name).is_dir()
     ]

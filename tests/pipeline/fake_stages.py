@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import sys
@@ -16,8 +17,8 @@ from bodycap_batch.runner.child import main
 
 Json = Mapping[str, Any]
 ORDERS = "BODYCAP_FAKE_ORDERS"
-"""Path of a JSON file: {"fail" | "hang" | "fill": stage, "wanted" | "localised": [a value per round],
-"rolling": true}."""
+"""Path of a JSON file: {"fail" | "crash" | "hang" | "fill": stage, "on": text in its videos,
+"wanted" | "localised": [a value per round], "rolling": true}."""
 
 
 def orders() -> dict[str, Any]:
@@ -39,11 +40,14 @@ def made_of(value: Any) -> Any:
 def stage(name: str) -> Any:
     def run(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
         context.progress(1, 1, "steps")
-        if orders().get("hang") == name:
+        meant = orders().get("on", "") in " ".join(videos(arguments))
+        if orders().get("crash") == name and meant:
+            ctypes.string_at(0)
+        if orders().get("hang") == name and meant:
             Path(orders()["started"]).write_text(str(os.getpid()))
             while True:
                 time.sleep(0.05)
-        if orders().get("fail") == name:
+        if orders().get("fail") == name and meant:
             raise EstimationError(f"{name} does not work out", hint="film more")
         if orders().get("fill") == name:
             with (files / "big.bin").open("wb") as stream:

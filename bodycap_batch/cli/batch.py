@@ -1,0 +1,218 @@
+"""`bodycap batch`."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from bodycap_batch.cli.base import app
+from bodycap_batch.cli.display import sentence
+from bodycap_batch.cli.run import STORE_VARIABLE, cores, default_out, results_folder
+from bodycap_batch.cli.stop import stoppable
+from bodycap_batch.errors import Cancelled, JobError
+from bodycap_batch.progress import Event
+
+if TYPE_CHECKING:
+    from bodycap_batch.config.models import Job
+    from bodycap_batch.pipeline import BatchJob, Outcome, Settings
+    from bodycap_batch.runner import Executor
+
+_JOBS_ON_A_CLUSTER = 32
+"""A job at work is a thread that waits; its tasks wait at the scheduler, in order of priority."""
+
+
+_ExecutorOption = Annotated[
+    str,
+    typer.Option(
+        metavar="local|ADDRESS|slurm|pbs",
+        help="Where tasks run: here, on a Dask scheduler's workers (tcp://HOST:8786), or in a queue.",
+    ),
+]
+_OutOption = Annotated[
+    Path | None,
+    typer.Option("--out", metavar="DIR", help="Folder for the jobs' folders of results (default: out)."),
+]
+_StoreOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        help="Where finished stages are kept (default: .store in the folder of results).",
+        envvar=STORE_VARIABLE,
+        show_envvar=True,
+    ),
+]
+
+
+@app.command()
+def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
+    jobs: Annotated[list[Path], typer.Argument(metavar="JOBS...", help="Job files and folders of videos.")],
+    executor: _ExecutorOption = "local",
+    out: _OutOption = None,
+    store: _StoreOption = None,
+    max_jobs: Annotated[
+        int | None, typer.Option(min=1, help="Most jobs at work at once.", show_default=False)
+    ] = None,
+    threads: Annotated[int, typer.Option(min=1, max=1024, help="Threads of one task.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Workers to ask a queue for.")] = 2,
+    worker_memory: Annotated[
+        int, typer.Option(min=500, metavar="MB", help="Memory of each worker of a queue.")
+    ] = 4000,
+    priority: Annotated[
+        list[str] | None,
+        typer.Option(metavar="JOB=NUMBER", help="Jobs of higher numbers go first; may be repeated."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON line an event and a job.")] = False,
+) -> None:
+    """Run many jobs, on this machine or on many.
+
+    A job that fails does not stop the others; the exit code is the worst job's. Started again, the batch goes
+    on from finished stages. On a cluster the jobs, their videos, the store and the results lie on
+    a disk that all machines mount at the same place.
+
+    \b
+    Examples:
+      bodycap batch monday/*/ tuesday/*/
+      bodycap batch jobs/*.yaml --priority jobs/urgent.yaml=1 --max-jobs 4
+      bodycap batch jobs/*.yaml --executor tcp://scheduler:8786
+    """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.pipeline import Batch, Settings
+    from bodycap_batch.store import Store
+
+    wanted = _prioritised(list(dict.fromkeys(jobs)), priority or [])
+    folder = (out or default_out()).resolve()
+    teller = _Teller(as_json=as_json)
+    kept = Store(store or folder / ".store")
+    with stoppable() as stop, _executor(executor, threads, workers, worker_memory) as (shared, usual):
+
+        def settings(job: BatchJob, _: Path | None) -> Settings:
+            return Settings(
+                store=kept,
+                threads=threads,
+                listener=teller.listener(job.path),
+                cancelled=stop.is_set,
+                executor=shared,
+                priority=job.priority,
+            )
+
+        work = Batch(settings, lambda job: _results_folder(job, folder), max_jobs or usual)
+        outcomes = [teller.ended(outcome) for outcome in work.run(wanted)]
+        if stop.is_set():
+            raise Cancelled("stopped on request; finished stages are kept", hint="run it again to go on")
+    teller.summarise(wanted, outcomes)
+    raise typer.Exit(max(outcome.exit_code for outcome in outcomes))
+
+
+@contextmanager
+def _executor(kind: str, threads: int, workers: int, memory_mb: int) -> Iterator[tuple[Executor, int]]:
+    """Yield what makes the tasks, and how many jobs keep it busy."""
+    if kind == "local":
+        from bodycap_batch.runner.pool import LocalPool
+
+        pool = LocalPool(max(cores(), threads))
+        try:
+            yield pool, max(1, cores() // threads) + 1
+        finally:
+            pool.shutdown()
+        return
+    from bodycap_batch.cluster import QUEUES, SCHEMES, Cluster, start_queue
+
+    if kind in QUEUES:
+        with (
+            start_queue(kind, workers, threads, memory_mb) as queue,
+            Cluster(queue.scheduler_address) as cluster,
+        ):
+            yield cluster, _JOBS_ON_A_CLUSTER
+    elif kind.startswith(SCHEMES):
+        with Cluster(kind) as cluster:
+            yield cluster, _JOBS_ON_A_CLUSTER
+    else:
+        raise JobError(
+            f"there is no executor {kind!r}",
+            field="--executor",
+            hint=f"local, an address ({', '.join(SCHEMES)}HOST:8786), {' or '.join(QUEUES)}",
+        )
+
+
+def _results_folder(job: Job, folder: Path) -> Path:
+    """A job that names no folder of its own has one of its name in the batch's."""
+    usual = default_out() / job.name
+    return folder / job.name if job.out in (None, usual) else results_folder(job)
+
+
+def _prioritised(jobs: Sequence[Path], priorities: Sequence[str]) -> list[BatchJob]:
+    from bodycap_batch.pipeline import BatchJob
+
+    known: dict[Path, int] = {}
+    for text in priorities:
+        name, _, number = text.rpartition("=")
+        if Path(name) not in jobs or not number.lstrip("-").isdigit():
+            raise JobError(f"{text!r} is no JOB=NUMBER of a job of this batch", field="--priority")
+        known[Path(name)] = int(number)
+    return [BatchJob(path=path, priority=known.get(path, 0)) for path in jobs]
+
+
+class _Teller:
+    """Tells what happens in all jobs, as lines or JSON."""
+
+    def __init__(self, *, as_json: bool) -> None:
+        self._as_json = as_json
+        self._lock = threading.Lock()
+
+    def listener(self, job: Path) -> Callable[[Event], None]:
+        """What listens to one job."""
+
+        def listen(event: Event) -> None:
+            if self._as_json:
+                self._line({"job": str(job), **event.to_dict()})
+            elif event.kind != "progress":
+                self._say(f"{job.stem}: {sentence(event)}")
+
+        return listen
+
+    def ended(self, outcome: Outcome) -> Outcome:
+        """Tell how a job ended; gives it back."""
+        if self._as_json:
+            self._line({"kind": "job", **outcome.to_dict()})
+        elif outcome.error is not None:
+            self._say(f"{outcome.job.path.stem}: {outcome.error}")
+            for note in getattr(outcome.error, "__notes__", []):
+                self._say(note)
+        return outcome
+
+    def summarise(self, jobs: Sequence[BatchJob], outcomes: Sequence[Outcome]) -> None:
+        """A table of all jobs, in the order they were given."""
+        if self._as_json:
+            return
+        found = {outcome.job: outcome for outcome in outcomes}
+        width = max(len(job.path.name) for job in jobs)
+        for job in jobs:
+            typer.echo(f"{job.path.name:{width}}  {_end_of(found[job])}")
+        failed = sum(outcome.exit_code != 0 for outcome in outcomes)
+        typer.echo(f"{len(jobs) - failed} of {len(jobs)} jobs done")
+
+    def _say(self, text: str) -> None:
+        with self._lock:
+            sys.stderr.write(f"{time.strftime('%H:%M:%S')} {text}\n")
+            sys.stderr.flush()
+
+    def _line(self, values: dict[str, Any]) -> None:
+        with self._lock:
+            sys.stdout.write(json.dumps(values) + "\n")
+            sys.stdout.flush()
+
+
+def _end_of(outcome: Outcome) -> str:
+    if outcome.summary is None:
+        message = outcome.error.message if outcome.error is not None else ""
+        return f"failed ({outcome.exit_code}): {message}"
+    if outcome.summary.executed == 0:
+        return f"nothing to do  {outcome.summary.out_dir}"
+    return f"done in {outcome.seconds:.0f} s  {outcome.summary.out_dir}"

@@ -1,0 +1,138 @@
+"""Many jobs at once: each in a thread that only waits, while an executor makes their tasks."""
+
+from __future__ import annotations
+
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bodycap_batch.config.job import Overrides, load_job
+from bodycap_batch.config.models import Job
+from bodycap_batch.errors import EXIT_BUG, BodycapError, JobError
+from bodycap_batch.pipeline.run import RunSummary, run_job
+from bodycap_batch.pipeline.sample import prepare_capture
+from bodycap_batch.pipeline.settings import Settings
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BatchJob:
+    """One job of a batch.
+
+    Attributes:
+        path: A job file or a folder of videos.
+        priority: Higher goes first.
+    """
+
+    path: Path
+    priority: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """How a job of a batch ended.
+
+    Attributes:
+        job: The job.
+        seconds: From its start to its end.
+        summary: What it left behind; None where it failed.
+        error: Why it failed.
+    """
+
+    job: BatchJob
+    seconds: float
+    summary: RunSummary | None = None
+    error: BodycapError | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """0, or that of the error."""
+        return 0 if self.error is None else self.error.exit_code
+
+    def to_dict(self) -> dict[str, Any]:
+        """The outcome as plain JSON values."""
+        return {
+            "job": str(self.job.path),
+            "exit_code": self.exit_code,
+            "seconds": round(self.seconds, 3),
+            "out_dir": None if self.summary is None else str(self.summary.out_dir),
+            "executed": None if self.summary is None else self.summary.executed,
+            "error": None if self.error is None else self.error.to_dict(),
+        }
+
+
+class Batch:
+    """Jobs that run side by side and do not stop one another.
+
+    Args:
+        settings: Called with a job and its folder of results (or None before that is known); all settings
+            share one executor.
+        results: Folder of a resolved job's results.
+        max_jobs: How many are at work at once.
+    """
+
+    def __init__(
+        self,
+        settings: Callable[[BatchJob, Path | None], Settings],
+        results: Callable[[Job], Path],
+        max_jobs: int,
+    ) -> None:
+        self._settings = settings
+        self._results = results
+        self._max_jobs = max_jobs
+        self._taken: dict[Path, Path] = {}
+        self._lock = threading.Lock()
+
+    def run(self, jobs: Sequence[BatchJob]) -> Iterator[Outcome]:
+        """Run the jobs, those of high priority first; yields each as it ends."""
+        ordered = sorted(jobs, key=lambda job: -job.priority)
+        began: dict[BatchJob, float] = {}
+
+        def run(job: BatchJob) -> RunSummary:
+            began[job] = time.monotonic()
+            return self._run_one(job)
+
+        with ThreadPoolExecutor(max_workers=self._max_jobs) as pool:
+            waiting = {pool.submit(run, job): job for job in ordered}
+            while waiting:
+                for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                    job = waiting.pop(future)
+                    yield _outcome(job, future, time.monotonic() - began[job])
+
+    def _run_one(self, job: BatchJob) -> RunSummary:
+        def prepare(options: Mapping[str, Any], folder: Path) -> None:
+            prepare_capture(options, folder, self._settings(job, None))
+
+        resolved = load_job(job.path, Overrides(), prepare=prepare)
+        out_dir = self._results(resolved)
+        self._take(out_dir, job.path)
+        resolved = resolved.model_copy(update={"out": out_dir})
+        return run_job(resolved, out_dir=out_dir, settings=self._settings(job, out_dir))
+
+    def _take(self, out_dir: Path, path: Path) -> None:
+        """Two jobs of one batch must not write into the same folder."""
+        with self._lock:
+            other = self._taken.setdefault(out_dir.resolve(), path)
+        if other != path:
+            raise JobError(
+                f"its results would go to {out_dir}, where those of {other} go",
+                path=path,
+                field="name",
+                hint="give the jobs different names (`name:`) or folders (`out:`)",
+            )
+
+
+def _outcome(job: BatchJob, future: Future[RunSummary], seconds: float) -> Outcome:
+    failure = future.exception()
+    if failure is None:
+        return Outcome(job=job, seconds=seconds, summary=future.result())
+    if isinstance(failure, BodycapError):
+        return Outcome(job=job, seconds=seconds, error=failure)
+    bug = BodycapError(f"{type(failure).__name__}: {failure}", path=job.path, hint="this is a bug")
+    bug.exit_code = EXIT_BUG
+    bug.add_note("".join(traceback.format_exception(failure)))
+    return Outcome(job=job, seconds=seconds, error=bug)

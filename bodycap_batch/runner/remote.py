@@ -1,0 +1,86 @@
+"""A task on another machine: the same child, started there."""
+
+from __future__ import annotations
+
+import platform
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from bodycap_batch.errors import BodycapError, StoreError
+from bodycap_batch.identity import algorithm_version, library_versions
+from bodycap_batch.runner.children import Children, Making
+from bodycap_batch.runner.task import Task, task_from_json
+from bodycap_batch.store import Store
+from bodycap_batch.tasks import STAGES
+
+_children: dict[tuple[str, ...], Children] = {}
+_lock = threading.Lock()
+
+
+def order_of(task: Task, making: Making, command: tuple[str, ...]) -> dict[str, Any]:
+    """All that another machine has to be told: paths on the shared disk, options, digests."""
+    order = {"task": task.to_json(making.store.root), "logs": str(making.logs), "command": list(command)}
+    return {**order, "checked": task.key.stage in STAGES and bool(task.key.libraries)}
+
+
+def perform(
+    order: Mapping[str, Any], progress: Callable[[int, int, str], None], cancelled: Callable[[], bool]
+) -> dict[str, Any]:
+    """Make and commit a task's artefact in a child of this machine.
+
+    Args:
+        order: What `order_of` gave.
+        progress: Called as ``progress(done, total, what)``.
+        cancelled: Asked several times a second whether to stop.
+
+    Returns:
+        Nothing, or ``error`` and ``notes`` of the `BodycapError` that ended it.
+    """
+    task, root = task_from_json(order["task"])
+    try:
+        _require_shared(root)
+        if order["checked"]:
+            _require_same_program(task)
+        store = Store(root)
+        if not task.again and store.find(task.key) is not None:
+            return {}  # a worker that died committed it before it could say so
+        making = Making(
+            store=store,
+            logs=Path(order["logs"]),
+            progress=progress,
+            cancelled=cancelled,
+            may_commit=lambda: not cancelled(),
+        )
+        _children_of(tuple(order["command"])).make(task, making)
+    except BodycapError as error:
+        return {"error": error.to_dict(), "notes": list(getattr(error, "__notes__", []))}
+    return {}
+
+
+def _children_of(command: tuple[str, ...]) -> Children:
+    """This process's children; they end with it."""
+    with _lock:
+        return _children.setdefault(command, Children(command))
+
+
+def _require_shared(root: Path) -> None:
+    if not (root / "artefacts").is_dir():
+        raise StoreError(
+            f"worker {platform.node()} does not see the store",
+            path=root,
+            hint="put the store and the videos on a disk that all machines mount at the same path",
+        )
+
+
+def _require_same_program(task: Task) -> None:
+    """A result computed by another version must never be kept under this one's key."""
+    stage = STAGES[task.key.stage]
+    mine = algorithm_version(stage.code), library_versions(stage.libraries)
+    if mine != (task.key.algorithm, dict(task.key.libraries)):
+        other = {name for name, version in task.key.libraries.items() if mine[1].get(name) != version}
+        raise BodycapError(
+            f"worker {platform.node()} has another version of {', '.join(sorted(other)) or 'bodycap_batch'}",
+            hint="install the same bodycap_batch and the same requirements.lock on all machines",
+        )

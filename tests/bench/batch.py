@@ -1,0 +1,127 @@
+"""Many short jobs on two cores: what a second worker gains, and what handing a task over costs."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from bodycap_batch.cli import main
+from bodycap_batch.runner import Children, Executor, Making, Task
+from bodycap_batch.store import ArtefactKey, Store
+from tests.cluster.site import REAL, Site
+from tests.unit.test_runner import FAKE
+
+JOBS = 8
+TASKS = 100
+JOB = """
+name: {name}
+capture:
+  # Another microsecond: the same work, nothing shared in the store.
+  start_s: {start}
+  calibration: capture/calib.json
+  cameras:
+    - {{name: torso, video: capture/torso.mp4}}
+    - {{name: left_palm, video: capture/left_palm.mp4}}
+height_m: 1.75
+"""
+LAYOUTS = (
+    ("two workers, one thread each", 2, 1),
+    ("one worker, one thread", 1, 1),
+    ("one worker, two threads a task", 1, 2),
+)
+
+
+def run(folder: Path) -> dict[str, Any]:
+    """Time eight jobs on each layout of workers, and a hundred empty tasks."""
+    folder.mkdir(parents=True)
+    options = ["--seconds", "2", "--size", "320x240", "--cameras", "torso,left_palm"]
+    if main(["synth", str(folder / "capture"), *options]) != 0:
+        return {"row": "batch", "exit": 1}
+    for index in range(JOBS):
+        text = JOB.format(name=f"job{index}", start=f"{index * 1e-6:.6f}")
+        (folder / f"job{index}.yaml").write_text(text)
+    seconds = {name: _batch(folder, workers, threads) for name, workers, threads in LAYOUTS}
+    return {"row": "batch", "exit": 0, "jobs": JOBS, "seconds": seconds, **_overhead(folder / "overhead")}
+
+
+def lines_of(result: dict[str, Any]) -> Iterator[str]:
+    """The figures as one reads them."""
+    if result["exit"]:
+        yield "batch: the capture could not be rendered"
+        return
+    both, one, threads = result["seconds"].values()
+    yield f"batch of {result['jobs']} short jobs"
+    for name, value in result["seconds"].items():
+        yield f"  {name}: {value:.1f} s"
+    yield f"  two workers / one worker: {one / both:.2f} times as fast (aim 1.8)"
+    yield f"  two workers / one worker with two threads: {threads / both:.2f} (aim 1.2)"
+    yield (
+        f"  a task: {result['here_ms']:.1f} ms here, {result['dask_ms']:.1f} ms through Dask, "
+        f"scheduling {result['dask_ms'] - result['here_ms']:.1f} ms (aim 20); "
+        f"starting a child {result['child_ms']:.0f} ms"
+    )
+
+
+def _batch(folder: Path, workers: int, threads: int) -> float:
+    site = Site(folder)
+    try:
+        address = site.scheduler()
+        for index in range(workers):
+            site.worker(f"worker{index}", "--nthreads", "1")
+        out = folder / f"out-{workers}-{threads}"
+        jobs = [f"job{index}.yaml" for index in range(JOBS)]
+        begun = time.perf_counter()
+        code, _, err = site.run(
+            *jobs, "--executor", address, "--out", str(out), "--threads", str(threads), command=REAL
+        )
+        assert code == 0, err
+        return time.perf_counter() - begun
+    finally:
+        site.close()
+
+
+def _overhead(folder: Path) -> dict[str, float]:
+    """Milliseconds of a task that does nothing, by a child that runs already."""
+    from bodycap_batch.cluster import Cluster
+
+    folder.mkdir()
+    site, store = Site(folder), Store(folder / "store")
+    children = Children(FAKE)
+    try:
+        begun = time.perf_counter()
+        _make(children, store, folder, "first")
+        child_ms = 1e3 * (time.perf_counter() - begun)
+        here_ms = _median_ms(children, store, folder, "here")
+        address = site.scheduler()
+        site.worker("one", "--nthreads", "1")
+        with Cluster(address, FAKE) as cluster:
+            _make(cluster, store, folder, "warm")
+            dask_ms = _median_ms(cluster, store, folder, "dask")
+    finally:
+        children.close(folder / "logs")
+        site.close()
+    return {"child_ms": child_ms, "here_ms": here_ms, "dask_ms": dask_ms}
+
+
+def _median_ms(executor: Executor, store: Store, folder: Path, name: str) -> float:
+    times = []
+    for index in range(TASKS):
+        begun = time.perf_counter()
+        _make(executor, store, folder, f"{name}{index}")
+        times.append(1e3 * (time.perf_counter() - begun))
+    return statistics.median(times)
+
+
+def _make(executor: Executor, store: Store, folder: Path, value: str) -> None:
+    key = ArtefactKey(stage="work", algorithm="1", options={"value": value}, inputs={}, libraries={})
+    making = Making(
+        store=store,
+        logs=folder / "logs",
+        progress=lambda done, total, what: None,
+        cancelled=lambda: False,
+        may_commit=lambda: True,
+    )
+    executor.make(Task(key=key), making)

@@ -1,0 +1,109 @@
+"""The `bodycap` command that is killed, or whose disk fills up, at a chosen moment.
+
+Orders come in a JSON file named by the environment:
+
+- ``{"kill": "before" | "after", "done": file}``: at the first renaming of a file or folder that no earlier
+  run was killed at, the command and all its children get SIGKILL, just before or just after it happens.
+- ``{"fill": stage, "disk": folder}``: the disk is filled to the last byte when this stage begins.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import re
+import signal
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from bodycap_batch import pipeline
+from bodycap_batch.cli import main
+from bodycap_batch.context import StageContext
+from bodycap_batch.runner import child
+from bodycap_batch.runner.task import TaskFunction
+from bodycap_batch.tasks import STAGES
+
+ORDERS = "BODYCAP_HURT_ORDERS"
+PIDS = "BODYCAP_HURT_PIDS"
+CHILD = (sys.executable, __file__, "--child")
+BALLAST = "ballast.bin"
+
+
+def place_of(target: Path) -> str:
+    """A renaming's name: its target without what differs from run to run."""
+    text = re.sub(r"/(\.store/tmp/[a-z]+)-[^/]+", r"/\1", str(target))
+    return re.sub(r"/(digests|logs|corrupt)/.*", r"/\1", text)
+
+
+def kill_everything() -> None:
+    """End all processes of this run at once, this one last."""
+    for name in os.listdir(os.environ[PIDS]):
+        if int(name) != os.getpid():
+            try:
+                os.kill(int(name), signal.SIGKILL)
+            except ProcessLookupError:
+                continue
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def deadly(rename: Callable[..., None], when: str, done: Path) -> Callable[..., None]:
+    def wrapped(source: Any, target: Any, **values: Any) -> None:
+        place = place_of(Path(target))
+        fresh = place not in done.read_text().splitlines()
+        if fresh:
+            with done.open("a") as stream:
+                stream.write(place + "\n")
+        if fresh and when == "before":
+            kill_everything()
+        rename(source, target, **values)
+        if fresh and when == "after":
+            kill_everything()
+
+    return wrapped
+
+
+def filling(name: str, disk: Path) -> TaskFunction:
+    def run(
+        options: Mapping[str, Any], arguments: Mapping[str, Any], context: StageContext, files: Path
+    ) -> None:
+        fill(disk)
+        STAGES[name].function(options, arguments, context, files)
+
+    return run
+
+
+def fill(disk: Path) -> None:
+    """Leave no byte."""
+    size = 1 << 20
+    with (disk / BALLAST).open("ab", buffering=0) as stream:
+        while size:
+            try:
+                while stream.write(bytes(size)) == size:
+                    continue
+            except OSError:
+                size //= 2
+
+
+def hurt() -> dict[str, TaskFunction]:
+    """Prepare what was ordered; returns the stages to run."""
+    orders = json.loads(Path(os.environ[ORDERS]).read_text())
+    table = {name: stage.function for name, stage in STAGES.items()}
+    (Path(os.environ[PIDS]) / str(os.getpid())).touch()
+    if "kill" in orders:
+        done = Path(orders["done"])
+        os.replace = deadly(os.replace, orders["kill"], done)
+        os.rename = deadly(os.rename, orders["kill"], done)
+    if "fill" in orders:
+        table[orders["fill"]] = filling(orders["fill"], Path(orders["disk"]))
+    return table
+
+
+if __name__ == "__main__":
+    stages = hurt()
+    if sys.argv[1] == "--child":
+        sys.exit(child.main(sys.argv[2:], stages))
+    pipeline.Settings = functools.partial(pipeline.Settings, command=CHILD)  # type: ignore[assignment, misc]
+    sys.exit(main(sys.argv[1:]))
