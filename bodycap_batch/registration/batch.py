@@ -20,6 +20,8 @@ _CONVERGED_PX = 1e-2
 _MAX_TURN_RAD = 0.5
 _WIDE = 3.0
 """Medians beyond which a residual counts as wrong while the start is still bad."""
+COUNTING_WEIGHT = 0.05
+"""Views that weigh less decide nothing where there are others."""
 _LOSS_SHARE = 0.25
 """The loss's width in limits. 1, 1/2, 1/4: walk12 0.42, 0.39, 0.38 cm; walk131 0.68, 0.67, 0.65 cm."""
 _DAMPING = 1e-10
@@ -71,13 +73,15 @@ class Fits:
     Attributes:
         inliers: (F,) views within the limit.
         error_px: (F,) their mean residual.
-        noise_px: (F,) median of their absolute residuals along an axis, evened out by weight.
+        evidence: (F,) their share of the weight of all views.
+        noise_px: (F,) median of absolute residuals along an axis, evened out by weight, of those that count.
         depth: (F,) their median depth.
         information: (F,6,6) Gauss–Newton information of a left perturbation for a noise of 1 px.
     """
 
     inliers: IntArray
     error_px: FloatArray
+    evidence: FloatArray
     noise_px: FloatArray
     depth: FloatArray
     information: FloatArray
@@ -135,6 +139,7 @@ def assess_poses(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> F
     fits = Fits(
         inliers=np.zeros(frames, np.int64),
         error_px=np.full(frames, np.nan),
+        evidence=np.zeros(frames),
         noise_px=np.full(frames, np.nan),
         depth=np.full(frames, np.nan),
         information=np.zeros((frames, 6, 6)),
@@ -147,9 +152,13 @@ def assess_poses(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> F
         count = np.add.reduceat(inlier, starts, dtype=np.int64)
         fits.inliers[some] = count
         fits.error_px[some] = np.add.reduceat(np.where(inlier, size, 0.0), starts) / np.maximum(count, 1)
-        even = residual * np.sqrt(views.weight[rows])
-        spread = np.abs(np.where(inlier, even, _FAR)).T.ravel()
-        fits.noise_px[some] = _medians(spread, np.repeat(owner, 2), 2 * starts, 2 * count)
+        weight = views.weight[rows]
+        total = np.maximum(np.add.reduceat(weight, starts), _TINY)
+        fits.evidence[some] = np.add.reduceat(inlier * weight, starts) / total
+        counts = inlier & (weight >= COUNTING_WEIGHT)
+        spread = np.abs(np.where(counts, residual * np.sqrt(weight), _FAR)).T.ravel()
+        many = np.add.reduceat(counts, starts, dtype=np.int64)
+        fits.noise_px[some] = _medians(spread, np.repeat(owner, 2), 2 * starts, 2 * many)
         fits.depth[some] = _medians(np.where(inlier, depth, np.inf), owner, starts, count)
         fits.information[some] = _normal_equations(residual, jacobian, inlier * views.weight[rows], starts)[0]
     return fits

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray, IntArray
+from bodycap_batch.arrays import FloatArray
 from bodycap_batch.camera import Camera
 from bodycap_batch.geometry import invert, make_transform
-from bodycap_batch.registration.batch import Fits, Views, assess_poses, refine_poses
+from bodycap_batch.registration.batch import COUNTING_WEIGHT, Fits, Views, assess_poses, refine_poses
 from bodycap_batch.scene import FrameStatus
 
-_MIN_INLIER_RATIO = 0.3
+_MIN_EVIDENCE = 0.3
 _MIN_NOISE_PX = 0.3
 MAP_VARIANCE_RATIO = 5.0
 """Variance of a pose over what its residuals tell: the map's points around a frame are displaced together.
@@ -21,9 +21,11 @@ Measured as the normalised error without it (median over what a chi-squared has)
 walk131 5.2 (room131, where blocks of the map are loose, 16). The poses that a frame's two keyframes lead to
 differ by 0.8 of their own variances, so nothing in a frame alone can tell."""
 _HUGE = 1e12
+_LEAST_EVIDENCE = 1e-3
 _MAX_TRIALS = 2000
 _TRUSTED_RATIO = 0.6
-"""Share of inliers above which a start led to the right pose: sampling never found a better one."""
+"""Share of the weight with the inliers above which a start led to the right pose: sampling never found a
+better one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +54,7 @@ class FramePose:
         gauge_from_cam: (4,4), None unless registered.
         covariance: (6,6) as `Trajectory` has it.
         inliers: Number of inliers.
+        evidence: Their share of the weight of all views.
         error_px: Mean reprojection error of the inliers.
     """
 
@@ -59,6 +62,7 @@ class FramePose:
     gauge_from_cam: FloatArray | None = None
     covariance: FloatArray | None = None
     inliers: int = 0
+    evidence: float = 0.0
     error_px: float = float("nan")
 
 
@@ -81,14 +85,17 @@ def solve_poses(
     count = np.diff(views.bounds)
     found = judge_poses(views, poses, limits)
     for frame in np.flatnonzero(count >= limits.min_inliers).tolist():
-        if known[frame] and found[frame].inliers >= _TRUSTED_RATIO * count[frame]:
+        if known[frame] and found[frame].evidence >= _TRUSTED_RATIO:
             continue
-        alone, rows = views.of_frame(frame), views.rows(frame)
-        sampled = sample_pose(camera, alone.points, px[rows], limits)
+        alone = views.of_frame(frame)
+        some = alone.weight >= COUNTING_WEIGHT
+        if some.sum() < limits.min_inliers:
+            some[:] = True
+        sampled = sample_pose(camera, alone.points[some], px[views.rows(frame)][some], limits)
         if sampled is not None:
             refined = refine_poses(alone, sampled[None], limits.max_error_px)
             found[frame] = max(
-                found[frame], *judge_poses(alone, refined, limits), key=lambda pose: pose.inliers
+                found[frame], *judge_poses(alone, refined, limits), key=lambda pose: pose.evidence
             )
     return found
 
@@ -114,7 +121,7 @@ def sample_pose(camera: Camera, points: FloatArray, px: FloatArray, limits: Pose
 def judge_poses(views: Views, cam_from_gauge: FloatArray, limits: PoseLimits) -> list[FramePose]:
     """Count the inliers of poses (F,4,4), estimate their covariance, and accept or refuse them."""
     fits = assess_poses(views, cam_from_gauge, limits.max_error_px)
-    covariance = _covariance(fits, np.diff(views.bounds))
+    covariance = _covariance(fits)
     sigma = np.sqrt(np.linalg.eigvalsh(covariance[:, 3:, 3:])[:, -1])
     constrained = sigma < limits.max_sigma_depth * fits.depth
     gauge_from_cam = invert(cam_from_gauge)
@@ -123,8 +130,9 @@ def judge_poses(views: Views, cam_from_gauge: FloatArray, limits: PoseLimits) ->
         inliers = int(fits.inliers[frame])
         if count < limits.min_inliers:
             out.append(FramePose(status=FrameStatus.FEW_TRACKS))
-        elif inliers < max(limits.min_inliers, _MIN_INLIER_RATIO * count):
-            out.append(FramePose(status=FrameStatus.FEW_INLIERS, inliers=inliers))
+        elif inliers < limits.min_inliers or fits.evidence[frame] < _MIN_EVIDENCE:
+            evidence = float(fits.evidence[frame])
+            out.append(FramePose(status=FrameStatus.FEW_INLIERS, inliers=inliers, evidence=evidence))
         else:
             good = bool(constrained[frame])
             out.append(
@@ -133,16 +141,17 @@ def judge_poses(views: Views, cam_from_gauge: FloatArray, limits: PoseLimits) ->
                     gauge_from_cam=gauge_from_cam[frame] if good else None,
                     covariance=covariance[frame] if good else None,
                     inliers=inliers,
+                    evidence=float(fits.evidence[frame]),
                     error_px=float(fits.error_px[frame]),
                 )
             )
     return out
 
 
-def _covariance(fits: Fits, views: IntArray) -> FloatArray:
+def _covariance(fits: Fits) -> FloatArray:
     """Covariance (F,6,6) from the inliers' information and their own spread; huge where there is no inverse.
 
-    Views that disagree with a pose are evidence against it: the sigmas grow as the share of inliers falls.
+    Views that disagree with a pose are evidence against it: the sigmas grow as the inliers' share falls.
     (room131, frames off by more than 10 cm: 5 of 7 then lie beyond the limit, none of 7 without.)
 
     A left perturbation of cam_from_gauge is a right one of gauge_from_cam with the sign turned: the
@@ -151,5 +160,5 @@ def _covariance(fits: Fits, views: IntArray) -> FloatArray:
     noise_px = np.maximum(1.4826 * np.nan_to_num(fits.noise_px), _MIN_NOISE_PX)
     solvable = np.linalg.matrix_rank(fits.information) == 6
     safe = np.where(solvable[:, None, None], fits.information, np.eye(6) / _HUGE)
-    sigma_px = noise_px * views / np.maximum(fits.inliers, 1)
+    sigma_px = noise_px / np.maximum(fits.evidence, _LEAST_EVIDENCE)
     return np.asarray(np.linalg.inv(safe) * MAP_VARIANCE_RATIO * sigma_px[:, None, None] ** 2)
