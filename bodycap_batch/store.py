@@ -29,8 +29,9 @@ MANIFEST = "manifest.json"
 DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG})
 _VOLATILE_SUFFIXES = (".db",)
 """A database differs from run to run although what it holds is the same: no part of the content."""
-_REMEMBER_BYTES = 64 << 20
-"""Files above this are hashed again only when their inode, size or times changed."""
+_REMEMBER_BYTES = 1 << 20
+"""When an artefact is looked up, files above this are hashed again only if their inode, size or times
+changed: a finished job of any length is found finished in a moment. What a task reads is hashed whole."""
 _UNLOCKED = "new-"
 """Name of a draft between its making and its locking; swept only when it is older than a minute."""
 _STALE_S = 60.0
@@ -127,6 +128,36 @@ class Store:
             if artefact is None:
                 self._set_aside(path)
             return artefact
+
+    def verify(self, path: Path) -> None:
+        """Hash all of an artefact that is about to be read; what does not hold is set aside.
+
+        Args:
+            path: The artefact's folder.
+
+        Raises:
+            StoreError: It is damaged, although nothing has written to it: the disk fails.
+        """
+        with disk_errors(self.root):
+            try:
+                files = json.loads((path / MANIFEST).read_text(encoding="utf-8"))["files"]
+                sound = all(file_sha256(path / name) == want for name, want in files.items())
+            except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
+                sound = False
+            if not sound:
+                self._set_aside(path)
+                hint = "check the disk; run the job again, what was damaged is made anew"
+                raise StoreError("a stored artefact is damaged", path=path, hint=hint)
+
+    def artefacts_in(self, value: Any) -> Iterator[Path]:
+        """Folders of artefacts that the arguments of a task name."""
+        if isinstance(value, Mapping):
+            value = list(value.values())
+        if isinstance(value, list | tuple):
+            for part in value:
+                yield from self.artefacts_in(part)
+        elif isinstance(value, str) and value.startswith(f"{self._artefacts}{os.sep}"):
+            yield Path(value)
 
     @contextmanager
     def draft(self, key: ArtefactKey) -> Iterator[Draft]:

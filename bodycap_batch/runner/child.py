@@ -108,6 +108,8 @@ def _run(task: Task, store: Store, function: TaskFunction, link: _Link) -> None:
     started = time.monotonic()
     _pin_opencv(task.threads)
     _forget_peak_memory()
+    for artefact in store.artefacts_in(task.arguments):
+        store.verify(artefact)
     with store.draft(task.key) as draft, _DiskWatch(store):
         context = StageContext(
             work_dir=draft.work,

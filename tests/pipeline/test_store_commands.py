@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -217,6 +218,28 @@ def test_results_are_hard_links(done: Bench) -> None:
     shutil.rmtree(done.out)
     done.run()
     assert (done.out / "metrics.json").stat().st_nlink == 2
+
+
+def test_damage_that_the_file_system_does_not_tell_is_found_when_the_artefact_is_read(done: Bench) -> None:
+    """A failing disk changes bytes and no time; here the remembered digest is made to lie."""
+    before = done.results()
+    victim = next((done.folder / "store" / "artefacts" / "map").glob("*/made_of.txt"))
+    manifest = json.loads(victim.with_name("manifest.json").read_text())
+    victim.write_text(victim.read_text() + " " * (2 << 20))
+    os.utime(victim, (1e9, 1e9))
+    store = Store(done.folder / "store")
+    stat = victim.stat()
+    identity = (stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)
+    name = hashlib.sha256(json.dumps(identity).encode()).hexdigest()
+    (store.root / "digests").mkdir(exist_ok=True)
+    (store.root / "digests" / name).write_text(manifest["files"]["made_of.txt"])
+    assert done.executed() == [], "looked up, it seems sound"
+    with pytest.raises(StoreError, match="damaged") as caught:
+        done.run(merge={"max_gap_s": 0.5})
+    assert caught.value.hint
+    assert "map" in done.executed(merge={"max_gap_s": 0.5})
+    assert done.executed() == []
+    assert done.results() == before
 
 
 def test_no_store_no_garbage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
