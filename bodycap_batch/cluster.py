@@ -28,6 +28,7 @@ MEMORY = "memory"
 """Name of the resource (MB) by which a worker says what tasks may use together."""
 _POLL_S = 0.2
 _CONNECT_S = 30.0
+_ENDING = ("closing", "closed", "failed")
 _ALLOWED_FAILURES = 1
 """A task whose worker dies is done once more elsewhere; one that kills two workers is given up."""
 
@@ -169,6 +170,12 @@ def _connect(address: str) -> Client:
     try:
         # TLS certificates come from Dask's configuration.
         return Client(address, timeout=_CONNECT_S, set_as_default=False)
+    except TypeError as error:  # Dask has no SSL context to give
+        raise JobError(
+            f"no certificates to talk to {address} with",
+            field="--executor",
+            hint="name them below distributed.comm.tls in ~/.config/dask/distributed.yaml",
+        ) from error
     except (OSError, TimeoutError, ValueError) as error:
         raise JobError(
             f"no scheduler answers at {address}",
@@ -198,9 +205,9 @@ def _on_worker(order: Mapping[str, Any], topic: str) -> dict[str, Any]:
         worker.log_event(topic, {"key": key, "done": done, "total": total, "what": what})
 
     def cancelled() -> bool:
-        # A task nobody waits for any more, its client being gone or having cancelled it.
+        # A task nobody waits for any more: its client is gone or has cancelled it, or the scheduler is gone.
         known = worker.state.tasks.get(key)
-        return known is None or known.state == "cancelled"
+        return known is None or known.state == "cancelled" or worker.status.name in _ENDING
 
     return perform(order, progress, cancelled)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
 import threading
 import time
@@ -129,9 +130,11 @@ def _executor(kind: str, threads: int, workers: int, memory_mb: int) -> Iterator
             start_queue(kind, workers, threads, memory_mb) as queue,
             Cluster(queue.scheduler_address) as cluster,
         ):
+            _quieten_dask()
             yield cluster, _JOBS_ON_A_CLUSTER
     elif kind.startswith(SCHEMES):
         with Cluster(kind) as cluster:
+            _quieten_dask()
             yield cluster, _JOBS_ON_A_CLUSTER
     else:
         raise JobError(
@@ -139,6 +142,12 @@ def _executor(kind: str, threads: int, workers: int, memory_mb: int) -> Iterator
             field="--executor",
             hint=f"local, an address ({', '.join(SCHEMES)}HOST:8786), {' or '.join(QUEUES)}",
         )
+
+
+def _quieten_dask() -> None:
+    """What becomes of the jobs is told; Dask's own view of a lost connection is a page of traceback."""
+    for name in ("distributed", "distributed.client", "distributed.core"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # Dask sets their levels when it is loaded
 
 
 def _results_folder(job: Job, folder: Path) -> Path:
