@@ -32,6 +32,7 @@ _VOLATILE_SUFFIXES = (".db",)
 _REMEMBER_BYTES = 1 << 20
 """When an artefact is looked up, files above this are hashed again only if their inode, size or times
 changed: a finished job of any length is found finished in a moment. What a task reads is hashed whole."""
+_LOCK = "lock"
 _UNLOCKED = "new-"
 """Name of a draft between its making and its locking; swept only when it is older than a minute."""
 _STALE_S = 60.0
@@ -164,7 +165,8 @@ class Store:
         """Temporary folder for making an artefact; locked while in use, removed afterwards."""
         with disk_errors(self.root):
             unlocked = Path(tempfile.mkdtemp(dir=self._temporary, prefix=_UNLOCKED))
-            lock = os.open(unlocked, os.O_RDONLY)
+            # A file, opened for writing: network file systems lock nothing else across machines.
+            lock = os.open(unlocked / _LOCK, os.O_RDWR | os.O_CREAT)
             fcntl.flock(lock, fcntl.LOCK_EX)
             folder = unlocked.with_name(f"{key.stage}-{unlocked.name.removeprefix(_UNLOCKED)}")
             unlocked.rename(folder)
@@ -337,7 +339,7 @@ def _remove_if_abandoned(folder: Path) -> bool:
     try:
         if folder.name.startswith(_UNLOCKED) and time.time() - folder.stat().st_mtime < _STALE_S:
             return False
-        lock = os.open(folder, os.O_RDONLY)
+        lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT)
     except OSError:
         return False
     try:

@@ -13,7 +13,7 @@ from typing import Any
 
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import Job
-from bodycap_batch.errors import EXIT_BUG, BodycapError, JobError
+from bodycap_batch.errors import EXIT_BUG, BodycapError, Cancelled, JobError
 from bodycap_batch.pipeline.run import RunSummary, run_job
 from bodycap_batch.pipeline.sample import prepare_capture
 from bodycap_batch.pipeline.settings import Settings
@@ -104,6 +104,9 @@ class Batch:
                     yield _outcome(job, future, time.monotonic() - began[job])
 
     def _run_one(self, job: BatchJob) -> RunSummary:
+        if self._settings(job, None).cancelled():
+            raise Cancelled("stopped before it began", hint="run it again to go on")
+
         def prepare(options: Mapping[str, Any], folder: Path) -> None:
             prepare_capture(options, folder, self._settings(job, None))
 
