@@ -27,6 +27,10 @@ setup: $(VENV)/.project ## make .venv from requirements.lock and install bodycap
 job: $(VENV)/.project ## run a job: make job JOB=jobs/cpl_lab.yaml
 	$(BIN)/bodycap run $(JOB) $(ARGS)
 
+.PHONY: watch
+watch: $(VENV)/.project ## work on every folder of videos dropped into jobs/inbox (Ctrl-C stops it, it goes on later)
+	$(BIN)/bodycap watch jobs/inbox $(ARGS)
+
 .PHONY: test
 test: $(VENV)/.dev ## run the fast tests
 	$(PYTEST) $(ARGS)

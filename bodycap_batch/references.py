@@ -60,6 +60,24 @@ class References:
             write_atomically(self._path, json.dumps(content, indent=1).encode())
 
 
+def move_references(store: Store, before: Path, after: Path) -> None:
+    """A folder of results was moved: what it was made from is kept for its new place.
+
+    Args:
+        store: Where the artefacts are.
+        before: Where the folder was when its job ran.
+        after: Where it is now.
+
+    Raises:
+        StoreError: The disk fails.
+    """
+    # The old folder may be gone, but its parents are where they were: the path resolves as it did then.
+    old = References(store, before)
+    References(store, after).keep_only(old._named)
+    with disk_errors(store.root):
+        old._path.unlink(missing_ok=True)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Garbage:
     """What no job refers to.

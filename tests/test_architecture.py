@@ -52,7 +52,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "runner": KEEPING | {"context", "store", "tasks"},
     "cluster": KEEPING | {"context", "store", "runner"},
     "pipeline": MATERIAL | STAGES | KEEPING | {"store", "references", "tasks", "runner"},
-    "watch": MATERIAL | KEEPING | {"store", "runner", "cluster", "pipeline"},
+    "watch": MATERIAL | KEEPING | {"store", "references", "runner", "cluster", "pipeline"},
     "cli": MATERIAL
     | STAGES
     | KEEPING

@@ -117,11 +117,15 @@ def read_job(place: JobDir, terms: Terms) -> Job:
     return job.model_copy(update={"out": place.result})
 
 
-def rewrite_results(place: JobDir) -> None:
-    """Let the `job.yaml` of the results name the footage relative to itself: the folder will be moved."""
+def rewrite_results(place: JobDir, job: Job) -> None:
+    """Let the `job.yaml` of the results name the footage relative to itself: the folder will be moved.
+
+    Args:
+        place: The job's folder.
+        job: The job that was run.
+    """
     for file in (place.result / "job.yaml", place.result / "partial" / "job.yaml"):
         if file.is_file():
-            job = load_job(file)
             text = job_text(moved(job, lambda path, file=file: _up_from(path, place.path, file)))  # type: ignore[misc]
             temporary = file.with_name(f".{file.name}.part")
             temporary.write_text(text, encoding="utf-8")

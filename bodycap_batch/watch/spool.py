@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import unicodedata
 import uuid
@@ -118,9 +119,12 @@ class Spool:
 
     def free_name(self, name: str) -> str:
         """The name, or name-2, name-3 … where a job of that name has been here before."""
-        candidates = (name, *(f"{name}-{number}" for number in range(2, 1_000_000)))
         folders = (self.running, self.done, self.failed)
-        return next(c for c in candidates if not any(os.path.lexists(folder / c) for folder in folders))
+        for number in itertools.count(1):
+            candidate = name if number == 1 else f"{name}-{number}"
+            if not any(os.path.lexists(folder / candidate) for folder in folders):
+                return candidate
+        raise AssertionError("numbers do not end")
 
     def _try_to_rename(self) -> None:
         folder = self.inbox / f".probe-{uuid.uuid4().hex}"
@@ -171,7 +175,7 @@ def move(
     Returns:
         Where it is now.
     """
-    for number in range(1, 1_000_000):
+    for number in itertools.count(1):
         target = folder / (name if number == 1 else f"{name.removesuffix(suffix)}-{number}{suffix}")
         if os.path.lexists(target):
             continue
@@ -184,7 +188,7 @@ def move(
                 raise
         else:
             return target
-    raise StoreError("too many jobs of one name", path=folder / name, hint="clear the folder")
+    raise AssertionError("numbers do not end")
 
 
 def visible(folder: Path) -> list[Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import shutil
 import threading
 import time
@@ -21,6 +22,8 @@ Teller = Callable[[str], None]
 _LOOK_S = 1.0
 _IDLE_LOOK_S = 5.0
 """A look at the folder although nobody told a change, with and without something being copied."""
+_LOOK_SHARE = 20.0
+"""A thousand large folders on a slow disk take seconds to look at: then one look in twenty times that."""
 _ORPHANS_S = 2.0
 
 
@@ -49,6 +52,9 @@ class Watcher:
         self._worker = Worker(spool, options, self._stop)
         self._running: dict[Future[Outcome], Claim] = {}
         self._refused: dict[str, str] = {}
+        self._complete: collections.deque[tuple[Drop, Look]] = collections.deque()
+        self._waiting = False
+        self._look_at = 0.0
         self._orphans_at = 0.0
         self._worst = 0
 
@@ -106,15 +112,23 @@ class Watcher:
         for claim in self._orphans(free):
             self._start(pool, claim, None)
             free -= 1
-        drops = drops_in(self._spool.inbox)
-        complete = self._settling.complete(drops)
-        for drop, look in complete:
-            if free <= 0:
-                break
-            if (claimed := self._claim(drop, look)) is not None:
+        self._look()
+        while free > 0 and self._complete:
+            if (claimed := self._claim(*self._complete.popleft())) is not None:
                 self._start(pool, *claimed)
                 free -= 1
-        return bool(self._running) or any(str(drop.path) not in self._refused for drop in drops)
+        return bool(self._running or self._complete or self._waiting)
+
+    def _look(self) -> None:
+        """See what lies in the inbox; not so often that looking is all there is time for."""
+        started = time.monotonic()
+        if started < self._look_at:
+            return
+        drops = drops_in(self._spool.inbox)
+        self._complete = collections.deque(self._settling.complete(drops))
+        self._waiting = any(str(drop.path) not in self._refused for drop in drops)
+        now = time.monotonic()
+        self._look_at = now + _LOOK_SHARE * (now - started)
 
     def _start(self, pool: ThreadPoolExecutor, claim: Claim, refused: BodycapError | None) -> None:
         if refused is None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from bodycap_batch.errors import BodycapError, Cancelled, JobError, StoreError, error_from_dict
 from bodycap_batch.pipeline import Settings, run_job
+from bodycap_batch.references import move_references
 from bodycap_batch.store import Store
 from bodycap_batch.watch.claim import Claim, clear_claim
 from bodycap_batch.watch.intake import read_job, rewrite_results
@@ -113,7 +114,7 @@ class Worker:
             run_job(job, out_dir=place.result, settings=settings)
         finally:
             if claim.guard.holds():
-                rewrite_results(place)
+                rewrite_results(place, job)
 
     def _is_cancelled(self, claim: Claim) -> bool:
         return self._stop.is_set() or claim.lost.is_set() or claim.job.cancel.exists()
@@ -155,7 +156,9 @@ class Worker:
             if status is not None:
                 status.finish(state, error, target, self._spool.inbox)
 
+        before = claim.job.result
         target = move(claim.job.path, folder, claim.job.name, last_word)
+        move_references(self._store, before, JobDir(target).result)
         clear_claim(JobDir(target))
         return Outcome(
             name=target.name,

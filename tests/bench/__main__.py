@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.bench import batch, ours, peers, scaling, simulation
+from tests.bench import batch, ours, peers, scaling, simulation, spool
 from tests.bench.rows import DATA, LAB, Row, row_of, rows_in
 
 
@@ -27,7 +27,7 @@ def main() -> int:
     parser.add_argument(
         "only",
         nargs="*",
-        help="rows to run, or folders of captures with truth (default: all), `scaling`, `batch`; "
+        help="rows to run, or folders of captures with truth (default: all), `scaling`, `batch`, `spool`; "
         "`simulation` first runs the skeleton stage on simulated poses, with options of its own",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
@@ -59,6 +59,9 @@ def main() -> int:
         if "batch" in options.only:
             done = batch.run(work / "batch")
             _tell(results, done, list(batch.lines_of(done)))
+        if "spool" in options.only:
+            for measured in spool.run(work / "spool"):
+                _tell(results, measured, spool.lines_of(measured))
     if options.json:
         options.json.write_text(json.dumps([each for each in results if each], indent=1), encoding="utf-8")
     jobs = [result for result in results if result and "peer" not in result]
@@ -77,7 +80,7 @@ def _chosen(options: argparse.Namespace, work: Path) -> list[Row]:
     if not options.only:
         return known
     rows = [row for row in known if row.name in options.only]
-    names = {row.name for row in rows} | {"scaling", "batch"}
+    names = {row.name for row in rows} | {"scaling", "batch", "spool"}
     rows += [
         row_of(Path(name).resolve()) for name in options.only if name not in names and Path(name).is_dir()
     ]

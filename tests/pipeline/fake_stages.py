@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.context import StageContext
-from bodycap_batch.errors import EstimationError
+from bodycap_batch.errors import CaptureError, EstimationError
 from bodycap_batch.runner.child import main
 
 Json = Mapping[str, Any]
@@ -49,6 +49,8 @@ def stage(name: str) -> Any:
                 time.sleep(0.05)
         if orders().get("fail") == name and meant:
             raise EstimationError(f"{name} does not work out", hint="film more")
+        if name == "check" and any("unreadable" in text for text in videos(arguments["job"])):
+            raise CaptureError("not a readable video", hint="copy it again")
         if orders().get("fill") == name:
             with (files / "big.bin").open("wb") as stream:
                 for _ in range(1000):

@@ -30,6 +30,7 @@ class SpoolBench:
         self.spool = Spool(inbox=folder / "jobs" / "inbox", root=folder / "jobs")
         self.spool.make()
         self.told: list[str] = []
+        self._processes: list[subprocess.Popen[str]] = []
         self.order()
 
     def order(self, **orders: Any) -> None:
@@ -74,7 +75,7 @@ class SpoolBench:
         """Start the command with stand-in stages in a process of its own."""
         environment = {**os.environ, "PYTHONPATH": str(ROOT), ORDERS: str(self.orders)}
         environment.pop("BODYCAP_STORE", None)
-        return subprocess.Popen(
+        process = subprocess.Popen(
             [*BODYCAP, *arguments],
             cwd=self.folder,
             env=environment,
@@ -82,6 +83,15 @@ class SpoolBench:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
         )
+        self._processes.append(process)
+        return process
+
+    def close(self) -> None:
+        """End what a failed test left running."""
+        for process in self._processes:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
 
     def hanging(self) -> int:
         """Wait until a stage that was ordered to hang does; returns its process id."""

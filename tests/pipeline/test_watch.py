@@ -8,6 +8,7 @@ import shutil
 import signal
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,8 @@ import yaml
 from bodycap_batch.cli import main
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.errors import JobError
+from bodycap_batch.references import collect_garbage
+from bodycap_batch.store import Store
 from bodycap_batch.watch import cancel_job, retry_job, rows_of
 from bodycap_batch.watch.claim import first_claim, take_over
 from bodycap_batch.watch.spool import JobDir
@@ -25,11 +28,12 @@ from tests.pipeline.test_cli import gone
 
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SpoolBench:
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SpoolBench]:
     bench = SpoolBench(tmp_path)
     monkeypatch.setenv(ORDERS, str(bench.orders))
     monkeypatch.chdir(tmp_path)
-    return bench
+    yield bench
+    bench.close()
 
 
 def leftovers(bench: SpoolBench) -> list[str]:
@@ -340,6 +344,18 @@ def test_a_job_is_cancelled_within_five_seconds_and_goes_on_when_retried(bench: 
     process.terminate()
     assert process.wait(30) == 143
     assert {"stage": "check", "reused": True}.items() <= bench.status("walk")["finished_stages"][0].items()
+
+
+def test_what_done_and_failed_jobs_were_made_from_is_not_taken_for_garbage(bench: SpoolBench) -> None:
+    bench.drop("good")
+    bench.work_off()
+    bench.order(fail="merge")
+    bench.drop("bad")
+    bench.work_off()
+    store = Store(bench.spool.root / ".store")
+    assert collect_garbage(store, delete=True).artefacts == ()
+    shutil.rmtree(bench.job("bad").path)
+    assert len(collect_garbage(store, delete=False).artefacts) == 7  # all but the check, which both share
 
 
 def test_a_waiting_job_is_cancelled_where_it_lies(bench: SpoolBench) -> None:

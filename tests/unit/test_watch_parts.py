@@ -1,0 +1,227 @@
+"""Parts of the watched folder: what is complete, whose job it is, what a heartbeat says."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from bodycap_batch.watch.changes import Changes, on_network_disk
+from bodycap_batch.watch.claim import Onlooker, first_claim, take_over
+from bodycap_batch.watch.drops import Drop, Settling, drops_in, look_at
+from bodycap_batch.watch.spool import JobDir, Spool, move, spool_at, spool_name
+
+ROOT = Path(__file__).parents[2]
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def completed(settling: Settling, inbox: Path) -> list[str]:
+    return [drop.name for drop, _ in settling.complete(drops_in(inbox))]
+
+
+def test_a_folder_is_complete_when_it_has_been_still_for_long_enough(tmp_path: Path) -> None:
+    clock = Clock()
+    settling = Settling(10.0, 100, clock)
+    folder = tmp_path / "walk"
+    folder.mkdir()
+    assert completed(settling, tmp_path) == []
+    clock.now += 60
+    assert completed(settling, tmp_path) == []  # empty: it has just been made
+    video = folder / "torso.mp4"
+    for size in (100, 200):
+        video.write_bytes(bytes(size))
+        assert completed(settling, tmp_path) == []
+        clock.now += 9.9
+        assert completed(settling, tmp_path) == []
+    os.utime(video, ns=(1, 1))  # a copy that keeps times ends by setting them
+    assert completed(settling, tmp_path) == []
+    clock.now += 10
+    assert completed(settling, tmp_path) == ["walk"]
+
+
+@pytest.mark.parametrize(
+    "left", ["head.mp4.part", ".head.mp4.Xy3", "head/.GX01.MP4.tmp", ".rsync-partial/head.mp4"]
+)
+def test_what_a_copying_program_left_holds_a_folder_back_until_ready(tmp_path: Path, left: str) -> None:
+    clock = Clock()
+    settling = Settling(10.0, 100, clock)
+    (tmp_path / "walk" / left).parent.mkdir(parents=True)
+    (tmp_path / "walk" / left).touch()
+    (tmp_path / "walk" / "torso.mp4").touch()
+    completed(settling, tmp_path)
+    clock.now += 1000
+    assert completed(settling, tmp_path) == []
+    assert left in look_at(Drop(tmp_path / "walk"), 100).waits_for
+    (tmp_path / "walk" / "READY").touch()
+    assert completed(settling, tmp_path) == ["walk"]
+
+
+def test_what_file_managers_leave_holds_nothing_back(tmp_path: Path) -> None:
+    (tmp_path / "walk").mkdir()
+    for name in ("torso.mp4", ".DS_Store", "._torso.mp4"):
+        (tmp_path / "walk" / name).touch()
+    assert completed(Settling(0.0, 100), tmp_path) == ["walk"]
+
+
+def test_the_drop_that_has_been_complete_for_longest_comes_first(tmp_path: Path) -> None:
+    clock = Clock()
+    settling = Settling(10.0, 100, clock)
+    for name in ("b", "a", "c.yaml"):
+        (tmp_path / name).write_text("x")
+        completed(settling, tmp_path)
+        clock.now += 1
+    (tmp_path / "z").mkdir()
+    (tmp_path / "z" / "torso.mp4").touch()
+    clock.now += 20
+    completed(settling, tmp_path)
+    clock.now += 20
+    assert completed(settling, tmp_path) == ["c", "z"]  # a and b are files, but no job files
+
+
+def test_a_heartbeat_counts_as_stopped_by_the_own_clock_alone(tmp_path: Path) -> None:
+    job = JobDir(tmp_path / "walk")
+    job.path.mkdir()
+    claim = first_claim(job)
+    clock = Clock()
+    onlooker = Onlooker(60.0, clock)
+
+    def elsewhere() -> None:
+        owner = json.loads(job.owner.read_text())
+        job.owner.write_text(json.dumps({**owner, "machine": "another", "pid": 1}))
+
+    for _ in range(5):
+        claim.beat()
+        elsewhere()
+        os.utime(job.owner, (1e9, 1e9))  # that host's clock is years behind: nobody asks
+        assert onlooker.abandoned([job]) == []
+        clock.now += 59
+    assert onlooker.abandoned([job]) == []
+    clock.now += 1
+    assert onlooker.abandoned([job]) == [job]
+
+
+def test_an_owner_that_let_go_or_ended_on_this_machine_is_not_waited_for(tmp_path: Path) -> None:
+    job = JobDir(tmp_path / "walk")
+    job.path.mkdir()
+    claim = first_claim(job)
+    onlooker = Onlooker(1e9)
+    assert onlooker.abandoned([job]) == []
+    owner = json.loads(job.owner.read_text())
+    if owner["machine"]:
+        job.owner.write_text(json.dumps({**owner, "process": "1"}))
+        # its number belongs to another process now
+        assert onlooker.abandoned([job]) == [job]
+    job.owner.write_text(json.dumps(owner))
+    claim.release()
+    assert onlooker.abandoned([job]) == [job]
+
+
+def test_a_late_heartbeat_of_an_earlier_owner_takes_nothing_back(tmp_path: Path) -> None:
+    job = JobDir(tmp_path / "walk")
+    job.path.mkdir()
+    first = first_claim(job)
+    stale = job.owner.read_bytes()
+    second = take_over(job)
+    assert second is not None
+    assert second.generation == 2
+    job.owner.write_bytes(stale)  # suspended between its look and its write
+    assert second.guard.holds()
+    assert not first.guard.holds()
+    second.beat()
+    assert json.loads(job.owner.read_text())["generation"] == 2
+    shutil.rmtree(job.path)
+    assert not second.guard.holds()
+
+
+def test_a_job_of_the_same_name_is_not_mistaken_for_the_one_that_was_taken_away(tmp_path: Path) -> None:
+    job = JobDir(tmp_path / "walk")
+    job.path.mkdir()
+    first = first_claim(job)
+    job.path.rename(tmp_path / "filed away")
+    job.path.mkdir()
+    other = first_claim(job)
+    assert other.guard.holds()
+    assert not first.guard.holds()
+    first.beat()
+    assert first.lost.is_set()
+    assert other.guard.holds()
+
+
+def test_moves_never_overwrite(tmp_path: Path) -> None:
+    for number in range(3):
+        (tmp_path / "from" / "walk").mkdir(parents=True)
+        (tmp_path / "from" / "walk" / "n").write_text(str(number))
+        (tmp_path / "to").mkdir(exist_ok=True)
+        move(tmp_path / "from" / "walk", tmp_path / "to", "walk")
+    assert {path.name: (path / "n").read_text() for path in (tmp_path / "to").iterdir()} == {
+        "walk": "0",
+        "walk-2": "1",
+        "walk-3": "2",
+    }
+
+
+def test_names_of_jobs_are_safe_to_show_and_to_type() -> None:
+    assert spool_name("küche 3") == "küche 3"
+    assert spool_name("e\u0301") == "é"
+    assert spool_name("a\n\x1b[31mb") == "a__[31mb"
+    assert spool_name("-rf")[0] != "-"
+    assert spool_name("..")[0] != "."
+    assert spool_name(" ") == "_"
+    assert len(spool_name("日" * 200).encode()) <= 200
+
+
+def test_the_spool_is_found_from_its_inbox_and_from_its_folder(tmp_path: Path) -> None:
+    (tmp_path / "jobs" / "inbox").mkdir(parents=True)
+    want = Spool(inbox=tmp_path / "jobs" / "inbox", root=tmp_path / "jobs")
+    assert spool_at(tmp_path / "jobs") == want
+    assert spool_at(tmp_path / "jobs" / "inbox") == want
+    assert spool_at(tmp_path / "drop") == Spool(inbox=tmp_path / "drop", root=tmp_path)
+
+
+@pytest.mark.parametrize("poll", [False, True])
+def test_a_change_wakes_the_watcher(tmp_path: Path, poll: bool) -> None:
+    woken = threading.Event()
+    with Changes(tmp_path, woken, poll=poll):
+        end = time.monotonic() + 20
+        number = 0
+        while not woken.is_set() and time.monotonic() < end:
+            (tmp_path / str(number)).mkdir()
+            number += 1
+            time.sleep(0.1)
+    assert woken.is_set()
+
+
+def test_a_network_disk_is_known_by_its_mount(tmp_path: Path) -> None:
+    mounts = tmp_path / "mounts"
+    nas = f"{tmp_path}/my\\040nas"
+    mounts.write_text(f"/dev/sda / ext4 rw 0 0\nhost:/x {nas} nfs4 rw 0 0\n/dev/sdb {nas}/disk xfs rw 0 0\n")
+    assert on_network_disk(tmp_path / "my nas" / "jobs", mounts)
+    assert not on_network_disk(tmp_path / "my nas" / "disk" / "jobs", mounts)
+    assert not on_network_disk(tmp_path, mounts)
+
+
+def test_the_service_example_is_a_valid_unit(tmp_path: Path) -> None:
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("needs systemd-analyze")
+    text = (ROOT / "examples" / "bodycap-watch.service").read_text()
+    unit = tmp_path / "bodycap-watch.service"
+    # The verifier wants the program to be there; where it is installed is for the operator to decide.
+    unit.write_text(text.replace("/opt/bodycap_batch/.venv/bin/bodycap", "/bin/true"))
+    assert "/bin/true watch /srv/bodycap/jobs/inbox" in unit.read_text()
+    done = subprocess.run(
+        ["systemd-analyze", "verify", str(unit)], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr.strip()) == (0, "")
