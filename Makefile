@@ -43,6 +43,11 @@ test-slow: $(VENV)/.dev ## run the slow tests and those on real captures
 test-cluster: $(VENV)/.dev ## run jobs on a Dask scheduler and workers of this machine, killing some
 	$(BIN)/python -m pytest -m cluster tests/cluster $(ARGS)
 
+.PHONY: test-blender
+test-blender: $(VENV)/.dev $(BLENDER)/.ready ## import the results into Blender; pictures in build/blender
+	BODYCAP_BLENDER=$(CURDIR)/$(BLENDER)/bin/python OMP_NUM_THREADS=1 \
+		$(BIN)/python -m pytest -m blender tests/blender $(ARGS)
+
 .PHONY: lint
 lint: $(VENV)/.dev ## check format, lint and types
 	$(BIN)/ruff format --check .

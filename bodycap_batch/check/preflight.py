@@ -16,6 +16,8 @@ from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, Job
 from bodycap_batch.errors import BodycapError, CaptureError, JobError
 from bodycap_batch.formats.bvh import read_bvh
+from bodycap_batch.formats.fbx import require_blender
+from bodycap_batch.formats.needs import require_libraries
 
 # Frames whose distance differs by more than this share from the usual one make a variable rate.
 _RATE_TOLERANCE = 0.2
@@ -41,7 +43,7 @@ def require_ready(job: Job) -> CheckReport:
 
     The room on the disk is left out: it is another one at any moment.
     """
-    report = _checked(job, (_check_clocks, _check_skeleton))
+    report = _checked(job, (_check_clocks, _check_skeleton, _check_formats))
     if report.errors:
         raise report.errors[0]
     return report
@@ -49,7 +51,7 @@ def require_ready(job: Job) -> CheckReport:
 
 def check_job(job: Job) -> CheckReport:
     """Check a resolved job: every video opened and looked at, calibration, clocks, skeleton, disk."""
-    return _checked(job, (_check_clocks, _check_skeleton, _check_disk))
+    return _checked(job, (_check_clocks, _check_skeleton, _check_formats, _check_disk))
 
 
 def _checked(job: Job, checks: Iterable[Callable[[Job, list[CameraFinding]], list[str]]]) -> CheckReport:
@@ -204,6 +206,22 @@ def _check_skeleton(job: Job, _findings: list[CameraFinding]) -> list[str]:
                 hint=f"its joints: {', '.join(skeleton.joints[:30])}; rename them the HumanIK way",
             )
     return [f"skeleton {path.name}: {len(skeleton.joints)} joints"]
+
+
+def _check_formats(job: Job, _findings: list[CameraFinding]) -> list[str]:
+    """What the files take must be installed, and a rig of the user's own keeps its names."""
+    if job.skeleton == NO_SKELETON:
+        return []
+    require_libraries(job.export.formats)
+    if "fbx" in job.export.formats:
+        require_blender()
+    if job.export.names != "hik" and job.skeleton not in SKELETON_PRESETS:
+        raise JobError(
+            f"names: {job.export.names} does not go with a skeleton file: its joints keep their names",
+            field="export.names",
+            hint="leave names out, or use the skeleton upper_body or full_body",
+        )
+    return []
 
 
 def _check_disk(job: Job, findings: list[CameraFinding]) -> list[str]:

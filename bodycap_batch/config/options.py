@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 FrameName = Annotated[str, StringConstraints(pattern=r"^.+:\d+$")]
 """One frame of one camera, ``camera:frame``."""
 
+FileFormat = Literal["ply", "bvh", "glb", "fbx", "usd", "c3d", "trc", "tum", "csv", "npz", "colmap"]
 NamePreset = Literal["hik", "mixamo", "biped", "unreal"]
 RootMode = Literal["hips", "ground", "in_place"]
 
@@ -70,14 +71,7 @@ class MergeOptions(Options):
 class ExportOptions(Options):
     """Stage 5, the files."""
 
-    formats: tuple[Literal["ply", "bvh", "glb", "tum", "csv", "colmap"], ...] = (
-        "ply",
-        "bvh",
-        "glb",
-        "tum",
-        "csv",
-        "colmap",
-    )
+    formats: tuple[FileFormat, ...] = ("ply", "bvh", "glb", "tum", "csv", "colmap")
     units: Literal["cm", "m"] = Field("cm", description="unit of the BVH")
     names: NamePreset = Field("hik", description="joint names and spine count of the files for animation")
     root: RootMode = Field(

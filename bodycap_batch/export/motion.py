@@ -12,7 +12,9 @@ from bodycap_batch.arrays import BoolArray
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.errors import JobError, StoreError
 from bodycap_batch.formats.bvh import read_bvh, write_bvh
+from bodycap_batch.formats.c3d import Points
 from bodycap_batch.formats.gltf import read_glb, write_glb
+from bodycap_batch.formats.usd import read_usd, write_usd
 from bodycap_batch.geometry import rotation_angle_rad
 from bodycap_batch.skeleton import Motion, SkeletonModel
 
@@ -36,6 +38,20 @@ def write_figure(path: Path, motion: Motion) -> Path:
     write_glb(path, motion)
     _verify(path, motion, read_glb)
     return path
+
+
+def write_stage(path: Path, motion: Motion) -> Path:
+    """Write a USD stage, verify that it holds the motion, return its path. Raises as `write_motion`."""
+    write_usd(path, motion)
+    _verify(path, motion, read_usd)
+    return path
+
+
+def joint_centres(motion: Motion) -> Points:
+    """The joint centres as named points."""
+    return Points(
+        names=motion.skeleton.joints, fps=motion.fps, x_in_world_m=motion.world_from_joint()[..., :3, 3]
+    )
 
 
 def _verify(path: Path, motion: Motion, read: Callable[[Path], Motion | None]) -> None:

@@ -10,22 +10,27 @@ from typing import Any
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.export.inputs import ExportInputs
+from bodycap_batch.export.joint_tables import write_joint_arrays, write_joint_table
 from bodycap_batch.export.layout import lay_out
 from bodycap_batch.export.metrics import collect_metrics
-from bodycap_batch.export.motion import only_solved, write_figure, write_motion
+from bodycap_batch.export.motion import joint_centres, only_solved, write_figure, write_motion, write_stage
 from bodycap_batch.export.projection import project_motion
 from bodycap_batch.export.scene_files import write_colmap, write_maps, write_trajectories
 from bodycap_batch.export.tables import write_frames
+from bodycap_batch.formats.c3d import write_c3d
+from bodycap_batch.formats.fbx import write_fbx
 from bodycap_batch.formats.files import write_text
+from bodycap_batch.formats.needs import require_libraries
+from bodycap_batch.formats.trc import write_trc
 from bodycap_batch.skeleton import Motion
 
 
 def export_results(inputs: ExportInputs, options: ExportOptions, context: StageContext) -> tuple[Path, ...]:
     """Write a job's results into ``inputs.out_dir``, each file whole or not at all, and verify them.
 
-    ``map.ply``, ``trajectories/<camera>.tum``, ``colmap/<n>/``, ``frames.csv``, ``motion.bvh`` and
-    ``motion.glb`` (as the options ask) and always ``metrics.json``. Everything is in the world where there is
-    one.
+    ``map.ply``, ``trajectories/<camera>.tum``, ``colmap/<n>/``, ``frames.csv``, ``joints.csv``,
+    ``motion.bvh``, ``motion.glb`` and further formats (as the options ask) and always ``metrics.json``.
+    Everything is in the world where there is one.
 
     Args:
         inputs: Maps, trajectories and the merged body.
@@ -36,17 +41,21 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
         The files written, relative to the folder.
 
     Raises:
+        JobError: A format takes a library or a program that is not installed.
         StoreError: A file cannot be written, or read back it differs from what was meant.
     """
+    require_libraries(options.formats)
     motion, gap = _project(inputs, options)
     steps: dict[str, Callable[[], list[Path]]] = {"tum": lambda: write_trajectories(inputs)}
     if inputs.maps:
         steps |= {"ply": lambda: write_maps(inputs), "colmap": lambda: write_colmap(inputs)}
     steps["csv"] = lambda: [write_frames(inputs.out_dir / "frames.csv", inputs)]
     if motion is not None:
-        animated = lay_out(motion, options)
-        steps["bvh"] = lambda: [write_motion(inputs.out_dir / "motion.bvh", animated, options)]
-        steps["glb"] = lambda: [write_figure(inputs.out_dir / "motion.glb", animated)]
+        steps |= _motion_steps(inputs.out_dir, motion, options)
+        steps["csv"] = lambda: [
+            write_frames(inputs.out_dir / "frames.csv", inputs),
+            write_joint_table(inputs.out_dir / "joints.csv", motion),
+        ]
     steps = {name: write for name, write in steps.items() if name in options.formats}
     steps["metrics"] = lambda: [_write_metrics(inputs, motion, gap)]
     written: list[Path] = []
@@ -56,6 +65,22 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
         written += write()
     context.progress(len(steps), len(steps), "")
     return tuple(path.relative_to(inputs.out_dir) for path in written)
+
+
+def _motion_steps(
+    folder: Path, motion: Motion, options: ExportOptions
+) -> dict[str, Callable[[], list[Path]]]:
+    """The files of the motion: for animation as it is laid out, for measuring as it was solved."""
+    animated, centres = lay_out(motion, options), joint_centres(motion)
+    return {
+        "bvh": lambda: [write_motion(folder / "motion.bvh", animated, options)],
+        "glb": lambda: [write_figure(folder / "motion.glb", animated)],
+        "fbx": lambda: [write_fbx(folder / "motion.fbx", animated)],
+        "usd": lambda: [write_stage(folder / "motion.usd", animated)],
+        "c3d": lambda: [write_c3d(folder / "joints.c3d", centres)],
+        "trc": lambda: [write_trc(folder / "joints.trc", centres)],
+        "npz": lambda: [write_joint_arrays(folder / "joints.npz", motion)],
+    }
 
 
 def _write_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[str, Any]) -> Path:

@@ -13,6 +13,7 @@ from typing import Any
 from bodycap_batch.check import require_room
 from bodycap_batch.config.models import CameraConfig, Job
 from bodycap_batch.errors import Cancelled, EstimationError
+from bodycap_batch.formats.needs import require_libraries
 from bodycap_batch.pipeline.inputs import (
     all_cameras,
     body_arguments,
@@ -75,10 +76,15 @@ class Flow:
         Raises:
             BodycapError: The job, a video or a calibration cannot be used.
         """
-        body = body_digest(self._job, self._settings.store.digests) if has_body(self._job) else None
+        body = None
+        if has_body(self._job):
+            # What is installed can change between two runs: looked at each time, not kept with the check.
+            require_libraries(self._job.export.formats)
+            body = body_digest(self._job, self._settings.store.digests)
         limits = self._settings.limits
         bounds = {} if limits is None else {"limits": asdict(limits)}
-        key = key_of("check", {}, {"cameras": self._digests, "body": body, **bounds})
+        files = self._job.export.model_dump(mode="json", include={"formats", "names"})
+        key = key_of("check", {}, {"cameras": self._digests, "body": body, "files": files, **bounds})
         task = Task(key=key, arguments={"job": self._job.model_dump(mode="json"), **bounds})
         artefact = self._one(task, [STAGES["keyframes"].modules] * (self._side_by_side - 1))
         self._frames = int(read_summary(artefact.path)["frames"])

@@ -35,6 +35,6 @@ def _export(options: Json, arguments: Json, context: StageContext, files: Path) 
 
 EXPORT = Stage(
     function=_export,
-    libraries=("numpy", "scipy", "open3d-cpu|open3d"),
+    libraries=("numpy", "scipy", "open3d-cpu|open3d", "pygltflib", "usd-core", "ezc3d"),
     modules=("bodycap_batch.export", "open3d", "scipy.spatial.transform"),
 )

@@ -52,26 +52,26 @@ def frames_of(body: Any) -> tuple[int, int]:
 
 def report() -> dict[str, Any]:
     """What the scene holds."""
-    out: dict[str, Any] = {
-        "clouds": {},
-        "fps": bpy.context.scene.render.fps / bpy.context.scene.render.fps_base,
-    }
+    rate = bpy.context.scene.render
+    out: dict[str, Any] = {"clouds": {}, "colors": {}, "fps": rate.fps / rate.fps_base}
     for item in bpy.data.objects:
         if item.type == "MESH" and not item.data.polygons:
             out["clouds"][item.name] = [list(item.matrix_world @ vertex.co) for vertex in item.data.vertices]
+            out["colors"][item.name] = [
+                list(entry.color_srgb) for entry in item.data.color_attributes[0].data
+            ]
     body = armature()
     out["armature"] = rows(body.matrix_world)
     out["joints"] = [bone.name for bone in body.data.bones]
     out["parents"] = {bone.name: bone.parent.name if bone.parent else None for bone in body.data.bones}
-    out["rest"] = {bone.name: list(body.matrix_world @ bone.head_local) for bone in body.data.bones}
-    out["rest_tail"] = {bone.name: list(body.matrix_world @ bone.tail_local) for bone in body.data.bones}
+    out["rest"] = {bone.name: rows(body.matrix_world @ bone.matrix_local) for bone in body.data.bones}
     out["frames"] = first, last = frames_of(body)
     out["world"] = {bone.name: [] for bone in body.pose.bones}
     for frame in range(first, last + 1):
         bpy.context.scene.frame_set(frame)
         for bone in body.pose.bones:
             out["world"][bone.name].append(rows(body.matrix_world @ bone.matrix))
-    figures = [item for item in bpy.data.objects if item.type == "MESH" and item.data.polygons]
+    figures = [item for item in bpy.data.objects if item.type == "MESH" and item.find_armature() == body]
     out["figure"] = {}
     for item in figures:
         seen = item.evaluated_get(bpy.context.evaluated_depsgraph_get())
@@ -85,7 +85,7 @@ def draw(picture: Path) -> None:
     body = armature()
     heads = [body.matrix_world @ bone.head for bone in body.pose.bones]
     middle = sum(heads, Vector()) / len(heads)
-    if not any(item.type == "MESH" and item.data.polygons for item in bpy.data.objects):
+    if not any(item.type == "MESH" and item.find_armature() == body for item in bpy.data.objects):
         for bone in body.pose.bones:
             start, end = body.matrix_world @ bone.head, body.matrix_world @ bone.tail
             bpy.ops.mesh.primitive_cone_add(
@@ -107,9 +107,9 @@ def draw(picture: Path) -> None:
     scene.world = scene.world or bpy.data.worlds.new("world")
     scene.world.color = (0.25, 0.27, 0.3)
     scene.render.engine = "CYCLES"
-    scene.cycles.samples = 8
+    scene.cycles.samples = 4
     scene.cycles.device = "CPU"
-    scene.render.resolution_x, scene.render.resolution_y = 480, 480
+    scene.render.resolution_x, scene.render.resolution_y = 320, 320
     scene.render.filepath = str(picture)
     bpy.ops.render.render(write_still=True)
 

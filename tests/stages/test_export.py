@@ -63,7 +63,15 @@ def run(inputs: ExportInputs, **options: Any) -> dict[str, Any]:
 def test_all_files_are_there(tmp_path: Path) -> None:
     inputs = inputs_of(tmp_path)
     files = export_results(inputs, ExportOptions(), StageContext(work_dir=tmp_path))
-    expected = {"map.ply", "map_1.ply", "motion.bvh", "motion.glb", "frames.csv", "metrics.json"}
+    expected = {
+        "map.ply",
+        "map_1.ply",
+        "motion.bvh",
+        "motion.glb",
+        "joints.csv",
+        "frames.csv",
+        "metrics.json",
+    }
     expected |= {f"trajectories/{camera}.tum" for camera in CAMERAS}
     expected |= {f"colmap/{n}/{name}.bin" for n in (0, 1) for name in ("cameras", "images", "points3D")}
     assert {str(file) for file in files} == expected

@@ -15,6 +15,10 @@ from bodycap_batch.skeleton import Motion, SkeletonModel, rest_pose
 _UPRIGHT = 0.1
 """Below this the hips are near upside down and have no heading: the one before is kept."""
 
+_ASIDE_M = 1e-3
+"""At rest the hips stand this little before the root: right above it, at the tip of its bone, Blender's FBX
+importer takes them for fixed to it and ignores their motion."""
+
 
 def floor_name(names: str, mode: RootMode) -> str | None:
     """Name of the root on the floor where the preset or the mode asks for one."""
@@ -89,7 +93,7 @@ def _on_floor(skeleton: SkeletonModel, name: str) -> SkeletonModel:
     while free in skeleton.joints:
         free, number = f"{name}{number}", number + 1
     offsets = np.concatenate([np.zeros((1, 3)), skeleton.offsets_m])
-    offsets[1] = [0.0, 0.0, rest_pose(skeleton)[0, 2, 3]]
+    offsets[1] = [0.0, -_ASIDE_M, rest_pose(skeleton)[0, 2, 3]]
     tpose = skeleton.tpose_rotation
     return SkeletonModel(
         name=skeleton.name,

@@ -20,15 +20,10 @@ WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 ELEMENTS, VERTICES = 34963, 34962
 
 
-def poses_in_file_axes(world_from_joint: FloatArray, scale: float = 1.0) -> FloatArray:
-    """Poses (...,4,4) with both frames turned from world axes to the file's, lengths scaled."""
-    rotation = rotations_in_file_axes(world_from_joint[..., :3, :3])
-    return make_transform(rotation, scale * world_from_joint[..., :3, 3] @ FILE_FROM_WORLD.T)
-
-
-def rotations_in_file_axes(rotation: FloatArray) -> FloatArray:
-    """Local rotations (...,3,3) from world axes to the file's."""
-    return np.asarray(FILE_FROM_WORLD @ rotation @ FILE_FROM_WORLD.T)
+def poses_in_file_axes(world_from_joint: FloatArray) -> FloatArray:
+    """Poses (...,4,4) with both frames turned from world axes to the file's."""
+    rotation = FILE_FROM_WORLD @ world_from_joint[..., :3, :3] @ FILE_FROM_WORLD.T
+    return make_transform(rotation, world_from_joint[..., :3, 3] @ FILE_FROM_WORLD.T)
 
 
 def rotations_in_world_axes(rotation: FloatArray) -> FloatArray:

@@ -20,15 +20,19 @@ from bodycap_batch.formats.gltf.axes import (
     UINT32,
     VERTICES,
     poses_in_file_axes,
-    rotations_in_file_axes,
 )
-from bodycap_batch.geometry import continuous_quat_xyzw, invert, quat_xyzw_from_rotation
+from bodycap_batch.geometry import continuous_quat_xyzw, invert, make_transform, quat_xyzw_from_rotation
 from bodycap_batch.skeleton import Motion, SkeletonModel, rest_pose
 
 _COLOR = (0.86, 0.39, 0.10, 1.0)
 
 
-def write_glb(path: Path | str, motion: Motion, *, units_per_metre: float = 1.0) -> None:
+def write_glb(
+    path: Path | str,
+    motion: Motion,
+    *,
+    file_from_up: FloatArray | None = None,
+) -> None:
     """Write a motion as a skinned, animated stick figure.
 
     Joints are nodes under one node ``Armature``; bones bind at the T-pose. Every joint has a LINEAR rotation
@@ -37,7 +41,7 @@ def write_glb(path: Path | str, motion: Motion, *, units_per_metre: float = 1.0)
     Args:
         path: The file; replaced in one step.
         motion: What to write; world axes, metres.
-        units_per_metre: 1 as the format wants it; 100 for a converter that takes the numbers for centimetres.
+        file_from_up: (3,3) turns the whole scene, for a converter that will turn it back; default not.
 
     Raises:
         StoreError: The file cannot be written.
@@ -45,9 +49,10 @@ def write_glb(path: Path | str, motion: Motion, *, units_per_metre: float = 1.0)
     import pygltflib as gl
 
     buffer = _Buffer()
-    figure = _figure(motion.skeleton, units_per_metre, buffer)
-    animation = _animation(motion, units_per_metre, buffer)
-    rest = poses_in_file_axes(rest_pose(motion.skeleton), units_per_metre)
+    turn = make_transform(np.eye(3) if file_from_up is None else file_from_up, np.zeros(3))
+    figure = _figure(motion.skeleton, turn, buffer)
+    animation = _animation(motion, turn, buffer)
+    rest = turn @ poses_in_file_axes(rest_pose(motion.skeleton))
     binds = buffer.add(np.swapaxes(invert(rest), -1, -2).reshape(-1, 16), "MAT4")
     joints = len(motion.skeleton.joints)
     document = gl.GLTF2(
@@ -140,19 +145,20 @@ def _joint_nodes(skeleton: SkeletonModel, rest: FloatArray) -> list[Any]:
     ]
 
 
-def _figure(skeleton: SkeletonModel, scale: float, buffer: _Buffer) -> Any:
+def _figure(skeleton: SkeletonModel, turn: FloatArray, buffer: _Buffer) -> Any:
     """The stick figure as a primitive: every vertex follows one joint with weight 1."""
     import pygltflib as gl
 
     figure = stick_figure(skeleton)
+    axes = (turn[:3, :3] @ FILE_FROM_WORLD).T
     count = len(figure.vertices_m)
     joints = np.zeros((count, 4))
     joints[:, 0] = figure.joints
     weights = np.zeros((count, 4))
     weights[:, 0] = 1.0
     attributes = gl.Attributes(
-        POSITION=buffer.add(scale * figure.vertices_m @ FILE_FROM_WORLD.T, "VEC3", target=VERTICES),
-        NORMAL=buffer.add(figure.normals @ FILE_FROM_WORLD.T, "VEC3", target=VERTICES),
+        POSITION=buffer.add(figure.vertices_m @ axes, "VEC3", target=VERTICES),
+        NORMAL=buffer.add(figure.normals @ axes, "VEC3", target=VERTICES),
         JOINTS_0=buffer.add(joints, "VEC4", target=VERTICES, component=UINT16),
         WEIGHTS_0=buffer.add(weights, "VEC4", target=VERTICES),
     )
@@ -160,13 +166,15 @@ def _figure(skeleton: SkeletonModel, scale: float, buffer: _Buffer) -> Any:
     return gl.Primitive(attributes=attributes, indices=faces, material=0)
 
 
-def _animation(motion: Motion, scale: float, buffer: _Buffer) -> Any:
+def _animation(motion: Motion, turn: FloatArray, buffer: _Buffer) -> Any:
     """Rotations of all joints, translations of those that travel."""
     import pygltflib as gl
 
     times = buffer.add(np.arange(len(motion.root_in_world_m)) / motion.fps, "SCALAR")
-    quats = continuous_quat_xyzw(rotations_in_file_axes(motion.local_rotation))
-    position = scale * motion.local_position_m() @ FILE_FROM_WORLD.T
+    local = make_transform(motion.local_rotation, motion.local_position_m())
+    local = poses_in_file_axes(local)
+    local[:, 0] = turn @ local[:, 0]
+    quats, position = continuous_quat_xyzw(local[..., :3, :3]), local[..., :3, 3]
     curves = [(joint, "rotation", buffer.add(quats[:, joint], "VEC4")) for joint in range(quats.shape[1])]
     travelling = range(1 if motion.hips_in_root_m is None else 2)
     curves += [(joint, "translation", buffer.add(position[:, joint], "VEC3")) for joint in travelling]

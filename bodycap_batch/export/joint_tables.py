@@ -1,0 +1,78 @@
+"""``joints.csv`` and ``joints.npz``: the motion as numbers, every joint at every tick."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.formats.bundle import write_npz
+from bodycap_batch.formats.files import replacing, write_text
+from bodycap_batch.formats.tum import seconds_text
+from bodycap_batch.geometry import continuous_quat_xyzw
+from bodycap_batch.skeleton import Motion
+
+COLUMNS = "time,joint,x_m,y_m,z_m,qx,qy,qz,qw,local_qx,local_qy,local_qz,local_qw,observed,sigma_m"
+
+
+def write_joint_table(path: Path, motion: Motion, sigma_m: FloatArray | None = None) -> Path:
+    """Write one line a tick and joint, and return the path.
+
+    Common time in seconds; position and orientation (world_from_joint) in the world, rotation in the parent;
+    whether cameras measured the joint; how well its centre is known relative to the root (empty: not known).
+
+    Args:
+        path: The file.
+        motion: The motion in the world.
+        sigma_m: (T,J), NaN where not known.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
+    poses = motion.world_from_joint()
+    world = continuous_quat_xyzw(poses[..., :3, :3])
+    local = continuous_quat_xyzw(motion.local_rotation)
+    numbers = np.concatenate([poses[..., :3, 3], world, local], axis=-1) + 0.0
+    line = "%s,%s," + "%.6f," * numbers.shape[-1] + "%d,%s\n"
+    names = [f'"{name}"' if set(name) & set(',"\n') else name for name in motion.skeleton.joints]
+    text = io.StringIO()
+    text.write(COLUMNS + "\n")
+    for tick, time_ns in enumerate(motion.times_ns().tolist()):
+        time = seconds_text(time_ns)
+        for joint, name in enumerate(names):
+            sigma = np.nan if sigma_m is None else sigma_m[tick, joint]
+            known = f"{sigma:.6f}" if np.isfinite(sigma) else ""
+            text.write(line % (time, name, *numbers[tick, joint], motion.observed[tick, joint], known))
+    write_text(path, text.getvalue())
+    return path
+
+
+def write_joint_arrays(path: Path, motion: Motion, sigma_m: FloatArray | None = None) -> Path:
+    """Write the same as arrays, and return the path; J joints, T ticks.
+
+    ``names`` and ``roles`` (J,), ``parents`` (J,) −1 for the root, ``offsets_m`` (J,3) in the parent,
+    ``t`` (T,) seconds on the common clock, ``fps``, ``world`` (T,J,3) metres, ``world_quat_xyzw`` and
+    ``local_quat_xyzw`` (T,J,4), ``observed`` (T,J), ``sigma_m`` (T,J) NaN where not known.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
+    poses, body = motion.world_from_joint(), motion.skeleton
+    arrays = {
+        "names": np.array(body.joints),
+        "roles": np.array(body.roles),
+        "parents": body.parents,
+        "offsets_m": body.offsets_m,
+        "t": motion.times_ns() / 1e9,
+        "fps": np.array(motion.fps),
+        "world": poses[..., :3, 3],
+        "world_quat_xyzw": continuous_quat_xyzw(poses[..., :3, :3]),
+        "local_quat_xyzw": continuous_quat_xyzw(motion.local_rotation),
+        "observed": motion.observed,
+        "sigma_m": np.full(motion.observed.shape, np.nan) if sigma_m is None else sigma_m,
+    }
+    with replacing(path) as temporary:
+        write_npz(temporary, arrays)
+    return path

@@ -1,0 +1,89 @@
+"""C3D: joint centres as points, millimetres, in the world's own axes (Z up, facing −Y)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray, set_array
+from bodycap_batch.errors import JobError, StoreError
+from bodycap_batch.formats.files import replacing
+
+_MM_PER_M = 1000.0
+_TOLERANCE_M = 1e-5
+"""The format keeps single precision: 1 µm at 10 m."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Points:
+    """Named points over time, in the world.
+
+    Attributes:
+        names: (N,) labels.
+        fps: Frames per second.
+        x_in_world_m: (T,N,3).
+    """
+
+    names: tuple[str, ...]
+    fps: float
+    x_in_world_m: FloatArray
+
+    def __post_init__(self) -> None:
+        set_array(self, "x_in_world_m", (None, len(self.names), 3))
+
+
+def write_c3d(path: Path, points: Points) -> Path:
+    """Write points as C3D and verify them by reading them back.
+
+    Returns:
+        The path.
+
+    Raises:
+        StoreError: The file cannot be written, or does not hold the points.
+    """
+    import ezc3d
+
+    content = ezc3d.c3d()
+    group = content["parameters"]["POINT"]
+    group["RATE"]["value"] = [points.fps]
+    group["LABELS"]["value"] = list(points.names)
+    group["UNITS"]["value"] = ["mm"]
+    content.add_parameter("POINT", "X_SCREEN", ["+X"])
+    content.add_parameter("POINT", "Y_SCREEN", ["+Z"])
+    frames, count = points.x_in_world_m.shape[:2]
+    data = np.ones((4, count, frames))
+    data[:3] = _MM_PER_M * points.x_in_world_m.transpose(2, 1, 0)
+    content["data"]["points"] = data
+    with replacing(path) as temporary:
+        content.write(str(temporary))
+        back = read_c3d(temporary)
+        same = back.names == points.names and back.x_in_world_m.shape == points.x_in_world_m.shape
+        if not same or np.abs(back.x_in_world_m - points.x_in_world_m).max(initial=0.0) > _TOLERANCE_M:
+            raise StoreError(
+                "the points read back differ from what was written",
+                path=path,
+                hint="check that the disk is not full",
+            )
+    return path
+
+
+def read_c3d(path: Path) -> Points:
+    """Read the points of a C3D file in millimetres.
+
+    Raises:
+        JobError: The file is missing or no C3D file.
+    """
+    import ezc3d
+
+    try:
+        content = ezc3d.c3d(str(path))
+    except (OSError, RuntimeError, ValueError) as error:
+        raise JobError(f"cannot be read as C3D: {error}", path=path) from error
+    group = content["parameters"]["POINT"]
+    return Points(
+        names=tuple(group["LABELS"]["value"]),
+        fps=float(group["RATE"]["value"][0]),
+        x_in_world_m=content["data"]["points"][:3].transpose(2, 1, 0) / _MM_PER_M,
+    )

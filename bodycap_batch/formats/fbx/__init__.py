@@ -1,0 +1,6 @@
+"""FBX, made by Blender in a process of its own: centimetres, Y up, facing +Z."""
+
+from bodycap_batch.formats.fbx.blender import find_blender, require_blender
+from bodycap_batch.formats.fbx.writer import write_fbx
+
+__all__ = ["find_blender", "require_blender", "write_fbx"]

@@ -1,0 +1,85 @@
+"""Where Blender is, and running a script in it."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from bodycap_batch.errors import JobError
+
+VARIABLE = "BODYCAP_BLENDER"
+_HINT = (
+    f"`make blender` installs it as a Python module (Python 3.11); or set {VARIABLE} to a Python that "
+    "has bpy, or to a blender executable"
+)
+_TIMEOUT_S = 3600.0
+_TRIAL = "import bpy"
+
+
+def find_blender() -> Path:
+    """A Python that has ``bpy``, or a blender executable.
+
+    Looked for in ``BODYCAP_BLENDER``, this Python, and ``.venv-blender`` in the working folder and beside
+    this package.
+
+    Raises:
+        JobError: There is none, or the one that is named does not exist.
+    """
+    named = os.environ.get(VARIABLE)
+    if named:
+        if not os.access(named, os.X_OK) or Path(named).is_dir():
+            raise JobError(f"{VARIABLE} names no program", path=named, hint=_HINT)
+        return Path(named)
+    if importlib.util.find_spec("bpy") is not None:
+        return Path(sys.executable)
+    beside = Path(__file__).resolve().parents[3]
+    for folder in (Path.cwd(), beside):
+        python = folder / ".venv-blender" / "bin" / "python"
+        if python.is_file():
+            return python
+    raise JobError("FBX files take Blender, which was not found", field="export.formats", hint=_HINT)
+
+
+def require_blender() -> None:
+    """Find Blender and start it once.
+
+    Raises:
+        JobError: It is not there or does not start.
+    """
+    blender = find_blender()
+    script = ["--python-expr", _TRIAL] if is_application(blender) else ["-c", _TRIAL]
+    done = _run([str(blender), *_flags(blender), *script])
+    if done.returncode != 0:
+        last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
+        raise JobError(f"Blender does not start: {last}", path=blender, hint=_HINT)
+
+
+def run_script(script: Path, arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    """Run a Python file in Blender; names hash the same in every run, so that files come out the same."""
+    blender = find_blender()
+    if is_application(blender):
+        return _run([str(blender), *_flags(blender), "--python", str(script), "--", *arguments])
+    return _run([str(blender), *_flags(blender), str(script), *arguments])
+
+
+def is_application(blender: Path) -> bool:
+    """True for Blender itself, False for a Python with its module."""
+    return blender.name.lower().startswith("blender")
+
+
+def _flags(blender: Path) -> list[str]:
+    if is_application(blender):
+        return ["--background", "--factory-startup", "--python-exit-code", "1"]
+    return ["-P"]
+
+
+def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    environment = {**kept, "PYTHONHASHSEED": "0"}
+    return subprocess.run(
+        command, env=environment, capture_output=True, text=True, check=False, timeout=_TIMEOUT_S
+    )

@@ -1,0 +1,44 @@
+"""TRC, OpenSim's marker file: joint centres in millimetres, Y up, X forward, Z to the right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray, frozen_array
+from bodycap_batch.formats.c3d import Points
+from bodycap_batch.formats.files import write_text
+
+_FILE_FROM_WORLD: FloatArray = frozen_array(
+    [[0, -1, 0], [0, 0, 1], [-1, 0, 0]], name="file_from_world", shape=(3, 3)
+)
+_MM_PER_M = 1000.0
+
+
+def write_trc(path: Path, points: Points) -> Path:
+    """Write points; a frame's time counts from 0, a micrometre is its last digit.
+
+    Returns:
+        The path.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
+    rate, frames, count = f"{points.fps:g}", len(points.x_in_world_m), len(points.names)
+    names = [" ".join(name.split()) for name in points.names]
+    axes = "\t".join(f"{axis}{number}" for number in range(1, count + 1) for axis in "XYZ")
+    lines = [
+        f"PathFileType\t4\t(X/Y/Z)\t{path.name}",
+        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
+        f"{rate}\t{rate}\t{frames}\t{count}\tmm\t{rate}\t1\t{frames}",
+        "Frame#\tTime\t" + "\t\t\t".join(names) + "\t\t",
+        f"\t\t{axes}",
+        "",
+    ]
+    table = (_MM_PER_M * points.x_in_world_m @ _FILE_FROM_WORLD.T + 0.0).reshape(frames, 3 * count)
+    row = "%d\t%.6f" + "\t%.3f" * (3 * count)
+    seconds = np.arange(frames) / points.fps
+    lines += [row % (index + 1, seconds[index], *values) for index, values in enumerate(table)]
+    write_text(path, "\n".join(lines) + "\n")
+    return path

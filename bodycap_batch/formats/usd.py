@@ -1,0 +1,199 @@
+"""USD: the world's own axes and metres (Z up, facing −Y); SkelRoot, Skeleton, SkelAnimation, stick figure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.errors import JobError, StoreError
+from bodycap_batch.formats.figure import Figure, stick_figure
+from bodycap_batch.formats.files import replacing
+from bodycap_batch.geometry import continuous_quat_xyzw, invert, rotation_from_quat_xyzw
+from bodycap_batch.skeleton import Motion, SkeletonModel, rest_pose
+
+_BODY, _SKELETON, _FIGURE = "/Body", "/Body/Skeleton", "/Body/Figure"
+_MOTION = "/Body/Skeleton/Motion"
+_COLOR = (0.86, 0.39, 0.10)
+
+
+def write_usd(path: Path, motion: Motion) -> Path:
+    """Write a motion as a skinned, animated stick figure; time codes count frames from 0.
+
+    Joints bind at the T-pose. Their tokens are paths of names that USD allows (``mixamorig_Hips``); the names
+    as they are stand in ``jointNames``. Translations, rotations and scales are authored at every frame.
+
+    Args:
+        path: The file (``.usd``, ``.usda``, ``.usdc``); replaced in one step.
+        motion: What to write; world axes, metres.
+
+    Returns:
+        The path.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
+    from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
+
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    frames = len(motion.root_in_world_m)
+    stage.SetTimeCodesPerSecond(motion.fps)
+    stage.SetFramesPerSecond(motion.fps)
+    stage.SetStartTimeCode(0.0)
+    stage.SetEndTimeCode(float(frames - 1))
+    body = UsdSkel.Root.Define(stage, _BODY)
+    stage.SetDefaultPrim(body.GetPrim())
+    centres = motion.world_from_joint()[..., :3, 3].reshape(-1, 3)
+    corners = [centres.min(axis=0) - _MARGIN_M, centres.max(axis=0) + _MARGIN_M]
+    body.CreateExtentAttr(Vt.Vec3fArray([Gf.Vec3f(*corner.tolist()) for corner in corners]))
+    tokens = _tokens(motion.skeleton)
+    skeleton = _skeleton(stage, motion.skeleton, tokens)
+    animation = _animation(stage, motion, tokens)
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    _figure(stage, stick_figure(motion.skeleton), skeleton)
+    with replacing(path) as temporary:
+        if not stage.GetRootLayer().Export(str(temporary)):
+            raise StoreError(
+                "USD could not write the stage", path=path, hint="check that the disk is not full"
+            )
+    return path
+
+
+_MARGIN_M = 0.3
+"""The figure's bones reach beyond the joints' centres: head, hands, feet."""
+
+
+def _tokens(skeleton: SkeletonModel) -> list[str]:
+    """Each joint's path, of names that USD allows; siblings never share one."""
+    from pxr import Tf
+
+    out: list[str] = []
+    for name, parent in zip(skeleton.joints, skeleton.parents.tolist(), strict=True):
+        base = Tf.MakeValidIdentifier(name)
+        above = f"{out[parent]}/" if parent >= 0 else ""
+        token, number = f"{above}{base}", 2
+        while token in out:
+            token, number = f"{above}{base}_{number}", number + 1
+        out.append(token)
+    return out
+
+
+def _matrices(poses: FloatArray) -> Any:
+    """Poses (J,4,4) as USD keeps matrices: row vectors."""
+    from pxr import Gf, Vt
+
+    return Vt.Matrix4dArray([Gf.Matrix4d(*pose.T.reshape(-1).tolist()) for pose in poses])
+
+
+def _skeleton(stage: Any, model: SkeletonModel, tokens: list[str]) -> Any:
+    from pxr import UsdSkel
+
+    rest = rest_pose(model)
+    local = [rest[j] if p < 0 else invert(rest[p]) @ rest[j] for j, p in enumerate(model.parents.tolist())]
+    skeleton = UsdSkel.Skeleton.Define(stage, _SKELETON)
+    skeleton.CreateJointsAttr(tokens)
+    skeleton.CreateJointNamesAttr(list(model.joints))
+    skeleton.CreateBindTransformsAttr(_matrices(rest))
+    skeleton.CreateRestTransformsAttr(_matrices(np.array(local)))
+    return skeleton
+
+
+def _animation(stage: Any, motion: Motion, tokens: list[str]) -> Any:
+    from pxr import Gf, UsdSkel, Vt
+
+    animation = UsdSkel.Animation.Define(stage, _MOTION)
+    animation.CreateJointsAttr(tokens)
+    attributes = (
+        animation.CreateTranslationsAttr(),
+        animation.CreateRotationsAttr(),
+        animation.CreateScalesAttr(),
+    )
+    position = motion.local_position_m().astype(np.float32)
+    quats = continuous_quat_xyzw(motion.local_rotation).tolist()
+    ones = Vt.Vec3hArray([Gf.Vec3h(1.0, 1.0, 1.0)] * len(tokens))
+    for frame in range(len(position)):
+        turns = Vt.QuatfArray([Gf.Quatf(w, x, y, z) for x, y, z, w in quats[frame]])
+        for attribute, value in zip(
+            attributes, (Vt.Vec3fArray.FromNumpy(position[frame]), turns, ones), strict=True
+        ):
+            attribute.Set(value, float(frame))
+    return animation
+
+
+def _figure(stage: Any, figure: Figure, skeleton: Any) -> None:
+    """The mesh, every vertex bound to one joint with weight 1."""
+    from pxr import Gf, UsdGeom, UsdSkel, Vt
+
+    mesh = UsdGeom.Mesh.Define(stage, _FIGURE)
+    vertices = figure.vertices_m.astype(np.float32)
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(vertices))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(figure.faces), 3, dtype=np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(
+        Vt.IntArray.FromNumpy(np.ascontiguousarray(figure.faces.reshape(-1), dtype=np.int32))
+    )
+    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(figure.normals.astype(np.float32)))
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.CreateDisplayColorAttr([Gf.Vec3f(*_COLOR)])
+    low, high = vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()
+    mesh.CreateExtentAttr([Gf.Vec3f(*low), Gf.Vec3f(*high)])
+    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1.0))
+    joints = figure.joints.astype(np.int32)
+    binding.CreateJointIndicesPrimvar(False, 1).Set(Vt.IntArray.FromNumpy(joints))
+    weights = np.ones(len(joints), dtype=np.float32)
+    binding.CreateJointWeightsPrimvar(False, 1).Set(Vt.FloatArray.FromNumpy(weights))
+
+
+def read_usd(path: Path) -> Motion:
+    """Read the animated skeleton of a file of ours; its T-pose is the rest pose, its zero pose unturned.
+
+    Raises:
+        JobError: The file is no USD stage with a skeleton and its animation.
+    """
+    from pxr import Tf, Usd, UsdSkel
+
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise JobError("cannot be read as USD", path=path) from error
+    skeleton, animation = UsdSkel.Skeleton.Get(stage, _SKELETON), UsdSkel.Animation.Get(stage, _MOTION)
+    if not skeleton or not animation:
+        raise JobError("holds no skeleton with its motion", path=path)
+    frames = [float(frame) for frame in range(round(stage.GetEndTimeCode()) + 1)]
+    tokens = list(animation.GetJointsAttr().Get())
+    parents = [tokens.index(t.rpartition("/")[0]) if "/" in t else -1 for t in tokens]
+    moved = np.array([animation.GetTranslationsAttr().Get(frame) for frame in frames], dtype=np.float64)
+    turned = np.array(
+        [
+            [[*quat.GetImaginary(), quat.GetReal()] for quat in animation.GetRotationsAttr().Get(frame)]
+            for frame in frames
+        ]
+    )
+    rest = np.array([np.array(matrix).T for matrix in skeleton.GetRestTransformsAttr().Get()])
+    count = len(tokens)
+    model = SkeletonModel(
+        name=path.stem,
+        joints=tuple(skeleton.GetJointNamesAttr().Get()),
+        parents=np.array(parents),
+        offsets_m=rest[:, :3, 3],
+        end_offsets_m=np.full((count, 3), np.nan),
+        roles=("",) * count,
+        bvh_channels=((),) * count,
+        tpose_rotation=rest[:, :3, :3],
+    )
+    travels = count > 1 and bool(np.ptp(moved[:, 1], axis=0).max() > 0.0)
+    return Motion(
+        skeleton=model,
+        fps=float(stage.GetTimeCodesPerSecond()),
+        start_ns=0,
+        root_in_world_m=moved[:, 0],
+        local_rotation=rotation_from_quat_xyzw(turned),
+        observed=np.ones((len(frames), count), dtype=bool),
+        hips_in_root_m=moved[:, 1] if travels else None,
+    )

@@ -1,0 +1,232 @@
+"""The files in the real client: Blender's own importers, defaults only, in a process of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from bodycap_batch.config.options import ExportOptions
+from bodycap_batch.context import StageContext
+from bodycap_batch.errors import JobError
+from bodycap_batch.export import ExportInputs, export_results
+from bodycap_batch.export.layout import lay_out
+from bodycap_batch.export.projection import project_motion
+from bodycap_batch.formats.fbx import find_blender, write_fbx
+from bodycap_batch.formats.ply import PATH_COLORS
+from bodycap_batch.geometry import Similarity, invert, rotation_angle_rad
+from bodycap_batch.skeleton import Motion
+from tests.bodies import merged, reaching
+from tests.scenes import small_map
+
+pytestmark = pytest.mark.blender
+REPOSITORY = Path(__file__).resolve().parents[2]
+LOOK = Path(__file__).with_name("look.py")
+PICTURES = REPOSITORY / "build" / "blender"
+FORMATS = ("bvh", "glb", "fbx", "usd")
+WORLD_FRAMES = 20
+
+
+@pytest.fixture(scope="session")
+def blender() -> Path:
+    try:
+        return find_blender()
+    except JobError as error:
+        pytest.skip(f"{error.message}; {error.hint}")
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What Blender says is in the scene."""
+
+    report: dict[str, Any]
+
+    @cached_property
+    def world(self) -> np.ndarray:
+        """(T,J,4,4) bone poses, in the order of `joints`."""
+        return np.array([self.report["world"][name] for name in self.report["joints"]]).swapaxes(0, 1)
+
+    @cached_property
+    def rest(self) -> np.ndarray:
+        """(J,4,4) bone poses at rest."""
+        return np.array([self.report["rest"][name] for name in self.report["joints"]])
+
+    def order(self, motion: Motion) -> list[int]:
+        return [self.report["joints"].index(name) for name in motion.skeleton.joints]
+
+    def joint_poses(self, motion: Motion) -> np.ndarray:
+        """(T,J,4,4) world_from_joint in our convention: unturned at rest, without the file's scale."""
+        order = self.order(motion)
+        out = self.world[:, order]
+        turn = out[..., :3, :3] @ np.linalg.inv(self.rest[order][:, :3, :3])
+        return np.concatenate(
+            [
+                np.concatenate([turn, out[..., :3, 3:]], axis=-1),
+                np.broadcast_to([[0, 0, 0, 1]], (*out.shape[:2], 1, 4)),
+            ],
+            axis=-2,
+        )
+
+
+def look(blender: Path, folder: Path, fps: float, *files: Path, picture: Path | None = None) -> Seen:
+    target = folder / "report.json"
+    more = [] if picture is None else ["--picture", str(picture)]
+    command = [str(blender), str(LOOK), str(target), str(fps), *map(str, files), *more]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300, env=clean())
+    assert done.returncode == 0, done.stderr[-2000:]
+    return Seen(json.loads(target.read_text()))
+
+
+def clean() -> dict[str, str]:
+    return {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+
+
+@dataclass(frozen=True)
+class Case:
+    """Results of an export, the motion they hold, and what Blender made of each format."""
+
+    folder: Path
+    inputs: ExportInputs
+    motion: Motion
+    seen: dict[str, Seen]
+
+
+@pytest.fixture(scope="session")
+def case(blender: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
+    folder = tmp_path_factory.mktemp("results")
+    result, clocks = merged(reaching(60), world_from_map={"map-0": Similarity(1.0, np.eye(3), np.zeros(3))})
+    inputs = ExportInputs(
+        out_dir=folder, maps=(small_map(),), trajectories=result.trajectories, clocks=clocks, merge=result
+    )
+    options = ExportOptions(formats=(*FORMATS, "ply"))
+    export_results(inputs, options, StageContext(work_dir=folder))
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    seen = {
+        name: look(blender, folder, 30.0, folder / f"motion.{name}", picture=PICTURES / f"{name}.png")
+        for name in FORMATS
+    }
+    return Case(folder, inputs, project_motion(result, clocks).motion, seen)
+
+
+@pytest.fixture(params=FORMATS)
+def name(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def test_all_joints_and_no_other_bones(case: Case, name: str) -> None:
+    report = case.seen[name].report
+    assert sorted(report["joints"]) == sorted(case.motion.skeleton.joints)
+    body = case.motion.skeleton
+    parents = {
+        joint: body.joints[parent] if parent >= 0 else None
+        for joint, parent in zip(body.joints, body.parents, strict=True)
+    }
+    assert report["parents"] == parents
+
+
+def test_it_stands_upright_faces_minus_y_and_has_its_size(case: Case, name: str) -> None:
+    seen, body = case.seen[name], case.motion.skeleton
+    rest = dict(zip(seen.report["joints"], seen.rest[:, :3, 3], strict=True))
+    # T-pose: head above hips, hands out to ±X at shoulder height, toes before the ankles (−Y)
+    assert rest["Head"][2] - rest["Hips"][2] > 0.5
+    assert rest["LeftHand"][0] > 0.7 > -0.7 > rest["RightHand"][0]
+    assert abs(rest["LeftHand"][2] - rest["LeftArm"][2]) < 1e-3
+    assert rest["LeftToeBase"][1] < rest["LeftFoot"][1] - 0.05
+    for joint in range(1, len(body.joints)):
+        bone = rest[body.joints[joint]] - rest[body.joints[body.parents[joint]]]
+        np.testing.assert_allclose(bone, body.offsets_m[joint], atol=1e-4)
+
+
+def test_joints_are_where_ours_are(case: Case, name: str) -> None:
+    """Within 1 mm at 20 frames."""
+    seen = case.seen[name]
+    first, last = seen.report["frames"]
+    assert last - first + 1 == len(case.motion.root_in_world_m)
+    ticks = np.linspace(0, last - first, WORLD_FRAMES).round().astype(int)
+    found = seen.world[:, seen.order(case.motion)][ticks]
+    expected = case.motion.world_from_joint()[ticks]
+    assert np.linalg.norm(found[..., :3, 3] - expected[..., :3, 3], axis=-1).max() < 1e-3
+    turned = np.swapaxes(seen.joint_poses(case.motion)[ticks][..., :3, :3], -1, -2) @ expected[..., :3, :3]
+    # single precision in Blender, and its bones' own axes in between
+    assert np.degrees(rotation_angle_rad(turned)).max() < 0.05
+
+
+def test_rate_and_steps(case: Case, name: str) -> None:
+    """No local rotation jumps: at most 60° in 1/30 s, on matrices."""
+    seen = case.seen[name]
+    assert seen.report["fps"] == pytest.approx(30.0)
+    poses = seen.joint_poses(case.motion)
+    parents = case.motion.skeleton.parents
+    local = np.concatenate([poses[:, :1], invert(poses[:, parents[1:]]) @ poses[:, 1:]], axis=1)[..., :3, :3]
+    step = np.swapaxes(local[:-1], -1, -2) @ local[1:]
+    assert np.degrees(rotation_angle_rad(step)).max() < 60.0
+
+
+def test_the_figure_moves_with_its_bones(case: Case, name: str) -> None:
+    if name == "bvh":
+        pytest.skip("a BVH has no mesh")
+    (vertices,) = case.seen[name].report["figure"].values()
+    figure = np.array(vertices)
+    joints = case.motion.world_from_joint()[-1, :, :3, 3]
+    nearest = np.linalg.norm(figure[:, None] - joints[None], axis=-1).min(axis=0)
+    # every joint is the tip or the foot of a spindle
+    assert nearest.max() < 1e-3
+
+
+def test_a_picture_shows_a_body(case: Case, name: str) -> None:
+    picture = cv2.imread(str(PICTURES / f"{name}.png"))
+    assert picture is not None
+    assert picture.std() > 5.0
+
+
+@pytest.mark.parametrize("units", ["cm", "m"])
+def test_room_and_body_share_one_scene(case: Case, blender: Path, tmp_path: Path, units: str) -> None:
+    """Each camera's path in the PLY and its mount on the armature agree within 2 cm (95 % of the frames)."""
+    bvh = case.folder / "motion.bvh"
+    if units == "m":
+        inputs = replace(case.inputs, out_dir=tmp_path / "metres")
+        export_results(inputs, ExportOptions(formats=("bvh",), units="m"), StageContext(work_dir=tmp_path))
+        bvh = (tmp_path / "metres" / "motion.bvh").rename(tmp_path / "motion_m.bvh")
+    seen = look(blender, tmp_path, 30.0, case.folder / "map.ply", bvh)
+    (points,), (colors,) = seen.report["clouds"].values(), seen.report["colors"].values()
+    cloud, shade = np.array(points), np.round(np.array(colors)[:, :3] * 255)
+    poses = seen.joint_poses(case.motion)
+    assert case.inputs.merge is not None
+    for number, mount in enumerate(sorted(case.inputs.merge.mounts, key=lambda each: each.camera)):
+        path = cloud[(np.abs(shade - PATH_COLORS[number]) <= 1).all(axis=1)]
+        assert len(path) > 100
+        joint = case.motion.skeleton.roles.index(mount.role)
+        trajectory = next(t for t in case.inputs.merge.trajectories if t.camera == mount.camera)
+        riding = (poses[:, joint] @ mount.joint_from_cam)[trajectory.localised, :3, 3]
+        off = np.linalg.norm(riding[:, None] - path[None], axis=-1).min(axis=1)
+        assert np.percentile(off, 95) < 0.02
+
+
+@pytest.mark.parametrize("names", ["mixamo", "unreal"])
+@pytest.mark.parametrize("root", ["ground", "in_place"])
+def test_other_layouts_arrive(case: Case, blender: Path, tmp_path: Path, names: str, root: str) -> None:
+    options = ExportOptions.model_validate(
+        {"names": names, "root": root, "fps": 60, "tpose": True, "formats": FORMATS}
+    )
+    export_results(replace(case.inputs, out_dir=tmp_path), options, StageContext(work_dir=tmp_path))
+    motion = lay_out(case.motion, options)
+    for name in FORMATS:
+        seen = look(blender, tmp_path, 60.0, tmp_path / f"motion.{name}")
+        found = seen.world[:, seen.order(motion)]
+        assert len(found) == len(motion.root_in_world_m) == 120
+        expected = motion.world_from_joint()
+        assert np.linalg.norm(found[..., :3, 3] - expected[..., :3, 3], axis=-1).max() < 1e-3
+
+
+def test_fbx_is_the_same_twice(case: Case, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_fbx(tmp_path / f"{name}.fbx", case.motion)
+    assert (tmp_path / "a.fbx").read_bytes() == (tmp_path / "b.fbx").read_bytes()
