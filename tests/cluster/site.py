@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.pipeline.fake_stages import ORDERS
+from tests.processes import END_WITH_PARENT
 
 ROOT = Path(__file__).parents[2]
 FAKE = (sys.executable, str(ROOT / "tests" / "pipeline" / "fake_bodycap.py"))
@@ -56,7 +57,7 @@ class Site:
     def spawn(self, name: str, module: str, *arguments: str) -> None:
         with (self.folder / f"{name}.log").open("ab") as log:
             self.processes[name] = subprocess.Popen(
-                [sys.executable, "-m", f"distributed.cli.{module}", *arguments],
+                [*END_WITH_PARENT, sys.executable, "-m", f"distributed.cli.{module}", *arguments],
                 cwd=self.folder,
                 env=self.environment,
                 stdout=log,
@@ -89,7 +90,7 @@ class Site:
 
     def start(self, *arguments: str, command: tuple[str, ...] = FAKE) -> subprocess.Popen[str]:
         return subprocess.Popen(
-            [*command, "batch", *arguments],
+            [*END_WITH_PARENT, *command, "batch", *arguments],
             cwd=self.folder,
             env=self.environment,
             text=True,

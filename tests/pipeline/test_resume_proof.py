@@ -21,6 +21,7 @@ import pytest
 
 from bodycap_batch.cli import main
 from tests.pipeline.hurt_bodycap import BALLAST, ORDERS, PIDS
+from tests.processes import END_WITH_PARENT
 
 pytestmark = pytest.mark.slow
 
@@ -69,7 +70,7 @@ class Place:
         }
         environment.pop("BODYCAP_STORE", None)
         return subprocess.Popen(
-            [*COMMAND, "run", "tiny.yaml", "--out", "out", "--json-progress"],
+            [*END_WITH_PARENT, *COMMAND, "run", "tiny.yaml", "--out", "out", "--json-progress"],
             cwd=self.folder,
             env=environment,
             text=True,
