@@ -201,7 +201,8 @@ class Registration:
         obs_keyframe: (M,) frame index of the keyframe whose observation was tracked.
         obs_feature: (M,) feature index in that keyframe (identifies the track after the map changed).
         obs_px: (M,2) float32 tracked pixel, COLMAP origin.
-        wanted_keyframes: (W,) frames that should become keyframes where tracking failed.
+        wanted_keyframes: (W,) frames that should become keyframes where tracking failed, and
+            keyframes that the video contradicts, to be placed again.
         tried_keyframes: (V,) frames of this camera that were offered to the map so far.
     """
 

@@ -23,11 +23,10 @@ from bodycap_batch.mapping.initial import Start, named_start, rank_starts
 from bodycap_batch.mapping.lens import better_lenses, misfitting_lenses
 from bodycap_batch.mapping.pairs import PairChooser, link_keyframes
 from bodycap_batch.mapping.reach import Reach, check_reach
-from bodycap_batch.mapping.repair import Workshop, repair
+from bodycap_batch.mapping.repair import Workshop, cut_doubtful, place_again, repair
 from bodycap_batch.mapping.rolling import Readout, RollingModel
 from bodycap_batch.mapping.solve import (
     MODELS_NAME,
-    extend,
     mapper_options,
     reconstruct,
     refine,
@@ -155,10 +154,12 @@ def extend_map(
 ) -> MapResult:
     """Add keyframes to a map: existing poses are held while the new ones register, then all are refined.
 
+    Keyframes that contradict the map afterwards are cut out.
+
     Args:
         capture: All cameras.
         previous: The map so far; its workspace is copied, not changed.
-        extra_frames: New keyframes, frame indices by camera.
+        extra_frames: Frame indices by camera: new keyframes, and old ones to be taken out and placed again.
         options: The stage's options.
         context: Work folder, threads, progress.
 
@@ -172,12 +173,7 @@ def extend_map(
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         known = image_ids(database)
     cameras = _camera_ids(workspace)
-    new = [
-        ImageRef(name, int(frame))
-        for name, frames in sorted(extra_frames.items())
-        for frame in frames
-        if ImageRef(name, int(frame)) not in known
-    ]
+    new = [ref for ref in _refs(extra_frames) if ref not in known]
     wanted = [
         (capture.camera(name), cameras[name], np.array(sorted(r.frame for r in new if r.camera == name)))
         for name in sorted({ref.camera for ref in new})
@@ -187,19 +183,30 @@ def extend_map(
     chooser = PairChooser(workspace, new, _common_ns(capture), options)
     _, linked = link_keyframes(chooser, workspace, _lenses(capture), context)
     constant = _constant(capture, cameras)
-    models = []
+    doubted = {known[ref] for ref in _refs(extra_frames) if ref in known}
+    shop = Workshop(
+        workspace=workspace,
+        lenses=_lenses(capture),
+        settings=lambda: mapper_options(options, constant, scale),
+        constant=constant,
+        context=context,
+    )
+    models, cut = [], []
     for number in range(len(previous.maps)):
-        settings = mapper_options(options, constant, scale)
-        source = workspace / MODELS_NAME / str(number)
-        model = extend(workspace, source, settings, context, len(known) + len(new))
-        if model is None:
-            model = pycolmap.Reconstruction(str(source))
-        refine(model, settings, constant)
+        model = pycolmap.Reconstruction(str(workspace / MODELS_NAME / str(number)))
+        inside = doubted & set(map(int, model.reg_image_ids()))
+        model, names = cut_doubtful(place_again(model, inside, shop, len(known) + len(new)), shop)
         models.append(model)
+        cut += names
     write_models(workspace, models)
-    growth = [*previous.log.get("growth", []), {"new_keyframes": len(new), **linked}]
+    entry = {"new_keyframes": len(new), "placed_again": len(doubted), "cut": cut, **linked}
+    growth = [*previous.log.get("growth", []), entry]
     log = {**previous.log, "keyframes": len(known) + len(new), "growth": growth}
     return _result(models, workspace, log)
+
+
+def _refs(frames: Mapping[str, IntArray]) -> list[ImageRef]:
+    return [ImageRef(name, int(frame)) for name, mine in sorted(frames.items()) for frame in mine]
 
 
 def refine_map(

@@ -80,7 +80,7 @@ def repair(model: pycolmap.Reconstruction, tried: set[Pair], shop: Workshop) -> 
         log.append(entry)
         if not held and not suspects:
             break
-        other = _without(model, suspects, shop, len(ids))
+        other = place_again(model, suspects, shop, len(ids))
         other_links = links_of(shop.workspace, other)
         left = doubtful(other_links)
         sound_before = len(placed - suspects)
@@ -90,12 +90,23 @@ def repair(model: pycolmap.Reconstruction, tried: set[Pair], shop: Workshop) -> 
             break
         model, suspects, links = other, left, other_links
     share = round(contradicted_share(links), 4)
-    cut = [ref.name for ref, number in sorted(ids.items()) if number in suspects]
-    if suspects:
-        # Points that only they see go with them; tracking finds their frames' poses from what is left.
-        model = part_of(model, set(map(int, model.reg_image_ids())) - suspects)
-        refine(model, shop.settings(), shop.constant)
+    model, cut = _without(model, suspects, shop)
     return model, {"rounds": log, "cut": cut, "contradicted_share": share}
+
+
+def cut_doubtful(model: pycolmap.Reconstruction, shop: Workshop) -> tuple[Any, list[str]]:
+    """The model without keyframes that contradict it, and their names."""
+    return _without(model, doubtful(links_of(shop.workspace, model)), shop)
+
+
+def _without(model: Any, suspects: set[int], shop: Workshop) -> tuple[Any, list[str]]:
+    if not suspects:
+        return model, []
+    cut = sorted(model.image(number).name for number in suspects)
+    # Points that only they see go with them; tracking finds their frames' poses from what is left.
+    model = part_of(model, set(map(int, model.reg_image_ids())) - suspects)
+    refine(model, shop.settings(), shop.constant)
+    return model, cut
 
 
 def _untried(ids: Mapping[ImageRef, int], images: set[int], tried: set[Pair]) -> list[Pair]:
@@ -104,8 +115,15 @@ def _untried(ids: Mapping[ImageRef, int], images: set[int], tried: set[Pair]) ->
     return sorted({(min(a, b), max(a, b)) for a in chosen for b in refs if a != b} - tried)
 
 
-def _without(model: pycolmap.Reconstruction, suspects: Collection[int], shop: Workshop, total: int) -> Any:
-    """The model with suspects taken out and registered anew against what is left, all refined."""
+def place_again(model: pycolmap.Reconstruction, suspects: Collection[int], shop: Workshop, total: int) -> Any:
+    """The model with suspects taken out, they and new keyframes registered against what is left, all refined.
+
+    Args:
+        model: A reconstruction; not changed.
+        suspects: Ids of images.
+        shop: Workspace, lenses, settings.
+        total: Keyframes there are.
+    """
     source = shop.workspace / "repair"
     shutil.rmtree(source, ignore_errors=True)
     source.mkdir()

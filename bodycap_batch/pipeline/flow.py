@@ -149,9 +149,13 @@ class Flow:
                 break
             grown = self._extend(scene, wanted, map_round)
             again = self.registrations(grown, keyframes, registrations, map_round)
-            if _localised(again) <= _localised(registrations):
+            gained = _localised(again) - _localised(registrations)
+            if gained < 0:
                 break
+            # Keyframes that the video contradicted were placed anew, even where no frame was gained.
             scene, registrations = grown, again
+            if gained == 0:
+                break
         return scene, registrations
 
     def refine(

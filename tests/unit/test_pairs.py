@@ -62,8 +62,8 @@ def test_pairs_per_keyframe_are_bounded(tmp_path: Path, keyframes: int) -> None:
     times = _database(tmp_path, keyframes)
     refs = [ImageRef(camera, frame) for camera in times for frame in range(keyframes)]
     pairs = PairChooser(tmp_path, refs, times, MapOptions(pairs="retrieval")).first()
-    # Per keyframe: 14 neighbours (each pair counts twice), 2 at the same instant, up to 48 that look alike.
-    assert len(pairs) <= (7 + 2 + 48) * len(refs)
+    # Per keyframe: 14 neighbours (each pair counts twice), 2 at the same instant, up to 64 that look alike.
+    assert len(pairs) <= (7 + 2 + 64) * len(refs)
     assert len(set(pairs)) == len(pairs)
     assert (ImageRef("a", 7), ImageRef("b", 7)) in pairs
     assert (ImageRef("a", 7), ImageRef("a", 8)) in pairs
@@ -83,7 +83,7 @@ def test_growing_matches_new_keyframes_only(tmp_path: Path) -> None:
     chooser = PairChooser(tmp_path, new, times, MapOptions(pairs="retrieval"))
     pairs = chooser.first()
     assert all(a in new or b in new for a, b in pairs)
-    assert len(pairs) <= (14 + 2 + 48) * len(new)
+    assert len(pairs) <= (14 + 2 + 64) * len(new)
     more = chooser.wider(dict.fromkeys(pairs, 50), set(pairs))
     assert all(a in new or b in new for a, b in more)
 

@@ -22,7 +22,7 @@ from bodycap_batch.mapping.consistency import Link, doubtful, links_of
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, image_ids, write_image
 from bodycap_batch.mapping.initial import named_start, rank_starts
 from bodycap_batch.mapping.matching import match_pairs
-from bodycap_batch.mapping.repair import Workshop, repair
+from bodycap_batch.mapping.repair import Workshop, cut_doubtful, place_again, repair
 from bodycap_batch.mapping.solve import mapper_options, reconstruct
 
 _LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
@@ -143,10 +143,25 @@ def test_what_cannot_be_put_right_is_cut_out(
     monkeypatch.setattr(module, "extend", lambda *_: pycolmap.Reconstruction(wrong))
     monkeypatch.setattr(module, "refine", lambda *_: None)
     refs = sorted(_ids(shop))
+    alone, names = cut_doubtful(wrong, shop)
+    assert names == [f"cam/{frame:07d}" for frame in _MOVED]
+    assert alone.num_reg_images() == _KEYFRAMES - len(_MOVED)
+    assert cut_doubtful(model, shop)[1] == []
     cut, log = repair(wrong, pairs | {(a, b) for a in refs for b in refs if a < b}, shop)
     assert log["cut"] == [f"cam/{frame:07d}" for frame in _MOVED]
     assert cut.num_reg_images() == _KEYFRAMES - len(_MOVED)
     assert _rms(cut, poses) < 0.01
+
+
+def test_keyframes_are_placed_again_against_the_rest(
+    built: tuple[Any, FloatArray, Workshop, set[Any]],
+) -> None:
+    model, poses, shop, _ = built
+    ids = {ref.frame: number for ref, number in _ids(shop).items()}
+    wrong = _with_moved_block(model, ids)
+    placed = place_again(wrong, {ids[frame] for frame in _MOVED}, shop, _KEYFRAMES)
+    assert placed.num_reg_images() == _KEYFRAMES
+    assert _rms(placed, poses) < 0.01
 
 
 def _with_moved_block(model: Any, ids: dict[int, int]) -> Any:
