@@ -106,6 +106,8 @@ class MergeResult:
         mounts: The solved mounts with their sigmas.
         unused_cameras: Cameras whose map could not be linked to the body, with the reason.
         report: Plain JSON values: sources and values of scale, up and floor, residuals, outliers …
+        joint_covariance_m2: (T,J,3,3) of each joint's centre minus the first solved joint's, world axes:
+            measurement noise, mounts and scale together; not the world's own axes. NaN where not solved.
     """
 
     skeleton: SkeletonModel
@@ -119,12 +121,21 @@ class MergeResult:
     mounts: tuple[Mount, ...]
     unused_cameras: Mapping[str, str]
     report: Mapping[str, Any]
+    joint_covariance_m2: FloatArray | None = None
 
     def __post_init__(self) -> None:
         ticks, joints = len(self.world_from_joint), len(self.skeleton.joints)
         set_array(self, "world_from_joint", (ticks, joints, 4, 4))
         set_array(self, "solved", (joints,), np.bool_)
         set_array(self, "observed", (ticks, joints), np.bool_)
+        if self.joint_covariance_m2 is not None:
+            set_array(self, "joint_covariance_m2", (ticks, joints, 3, 3), finite=False)
+
+    def joint_sigma_m(self) -> FloatArray:
+        """(T,J) sigma per axis of each joint's centre relative to the first solved one's; NaN: not solved."""
+        if self.joint_covariance_m2 is None:
+            return np.full(self.observed.shape, np.nan)
+        return np.asarray(np.sqrt(np.trace(self.joint_covariance_m2, axis1=2, axis2=3) / 3.0))
 
     def times_ns(self) -> IntArray:
         """(T,) common time of each tick."""

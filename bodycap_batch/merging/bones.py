@@ -65,12 +65,14 @@ class Hinge:
 
     Attributes:
         upper: Index of the bone above the hinge.
+        lower: Index of the bone that starts at it.
         following: Index of the bone that starts at the lower bone's far end.
         anchors_m: (2,3) the two points in the upper bone's frame.
         range_m: Their distance to the following bone's joint.
     """
 
     upper: int
+    lower: int
     following: int
     anchors_m: FloatArray
     range_m: float
@@ -178,6 +180,7 @@ def hinges(skeleton: SkeletonModel, bones: tuple[Bone, ...]) -> tuple[Hinge, ...
         out.append(
             Hinge(
                 upper=bone.parent,
+                lower=index[bone.role],
                 following=following,
                 anchors_m=bone.offset_m + HINGE_ARM_M * np.array([axis, -axis]),
                 range_m=float(np.hypot(HINGE_ARM_M, length)),

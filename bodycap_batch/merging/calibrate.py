@@ -20,12 +20,24 @@ from bodycap_batch.merging.graph import (
     add_mount_prior,
     bone_key,
     insert_mount,
+    mount_change,
     mount_keys,
-    mount_sigmas,
     optimise,
     read_mount,
 )
 from bodycap_batch.merging.initial import fill_gaps, pose_bones
+from bodycap_batch.merging.linear import linearise
+from bodycap_batch.merging.mount_spread import JOINED, MEASURED, SolvedMounts, kinds_of
+from bodycap_batch.merging.spread import (
+    BETWEEN_SHARE,
+    Body,
+    Spread,
+    habits,
+    joined,
+    map_bends,
+    mount_slope,
+    scale_direction,
+)
 from bodycap_batch.merging.tracks import MIN_SIGMA_M, MIN_SIGMA_RAD, Track
 from bodycap_batch.skeleton import Mount, SkeletonModel
 
@@ -52,6 +64,7 @@ class Samples:
         sigma_rad: (C,) rotation sigma of each camera's measurements.
         sigma_map: (C,) centre sigma, map units.
         repeats: How many samples share one error of the map, 1 or more.
+        white_share: Of the measurements' variance, what is not the map's error.
     """
 
     cameras: tuple[str, ...]
@@ -61,6 +74,7 @@ class Samples:
     sigma_rad: FloatArray
     sigma_map: FloatArray
     repeats: float
+    white_share: float
 
     def points(self, scale: float) -> list[MountPoints]:
         """The points that stand for each camera's mount at a scale."""
@@ -100,14 +114,16 @@ def take_samples(tracks: Sequence[Track], provisional: float, count: int) -> Sam
     white_map = np.array(
         [max(float(np.median(track.sigma_map)), MIN_SIGMA_M / provisional) for track in tracks]
     )
+    sigma_map = np.sqrt(white_map**2 + repeats * (MAP_ERROR_M / provisional) ** 2)
     return Samples(
         cameras=tuple(track.camera for track in tracks),
         bones=tuple(track.bone for track in tracks),
         map_from_cam=np.array([poses[pick] for poses, _ in looks]),
         valid=np.array([valid[pick] for _, valid in looks]),
         sigma_rad=np.sqrt(white_rad**2 + repeats * MAP_ERROR_RAD**2),
-        sigma_map=np.sqrt(white_map**2 + repeats * (MAP_ERROR_M / provisional) ** 2),
+        sigma_map=sigma_map,
         repeats=repeats,
+        white_share=float(((white_map / sigma_map) ** 2).mean()),
     )
 
 
@@ -139,7 +155,7 @@ class Calibration:
         self._priors, self._step = priors, step
         self._slack_map = JOINT_SLACK_M * np.sqrt(samples.repeats) / provisional
         self._values: Any = None
-        self._scale = 1.0
+        self._scale, self._first_joint = 1.0, 0
         self.mounts = {name: np.array(priors[name].joint_from_cam) for name in samples.cameras}
 
     def solve(self, scale: float, iterations: int = 30) -> float:
@@ -161,34 +177,82 @@ class Calibration:
             self.mounts[name] = read_mount(self._values, camera, points[camera])
         return float(graph.error(self._values))
 
-    def solved_mounts(self, sigma_log: float, slope: Mapping[str, FloatArray]) -> tuple[Mount, ...]:
-        """The mounts of the last solution with their sigmas.
+    def spread(self, sigma_log: float, slope: Mapping[str, FloatArray]) -> tuple[Spread, Spread]:
+        """How far off the last solution may be, and what comes and goes while it is used.
+
+        Constant are the noise's effect, the wearer's habits and the scale, and the mounts with them; a map's
+        bends and passing postures move single stretches of the motion only.
 
         Args:
             sigma_log: Sigma of the scale's logarithm.
             slope: By camera, change of joint_from_cam (4,4) per unit of log scale.
         """
+        samples, cameras = self._samples, self._samples.cameras
+        mounts = self._solved()
+        solved = mounts.eliminated()
+        white = samples.white_share
+        bent = max(mounts.variance(solved, MEASURED) - white, 0.0)
+        # Rotations are weighed at the pose prior's widened sigmas; what comes and goes differs by sample.
+        fleeting = float(np.sqrt(1.0 - BETWEEN_SHARE**2))
+        factors = np.array(
+            [
+                1.0,
+                white + samples.repeats * bent,
+                mounts.variance(solved, JOINED),
+                (fleeting / PRIOR_SCALE) ** 2,
+            ]
+        )
+        follow = {name: mount_slope(self.mounts[name], slope[name]) for name in cameras}
+        bends = np.sqrt(bent) * np.stack([samples.sigma_rad, self._scale * samples.sigma_map], axis=1)
+        constant = joined(
+            [
+                mounts.spread(solved, factors, habits(self._bones, cameras, BETWEEN_SHARE)),
+                scale_direction(self._bones, sigma_log, follow),
+            ]
+        )
+        passing = [
+            habits(self._bones, cameras, fleeting),
+            map_bends(self._bones, dict(zip(cameras, bends, strict=True))),
+        ]
+        return constant, joined(passing)
+
+    def _solved(self) -> SolvedMounts:
+        cameras = self._samples.cameras
+        all_points = self._samples.points(self._scale)
         poses = self._samples.map_from_cam.copy()
         poses[..., :3, 3] *= self._scale
-        marginals = gtsam.Marginals(self._graph(poses, self._scale), self._values)
+        graph = self._graph(poses, self._scale)
+        linear = linearise(graph, self._values)
+        body = Body(bones=self._bones, hinges=hinges(self._skeleton, tuple(self._bones)))
+        joints = self._samples.valid.shape[1] * body.factors_per_tick
+        return SolvedMounts(
+            linear=linear,
+            body=body,
+            world_from_bone=self.poses(),
+            mount_columns={
+                name: np.concatenate([linear.columns[key] + np.arange(3) for key in mount_keys(camera)])
+                for camera, name in enumerate(cameras)
+            },
+            mount_change={
+                name: mount_change(self.mounts[name], all_points[camera])
+                for camera, name in enumerate(cameras)
+            },
+            kinds=kinds_of(linear, (self._first_joint, self._first_joint + joints)),
+            first_joint=self._first_joint,
+        )
+
+    def solved_mounts(self, spread: Spread) -> tuple[Mount, ...]:
+        """The mounts of the last solution with their sigmas."""
         out = []
-        for camera, (name, points) in enumerate(
-            zip(self._samples.cameras, self._samples.points(self._scale), strict=True)
-        ):
-            keys = gtsam.KeyVector(mount_keys(camera))
-            covariance = marginals.jointMarginalCovariance(keys).fullMatrix()
-            sigma_rad, sigma_m = mount_sigmas(covariance, self.mounts[name], points)
-            turned = slope[name][:3, :3] @ self.mounts[name][:3, :3].T
-            # The antisymmetric part of dR Rᵀ holds the turn twice, over three axes.
-            turn = sigma_log * float(np.linalg.norm(turned - turned.T)) / np.sqrt(8.0 * 3.0)
-            shift = sigma_log * float(np.linalg.norm(slope[name][:3, 3])) / np.sqrt(3.0)
+        for name in self._samples.cameras:
+            variance = (spread.mounts[name] ** 2).sum(axis=1)
             out.append(
                 Mount(
                     camera=name,
                     role=self._priors[name].role,
                     joint_from_cam=self.mounts[name],
-                    sigma_rad=float(np.hypot(sigma_rad, turn)),
-                    sigma_m=float(np.hypot(sigma_m, shift)),
+                    sigma_rad=float(np.sqrt(variance[:3].mean())),
+                    sigma_m=float(np.sqrt(variance[3:].mean())),
                 )
             )
         return tuple(out)
@@ -208,6 +272,7 @@ class Calibration:
             prior_scale=PRIOR_SCALE,
             slack_m=scale * self._slack_map,
         )
+        self._first_joint = int(graph.size())
         for tick in range(samples.valid.shape[1]):
             joints.add(graph, tick)
         return graph

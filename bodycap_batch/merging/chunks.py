@@ -8,6 +8,7 @@ import numpy as np
 
 from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.merging.solve import MotionGraph, Solution
+from bodycap_batch.merging.spread import Spread
 from bodycap_batch.merging.tracks import Track
 
 CHUNK_TICKS = 1500
@@ -27,6 +28,7 @@ def solve_motion(
     step: Callable[[], None],
     *,
     chunk_ticks: int = CHUNK_TICKS,
+    spread: Spread | None = None,
 ) -> Solution:
     """Solve the whole timeline, stretch by stretch where it is long.
 
@@ -36,13 +38,14 @@ def solve_motion(
         tracks: Cleaned tracks, poses in metres.
         step: Called after each iteration; may raise to stop.
         chunk_ticks: Longest stretch, without its overlaps.
+        spread: How far off the calibration may be; with it the joints' covariance is computed.
     """
     parts: list[Part] = []
     for first, last in stretches(tick_times_ns, tracks, chunk_ticks):
         low, high = max(first - OVERLAP_TICKS, 0), min(last + OVERLAP_TICKS, len(tick_times_ns))
         inside = [_between(track, tick_times_ns, low, high) for track in tracks]
         seen = [track for track in inside if len(track.times_ns)]
-        solution = build(tick_times_ns[low:high], seen).solve(MAX_ITERATIONS, step)
+        solution = build(tick_times_ns[low:high], seen).solve(MAX_ITERATIONS, step, spread)
         parts.append((solution, seen, (first, last), low))
     return parts[0][0] if len(parts) == 1 else _joined(parts, tick_times_ns)
 
@@ -79,6 +82,11 @@ def _between(track: Track, tick_times_ns: IntArray, first: int, last: int) -> Tr
 
 def _joined(parts: Sequence[Part], tick_times_ns: IntArray) -> Solution:
     poses = [solution.world_from_bone[first - low : last - low] for solution, _, (first, last), low in parts]
+    spreads = [
+        solution.joint_covariance[first - low : last - low]
+        for solution, _, (first, last), low in parts
+        if solution.joint_covariance is not None
+    ]
     collected: dict[str, dict[str, list[FloatArray]]] = {"residual_m": {}, "residual_rad": {}, "weights": {}}
     errors: dict[str, float] = {}
     for solution, tracks, (first, last), _ in parts:
@@ -100,4 +108,5 @@ def _joined(parts: Sequence[Part], tick_times_ns: IntArray) -> Solution:
         weights=joined["weights"],
         iterations=max(solution.iterations for solution, *_ in parts),
         errors=errors,
+        joint_covariance=np.concatenate(spreads) if spreads else None,
     )

@@ -175,18 +175,23 @@ def read_mount(values: Any, camera: int, points: MountPoints) -> FloatArray:
     return out
 
 
-def mount_sigmas(
-    covariance: FloatArray, joint_from_cam: FloatArray, points: MountPoints
-) -> tuple[float, float]:
-    """Sigmas per axis (rad, m) of a mount from the covariance (12,12) of its four points."""
-    turn = np.zeros((3, 12))
+def mount_change(joint_from_cam: FloatArray, points: MountPoints) -> FloatArray:
+    """(6,12) from changes of a mount's four points to joint_from_cam's right perturbation, rotation first."""
+    turn, shift = np.zeros((3, 12)), np.zeros((3, 12))
+    shift[:, :3] = np.eye(3)
     for axis in range(3):
         arm = points.radius_m * joint_from_cam[:3, axis]
         cross = np.array([[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]])
         turn[:, 3 + 3 * axis : 6 + 3 * axis] = cross / (2.0 * points.radius_m**2)
         turn[:, :3] -= cross / (2.0 * points.radius_m**2)
-    rotation = turn @ covariance @ turn.T
-    return float(np.sqrt(np.trace(rotation) / 3.0)), float(np.sqrt(np.trace(covariance[:3, :3]) / 3.0))
+        shift[:, 3 + 3 * axis : 6 + 3 * axis] = _AXIS_WEIGHT * np.eye(3)
+    for axis in range(3):
+        # An axis point less the turned arm is a second look at the centre.
+        arm = points.radius_m * joint_from_cam[:3, axis]
+        cross = np.array([[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]])
+        shift += _AXIS_WEIGHT * cross @ turn
+    shift /= 1.0 + 3.0 * _AXIS_WEIGHT
+    return np.vstack([joint_from_cam[:3, :3].T @ turn, joint_from_cam[:3, :3].T @ shift])
 
 
 def insert_mount(values: Any, camera: int, joint_from_cam: FloatArray, points: MountPoints) -> None:

@@ -29,8 +29,8 @@ def build_report(
         calibrated: Scale, mounts and up.
         solution: The solved motion.
         tracks: The tracks that were used.
-        notes: ``dropped`` frames by camera, the ``floor``, the ``unused`` cameras, ``joint_gap_m`` by role
-            and how often the activity's ``rules`` were active.
+        notes: ``dropped`` frames by camera, the ``floor``, the ``unused`` cameras, ``joint_gap_m`` and
+            ``uncertainty`` by role and how often the activity's ``rules`` were active.
     """
     floor = notes["floor"]
     return {
@@ -57,6 +57,7 @@ def build_report(
         },
         "unused_cameras": dict(notes["unused"]),
         "joint_gap_m": {role: _percentiles(gap) for role, gap in notes["joint_gap_m"].items()},
+        "joint_sigma_m": notes["uncertainty"],
         "activity": {"name": inputs.activity, "rules_active": notes["rules"]},
         "solver": {
             "ticks": len(solution.world_from_bone),

@@ -10,6 +10,7 @@ import numpy as np
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.merging.calibrate import Calibration
 from bodycap_batch.merging.gauge import WALKING_HEIGHT, Direction
+from bodycap_batch.merging.spread import Spread
 from bodycap_batch.skeleton import Mount
 
 _COARSE = 0.16
@@ -50,6 +51,7 @@ class Calibrated:
     up: Direction
     floor_believed: bool
     height_over_floor_m: float | None
+    spread: Spread
 
 
 def find_scale(calibration: Calibration, provisional: float) -> ScaleEstimate:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -23,7 +23,9 @@ from bodycap_batch.merging.graph import (
     velocity_key,
 )
 from bodycap_batch.merging.initial import fill_gaps, pose_bones
+from bodycap_batch.merging.marginals import SolvedGraph, joint_covariance
 from bodycap_batch.merging.rules import Rule
+from bodycap_batch.merging.spread import Body, Spread
 from bodycap_batch.merging.tracks import MIN_SIGMA_M, MIN_SIGMA_RAD, Track
 from bodycap_batch.skeleton import SkeletonModel
 
@@ -47,6 +49,7 @@ class Solution:
         weights: By camera, (N,) robust weight of each measurement, 1 = kept whole.
         iterations: Steps the optimiser took.
         errors: Half the sum of squares by kind of factor.
+        joint_covariance: (T,B,3,3) of each bone's joint centre minus the first bone's, m²; None if not asked.
     """
 
     world_from_bone: FloatArray
@@ -55,6 +58,7 @@ class Solution:
     weights: Mapping[str, FloatArray]
     iterations: int
     errors: Mapping[str, float]
+    joint_covariance: FloatArray | None = None
 
 
 class MotionGraph:
@@ -92,8 +96,14 @@ class MotionGraph:
         self._add_joints()
         self._add_rules()
 
-    def solve(self, iterations: int, step: Callable[[], None]) -> Solution:
-        """Optimise and read the result off."""
+    def solve(self, iterations: int, step: Callable[[], None], spread: Spread | None = None) -> Solution:
+        """Optimise and read the result off.
+
+        Args:
+            iterations: Most steps.
+            step: Called after each; may raise to stop.
+            spread: How far off the calibration may be; None leaves the joints' covariance out.
+        """
         values, count = optimise(self._graph, self._start(), iterations=iterations, step=step)
         poses = np.array(
             [
@@ -101,7 +111,23 @@ class MotionGraph:
                 for tick in range(len(self._times))
             ]
         )
-        return self._read(values, poses, count)
+        solution = self._read(values, poses, count)
+        if spread is None:
+            return solution
+        return replace(solution, joint_covariance=joint_covariance(self._solved(values), poses, spread))
+
+    def _solved(self, values: Any) -> SolvedGraph:
+        return SolvedGraph(
+            graph=self._graph,
+            values=values,
+            body=Body(bones=self._bones, hinges=hinges(self._skeleton, tuple(self._bones))),
+            tick_times_ns=self._times,
+            chains=self._chains,
+            tracks=self._tracks,
+            measured_keys=self._measured_keys,
+            mounts=self._mounts,
+            first_joint=self._sizes["measurements"] + self._sizes["smoothness"],
+        )
 
     def _node_keys(self) -> list[dict[int, tuple[int, int]]]:
         """Per bone: time of each state -> its pose and velocity keys, ticks first."""

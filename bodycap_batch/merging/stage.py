@@ -20,10 +20,12 @@ from bodycap_batch.merging.calibrate import Calibration, Samples, take_samples
 from bodycap_batch.merging.chunks import MAX_ITERATIONS, solve_motion
 from bodycap_batch.merging.complete import complete_body, observed_joints
 from bodycap_batch.merging.initial import provisional_scale
+from bodycap_batch.merging.marginals import joints_in_axes, sigma_summary
 from bodycap_batch.merging.report import build_report
 from bodycap_batch.merging.rules import activity_rules
 from bodycap_batch.merging.scale import Calibrated, find_scale, weigh_floor
 from bodycap_batch.merging.solve import MotionGraph, Solution, joint_gaps
+from bodycap_batch.merging.spread import joined
 from bodycap_batch.merging.tracks import Track, adapt_psd, clean, make_track
 from bodycap_batch.scene import Trajectory
 from bodycap_batch.skeleton_presets import split_side
@@ -71,9 +73,12 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         tick_times,
         metric,
         step,
+        spread=calibrated.spread,
     )
     world_from_solved, joints, solved, floor = _place(inputs, bones, solution, calibrated, fps)
     place = Similarity(calibrated.scale, world_from_solved.rotation, world_from_solved.translation)
+    observed = observed_joints(inputs.skeleton, bones, tracks, tick_times, options.max_gap_s)
+    covariance = joints_in_axes(world_from_solved.rotation, bones, solution.joint_covariance, len(solved))
     step.finish()
     return MergeResult(
         skeleton=inputs.skeleton,
@@ -81,7 +86,7 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         start_ns=int(tick_times[0]),
         world_from_joint=joints,
         solved=solved,
-        observed=observed_joints(inputs.skeleton, bones, tracks, tick_times, options.max_gap_s),
+        observed=observed,
         world_from_map={used[0].gauge: place},
         trajectories=tuple(_in_world(trajectory, place) for trajectory in used),
         mounts=calibrated.mounts,
@@ -95,10 +100,12 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
                 "dropped": dropped,
                 "floor": floor,
                 "unused": unused,
+                "uncertainty": sigma_summary(inputs.skeleton.roles, covariance, observed),
                 "joint_gap_m": joint_gaps(bones, solution.world_from_bone),
                 "rules": {rule.name: rule.active(solution.world_from_bone) for rule in rules},
             },
         ),
+        joint_covariance_m2=covariance,
     )
 
 
@@ -184,14 +191,16 @@ def _calibrate(
     scale = factor * estimate.scale
     if factor != 1.0:
         calibration.solve(scale)
+    constant, passing = calibration.spread(sigma, estimate.mount_slope)
     return Calibrated(
         scale=scale,
         sigma_log=sigma,
         estimate=estimate,
-        mounts=calibration.solved_mounts(sigma, estimate.mount_slope),
+        mounts=calibration.solved_mounts(constant),
         up=up,
         floor_believed=believed,
         height_over_floor_m=height,
+        spread=joined([constant, passing]),
     )
 
 

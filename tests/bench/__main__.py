@@ -15,20 +15,24 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.bench import batch, ours, peers, scaling, simulation, spool
+from tests.bench import batch, ours, peers, scaling, simulation, spool, uncertainty
 from tests.bench.rows import DATA, LAB, Row, row_of, rows_in
+
+_ON_POSES = {"simulation": simulation.main, "uncertainty": uncertainty.main}
+"""Benchmarks of the skeleton stage alone; they take options of their own."""
 
 
 def main() -> int:
     """Run the chosen benchmarks; the exit code says whether every job of ours ran."""
-    if sys.argv[1:2] == ["simulation"]:
-        return simulation.main(sys.argv[2:])
+    if sys.argv[1:2] and sys.argv[1] in _ON_POSES:
+        return _ON_POSES[sys.argv[1]](sys.argv[2:])
     parser = argparse.ArgumentParser(prog="make bench ARGS=...", description=__doc__)
     parser.add_argument(
         "only",
         nargs="*",
         help="rows to run, or folders of captures with truth (default: all), `scaling`, `batch`, `spool`; "
-        "`simulation` first runs the skeleton stage on simulated poses, with options of its own",
+        "`simulation` or `uncertainty` first run the skeleton stage on simulated poses, with options of "
+        "their own",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)

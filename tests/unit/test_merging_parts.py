@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from bodycap_batch.body import CameraClock
 from bodycap_batch.errors import EstimationError
-from bodycap_batch.geometry import invert, make_transform, so3_exp
+from bodycap_batch.geometry import invert, make_transform, so3_exp, so3_log
 from bodycap_batch.merging.bones import graph_bones, hinges, proper_axes
 from bodycap_batch.merging.complete import complete_body, observed_joints
 from bodycap_batch.merging.gauge import (
@@ -28,7 +28,7 @@ from bodycap_batch.merging.graph import (
     add_mount_prior,
     bone_key,
     insert_mount,
-    mount_sigmas,
+    mount_change,
     read_mount,
 )
 from bodycap_batch.merging.initial import anchor_and_reach, fill_gaps, pose_bones, provisional_scale
@@ -224,7 +224,16 @@ def test_mount_points_carry_exactly_the_pose_they_stand_for():
     assert_allclose(read_mount(values, 0, points), mount, atol=1e-12)
     keys = gtsam.KeyVector([gtsam.symbol("m", i) for i in range(4)])
     covariance = gtsam.Marginals(graph, values).jointMarginalCovariance(keys).fullMatrix()
-    assert mount_sigmas(covariance, mount, points) == pytest.approx((0.2, 0.03))
+    change = mount_change(mount, points)
+    assert_allclose(np.diag(change @ covariance @ change.T)[:3], 0.2**2)
+    # The derivative of reading the mount, by moving each coordinate of each point.
+    for column in range(12):
+        moved = gtsam.Values(values)
+        point, axis = divmod(column, 3)
+        moved.update(keys[point], values.atPoint3(keys[point]) + 1e-6 * np.eye(3)[axis])
+        off = invert(mount) @ read_mount(moved, 0, points)
+        numeric = np.array([*so3_log(off[:3, :3]), *off[:3, 3]]) / 1e-6
+        assert_allclose(change[:, column], numeric, atol=1e-4)
 
 
 def test_walls_and_floor_give_the_vertical_and_the_floor():

@@ -1,0 +1,141 @@
+"""How far off the calibration's mounts may be: every residual's own variance, carried through the estimator.
+
+The calibration weighs its residuals by what they might be at worst; how far off its result is follows from
+what they are. Each kind's variance is estimated from the residuals and their redundancy, and the mounts'
+covariance is that of an estimator with those weights under noise of that size.
+
+Source: variance components by redundancy, W. Foerstner, "Ein Verfahren zur Schaetzung von Varianz- und
+Kovarianzkomponenten", AVN 1979; the covariance is the sandwich form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from bodycap_batch.arrays import FloatArray, IntArray
+from bodycap_batch.merging.graph import bone_key, mount_keys
+from bodycap_batch.merging.linear import Linear
+from bodycap_batch.merging.spread import Body, Spread, joined, joint_shifts
+
+PRIOR, MEASURED, JOINED, POSED = range(4)
+"""Kinds of rows: what is believed beforehand, camera points, gaps of joints and hinges, joint rotations."""
+_BELIEF = 30.0
+"""Redundant residuals that the variance believed beforehand counts as much as."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SolvedMounts:
+    """A calibration graph at its solution: ticks that are linked through the mounts alone.
+
+    Attributes:
+        linear: Its derivatives.
+        body: Bones and hinges.
+        world_from_bone: (K,B,4,4) the solution.
+        mount_columns: By camera, the columns of the unknowns that stand for its mount.
+        mount_change: By camera, (6,12) from those unknowns to joint_from_cam's right perturbation.
+        kinds: (R,) kind of each row.
+        first_joint: Index of the first joint factor.
+    """
+
+    linear: Linear
+    body: Body
+    world_from_bone: FloatArray
+    mount_columns: Mapping[str, IntArray]
+    mount_change: Mapping[str, FloatArray]
+    kinds: IntArray
+    first_joint: int
+
+    def eliminated(self) -> Eliminated:
+        """Solve every tick's body for given mounts, and keep what the residuals then say of the mounts."""
+        matrix = self.linear.matrix
+        mounts = np.concatenate(list(self.mount_columns.values()))
+        influence = matrix[:, mounts].toarray()
+        own = np.zeros(matrix.shape[0])
+        by_column = matrix.tocsc()
+        for tick in range(len(self.world_from_bone)):
+            start = self.linear.columns[bone_key(tick, 0)]
+            columns = by_column[:, start : start + 6 * len(self.body.bones)]
+            rows = np.unique(columns.indices)
+            dense = columns[rows].toarray()
+            normal = np.linalg.inv(dense.T @ dense)
+            half = dense @ normal
+            influence[rows] -= half @ (dense.T @ influence[rows])
+            own[rows] = (half * dense).sum(axis=1)
+        covariance = np.linalg.inv(influence.T @ influence)
+        taken = own + np.einsum("ri,ij,rj->r", influence, covariance, influence)
+        return Eliminated(influence=influence, covariance=covariance, redundancy=1.0 - taken)
+
+    def variance(self, solved: Eliminated, kind: int) -> float:
+        """Variance factor of a kind of rows: 1 where they are as large as was believed."""
+        mine = self.kinds == kind
+        redundancy = max(float(solved.redundancy[mine].sum()), 0.0)
+        return (_BELIEF + float((self.linear.right[mine] ** 2).sum())) / (_BELIEF + redundancy)
+
+    def spread(self, solved: Eliminated, factors: FloatArray, bias: Spread) -> Spread:
+        """How far off the mounts may be.
+
+        Args:
+            solved: The mounts' share of the graph.
+            factors: (4,) variance of each kind of rows, as a factor on what the graph believes.
+            bias: Directions in which the body differs from what the calibration believed.
+
+        Returns:
+            The directions of the residuals' noise, and `bias` with the mounts that follow it.
+        """
+        gain = solved.covariance @ solved.influence.T
+        change = block_diag(*self.mount_change.values())
+        noise = change @ (gain * factors[self.kinds]) @ gain.T @ change.T
+        values, vectors = np.linalg.eigh(0.5 * (noise + noise.T))
+        white = vectors * np.sqrt(np.maximum(values, 0.0))
+        shifts = joint_shifts(self.linear, self.body, self.first_joint, self.world_from_bone, bias)
+        follow = change @ np.asarray(shifts.T @ gain.T).T
+        count = len(white)
+        nothing = np.zeros((len(self.body.bones), 3, count))
+        noisy = Spread(
+            mounts=self._by_camera(white), log_scale=np.zeros(count), rest=nothing, offsets_m=nothing
+        )
+        return joined([noisy, replace(bias, mounts=self._by_camera(follow))])
+
+    def _by_camera(self, changes: FloatArray) -> dict[str, FloatArray]:
+        return {camera: changes[6 * index : 6 * index + 6] for index, camera in enumerate(self.mount_columns)}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Eliminated:
+    """What the rows say of the mounts once every tick's body follows them.
+
+    Attributes:
+        influence: (R,U) derivatives by the mounts' unknowns.
+        covariance: (U,U) of those unknowns where every row's variance is 1.
+        redundancy: (R,) share of each row that is left over after the fit, 0 to 1.
+    """
+
+    influence: FloatArray
+    covariance: FloatArray
+    redundancy: FloatArray
+
+
+def kinds_of(linear: Linear, joints: tuple[int, int]) -> IntArray:
+    """Kind of each row (R,) from what it touches.
+
+    Args:
+        linear: A calibration graph; its mounts' columns follow all bones'.
+        joints: First joint factor and the one after the last.
+    """
+    height = np.diff(linear.first_row)
+    factor = np.repeat(np.arange(len(height)), height)
+    place = np.arange(len(factor)) - linear.first_row[factor]
+    first_mount = linear.columns[mount_keys(0)[0]]
+    touches = linear.matrix.tocoo()
+    of_bones = np.bincount(touches.row, touches.col < first_mount, len(factor)) > 0
+    of_mounts = np.bincount(touches.row, touches.col >= first_mount, len(factor)) > 0
+    kinds = np.full(len(factor), POSED, dtype=np.int64)
+    kinds[of_bones & of_mounts] = MEASURED
+    kinds[of_mounts & ~of_bones] = PRIOR
+    inside = (factor >= joints[0]) & (factor < joints[1])
+    kinds[inside & ((height[factor] == 1) | (place >= 3))] = JOINED
+    return kinds

@@ -1,0 +1,114 @@
+"""Captures without pictures: the walker's camera paths with noise, gaps and gross errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.body import CameraClock, MergeInputs
+from bodycap_batch.geometry import Similarity, so3_exp
+from bodycap_batch.scene import FrameStatus, Trajectory
+from bodycap_batch.skeleton import Mount
+from bodycap_batch.skeleton_presets import nominal_mount
+from bodycap_batch.synthetic.filming import Moving, camera_at, joints_at
+from bodycap_batch.synthetic.making import Subject, draw_subject, frame_times_ns
+from bodycap_batch.synthetic.measured import measure
+from bodycap_batch.synthetic.options import SynthOptions
+from bodycap_batch.synthetic.truth import common_ticks_ns, in_seconds
+
+GAUGE = "map-0"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Posed:
+    """A simulated capture.
+
+    Attributes:
+        inputs: As the merge takes them, mounts nominal, the body's own skeleton.
+        gauges: By gauge id, map_from_world.
+        mounts: The true mounts.
+        motion: The true motion.
+        options: What it was drawn from.
+    """
+
+    inputs: MergeInputs
+    gauges: Mapping[str, Similarity]
+    mounts: tuple[Mount, ...]
+    motion: Moving
+    options: SynthOptions = field(repr=False)
+
+    def by_mount(self, mounts: Sequence[Mount]) -> list[Trajectory]:
+        """The trajectories of the mounts' cameras, in their order."""
+        found = {each.camera: each for each in self.inputs.trajectories}
+        return [found[mount.camera] for mount in mounts]
+
+    def world_from_joint(self) -> FloatArray:
+        """True (T,J,4,4) at the merge's ticks."""
+        return joints_at(self.motion, in_seconds(common_ticks_ns(self.options)))
+
+
+def posed(options: SynthOptions, maps: Mapping[str, str] | None = None) -> Posed:
+    """Simulate what registration delivers.
+
+    Args:
+        options: Cameras, noise, gaps; the mounts and the walk follow its seed.
+        maps: By camera, the gauge its poses are in; all in one where it is missing.
+    """
+    subject = draw_subject(options)
+    rng = np.random.default_rng([options.seed, 77])
+    names = sorted({(maps or {}).get(camera, GAUGE) for camera in options.cameras})
+    gauges = {name: _draw_gauge(rng) for name in names}
+    trajectories = tuple(
+        _trajectory(options, subject, mount, (name := (maps or {}).get(mount.camera, GAUGE), gauges[name]))
+        for mount in subject.mounts
+    )
+    skeleton = subject.motion.skeleton
+    inputs = MergeInputs(
+        trajectories=trajectories,
+        clocks={
+            camera: CameraClock(
+                nominal_fps=options.rate_fps(camera), offset_s=options.offsets_s.get(camera, 0.0)
+            )
+            for camera in options.cameras
+        },
+        skeleton=skeleton,
+        mounts=tuple(nominal_mount(mount.camera, mount.role, skeleton) for mount in subject.mounts),
+        skeleton_is_measured=True,
+        height_m=options.subject_height_m,
+    )
+    return Posed(inputs=inputs, gauges=gauges, mounts=subject.mounts, motion=subject.motion, options=options)
+
+
+def _draw_gauge(rng: np.random.Generator) -> Similarity:
+    turn = so3_exp(rng.normal(size=3))
+    return Similarity(float(np.exp(rng.uniform(-1.0, 1.0))), turn, rng.normal(size=3))
+
+
+def _trajectory(
+    options: SynthOptions, subject: Subject, mount: Mount, gauge: tuple[str, Similarity]
+) -> Trajectory:
+    name, map_from_world = gauge
+    times_ns = frame_times_ns(options, mount.camera)
+    true = camera_at(subject.motion, mount, in_seconds(times_ns) + options.offsets_s.get(mount.camera, 0.0))
+    seed = [options.cameras.index(mount.camera), *subject.seeds["poses"].generate_state(4).tolist()]
+    seen = measure(true, options, np.random.default_rng(seed))
+    hidden = ~seen.present[:, None, None]
+    sigmas = np.repeat(
+        [np.radians(options.pose_sigma_deg), options.pose_sigma_m * map_from_world.scale], 3
+    ).astype(np.float64)
+    return Trajectory(
+        camera=mount.camera,
+        gauge=name,
+        frame_numbers=np.arange(len(times_ns)),
+        times_ns=times_ns,
+        gauge_from_cam=np.where(hidden, np.nan, map_from_world.apply_to_poses(seen.world_from_cam)),
+        covariance=np.where(hidden, np.nan, np.diag(sigmas**2)),
+        status=tuple(
+            FrameStatus.REGISTERED if present else FrameStatus.FEW_TRACKS for present in seen.present
+        ),
+        inliers=np.where(seen.present, 60, 0),
+        error_px=np.where(seen.present, 0.5, np.nan),
+    )

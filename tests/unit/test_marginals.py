@@ -1,0 +1,195 @@
+"""Covariance of the solved body: against dense algebra, GTSAM's own marginals and solving again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy import sparse
+
+from bodycap_batch.geometry import make_transform, so3_exp
+from bodycap_batch.merging.linear import Chain
+from tests.stages.walker import FPS, ROLES, make_inputs, make_walk, record
+
+gtsam = pytest.importorskip("gtsam")
+
+from bodycap_batch.merging.bones import graph_bones  # noqa: E402
+from bodycap_batch.merging.graph import bone_key  # noqa: E402
+from bodycap_batch.merging.marginals import sigma_summary  # noqa: E402
+from bodycap_batch.merging.solve import MotionGraph, Solution  # noqa: E402
+from bodycap_batch.merging.spread import Spread, adjoint, joined  # noqa: E402
+from bodycap_batch.merging.tracks import make_track  # noqa: E402
+
+
+def test_a_chain_of_blocks_is_the_dense_solution():
+    rng = np.random.default_rng(0)
+    bounds = np.array([0, 3, 7, 8, 12])
+    rows = np.zeros((0, 12))
+    for block in range(4):
+        reach = np.zeros((9, 12))
+        reach[:, bounds[block] : bounds[min(block + 2, 4)]] = rng.normal(
+            size=(9, bounds[min(block + 2, 4)] - bounds[block])
+        )
+        rows = np.vstack([rows, reach])
+    order = rng.permutation(12)
+    shuffled = np.zeros_like(rows)
+    shuffled[:, order] = rows
+    information = shuffled.T @ shuffled
+    chain = Chain(sparse.csr_matrix(information), order, bounds)
+    right = rng.normal(size=(12, 2))
+    assert_allclose(np.vstack(chain.solve(right)), np.linalg.solve(information, right)[order], atol=1e-9)
+    inverse = np.linalg.inv(information)[np.ix_(order, order)]
+    found = {}
+    chain.covariances(found.setdefault)
+    for block, (start, end) in enumerate(pairwise(bounds.tolist())):
+        assert_allclose(found[block], inverse[start:end, start:end], atol=1e-9)
+
+
+def test_the_adjoint_is_gtsams():
+    pose = gtsam.Pose3.Expmap(np.array([0.3, -1.1, 0.7, 0.2, 2.0, -0.4]))
+    assert_allclose(adjoint(pose.matrix()), pose.AdjointMap(), atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return make_walk(np.random.default_rng(3), off_deg=8.0, off_m=0.03)
+
+
+def _graph(walk, mounts=None, change=None, scale=1.0, shift_s=0.0):
+    """One second of walking; `change` alters the bones, `scale` the camera paths."""
+    bones = list(graph_bones(walk.skeleton, set(ROLES.values())))
+    if change is not None:
+        bones = [change(index, bone) for index, bone in enumerate(bones)]
+    index = {bone.role: place for place, bone in enumerate(bones)}
+    recorded = [
+        record(walk, name, np.random.default_rng(7), seconds=1.0, shift_s=shift_s if name == "torso" else 0.0)
+        for name in ROLES
+    ]
+    inputs = make_inputs(walk, recorded)
+    tracks = [make_track(inputs, each, index[ROLES[each.camera]]) for each in recorded]
+    middle = np.concatenate([track.map_from_cam[:, :3, 3] for track in tracks]).mean(axis=0)
+    stretched = []
+    for track in tracks:
+        poses = track.map_from_cam.copy()
+        poses[:, :3, 3] = middle + scale * (poses[:, :3, 3] - middle)
+        stretched.append(replace(track, map_from_cam=poses))
+    ticks = np.round(np.arange(round(FPS)) * 1e9 / FPS).astype(np.int64)
+    held = {name: mount.joint_from_cam for name, mount in walk.mounts.items()} | (mounts or {})
+    return MotionGraph(walk.skeleton, bones, ticks, stretched, held), bones, held
+
+
+def _solve(graph, spread=None) -> Solution:
+    return graph.solve(60, lambda: None, spread)
+
+
+def _nothing(bones) -> Spread:
+    empty = np.zeros((len(bones), 3, 1))
+    return Spread(
+        mounts={name: np.zeros((6, 1)) for name in ROLES},
+        log_scale=np.zeros(1),
+        rest=empty,
+        offsets_m=empty.copy(),
+    )
+
+
+def _relative(solution: Solution) -> np.ndarray:
+    centres = solution.world_from_bone[..., :3, 3]
+    return np.asarray(centres - centres[:, :1])
+
+
+def test_without_a_spread_the_covariance_is_gtsams_marginal(walk):
+    graph, bones, _ = _graph(walk)
+    solution = _solve(graph, _nothing(bones))
+    values, _ = _optimised(graph)
+    marginals = gtsam.Marginals(graph._graph, values)
+    hand = next(place for place, bone in enumerate(bones) if bone.role == "RightHand")
+    for tick in (0, 14, 29):
+        keys = gtsam.KeyVector([bone_key(tick, 0), bone_key(tick, hand)])
+        joint = marginals.jointMarginalCovariance(keys).fullMatrix()
+        turns = solution.world_from_bone[tick, [0, hand], :3, :3]
+        reader = np.hstack([np.zeros((3, 3)), -turns[0], np.zeros((3, 3)), turns[1]])
+        expected = reader @ joint @ reader.T
+        # The two linearise at solutions a stopping rule apart.
+        assert_allclose(solution.joint_covariance[tick, hand], expected, rtol=1e-3, atol=1e-9)
+
+
+def _optimised(graph):
+    from bodycap_batch.merging.graph import optimise
+
+    return optimise(graph._graph, graph._start(), iterations=60)
+
+
+@pytest.mark.parametrize("what", ["mount", "scale", "rest", "offset", "off the ticks"])
+def test_the_solution_follows_the_calibration_as_predicted(walk, what):
+    shift_s = 0.012 if what == "off the ticks" else 0.0
+    graph, bones, held = _graph(walk, shift_s=shift_s)
+    spread = _nothing(bones)
+    arm = next(place for place, bone in enumerate(bones) if bone.role == "LeftForeArm")
+    changes = {}
+    if what in ("mount", "off the ticks"):
+        twist = np.array([0.004, -0.006, 0.002, 0.003, 0.001, -0.002])
+        spread.mounts["left_palm"][:, 0] = twist
+        moved = gtsam.Pose3(held["left_palm"]).compose(gtsam.Pose3.Expmap(twist)).matrix()
+        changes["mounts"] = {"left_palm": moved}
+    elif what == "scale":
+        spread.log_scale[0] = 0.004
+        changes["scale"] = float(np.exp(0.004))
+    elif what == "rest":
+        turn = np.array([0.02, -0.01, 0.015])
+        spread.rest[arm, :, 0] = turn
+        changes["change"] = lambda place, bone: (
+            replace(bone, mean_rotation=bone.mean_rotation @ so3_exp(turn)) if place == arm else bone
+        )
+    else:
+        longer = 0.02 * bones[arm].offset_m
+        spread.offsets_m[arm, :, 0] = longer
+        changes["change"] = lambda place, bone: (
+            replace(bone, offset_m=bone.offset_m + longer) if place == arm else bone
+        )
+    plain = _solve(graph, _nothing(bones))
+    told = _solve(graph, spread)
+    again = _solve(_graph(walk, shift_s=shift_s, **changes)[0])
+    actual = _relative(again) - _relative(plain)
+    predicted = np.sqrt(np.einsum("tbii->tb", told.joint_covariance - plain.joint_covariance).clip(min=0.0))
+    size = np.linalg.norm(actual, axis=-1)
+    assert size[:, 1:].max() > 5e-4
+    # Geman-McClure's own curvature is a tenth below what its weights give (residuals of 2.4 sigmas, c = 6).
+    assert np.sqrt(((predicted - size) ** 2).mean()) < 0.15 * np.sqrt((size**2).mean())
+
+
+def test_directions_of_several_parts_stand_side_by_side(walk):
+    bones = graph_bones(walk.skeleton, set(ROLES.values()))
+    both = joined([_nothing(bones), _nothing(bones)])
+    assert both.log_scale.shape == (2,)
+    assert both.rest.shape == (len(bones), 3, 2)
+    assert both.mounts["torso"].shape == (6, 2)
+
+
+def test_sigmas_are_told_apart_where_measured_and_where_filled():
+    covariance = np.tile(np.eye(3) * 1e-4, (10, 3, 1, 1))
+    covariance[5:, 1] *= 4.0
+    covariance[:, 2] = np.nan
+    observed = np.ones((10, 3), dtype=bool)
+    observed[5:, 1] = False
+    covariance[:, 0] = 0.0
+    found = sigma_summary(("Spine1", "LeftHand", "LeftFoot"), covariance, observed)
+    assert found == {
+        "LeftHand": {"observed": {"p50": 0.01, "p95": 0.01}, "filled": {"p50": 0.02, "p95": 0.02}}
+    }
+
+
+def test_a_mount_change_in_the_wrong_frame_would_show(walk):
+    # A palm's mount that turns about the camera's own axis moves the wrist by the lever, not the camera.
+    graph, bones, held = _graph(walk)
+    spread = _nothing(bones)
+    spread.mounts["right_palm"][2, 0] = 0.05
+    hand = next(place for place, bone in enumerate(bones) if bone.role == "RightHand")
+    plain, told = _solve(graph, _nothing(bones)), _solve(graph, spread)
+    added = np.sqrt(np.einsum("tii->t", told.joint_covariance[:, hand] - plain.joint_covariance[:, hand]))
+    wrist_in_cam = np.linalg.inv(held["right_palm"] @ make_transform(np.eye(3), np.zeros(3)))[:3, 3]
+    lever = np.linalg.norm(np.cross([0.0, 0.0, 1.0], wrist_in_cam))
+    # Joints and the pose prior share in it: at most the whole lever, at least a quarter.
+    assert 0.25 * 0.05 * lever < np.median(added) <= 1.05 * 0.05 * lever
