@@ -15,7 +15,7 @@ import yaml
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.errors import JobError
 from bodycap_batch.geometry import make_transform
-from bodycap_batch.skeleton import Mount, SkeletonModel
+from bodycap_batch.skeleton import Mount, SkeletonModel, rest_pose
 
 PRESETS = ("upper_body", "full_body")
 """Both are the whole humanoid: what is solved follows the cameras, not the preset."""
@@ -130,25 +130,28 @@ def _descends(skeleton: SkeletonModel, joint: int, ancestor: int) -> bool:
 def segment_axes(skeleton: SkeletonModel, role: str) -> FloatArray:
     """Anatomical axes of a segment as columns (3,3) in its joint's frame: along, forward, outward.
 
-    They are read off the rig's zero pose, so that arms may rest stretched out or hanging. Along points to
+    They are read off the rig's T-pose, its zero pose where it names none, so that arms may rest stretched out
+    or hanging. Along points to
     the bone's far end (up for trunk and head, down for feet); forward is where the standing body faces (the
     side the elbow closes to, the thumb's side of the hand); outward is away from the body for a hanging
     limb (the back of the hand), left for trunk and head. Left-hand segments make a left-handed triad,
     so that mirrored segments have mirrored axes.
     """
     side, part = split_side(role)
+    joint = skeleton.index_of_role(role)
+    turn = np.eye(3) if joint is None else rest_pose(skeleton)[joint, :3, :3]
     if not side:
-        return np.stack([_UP, _FORWARD, _LEFT], axis=1)
+        return np.asarray(turn.T @ np.stack([_UP, _FORWARD, _LEFT], axis=1))
     vector = None if part in ("Foot", "ToeBase") else bone_vector(skeleton, role)
     if vector is None and part == "Hand":
         vector = bone_vector(skeleton, side + "ForeArm")
-    along = -_UP if vector is None else vector / np.linalg.norm(vector)
+    along = -_UP if vector is None else turn @ vector / np.linalg.norm(vector)
     # A limb that rests pointing forward closes upwards instead.
     reference = _FORWARD if abs(along @ _FORWARD) < 0.9 else _UP
     forward = reference - (reference @ along) * along
     forward /= np.linalg.norm(forward)
     outward = np.cross(forward, along) if side == "Left" else np.cross(along, forward)
-    return np.stack([along, forward, outward], axis=1)
+    return np.asarray(turn.T @ np.stack([along, forward, outward], axis=1))
 
 
 def nominal_mount(camera: str, role: str, skeleton: SkeletonModel) -> Mount:

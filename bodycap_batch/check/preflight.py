@@ -15,7 +15,7 @@ from bodycap_batch.check.settings import setting_notes
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, Job
 from bodycap_batch.errors import BodycapError, CaptureError, JobError
-from bodycap_batch.formats.bvh import read_bvh
+from bodycap_batch.formats.bvh import RigOptions, read_rig
 from bodycap_batch.formats.fbx import require_blender
 from bodycap_batch.formats.needs import require_libraries
 
@@ -196,14 +196,15 @@ def _check_skeleton(job: Job, _findings: list[CameraFinding]) -> list[str]:
     if job.skeleton is None or job.skeleton in SKELETON_PRESETS:
         return []
     path = Path(job.skeleton)
-    skeleton, _ = read_bvh(path)
+    skeleton, _ = read_rig(path, RigOptions(roles=job.skeleton_map, tpose_frame=job.tpose_frame))
     for camera in job.capture.cameras:
         if camera.role is not None and skeleton.index_of_role(camera.role) is None:
             raise JobError(
                 f"no joint of it is recognised as {camera.role}, which carries camera {camera.name}",
                 path=path,
                 field="skeleton",
-                hint=f"its joints: {', '.join(skeleton.joints[:30])}; rename them the HumanIK way",
+                hint=f"`bodycap skeleton {path.name}` shows the mapping, skeleton_map mends it; its joints: "
+                + ", ".join(skeleton.joints[:30]),
             )
     return [f"skeleton {path.name}: {len(skeleton.joints)} joints"]
 

@@ -6,12 +6,24 @@ import sys
 import traceback
 from collections.abc import Sequence
 
-from bodycap_batch.cli import batch, calibrate, check, evaluate, run, spool, synth, watch, why
+from bodycap_batch.cli import batch, calibrate, check, evaluate, run, skeleton, spool, synth, watch, why
 from bodycap_batch.cli.base import app
 from bodycap_batch.cli.stop import exit_code_of_stop, stop_by_exception
 from bodycap_batch.errors import EXIT_BUG, BodycapError, Cancelled
 
-__all__ = ["batch", "calibrate", "check", "evaluate", "main", "run", "spool", "synth", "watch", "why"]
+__all__ = [
+    "batch",
+    "calibrate",
+    "check",
+    "evaluate",
+    "main",
+    "run",
+    "skeleton",
+    "spool",
+    "synth",
+    "watch",
+    "why",
+]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

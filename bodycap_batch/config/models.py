@@ -145,6 +145,12 @@ class Job(_Block):
     skeleton: str | None = Field(
         None, description="none, upper_body, full_body or a BVH file; default upper_body, none for one camera"
     )
+    skeleton_map: dict[str, str] = Field(
+        default_factory=dict, description="role by joint name of a skeleton file, over what its names say"
+    )
+    tpose_frame: int | None = Field(
+        None, ge=0, description="frame of the skeleton file that holds its T-pose, where zero is none"
+    )
     height_m: float | None = Field(None, ge=0.4, le=2.6, description="the subject's height")
     activity: Literal["walk", "generic"] = Field("generic", description="what the subject does")
     keyframes: KeyframeOptions = KeyframeOptions()

@@ -81,6 +81,8 @@ def body_arguments(job: Job) -> dict[str, Any]:
     return {
         "skeleton": None if path else job.skeleton,
         "skeleton_file": str(path) if path else None,
+        "skeleton_map": dict(job.skeleton_map) if path else {},
+        "tpose_frame": job.tpose_frame if path else None,
         "height_m": job.height_m,
         "activity": job.activity,
         "mounts": [_mount_block(camera) for camera in job.capture.cameras],

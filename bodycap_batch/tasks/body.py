@@ -50,9 +50,10 @@ def mount_prior(block: Json, skeleton: SkeletonModel) -> Mount:
 
 def _skeleton(arguments: Json) -> SkeletonModel:
     if arguments["skeleton_file"] is not None:
-        from bodycap_batch.formats.bvh import read_bvh
+        from bodycap_batch.formats.bvh import RigOptions, read_rig
 
-        return read_bvh(Path(arguments["skeleton_file"]))[0]
+        rig = RigOptions(roles=arguments["skeleton_map"], tpose_frame=arguments["tpose_frame"])
+        return read_rig(Path(arguments["skeleton_file"]), rig)[0]
     from bodycap_batch.skeleton_presets import load_skeleton
 
     return load_skeleton(arguments["skeleton"], arguments["height_m"])

@@ -16,6 +16,12 @@ from bodycap_batch.arrays import FloatArray
 _ARM = ("Shoulder", "Arm", "ForeArm", "Hand")
 _LEG = ("UpLeg", "Leg", "Foot", "ToeBase")
 
+ROLES = (
+    *("Hips", "Spine", "Spine1", "Neck", "Head"),
+    *(side + part for side in ("Left", "Right") for part in (*_ARM, *_LEG)),
+)
+"""Every role: HumanIK's names."""
+
 _ARM_WORDS = {
     (0,): "clavicle collar collarbone clav",
     (0, 1): "shoulder",

@@ -1,0 +1,122 @@
+"""`bodycap skeleton`."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from bodycap_batch.cli.base import app
+from bodycap_batch.errors import JobError
+
+if TYPE_CHECKING:
+    from bodycap_batch.formats.bvh import RigOptions
+    from bodycap_batch.skeleton import Motion, SkeletonModel
+
+
+@app.command()
+def skeleton(
+    file: Annotated[Path, typer.Argument(metavar="FILE.bvh", help="A character's rig.")],
+    roles: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--map", metavar="JOINT=ROLE", help="The joint plays that role (none: no role). Repeatable."
+        ),
+    ] = None,
+    tpose_frame: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="The frame, counted from 0, that holds the T-pose, if zero is none."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the mapping as JSON.")] = False,
+) -> None:
+    """Show how a rig is understood before a job is solved onto it.
+
+    Which joint plays which role, how long its bone is and where it points, and what is missing. Joints
+    without a role (fingers, twist bones, helpers) stay at zero. The file's hierarchy, OFFSETs, channel order
+    and zero pose are kept in the results.
+
+    \b
+    Examples:
+      bodycap skeleton hero.bvh
+      bodycap skeleton hero.bvh --map Bip_Chest=Spine1 --map prop_01=none
+      bodycap skeleton hero.bvh --tpose-frame 0
+      bodycap run my_walk/ --skeleton hero.bvh
+    """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.formats.bvh import RigOptions, read_rig
+    from bodycap_batch.formats.bvh.mapping import joint_lines, missing_roles
+
+    options = RigOptions(roles=_pairs(roles or []), tpose_frame=tpose_frame)
+    rig, motion = read_rig(file, options)
+    if as_json:
+        joints = [dataclasses.asdict(line) for line in joint_lines(rig)]
+        typer.echo(
+            json.dumps({"joints": joints, "missing": missing_roles(rig)}, indent=1, ensure_ascii=False)
+        )
+        return
+    for line in (*_heading(file, rig, motion, tpose_frame), "", *_table(rig), "", *_ending(rig, options)):
+        typer.echo(line)
+
+
+def _pairs(words: list[str]) -> dict[str, str]:
+    """``JOINT=ROLE`` as a mapping."""
+    pairs = [word.rpartition("=") for word in words]
+    bad = next(
+        (word for word, (name, _, role) in zip(words, pairs, strict=True) if not (name and role)), None
+    )
+    if bad is not None:
+        raise JobError(
+            f"no mapping: {bad!r}", field="--map", hint="JOINT=ROLE, for example --map Bip_Chest=Spine1"
+        )
+    return {name: role for name, _, role in pairs}
+
+
+def _heading(file: Path, rig: SkeletonModel, motion: Motion | None, frame: int | None) -> list[str]:
+    import numpy as np
+
+    from bodycap_batch.formats.bvh.mapping import pose_words
+    from bodycap_batch.skeleton import rest_pose
+
+    rest = rest_pose(rig)
+    tips = rest[:, :3, 3] + (rest[:, :3, :3] @ np.nan_to_num(rig.end_offsets_m)[:, :, None])[..., 0]
+    heights = [*rest[:, 2, 3], *tips[:, 2]]
+    count = 0 if motion is None else len(motion.root_in_world_m)
+    frames = f"{count} frame{'s' * (count != 1)}" + (f" at {motion.fps:g} Hz" if motion and count > 1 else "")
+    pose = "zero pose" if frame is None else f"frame {frame}"
+    return [
+        f"{file.name}: {len(rig.joints)} joints, {frames}",
+        f"{pose}: {pose_words(rig)}; {max(heights) - min(heights):.2f} m from top to bottom",
+    ]
+
+
+def _table(rig: SkeletonModel) -> list[str]:
+    from bodycap_batch.formats.bvh.mapping import joint_lines
+
+    rows = [("joint", "role", "bone", "points", "")]
+    depth: dict[str, int] = {"": -1}
+    for line in joint_lines(rig):
+        depth[line.name] = depth[line.parent] + 1
+        name = "  " * min(depth[line.name], 12) + line.name
+        bone = f"{100.0 * line.bone_m:5.1f} cm" if line.points else ""
+        rows.append((name, line.role or "-", bone, line.points, line.note))
+    widths = [max(len(row[column]) for row in rows) for column in range(4)]
+    return [
+        "  ".join((*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[4])).rstrip()
+        for row in rows
+    ]
+
+
+def _ending(rig: SkeletonModel, options: RigOptions) -> list[str]:
+    from bodycap_batch.formats.bvh.mapping import missing_roles, warnings
+
+    missing = missing_roles(rig)
+    lines = [f"missing: {', '.join(missing)}" if missing else "missing: nothing"]
+    lines += [f"warning: {text}" for text in warnings(rig)]
+    if options.roles:
+        pairs = ", ".join(f"{json.dumps(name)}: {role}" for name, role in options.roles.items())
+        lines.append(f"in the job: skeleton_map: {{{pairs}}}")
+    if options.tpose_frame is not None:
+        lines.append(f"in the job: tpose_frame: {options.tpose_frame}")
+    return lines

@@ -1,0 +1,133 @@
+"""A user's own rig: its mapping, overrides, and a T-pose that is not its zero pose."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bodycap_batch.cli import main
+from bodycap_batch.errors import JobError
+from bodycap_batch.formats.bvh import RigOptions, read_bvh, read_rig, write_bvh
+from bodycap_batch.formats.bvh.mapping import direction_words, joint_lines, missing_roles, warnings
+from bodycap_batch.geometry import so3_exp
+from bodycap_batch.skeleton import Motion, SkeletonModel, rest_pose
+from bodycap_batch.skeleton_presets import bone_vector, load_skeleton, nominal_mount, segment_axes
+from tests.bodies import reaching
+
+
+def folded(turn_rad: float = 0.9) -> Motion:
+    """A rig whose zero pose is no pose at all; frame 1 holds a T-pose, facing any way."""
+    motion = reaching(3)
+    body = motion.skeleton
+    zero = so3_exp(np.random.default_rng(4).normal(size=(len(body.joints), 3)))
+    offsets, ends = np.array(body.offsets_m), np.array(body.end_offsets_m)
+    for joint, parent in enumerate(body.parents.tolist()):
+        if parent >= 0:
+            offsets[joint] = zero[parent] @ offsets[joint]
+        ends[joint] = zero[joint] @ ends[joint]
+    local = np.tile(np.eye(3), (3, len(body.joints), 1, 1))
+    world = np.swapaxes(zero, -1, -2)
+    for joint, parent in enumerate(body.parents.tolist()):
+        local[1, joint] = world[joint] if parent < 0 else world[parent].T @ world[joint]
+    local[1, 0] = so3_exp([0.0, 0.0, turn_rad]) @ local[1, 0]
+    channels = ("Zrotation", "Xrotation", "Yrotation")
+    rig = replace(body, offsets_m=offsets, end_offsets_m=ends, bvh_channels=(channels,) * len(body.joints))
+    return replace(motion, skeleton=rig, local_rotation=local)
+
+
+def test_the_t_pose_comes_from_a_frame_and_faces_the_front(tmp_path: Path) -> None:
+    write_bvh(tmp_path / "rig.bvh", folded())
+    rig, _ = read_rig(tmp_path / "rig.bvh", RigOptions(tpose_frame=1))
+    plain = load_skeleton("upper_body", 1.75)
+    expected = rest_pose(plain)
+    found = rest_pose(rig)
+    order = [rig.roles.index(role) for role in plain.roles]
+    off = found[order, :3, 3] - expected[:, :3, 3]
+    np.testing.assert_allclose(off, np.broadcast_to(off[0], off.shape), atol=1e-6)
+    assert not list(warnings(rig))
+    assert list(warnings(read_rig(tmp_path / "rig.bvh")[0]))
+
+
+@pytest.mark.parametrize("role", ["LeftForeArm", "RightHand", "LeftLeg", "RightFoot", "Spine1", "Head"])
+def test_limb_axes_are_those_of_the_t_pose(tmp_path: Path, role: str) -> None:
+    """A camera sits at the same place on the body, whatever the rig's zero pose."""
+    write_bvh(tmp_path / "rig.bvh", folded())
+    rig, _ = read_rig(tmp_path / "rig.bvh", RigOptions(tpose_frame=1))
+    plain = load_skeleton("upper_body", 1.75)
+    joint = rig.roles.index(role)
+    turn = rest_pose(rig)[joint, :3, :3]
+    np.testing.assert_allclose(turn @ segment_axes(rig, role), segment_axes(plain, role), atol=1e-6)
+    vector, expected = bone_vector(rig, role), bone_vector(plain, role)
+    if role in ("LeftForeArm", "LeftLeg"):
+        assert vector is not None
+        assert expected is not None
+        np.testing.assert_allclose(turn @ vector, expected, atol=1e-6)
+    mount, usual = nominal_mount("camera", role, rig), nominal_mount("camera", role, plain)
+    np.testing.assert_allclose(turn @ mount.joint_from_cam[:3, :3], usual.joint_from_cam[:3, :3], atol=1e-6)
+
+
+def test_overrides_move_roles(tmp_path: Path) -> None:
+    write_bvh(tmp_path / "rig.bvh", reaching(2))
+    rig, _ = read_rig(tmp_path / "rig.bvh", RigOptions(roles={"Neck": "Spine1", "LeftToeBase": "none"}))
+    at = dict(zip(rig.joints, rig.roles, strict=True))
+    assert (at["Neck"], at["Spine1"], at["LeftToeBase"]) == ("Spine1", "", "")
+    assert missing_roles(rig) == ("Neck", "LeftToeBase")
+
+
+@pytest.mark.parametrize(
+    ("options", "says", "hint"),
+    [
+        (RigOptions(roles={"Nek": "Neck"}), "no joint 'Nek'", "did you mean 'Neck'"),
+        (RigOptions(roles={"Neck": "Tentacle"}), "no role 'Tentacle'", "one of"),
+        (RigOptions(roles={"Neck": "Head", "Spine": "Head"}), "two joints", "one joint"),
+        (RigOptions(tpose_frame=2), "no frame 2", "it has 2"),
+        (RigOptions(tpose_frame=-1), "no frame -1", "count from 0"),
+    ],
+)
+def test_what_does_not_exist_is_named(tmp_path: Path, options: RigOptions, says: str, hint: str) -> None:
+    write_bvh(tmp_path / "rig.bvh", reaching(2))
+    with pytest.raises(JobError, match=says) as caught:
+        read_rig(tmp_path / "rig.bvh", options)
+    assert hint in str(caught.value.hint)
+    assert caught.value.path is not None
+
+
+def test_the_mapping_in_words() -> None:
+    body: SkeletonModel = load_skeleton("full_body", 1.75)
+    lines = {line.role: line for line in joint_lines(body)}
+    assert (lines["LeftForeArm"].points, lines["RightLeg"].points) == ("left", "down")
+    assert lines["LeftForeArm"].bone_m == pytest.approx(1.75 * 0.146)
+    assert lines["LeftFoot"].points.startswith("forward, ")
+    assert direction_words(np.array([0.0, -1.0, -1.0])) in ("forward, 45° down", "down, 45° forward")
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_bvh(tmp_path / "rig.bvh", folded())
+    assert main(["skeleton", str(tmp_path / "rig.bvh"), "--tpose-frame", "1", "--map", "Neck=none"]) == 0
+    out = capsys.readouterr().out
+    assert "arms stretched out to the sides (T-pose)" in out
+    assert "missing: Neck" in out
+    assert 'skeleton_map: {"Neck": none}' in out
+    assert "tpose_frame: 1" in out
+    assert main(["skeleton", str(tmp_path / "rig.bvh"), "--json"]) == 0
+    joints = json.loads(capsys.readouterr().out)["joints"]
+    assert [joint["name"] for joint in joints] == list(read_bvh(tmp_path / "rig.bvh")[0].joints)
+    assert main(["skeleton", str(tmp_path / "rig.bvh"), "--map", "Neck"]) == 2
+    assert "JOINT=ROLE" in capsys.readouterr().err
+
+
+def test_a_rig_with_a_t_pose_keeps_its_file_layout(tmp_path: Path) -> None:
+    motion = folded()
+    write_bvh(tmp_path / "rig.bvh", motion)
+    rig, moving = read_rig(tmp_path / "rig.bvh", RigOptions(tpose_frame=1))
+    assert moving is not None
+    write_bvh(tmp_path / "again.bvh", moving)
+    first, second = (
+        (tmp_path / name).read_text().partition("MOTION")[0] for name in ("rig.bvh", "again.bvh")
+    )
+    assert first == second
+    assert rig.tpose_rotation is not None
