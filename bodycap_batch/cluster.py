@@ -8,6 +8,7 @@ Source: the Dask distributed documentation (resources, priorities, allowed failu
 
 from __future__ import annotations
 
+import os
 import threading
 import uuid
 from collections.abc import Callable, Mapping, Sequence
@@ -209,7 +210,9 @@ def _on_worker(order: Mapping[str, Any], topic: str) -> dict[str, Any]:
         known = worker.state.tasks.get(key)
         return known is None or known.state == "cancelled" or worker.status.name in _ENDING
 
-    return perform(order, progress, cancelled)
+    # Threads of all tasks of this worker together: no more than it has cores.
+    threads = min(order["task"]["threads"], max(1, (os.cpu_count() or 1) // worker.state.nthreads))
+    return perform({**order, "task": {**order["task"], "threads": threads}}, progress, cancelled)
 
 
 def _raise_error_in(answer: Mapping[str, Any]) -> None:
