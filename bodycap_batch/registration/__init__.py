@@ -81,7 +81,7 @@ def _without_misplaced(
     Frames around a misplaced keyframe are tracked from the next ones that are in their place.
     """
     none = np.zeros(0, np.int64)
-    wrong = misplaced(camera.name, scene_map, tracks, limits.max_error_px)
+    wrong = misplaced(camera.name, scene_map, tracks, limits)
     if len(wrong) == 0:
         return scene_map, tracks, none
     known = Known(tracks, sorted(anchors_of(scene_map, camera.name)))

@@ -8,6 +8,7 @@ import pytest
 from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.camera import Camera
 from bodycap_batch.geometry import invert, make_transform, transform_points
+from bodycap_batch.registration.pose import PoseLimits
 from bodycap_batch.registration.seams import misplaced, without_keyframes
 from bodycap_batch.registration.tracks import Tracks
 from bodycap_batch.scene import Map
@@ -16,7 +17,7 @@ _LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([40
 _KEYFRAMES = 12
 _STEP = 5
 _POINTS = 120
-_LIMIT_PX = 2.0
+_LIMITS = PoseLimits(max_error_px=2.0, min_inliers=15, max_sigma_depth=0.05)
 
 
 def _walk() -> FloatArray:
@@ -62,15 +63,25 @@ def _map(moved: IntArray, shift_m: float) -> tuple[Map, Tracks]:
 def test_a_block_in_the_wrong_place_is_blamed(moved: list[int]) -> None:
     # 0.2 m at 3 m and 400 px are 27 px: far beyond four limits of 2 px.
     scene_map, tracks = _map(np.array(moved), 0.2)
-    assert misplaced("cam", scene_map, tracks, _LIMIT_PX).tolist() == moved
+    assert misplaced("cam", scene_map, tracks, _LIMITS).tolist() == moved
+
+
+def test_tracks_that_slipped_condemn_no_keyframe() -> None:
+    scene_map, tracks = _map(np.array([], dtype=np.int64), 0.0)
+    px = tracks.px.copy()
+    gap = (tracks.frame == 5 * _STEP) & (tracks.keyframe == 4 * _STEP)
+    gap |= (tracks.frame == 4 * _STEP) & (tracks.keyframe == 5 * _STEP)
+    px[gap] += np.random.default_rng(1).normal(0.0, 40.0, (int(gap.sum()), 2)).astype(np.float32)
+    slipped = Tracks(tracks.frame, tracks.keyframe, tracks.feature, px)
+    assert len(misplaced("cam", scene_map, slipped, _LIMITS)) == 0
 
 
 def test_a_bent_but_whole_map_is_left_alone() -> None:
     # 0.03 m are 4 px, two limits.
     scene_map, tracks = _map(np.array([4, 5, 6]), 0.03)
-    assert len(misplaced("cam", scene_map, tracks, _LIMIT_PX)) == 0
-    assert len(misplaced("cam", scene_map, Tracks.join([]), _LIMIT_PX)) == 0
-    assert len(misplaced("other", scene_map, tracks, _LIMIT_PX)) == 0
+    assert len(misplaced("cam", scene_map, tracks, _LIMITS)) == 0
+    assert len(misplaced("cam", scene_map, Tracks.join([]), _LIMITS)) == 0
+    assert len(misplaced("other", scene_map, tracks, _LIMITS)) == 0
 
 
 def test_the_scale_of_a_map_changes_no_verdict() -> None:
@@ -80,7 +91,7 @@ def test_the_scale_of_a_map_changes_no_verdict() -> None:
         poses[:, :3, 3] *= factor
         fields = {name: getattr(scene_map, name) for name in scene_map.__dataclass_fields__}
         scaled = Map(**{**fields, "map_from_cam": poses, "points": factor * scene_map.points})
-        assert misplaced("cam", scaled, tracks, _LIMIT_PX).tolist() == [4, 5, 6]
+        assert misplaced("cam", scaled, tracks, _LIMITS).tolist() == [4, 5, 6]
 
 
 def test_the_rest_keeps_its_observations() -> None:
