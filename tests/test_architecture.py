@@ -22,7 +22,7 @@ MATERIAL = TYPES | {
 }  # fmt: skip
 STAGES = {
     "keyframes", "mapping", "registration", "merging", "export", "report", "evaluate", "synthetic", "check",
-    "calibration",
+    "calibration", "preview",
 }  # fmt: skip
 KEEPING = {"errors", "digests", "identity", "progress"}
 MAY_IMPORT: dict[str, set[str]] = {

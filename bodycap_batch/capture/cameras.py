@@ -102,7 +102,9 @@ class CaptureCamera:
         indices = range(*slice(start, stop).indices(len(self.frame_numbers)))
         return self.read(np.array(indices, dtype=np.int64))
 
-    def read(self, indices: Sequence[int] | IntArray, *, colour: bool = False) -> Iterator[tuple[int, Image]]:
+    def read(
+        self, indices: Sequence[int] | IntArray, *, colour: bool = False
+    ) -> Generator[tuple[int, Image], None, None]:
         """Decode chosen frames, grey (H,W) or RGB (H,W,3) uint8 at the work size.
 
         Args:

@@ -88,3 +88,4 @@ class ExportOptions(Options):
         "ZXY", description="rotation channels"
     )
     hierarchy: Literal["full", "solved"] = Field("full", description="whole humanoid, or solved joints only")
+    preview: bool = Field(True, description="preview.mp4: the body in its room beside the videos")

@@ -21,9 +21,8 @@ _OUTLINE = (20, 20, 20)
 _GOOD, _BAD = np.array([60.0, 220.0, 120.0]), np.array([235.0, 60.0, 60.0])
 _BAD_PX = 3.0
 """Error at 640 px width that is drawn fully red."""
+_SHADES = 6
 _SUBPIXEL = 4
-_BONE_M = 0.012
-"""Half the drawn width of a bone: a thick pencil at its true size."""
 
 
 def side_colour(side: str) -> Colour:
@@ -63,35 +62,35 @@ def draw_overlay(
 
 
 def _draw_points(image: Picture, points: SeenPoints, scale: float, bad_px: float) -> None:
+    """One call for all points of a shade: a dot is a line of no length."""
     import cv2
 
-    share = np.clip(points.error_px / bad_px, 0.0, 1.0)[:, None]
-    colours = np.round((1.0 - share) * _GOOD + share * _BAD).astype(int).tolist()
+    shade = np.round(np.clip(points.error_px / bad_px, 0.0, 1.0) * (_SHADES - 1)).astype(int)
     there, seen = _fixed(points.px, scale), _fixed(points.observed_px, scale)
-    radius = max(1, round(image.shape[1] / 480)) << _SUBPIXEL
-    for at, shown, colour in zip(there, seen, colours, strict=True):
-        cv2.line(image, at, shown, colour, 1, cv2.LINE_AA, _SUBPIXEL)
-        cv2.circle(image, at, radius, colour, -1, cv2.LINE_AA, _SUBPIXEL)
+    width = 1 + 2 * max(1, round(image.shape[1] / 480))
+    for step in range(_SHADES):
+        mine = shade == step
+        if not mine.any():
+            continue
+        share = step / (_SHADES - 1)
+        colour = np.round((1.0 - share) * _GOOD + share * _BAD).astype(int).tolist()
+        hairs, dots = (np.stack([there[mine], to[mine]], axis=1) for to in (seen, there))
+        cv2.polylines(image, list(hairs), False, colour, 1, cv2.LINE_AA, _SUBPIXEL)
+        cv2.polylines(image, list(dots), False, colour, width, cv2.LINE_AA, _SUBPIXEL)
 
 
 def _draw_bone(image: Picture, line: BoneLine, scale: float, colour: Colour, thickness: int) -> None:
     import cv2
 
     at = _fixed(line.px, scale)
+    pieces = [at] if line.observed else [at[start : start + 2] for start in range(0, len(at) - 1, 2)]
+    thickness += int(line.observed)
+    cv2.polylines(image, pieces, False, colour, thickness, cv2.LINE_AA, _SUBPIXEL)
     if line.observed:
-        thickness += 1
-        pieces = [at]
-    else:
-        pieces = [at[start : start + 2] for start in range(0, len(at) - 1, 2)]
-    for piece in pieces:
-        cv2.polylines(image, [np.array(piece)], False, colour, thickness, cv2.LINE_AA, _SUBPIXEL)
-    if line.observed:
-        for end in (at[0], at[-1]):
-            cv2.circle(image, end, (thickness + 1) << (_SUBPIXEL - 1), colour, -1, cv2.LINE_AA, _SUBPIXEL)
+        joints = [at[[0, 0]], at[[-1, -1]]]
+        cv2.polylines(image, joints, False, colour, thickness + 2, cv2.LINE_AA, _SUBPIXEL)
 
 
-def _fixed(px: FloatArray, scale: float) -> list[list[int]]:
+def _fixed(px: FloatArray, scale: float) -> npt.NDArray[np.int32]:
     """COLMAP pixels of another size as OpenCV's fixed-point coordinates."""
-    at = np.round((px * scale - CV2_PIXEL_OFFSET_PX) * (1 << _SUBPIXEL)).astype(np.int64)
-    rows: list[list[int]] = at.tolist()
-    return rows
+    return np.asarray(np.round((px * scale - CV2_PIXEL_OFFSET_PX) * (1 << _SUBPIXEL)), dtype=np.int32)

@@ -49,7 +49,7 @@ class CameraView:
         frame_from_cam: (N,4,4) poses; NaN where the frame was not localised.
         status: (N,) whether it was, and if not, why.
         points: (P,3) all points of the map it was solved in.
-        seen_frame: (M,) frame index of each observation, increasing.
+        seen_from: (N+1,) index of each frame's first observation below, and after the last frame's last.
         seen_point: (M,) point index.
         seen_px: (M,2) observed pixel, COLMAP origin.
     """
@@ -61,7 +61,7 @@ class CameraView:
     frame_from_cam: FloatArray
     status: tuple[FrameStatus, ...]
     points: FloatArray
-    seen_frame: IntArray
+    seen_from: IntArray
     seen_point: IntArray
     seen_px: FloatArray
 
@@ -70,7 +70,7 @@ class CameraView:
         set_array(self, "times_ns", (frames,), np.int64)
         set_array(self, "frame_from_cam", (frames, 4, 4), finite=False)
         set_array(self, "points", (None, 3))
-        set_array(self, "seen_frame", (seen,), np.int64)
+        set_array(self, "seen_from", (frames + 1,), np.int64)
         set_array(self, "seen_point", (seen,), np.int64)
         set_array(self, "seen_px", (seen, 2))
 
@@ -98,10 +98,9 @@ class CameraView:
         A rolling shutter's pose holds for the middle row: points of other rows lie off by their row's delay.
         """
         cam_from_frame = self.cam_from_frame(index)
-        first, stop = np.searchsorted(self.seen_frame, [index, index + 1])
-        if cam_from_frame is None:
-            stop = first
-        point, observed = self.seen_point[first:stop], self.seen_px[first:stop]
+        first, stop = self.seen_from[index : index + 2].tolist()
+        seen = slice(first, first if cam_from_frame is None else stop)
+        point, observed = self.seen_point[seen], self.seen_px[seen]
         pose = np.eye(4) if cam_from_frame is None else cam_from_frame
         x_in_cam = transform_points(pose, self.points[point])
         px = self.lens.project(x_in_cam)
@@ -154,7 +153,7 @@ def camera_views(
                 frame_from_cam=path.gauge_from_cam,
                 status=solved.status,
                 points=world_from_map.apply(scene.points) if in_world and world_from_map else scene.points,
-                seen_frame=frame,
+                seen_from=np.searchsorted(frame, np.arange(len(solved.status) + 1)),
                 seen_point=point,
                 seen_px=px,
             )

@@ -204,7 +204,7 @@ class Flow:
         failure: EstimationError | None,
     ) -> Artefact:
         """The files of the results."""
-        options = self._job.export.model_dump(mode="json")
+        options = self._job.export.model_dump(mode="json", exclude={"preview"})
         reason = None if failure is None else failure.message
         inputs = {
             "map": scene.digest,
@@ -221,6 +221,32 @@ class Flow:
             "failure": reason,
         }
         key = key_of("export", options, inputs)
+        return self._one(Task(key=key, arguments=arguments, threads=self._settings.threads))
+
+    def preview(
+        self,
+        scene: Artefact,
+        registrations: ByCamera,
+        merged: Artefact | None,
+        failure: EstimationError | None,
+    ) -> Artefact:
+        """The results as a video."""
+        reason = None if failure is None else failure.message
+        inputs = {
+            "cameras": self._digests,
+            "map": scene.digest,
+            "registrations": _content(registrations),
+            "merge": None if merged is None else merged.digest,
+            "failure": reason,
+        }
+        arguments = {
+            "capture": all_cameras(self._job.capture),
+            "map": str(scene.path),
+            "registrations": [str(artefact.path) for artefact in registrations.values()],
+            "merge": None if merged is None else str(merged.path),
+            "failure": reason,
+        }
+        key = key_of("preview", {}, inputs)
         return self._one(Task(key=key, arguments=arguments, threads=self._settings.threads))
 
     def keep_only_this(self) -> None:

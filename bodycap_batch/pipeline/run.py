@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -72,8 +72,9 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
             if stage == settings.until:
                 break
         summary = RunSummary(out_dir=out_dir, files=(), stages=tuple(flow.records), versions=_versions(flow))
-        if made.exported is not None:
-            summary = replace(summary, files=_names(made.exported))
+        if made.results:
+            files = tuple(name for name, _ in _result_files(made.results))
+            summary = replace(summary, files=files)
             settings.require_owner()
             _hand_over(job, made, summary, settings)
             if made.failure is None:
@@ -85,9 +86,9 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
 
 @dataclass(slots=True)
 class Made:
-    """What the stages gave: the results, and why there is no skeleton among them."""
+    """What the stages gave: the artefacts with results, and why there is no skeleton among them."""
 
-    exported: Artefact | None = None
+    results: tuple[Artefact, ...] = ()
     failure: EstimationError | None = None
 
 
@@ -105,19 +106,21 @@ def run_stages(job: Job, flow: Flow, made: Made) -> Iterator[str]:
     yield "registration"
     merged, made.failure = _merge(job, flow, scene, registrations)
     yield "merge"
-    made.exported = flow.export(keyframes, scene, registrations, merged, made.failure)
+    made.results = (flow.export(keyframes, scene, registrations, merged, made.failure),)
     yield "export"
+    if job.export.preview:
+        made.results += (flow.preview(scene, registrations, merged, made.failure),)
+        yield "preview"
 
 
 def _hand_over(job: Job, made: Made, summary: RunSummary, settings: Settings) -> None:
     """Publish the results; those without a skeleton are set apart and called partial."""
-    assert made.exported is not None
     if made.failure is None:
-        _finish(job, made.exported, summary, settings)
+        _finish(job, made.results, summary, settings)
         clear_partial(summary.out_dir)
         return
     partial = summary.out_dir / PARTIAL
-    _finish(job, made.exported, replace(summary, out_dir=partial), settings)
+    _finish(job, made.results, replace(summary, out_dir=partial), settings)
     kept = f"the map, the cameras' paths and the frames are in {partial}"
     made.failure.hint = f"{made.failure.hint}; {kept}" if made.failure.hint else kept
 
@@ -134,10 +137,10 @@ def _merge(
         return None, error
 
 
-def _finish(job: Job, exported: Artefact, summary: RunSummary, settings: Settings) -> None:
+def _finish(job: Job, results: Sequence[Artefact], summary: RunSummary, settings: Settings) -> None:
     """Results first, then the record of the run, so that the record never speaks of what is not there."""
     out_dir = summary.out_dir
-    publish(dict(_exported(exported)), out_dir)
+    publish(dict(_result_files(results)), out_dir)
     resolved = yaml.safe_dump(
         job.model_dump(mode="json", exclude_none=True), sort_keys=False, allow_unicode=True
     )
@@ -159,14 +162,11 @@ def _versions(flow: Flow) -> dict[str, str]:
     return {**own, **dict(sorted(flow.libraries.items()))}
 
 
-def _exported(artefact: Artefact) -> list[tuple[str, Path]]:
-    """Name in the results' folder and file in the store of each exported file."""
+def _result_files(artefacts: Sequence[Artefact]) -> list[tuple[str, Path]]:
+    """Name in the results' folder and file in the store of each file that goes to the user."""
     return [
         (Path(name).relative_to(RESULTS).as_posix(), artefact.path / name)
+        for artefact in artefacts
         for name in artefact.files
         if name.startswith(f"{RESULTS}/")
     ]
-
-
-def _names(artefact: Artefact) -> tuple[str, ...]:
-    return tuple(name for name, _ in _exported(artefact))

@@ -71,9 +71,17 @@ def explain_job(job: Job, *, out_dir: Path, settings: Settings) -> list[Step]:
     steps += [Step(stage=task.label, stored=False, reason=_reason(task, settings.store)) for task in missing]
     if missing:
         after = _place(missing[0].key.stage)
-        later = [name for name in ORDER if _place(name) > after and (name != "merge" or has_body(job))]
-        steps += [Step(stage=name, stored=False, reason=f"after {missing[0].key.stage}") for name in later]
+        first = missing[0].key.stage
+        later = [name for name in ORDER if _place(name) > after and _follows(name, first, job)]
+        steps += [Step(stage=name, stored=False, reason=f"after {first}") for name in later]
     return steps
+
+
+def _follows(stage: str, first: str, job: Job) -> bool:
+    """Whether a job has a later stage, and whether that stage uses what the first one gives."""
+    if stage == "preview":
+        return job.export.preview and first != "export"
+    return stage != "merge" or has_body(job)
 
 
 def _place(stage: str) -> int:

@@ -18,6 +18,7 @@ from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import JobError, StoreError
 from bodycap_batch.formats.files import store_error
+from bodycap_batch.formats.mp4 import VideoWriter
 from bodycap_batch.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
 from bodycap_batch.synthetic.clip import load_clip
@@ -39,7 +40,6 @@ from bodycap_batch.synthetic.truth import (
     write_timestamps,
     write_truth,
 )
-from bodycap_batch.synthetic.video import VideoWriter
 from bodycap_batch.synthetic.wearer import Wearer
 
 _TEXELS_PER_PIXEL_M = 0.85

@@ -90,6 +90,11 @@ def exported(options: Json, arguments: Json, files: Path) -> None:
     (results / "metrics.json").write_text(json.dumps({"partial": arguments["failure"] is not None}))
 
 
+def previewed(options: Json, arguments: Json, files: Path) -> None:
+    (files / "results").mkdir()
+    (files / "results" / "preview.mp4").write_text(json.dumps(made_of(arguments), sort_keys=True))
+
+
 def rendered(options: Json, arguments: Json, files: Path) -> None:
     capture = files / "capture"
     (capture / "gt").mkdir(parents=True)
@@ -98,8 +103,19 @@ def rendered(options: Json, arguments: Json, files: Path) -> None:
     (capture / "gt" / "torso.tum").write_text("0 0 0 0 0 0 0 1\n")
 
 
-EXTRA = {"registration": registered, "export": exported, "synth": rendered}
-NAMES = ("synth", "check", "keyframes", "map", "extend", "refine", "registration", "merge", "export")
+EXTRA = {"registration": registered, "export": exported, "preview": previewed, "synth": rendered}
+NAMES = (
+    "synth",
+    "check",
+    "keyframes",
+    "map",
+    "extend",
+    "refine",
+    "registration",
+    "merge",
+    "export",
+    "preview",
+)
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:], {name: stage(name) for name in NAMES}))

@@ -111,13 +111,13 @@ def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done_once: Path) -> Be
 
 PER_CAMERA = ["keyframes left_palm", "keyframes torso"]
 REGISTERED = ["registration left_palm", "registration torso"]
-ALL = sorted(["check", *PER_CAMERA, "map", *REGISTERED, "merge", "export"])
+ALL = sorted(["check", *PER_CAMERA, "map", *REGISTERED, "merge", "export", "preview"])
 
 
 def test_all_stages_run_and_the_results_are_there(bench: Bench) -> None:
     assert bench.executed() == ALL
     names = set(bench.results())
-    assert {"metrics.json", "result.ply", "result.bvh", "trajectories/torso.tum"} <= names
+    assert {"metrics.json", "result.ply", "result.bvh", "trajectories/torso.tum", "preview.mp4"} <= names
     resolved = Job.model_validate(yaml.safe_load((bench.out / "job.yaml").read_text()))
     assert resolved == bench.job()
     record = json.loads((bench.out / "run.json").read_text())
@@ -155,13 +155,14 @@ def test_moving_the_capture_executes_nothing(done: Bench) -> None:
     ("changes", "expected"),
     [
         ({"export": {"units": "m"}}, ["export"]),
-        ({"merge": {"max_gap_s": 0.5}}, ["export", "merge"]),
-        ({"height_m": 1.8}, ["check", "export", "merge"]),
-        ({"activity": "walk"}, ["check", "export", "merge"]),
-        ({"torso": {"sigma_deg": 3.0}}, ["check", "export", "merge"]),
-        ({"registration": {"min_inliers": 20}}, ["export", "merge", *REGISTERED]),
+        ({"export": {"preview": False}}, []),
+        ({"merge": {"max_gap_s": 0.5}}, ["export", "merge", "preview"]),
+        ({"height_m": 1.8}, ["check", "export", "merge", "preview"]),
+        ({"activity": "walk"}, ["check", "export", "merge", "preview"]),
+        ({"torso": {"sigma_deg": 3.0}}, ["check", "export", "merge", "preview"]),
+        ({"registration": {"min_inliers": 20}}, ["export", "merge", "preview", *REGISTERED]),
         ({"registration": {"rounds": 1}}, []),
-        ({"map": {"features": 1024}}, ["export", "map", "merge", *REGISTERED]),
+        ({"map": {"features": 1024}}, ["export", "map", "merge", "preview", *REGISTERED]),
         ({"keyframes": {"parallax_px": 50.0}}, sorted(set(ALL) - {"check"})),
         ({"torso": {"offset_s": 0.1}}, sorted(set(ALL) - {"keyframes left_palm"})),
         ({"capture": {"work_px": 640}}, ALL),

@@ -56,8 +56,9 @@ def artefacts(bench: Bench) -> set[str]:
     [
         ("check", ALL),
         ("keyframes", sorted(set(ALL) - {"check"})),
-        ("registration", ["export", "merge", *REGISTERED]),
-        ("export", ["export"]),
+        ("registration", ["export", "merge", "preview", *REGISTERED]),
+        ("export", ["export", "preview"]),
+        ("preview", ["preview"]),
     ],
 )
 def test_from_a_stage_it_and_all_after_it_are_done_again(
@@ -73,7 +74,7 @@ def test_from_a_stage_it_and_all_after_it_are_done_again(
 def test_until_a_stage_nothing_after_it_is_done_and_no_result_is_written(bench: Bench) -> None:
     assert executed(bench, until="map") == sorted(["check", *PER_CAMERA, "map"])
     assert bench.results() == {}
-    assert bench.executed() == sorted(["export", "merge", *REGISTERED])
+    assert bench.executed() == sorted(["export", "merge", "preview", *REGISTERED])
 
 
 def test_a_job_taken_over_publishes_nothing(done: Bench) -> None:
@@ -104,7 +105,12 @@ def test_why_a_finished_job_would_do_nothing(done: Bench) -> None:
 @pytest.mark.parametrize(
     ("changes", "stage", "reason", "later"),
     [
-        ({"map": {"features": 1024}}, "map", "features: 512 -> 1024", ["registration", "merge", "export"]),
+        (
+            {"map": {"features": 1024}},
+            "map",
+            "features: 512 -> 1024",
+            ["registration", "merge", "export", "preview"],
+        ),
         ({"height_m": 1.8}, "check", "the body: height_m changed", None),
         ({"export": {"units": "m"}}, "export", 'units: "cm" -> "m"', []),
         ({"torso": {"offset_s": 0.1}}, "check", "the video, calibration, clock or window of torso", None),
@@ -123,7 +129,7 @@ def test_why_names_the_change_and_what_follows(
 def test_why_of_a_job_never_run_and_of_a_damaged_artefact(bench: Bench) -> None:
     assert steps(bench) == {
         "check": "not computed before",
-        **dict.fromkeys(("keyframes", "map", "registration", "merge", "export"), "after check"),
+        **dict.fromkeys(("keyframes", "map", "registration", "merge", "export", "preview"), "after check"),
     }
     bench.run()
     victim = next((bench.folder / "store" / "artefacts" / "merge").glob("*/made_of.txt"))
@@ -158,7 +164,13 @@ def test_garbage_is_what_no_finished_job_used(alone: Bench) -> None:
     alone.run(map={"features": 1024})
     store = Store(alone.folder / "store")
     dry = collect_garbage(store, delete=False)
-    assert {name.split("/")[1] for name in dry.artefacts} == {"map", "registration", "merge", "export"}
+    assert {name.split("/")[1] for name in dry.artefacts} == {
+        "map",
+        "registration",
+        "merge",
+        "export",
+        "preview",
+    }
     assert dry.freed_bytes > 0
     assert artefacts(alone) > kept, "a dry run removes nothing"
     assert collect_garbage(store, delete=True) == dry

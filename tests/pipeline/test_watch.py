@@ -52,7 +52,7 @@ def test_a_dropped_folder_ends_in_done_with_results_footage_and_a_status(bench: 
     assert "map: finished" in job.log.read_text()
     status = bench.status("küchen gang 1")
     assert (status["state"], status["exit_code"], status["error"]) == ("done", 0, None)
-    assert {"stage": "export", "reused": False}.items() <= status["finished_stages"][-1].items()
+    assert {"stage": "preview", "reused": False}.items() <= status["finished_stages"][-1].items()
     assert status["claimed_at"] <= status["started_at"] <= status["finished_at"]
     assert leftovers(bench) == []
     assert sorted(path.name for path in job.path.iterdir()) == ["input", "job.yaml", "result", "status.json"]
@@ -246,7 +246,7 @@ def test_a_failed_job_says_why_keeps_what_there_is_and_can_be_retried(bench: Spo
     assert bench.work_off() == 0
     status = bench.status("walk")
     fresh = {stage["stage"] for stage in status["finished_stages"] if not stage["reused"]}
-    assert fresh == {"merge", "export"}
+    assert fresh == {"merge", "export", "preview"}
 
 
 def test_a_job_file_comes_back_as_a_file_when_it_is_retried(bench: SpoolBench) -> None:

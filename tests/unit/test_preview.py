@@ -1,0 +1,143 @@
+"""Which instants the preview shows, where its parts stand, and what its view of the room frames."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from bodycap_batch.preview import room
+from bodycap_batch.preview.layout import HEIGHT, ROOM_WIDTH, WIDTH, Box, place_videos
+from bodycap_batch.preview.room import Cloud
+from bodycap_batch.preview.timeline import MAX_FRAMES, make_timeline
+from bodycap_batch.preview.viewpoint import Viewpoint, follow
+
+SECOND = 1_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("seconds", "fps", "shown_fps", "speed"),
+    [
+        (10.0, 30.0, 30.0, 1.0),
+        (10.0, 24.0, 24.0, 1.0),
+        (10.0, 120.0, 30.0, 1.0),
+        (40.0, 30.0, 15.0, 1.0),
+        (59.0, 29.97, 12.0, 1.2),  # every third: 9.99 a second, played at 12
+        (3600.0, 60.0, 12.0, 60.4),  # 108,001 pictures, every 151st
+    ],
+)
+def test_at_most_a_minute_is_shown_evenly_and_faster_only_when_it_must(
+    seconds: float, fps: float, shown_fps: float, speed: float
+) -> None:
+    start = 5 * SECOND
+    timeline = make_timeline(start, start + round(seconds * SECOND), fps)
+    assert len(timeline.times_ns) <= MAX_FRAMES
+    assert len(timeline.times_ns) / timeline.fps <= 60
+    assert float(timeline.fps) == pytest.approx(shown_fps, rel=0.002)
+    assert timeline.speed == pytest.approx(speed, rel=0.01)
+    steps = np.diff(timeline.times_ns)
+    assert np.ptp(steps) <= 1, "evenly spaced, to the nanosecond"
+    assert timeline.times_ns[0] == start
+    last = start + round(seconds * SECOND)
+    assert last - steps[0] < timeline.times_ns[-1] <= last + 1
+
+
+def test_a_single_instant_is_one_picture() -> None:
+    timeline = make_timeline(7, 7, 30.0)
+    assert timeline.times_ns.tolist() == [7]
+    assert timeline.fps == Fraction(30)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 8, 11, 16])
+@pytest.mark.parametrize("aspect", [16 / 9, 4 / 3, 9 / 16])
+def test_videos_fit_beside_the_room_without_touching_each_other(count: int, aspect: float) -> None:
+    boxes = [box for pair in place_videos([aspect] * count) for box in pair]
+    assert len(boxes) == 2 * count
+    taken = np.zeros((HEIGHT, WIDTH), dtype=int)
+    for box in boxes:
+        assert box.x >= ROOM_WIDTH
+        assert box.x + box.width <= WIDTH
+        assert 0 <= box.y <= box.y + box.height <= HEIGHT
+        taken[box.y : box.y + box.height, box.x : box.x + box.width] += 1
+    assert taken.max() == 1
+    for picture in boxes[::2]:
+        # Whole pixels: half a pixel off in width and height.
+        assert abs(picture.width - aspect * picture.height) <= 1 + aspect
+
+
+def test_three_videos_are_one_large_over_two() -> None:
+    first, second, third = (picture for picture, _ in place_videos([4 / 3] * 3))
+    assert first.width > 1.9 * second.width
+    assert second.y == third.y > first.y + first.height
+    assert place_videos([]) == []
+    assert isinstance(first, Box)
+
+
+def walk(frames: int = 200) -> tuple[np.ndarray, np.ndarray]:
+    seconds = np.arange(frames) / 30.0
+    return np.stack([0 * seconds, -1.2 * seconds, 0 * seconds + 0.9], axis=1), seconds
+
+
+def test_the_view_keeps_the_whole_walking_body_in_the_picture() -> None:
+    target, seconds = walk()
+    views = follow(target, seconds, (ROOM_WIDTH, HEIGHT), 1.05)
+    for at, view in zip(target, views, strict=True):
+        # Feet, head and both hands of a person 1.8 m high.
+        body = at + np.array([[0, 0, -0.9], [0, 0, 0.9], [0.6, 0, 0.4], [-0.6, 0, 0.4]])
+        px, depth = view.project(body)
+        assert (depth > 0).all()
+        assert (px >= 0).all()
+        assert (px <= [ROOM_WIDTH, HEIGHT]).all()
+        assert np.ptp(px[:, 1]) > 0.35 * HEIGHT, "and large enough to judge"
+
+
+def test_the_view_is_calm_while_the_body_bobs() -> None:
+    target, seconds = walk()
+    bobbing = target + np.stack([0 * seconds, 0 * seconds, 0.03 * np.sin(2 * np.pi * 1.8 * seconds)], axis=1)
+    calm = [view.cam_from_room for view in follow(target, seconds, (640, 640), 1.0)]
+    shaken = [view.cam_from_room for view in follow(bobbing, seconds, (640, 640), 1.0)]
+    middle = slice(60, -60)  # two seconds from the ends, where the Gaussian is whole
+    moved = np.linalg.norm(np.array(calm)[middle, :3, 3] - np.array(shaken)[middle, :3, 3], axis=1)
+    # A Gaussian of 1 s takes exp(-(2 pi 1.8)^2 / 2) of a step's bob: nothing; the distance may still change.
+    assert np.ptp(moved) < 1e-3
+
+
+def looking_down_z(distance: float = 4.0) -> Viewpoint:
+    pose = np.eye(4)
+    pose[2, 3] = distance
+    return Viewpoint(size=(100, 80), focal_px=100.0, cam_from_room=pose, distance=distance)
+
+
+def test_near_points_hide_far_ones_and_those_at_the_lens_are_left_out() -> None:
+    image = room.blank((100, 80))
+    points = np.array([[0.0, 0, 0], [0, 0, 3.0], [0, 0, -3.5], [0, 0, -6.0]])
+    colours = np.array([[250, 0, 0], [0, 250, 0], [0, 0, 250], [250, 250, 250]], dtype=np.uint8)
+    room.draw_cloud(image, looking_down_z(), Cloud(points=points, colours=colours))
+    red, green, blue = image[40, 50].astype(int)
+    assert red > 150
+    assert max(green, blue) < 60
+
+
+def test_large_clouds_are_thinned_evenly() -> None:
+    cloud = Cloud(points=np.arange(300_000).reshape(-1, 3) * 1.0, colours=np.zeros((100_000, 3), np.uint8))
+    thin = cloud.thinned()
+    assert len(thin.points) == len(thin.colours)
+    assert 30_000 < len(thin.points) <= 40_000
+    assert np.ptp(np.diff(thin.points[:, 0])) == 0
+
+
+def test_the_floor_lies_at_zero_and_reaches_past_the_walk() -> None:
+    grid = room.floor_grid(np.array([[0.0, 0.0, 0.9], [3.0, -4.0, 0.9]]))
+    assert (grid[..., 2] == 0).all()
+    assert grid[..., :2].min(axis=(0, 1)).tolist() == [-2, -6]
+    assert grid[..., :2].max(axis=(0, 1)).tolist() == [5, 2]
+    np.testing.assert_allclose(np.linalg.norm(np.diff(grid, axis=1), axis=-1), 1.0)
+
+
+def test_lines_behind_the_viewer_are_not_drawn() -> None:
+    image = room.blank((100, 80))
+    room.draw_lines(image, looking_down_z(), np.array([[[0, 0, -9.0], [1, 0, -9.0]]]), (255, 255, 255))
+    assert (image == room.BACKGROUND).all()
+    room.draw_lines(image, looking_down_z(), np.array([[[-1, 0, 0.0], [1, 0, 0.0]]]), (255, 255, 255))
+    assert image[40, 40:60].min() > 100
