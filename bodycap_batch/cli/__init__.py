@@ -6,7 +6,20 @@ import sys
 import traceback
 from collections.abc import Sequence
 
-from bodycap_batch.cli import batch, calibrate, check, evaluate, run, skeleton, spool, synth, watch, why
+from bodycap_batch.cli import (
+    batch,
+    calibrate,
+    check,
+    doctor,
+    evaluate,
+    init,
+    run,
+    skeleton,
+    spool,
+    synth,
+    watch,
+    why,
+)
 from bodycap_batch.cli.base import app
 from bodycap_batch.cli.stop import exit_code_of_stop, stop_by_exception
 from bodycap_batch.errors import EXIT_BUG, BodycapError, Cancelled
@@ -15,7 +28,9 @@ __all__ = [
     "batch",
     "calibrate",
     "check",
+    "doctor",
     "evaluate",
+    "init",
     "main",
     "run",
     "skeleton",

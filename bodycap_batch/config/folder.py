@@ -66,12 +66,11 @@ def chapters_in(folder: Path) -> tuple[Path, ...]:
     return tuple(chapters)
 
 
-def folder_capture(folder: Path) -> dict[str, object]:
-    """Describe a folder as the raw ``capture`` block of a job.
+def videos_in(folder: Path) -> list[Path]:
+    """Videos and folders of chapters in a folder, by name.
 
     Raises:
-        CaptureError: No videos in it, or unreadable.
-        JobError: Several cameras, and one whose name says no place on the body; two of one name.
+        CaptureError: There are none, or the folder cannot be read.
     """
     try:
         entries = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
@@ -88,6 +87,31 @@ def folder_capture(folder: Path) -> dict[str, object]:
             path=folder,
             hint="name them after their place on the body, e.g. torso.mp4, left_palm.mp4, right_palm.mp4",
         )
+    return videos
+
+
+def recordings_in(folder: Path) -> list[tuple[str, tuple[Path, ...]]]:
+    """The recordings of a folder by name: a file, a folder of chapters, or a GoPro's chapters side by side.
+
+    Raises:
+        CaptureError: There are none, or a folder cannot be read.
+    """
+    found: dict[str, list[Path]] = {}
+    for path in videos_in(folder):
+        gopro = None if path.is_dir() else _GOPRO.match(path.stem)
+        name = f"{gopro.group(1)}-{gopro.group(3)}" if gopro else path.name if path.is_dir() else path.stem
+        found.setdefault(name.replace("GP-", "GO-"), []).append(path)
+    return [(name, tuple(sorted(paths, key=natural_key))) for name, paths in found.items()]
+
+
+def folder_capture(folder: Path) -> dict[str, object]:
+    """Describe a folder as the raw ``capture`` block of a job.
+
+    Raises:
+        CaptureError: No videos in it, or unreadable.
+        JobError: Several cameras, and one whose name says no place on the body; two of one name.
+    """
+    videos = videos_in(folder)
     named = [(path.name if path.is_dir() else path.stem, path) for path in videos]
     _refuse_doubles(named)
     if len(named) > 1:

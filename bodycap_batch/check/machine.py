@@ -1,0 +1,220 @@
+"""Is this machine fit for the work? What `bodycap doctor` looks at."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib import metadata, util
+from pathlib import Path
+from typing import Literal
+
+State = Literal["ok", "note", "problem"]
+
+_PYTHON = ((3, 11), (3, 14))
+_MEMORY_MB = 4000
+"""Three cameras, ten minutes: the map's stage takes 2 to 3 GB."""
+_DISK_MB = 5000
+_LIBRARIES = {
+    "numpy": "numpy",
+    "scipy": "scipy.optimize",
+    "opencv-python-headless": "cv2",
+    "av": "av",
+    "open3d-cpu": "open3d",
+    "pycolmap": "pycolmap",
+    "gtsam": "gtsam",
+    "pydantic": "pydantic",
+}
+_SYSTEM_PACKAGES = "apt-get install libegl1 libgl1 libx11-6 libusb-1.0-0"
+_EXTRAS = {
+    "formats": (("ezc3d", "pxr"), "C3D and USD files"),
+    "cluster": (("distributed", "dask_jobqueue"), "many machines"),
+    "web": (("starlette", "uvicorn"), "the live page of the watched folder"),
+    "viewer": (("rerun",), "recordings for the Rerun viewer"),
+}
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox", "microsoft-edge")
+_TIMEOUT_S = 60
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """One thing looked at.
+
+    Attributes:
+        what: Its name.
+        state: "ok"; "note" where something optional is missing; "problem" where jobs will fail.
+        found: What is there.
+        remedy: What to do, "" where nothing has to be done.
+    """
+
+    what: str
+    state: State
+    found: str
+    remedy: str = ""
+
+    def line(self) -> str:
+        """The finding as a person reads it."""
+        text = f"{self.state:8} {self.what}: {self.found}"
+        return f"{text}\n         -> {self.remedy}" if self.remedy else text
+
+
+def examine_machine(folder: Path) -> Iterator[Look]:
+    """Look at Python, processors, memory, libraries, disk, extras and programs, one after the other.
+
+    Args:
+        folder: Where results will be written.
+    """
+    yield _python()
+    yield _processors()
+    yield _memory()
+    # Each in a process of its own: a library that crashes when it is loaded takes no other with it.
+    with ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1)) as pool:
+        yield from pool.map(_library, _LIBRARIES)
+    yield _video()
+    yield _disk(folder)
+    yield _writing(folder)
+    for extra in _EXTRAS:
+        yield _extra(extra)
+    yield _program("Blender", ("blender",), "opens every result; not needed to compute")
+    yield _program("a browser", _BROWSERS, "opens report.html and plays preview.mp4; any other will do")
+
+
+def _python() -> Look:
+    here = sys.version_info[:2]
+    found = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
+    if _PYTHON[0] <= here < _PYTHON[1]:
+        return Look(what="Python", state="ok", found=found)
+    return Look(what="Python", state="problem", found=found, remedy="use Python 3.11, 3.12 or 3.13")
+
+
+def _processors() -> Look:
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if count > 1:
+        return Look(what="processors", state="ok", found=f"{count}; no GPU is used")
+    return Look(what="processors", state="note", found="one", remedy="it works, at half the speed of two")
+
+
+def _memory() -> Look:
+    total_mb = _total_memory_mb()
+    if total_mb is None:
+        return Look(what="memory", state="note", found="unknown", remedy=f"{_MEMORY_MB} MB are enough")
+    found = f"{total_mb} MB"
+    if total_mb >= _MEMORY_MB:
+        return Look(what="memory", state="ok", found=found)
+    remedy = f"long captures take {_MEMORY_MB} MB: cut them with start_s and end_s, or lower work_px"
+    return Look(what="memory", state="note", found=found, remedy=remedy)
+
+
+def _total_memory_mb() -> int | None:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") >> 20
+    except (ValueError, OSError, AttributeError):
+        return None
+
+
+def _library(name: str) -> Look:
+    failure = _fails(f"import zlib, {_LIBRARIES[name]}")
+    if failure is None:
+        return Look(what=name, state="ok", found=_version(name))
+    remedy = "make setup (or pip install -r requirements.lock)"
+    if ".so" in failure:
+        remedy = f"a system library is missing: {_SYSTEM_PACKAGES}"
+    return Look(what=name, state="problem", found=failure, remedy=remedy)
+
+
+def _fails(code: str) -> str | None:
+    """The last line of what a child says that runs this code, None where it goes well."""
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, timeout=_TIMEOUT_S, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return str(error).splitlines()[0]
+    if done.returncode == 0:
+        return None
+    said = done.stderr.strip().splitlines()
+    return said[-1] if said else f"ended with {done.returncode}"
+
+
+def _version(name: str) -> str:
+    for each in (name, name.removesuffix("-cpu"), name.removesuffix("-headless")):
+        try:
+            return metadata.version(each)
+        except metadata.PackageNotFoundError:
+            continue
+    return "there"
+
+
+def _video() -> Look:
+    code = "import av; assert 'libx264' in av.codecs_available; av.Codec('h264', 'r'); av.Codec('hevc', 'r')"
+    failure = _fails(code)
+    if failure is None:
+        return Look(what="video", state="ok", found="reads H.264 and H.265, writes H.264")
+    remedy = "install PyAV from its wheel: pip install --force-reinstall av"
+    return Look(what="video", state="problem", found=failure, remedy=remedy)
+
+
+def _disk(folder: Path) -> Look:
+    place = _nearest(folder)
+    free_mb = shutil.disk_usage(place).free >> 20
+    found = f"{free_mb} MB free at {place}"
+    if free_mb >= _DISK_MB:
+        return Look(what="disk", state="ok", found=found)
+    remedy = "free some, or name another place with --out and --store; `bodycap gc` drops what no job needs"
+    return Look(what="disk", state="note" if free_mb > 500 else "problem", found=found, remedy=remedy)
+
+
+def _writing(folder: Path) -> Look:
+    """Results come by hard link and rename: what the file system can do decides how fast."""
+    place = _nearest(folder)
+    try:
+        with tempfile.TemporaryDirectory(dir=place, prefix=".bodycap-doctor-") as scratch:
+            first = Path(scratch) / "first"
+            first.write_text("x")
+            first.replace(Path(scratch) / "second")
+            linked = _links(Path(scratch) / "second", Path(scratch) / "third")
+    except OSError as error:
+        remedy = "choose a folder you may write to (--out, --store)"
+        return Look(what="writing", state="problem", found=f"{place}: {error.strerror}", remedy=remedy)
+    if linked:
+        return Look(what="writing", state="ok", found=f"{place} takes files, renames and hard links")
+    remedy = "nothing has to be done: results are copied from the store and take twice the room"
+    return Look(what="writing", state="note", found=f"{place} has no hard links", remedy=remedy)
+
+
+def _links(source: Path, target: Path) -> bool:
+    try:
+        os.link(source, target)
+    except OSError:
+        return False
+    return True
+
+
+def _nearest(folder: Path) -> Path:
+    """The folder, or the nearest one above it that exists."""
+    folder = folder.resolve()
+    while not folder.exists():
+        folder = folder.parent
+    return folder
+
+
+def _extra(name: str) -> Look:
+    modules, purpose = _EXTRAS[name]
+    missing = [module for module in modules if util.find_spec(module) is None]
+    if not missing:
+        return Look(what=f"extra [{name}]", state="ok", found=purpose)
+    remedy = f"for {purpose}: pip install 'bodycap-batch[{name}]'"
+    return Look(what=f"extra [{name}]", state="note", found=f"no {', '.join(missing)}", remedy=remedy)
+
+
+def _program(what: str, names: Sequence[str], purpose: str) -> Look:
+    found = next((place for name in names if (place := shutil.which(name))), None)
+    if found:
+        return Look(what=what, state="ok", found=found)
+    return Look(what=what, state="note", found="not found", remedy=purpose)

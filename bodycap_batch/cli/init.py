@@ -1,0 +1,39 @@
+"""`bodycap init`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bodycap_batch.cli.base import app
+
+
+@app.command()
+def init(
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="A folder of videos.", exists=True, file_okay=False)
+    ],
+    force: Annotated[bool, typer.Option("--force", help="Write over a job file that is there.")] = False,
+) -> None:
+    """Write a commented job.yaml for the videos found in a folder.
+
+    Every camera, every option with its default and meaning; what the files do not tell is left to fill in.
+
+    \b
+    Example:
+      bodycap init my_walk/
+      bodycap check my_walk/job.yaml
+    """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.check.starting import UNKNOWN, write_starting_job
+
+    path = write_starting_job(folder, replace=force)
+    text = path.read_text(encoding="utf-8")
+    typer.echo(f"wrote {path}")
+    missing = text.count(UNKNOWN)
+    if missing:
+        typer.echo(
+            f"fill in where {missing} camera{'s were' if missing > 1 else ' was'} worn (`mount:`), then"
+        )
+    typer.echo(f"next: bodycap check {path}")

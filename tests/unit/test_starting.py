@@ -1,0 +1,93 @@
+"""`bodycap init`: the job file says what the folder holds, and means the same as the folder."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from bodycap_batch.check.starting import UNKNOWN, starting_job, write_starting_job
+from bodycap_batch.cli import main
+from bodycap_batch.config.job import load_job
+from bodycap_batch.config.models import Job
+from bodycap_batch.errors import CaptureError, JobError
+from tests.broken import BVH, FRAMES, LENS
+from tests.videos import write_video
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    walk = tmp_path / "my walk"
+    for name in ("torso.mp4", "left_palm.mp4"):
+        write_video(walk / name, FRAMES[:10])
+    return walk
+
+
+def test_the_job_written_means_what_the_folder_means(folder: Path) -> None:
+    (folder / "calib.json").write_text(json.dumps(LENS))
+    path = write_starting_job(folder)
+    assert load_job(path) == load_job(folder)
+
+
+def test_what_is_found_is_used_and_said(folder: Path) -> None:
+    (folder / "subject.bvh").write_text(BVH)
+    text = starting_job(folder)
+    assert yaml.safe_load(text)["skeleton"] == "subject.bvh"
+    assert "# 64×48, 30 fps, 0.3 s" in text
+    assert "calibration: auto" in text
+    (folder / "calib.json").write_text(json.dumps(LENS))
+    assert yaml.safe_load(starting_job(folder))["capture"]["calibration"] == "calib.json"
+
+
+def test_chapters_side_by_side_are_one_camera_whose_place_is_asked_for(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("GX020042.mp4", "GX010042.mp4"):
+        write_video(folder / name, FRAMES[:10])
+    assert main(["init", str(folder)]) == 0
+    assert "where 1 camera was worn" in capsys.readouterr().out
+    data = yaml.safe_load((folder / "job.yaml").read_text())
+    (gopro,) = (camera for camera in data["capture"]["cameras"] if camera.get("mount"))
+    assert gopro["video"] == ["GX010042.mp4", "GX020042.mp4"]
+    with pytest.raises(JobError, match="still to be filled in: where on the body") as caught:
+        load_job(folder / "job.yaml")
+    assert caught.value.line
+    assert "left_palm" in str(caught.value.hint)
+    text = (folder / "job.yaml").read_text().replace(f'"{UNKNOWN}"', "head")
+    (folder / "job.yaml").write_text(text)
+    assert len(load_job(folder / "job.yaml").capture.cameras) == 3
+
+
+def options_switched_on(text: str) -> dict[str, Any]:
+    """The lines after the last heading, without their comment signs."""
+    lines = text.partition("change what you need, leave the rest.\n")[2].splitlines()
+    assert all(line.startswith("#") for line in lines)
+    return dict(yaml.safe_load("\n".join(line.removeprefix("# ") for line in lines)))
+
+
+def test_every_option_of_every_stage_is_there_with_its_default(folder: Path) -> None:
+    found = options_switched_on(starting_job(folder))
+    plain = Job.model_validate({"capture": {"cameras": [{"name": "torso", "video": ["torso.mp4"]}]}})
+    for stage, options in found.items():
+        assert options == getattr(plain, stage).model_dump(mode="json"), stage
+    assert set(found) == {"keyframes", "map", "registration", "merge", "export"}
+
+
+def test_a_job_that_is_there_is_kept_unless_told_otherwise(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "job.yaml").write_text("mine")
+    assert main(["init", str(folder)]) == 2
+    assert "--force" in capsys.readouterr().err
+    assert (folder / "job.yaml").read_text() == "mine"
+    assert main(["init", str(folder), "--force"]) == 0
+    assert load_job(folder / "job.yaml").name == "my_walk"
+
+
+def test_a_folder_without_videos_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match="no video in this folder"):
+        write_starting_job(tmp_path)
+    assert list(tmp_path.iterdir()) == []
