@@ -1,0 +1,29 @@
+"""Every error says what to do, and the README's table of them is the code's."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.error_table import BEGIN, CODES, README, inserted, messages, table
+
+
+def test_the_table_holds_the_errors_of_the_code() -> None:
+    texts = {message.text: message for message in messages()}
+    assert len(texts) > 150
+    black = texts["camera … shows black pictures only (… of … looked at)"]
+    assert black.code == 3
+    assert "was the lens covered?" in black.remedy
+    assert any("unknown key" in text for text in texts)
+    assert {message.code for message in messages()} == set(CODES.values())
+
+
+def test_the_readme_lists_them_all() -> None:
+    readme = README.read_text(encoding="utf-8")
+    if BEGIN not in readme:
+        pytest.skip("the README has no table of errors")
+    assert inserted(readme) == readme, "run: python -m tests.error_table --write"
+
+
+def test_the_table_is_markdown_of_three_columns() -> None:
+    for row in table().splitlines():
+        assert row.replace("\\|", "").count("|") == 4, row
