@@ -22,6 +22,7 @@ Orientation = tuple[tuple[int, int], tuple[int, int]]
 """Signed permutation matrix, shown = orientation · stored, x right and y down."""
 
 COPY_AGAIN = "copy it again from the camera's card, or leave this camera out"
+MAY_READ = "let the user who runs this read the file and enter its folders (chmod)"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,16 +79,18 @@ def open_container(path: Path) -> InputContainer:
     """
     import av
 
-    if not path.is_file():
-        raise CaptureError(
-            "no such video", path=path, hint="check the path in the job, relative to the job file"
-        )
-    if path.stat().st_size == 0:
-        raise CaptureError("the video is empty (0 bytes)", path=path, hint=COPY_AGAIN)
     try:
+        if not path.is_file():
+            raise CaptureError(
+                "no such video", path=path, hint="check the path in the job, relative to the job file"
+            )
+        if path.stat().st_size == 0:
+            raise CaptureError("the video is empty (0 bytes)", path=path, hint=COPY_AGAIN)
         container: InputContainer = av.open(str(path), metadata_errors="replace")
     except av.error.EOFError as error:
         raise CaptureError("the video holds no frame", path=path, hint=COPY_AGAIN) from error
+    except PermissionError as error:
+        raise CaptureError("no permission to read it", path=path, hint=MAY_READ) from error
     except (av.error.FFmpegError, OSError) as error:
         raise CaptureError(
             f"not a readable video ({reason_of(error)}); recordings cut short have no index",

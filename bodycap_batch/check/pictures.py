@@ -24,13 +24,21 @@ def look_at_frames(camera: CaptureCamera) -> list[str]:
         Notes about pictures that make a hard job.
 
     Raises:
-        CaptureError: A frame cannot be decoded, or all are black.
+        CaptureError: A frame cannot be decoded, there is only one, or all are black.
     """
+    if sum(len(video.pts) for video in camera.videos) < 2:
+        raise CaptureError(
+            f"camera {camera.name} has a single frame: a picture, no video",
+            path=camera.chapters[0],
+            hint="copy the video again, or leave the camera out",
+        )
     dark, bright = [], []
+    pictures = set()
     for _, image in camera.read(sample_indices(camera, _SAMPLES)):
         low, high = np.percentile(image, (1, 99))
         dark.append(float(low))
         bright.append(float(high))
+        pictures.add(image.tobytes())
     black = int(np.sum(np.array(bright) < _BLACK_LEVEL))
     if black == len(bright):
         raise CaptureError(
@@ -43,6 +51,8 @@ def look_at_frames(camera: CaptureCamera) -> list[str]:
         notes.append(
             "interlaced: make whole pictures of it first (ffmpeg -i in -vf bwdif=send_frame out.mp4)"
         )
+    if len(pictures) == 1 and len(bright) > 1:
+        notes.append("the picture stands still throughout: nothing can be solved from it")
     if black:
         notes.append(
             f"{black} of {len(bright)} pictures looked at are black; cut them off with start_s and end_s"

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera, open_camera
+from bodycap_batch.check.files import check_files
 from bodycap_batch.check.pictures import look_at_frames
 from bodycap_batch.check.report import CameraFinding, CheckReport
 from bodycap_batch.check.room import require_room
@@ -43,7 +44,7 @@ def require_ready(job: Job) -> CheckReport:
 
     The room on the disk is left out: it is another one at any moment.
     """
-    report = _checked(job, (_check_clocks, _check_skeleton, _check_formats))
+    report = _checked(job, _ALWAYS)
     if report.errors:
         raise report.errors[0]
     return report
@@ -51,7 +52,7 @@ def require_ready(job: Job) -> CheckReport:
 
 def check_job(job: Job) -> CheckReport:
     """Check a resolved job: every video opened and looked at, calibration, clocks, skeleton, disk."""
-    return _checked(job, (_check_clocks, _check_skeleton, _check_formats, _check_disk))
+    return _checked(job, (*_ALWAYS, _check_disk))
 
 
 def _checked(job: Job, checks: Iterable[Callable[[Job, list[CameraFinding]], list[str]]]) -> CheckReport:
@@ -225,6 +226,15 @@ def _check_formats(job: Job, _findings: list[CameraFinding]) -> list[str]:
     return []
 
 
+def _check_files(job: Job, _findings: list[CameraFinding]) -> list[str]:
+    """No video twice, no chapter missing."""
+    check_files(job)
+    return []
+
+
 def _check_disk(job: Job, findings: list[CameraFinding]) -> list[str]:
     """Room for the job's results and intermediate files, and the right to write them."""
     return require_room(job.out or Path("out").resolve(), sum(camera.used_frames for camera in findings))
+
+
+_ALWAYS = (_check_files, _check_clocks, _check_skeleton, _check_formats)

@@ -24,7 +24,12 @@ if TYPE_CHECKING:
 
 STORE_VARIABLE = "BODYCAP_STORE"
 JobArgument = Annotated[
-    Path, typer.Argument(metavar="JOB_OR_FOLDER", help="A job file (YAML), or a folder of videos.")
+    Path,
+    typer.Argument(
+        metavar="JOB_OR_FOLDER",
+        help="A job file (YAML), or a folder of videos.",
+        readable=False,  # the loader says it better, with the remedy
+    ),
 ]
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="DIR", help="Folder for the results (default: out/<job>).")

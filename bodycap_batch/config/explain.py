@@ -81,6 +81,8 @@ def _problem(details: Any, model: type[BaseModel], data: object) -> Problem:
         return Problem(location, f"{_short(details['input'])} should be {_WANTED[kind]}", None)
     if kind == "literal_error":
         return _not_among(location, details)
+    if kind == "too_short" and not details["input"]:
+        return Problem(location, "this is an empty list", None)
     text = str(details["msg"]).removeprefix("Value error, ").replace("Input should be", "should be")
     if kind == "value_error":
         return Problem(location, text, None)

@@ -64,12 +64,36 @@ def load_job(
         CaptureError: A calibration or a folder of videos cannot be used.
     """
     full = path.resolve()
+    try:
+        return _loaded(full, _source(full, limits or Limits()), overrides or Overrides(), prepare, policy)
+    except PermissionError as error:
+        kind = JobError if error.filename == str(full) else CaptureError
+        raise kind(
+            "no permission to read it",
+            path=error.filename,
+            hint="let the user who runs this read the file and enter its folders (chmod)",
+        ) from error
+
+
+def _source(full: Path, limits: Limits) -> YamlSource | None:
+    """The job's YAML, None for a folder of videos."""
     if full.is_dir():
-        source, data, base = None, {"capture": folder_capture(full)}, full
+        return None
+    return read_yaml(full, max_bytes=int(1024 * limits.yaml_kb), max_depth=int(limits.yaml_depth))
+
+
+def _loaded(
+    full: Path,
+    source: YamlSource | None,
+    overrides: Overrides,
+    prepare: Prepare | None,
+    policy: PathPolicy | None,
+) -> Job:
+    if source is None:
+        data, base, name = {"capture": folder_capture(full)}, full, full.name
     else:
-        source = _read(full, limits or Limits())
-        data, base = _mapping(source), full.parent
-    job = _with_overrides(_validated(data, full, source), overrides or Overrides())
+        data, base, name = _mapping(source), full.parent, full.stem
+    job = _with_overrides(_validated(data, full, source), overrides)
     problems = problems_in(job)
     if problems:
         raise job_error(problems, full, source)
@@ -77,7 +101,7 @@ def load_job(
         policy.require_named(job, base)
     if job.capture.synthetic is not None:
         _prepare_synthetic(job, base, full, prepare)
-    resolved = _resolved(job, base, safe_name(full.name if full.is_dir() else full.stem), full, source)
+    resolved = _resolved(job, base, safe_name(name), full, source)
     if policy is not None:
         policy.require_resolved(resolved)
     return resolved
@@ -93,10 +117,6 @@ def synthetic_folder(job: Job, base: Path) -> Path:
             hint="bodycap synth writes <folder>/<camera>.mp4",
         )
     return folders.pop()
-
-
-def _read(path: Path, limits: Limits) -> YamlSource:
-    return read_yaml(path, max_bytes=int(1024 * limits.yaml_kb), max_depth=int(limits.yaml_depth))
 
 
 def _mapping(source: YamlSource) -> dict[str, Any]:

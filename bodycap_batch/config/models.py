@@ -151,7 +151,9 @@ class Job(_Block):
     tpose_frame: int | None = Field(
         None, ge=0, description="frame of the skeleton file that holds its T-pose, where zero is none"
     )
-    height_m: float | None = Field(None, ge=0.4, le=2.6, description="the subject's height")
+    height_m: float | None = Field(
+        None, ge=0.4, le=2.6, description="the subject's height in metres, e.g. 1.75"
+    )
     activity: Literal["walk", "generic"] = Field("generic", description="what the subject does")
     keyframes: KeyframeOptions = KeyframeOptions()
     map: MapOptions = MapOptions()

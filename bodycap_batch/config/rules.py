@@ -26,7 +26,7 @@ def problems_in(job: Job) -> list[Problem]:
     for index, camera in enumerate(job.capture.cameras):
         for found in (*_camera_names(job, index), *_mount(job, camera), *_pose(camera), *_paths(camera)):
             problems.append(found._replace(location=("capture", "cameras", index, *found.location)))
-    return [*problems, *_job_names(job), *_skeleton(job), *_times(job)]
+    return [*problems, *_job_names(job), *_skeleton(job), *_times(job), *_first_frames(job)]
 
 
 def skeleton_of(job: Job) -> str:
@@ -57,6 +57,9 @@ def _mount(job: Job, camera: CameraConfig) -> Iterator[Problem]:
     if camera.segment is not None and camera.role is None:
         known = (*ROLES, *MOUNT_NAMES)
         yield Problem(("segment",), f"unknown segment {camera.segment!r}", _nearest(camera.segment, known))
+    elif camera.mount is not None and _UNFILLED.search(camera.mount):
+        message = f"still to be filled in: where on the body was camera {camera.name!r}?"
+        yield Problem(("mount",), message, f"one of {', '.join(MOUNT_NAMES)}")
     elif camera.segment is None and camera.mount is not None and camera.role is None:
         yield Problem(("mount",), f"unknown mount {camera.mount!r}", _nearest(camera.mount, MOUNT_NAMES))
     elif camera.role is None and skeleton_of(job) != NO_SKELETON:
@@ -136,6 +139,16 @@ def _times(job: Job) -> Iterator[Problem]:
     start, end = job.capture.start_s, job.capture.end_s
     if start is not None and end is not None and end <= start:
         yield Problem(("capture", "end_s"), f"end_s {end:g} is not after start_s {start:g}", "swap them?")
+
+
+def _first_frames(job: Job) -> Iterator[Problem]:
+    """The two frames a map starts from are named after cameras of the job."""
+    names = tuple(camera.name for camera in job.capture.cameras)
+    for index, frame in enumerate(job.map.init_frames or ()):
+        camera = frame.rpartition(":")[0]
+        if camera not in names:
+            where = ("map", "init_frames", index)
+            yield Problem(where, f"there is no camera {camera[:40]!r}", _nearest(camera, names))
 
 
 def _nearest(value: str, known: tuple[str, ...]) -> str:

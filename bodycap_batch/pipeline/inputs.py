@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from bodycap_batch.capture.video import MAY_READ
 from bodycap_batch.config.models import CameraConfig, CaptureConfig, Job
 from bodycap_batch.digests import FileDigests, json_digest
 from bodycap_batch.errors import CaptureError, JobError
@@ -49,7 +50,7 @@ def camera_digest(
     except FileNotFoundError as error:
         raise CaptureError("there is no such file", path=error.filename, hint="check the path") from error
     except OSError as error:
-        raise CaptureError(f"cannot be read: {error.strerror}", path=error.filename) from error
+        raise CaptureError(f"cannot be read: {error.strerror}", path=error.filename, hint=MAY_READ) from error
     return json_digest(
         {
             **settings,
@@ -95,7 +96,9 @@ def body_digest(job: Job, digests: FileDigests) -> dict[str, Any]:
     try:
         content = digests.sha256(path) if path else None
     except OSError as error:
-        raise JobError(f"cannot be read: {error.strerror}", path=path, field="skeleton") from error
+        raise JobError(
+            f"cannot be read: {error.strerror}", path=path, field="skeleton", hint=MAY_READ
+        ) from error
     return {**body_arguments(job), "skeleton_file": content}
 
 

@@ -2,164 +2,116 @@
 
 from __future__ import annotations
 
-import json
-import struct
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from bodycap_batch.check import check_path, require_ready
 from bodycap_batch.cli import main
 from bodycap_batch.config.job import load_job
 from bodycap_batch.errors import BodycapError
-from tests.videos import textured_frame, write_tone, write_video
+from tests.broken import CASES, FRAMES, MIRRORED, Case, black, edit, sound
+from tests.videos import textured_frame, write_video
 
-FRAMES = [textured_frame(index) for index in range(40)]
-LENS = {"model": "PINHOLE", "params": [40, 40, 32, 24], "width": 64, "height": 48}
+
+@pytest.fixture(scope="module")
+def sound_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sound")
+    sound(folder)
+    return folder
 
 
 @pytest.fixture
-def capture(tmp_path: Path) -> Path:
+def capture(sound_folder: Path, tmp_path: Path) -> Path:
     """A sound job of two cameras; each test then breaks one thing."""
-    for name in ("torso", "head"):
-        write_video(tmp_path / f"{name}.mp4", FRAMES)
-    cameras = "".join(f"    - {{name: {name}, video: {name}.mp4}}\n" for name in ("torso", "head"))
-    (tmp_path / "calib.json").write_text(json.dumps(LENS))
-    (tmp_path / "job.yaml").write_text(f"capture:\n  calibration: calib.json\n  cameras:\n{cameras}")
-    return tmp_path
+    return Path(shutil.copytree(sound_folder, tmp_path / "walk"))
 
 
-def missing(root: Path) -> None:
-    (root / "torso.mp4").unlink()
+def test_there_are_enough_of_them() -> None:
+    assert len(CASES) >= 40
+    assert len({case.name for case in CASES}) == len(CASES)
 
 
-def empty(root: Path) -> None:
-    (root / "torso.mp4").write_bytes(b"")
-
-
-def not_a_video(root: Path) -> None:
-    (root / "torso.mp4").write_bytes(np.random.default_rng(0).bytes(5000))
-
-
-def truncated_index_last(root: Path) -> None:
-    """The camera lost power: the index, written last, is not there."""
-    data = (root / "torso.mp4").read_bytes()
-    (root / "torso.mp4").write_bytes(data[: len(data) // 2])
-
-
-def truncated_index_first(root: Path) -> None:
-    """A copy that broke off, of a file whose index stands first."""
-    import av
-
-    with (
-        av.open(str(root / "torso.mp4")) as source,
-        av.open(str(root / "fast.mp4"), "w", options={"movflags": "faststart"}) as target,
-    ):
-        stream = target.add_stream_from_template(source.streams.video[0])
-        for packet in source.demux(video=0):
-            if packet.dts is not None:
-                packet.stream = stream
-                target.mux(packet)
-    data = (root / "fast.mp4").read_bytes()
-    start = data.index(b"mdat")
-    (root / "torso.mp4").write_bytes(data[: start + (len(data) - start) // 2])
-
-
-def zero_frames(root: Path) -> None:
-    """A container with a video stream and nothing in it."""
-    import av
-
-    with av.open(str(root / "torso.mp4"), "w", format="avi") as container:
-        stream = container.add_stream("libx264", rate=30)
-        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-        container.start_encoding()
-
-
-def audio_only(root: Path) -> None:
-    write_tone(root / "torso.mp4")
-
-
-def black(root: Path) -> None:
-    rng = np.random.default_rng(1)
-    # A covered lens is not quite black: sensor noise of a few grey levels.
-    write_video(root / "torso.mp4", [rng.integers(0, 8, (48, 64)).astype(np.uint8) for _ in range(20)])
-
-
-def corrupt_in_the_middle(root: Path) -> None:
-    """Zeroes over whole access units: no frame can come of them."""
-    path = root / "torso.mp4"
-    data = bytearray(path.read_bytes())
-    start = data.index(b"mdat") + 4
-    length = struct.unpack(">I", data[start - 8 : start - 4])[0] - 8
-    data[start + length // 3 : start + length] = bytes(length - length // 3)
-    path.write_bytes(bytes(data))
-
-
-def wrong_aspect(root: Path) -> None:
-    (root / "calib.json").write_text(json.dumps({**LENS, "width": 64, "height": 36}))
-
-
-def no_calibration_file(root: Path) -> None:
-    (root / "calib.json").unlink()
-
-
-def few_timestamps(root: Path) -> None:
-    (root / "torso.timestamps.txt").write_text("0.0\n0.1\n")
-
-
-def edit(old: str, new: str) -> Callable[[Path], None]:
-    """Change the job's text."""
-
-    def change(root: Path) -> None:
-        path = root / "job.yaml"
-        text = path.read_text()
-        assert old in text
-        path.write_text(text.replace(old, new, 1))
-
-    return change
-
-
-VIDEO = "torso.mp4"
-CASES = [
-    (missing, 3, VIDEO, "no such video"),
-    (empty, 3, VIDEO, "empty"),
-    (not_a_video, 3, VIDEO, "not a readable video"),
-    (truncated_index_last, 3, VIDEO, "not a readable video"),
-    (truncated_index_first, 3, VIDEO, "cut short"),
-    (zero_frames, 3, VIDEO, "no frame"),
-    (audio_only, 3, VIDEO, "sound only"),
-    (black, 3, VIDEO, "black pictures only"),
-    (corrupt_in_the_middle, 3, VIDEO, "decod"),
-    (wrong_aspect, 3, VIDEO, "another aspect"),
-    (no_calibration_file, 3, "calib.json", "cannot read"),
-    (few_timestamps, 3, "torso.timestamps.txt", "2 timestamps for 40 frames"),
-    (edit("name: torso", "mount: trso, name: torso"), 2, "job.yaml", "unknown mount"),
-    (edit("name: head", "name: torso"), 2, "job.yaml", "two cameras"),
-    (edit("  cameras", "\tcameras"), 2, "job.yaml", "tab"),
-    (edit("capture:", "height_m: [1]\ncapture:"), 2, "job.yaml", "should be a number"),
-    (edit("capture:", "hight_m: 1\ncapture:"), 2, "job.yaml", "unknown key"),
-    (edit("capture:", "name: a\nname: b\ncapture:"), 2, "job.yaml", "twice"),
-    (edit("capture:", "capture:\n  start_s: 100"), 3, VIDEO, "no frame between"),
-    (edit("video: head.mp4", "video: head.mp4, offset_s: 60"), 3, VIDEO, "shares no time"),
-]
-
-
-@pytest.mark.parametrize(("break_it", "code", "file", "message"), CASES)
-def test_bad_input(
-    capture: Path, break_it: Callable[[Path], None], code: int, file: str, message: str
-) -> None:
+def test_the_sound_job_is_ready(capture: Path) -> None:
     assert check_path(capture / "job.yaml").ready
-    break_it(capture)
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_bad_input(capture: Path, case: Case) -> None:
+    case.break_it(capture)
     report = check_path(capture / "job.yaml")
     error = report.errors[0]
-    assert report.exit_code == error.exit_code == code
-    assert message in error.message
-    assert Path(str(error.path)).name == file
+    assert report.exit_code == error.exit_code == case.code
+    assert case.message in error.message
+    assert Path(str(error.path)).name == case.file
     assert error.hint
-    with pytest.raises(BodycapError):
-        require_ready(load_job(capture / "job.yaml"))
+    assert len(error.message) < 500
+    if case.code != 5:  # the disk is looked at when a stage starts, not before
+        with pytest.raises(BodycapError):
+            require_ready(load_job(capture / "job.yaml"))
+
+
+def shorter(root: Path) -> None:
+    write_video(root / "head.mp4", MIRRORED[:20])
+
+
+def upside_down(root: Path) -> None:
+    write_video(root / "head.mp4", MIRRORED, rotation=180)
+
+
+def variable_rate(root: Path) -> None:
+    write_video(root / "head.mp4", MIRRORED, pts=[10 * i + (i % 3) * 4 for i in range(40)])
+
+
+def dropped(root: Path) -> None:
+    write_video(root / "head.mp4", MIRRORED, pts=[10 * (i + 15 * (i > 20)) for i in range(40)])
+
+
+def frozen(root: Path) -> None:
+    write_video(root / "head.mp4", [MIRRORED[0]] * 40)
+
+
+def no_contrast(root: Path) -> None:
+    write_video(root / "head.mp4", [textured_frame(i) // 12 + 90 for i in range(40)])
+
+
+def partly_black(root: Path) -> None:
+    write_video(root / "head.mp4", [*MIRRORED[:12], *[MIRRORED[0] * 0] * 28])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (shorter, "all cameras run together for 0.6 s"),
+        (upside_down, "ready to run"),
+        (variable_rate, "variable rate"),
+        (dropped, "15 frames were dropped"),
+        (frozen, "the picture stands still"),
+        (no_contrast, "hardly any contrast"),
+        (partly_black, "pictures looked at are black"),
+        (edit("capture:", "skeleton: none\ncapture:"), "ready to run"),
+        (lambda root: (root / "calib.json").unlink() or edit("calib.json", "auto")(root), "not calibrated"),
+    ],
+)  # fmt: skip
+def test_what_makes_a_job_hard_is_said_and_does_not_stop_it(
+    capture: Path, change: Callable[[Path], None], said: str
+) -> None:
+    change(capture)
+    report = check_path(capture / "job.yaml")
+    assert report.ready, report.lines()
+    assert said in "\n".join(report.lines())
+
+
+def test_a_missing_chapter_is_no_matter_where_the_times_are_stated(capture: Path) -> None:
+    (capture / "torso.mp4").unlink()
+    for name in ("GX010042.MP4", "GX030042.MP4"):
+        write_video(capture / "card" / name, FRAMES[:20])
+    times = "\n".join(str((index + 100 * (index > 19)) / 30) for index in range(40))
+    (capture / "times.txt").write_text(times)
+    edit("video: torso.mp4", "video: card, timestamps: times.txt")(capture)
+    assert check_path(capture / "job.yaml").ready
 
 
 @pytest.mark.parametrize(

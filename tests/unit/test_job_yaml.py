@@ -121,7 +121,7 @@ def test_yaml_words_are_not_turned_into_other_things(tmp_path: Path) -> None:
         (MINIMAL + "skeleton: " + "a" * 300 + ".bvh", 7, "skeleton", "no path", "check"),
         (MINIMAL + "out: " + "a" * 300, 7, "out", "no path", "check"),
         ("height_m: 1.8\n", 1, "capture", "missing", "capture"),
-        ("capture: {cameras: []}\n", 1, "capture.cameras", "at least 1", None),
+        ("capture: {cameras: []}\n", 1, "capture.cameras", "empty list", None),
         (MINIMAL + "skeleton: none\nskeleton: none\n", 8, "skeleton", "twice, first on line 7", "one"),
         (MINIMAL.replace("    - name: left", "\t- name: left"), 5, None, "tab", "spaces"),
         (MINIMAL + "name:\tx\n\tout: y\n", 8, None, "tab", "spaces"),

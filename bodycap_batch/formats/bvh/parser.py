@@ -84,7 +84,12 @@ class _Lines:
 
     def error(self, message: str, *, line: int | None = None, hint: str | None = None) -> JobError:
         """The typed error at this line."""
-        return JobError(message, path=self.path, line=self.number if line is None else line, hint=hint)
+        return JobError(
+            message,
+            path=self.path,
+            line=self.number if line is None else line,
+            hint=hint or "export the skeleton again as BVH, or take a preset: `skeleton: upper_body`",
+        )
 
 
 def _decode(raw: bytes) -> str:

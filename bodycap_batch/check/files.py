@@ -1,0 +1,60 @@
+"""Files that were mixed up: one video for two cameras, a chapter that was not copied."""
+
+from __future__ import annotations
+
+import filecmp
+import re
+from itertools import combinations, pairwise
+from pathlib import Path
+
+from bodycap_batch.config.models import CameraConfig, Job
+from bodycap_batch.errors import CaptureError
+
+_GOPRO_CHAPTER = re.compile(r"G[HXL](?P<chapter>[0-9]{2})(?P<video>[0-9]{4})", re.IGNORECASE)
+
+
+def check_files(job: Job) -> None:
+    """Refuse a video that two cameras share, and chapters with one missing between them.
+
+    Raises:
+        CaptureError: One of these; names the file.
+    """
+    for camera in job.capture.cameras:
+        _missing_chapter(camera)
+    for first, second in combinations(job.capture.cameras, 2):
+        for video in second.video:
+            twin = next((other for other in first.video if _same(other, video)), None)
+            if twin is not None:
+                raise CaptureError(
+                    f"camera {second.name} shows the same video as camera {first.name} ({twin.name})",
+                    path=video,
+                    hint=f"copy the video of {second.name} again, or leave that camera out",
+                )
+
+
+def _same(first: Path, second: Path) -> bool:
+    """Whether two files hold the same bytes; other sizes answer at once. Missing files are told elsewhere."""
+    try:
+        size = first.stat().st_size
+        return size > 0 and size == second.stat().st_size and filecmp.cmp(first, second, shallow=False)
+    except OSError:
+        return False
+
+
+def _missing_chapter(camera: CameraConfig) -> None:
+    """A GoPro numbers the chapters of a recording; without one, all that follows would be too early."""
+    if camera.timestamps:
+        return
+    for before, after in pairwise(camera.video):
+        numbers = [_GOPRO_CHAPTER.fullmatch(path.stem) for path in (before, after)]
+        if not (numbers[0] and numbers[1] and numbers[0]["video"] == numbers[1]["video"]):
+            continue
+        last, following = (int(number["chapter"]) for number in numbers if number)
+        if following > last + 1:
+            raise CaptureError(
+                f"chapter {last + 1} of recording {numbers[1]['video']} is missing between {before.name} and "
+                f"{after.name}",
+                path=after,
+                hint="copy it from the card, too; if it is lost, end before it with end_s and list only the "
+                "chapters up to there",
+            )

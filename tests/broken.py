@@ -1,0 +1,299 @@
+"""Broken captures and jobs: how each is made, and what a user is told of it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tests.videos import textured_frame, write_tone, write_video
+
+FRAMES = [textured_frame(index) for index in range(40)]
+MIRRORED = [frame[:, ::-1] for frame in FRAMES]
+LENS = {"model": "PINHOLE", "params": [40, 40, 32, 24], "width": 64, "height": 48}
+BVH = """HIERARCHY
+ROOT Hips
+{
+  OFFSET 0 90 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  End Site
+  {
+    OFFSET 0 30 0
+  }
+}
+"""
+
+
+def sound(root: Path) -> Path:
+    """Make a sound job of two cameras in a folder; return its file."""
+    write_video(root / "torso.mp4", FRAMES)
+    write_video(root / "head.mp4", MIRRORED)
+    cameras = "".join(f"    - {{name: {name}, video: {name}.mp4}}\n" for name in ("torso", "head"))
+    (root / "calib.json").write_text(json.dumps(LENS))
+    (root / "job.yaml").write_text(f"capture:\n  calibration: calib.json\n  cameras:\n{cameras}")
+    return root / "job.yaml"
+
+
+@dataclass(frozen=True)
+class Case:
+    """One way to break the sound job.
+
+    Attributes:
+        name: For the test's title.
+        break_it: Called with the job's folder.
+        code: Exit code.
+        file: Name of the file that is at fault.
+        message: Part of what is said about it.
+    """
+
+    name: str
+    break_it: Callable[[Path], None]
+    code: int
+    file: str
+    message: str
+
+
+def missing(root: Path) -> None:
+    (root / "torso.mp4").unlink()
+
+
+def empty(root: Path) -> None:
+    (root / "torso.mp4").write_bytes(b"")
+
+
+def not_a_video(root: Path) -> None:
+    (root / "torso.mp4").write_bytes(np.random.default_rng(0).bytes(5000))
+
+
+def truncated_index_last(root: Path) -> None:
+    """The camera lost power: the index, written last, is not there."""
+    data = (root / "torso.mp4").read_bytes()
+    (root / "torso.mp4").write_bytes(data[: len(data) // 2])
+
+
+def truncated_index_first(root: Path) -> None:
+    """A copy that broke off, of a file whose index stands first."""
+    import av
+
+    with (
+        av.open(str(root / "torso.mp4")) as source,
+        av.open(str(root / "fast.mp4"), "w", options={"movflags": "faststart"}) as target,
+    ):
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                target.mux(packet)
+    data = (root / "fast.mp4").read_bytes()
+    start = data.index(b"mdat")
+    (root / "torso.mp4").write_bytes(data[: start + (len(data) - start) // 2])
+
+
+def zero_frames(root: Path) -> None:
+    """A container with a video stream and nothing in it."""
+    import av
+
+    with av.open(str(root / "torso.mp4"), "w", format="avi") as container:
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        container.start_encoding()
+
+
+def audio_only(root: Path) -> None:
+    write_tone(root / "torso.mp4")
+
+
+def black(root: Path) -> None:
+    rng = np.random.default_rng(1)
+    # A covered lens is not quite black: sensor noise of a few grey levels.
+    write_video(root / "torso.mp4", [rng.integers(0, 8, (48, 64)).astype(np.uint8) for _ in range(20)])
+
+
+def corrupt_in_the_middle(root: Path) -> None:
+    """Zeroes over whole access units: no frame can come of them."""
+    path = root / "torso.mp4"
+    data = bytearray(path.read_bytes())
+    start = data.index(b"mdat") + 4
+    length = struct.unpack(">I", data[start - 8 : start - 4])[0] - 8
+    data[start + length // 3 : start + length] = bytes(length - length // 3)
+    path.write_bytes(bytes(data))
+
+
+def wrong_aspect(root: Path) -> None:
+    (root / "calib.json").write_text(json.dumps({**LENS, "width": 64, "height": 36}))
+
+
+def no_calibration_file(root: Path) -> None:
+    (root / "calib.json").unlink()
+
+
+def few_timestamps(root: Path) -> None:
+    (root / "torso.timestamps.txt").write_text("0.0\n0.1\n")
+
+
+def edit(old: str, new: str) -> Callable[[Path], None]:
+    """Change the job's text."""
+
+    def change(root: Path) -> None:
+        path = root / "job.yaml"
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new, 1))
+
+    return change
+
+
+def replace_text(name: str, text: str | bytes) -> Callable[[Path], None]:
+    """Give a file another content."""
+
+    def change(root: Path) -> None:
+        (root / name).write_bytes(text.encode() if isinstance(text, str) else text)
+
+    return change
+
+
+def calibrated(**changes: object) -> Callable[[Path], None]:
+    """Change values of the calibration."""
+    return replace_text("calib.json", json.dumps({**LENS, **changes}))
+
+
+def unknown_codec(root: Path) -> None:
+    """A phone's newest format, which this decoder has never heard of."""
+    data = (root / "torso.mp4").read_bytes()
+    (root / "torso.mp4").write_bytes(data.replace(b"avc1", b"zz99"))
+
+
+def identical(root: Path) -> None:
+    shutil.copy(root / "torso.mp4", root / "head.mp4")
+
+
+def one_frame(root: Path) -> None:
+    write_video(root / "torso.mp4", FRAMES[:1])
+
+
+def a_photo(root: Path) -> None:
+    import cv2
+
+    cv2.imwrite(str(root / "torso.png"), FRAMES[0])
+    (root / "torso.png").rename(root / "torso.mp4")
+
+
+def chapters(*names: str, size: tuple[int, int] = (64, 48)) -> Callable[[Path], None]:
+    """The torso's video as a folder of chapters; the second at another size where asked."""
+
+    def change(root: Path) -> None:
+        (root / "torso.mp4").unlink()
+        for index, name in enumerate(names):
+            width, height = size if index else (64, 48)
+            frames = [textured_frame(number, width, height) for number in range(20)]
+            write_video(root / "card" / name, frames)
+        edit("video: torso.mp4", "video: card")(root)
+
+    return change
+
+
+def empty_folder(root: Path) -> None:
+    (root / "card").mkdir()
+    edit("video: torso.mp4", "video: card")(root)
+
+
+def out_is_a_file(root: Path) -> None:
+    (root / "results").write_text("mine")
+    edit("capture:", "out: results\ncapture:")(root)
+
+
+def skeleton(text: str) -> Callable[[Path], None]:
+    """Ask for the subject's own skeleton, with this content."""
+
+    def change(root: Path) -> None:
+        (root / "subject.bvh").write_text(text)
+        edit("capture:", "skeleton: subject.bvh\ncapture:")(root)
+
+    return change
+
+
+def mask(root: Path) -> None:
+    (root / "mask.png").write_text("no picture")
+    edit("video: torso.mp4", "video: torso.mp4, mask: mask.png")(root)
+
+
+VIDEO, JOB, CALIB, TIMES = "torso.mp4", "job.yaml", "calib.json", "torso.timestamps.txt"
+CASES = (
+    Case("missing video", missing, 3, VIDEO, "no such video"),
+    Case("empty file", empty, 3, VIDEO, "empty"),
+    Case("no video at all", not_a_video, 3, VIDEO, "not a readable video"),
+    Case("power lost", truncated_index_last, 3, VIDEO, "not a readable video"),
+    Case("copy broken off", truncated_index_first, 3, VIDEO, "cut short"),
+    Case("zero frames", zero_frames, 3, VIDEO, "no frame"),
+    Case("sound only", audio_only, 3, VIDEO, "sound only"),
+    Case("lens covered", black, 3, VIDEO, "black pictures only"),
+    Case("damaged in the middle", corrupt_in_the_middle, 3, VIDEO, "decod"),
+    Case("unknown codec", unknown_codec, 3, VIDEO, "no decoder knows"),
+    Case("one frame", one_frame, 3, VIDEO, "single frame"),
+    Case("a photo", a_photo, 3, VIDEO, "single frame"),
+    Case("two identical videos", identical, 3, "head.mp4", "the same video as"),
+    Case("calibrated at another aspect", calibrated(height=36), 3, VIDEO, "another aspect"),
+    Case("calibrated sideways", calibrated(width=48, height=64), 3, VIDEO, "another aspect"),
+    Case("calibration missing", lambda root: (root / CALIB).unlink(), 3, CALIB, "cannot read"),
+    Case("calibration cut off", replace_text(CALIB, '{"model": "PINHO'), 3, CALIB, "JSON"),
+    Case("NaN in the calibration", calibrated(params=[float("nan"), 40, 32, 24]), 3, CALIB, "finite number"),
+    Case("negative focal length", calibrated(params=[-40, 40, 32, 24]), 3, CALIB, "must be positive"),
+    Case("too few parameters", calibrated(params=[40, 32, 24]), 3, CALIB, "takes 4 params, got 3"),
+    Case("unknown lens model", calibrated(model="PINHOLLE"), 3, CALIB, "did you mean PINHOLE"),
+    Case("calibration of other cameras", replace_text(CALIB, '{"cameras": {"left": {}}}'), 3, CALIB, "torso"),
+    Case("too few timestamps", few_timestamps, 3, TIMES, "2 timestamps for 40 frames"),
+    Case("timestamps go back", replace_text(TIMES, "0.0\n0.2\n0.1\n"), 3, TIMES, "does not come after"),
+    Case("timestamps are words", replace_text(TIMES, "0.0\nnoon\n"), 3, TIMES, "is no time in seconds"),
+    Case(
+        "timestamps are binary", replace_text(TIMES, b"\xff\xfe\x00"), 3, TIMES, "cannot read the timestamps"
+    ),
+    Case("window after the end", edit("capture:", "capture:\n  start_s: 100"), 3, VIDEO, "no frame between"),
+    Case("clocks apart", edit("head.mp4", "head.mp4, offset_s: 60"), 3, VIDEO, "shares no time"),
+    Case("missing chapter", chapters("GX010042.MP4", "GX030042.MP4"), 3, "GX030042.MP4", "chapter 2"),
+    Case(
+        "chapter of another size",
+        chapters("GX010042.MP4", "GX020042.MP4", size=(48, 64)),
+        3,
+        "GX020042.MP4",
+        "the first one 64×48",
+    ),
+    Case("folder without videos", empty_folder, 3, "card", "no video"),
+    Case("mask is no picture", mask, 3, "mask.png", "mask"),
+    Case("results' name is a file", out_is_a_file, 5, "results", "cannot be written"),
+    Case("skeleton cut off", skeleton(BVH[:60]), 2, "subject.bvh", "CHANNELS 6"),
+    Case("skeleton without hands", skeleton(BVH), 2, "subject.bvh", "recognised as"),
+    Case("skeleton missing", edit("capture:", "skeleton: no.bvh\ncapture:"), 2, JOB, "no such file"),
+    Case("unknown mount", edit("name: torso", "mount: trso, name: torso"), 2, JOB, "unknown mount"),
+    Case("no mount", edit("name: head", "name: c4"), 2, JOB, "c4"),
+    Case("two cameras of one name", edit("name: head", "name: torso"), 2, JOB, "two cameras"),
+    Case("camera's name is a path", edit("name: head", "name: ../head, mount: head"), 2, JOB, "name"),
+    Case("name of 300 letters", edit("capture:", f"name: {'n' * 300}\ncapture:"), 2, JOB, "at most 100"),
+    Case("tab in the job", edit("  cameras", "\tcameras"), 2, JOB, "tab"),
+    Case("a list for a number", edit("capture:", "height_m: [1]\ncapture:"), 2, JOB, "should be a number"),
+    Case(
+        "a height in centimetres", edit("capture:", "height_m: 175\ncapture:"), 2, JOB, "175: should be less"
+    ),
+    Case("a key misspelt", edit("capture:", "hight_m: 1\ncapture:"), 2, JOB, "unknown key"),
+    Case("a key twice", edit("capture:", "name: a\nname: b\ncapture:"), 2, JOB, "twice"),
+    Case("window turned round", edit("capture:", "capture:\n  start_s: 2\n  end_s: 1"), 2, JOB, "end_s"),
+    Case(
+        "first frames of no camera",
+        edit("capture:", "map: {init_frames: [a:1, b:2]}\ncapture:"),
+        2,
+        JOB,
+        "no camera",
+    ),
+    Case("no cameras", replace_text(JOB, "capture: {cameras: []}\n"), 2, JOB, "empty list"),
+    Case("nothing in it", replace_text(JOB, ""), 2, JOB, "empty"),
+    Case("a list of jobs", replace_text(JOB, "- a\n- b\n"), 2, JOB, "no block of"),
+    Case("not text", replace_text(JOB, bytes(range(128, 256))), 2, JOB, "cannot read the job"),
+    Case("aliases", replace_text(JOB, "a: &x [1]\nb: *x\n"), 2, JOB, "anchor"),
+    Case("a Python object", replace_text(JOB, "capture: !!python/object:os.system {}\n"), 2, JOB, "tag"),
+    Case("nested without end", replace_text(JOB, "[" * 5000), 2, JOB, "deep"),
+)
+"""The sound job broken in every way we know; `file` is what the message names."""
