@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +17,7 @@ from bodycap_batch.cli.run import ThreadsOption, cores
 from bodycap_batch.cli.stop import exit_code_of_stop, stoppable
 
 if TYPE_CHECKING:
-    from bodycap_batch.watch import Watcher
+    from bodycap_batch.watch import Spool, Watcher, WatchOptions
 
 
 RootOption = Annotated[
@@ -28,6 +30,21 @@ LimitOption = Annotated[
         metavar="NAME=VALUE",
         help="How large a job may be (default: video_gb=64 video_hours=4 video_px=8192 files=10000 "
         "yaml_kb=1024 yaml_depth=20); may be given several times.",
+    ),
+]
+
+WebOption = Annotated[
+    str | None,
+    typer.Option(metavar="HOST:PORT", help="Serve a live page of the jobs, e.g. on 127.0.0.1:8080."),
+]
+TokenOption = Annotated[
+    str,
+    typer.Option(
+        metavar="TOKEN",
+        help="What a browser has to show (?token=…); needed where --web is not a loopback address.",
+        envvar="BODYCAP_WEB_TOKEN",
+        show_envvar=True,
+        show_default=False,
     ),
 ]
 
@@ -58,6 +75,8 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
             min=1.0, metavar="SECONDS", help="Take jobs over whose watcher gave no sign for so long."
         ),
     ] = 60.0,
+    web: WebOption = None,
+    web_token: TokenOption = "",
     once: Annotated[bool, typer.Option("--once", help="Leave when nothing is left to do.")] = False,
 ) -> None:
     """Work on every folder of videos, or job file, that is dropped into INBOX.
@@ -74,6 +93,7 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap watch jobs/inbox
       bodycap watch /mnt/nas/jobs/inbox --root /mnt/nas/footage --jobs 2 --poll
       bodycap watch jobs/inbox --once          work off what is there, then leave
+      bodycap watch jobs/inbox --web 127.0.0.1:8080
       bodycap status jobs                      how the jobs are
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.config.limits import limits_from
@@ -93,7 +113,8 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
     with stoppable() as stop:
         watcher = Watcher(spool, options, _say)
         _say(f"watching {spool.inbox}; results go to {spool.done}")
-        worst = _run(watcher, stop)
+        with _live_page(spool, options, web, web_token):
+            worst = _run(watcher, stop)
     if stop.is_set():
         _say("stopped; running jobs go on at the next start")
         raise typer.Exit(exit_code_of_stop())
@@ -109,6 +130,19 @@ def _run(watcher: Watcher, stop: threading.Event) -> int:
 
     threading.Thread(target=end, name="stop", daemon=True).start()
     return watcher.run()
+
+
+@contextmanager
+def _live_page(spool: Spool, options: WatchOptions, address: str | None, token: str) -> Iterator[None]:
+    """Serve the live page meanwhile, where an address is given."""
+    if address is None:
+        yield
+        return
+    from bodycap_batch.watch.web import LivePage, access_from
+
+    with LivePage(spool, access_from(address, token), options.terms.limits) as page:
+        _say(f"live page: {page.access.url}{'?token=…' if page.access.token else ''}")
+        yield
 
 
 def _folder(path: Path) -> Path:

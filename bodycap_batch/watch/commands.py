@@ -58,6 +58,13 @@ class JobRow:
 
 def rows_of(spool: Spool) -> list[JobRow]:
     """Every job of a spool: waiting, running, done, failed."""
+    claimed = [claimed_row(JobDir(path)) for path in visible(spool.running) if path.is_dir()]
+    ended = [claimed_row(JobDir(path)) for folder in (spool.done, spool.failed) for path in visible(folder)]
+    return [*waiting_rows(spool), *claimed, *ended]
+
+
+def waiting_rows(spool: Spool) -> list[JobRow]:
+    """What lies in the inbox."""
     waiting = [_waiting(drop) for drop in drops_in(spool.inbox)]
     strays = [
         JobRow(
@@ -69,9 +76,7 @@ def rows_of(spool: Spool) -> list[JobRow]:
         )
         for path in strays_in(spool.inbox)
     ]
-    claimed = [_claimed(JobDir(path)) for path in visible(spool.running) if path.is_dir()]
-    ended = [_claimed(JobDir(path)) for folder in (spool.done, spool.failed) for path in visible(folder)]
-    return [*waiting, *strays, *claimed, *ended]
+    return [*waiting, *strays]
 
 
 def retry_job(spool: Spool, name: str) -> Path:
@@ -158,7 +163,8 @@ def _waiting(drop: Drop) -> JobRow:
     )
 
 
-def _claimed(job: JobDir) -> JobRow:
+def claimed_row(job: JobDir) -> JobRow:
+    """A job that has been claimed, as its files tell it."""
     status = read_status(job)
     state = str(status.get("state", "claimed"))
     if state == "running" and _is_alone(job):

@@ -20,6 +20,8 @@ State = Literal["claimed", "running", "stopped", "done", "failed", "cancelled"]
 FINAL = ("done", "failed", "cancelled")
 _PERIOD_S = 0.5
 _MOST_NOTES = 100
+_UNENDED = "reading videos"
+"""No stage, so nobody tells its end: it is over when a stage begins."""
 
 
 class StatusFile:
@@ -151,6 +153,8 @@ def _take(document: dict[str, Any], event: Event) -> None:
         _add_note(document, event.what)
         return
     document["stage"], document["camera"] = event.stage, event.camera
+    if event.kind != "progress":
+        document["active"].pop(_UNENDED, None)
     share = event.done / event.total if event.total else None
     document["progress"] = share
     if event.kind in ("started", "progress"):

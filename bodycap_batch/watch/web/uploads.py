@@ -1,0 +1,177 @@
+"""Videos sent by the browser: written beside the inbox's drops, out of sight until all are there."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import threading
+import time
+import uuid
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+from bodycap_batch.config.folder import VIDEO_SUFFIXES
+from bodycap_batch.config.limits import Limits
+from bodycap_batch.errors import CaptureError, JobError, StoreError
+from bodycap_batch.store import disk_errors
+from bodycap_batch.watch.drops import JOB_FILES, READY
+from bodycap_batch.watch.spool import Spool, move, spool_name
+
+PREFIX = ".upload-"
+_ALSO = ("calib.json", *JOB_FILES)
+_ALSO_SUFFIXES = (".timestamps.txt", ".bvh", ".png")
+_SMALL_BYTES = 64 << 20
+"""What is no video is small: calibrations, times, masks, skeletons."""
+_NAME = re.compile(r"[^/\\\x00-\x1f\x7f.][^/\\\x00-\x1f\x7f]{0,199}")
+_KEEP_FREE_BYTES = 1 << 30
+_MOST_OPEN = 8
+_STALE_S = 86_400.0
+
+
+@dataclass(slots=True)
+class _Upload:
+    """A folder being sent."""
+
+    name: str
+    folder: Path
+    touched: float
+    files: set[str] = field(default_factory=set)
+
+
+class Uploads:
+    """Folders that browsers are sending.
+
+    Args:
+        spool: Where complete folders are dropped.
+        limits: How much may be sent.
+    """
+
+    def __init__(self, spool: Spool, limits: Limits) -> None:
+        self._spool = spool
+        self._limits = limits
+        self._open: dict[str, _Upload] = {}
+        self._lock = threading.Lock()
+
+    def begin(self, name: str) -> str:
+        """Start a folder; returns its key.
+
+        Raises:
+            JobError: The name is none, or too much is being sent at once.
+        """
+        if not _NAME.fullmatch(name.strip()):
+            hint = "letters, digits, spaces; no / and no leading dot"
+            raise JobError(f"{name[:40]!r} is no name for a job", hint=hint)
+        with self._lock:
+            self._forget_stale()
+            if len(self._open) >= _MOST_OPEN:
+                raise JobError(
+                    f"{_MOST_OPEN} folders are being sent already", hint="wait until one of them is there"
+                )
+            key = uuid.uuid4().hex
+            folder = self._spool.inbox / f"{PREFIX}{key}"
+            with disk_errors(folder):
+                folder.mkdir()
+            self._open[key] = _Upload(name=spool_name(name), folder=folder, touched=time.monotonic())
+            return key
+
+    async def write(self, key: str, name: str, size: int, chunks: AsyncIterator[bytes]) -> None:
+        """Write one file.
+
+        Args:
+            key: What `begin` returned.
+            name: The file's path in the folder, at most one folder deep.
+            size: How many bytes there will be.
+            chunks: The bytes.
+
+        Raises:
+            JobError: An unknown key or a name that is not expected here.
+            CaptureError: More bytes than allowed, or not as many as were announced.
+            StoreError: The disk is full.
+        """
+        upload = self._get(key)
+        target = upload.folder / self._checked(upload, name, size)
+        with disk_errors(target):
+            target.parent.mkdir(exist_ok=True)
+            partial = target.with_name(f"{target.name}.part")
+            try:
+                written = await _write(partial, size, chunks, upload)
+                if written != size:
+                    hint = "send it again"
+                    raise CaptureError(f"{written} bytes came, {size} were announced", path=name, hint=hint)
+                partial.rename(target)
+            finally:
+                partial.unlink(missing_ok=True)
+        upload.files.add(name)
+
+    def finish(self, key: str) -> str:
+        """Drop the folder into the inbox; returns the name it has there.
+
+        Raises:
+            JobError: There is no video in it.
+        """
+        upload = self._get(key)
+        if not any(PurePosixPath(name).suffix.lower() in VIDEO_SUFFIXES for name in upload.files):
+            raise JobError("no video was sent", hint="name them torso.mp4, left_palm.mp4, right_palm.mp4 …")
+        with disk_errors(upload.folder), self._lock:
+            (upload.folder / READY).touch()
+            target = move(upload.folder, self._spool.inbox, upload.name)
+            del self._open[key]
+        return target.name
+
+    def drop(self, key: str) -> None:
+        """Forget a folder that will not be completed."""
+        with self._lock:
+            upload = self._open.pop(key, None)
+        if upload is not None:
+            shutil.rmtree(upload.folder, ignore_errors=True)
+
+    def clear(self) -> None:
+        """Remove what is not complete: the page ends, nobody can go on with it."""
+        for key in list(self._open):
+            self.drop(key)
+
+    def _get(self, key: str) -> _Upload:
+        if key not in self._open:
+            raise JobError("this upload is not known (any more)", hint="drop the folder again")
+        return self._open[key]
+
+    def _checked(self, upload: _Upload, name: str, size: int) -> PurePosixPath:
+        path = PurePosixPath(name)
+        if not 1 <= len(path.parts) <= 2 or not all(map(_NAME.fullmatch, name.split("/"))):
+            raise JobError(f"{name[:80]!r} is no name for a file", hint="a file, at most one folder deep")
+        video = path.suffix.lower() in VIDEO_SUFFIXES
+        if not video and path.name not in _ALSO and not path.name.lower().endswith(_ALSO_SUFFIXES):
+            known = ", ".join((*_ALSO, *_ALSO_SUFFIXES))
+            raise JobError(f"{path.name} is no video, nor any of {known}", hint="leave it out")
+        if name in upload.files or (upload.folder / path).exists():
+            raise JobError(f"{name} was sent twice", hint="give each file its own name")
+        if len(upload.files) >= self._limits.files:
+            raise CaptureError(f"more than {self._limits.files:g} files", hint="one folder per recording")
+        most = 1e9 * self._limits.video_gb if video else _SMALL_BYTES
+        if not 0 < size <= most:
+            hint = "cut the recording, or ask the operator to raise --limit video_gb"
+            raise CaptureError(f"{size / 1e9:.3g} GB, the limit is {most / 1e9:.3g}", path=name, hint=hint)
+        if shutil.disk_usage(upload.folder).free - size < _KEEP_FREE_BYTES:
+            raise StoreError(
+                "too little room on the disk", path=self._spool.inbox, hint="make room, then try again"
+            )
+        return path
+
+    def _forget_stale(self) -> None:
+        now = time.monotonic()
+        for key in [key for key, upload in self._open.items() if now - upload.touched > _STALE_S]:
+            shutil.rmtree(self._open.pop(key).folder, ignore_errors=True)
+
+
+async def _write(path: Path, size: int, chunks: AsyncIterator[bytes], upload: _Upload) -> int:
+    """Write what comes, at most one piece more than announced; returns how many bytes came."""
+    written = 0
+    with path.open("xb") as stream:
+        async for chunk in chunks:
+            written += len(chunk)
+            if written > size:
+                break
+            stream.write(chunk)
+            upload.touched = time.monotonic()
+    return written

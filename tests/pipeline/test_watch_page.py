@@ -1,0 +1,301 @@
+"""The live page: its requests, and the page itself in a real browser."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bodycap_batch.config.limits import Limits
+from bodycap_batch.errors import JobError
+from bodycap_batch.watch.web import Access, LivePage
+from tests.pipeline.fake_stages import ORDERS
+from tests.pipeline.spools import SpoolBench, wait_for
+
+pytest.importorskip("starlette", reason="needs the extra web")
+pytest.importorskip("uvicorn", reason="needs the extra web")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+class Client:
+    """Requests as the page sends them."""
+
+    def __init__(self, page: LivePage) -> None:
+        self.host = f"127.0.0.1:{page.access.port}"
+
+    def ask(
+        self, method: str, path: str, body: bytes | dict[str, Any] | None = None, **headers: str
+    ) -> tuple[int, bytes, dict[str, str]]:
+        connection = http.client.HTTPConnection(self.host, timeout=30)
+        data = json.dumps(body).encode() if isinstance(body, dict) else body
+        named = {name.replace("_", "-"): value for name, value in headers.items()}
+        connection.request(method, path, data, {"Origin": f"http://{self.host}", **named})
+        answer = connection.getresponse()
+        found = answer.status, answer.read(), {name.lower(): value for name, value in answer.getheaders()}
+        connection.close()
+        return found
+
+    def json(self, method: str, path: str, body: bytes | dict[str, Any] | None = None) -> Any:
+        code, data, _ = self.ask(method, path, body)
+        assert code == 200, data
+        return json.loads(data)
+
+    def begin(self, name: str) -> str:
+        return str(self.json("POST", "/api/uploads", {"name": name})["key"])
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SpoolBench:
+    bench = SpoolBench(tmp_path)
+    monkeypatch.setenv(ORDERS, str(bench.orders))
+    return bench
+
+
+@pytest.fixture
+def page(bench: SpoolBench) -> Iterator[LivePage]:
+    with LivePage(bench.spool, Access(host="127.0.0.1", port=0), Limits(video_gb=1e-5)) as page:
+        yield page
+
+
+@pytest.fixture
+def client(page: LivePage) -> Client:
+    return Client(page)
+
+
+def test_jobs_logs_and_results_are_shown(bench: SpoolBench, client: Client) -> None:
+    bench.drop("küche 1")
+    bench.work_off()
+    bench.drop("next")
+    found = {job["name"]: job for job in client.json("GET", "/api/jobs")["jobs"]}
+    assert (found["küche 1"]["state"], found["next"]["state"]) == ("done", "waiting")
+    name = "k%C3%BCche%201"
+    assert b"export: finished" in client.ask("GET", f"/api/jobs/{name}/log")[1]
+    assert "trajectories/torso.tum" in client.json("GET", f"/api/jobs/{name}/files")
+    code, data, headers = client.ask("GET", f"/results/{name}/metrics.json")
+    assert (code, json.loads(data)) == (200, {"partial": False})
+    assert "sandbox" in headers["content-security-policy"]
+    assert "allow-same-origin" not in headers["content-security-policy"]
+
+
+def test_nothing_but_results_is_served(bench: SpoolBench, client: Client) -> None:
+    bench.drop("walk")
+    bench.work_off()
+    (bench.job("walk").result / "link").symlink_to("/etc/passwd")
+    for path in (
+        "/results/walk/../status.json",
+        "/results/walk/..%2fstatus.json",
+        "/results/walk/%2e%2e/%2e%2e/%2e%2e/inbox",
+        "/results/walk//etc/passwd",
+        "/results/walk/link",
+        "/results/../done/walk/status.json",
+        "/results/walk/trajectories",
+        "/results/other/metrics.json",
+        "/app.py",
+        "/..%2fapp.py",
+    ):
+        assert client.ask("GET", path)[0] == 404, path
+
+
+def test_requests_of_other_pages_are_refused(bench: SpoolBench, client: Client) -> None:
+    bench.drop("walk")
+    for headers in (
+        {"Origin": "http://evil.example"},
+        {"Host": "evil.example"},
+        {"Sec_Fetch_Site": "cross-site"},
+    ):
+        code, _, _ = client.ask("POST", "/api/jobs/walk/cancel", b"", **headers)
+        assert code in (403, 421)
+        assert client.ask("GET", "/api/jobs", **headers)[0] in (403, 421)
+    assert (bench.spool.inbox / "walk").is_dir()
+    assert client.ask("POST", "/api/jobs/walk/cancel", b"")[0] == 200
+    assert (bench.spool.failed / "walk").is_dir()
+    assert client.ask("POST", "/api/jobs/walk/retry", b"")[0] == 200
+    code, data, _ = client.ask("POST", "/api/jobs/walk/retry", b"")
+    assert code == 400
+    assert json.loads(data)["hint"]
+
+
+def test_a_token_is_asked_for_and_remembered_in_a_cookie(bench: SpoolBench) -> None:
+    token = "0123456789abcdef0123"  # noqa: S105
+    with LivePage(bench.spool, Access(host="127.0.0.1", port=0, token=token), Limits()) as page:
+        client = Client(page)
+        for path in ("/", "/page.js", "/api/jobs", "/api/events"):
+            assert client.ask("GET", path)[0] == 401
+        code, _, headers = client.ask("GET", f"/?token={token}")
+        assert (code, headers["location"]) == (303, "/")
+        assert {"httponly", "samesite=strict"} <= {
+            part.strip().lower() for part in headers["set-cookie"].split(";")
+        }
+        assert client.ask("GET", "/", cookie=headers["set-cookie"].split(";")[0])[0] == 200
+
+
+def test_a_folder_that_is_sent_becomes_a_job(bench: SpoolBench, client: Client) -> None:
+    key = client.begin("kitchen walk")
+    client.json("PUT", f"/api/uploads/{key}/torso.mp4", b"frames of torso")
+    client.json("PUT", f"/api/uploads/{key}/left_palm/GX010001.MP4", b"frames of left_palm")
+    assert client.json("GET", "/api/jobs")["jobs"] == []  # nothing half sent is ever seen
+    assert client.json("POST", f"/api/uploads/{key}/finish")["name"] == "kitchen walk"
+    assert bench.work_off() == 0, bench.told
+    assert (
+        bench.job("kitchen walk").input / "left_palm" / "GX010001.MP4"
+    ).read_bytes() == b"frames of left_palm"
+
+
+@pytest.mark.parametrize(
+    ("name", "body", "code"),
+    [
+        ("../torso.mp4", b"x", (400, 404)),
+        ("..%2ftorso.mp4", b"x", (400, 404)),
+        ("%2e%2e/torso.mp4", b"x", (400, 404)),
+        ("a/b/torso.mp4", b"x", (400,)),
+        (".torso.mp4", b"x", (400,)),
+        ("%00.mp4", b"x", (400,)),
+        ("torso.exe", b"x", (400,)),
+        ("torso.mp4", b"", (413,)),
+        ("torso.mp4", b"x" * 20_000, (413,)),
+    ],
+    ids=lambda value: str(value)[:30],
+)
+def test_what_is_sent_is_checked(
+    bench: SpoolBench, client: Client, name: str, body: bytes, code: tuple[int, ...]
+) -> None:
+    key = client.begin("walk")
+    found, data, _ = client.ask("PUT", f"/api/uploads/{key}/{name}", body)
+    assert found in code, data
+    assert client.ask("POST", f"/api/uploads/{key}/finish")[0] == 400  # no video came
+    files = [path for path in bench.folder.rglob("*") if path.is_file()]
+    assert files == [bench.orders]
+
+
+def test_uploads_are_counted_and_swept(bench: SpoolBench, client: Client) -> None:
+    keys = [client.begin(f"walk {number}") for number in range(8)]
+    assert client.ask("POST", "/api/uploads", {"name": "one more"})[0] == 400
+    assert client.ask("DELETE", f"/api/uploads/{keys[0]}")[0] == 200
+    assert client.ask("POST", "/api/uploads", {"name": "../up"})[0] == 400
+    assert client.ask("POST", "/api/uploads", b"no JSON")[0] == 400
+    client.begin("one more")
+    assert client.ask("PUT", "/api/uploads/unknown/torso.mp4", b"x")[0] == 400
+
+
+def test_what_is_left_of_a_broken_upload_vanishes_with_the_page(bench: SpoolBench) -> None:
+    with LivePage(bench.spool, Access(host="127.0.0.1", port=0), Limits()) as page:
+        client = Client(page)
+        key = client.begin("walk")
+        connection = http.client.HTTPConnection(client.host, timeout=30)
+        connection.putrequest("PUT", f"/api/uploads/{key}/torso.mp4")
+        connection.putheader("Origin", f"http://{client.host}")
+        connection.putheader("Content-Length", "1000")
+        connection.endheaders()
+        connection.send(b"x" * 500)
+        wait_for(lambda: any(bench.spool.inbox.glob(".upload-*/*.part")))
+        connection.close()
+        wait_for(lambda: not any(bench.spool.inbox.glob(".upload-*/*.part")))
+    assert list(bench.spool.inbox.iterdir()) == []
+
+
+def test_a_port_in_use_is_named(bench: SpoolBench, page: LivePage) -> None:
+    with pytest.raises(JobError, match=str(page.access.port)):
+        LivePage(bench.spool, page.access, Limits())
+
+
+@pytest.fixture
+def browser() -> Iterator[Any]:
+    sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    if CHROMIUM is None:
+        pytest.skip("needs Chromium")
+    with sync_api.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.mark.browser
+def test_the_page_follows_the_jobs_and_takes_videos_in(
+    bench: SpoolBench, page: LivePage, browser: Any
+) -> None:
+    told: list[str] = []
+    tab = browser.new_page(viewport={"width": 900, "height": 900})
+    tab.on("console", lambda message: told.append(message.text))
+    tab.on("pageerror", lambda error: told.append(str(error)))
+    tab.goto(page.access.url)
+    tab.wait_for_function("document.getElementById('connection').textContent === 'live'")
+    assert tab.inner_text("#summary") == "No jobs yet."
+
+    # A folder's videos, dropped onto the page.
+    tab.evaluate(
+        """() => {
+        const transfer = new DataTransfer();
+        for (const name of ["torso.mp4", "left_palm.mp4"]) {
+          transfer.items.add(new File([`frames ${name}`], name));
+        }
+        document.getElementById("name").value = "<img src=x";
+        const drop = new DragEvent("drop", {dataTransfer: transfer, bubbles: true});
+        document.getElementById("drop").dispatchEvent(drop);
+        }"""
+    )
+    tab.wait_for_selector("#jobs .state.waiting")
+    assert tab.inner_text("#jobs .name") == "<img src=x"  # shown, not obeyed
+    bench.order(hang="map")
+    watcher = bench.watcher(once=False)
+    thread = threading.Thread(target=watcher.run)
+    thread.start()
+    try:
+        tab.wait_for_selector("#jobs .state.running")
+        tab.wait_for_selector("#jobs progress[aria-label='map']")
+        tab.click("button:text-is('Log')")
+        tab.wait_for_selector("#jobs pre >> text=keyframes torso: finished")
+        tab.screenshot(path=str(bench.folder / "running.png"))
+        tab.click("button:text-is('Cancel')")
+        tab.wait_for_selector("#jobs .state.cancelled", timeout=15_000)
+        bench.order()
+        tab.click("button:text-is('Retry')")
+        tab.wait_for_selector("#jobs .state.done", timeout=60_000)
+        assert len(tab.query_selector_all("#jobs > li")) == 1
+        tab.click("button:text-is('Files')")
+        with tab.expect_navigation():
+            tab.click("text=metrics.json")
+        assert "partial" in tab.content()
+        tab.go_back()
+        # A file the page does not take is told, with what to do.
+        tab.set_input_files("#files", files=[{"name": "notes.doc", "mimeType": "text/plain", "buffer": b"x"}])
+        tab.wait_for_selector("#uploads .cause >> text=no video")
+    finally:
+        watcher.stop()
+        thread.join()
+    # The browser itself tells of the refused file, and of the icon it wanted for the result in its sandbox.
+    assert [line for line in told if "400" not in line and "NotSameOrigin" not in line] == []
+
+
+@pytest.mark.browser
+def test_another_site_cannot_use_the_page(bench: SpoolBench, page: LivePage, browser: Any) -> None:
+    bench.drop("walk")
+    tab = browser.new_page()
+    tab.route(
+        "http://evil.example/", lambda route: route.fulfill(body="<p>evil</p>", content_type="text/html")
+    )
+    tab.goto("http://evil.example/")
+    outcome = tab.evaluate(
+        """async (url) => {
+        const told = [];
+        for (const [method, mode] of [["GET", "cors"], ["POST", "cors"], ["POST", "no-cors"]]) {
+          try {
+            const path = method === "GET" ? "api/jobs" : "api/jobs/walk/cancel";
+            const answer = await fetch(url + path, {method, mode});
+            told.push(answer.type === "opaque" ? "opaque" : answer.status);
+          } catch { told.push("failed"); }
+        }
+        return told;
+        }""",
+        page.access.url,
+    )
+    assert outcome[0] in ("failed", 403)
+    assert outcome[1] in ("failed", 403)
+    time.sleep(0.3)
+    assert (bench.spool.inbox / "walk").is_dir()
