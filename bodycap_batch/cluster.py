@@ -8,8 +8,10 @@ Source: the Dask distributed documentation (resources, priorities, allowed failu
 
 from __future__ import annotations
 
+import math
 import os
 import threading
+import time
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -29,6 +31,8 @@ MEMORY = "memory"
 """Name of the resource (MB) by which a worker says what tasks may use together."""
 _POLL_S = 0.2
 _CONNECT_S = 30.0
+_ASK_AGAIN_S = 2.0
+"""Workers come and go; asking the scheduler for each task takes longer than handing it over."""
 _ENDING = ("closing", "closed", "failed")
 _ALLOWED_FAILURES = 1
 """A task whose worker dies is done once more elsewhere; one that kills two workers is given up."""
@@ -51,6 +55,7 @@ class Cluster:
         self._topic = f"bodycap-{uuid.uuid4().hex}"
         self._progress: dict[str, Callable[[int, int, str], None]] = {}
         self._lock = threading.Lock()
+        self._largest, self._asked = 0.0, -math.inf
         self._client.subscribe_topic(self._topic, self._hear)
         self._client.run_on_scheduler(_allow_failures, _ALLOWED_FAILURES)
 
@@ -97,8 +102,13 @@ class Cluster:
 
     def _resources(self, task: Task) -> dict[str, float] | None:
         """What a task takes of a worker; one that wants more than any worker has takes all of one."""
-        declared = [found[MEMORY] for found in self.workers().values() if MEMORY in found]
-        return {MEMORY: float(min(task.memory_mb, max(declared)))} if declared else None
+        with self._lock:
+            if time.monotonic() - self._asked > _ASK_AGAIN_S:
+                self._largest = max(
+                    (found.get(MEMORY, 0.0) for found in self.workers().values()), default=0.0
+                )
+                self._asked = time.monotonic()
+            return {MEMORY: min(float(task.memory_mb), self._largest)} if self._largest else None
 
     def _wait(self, future: Any, task: Task, making: Making) -> dict[str, Any]:
         ended = threading.Event()
