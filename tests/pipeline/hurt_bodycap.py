@@ -19,8 +19,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch import pipeline
-from bodycap_batch.cli import main
 from bodycap_batch.context import StageContext
 from bodycap_batch.runner import child
 from bodycap_batch.runner.task import TaskFunction
@@ -105,5 +103,8 @@ if __name__ == "__main__":
     stages = hurt()
     if sys.argv[1] == "--child":
         sys.exit(child.main(sys.argv[2:], stages))
+    from bodycap_batch import pipeline
+    from bodycap_batch.cli import main
+
     pipeline.Settings = functools.partial(pipeline.Settings, command=CHILD)  # type: ignore[assignment, misc]
     sys.exit(main(sys.argv[1:]))
