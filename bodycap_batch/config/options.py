@@ -66,6 +66,12 @@ class MergeOptions(Options):
 
     fps: float | None = Field(None, gt=0, description="rate of the motion; default the torso camera's")
     max_gap_s: float = Field(1.0, gt=0, description="longest gap that is filled without a mark")
+    t_pose_s: float | None = Field(
+        None, ge=0, description="how long a T-pose stands at the start; default: looked for; 0: none"
+    )
+    known_distance: tuple[FrameName, FrameName, Annotated[float, Field(gt=0)]] | None = Field(
+        None, description="two frames, each camera:frame, and the metres between their lenses; sets the scale"
+    )
 
 
 class ExportOptions(Options):

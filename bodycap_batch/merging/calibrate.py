@@ -9,7 +9,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray, FloatArray
+from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import invert
 from bodycap_batch.merging.bones import JOINT_SLACK_M, Bone, hinges
@@ -28,6 +28,7 @@ from bodycap_batch.merging.graph import (
 from bodycap_batch.merging.initial import fill_gaps, pose_bones
 from bodycap_batch.merging.linear import linearise
 from bodycap_batch.merging.mount_spread import JOINED, MEASURED, SolvedMounts, kinds_of
+from bodycap_batch.merging.posture import Posture, PostureFactors, find_posture
 from bodycap_batch.merging.spread import (
     BETWEEN_SHARE,
     Body,
@@ -38,7 +39,8 @@ from bodycap_batch.merging.spread import (
     mount_slope,
     scale_direction,
 )
-from bodycap_batch.merging.tracks import MIN_SIGMA_M, MIN_SIGMA_RAD, Track
+from bodycap_batch.merging.t_pose import t_posed
+from bodycap_batch.merging.tracks import MIN_SIGMA_M, MIN_SIGMA_RAD, SAMPLE_REACH_NS, Track
 from bodycap_batch.skeleton import Mount, SkeletonModel
 
 PRIOR_SCALE = 4.0
@@ -48,8 +50,7 @@ MAP_ERROR_RAD = float(np.radians(0.5))
 MAP_ERROR_S = 1.0
 """Maps bend: camera paths are off by about this much for about this long, all poses of a stretch together.
 What repeats must not count as often as it was sampled, or the mounts follow the map (one by 10 cm)."""
-SAMPLE_REACH_NS = 100_000_000
-"""Longest hole between two frames that is interpolated for a sample."""
+T_POSE_TICKS = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,6 +58,7 @@ class Samples:
     """Camera poses at the ticks the calibration uses.
 
     Attributes:
+        times_ns: (K,) common clock.
         cameras: Names, in the order of the other fields.
         bones: Index of each camera's bone.
         map_from_cam: (C,K,4,4).
@@ -65,8 +67,10 @@ class Samples:
         sigma_map: (C,) centre sigma, map units.
         repeats: How many samples share one error of the map, 1 or more.
         white_share: Of the measurements' variance, what is not the map's error.
+        posture: What is known of the body at the ticks.
     """
 
+    times_ns: IntArray
     cameras: tuple[str, ...]
     bones: tuple[int, ...]
     map_from_cam: FloatArray
@@ -75,6 +79,7 @@ class Samples:
     sigma_map: FloatArray
     repeats: float
     white_share: float
+    posture: Posture
 
     def points(self, scale: float) -> list[MountPoints]:
         """The points that stand for each camera's mount at a scale."""
@@ -84,13 +89,21 @@ class Samples:
         ]
 
 
-def take_samples(tracks: Sequence[Track], provisional: float, count: int) -> Samples:
+def take_samples(
+    tracks: Sequence[Track],
+    provisional: float,
+    count: int,
+    up: FloatArray | None = None,
+    t_pose_ns: tuple[int, int] | None = None,
+) -> Samples:
     """Pick up to `count` times, evenly among those where most cameras were measured together.
 
     Args:
         tracks: Cleaned tracks, the trunk's first.
         provisional: Metres per map unit.
         count: Most times to take.
+        up: (3,) the vertical in the map where it is known.
+        t_pose_ns: From when to when a T-pose stands; a few more times are taken in it.
 
     Raises:
         EstimationError: The trunk's camera never saw the map together with another one.
@@ -108,6 +121,10 @@ def take_samples(tracks: Sequence[Track], provisional: float, count: int) -> Sam
     full = np.flatnonzero(together == together.max())
     pool = full if len(full) >= count else wanted
     pick = pool[np.unique(np.linspace(0, len(pool) - 1, count).round().astype(np.int64))]
+    if t_pose_ns is not None:
+        inside = np.flatnonzero((times_ns >= t_pose_ns[0]) & (times_ns <= t_pose_ns[1]) & (together >= 2))
+        chosen = inside[np.unique(np.linspace(0, len(inside) - 1, T_POSE_TICKS).round().astype(np.int64))]
+        pick = np.union1d(pick, chosen)
     seconds = 1e-9 * float(times_ns[pick[-1]] - times_ns[pick[0]])
     repeats = max(1.0, MAP_ERROR_S * len(pick) / max(seconds, 1e-3))
     white_rad = np.array([max(float(np.median(track.sigma_rad)), MIN_SIGMA_RAD) for track in tracks])
@@ -116,6 +133,7 @@ def take_samples(tracks: Sequence[Track], provisional: float, count: int) -> Sam
     )
     sigma_map = np.sqrt(white_map**2 + repeats * (MAP_ERROR_M / provisional) ** 2)
     return Samples(
+        times_ns=times_ns[pick],
         cameras=tuple(track.camera for track in tracks),
         bones=tuple(track.bone for track in tracks),
         map_from_cam=np.array([poses[pick] for poses, _ in looks]),
@@ -124,6 +142,7 @@ def take_samples(tracks: Sequence[Track], provisional: float, count: int) -> Sam
         sigma_map=sigma_map,
         repeats=repeats,
         white_share=float(((white_map / sigma_map) ** 2).mean()),
+        posture=find_posture(tracks[0].scaled(provisional), times_ns[pick], up, t_pose_ns),
     )
 
 
@@ -224,7 +243,9 @@ class Calibration:
         graph = self._graph(poses, self._scale)
         linear = linearise(graph, self._values)
         body = Body(bones=self._bones, hinges=hinges(self._skeleton, tuple(self._bones)))
-        joints = self._samples.valid.shape[1] * body.factors_per_tick
+        each, last = body.factors_per_tick, self._samples.valid.shape[1]
+        posed = np.flatnonzero(self._samples.posture.t_pose)
+        stated = (self._first_joint + each * posed[:, None] + np.arange(each)).reshape(-1)
         return SolvedMounts(
             linear=linear,
             body=body,
@@ -237,7 +258,7 @@ class Calibration:
                 name: mount_change(self.mounts[name], all_points[camera])
                 for camera, name in enumerate(cameras)
             },
-            kinds=kinds_of(linear, (self._first_joint, self._first_joint + joints)),
+            kinds=kinds_of(linear, (self._first_joint, self._first_joint + each * last), stated),
             first_joint=self._first_joint,
         )
 
@@ -266,16 +287,23 @@ class Calibration:
             for tick in np.flatnonzero(samples.valid[camera]).tolist():
                 key = bone_key(tick, samples.bones[camera])
                 add_mount_measurement(graph, key, camera, world_from_cam[camera, tick], points)
-        joints = JointFactors(
-            self._bones,
-            hinges(self._skeleton, tuple(self._bones)),
-            prior_scale=PRIOR_SCALE,
-            slack_m=scale * self._slack_map,
-        )
+        usual, t_pose = self._joint_factors(scale)
         self._first_joint = int(graph.size())
         for tick in range(samples.valid.shape[1]):
-            joints.add(graph, tick)
+            (t_pose if samples.posture.t_pose[tick] else usual).add(graph, tick)
+        posture = PostureFactors(self._bones, samples.posture)
+        for tick in range(samples.valid.shape[1]):
+            posture.add(graph, tick)
         return graph
+
+    def _joint_factors(self, scale: float) -> tuple[JointFactors, JointFactors]:
+        """The body's factors at usual ticks, and in a T-pose (which counts once over all of its ticks)."""
+        limits, slack_m = hinges(self._skeleton, tuple(self._bones)), scale * self._slack_map
+        once = float(np.sqrt(max(self._samples.posture.t_pose.sum(), 1)))
+        return (
+            JointFactors(self._bones, limits, prior_scale=PRIOR_SCALE, slack_m=slack_m),
+            JointFactors(t_posed(self._skeleton, self._bones), limits, prior_scale=once, slack_m=slack_m),
+        )
 
     def _start(self, world_from_cam: FloatArray, scale: float) -> Any:
         if self._values is not None:

@@ -12,14 +12,16 @@ from bodycap_batch.arrays import BoolArray, FloatArray
 from bodycap_batch.geometry import Similarity, so3_exp
 from bodycap_batch.merging.bones import Bone, proper_axes
 from bodycap_batch.merging.planes import find_planes, vertical
-from bodycap_batch.skeleton import SkeletonModel
+from bodycap_batch.merging.posture import walking_plane
+from bodycap_batch.merging.tracks import Track
+from bodycap_batch.skeleton import Mount, SkeletonModel
 from bodycap_batch.skeleton_presets import rest_positions, split_side
 
 MOVING_M_PER_S = 0.4
 WALKING_HEIGHT = 0.97
 """Mean height of the trunk in walking over its standing height: 0.95 to 1.00 on four captures."""
 
-_SLAB_M = 0.03
+SLAB_M = 0.03
 _MIN_POINTS = 100
 _MIN_FLOOR_POINTS = 30
 _MOST_BELOW = 0.02
@@ -62,20 +64,40 @@ def body_up(skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: Flo
     return np.asarray(direction / np.linalg.norm(direction))
 
 
-def find_up(points_m: FloatArray, body: FloatArray, rng: np.random.Generator) -> Direction:
-    """Turn the body's up onto the vertical of the map's walls, floor and ceiling where they show it.
+def body_up_from_prior(bones: Sequence[Bone], trunk: Track, mount: Mount) -> FloatArray:
+    """Mean up (3,) in the map that a camera's path and its mount's prior promise."""
+    rest = np.eye(3)
+    index = trunk.bone
+    while bones[index].parent >= 0:
+        rest = bones[index].mean_rotation.T @ rest
+        index = bones[index].parent
+    joint = trunk.map_from_cam[:, :3, :3] @ mount.joint_from_cam[:3, :3].T
+    direction = (joint @ rest)[:, :, 2].mean(axis=0)
+    return np.asarray(direction / np.linalg.norm(direction))
+
+
+def find_up(
+    points_m: FloatArray, body: FloatArray, rng: np.random.Generator, path_m: FloatArray
+) -> Direction:
+    """Turn the body's up onto the vertical of the map's walls, floor and ceiling, else of the walk.
 
     Args:
         points_m: (P,3) map points in the solved frame.
         body: (3,) the body's up.
         rng: Draws the planes' hypotheses.
+        path_m: (N,3) path of the trunk's camera.
     """
     found = vertical(find_planes(points_m, rng), body)
-    if found is None:
-        return Direction(body, "body", None, 0.0)
-    up, share = found
+    source, share = "map", 0.0
+    if found is not None:
+        up, share = found
+    else:
+        walked = walking_plane(path_m, body)
+        if walked is None:
+            return Direction(body, "body", None, 0.0)
+        up, source = walked, "walk"
     angle = float(np.degrees(np.arccos(np.clip(up @ body, -1.0, 1.0))))
-    return Direction(up, "map", angle, share)
+    return Direction(up, source, angle, share)
 
 
 def find_floor(heights_m: FloatArray, up: Direction, expected_m: float, standing_m: float) -> Floor:
@@ -93,14 +115,14 @@ def find_floor(heights_m: FloatArray, up: Direction, expected_m: float, standing
     """
     if up.source == "map" and len(heights_m) >= _MIN_POINTS:
         reach = 0.25 * standing_m
-        edges = np.arange(expected_m - reach, expected_m + reach, 0.25 * _SLAB_M)
-        inside = (heights_m >= edges[:, None]) & (heights_m < edges[:, None] + _SLAB_M)
-        below = (heights_m < edges[:, None] - 2.0 * _SLAB_M).mean(axis=1)
+        edges = np.arange(expected_m - reach, expected_m + reach, 0.25 * SLAB_M)
+        inside = (heights_m >= edges[:, None]) & (heights_m < edges[:, None] + SLAB_M)
+        below = (heights_m < edges[:, None] - 2.0 * SLAB_M).mean(axis=1)
         counts = np.where(below < _MOST_BELOW, inside.sum(axis=1), 0)
         best = int(np.argmax(counts))
         # Clutter spreads evenly over heights; a floor stands out from it.
         if counts[best] >= max(_MIN_FLOOR_POINTS, 3.0 * float(np.median(inside.sum(axis=1)))):
-            slab = heights_m[np.abs(heights_m - edges[best] - 0.5 * _SLAB_M) < _SLAB_M]
+            slab = heights_m[np.abs(heights_m - edges[best] - 0.5 * SLAB_M) < SLAB_M]
             return Floor(float(np.median(slab)), "map", len(slab))
     return Floor(expected_m, "standing hip height", 0)
 

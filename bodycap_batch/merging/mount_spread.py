@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import sparse
 from scipy.linalg import block_diag
 
 from bodycap_batch.arrays import FloatArray, IntArray
@@ -92,6 +93,7 @@ class SolvedMounts:
         values, vectors = np.linalg.eigh(0.5 * (noise + noise.T))
         white = vectors * np.sqrt(np.maximum(values, 0.0))
         shifts = joint_shifts(self.linear, self.body, self.first_joint, self.world_from_bone, bias)
+        shifts = sparse.diags_array((self.kinds != PRIOR).astype(np.float64)) @ shifts
         follow = change @ np.asarray(shifts.T @ gain.T).T
         count = len(white)
         nothing = np.zeros((len(self.body.bones), 3, count))
@@ -119,12 +121,13 @@ class Eliminated:
     redundancy: FloatArray
 
 
-def kinds_of(linear: Linear, joints: tuple[int, int]) -> IntArray:
+def kinds_of(linear: Linear, joints: tuple[int, int], stated: IntArray) -> IntArray:
     """Kind of each row (R,) from what it touches.
 
     Args:
         linear: A calibration graph; its mounts' columns follow all bones'.
         joints: First joint factor and the one after the last.
+        stated: Joint factors of postures that are believed as they stand (a T-pose), not widened habits.
     """
     height = np.diff(linear.first_row)
     factor = np.repeat(np.arange(len(height)), height)
@@ -137,5 +140,6 @@ def kinds_of(linear: Linear, joints: tuple[int, int]) -> IntArray:
     kinds[of_bones & of_mounts] = MEASURED
     kinds[of_mounts & ~of_bones] = PRIOR
     inside = (factor >= joints[0]) & (factor < joints[1])
+    kinds[(factor >= joints[1]) | np.isin(factor, stated)] = PRIOR
     kinds[inside & ((height[factor] == 1) | (place >= 3))] = JOINED
     return kinds

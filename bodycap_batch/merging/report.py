@@ -10,7 +10,9 @@ import numpy as np
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.body import MergeInputs
 from bodycap_batch.geometry import rotation_angle_rad
-from bodycap_batch.merging.scale import Calibrated
+from bodycap_batch.merging.advice import mount_sentence, scale_sentence
+from bodycap_batch.merging.constants import Calibrated
+from bodycap_batch.merging.scale import ScaleSource, disagreement
 from bodycap_batch.merging.solve import Solution
 from bodycap_batch.merging.tracks import Track
 
@@ -30,11 +32,13 @@ def build_report(
         solution: The solved motion.
         tracks: The tracks that were used.
         notes: ``dropped`` frames by camera, the ``floor``, the ``unused`` cameras, ``joint_gap_m`` and
-            ``uncertainty`` by role and how often the activity's ``rules`` were active.
+            ``hinge_m`` and ``uncertainty`` by role, how far the ``rules`` were pressed, and ``start_ns``,
+            the first tick.
     """
     floor = notes["floor"]
     return {
-        "scale": _scale(inputs, calibrated),
+        "scale": _scale(calibrated),
+        "t_pose": _t_pose(calibrated, notes["start_ns"]),
         "up": {
             "source": calibrated.up.source,
             "body_off_deg": None
@@ -47,7 +51,7 @@ def build_report(
         "cameras": {
             track.camera: {
                 "measurements": len(track.times_ns),
-                "dropped_as_gross_errors": notes["dropped"][track.camera],
+                "dropped_as_gross_errors": len(notes["dropped"][track.camera]),
                 "down_weighted": int((solution.weights[track.camera] < 0.25).sum()),
                 "residual_m": _percentiles(solution.residual_m[track.camera]),
                 "residual_deg": _percentiles(np.degrees(solution.residual_rad[track.camera])),
@@ -58,7 +62,16 @@ def build_report(
         "unused_cameras": dict(notes["unused"]),
         "joint_gap_m": {role: _percentiles(gap) for role, gap in notes["joint_gap_m"].items()},
         "joint_sigma_m": notes["uncertainty"],
-        "activity": {"name": inputs.activity, "rules_active": notes["rules"]},
+        "hinge_off_plane_m": {role: _percentiles(off) for role, off in notes["hinge_m"].items()},
+        "activity": {
+            "name": inputs.activity,
+            "rules_active": {name: float((off > 0.0).mean()) for name, off in notes["rules"].items()},
+            "rules_pressed_m": {
+                name: _percentiles(off[off > 0.0])
+                for name, off in notes["rules"].items()
+                if (off > 0.0).any()
+            },
+        },
         "solver": {
             "ticks": len(solution.world_from_bone),
             "bones": solution.world_from_bone.shape[1],
@@ -68,25 +81,50 @@ def build_report(
     }
 
 
-def _scale(inputs: MergeInputs, calibrated: Calibrated) -> dict[str, Any]:
-    if inputs.skeleton_is_measured:
-        source = "skeleton"
-    else:
-        source = "mean stature" if inputs.height_m is None else "height"
-    return {
-        "source": source,
+def _scale(calibrated: Calibrated) -> dict[str, Any]:
+    """The scale, everything that knows it, and how far all of that disagrees."""
+    chi2, freedom = disagreement(calibrated.sources)
+    out: dict[str, Any] = {
+        "source": " and ".join(source.name for source in calibrated.sources if source.used),
         "metres_per_map_unit": calibrated.scale,
         "relative_sigma": round(calibrated.sigma_log, 5),
+        "sources": [_source(source, calibrated.scale) for source in calibrated.sources],
+        "chi2": round(chi2, 3),
+        "degrees_of_freedom": freedom,
         "body_alone": {
             "metres_per_map_unit": calibrated.estimate.scale,
             "relative_sigma": round(calibrated.estimate.sigma_log, 5),
             "costs": [[scale, round(cost, 4)] for scale, cost in calibrated.estimate.costs],
         },
-        "floor": {
-            "believed": calibrated.floor_believed,
-            "trunk_over_floor_m": calibrated.height_over_floor_m,
-        },
+        "trunk_over_floor_m": calibrated.height_over_floor_m,
+        "known_to": scale_sentence(calibrated),
     }
+    if calibrated.limbs:
+        chi2, freedom = disagreement(calibrated.limbs)
+        out["limbs"] = {
+            "alone": [_source(limb, calibrated.scale) for limb in calibrated.limbs],
+            "chi2": round(chi2, 3),
+            "degrees_of_freedom": freedom,
+        }
+    return out
+
+
+def _source(source: ScaleSource, scale: float) -> dict[str, Any]:
+    return {
+        "name": source.name,
+        "metres_per_map_unit": source.scale,
+        "relative_sigma": round(source.sigma_log, 5),
+        "off": round(float(np.log(source.scale / scale)), 5),
+        "used": source.used,
+    }
+
+
+def _t_pose(calibrated: Calibrated, start_ns: int) -> dict[str, float] | None:
+    """From when to when a T-pose stands, seconds from the first tick."""
+    if calibrated.t_pose_ns is None:
+        return None
+    first, last = (round(1e-9 * (time - start_ns), 3) for time in calibrated.t_pose_ns)
+    return {"from_s": first, "to_s": last}
 
 
 def _mount(inputs: MergeInputs, camera: str, calibrated: Calibrated) -> dict[str, Any]:
@@ -96,11 +134,25 @@ def _mount(inputs: MergeInputs, camera: str, calibrated: Calibrated) -> dict[str
     moved = solved.joint_from_cam[:3, 3] - prior.joint_from_cam[:3, 3]
     return {
         "role": solved.role,
+        **_roll(calibrated, camera),
         "joint_from_cam": solved.joint_from_cam.tolist(),
         "sigma_deg": round(float(np.degrees(solved.sigma_rad)), 3),
         "sigma_m": round(solved.sigma_m, 5),
         "from_prior_deg": round(float(np.degrees(rotation_angle_rad(turned))), 3),
         "from_prior_m": round(float(np.linalg.norm(moved)), 5),
+        "known_to": mount_sentence(solved, t_pose=calibrated.t_pose_ns is not None),
+    }
+
+
+def _roll(calibrated: Calibrated, camera: str) -> dict[str, Any]:
+    """Which way up the camera sits, and how much worse the next best way explains its motion."""
+    search = next((each for each in calibrated.rolls if each.camera == camera), None)
+    if search is None:
+        return {}
+    roll, cost = search.runner_up()
+    return {
+        "roll_deg": search.chosen_deg,
+        "roll_runner_up": {"roll_deg": roll, "half_squared_sigmas_more": round(cost, 2)},
     }
 
 

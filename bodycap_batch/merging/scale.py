@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.merging.calibrate import Calibration
-from bodycap_batch.merging.gauge import WALKING_HEIGHT, Direction
-from bodycap_batch.merging.spread import Spread
-from bodycap_batch.skeleton import Mount
+from bodycap_batch.merging.gauge import WALKING_HEIGHT
 
 _COARSE = 0.16
 _FINE = 0.05
@@ -41,17 +39,20 @@ class ScaleEstimate:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Calibrated:
-    """What is constant over the capture."""
+class ScaleSource:
+    """Something that knows the metric scale.
 
+    Attributes:
+        name: For the report.
+        scale: Metres per map unit.
+        sigma_log: Sigma of its logarithm.
+        used: False where it was not believed, or something better was there.
+    """
+
+    name: str
     scale: float
     sigma_log: float
-    estimate: ScaleEstimate
-    mounts: tuple[Mount, ...]
-    up: Direction
-    floor_believed: bool
-    height_over_floor_m: float | None
-    spread: Spread
+    used: bool = True
 
 
 def find_scale(calibration: Calibration, provisional: float) -> ScaleEstimate:
@@ -99,25 +100,32 @@ def _mounts_beside(
     return nearest, mounts[nearest]
 
 
-def weigh_floor(estimate: ScaleEstimate, height_m: float, standing_m: float) -> tuple[float, float, bool]:
-    """Let the height of the trunk over the map's floor correct the scale.
+def floor_source(body: ScaleSource, height_m: float, standing_m: float) -> ScaleSource:
+    """What the height of the trunk over the map's floor says; used within 2 sigma of the body.
 
     Args:
-        estimate: The body's own estimate.
+        body: The bones' own estimate.
         height_m: Median height of a trunk joint over the floor at that scale.
         standing_m: Its height in the standing skeleton.
-
-    Returns:
-        Factor on the scale, its sigma, and whether the floor was believed (within 2 sigma of the body).
     """
     if height_m <= 0.0:
-        return 1.0, estimate.sigma_log, False
+        return ScaleSource(name="floor", scale=body.scale, sigma_log=FLOOR_SIGMA, used=False)
     difference = float(np.log(WALKING_HEIGHT * standing_m / height_m))
-    body, floor = estimate.sigma_log**2, FLOOR_SIGMA**2
-    if difference**2 > 4.0 * (body + floor):
-        return 1.0, estimate.sigma_log, False
-    return (
-        float(np.exp(difference * body / (body + floor))),
-        float(np.sqrt(body * floor / (body + floor))),
-        True,
-    )
+    believed = difference**2 <= 4.0 * (body.sigma_log**2 + FLOOR_SIGMA**2)
+    scale = body.scale * float(np.exp(difference))
+    return ScaleSource(name="floor", scale=scale, sigma_log=FLOOR_SIGMA, used=believed)
+
+
+def combine(sources: Sequence[ScaleSource]) -> tuple[float, float]:
+    """Scale and sigma of its logarithm from the sources in use, each by its precision."""
+    used = [source for source in sources if source.used]
+    weight = np.array([source.sigma_log**-2 for source in used])
+    mean = float(weight @ np.log([source.scale for source in used]) / weight.sum())
+    return float(np.exp(mean)), float(1.0 / np.sqrt(weight.sum()))
+
+
+def disagreement(sources: Sequence[ScaleSource]) -> tuple[float, int]:
+    """Chi-square of all sources about their weighted mean, used or not, and its degrees of freedom."""
+    mean, _ = combine([replace(source, used=True) for source in sources])
+    off = np.array([np.log(source.scale / mean) / source.sigma_log for source in sources])
+    return float(off @ off), len(sources) - 1

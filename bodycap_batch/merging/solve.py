@@ -298,3 +298,18 @@ def joint_gaps(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, 
             expected = world_from_bone[:, bone.parent] @ np.append(bone.offset_m, 1.0)
             out[bone.role] = np.linalg.norm(world_from_bone[:, index, :3, 3] - expected[:, :3], axis=1)
     return out
+
+
+def hinge_errors(
+    skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray
+) -> dict[str, FloatArray]:
+    """How far the end of each hinged bone lies off its hinge's plane, by its role: (T,) metres."""
+    out = {}
+    for hinge in hinges(skeleton, tuple(bones)):
+        axis = hinge.anchors_m[0] - hinge.anchors_m.mean(axis=0)
+        upper = world_from_bone[:, hinge.upper]
+        joint = np.einsum("tij,j->ti", upper[:, :3, :3], hinge.anchors_m.mean(axis=0)) + upper[:, :3, 3]
+        along = np.einsum("tij,j->ti", upper[:, :3, :3], axis / np.linalg.norm(axis))
+        end = world_from_bone[:, hinge.following, :3, 3]
+        out[bones[hinge.following].role] = np.abs(((end - joint) * along).sum(axis=1))
+    return out

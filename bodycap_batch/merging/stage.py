@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,24 +16,20 @@ from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging import gauge
 from bodycap_batch.merging.bones import Bone, graph_bones
-from bodycap_batch.merging.calibrate import Calibration, Samples, take_samples
 from bodycap_batch.merging.chunks import MAX_ITERATIONS, solve_motion
 from bodycap_batch.merging.complete import complete_body, observed_joints
+from bodycap_batch.merging.constants import Calibrated, Cleaned, calibrate_body, points_around
 from bodycap_batch.merging.initial import provisional_scale
 from bodycap_batch.merging.marginals import joints_in_axes, sigma_summary
 from bodycap_batch.merging.report import build_report
-from bodycap_batch.merging.rules import activity_rules
-from bodycap_batch.merging.scale import Calibrated, find_scale, weigh_floor
-from bodycap_batch.merging.solve import MotionGraph, Solution, joint_gaps
-from bodycap_batch.merging.spread import joined
+from bodycap_batch.merging.rules import soft_rules
+from bodycap_batch.merging.solve import MotionGraph, Solution, hinge_errors, joint_gaps
 from bodycap_batch.merging.tracks import Track, adapt_psd, clean, make_track
-from bodycap_batch.scene import Trajectory
-from bodycap_batch.skeleton_presets import split_side
+from bodycap_batch.scene import FrameStatus, Trajectory
 
 MIN_FRAMES = 15
 """Localised frames below which a camera tells nothing about a motion: half a second at 30 fps."""
 _TRUNK = ("Spine1", "Spine", "Hips", "Neck", "Head")
-_CALIBRATION_TICKS = 80
 
 
 class _Progress:
@@ -62,10 +58,10 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
     fps = options.fps or inputs.clocks[used[0].camera].nominal_fps
     tick_times = timeline(inputs, fps)
     tracks, provisional, dropped = _clean_tracks(inputs, used, bones)
-    calibrated = _calibrate(inputs, bones, tracks, provisional, step)
+    calibrated = calibrate_body(inputs, options, bones, Cleaned(tracks, provisional), step)
     step.what = "solving"
-    metric = [_in_metres(track, calibrated.scale) for track in tracks]
-    rules = activity_rules(inputs.skeleton, bones, inputs.activity)
+    metric = [track.scaled(calibrated.scale) for track in tracks]
+    rules = soft_rules(inputs.skeleton, bones, inputs.activity)
     psd_bones = adapt_psd(bones, metric)
     mounts = {mount.camera: mount.joint_from_cam for mount in calibrated.mounts}
     solution = solve_motion(
@@ -88,7 +84,7 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         solved=solved,
         observed=observed,
         world_from_map={used[0].gauge: place},
-        trajectories=tuple(_in_world(trajectory, place) for trajectory in used),
+        trajectories=tuple(_in_world(each, place, dropped[each.camera]) for each in used),
         mounts=calibrated.mounts,
         unused_cameras=unused,
         report=build_report(
@@ -97,12 +93,14 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
             solution,
             tracks,
             {
+                "start_ns": int(tick_times[0]),
                 "dropped": dropped,
                 "floor": floor,
                 "unused": unused,
                 "uncertainty": sigma_summary(inputs.skeleton.roles, covariance, observed),
                 "joint_gap_m": joint_gaps(bones, solution.world_from_bone),
-                "rules": {rule.name: rule.active(solution.world_from_bone) for rule in rules},
+                "hinge_m": hinge_errors(inputs.skeleton, bones, solution.world_from_bone),
+                "rules": {rule.name: rule.violation_m(solution.world_from_bone) for rule in rules},
             },
         ),
         joint_covariance_m2=covariance,
@@ -156,68 +154,18 @@ def timeline(inputs: MergeInputs, fps: float) -> IntArray:
 
 def _clean_tracks(
     inputs: MergeInputs, used: Sequence[Trajectory], bones: Sequence[Bone]
-) -> tuple[list[Track], float, dict[str, int]]:
+) -> tuple[list[Track], float, dict[str, IntArray]]:
+    """Tracks without gross errors, a provisional scale, and the frames that were dropped."""
     index = {bone.role: position for position, bone in enumerate(bones)}
     mounts = {mount.camera: mount for mount in inputs.mounts}
     tracks = [make_track(inputs, each, index[mounts[each.camera].role]) for each in used]
     provisional = provisional_scale(bones, tracks, mounts)
     cleaned, dropped = [], {}
     for track in tracks:
-        kept, dropped[track.camera] = clean(track, provisional, inputs.clocks[track.camera].nominal_fps)
+        kept, _ = clean(track, provisional, inputs.clocks[track.camera].nominal_fps)
+        dropped[track.camera] = np.setdiff1d(track.frames, kept.frames)
         cleaned.append(kept)
     return cleaned, provisional_scale(bones, cleaned, mounts), dropped
-
-
-def _calibrate(
-    inputs: MergeInputs,
-    bones: Sequence[Bone],
-    tracks: Sequence[Track],
-    provisional: float,
-    step: Callable[[], None],
-) -> Calibrated:
-    samples: Samples = take_samples(tracks, provisional, _CALIBRATION_TICKS)
-    priors = {mount.camera: mount for mount in inputs.mounts}
-    calibration = Calibration(inputs.skeleton, bones, samples, priors, provisional, step)
-    estimate = find_scale(calibration, provisional)
-    points = inputs.map_points.get(_gauge_of(inputs, tracks[0].camera), np.zeros((0, 3)))
-    poses = calibration.poses()
-    body = gauge.body_up(inputs.skeleton, bones, poses)
-    up = gauge.find_up(estimate.scale * points, body, np.random.default_rng(0))
-    height = _height_over_floor(inputs, bones, poses, up, estimate.scale * points)
-    factor, sigma, believed = (1.0, estimate.sigma_log, False)
-    if height is not None:
-        standing = gauge.standing_height(inputs.skeleton, bones[0].joint)
-        factor, sigma, believed = weigh_floor(estimate, height, standing)
-    scale = factor * estimate.scale
-    if factor != 1.0:
-        calibration.solve(scale)
-    constant, passing = calibration.spread(sigma, estimate.mount_slope)
-    return Calibrated(
-        scale=scale,
-        sigma_log=sigma,
-        estimate=estimate,
-        mounts=calibration.solved_mounts(constant),
-        up=up,
-        floor_believed=believed,
-        height_over_floor_m=height,
-        spread=joined([constant, passing]),
-    )
-
-
-def _gauge_of(inputs: MergeInputs, camera: str) -> str:
-    return next(each.gauge for each in inputs.trajectories if each.camera == camera)
-
-
-def _height_over_floor(
-    inputs: MergeInputs, bones: Sequence[Bone], poses: FloatArray, up: gauge.Direction, points_m: FloatArray
-) -> float | None:
-    """Median height of the trunk's first solved joint over the map's floor, None where the map shows none."""
-    if split_side(bones[0].role)[0]:
-        return None
-    height = float(np.median(poses[:, 0, :3, 3] @ up.up))
-    standing = gauge.standing_height(inputs.skeleton, bones[0].joint)
-    floor = gauge.find_floor(points_m @ up.up, up, height - gauge.WALKING_HEIGHT * standing, standing)
-    return height - floor.height_m if floor.source == "map" else None
 
 
 def _turned(rotation: FloatArray, poses: FloatArray) -> FloatArray:
@@ -233,7 +181,7 @@ def _place(
     joints, solved = complete_body(inputs.skeleton, bones, turned)
     hips = joints[:, 0, :3, 3]
     standing = gauge.standing_height(inputs.skeleton, 0)
-    points = inputs.map_points.get(_gauge_of(inputs, next(iter(solution.weights))), np.zeros((0, 3)))
+    points = points_around(inputs, next(iter(solution.weights)))
     heights = calibrated.scale * points @ rotation[2]
     expected = float(np.median(hips[:, 2])) - gauge.WALKING_HEIGHT * standing
     floor = gauge.find_floor(heights, calibrated.up, expected, standing)
@@ -245,17 +193,15 @@ def _place(
     return placed, to_world.apply_to_poses(joints), solved, floor
 
 
-def _in_metres(track: Track, scale: float) -> Track:
-    poses = track.map_from_cam.copy()
-    poses[:, :3, 3] *= scale
-    return replace(track, map_from_cam=poses, sigma_map=scale * track.sigma_map)
-
-
-def _in_world(trajectory: Trajectory, world_from_map: Similarity) -> Trajectory:
+def _in_world(trajectory: Trajectory, world_from_map: Similarity, dropped: IntArray) -> Trajectory:
+    """The trajectory in the world, without the poses that proved to be gross errors."""
     unit = np.repeat([1.0, world_from_map.scale], 3)
+    poses = world_from_map.apply_to_poses(trajectory.gauge_from_cam)
+    covariance = trajectory.covariance * np.outer(unit, unit)
+    status = list(trajectory.status)
+    poses[dropped], covariance[dropped] = np.nan, np.nan
+    for frame in dropped.tolist():
+        status[frame] = FrameStatus.POSE_JUMP
     return replace(
-        trajectory,
-        gauge="world",
-        gauge_from_cam=world_from_map.apply_to_poses(trajectory.gauge_from_cam),
-        covariance=trajectory.covariance * np.outer(unit, unit),
+        trajectory, gauge="world", gauge_from_cam=poses, covariance=covariance, status=tuple(status)
     )

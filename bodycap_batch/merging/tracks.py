@@ -15,11 +15,14 @@ from bodycap_batch.scene import Trajectory
 
 CLEAN_HALF_WINDOW = 6
 CLEAN_LIMIT_M = 0.12
-"""A quadratic over ±6 frames at 30 fps follows a throwing hand to a few cm; wrong poses are off by more."""
+"""A quadratic over ±6 frames at 30 fps follows a swinging hand to a few cm; wrong poses are off by more."""
 
 MIN_SIGMA_M = 0.004
 MIN_SIGMA_RAD = float(np.radians(0.4))
 """Floors of a pose's sigma: PnP's covariance knows image noise, not the map's error or a strap's give."""
+
+SAMPLE_REACH_NS = 100_000_000
+"""Longest hole between two frames that is interpolated for a sample."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +57,12 @@ class Track:
             sigma_rad=self.sigma_rad[mask],
             sigma_map=self.sigma_map[mask],
         )
+
+    def scaled(self, scale: float) -> Track:
+        """The same path with that many units in each of its own."""
+        poses = self.map_from_cam.copy()
+        poses[:, :3, 3] *= scale
+        return replace(self, map_from_cam=poses, sigma_map=scale * self.sigma_map)
 
     def at(self, times_ns: IntArray, *, reach_ns: int) -> tuple[FloatArray, BoolArray]:
         """Interpolate between neighbouring frames.
@@ -96,7 +105,7 @@ def make_track(inputs: MergeInputs, trajectory: Trajectory, bone: int) -> Track:
 
 
 def clean(track: Track, scale: float, fps: float) -> tuple[Track, int]:
-    """Drop frames whose centre lies off a robust quadratic through its neighbours.
+    """Drop frames whose centre jumps off a robust quadratic through its neighbours.
 
     Args:
         track: The measured path.
@@ -118,7 +127,19 @@ def clean(track: Track, scale: float, fps: float) -> tuple[Track, int]:
     # Extrapolation at the end of a stretch cannot tell a turn of the path from an error.
     inner = ((time < 0) & valid).sum(axis=1).clip(max=2) + ((time > 0) & valid).sum(axis=1).clip(max=2) == 4
     bad = (np.linalg.norm(predicted, axis=1) > CLEAN_LIMIT_M) & inner & (valid.sum(axis=1) >= 6)
+    bad = _jumping(bad, scale * track.map_from_cam[:, :3, 3])
     return track.keep(~bad), int(bad.sum())
+
+
+def _jumping(bad: BoolArray, centre_m: FloatArray) -> BoolArray:
+    """Those stretches of bad frames (N,) that jump: a thrown arm leaves any quadratic, but smoothly."""
+    jump = np.zeros(len(bad), dtype=bool)
+    jump[1:-1] = np.linalg.norm(np.diff(centre_m, n=2, axis=0), axis=1) > CLEAN_LIMIT_M
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], bad.astype(np.int8), [0]])))
+    out = np.zeros(len(bad), dtype=bool)
+    for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        out[first:end] = jump[max(first - 1, 0) : end + 1].any()
+    return out
 
 
 def _robust_quadratic(time: FloatArray, centre: FloatArray, valid: BoolArray) -> FloatArray:

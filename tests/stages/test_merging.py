@@ -19,6 +19,7 @@ from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.chunks import solve_motion, stretches
 from bodycap_batch.merging.solve import MotionGraph, Solution
 from bodycap_batch.merging.tracks import make_track
+from bodycap_batch.scene import FrameStatus
 from tests.stages.walker import FPS, ROLES, Walk, make_inputs, make_walk, record
 
 GAUGE = Similarity(0.37, Rotation.from_rotvec([1.0, -0.7, 0.4]).as_matrix(), np.array([2.0, -1.0, 0.5]))
@@ -197,6 +198,11 @@ def test_gross_errors_do_not_move_the_body(walk, base, context):
     assert np.abs(_relative(result, "left_palm") - _relative(base, "left_palm")).max() < 0.04
     dropped = [camera["dropped_as_gross_errors"] for camera in result.report["cameras"].values()]
     assert all(6 <= count <= 10 for count in dropped)
+    for trajectory, count in zip(result.trajectories, dropped, strict=True):
+        refused = np.array([status is FrameStatus.POSE_JUMP for status in trajectory.status])
+        assert refused.sum() == count
+        assert refused[[17, 18, 43, 44, 70, 71]].all()
+        assert np.isnan(trajectory.gauge_from_cam[refused]).all()
 
 
 def test_world_trajectories_carry_poses_and_metric_covariance(walk, base):

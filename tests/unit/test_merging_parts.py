@@ -33,8 +33,8 @@ from bodycap_batch.merging.graph import (
 )
 from bodycap_batch.merging.initial import anchor_and_reach, fill_gaps, pose_bones, provisional_scale
 from bodycap_batch.merging.planes import find_planes, vertical
-from bodycap_batch.merging.rules import activity_rules
-from bodycap_batch.merging.scale import ScaleEstimate, weigh_floor
+from bodycap_batch.merging.rules import activity_rules, limit_rules, reach_rules
+from bodycap_batch.merging.scale import ScaleSource, combine, disagreement, floor_source
 from bodycap_batch.merging.tracks import Track, adapt_psd, clean
 from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount, rest_positions
 
@@ -176,6 +176,13 @@ def test_cleaning_drops_bursts_and_keeps_a_throw():
     assert not {20, 21, 50} & set(kept.frames.tolist())
 
 
+def test_cleaning_keeps_an_arm_that_is_thrown_faster_than_a_quadratic_follows():
+    seconds = np.arange(90) / 30.0
+    # 2.5 Hz at 0.35 m: 5.5 m/s and 86 m/s²; a quadratic over 0.4 s, a whole period, is off by the amplitude.
+    throw = np.stack([0.35 * np.sin(5.0 * np.pi * seconds), seconds, 0.0 * seconds], axis=1)
+    assert clean(_track(throw), 1.0, 30.0)[1] == 0
+
+
 def test_interpolation_of_a_track_knows_its_holes():
     track = _track(np.stack([np.arange(10.0), np.zeros(10), np.zeros(10)], axis=1))
     holed = track.keep(np.array([True] * 3 + [False] * 4 + [True] * 3))
@@ -264,14 +271,27 @@ def test_one_wall_does_not_fix_the_vertical():
 
 
 def test_the_floor_corrects_the_scale_by_its_share_and_is_not_believed_when_far_off():
-    body = ScaleEstimate(scale=1.0, sigma_log=0.06, costs=(), mount_slope={})
-    factor, sigma, believed = weigh_floor(body, 0.97 * 1.2 / 1.06, 1.2)
+    body = ScaleSource(name="height", scale=2.0, sigma_log=0.06)
+    floor = floor_source(body, 0.97 * 1.2 / 1.06, 1.2)
+    assert floor.used
+    assert floor.scale == pytest.approx(2.0 * 1.06)
     # Equal sigmas: halfway.
-    assert believed
-    assert factor == pytest.approx(np.sqrt(1.06), rel=1e-6)
+    scale, sigma = combine([body, floor])
+    assert scale == pytest.approx(2.0 * np.sqrt(1.06))
     assert sigma == pytest.approx(0.06 / np.sqrt(2.0))
-    assert weigh_floor(body, 0.8, 1.2) == (1.0, 0.06, False)
-    assert weigh_floor(body, -0.1, 1.2) == (1.0, 0.06, False)
+    assert not floor_source(body, 0.8, 1.2).used
+    assert not floor_source(body, -0.1, 1.2).used
+    assert combine([body, floor_source(body, 0.8, 1.2)]) == pytest.approx((2.0, 0.06))
+
+
+def test_disagreement_counts_sources_that_were_not_believed():
+    sources = [
+        ScaleSource(name="height", scale=1.0, sigma_log=0.03),
+        ScaleSource(name="floor", scale=float(np.exp(0.12)), sigma_log=0.03, used=False),
+    ]
+    # Two values 4 sigma of one apart: 0.12² / (2 · 0.03²) = 8 about their mean.
+    assert disagreement(sources) == pytest.approx((8.0, 1))
+    assert disagreement(sources[:1]) == pytest.approx((0.0, 0))
 
 
 def test_world_has_hips_over_the_origin_and_faces_minus_y():
@@ -361,12 +381,12 @@ def test_walking_palms_stay_low_and_on_their_side():
     assert activity_rules(skeleton, bones, "generic") == ()
     rules = {rule.name: rule for rule in activity_rules(skeleton, bones, "walk")}
     poses = pose_bones(skeleton, bones, {0: np.eye(4)[None]})
-    assert {rule.active(poses) for rule in rules.values()} == {0.0}
+    assert all(not rule.violation_m(poses).any() for rule in rules.values())
     poses[0, 4, :3, 3] = [0.2, -0.3, 0.5]
-    assert rules["Left palm below the shoulder"].active(poses) == 1.0
+    assert (rules["Left palm below the shoulder"].violation_m(poses) > 0.0).all()
     poses[0, 4, :3, 3] = [-0.35, -0.3, -0.1]
-    assert rules["Left palm on its side"].active(poses) == 1.0
-    assert rules["Left palm below the shoulder"].active(poses) == 0.0
+    assert (rules["Left palm on its side"].violation_m(poses) > 0.0).all()
+    assert not rules["Left palm below the shoulder"].violation_m(poses).any()
 
 
 def test_a_rule_pulls_only_outside_its_bounds():
@@ -400,3 +420,37 @@ def test_a_head_camera_reaches_the_palms_through_the_chest():
     assert found[1] == pytest.approx((0.186 + 0.146) * 1.75)
     palms = graph_bones(skeleton, ("LeftHand", "RightHand"))
     assert anchor_and_reach(palms, 4, len(palms) - 1) is None
+
+
+@pytest.mark.parametrize("roles", [("Spine1", "LeftHand", "RightHand"), ("Hips", "LeftFoot", "RightFoot")])
+def test_elbows_and_knees_bend_one_way(roles):
+    skeleton = load_skeleton("full_body", 1.75)
+    bones = graph_bones(skeleton, roles)
+    index = {bone.role: position for position, bone in enumerate(bones)}
+    for rule in limit_rules(skeleton, bones):
+        side = rule.name.split()[0]
+        upper, lower, end = ("Arm", "ForeArm", "Hand") if "elbow" in rule.name else ("UpLeg", "Leg", "Foot")
+        axis = proper_axes(skeleton, side + upper)[:, 2]
+        for degrees, wrong in ((0.0, False), (40.0, False), (120.0, False), (-15.0, True)):
+            bend = degrees if upper == "Arm" else -degrees
+            poses = np.tile(np.eye(4), (1, len(bones), 1, 1))
+            joint = poses[:, index[side + upper]] @ make_transform(
+                np.eye(3), bones[index[side + lower]].offset_m
+            )
+            turned = joint @ make_transform(so3_exp(np.radians(bend) * axis), np.zeros(3))
+            poses[:, index[side + end]] = turned @ make_transform(
+                np.eye(3), bones[index[side + end]].offset_m
+            )
+            # At -15 degrees the end is 3 to 5 cm too far; rounding leaves nothing at 0.
+            assert bool(rule.violation_m(poses)[0] > 0.02) is wrong
+    assert len(limit_rules(skeleton, bones)) == 2
+
+
+def test_palms_stay_within_an_arms_length():
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = graph_bones(skeleton, PAPER)
+    left = next(rule for rule in reach_rules(skeleton, bones) if rule.name.startswith("Left"))
+    assert left.high_m == pytest.approx((0.186 + 0.146) * 1.75 + 0.05)
+    poses = np.tile(np.eye(4), (1, len(bones), 1, 1))
+    poses[:, left.bone, :3, 3] = left.anchor_m - np.array([0.0, left.high_m + 0.1, 0.0])
+    assert left.violation_m(poses) == pytest.approx([0.1])

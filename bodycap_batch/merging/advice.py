@@ -1,0 +1,58 @@
+"""A sentence for every solved constant: how well it is known, and which movement would tell more."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodycap_batch.merging.constants import Calibrated
+from bodycap_batch.skeleton import Mount
+from bodycap_batch.skeleton_presets import split_side
+
+_WELL_KNOWN_DEG = 5.0
+_WELL_KNOWN_M = 0.02
+_MOVEMENTS = {
+    "Spine1": "walk straight ahead, turn round, and lift both arms to the side",
+    "Spine": "walk straight ahead, turn round, and bend and twist the trunk",
+    "Hips": "walk straight ahead, turn round, and lift each knee",
+    "Neck": "nod and look over both shoulders",
+    "Head": "nod and look over both shoulders",
+    "Shoulder": "shrug, and circle the {side} arm",
+    "Arm": "circle the {side} arm about the shoulder",
+    "ForeArm": "swing the {side} elbow through 90°, then turn the {side} palm up and down",
+    "Hand": "swing the {side} elbow through 90°, then bend and turn the {side} wrist",
+    "UpLeg": "lift and circle the {side} knee",
+    "Leg": "bend the {side} knee through 90°",
+    "Foot": "lift the {side} foot and circle the ankle",
+    "ToeBase": "roll over the toes of the {side} foot",
+}
+
+
+def mount_sentence(mount: Mount, *, t_pose: bool) -> str:
+    """How well a camera's place on its bone is known.
+
+    Args:
+        mount: Solved, with its sigmas.
+        t_pose: A T-pose was used.
+    """
+    degrees, metres = float(np.degrees(mount.sigma_rad)), mount.sigma_m
+    text = f"{mount.camera}'s mount is known to {degrees:.1f}° and {100.0 * metres:.1f} cm (1 sigma)"
+    if degrees <= _WELL_KNOWN_DEG and metres <= _WELL_KNOWN_M:
+        return text
+    side, part = split_side(mount.role)
+    movement = _MOVEMENTS[part].format(side=side.lower())
+    stand = "" if t_pose else ", or stand in a T-pose for two seconds first"
+    return f"{text}; to know it better, {movement}{stand}"
+
+
+def scale_sentence(calibrated: Calibrated) -> str:
+    """How well the metric scale is known."""
+    text = f"the metric scale is known to {100.0 * calibrated.sigma_log:.1f} % (1 sigma)"
+    used = {source.name for source in calibrated.sources if source.used}
+    if calibrated.sigma_log <= 0.02 or "known distance" in used:
+        return text
+    ways = ["name a known distance (merge.known_distance)"]
+    if "mean stature" in used:
+        ways.insert(0, "give the subject's height (height_m)")
+    if calibrated.t_pose_ns is None:
+        ways.append("stand in a T-pose for two seconds first")
+    return f"{text}; to know it better, {' or '.join(ways)}"

@@ -1,0 +1,224 @@
+"""What is constant over a capture: mounts, metric scale, the vertical; and what each of them rests on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from bodycap_batch.arrays import BoolArray, FloatArray
+from bodycap_batch.body import MergeInputs
+from bodycap_batch.config.options import MergeOptions
+from bodycap_batch.merging import gauge
+from bodycap_batch.merging.bones import Bone
+from bodycap_batch.merging.calibrate import Calibration, take_samples
+from bodycap_batch.merging.distance import known_distance
+from bodycap_batch.merging.limbs import limb_scales
+from bodycap_batch.merging.rolls import RollSearch, rolled, search_rolls, trunk_roll
+from bodycap_batch.merging.scale import ScaleEstimate, ScaleSource, combine, find_scale, floor_source
+from bodycap_batch.merging.spread import Spread, joined
+from bodycap_batch.merging.t_pose import arm_span, find_t_pose
+from bodycap_batch.merging.tracks import Track
+from bodycap_batch.skeleton import Mount
+from bodycap_batch.skeleton_presets import split_side
+
+_CALIBRATION_TICKS = 80
+PROPORTION_SIGMA = 0.04
+"""Spread of a limb's share of the stature between people, so also of a scale that rests on it (standard
+deviations of segment lengths over stature are 3 to 5 %: Winter's table gives means only; C. C. Gordon et al.,
+"2012 Anthropometric Survey of U.S. Army Personnel", Natick 2014)."""
+STATURE_SIGMA = 0.055
+"""Spread of adults' stature about one mean for both sexes (7 cm within each, means 14 cm apart)."""
+_UNDER_THE_WALK_M = 0.4
+_WALKED_OVER = 5
+"""A floor is walked over: this many of its points lie so near to the path, seen from above. Nobody walks
+through a table."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cleaned:
+    """Cleaned tracks, the trunk's first, and a scale near the right one (metres per map unit)."""
+
+    tracks: Sequence[Track]
+    provisional: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibrated:
+    """What is constant over the capture.
+
+    Attributes:
+        scale: Metres per map unit.
+        sigma_log: Sigma of its logarithm.
+        estimate: What the bones alone say.
+        sources: All that know the scale, used or not.
+        limbs: The scale at which each limb alone fits.
+        mounts: Solved mounts with their sigmas.
+        spread: How far off all of this may be, and what passing postures add.
+        up: The vertical.
+        height_over_floor_m: Of the trunk's joint, where a walked floor was seen.
+        t_pose_ns: From when to when a T-pose stands, None without one.
+        rolls: Which way up each limb's camera was tried.
+    """
+
+    scale: float
+    sigma_log: float
+    estimate: ScaleEstimate
+    sources: tuple[ScaleSource, ...]
+    limbs: tuple[ScaleSource, ...]
+    mounts: tuple[Mount, ...]
+    spread: Spread
+    up: gauge.Direction
+    height_over_floor_m: float | None
+    t_pose_ns: tuple[int, int] | None
+    rolls: tuple[RollSearch, ...]
+
+
+def calibrate_body(
+    inputs: MergeInputs,
+    options: MergeOptions,
+    bones: Sequence[Bone],
+    cleaned: Cleaned,
+    step: Callable[[], None],
+) -> Calibrated:
+    """Solve mounts and scale from the body's free motion, weighed with whatever else knows the scale."""
+    tracks, provisional = cleaned.tracks, cleaned.provisional
+    points = points_around(inputs, tracks[0].camera)
+    t_pose_ns = _t_pose(inputs, options, bones, cleaned)
+    inputs, known_up, rolls = _right_way_up(inputs, bones, cleaned, t_pose_ns, step)
+    priors = {mount.camera: mount for mount in inputs.mounts}
+    samples = take_samples(tracks, provisional, _CALIBRATION_TICKS, known_up, t_pose_ns)
+    calibration = Calibration(inputs.skeleton, bones, samples, priors, provisional, step)
+    estimate = find_scale(calibration, provisional)
+    poses = calibration.poses()
+    path_m = estimate.scale * tracks[0].map_from_cam[:, :3, 3]
+    body_up = gauge.body_up(inputs.skeleton, bones, poses)
+    up = gauge.find_up(estimate.scale * points, body_up, np.random.default_rng(0), path_m)
+    height = _height_over_floor(inputs, bones, poses, up, (estimate.scale * points, path_m))
+    sources = _sources(inputs, options, bones, estimate, height)
+    scale, sigma = combine(sources)
+    if not inputs.skeleton_is_measured and inputs.height_m is None and sources[0].used:
+        sigma = float(np.hypot(sigma, STATURE_SIGMA))
+    if scale != estimate.scale:
+        calibration.solve(scale)
+    constant, passing = calibration.spread(sigma, estimate.mount_slope)
+    return Calibrated(
+        scale=scale,
+        sigma_log=sigma,
+        estimate=estimate,
+        sources=sources,
+        limbs=limb_scales(inputs, tracks, scale, (known_up, t_pose_ns), step),
+        mounts=calibration.solved_mounts(constant),
+        spread=joined([constant, passing]),
+        up=up,
+        height_over_floor_m=height,
+        t_pose_ns=t_pose_ns,
+        rolls=rolls,
+    )
+
+
+def _right_way_up(
+    inputs: MergeInputs,
+    bones: Sequence[Bone],
+    cleaned: Cleaned,
+    t_pose_ns: tuple[int, int] | None,
+    step: Callable[[], None],
+) -> tuple[MergeInputs, FloatArray | None, tuple[RollSearch, ...]]:
+    """The priors with each camera the way up it sits, the vertical where it is known, and what was tried."""
+    trunk = cleaned.tracks[0].scaled(cleaned.provisional)
+    points_m = cleaned.provisional * points_around(inputs, trunk.camera)
+    prior = inputs.mount_of(trunk.camera)
+    roll, up = trunk_roll(
+        inputs, cleaned.tracks, lambda degrees: _early_up(bones, trunk, rolled(prior, degrees), points_m)
+    )
+    inputs = _rolled(inputs, {trunk.camera: roll})
+    rolls = search_rolls(inputs, cleaned.tracks, cleaned.provisional, (up, t_pose_ns), step)
+    return _rolled(inputs, {each.camera: each.chosen_deg for each in rolls}), up, rolls
+
+
+def _rolled(inputs: MergeInputs, degrees: Mapping[str, float]) -> MergeInputs:
+    mounts = tuple(rolled(mount, degrees.get(mount.camera, 0.0)) for mount in inputs.mounts)
+    return replace(inputs, mounts=mounts)
+
+
+def points_around(inputs: MergeInputs, camera: str) -> FloatArray:
+    """Points (P,3) of the map a camera is in, none where it is not known."""
+    gauge_name = next(each.gauge for each in inputs.trajectories if each.camera == camera)
+    return inputs.map_points.get(gauge_name, np.zeros((0, 3)))
+
+
+def _t_pose(
+    inputs: MergeInputs, options: MergeOptions, bones: Sequence[Bone], cleaned: Cleaned
+) -> tuple[int, int] | None:
+    """Where a T-pose stands: where the job says, else where one is seen."""
+    if options.t_pose_s is not None:
+        start = min(int(track.times_ns[0]) for track in cleaned.tracks)
+        return (start, start + round(options.t_pose_s * 1e9)) if options.t_pose_s > 0.0 else None
+    return find_t_pose(bones, cleaned.tracks, arm_span(bones, inputs.skeleton) / cleaned.provisional)
+
+
+def _early_up(bones: Sequence[Bone], trunk: Track, prior: Mount, points_m: FloatArray) -> FloatArray | None:
+    """The vertical (3,) where planes or the walk show it, before anything is solved."""
+    hint = gauge.body_up_from_prior(bones, trunk, prior)
+    found = gauge.find_up(points_m, hint, np.random.default_rng(0), trunk.map_from_cam[:, :3, 3])
+    return None if found.source == "body" else found.up
+
+
+def _height_over_floor(
+    inputs: MergeInputs,
+    bones: Sequence[Bone],
+    poses: FloatArray,
+    up: gauge.Direction,
+    around: tuple[FloatArray, FloatArray],
+) -> float | None:
+    """Median height of the trunk's first solved joint over the walked floor, None if none was seen."""
+    points_m, path_m = around
+    if split_side(bones[0].role)[0] or not len(points_m):
+        return None
+    height = float(np.median(poses[:, 0, :3, 3] @ up.up))
+    standing = gauge.standing_height(inputs.skeleton, bones[0].joint)
+    heights = points_m @ up.up
+    floor = gauge.find_floor(heights, up, height - gauge.WALKING_HEIGHT * standing, standing)
+    inside = np.abs(heights - floor.height_m) < gauge.SLAB_M
+    if floor.source != "map" or (inside & _under(points_m, path_m, up.up)).sum() < _WALKED_OVER:
+        return None
+    return height - floor.height_m
+
+
+def _under(points_m: FloatArray, path_m: FloatArray, up: FloatArray) -> BoolArray:
+    """Which points (P,) lie below or above a path (N,3)."""
+    level = np.linalg.svd(up[None])[2][1:].T
+    distance, _ = cKDTree(path_m @ level).query(points_m @ level)
+    return np.asarray(distance < _UNDER_THE_WALK_M)
+
+
+def _sources(
+    inputs: MergeInputs,
+    options: MergeOptions,
+    bones: Sequence[Bone],
+    estimate: ScaleEstimate,
+    height_m: float | None,
+) -> tuple[ScaleSource, ...]:
+    """The bones, the floor and a measured distance; the last overrules the others."""
+    name, spread = "skeleton", 0.0
+    if not inputs.skeleton_is_measured:
+        name, spread = "height" if inputs.height_m is not None else "mean stature", PROPORTION_SIGMA
+    known = known_distance(inputs, options)
+    body = ScaleSource(
+        name=name,
+        scale=estimate.scale,
+        sigma_log=float(np.hypot(estimate.sigma_log, spread)),
+        used=known is None,
+    )
+    out = [body]
+    if height_m is not None:
+        standing = gauge.standing_height(inputs.skeleton, bones[0].joint)
+        floor = floor_source(body, height_m, standing)
+        out.append(
+            floor
+            if known is None
+            else ScaleSource(name="floor", scale=floor.scale, sigma_log=floor.sigma_log, used=False)
+        )
+    return (*out, known) if known is not None else tuple(out)

@@ -1,0 +1,162 @@
+"""What standing and walking tell before anything is solved: the vertical, the way ahead, a T-pose.
+
+Rules about a whole capture (a walker's chest is upright, faces where it goes) are wrong by the same amount in
+every frame. Each counts once, however many frames it is applied to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.merging.bones import Bone
+from bodycap_batch.merging.graph import bone_key
+from bodycap_batch.merging.tracks import Track
+
+WALKING_M_PER_S = 0.5
+_STRIDE_NS = 500_000_000
+"""The velocity is taken over half a second, about a step: the trunk sways within one."""
+UPRIGHT_RAD = float(np.radians(5.0))
+AHEAD_RAD = float(np.radians(8.0))
+"""How far a walker's mean chest is off the vertical and off the way it goes: the lean and turn of a habit,
+and a rig's or preset's own idea of the chest's axes."""
+_SIDEWAYS_RAD = float(np.radians(35.0))
+_BOUNCE_M = 0.03
+"""Half of the rise and fall of a walking trunk, 4 to 5 cm from lowest to highest."""
+_LEVEL_SHARE = 0.6
+_NARROWEST_M = 0.3
+"""Standard deviation of the path across: at 0.3 m, steps whose bounce is 2 cm tilt the plane of ten of them
+by a degree."""
+_OFF_BODY_RAD = float(np.radians(30.0))
+_TRUNK = ("Spine1", "Spine", "Hips")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Posture:
+    """What is known of the body at the sampled ticks (K,).
+
+    Attributes:
+        up: (3,) the vertical in the map, None where nothing but the body tells it.
+        walking: (K,) where the body walks ahead.
+        ahead: (K,3) horizontal direction it walks, NaN elsewhere.
+        t_pose: (K,) where it stands in a T-pose.
+    """
+
+    up: FloatArray | None
+    walking: BoolArray
+    ahead: FloatArray
+    t_pose: BoolArray
+
+    @staticmethod
+    def unknown(count: int) -> Posture:
+        """No knowledge of `count` ticks."""
+        none = np.zeros(count, dtype=bool)
+        return Posture(up=None, walking=none, ahead=np.full((count, 3), np.nan), t_pose=none)
+
+
+def find_posture(
+    track: Track, times_ns: IntArray, up: FloatArray | None, t_pose_ns: tuple[int, int] | None
+) -> Posture:
+    """Tell where the trunk's camera walks ahead.
+
+    Args:
+        track: The trunk's camera, metres (a provisional scale will do).
+        times_ns: (K,) the sampled times.
+        up: (3,) the vertical in the map, or None.
+        t_pose_ns: From when to when a T-pose stands.
+    """
+    posture = Posture.unknown(len(times_ns))
+    if t_pose_ns is not None:
+        posture = replace(posture, t_pose=(times_ns >= t_pose_ns[0]) & (times_ns <= t_pose_ns[1]))
+    if up is None:
+        return posture
+    before, after = (track.at(times_ns + sign * _STRIDE_NS // 2, reach_ns=_STRIDE_NS) for sign in (-1, 1))
+    velocity = (after[0] - before[0])[:, :3, 3] / (1e-9 * _STRIDE_NS)
+    velocity -= np.outer(velocity @ up, up)
+    speed = np.linalg.norm(velocity, axis=1)
+    moving = before[1] & after[1] & (speed > WALKING_M_PER_S)
+    ahead = np.where(moving[:, None], velocity / np.maximum(speed, 1e-9)[:, None], np.nan)
+    poses, _ = track.at(times_ns, reach_ns=_STRIDE_NS)
+    walking = moving & _facing_ahead(poses[:, :3, :3], ahead, up)
+    if walking.sum() < max(5, 0.5 * moving.sum()):
+        # Half of the steps go sideways or backwards: which way this body faces is not told by where it goes.
+        walking, ahead = moving, np.full_like(ahead, np.nan)
+    return replace(posture, up=up, walking=walking, ahead=np.where(walking[:, None], ahead, np.nan))
+
+
+def _facing_ahead(rotation: FloatArray, ahead: FloatArray, up: FloatArray) -> BoolArray:
+    """Where the camera's heading (T,) is at its usual angle to the way it goes."""
+    level = rotation - up[:, None] * np.einsum("i,tij->tj", up, rotation)[:, None, :]
+    axis = level[:, :, int(np.argmax(np.linalg.norm(level, axis=1).mean(axis=0)))]
+    angle = np.arctan2(np.cross(ahead, axis) @ up, (ahead * axis).sum(axis=1))
+    known = np.isfinite(angle)
+    if not known.any():
+        return np.asarray(known)
+    off = np.angle(np.exp(1j * (angle[:, None] - angle[known])))
+    usual = angle[known][int(np.argmax((np.abs(off[known]) < _SIDEWAYS_RAD).sum(axis=0)))]
+    near = np.abs(np.angle(np.exp(1j * (np.nan_to_num(angle) - usual)))) < _SIDEWAYS_RAD
+    return np.asarray(known & near)
+
+
+_OWN_UP, _OWN_LEFT = gtsam.Unit3(np.array([0.0, 0.0, 1.0])), gtsam.Unit3(np.array([1.0, 0.0, 0.0]))
+
+
+class PostureFactors:
+    """Adds what is known of the posture at a tick.
+
+    Args:
+        bones: The graph's bones.
+        posture: The knowledge.
+    """
+
+    def __init__(self, bones: Sequence[Bone], posture: Posture) -> None:
+        self._posture = posture
+        self._trunk = [position for position, bone in enumerate(bones) if bone.role in _TRUNK]
+        upright = posture.walking | posture.t_pose
+        self._upright = _once(UPRIGHT_RAD, int(upright.sum()))
+        self._facing = _once(AHEAD_RAD, int(np.isfinite(posture.ahead[:, 0]).sum()))
+
+    def add(self, graph: Any, tick: int) -> None:
+        """Add the factors of one tick: the trunk's up, and its left across the way it goes."""
+        posture = self._posture
+        if posture.up is None or not (posture.walking[tick] or posture.t_pose[tick]):
+            return
+        for bone in self._trunk:
+            key = bone_key(tick, bone)
+            graph.add(gtsam.AttitudeFactorPose3(key, gtsam.Unit3(posture.up), self._upright, _OWN_UP))
+            if np.isfinite(posture.ahead[tick, 0]):
+                left = gtsam.Unit3(np.cross(posture.up, posture.ahead[tick]))
+                graph.add(gtsam.AttitudeFactorPose3(key, left, self._facing, _OWN_LEFT))
+
+
+def _once(sigma: float, count: int) -> Any:
+    """Noise of a rule that is applied `count` times and counts once."""
+    return gtsam.noiseModel.Isotropic.Sigma(2, sigma * float(np.sqrt(max(count, 1))))
+
+
+def walking_plane(path_m: FloatArray, body: FloatArray) -> FloatArray | None:
+    """The vertical from a trunk's path (N,3): walking is level, but for the bounce of the steps.
+
+    Returns:
+        Up (3,), or None where the path is too narrow, too uneven, or far from the body's own up.
+    """
+    weight = np.ones(len(path_m))
+    normal = np.asarray(body, dtype=np.float64)
+    for _ in range(15):
+        centred = path_m - np.average(path_m, axis=0, weights=weight)
+        normal = np.linalg.svd(centred * np.sqrt(weight)[:, None], full_matrices=False)[2][2]
+        weight = 1.0 / (1.0 + (centred @ normal / _BOUNCE_M) ** 2)
+    level = np.abs(centred @ normal) < 2.0 * _BOUNCE_M
+    if level.mean() < _LEVEL_SHARE or level.sum() < 30:
+        return None
+    inside = path_m[level] - path_m[level].mean(axis=0)
+    spread = np.linalg.svd(inside, compute_uv=False) / np.sqrt(level.sum())
+    normal = normal if normal @ body > 0.0 else -normal
+    if spread[1] < _NARROWEST_M or normal @ body < np.cos(_OFF_BODY_RAD):
+        return None
+    return np.asarray(normal)

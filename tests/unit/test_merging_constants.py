@@ -1,0 +1,81 @@
+"""What fixes the scale beside the bones, and what is said about how well constants are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bodycap_batch.config.options import MergeOptions
+from bodycap_batch.errors import EstimationError, JobError
+from bodycap_batch.geometry import Similarity, so3_exp
+from bodycap_batch.merging.advice import mount_sentence
+from bodycap_batch.merging.distance import known_distance
+from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount
+from tests.stages.walker import make_inputs, make_walk, record
+
+GAUGE = Similarity(0.25, so3_exp([0.3, 1.0, -0.2]), np.array([2.0, 0.0, 1.0]))
+
+
+@pytest.fixture(scope="module")
+def inputs():
+    rng = np.random.default_rng(0)
+    walk = make_walk(rng)
+    recorded = [
+        record(walk, name, rng, gauge=GAUGE, lost=(1.0, 1.2) if name == "left_palm" else None)
+        for name in ("torso", "left_palm", "right_palm")
+    ]
+    return walk, make_inputs(walk, recorded)
+
+
+def _asked(first, second, metres):
+    return MergeOptions(known_distance=(first, second, metres))
+
+
+def test_a_known_distance_gives_the_scale(inputs):
+    walk, merged = inputs
+    ends = walk.camera("torso", np.array([0.0, 80.0]) / 30.0)[:, :3, 3]
+    metres = float(np.linalg.norm(ends[1] - ends[0]))
+    source = known_distance(merged, _asked("torso:0", "torso:80", metres))
+    # 3 mm of noise an axis at both ends, the floor of 4 mm on top, over some 2.5 m.
+    assert 0.003 < source.sigma_log < 0.006
+    assert abs(np.log(source.scale * GAUGE.scale)) < 3.0 * source.sigma_log
+    assert known_distance(merged, MergeOptions()) is None
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "error", "says"),
+    [
+        ("chest:0", "torso:80", JobError, "no camera 'chest'"),
+        ("torso:0", "torso:8000", JobError, "no frame 8000"),
+        ("torso:0", "left_palm:33", EstimationError, "not localised"),
+        ("torso:5", "torso:5", EstimationError, "too near"),
+    ],
+)
+def test_a_known_distance_that_cannot_be_says_why(inputs, first, second, error, says):
+    with pytest.raises(error, match=says):
+        known_distance(inputs[1], _asked(first, second, 1.0))
+
+
+def test_a_known_distance_needs_one_map(inputs):
+    trajectories = tuple(
+        replace(each, gauge="map-1") if each.camera == "left_palm" else each
+        for each in inputs[1].trajectories
+    )
+    apart = replace(inputs[1], trajectories=trajectories)
+    with pytest.raises(JobError, match="share no view"):
+        known_distance(apart, _asked("torso:0", "left_palm:0", 1.0))
+
+
+def test_every_mount_has_a_movement_that_tells_more():
+    skeleton = load_skeleton("full_body", 1.75)
+    for role in filter(None, skeleton.roles):
+        mount = nominal_mount("cam", role, skeleton)
+        sentence = mount_sentence(mount, t_pose=False)
+        assert "15.0° and 4.0 cm" in sentence
+        assert "to know it better" in sentence
+        assert "T-pose" in sentence
+        side = "left" if role.startswith("Left") else "right"
+        assert role in ("Hips", "Spine", "Spine1", "Neck", "Head") or side in sentence
+        assert "T-pose" not in mount_sentence(mount, t_pose=True)
+        known = replace(mount, sigma_rad=0.03, sigma_m=0.01)
+        assert "better" not in mount_sentence(known, t_pose=False)

@@ -1,0 +1,185 @@
+"""What standing and walking tell: the plane of a walk, the way ahead, a T-pose and its limits."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from bodycap_batch.geometry import make_transform, so3_exp
+from bodycap_batch.merging.bones import graph_bones
+from bodycap_batch.merging.posture import find_posture, walking_plane
+from bodycap_batch.merging.t_pose import arm_span, find_t_pose, t_posed
+from bodycap_batch.merging.tracks import Track
+from bodycap_batch.skeleton import forward_kinematics
+from bodycap_batch.skeleton_presets import load_skeleton, rest_positions
+
+FPS = 30.0
+ROLES = ("Spine1", "LeftHand", "RightHand")
+CAMERAS = dict(zip(ROLES, ("torso", "left_palm", "right_palm"), strict=True))
+TILT = so3_exp([0.5, -0.3, 0.2])
+
+
+def _track(poses, bone=0, camera="torso"):
+    count = len(poses)
+    return Track(
+        camera=camera,
+        bone=bone,
+        frames=np.arange(count),
+        times_ns=np.round(np.arange(count) * (1e9 / FPS)).astype(np.int64),
+        map_from_cam=poses,
+        sigma_rad=np.full(count, 0.005),
+        sigma_map=np.full(count, 0.005),
+    )
+
+
+def _circle(seconds=20.0):
+    """A level circle of 1.5 m with a walker's bounce, facing along it, seen in a tilted map."""
+    t = np.arange(0.0, seconds, 1.0 / FPS)
+    angle = 2 * np.pi * t / 10.0
+    centre = np.column_stack([1.5 * np.cos(angle), 1.5 * np.sin(angle), 1.2 + 0.02 * np.sin(11.0 * t)])
+    turn = so3_exp(np.outer(angle + np.pi, [0.0, 0.0, 1.0]))
+    poses = make_transform(turn, centre)
+    return make_transform(TILT, np.zeros(3)) @ poses
+
+
+def test_a_walk_tells_the_vertical_of_a_tilted_map():
+    path = _circle()[:, :3, 3]
+    rng = np.random.default_rng(0)
+    body = so3_exp([0.2, 0.1, 0.0]) @ TILT[:, 2]
+    up = walking_plane(path + rng.normal(scale=0.005, size=path.shape), body)
+    # The bounce averages out over 35 steps: 2 cm / (1 m of spread x sqrt(35)) is 0.2 degrees.
+    assert np.degrees(np.arccos(up @ TILT[:, 2])) < 0.5
+    assert walking_plane(path, -body) @ TILT[:, 2] < 0.0  # what is up is the body's word
+
+
+def test_bending_down_in_between_does_not_tilt_the_walk():
+    path = _circle()[:, :3, 3]
+    path[100:160] -= 0.45 * TILT[:, 2]
+    up = walking_plane(path, TILT[:, 2])
+    assert np.degrees(np.arccos(up @ TILT[:, 2])) < 0.5
+
+
+@pytest.mark.parametrize("kind", ["straight", "stairs", "short"])
+def test_a_path_that_shows_no_level_gives_none(kind):
+    path = _circle()[:, :3, 3]
+    if kind == "straight":
+        path = np.outer(np.arange(300.0) / 100.0, TILT[:, 0])
+    elif kind == "stairs":
+        path = path + np.outer(np.repeat(np.arange(20), 30) * 0.35, TILT[:, 2])
+    else:
+        path = path[:20]
+    assert walking_plane(path, TILT[:, 2]) is None
+
+
+def test_the_way_ahead_follows_the_path_and_leaves_side_steps_out():
+    poses = _circle()
+    sideways = slice(200, 260)
+    poses[sideways, :3, :3] = poses[sideways, :3, :3] @ so3_exp([0.0, 0.0, 0.5 * np.pi])
+    track = _track(poses)
+    posture = find_posture(track, track.times_ns, TILT[:, 2], None)
+    assert not posture.walking[sideways].any()
+    inner = np.r_[30:190, 270:560]
+    assert posture.walking[inner].all()
+    angle = 2 * np.pi * track.times_ns[inner] * 1e-9 / 10.0
+    tangent = np.column_stack([-np.sin(angle), np.cos(angle), 0.0 * angle]) @ TILT.T
+    # The chord over half a second leaves the tangent's direction alone; the bounce is projected out.
+    assert_allclose(posture.ahead[inner], tangent, atol=1e-3)
+
+
+def test_someone_who_faces_nowhere_in_particular_gets_no_heading():
+    poses = _circle()
+    rng = np.random.default_rng(1)
+    poses[:, :3, :3] = poses[:, :3, :3] @ so3_exp(np.outer(rng.uniform(-np.pi, np.pi, len(poses)), [0, 0, 1]))
+    track = _track(poses)
+    posture = find_posture(track, track.times_ns, TILT[:, 2], None)
+    assert np.isnan(posture.ahead).all()
+    assert posture.walking.any()
+
+
+def _posed_tracks(arm_deg, still=True):
+    """Three seconds of arms lowered by an angle from the side, then two of them hanging."""
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = graph_bones(skeleton, ROLES)
+    count = 150
+    local = np.tile(np.eye(3), (count, len(skeleton.joints), 1, 1))
+    lowered = np.where(np.arange(count) < 90, arm_deg, 80.0)
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        arm = skeleton.roles.index(side + "Arm")
+        local[:, arm] = so3_exp(np.outer(np.radians(sign * lowered), [0.0, 1.0, 0.0]))
+    root = np.tile([0.0, 0.0, 0.93], (count, 1))
+    if not still:
+        root[:, 1] -= np.arange(count) / FPS
+        wave = so3_exp(np.outer(1.2 * np.sin(np.arange(count) / 3.0), [0.0, 0.0, 1.0]))
+        local[:, skeleton.roles.index("LeftArm")] = wave
+    world = forward_kinematics(skeleton, root, local)
+    forward = make_transform(np.eye(3), [0.0, -0.12, 0.07])
+    tracks = [
+        _track(
+            world[:, skeleton.roles.index(role)] @ (forward if role == "Spine1" else np.eye(4)),
+            [bone.role for bone in bones].index(role),
+            CAMERAS[role],
+        )
+        for role in ROLES
+    ]
+    return skeleton, bones, tracks
+
+
+def test_a_t_pose_is_found_while_it_stands():
+    skeleton, bones, tracks = _posed_tracks(0.0)
+    span = arm_span(bones, skeleton)
+    wrists = rest_positions(skeleton)[[skeleton.roles.index("LeftHand"), skeleton.roles.index("RightHand")]]
+    # 0.2 m stand for the shoulders, 0.26 of the stature apart.
+    assert span < wrists[0, 0] - wrists[1, 0] < 1.35 * span
+    found = find_t_pose(bones, tracks, span)
+    assert found is not None
+    # The arms fall within one frame; speeds are taken over a third of a second.
+    assert found[0] == 0
+    assert 2.6e9 < found[1] < 3.0e9
+
+
+def test_a_t_pose_is_found_in_any_gauge():
+    skeleton, bones, tracks = _posed_tracks(0.0)
+    moved = []
+    for track in tracks:
+        poses = make_transform(TILT, np.zeros(3)) @ track.map_from_cam
+        poses[:, :3, 3] *= 7.0
+        moved.append(replace(track, map_from_cam=poses))
+    assert find_t_pose(bones, moved, 7.0 * arm_span(bones, skeleton)) == find_t_pose(
+        bones, tracks, arm_span(bones, skeleton)
+    )
+
+
+@pytest.mark.parametrize("arm_deg", [45.0, 80.0, -60.0])
+def test_other_ways_to_stand_are_none(arm_deg):
+    skeleton, bones, tracks = _posed_tracks(arm_deg)
+    assert find_t_pose(bones, tracks, arm_span(bones, skeleton)) is None
+
+
+def test_stretched_arms_in_passing_are_none():
+    skeleton, bones, tracks = _posed_tracks(0.0, still=False)
+    assert find_t_pose(bones, tracks, arm_span(bones, skeleton)) is None
+
+
+def test_the_t_pose_of_a_rig_that_rests_in_it_is_its_zero_pose():
+    skeleton = load_skeleton("full_body", 1.75)
+    bones = graph_bones(skeleton, ("Hips", "LeftHand", "RightHand", "Head", "LeftFoot", "RightFoot"))
+    for bone in t_posed(skeleton, bones):
+        assert_allclose(bone.mean_rotation, np.eye(3), atol=1e-12)
+        assert np.linalg.eigvalsh(bone.rotation_covariance).min() > 0.0
+
+
+def test_the_t_pose_of_a_rig_whose_arms_hang_lifts_them():
+    skeleton = load_skeleton("upper_body", 1.75)
+    offsets = np.array(skeleton.offsets_m)
+    for side in ("Left", "Right"):
+        for part in ("ForeArm", "Hand"):
+            joint = skeleton.roles.index(side + part)
+            offsets[joint] = [0.0, 0.0, -np.linalg.norm(offsets[joint])]
+    ends = np.where(np.isfinite(skeleton.end_offsets_m), skeleton.end_offsets_m, np.nan)
+    hanging = replace(skeleton, offsets_m=offsets, end_offsets_m=ends)
+    bones = {bone.role: bone for bone in t_posed(hanging, graph_bones(hanging, ROLES))}
+    lifted = bones["LeftArm"].mean_rotation @ bones["LeftForeArm"].offset_m
+    assert_allclose(lifted, [np.linalg.norm(lifted), 0.0, 0.0], atol=1e-9)
+    lifted = bones["RightArm"].mean_rotation @ bones["RightForeArm"].offset_m
+    assert_allclose(lifted, [-np.linalg.norm(lifted), 0.0, 0.0], atol=1e-9)

@@ -1,0 +1,66 @@
+"""Cameras worn sideways or upside down: which of four rolls explains the motion."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bodycap_batch.merging.bones import graph_bones
+from bodycap_batch.merging.rolls import ROLLS_DEG, RollSearch, is_open, rolled, search_rolls, trunk_roll
+from bodycap_batch.merging.tracks import make_track
+from bodycap_batch.skeleton_presets import STATED_SIGMA_RAD
+from tests.stages.walker import ROLES, make_inputs, make_walk, record
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def _worn(rolls):
+    """Inputs and tracks of a walk whose cameras were turned about their optical axes."""
+    rng = np.random.default_rng(2)
+    walk = make_walk(rng, off_deg=5.0, off_m=0.01)
+    mounts = {name: rolled(mount, rolls.get(name, 0.0)) for name, mount in walk.mounts.items()}
+    worn = replace(walk, mounts=mounts)
+    inputs = make_inputs(worn, [record(worn, name, rng) for name in ROLES])
+    index = {
+        bone.role: position for position, bone in enumerate(graph_bones(inputs.skeleton, ROLES.values()))
+    }
+    return inputs, [make_track(inputs, each, index[ROLES[each.camera]]) for each in inputs.trajectories]
+
+
+@pytest.mark.parametrize(("camera", "roll"), [("left_palm", 90.0), ("right_palm", 180.0)])
+def test_a_palm_camera_worn_sideways_is_found_out(camera, roll):
+    inputs, tracks = _worn({camera: roll})
+    found = {each.camera: each for each in search_rolls(inputs, tracks, 1.0, (UP, None), lambda: None)}
+    assert found[camera].chosen_deg == roll
+    others = [each for name, each in found.items() if name != camera]
+    assert all(each.chosen_deg == 0.0 for each in others)
+    assert found[camera].runner_up()[1] > 0.0
+
+
+def test_a_stated_orientation_is_not_tried():
+    inputs, tracks = _worn({})
+    stated = tuple(replace(mount, sigma_rad=STATED_SIGMA_RAD) for mount in inputs.mounts)
+    assert not any(is_open(mount) for mount in stated)
+    assert search_rolls(replace(inputs, mounts=stated), tracks, 1.0, (UP, None), lambda: None) == ()
+
+
+@pytest.mark.parametrize("roll", [0.0, 90.0, 180.0])
+def test_the_trunks_camera_is_above_the_hands(roll):
+    inputs, tracks = _worn({"torso": roll})
+    mount = inputs.mount_of("torso")
+
+    def up_of(degrees):
+        # Walls and floor agree with any of the four: each roll's own up is a direction of the room.
+        tilted = tracks[0].map_from_cam[:, :3, :3] @ rolled(mount, degrees).joint_from_cam[:3, :3].T
+        own = tilted[:, :, 2].mean(axis=0)
+        return own / np.linalg.norm(own)
+
+    chosen, up = trunk_roll(inputs, tracks, up_of)
+    assert chosen == roll
+    assert up @ UP > 0.9
+
+
+def test_the_runner_up_is_the_best_of_the_rest():
+    search = RollSearch("cam", (0.0, -20.0, 3.0, -5.0), 90.0)
+    assert search.runner_up() == (270.0, 15.0)
+    assert ROLLS_DEG == (0.0, 90.0, 180.0, 270.0)
