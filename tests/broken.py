@@ -224,7 +224,7 @@ def mask(root: Path) -> None:
 
 VIDEO, JOB, CALIB, TIMES = "torso.mp4", "job.yaml", "calib.json", "torso.timestamps.txt"
 CASES = (
-    Case("missing video", missing, 3, VIDEO, "no such video"),
+    Case("missing video", missing, 3, VIDEO, "no such"),
     Case("empty file", empty, 3, VIDEO, "empty"),
     Case("no video at all", not_a_video, 3, VIDEO, "not a readable video"),
     Case("power lost", truncated_index_last, 3, VIDEO, "not a readable video"),

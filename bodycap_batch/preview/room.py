@@ -62,10 +62,10 @@ def draw_cloud(image: Picture, view: Viewpoint, cloud: Cloud) -> None:
     shown &= (at[:, 0] < width - 2) & (at[:, 1] < height - 2)
     order = np.flatnonzero(shown)
     order = order[np.argsort(-depth[order], kind="stable")]
-    strength = np.clip(1.3 - 0.3 * depth[order] / view.distance, 0.3, 0.9)[:, None]
+    strength = np.clip(1.3 - 0.15 * depth[order] / view.distance, 0.5, 1.0)[:, None]
     colours = (strength * cloud.colours[order] + (1.0 - strength) * BACKGROUND).astype(np.uint8)
     x, y = at[order].T
-    for dx, dy in ((1, 0), (0, 1), (1, 1)):
+    for dx, dy in ((1, 0), (0, 1), (-1, 0), (0, -1)):
         image[y + dy, x + dx] = colours
     image[y, x] = colours
 

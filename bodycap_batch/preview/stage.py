@@ -145,13 +145,16 @@ class _Room:
             upright[:3, :3] = _upright(stacked)
         target, reach = _target(inputs.body, timeline, stacked[:, :3, 3] @ upright[:3, :3].T)
         seconds = np.arange(len(target)) / float(timeline.fps)
+        cloud = Cloud(points=inputs.points, colours=inputs.colours).thinned()
         return _Room(
-            cloud=Cloud(points=inputs.points, colours=inputs.colours).thinned(),
+            cloud=cloud,
             grid=room.floor_grid(target) if inputs.body is not None else None,
             tiles=placed,
             viewpoints=[
                 replace(each, cam_from_room=each.cam_from_room @ upright)
-                for each in follow(target, seconds, (ROOM_WIDTH, HEIGHT), reach)
+                for each in follow(
+                    target, seconds, (ROOM_WIDTH, HEIGHT), reach, cloud.points @ upright[:3, :3].T
+                )
             ],
             body=inputs.body,
             camera_size=0.1 * reach,

@@ -11,12 +11,15 @@ from bodycap_batch.geometry import transform_points
 
 _FIELD_RAD = float(np.deg2rad(42.0))
 _ELEVATION_RAD = float(np.deg2rad(17.0))
-_SIDE_RAD = float(np.deg2rad(35.0))
-"""Where the view stands at the middle of its sway: before the body, which starts out towards −Y."""
+_SIDES_RAD = tuple(float(np.deg2rad(side)) for side in (35, -35, 75, -75, 110, -110, 145, -145))
+"""Where the view may stand at the middle of its sway: best before the body, which starts out towards −Y."""
+_ENOUGH = 0.6
+"""A side is taken before a better one that shows at most so much more of the room: 1 / 0.6."""
 _SWAY_RAD = float(np.deg2rad(22.0))
 _SWAY_S = 24.0
 _CALM_S = 1.0
 """The view follows the body as smoothed by a Gaussian of this sigma: steps do not shake it."""
+_TRIED = 8
 _MARGIN = 1.1
 
 
@@ -45,7 +48,9 @@ class Viewpoint:
         return x_in_cam[..., :2] / safe[..., None] * self.focal_px + centre, depth
 
 
-def follow(target: FloatArray, seconds: FloatArray, size: tuple[int, int], reach: float) -> list[Viewpoint]:
+def follow(
+    target: FloatArray, seconds: FloatArray, size: tuple[int, int], reach: float, room: FloatArray
+) -> list[Viewpoint]:
     """One viewpoint a picture: calm, at a fixed distance that frames the target, swaying to show depth.
 
     Args:
@@ -53,6 +58,7 @@ def follow(target: FloatArray, seconds: FloatArray, size: tuple[int, int], reach
         seconds: (F,) when, in the preview's time.
         size: Width and height of the picture.
         reach: What has to be seen around the target.
+        room: (P,3) points of the room; the view stands where it sees them behind the target.
     """
     calm = _smoothed(target, seconds)
     focal = 0.5 * min(size) / np.tan(0.5 * _FIELD_RAD)
@@ -60,11 +66,23 @@ def follow(target: FloatArray, seconds: FloatArray, size: tuple[int, int], reach
     # A body is higher than wide: so much it may stray to the side and still be whole in the picture.
     distance = _MARGIN * max(reach, 0.6 * reach + astray) / np.tan(0.5 * _FIELD_RAD)
     phase = 2.0 * np.pi * seconds / _SWAY_S
-    turns = _SIDE_RAD + _SWAY_RAD * np.sin(phase)
-    return [
-        Viewpoint(size=size, focal_px=focal, cam_from_room=_looking(point, turn, distance), distance=distance)
-        for point, turn in zip(calm, turns, strict=True)
-    ]
+
+    def view(point: FloatArray, turn_rad: float) -> Viewpoint:
+        pose = _looking(point, turn_rad, distance)
+        return Viewpoint(size=size, focal_px=focal, cam_from_room=pose, distance=distance)
+
+    some = calm[:: max(1, len(calm) // _TRIED)]
+    seen = [sum(_seen_behind(view(point, side), room) for point in some) for side in _SIDES_RAD]
+    side = next(side for side, count in zip(_SIDES_RAD, seen, strict=True) if count >= _ENOUGH * max(seen))
+    turns = side + _SWAY_RAD * np.sin(phase)
+    return [view(point, float(turn)) for point, turn in zip(calm, turns, strict=True)]
+
+
+def _seen_behind(view: Viewpoint, room: FloatArray) -> int:
+    """How many points of the room a view shows behind what it looks at."""
+    px, depth = view.project(room)
+    inside = (px > 0.0).all(axis=-1) & (px < np.array(view.size)).all(axis=-1)
+    return int((inside & (depth > view.distance)).sum())
 
 
 def _looking(point: FloatArray, turn_rad: float, distance: float) -> FloatArray:

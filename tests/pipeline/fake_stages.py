@@ -14,11 +14,12 @@ from typing import Any
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import CaptureError, EstimationError
 from bodycap_batch.runner.child import main
+from bodycap_batch.tasks import STAGES
 
 Json = Mapping[str, Any]
 ORDERS = "BODYCAP_FAKE_ORDERS"
 """Path of a JSON file: {"fail" | "crash" | "hang" | "fill": stage, "on": text in its videos,
-"wanted" | "localised": [a value per round], "rolling": true}."""
+"wanted" | "localised": [a value per round], "rolling": true, "real": [stages that are no stand-ins]}."""
 
 
 def orders() -> dict[str, Any]:
@@ -64,7 +65,8 @@ def stage(name: str) -> Any:
 
 def videos(arguments: Json) -> list[str]:
     cameras = arguments.get("capture", {}).get("cameras", [])
-    return [Path(video).read_text() for camera in cameras for video in camera["video"]]
+    files = [Path(video) for camera in cameras for video in camera["video"]]
+    return [file.read_bytes().decode("utf-8", "replace") for file in files]
 
 
 def summary(options: Json, arguments: Json, files: Path) -> None:
@@ -118,4 +120,5 @@ NAMES = (
 )
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:], {name: stage(name) for name in NAMES}))
+    real = {name: STAGES[name].function for name in orders().get("real", [])}
+    sys.exit(main(sys.argv[1:], {name: stage(name) for name in NAMES} | real))

@@ -74,6 +74,9 @@ def test_three_videos_are_one_large_over_two() -> None:
     assert isinstance(first, Box)
 
 
+NO_ROOM = np.zeros((0, 3))
+
+
 def walk(frames: int = 200) -> tuple[np.ndarray, np.ndarray]:
     seconds = np.arange(frames) / 30.0
     return np.stack([0 * seconds, -1.2 * seconds, 0 * seconds + 0.9], axis=1), seconds
@@ -81,7 +84,7 @@ def walk(frames: int = 200) -> tuple[np.ndarray, np.ndarray]:
 
 def test_the_view_keeps_the_whole_walking_body_in_the_picture() -> None:
     target, seconds = walk()
-    views = follow(target, seconds, (ROOM_WIDTH, HEIGHT), 1.05)
+    views = follow(target, seconds, (ROOM_WIDTH, HEIGHT), 1.05, NO_ROOM)
     for at, view in zip(target, views, strict=True):
         # Feet, head and both hands of a person 1.8 m high.
         body = at + np.array([[0, 0, -0.9], [0, 0, 0.9], [0.6, 0, 0.4], [-0.6, 0, 0.4]])
@@ -95,12 +98,27 @@ def test_the_view_keeps_the_whole_walking_body_in_the_picture() -> None:
 def test_the_view_is_calm_while_the_body_bobs() -> None:
     target, seconds = walk()
     bobbing = target + np.stack([0 * seconds, 0 * seconds, 0.03 * np.sin(2 * np.pi * 1.8 * seconds)], axis=1)
-    calm = [view.cam_from_room for view in follow(target, seconds, (640, 640), 1.0)]
-    shaken = [view.cam_from_room for view in follow(bobbing, seconds, (640, 640), 1.0)]
+    calm = [view.cam_from_room for view in follow(target, seconds, (640, 640), 1.0, NO_ROOM)]
+    shaken = [view.cam_from_room for view in follow(bobbing, seconds, (640, 640), 1.0, NO_ROOM)]
     middle = slice(60, -60)  # two seconds from the ends, where the Gaussian is whole
     moved = np.linalg.norm(np.array(calm)[middle, :3, 3] - np.array(shaken)[middle, :3, 3], axis=1)
     # A Gaussian of 1 s takes exp(-(2 pi 1.8)^2 / 2) of a step's bob: nothing; the distance may still change.
     assert np.ptp(moved) < 1e-3
+
+
+def from_the_front(room_points: np.ndarray) -> bool:
+    """Whether the view stands before a body that faces -Y."""
+    target, seconds = walk()
+    view = follow(target, seconds, (640, 640), 1.0, room_points)[0]
+    return bool(np.linalg.inv(view.cam_from_room)[1, 3] < target[0, 1])
+
+
+def test_the_view_stands_where_the_room_is_behind_the_body_in_front_where_it_may() -> None:
+    rng = np.random.default_rng(3)
+    around = rng.uniform(-6, 6, (2000, 3))
+    assert from_the_front(NO_ROOM)
+    assert from_the_front(around)
+    assert not from_the_front(around - [0, 16.0, 0]), "all that was mapped lies ahead of the body"
 
 
 def looking_down_z(distance: float = 4.0) -> Viewpoint:
