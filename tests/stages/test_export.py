@@ -13,13 +13,15 @@ import pytest
 
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.context import StageContext
-from bodycap_batch.errors import Cancelled, StoreError
+from bodycap_batch.errors import Cancelled, JobError, StoreError
 from bodycap_batch.export import ExportInputs, export_results
 from bodycap_batch.export.motion import motion_difference, only_solved
 from bodycap_batch.export.projection import project_motion
 from bodycap_batch.formats.bvh import read_bvh, write_bvh
+from bodycap_batch.formats.c3d import read_c3d
 from bodycap_batch.formats.ply import read_ply
 from bodycap_batch.formats.tum import read_tum
+from bodycap_batch.formats.usd import read_usd
 from bodycap_batch.geometry import Similarity, so3_exp
 from bodycap_batch.scene import FrameStatus, KeyframeSelection
 from tests.bodies import CAMERAS, merged, reaching
@@ -216,6 +218,39 @@ def test_only_the_formats_asked_for(tmp_path: Path) -> None:
     run(inputs, formats=("tum",))
     names = sorted(path.name for path in inputs.out_dir.iterdir())
     assert names == ["metrics.json", "trajectories"]
+
+
+def test_further_formats_hold_the_same_joints(tmp_path: Path) -> None:
+    pytest.importorskip("ezc3d")
+    pytest.importorskip("pxr")
+    inputs = inputs_of(tmp_path)
+    run(inputs, formats=("usd", "c3d", "trc", "npz", "csv"), names="mixamo", root="in_place")
+    names = {path.name for path in inputs.out_dir.iterdir()}
+    assert names == {
+        *("motion.usd", "joints.c3d", "joints.trc", "joints.npz", "joints.csv", "frames.csv", "metrics.json")
+    }
+    assert inputs.merge is not None
+    motion = project_motion(inputs.merge, inputs.clocks).motion
+    arrays = np.load(inputs.out_dir / "joints.npz", allow_pickle=False)
+    # what is measured stays in the world, whatever the files for animation look like
+    np.testing.assert_array_equal(arrays["world"], motion.world_from_joint()[..., :3, 3])
+    np.testing.assert_array_equal(arrays["observed"], motion.observed)
+    np.testing.assert_allclose(
+        read_c3d(inputs.out_dir / "joints.c3d").x_in_world_m, arrays["world"], atol=1e-6
+    )
+    back = read_usd(inputs.out_dir / "motion.usd")
+    assert back.skeleton.joints[0] == "mixamorig:Hips"
+    assert np.abs(back.root_in_world_m[:, :2]).max() < 1e-6
+
+
+def test_a_missing_library_is_told_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs = inputs_of(tmp_path)
+    monkeypatch.setattr("bodycap_batch.formats.needs.find_spec", lambda name: None)
+    with pytest.raises(JobError, match="C3D"):
+        run(inputs, formats=("bvh", "c3d"))
+    assert not inputs.out_dir.exists()
 
 
 def test_solved_hierarchy_drops_what_hangs_off(tmp_path: Path) -> None:

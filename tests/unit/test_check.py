@@ -12,6 +12,11 @@ from bodycap_batch.capture import open_capture
 from bodycap_batch.check import check_job, check_path
 from bodycap_batch.check.pictures import sample_indices
 from bodycap_batch.config.job import Overrides, load_job
+from bodycap_batch.config.options import ExportOptions
+from bodycap_batch.errors import JobError
+from bodycap_batch.formats import needs
+from bodycap_batch.formats.bvh import write_bvh
+from tests.bodies import reaching
 from tests.videos import textured_frame, write_video
 
 FRAMES = [textured_frame(index % 40) for index in range(75)]
@@ -107,6 +112,38 @@ def test_the_skeleton_file_must_carry_the_cameras(walk: Path, tmp_path: Path) ->
     assert "LeftHand" in report.errors[0].message
     bvh.write_text("HIERARCHY\n")
     assert check_path(walk, Overrides(skeleton=str(bvh))).errors[0].path == str(bvh)
+
+
+def test_formats_that_cannot_be_written_are_refused_beforehand(
+    walk: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    job = load_job(walk, Overrides(out=tmp_path / "out", height_m=1.8))
+
+    def errors(**export: object) -> list[str]:
+        options = ExportOptions.model_validate({**job.export.model_dump(), **export})
+        found = check_job(job.model_copy(update={"export": options})).errors
+        return [str(error) for error in found if isinstance(error, JobError)]
+
+    assert errors() == []
+    monkeypatch.setattr(needs, "find_spec", lambda name: None)
+    (text,) = errors(formats=("bvh", "usd"))
+    assert text.startswith("export.formats: USD files take a library")
+    monkeypatch.setenv("BODYCAP_BLENDER", str(tmp_path / "nothing"))
+    (text,) = errors(formats=("fbx",))
+    assert "BODYCAP_BLENDER names no program" in text
+
+
+def test_a_skeleton_file_keeps_its_names(walk: Path, tmp_path: Path) -> None:
+    write_bvh(tmp_path / "s.bvh", reaching(1))
+    job = load_job(walk, Overrides(out=tmp_path / "out", skeleton=str(tmp_path / "s.bvh")))
+    other = job.model_copy(update={"export": ExportOptions(names="unreal")})
+    assert not [error for error in check_job(job).errors if isinstance(error, JobError)]
+    (error,) = [error for error in check_job(other).errors if isinstance(error, JobError)]
+    assert error.field == "export.names"
+    mapped = job.model_copy(update={"skeleton_map": {"LeftHand": "none"}})
+    (error,) = [error for error in check_job(mapped).errors if isinstance(error, JobError)]
+    assert "LeftHand, which carries camera left_palm" in error.message
+    assert "skeleton_map" in str(error.hint)
 
 
 def test_room_on_the_disk(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
