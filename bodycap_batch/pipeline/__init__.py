@@ -1,6 +1,7 @@
 """A job from its videos to its results: the stages in order."""
 
 from bodycap_batch.pipeline.batch import Batch, BatchJob, Outcome
+from bodycap_batch.pipeline.reporting import remake_report
 from bodycap_batch.pipeline.run import RunSummary, run_job
 from bodycap_batch.pipeline.sample import prepare_capture
 from bodycap_batch.pipeline.settings import Settings, StageRecord
@@ -16,5 +17,6 @@ __all__ = [
     "Step",
     "explain_job",
     "prepare_capture",
+    "remake_report",
     "run_job",
 ]

@@ -12,7 +12,7 @@ from typing import Any
 
 from bodycap_batch.check import require_room
 from bodycap_batch.config.models import CameraConfig, Job
-from bodycap_batch.errors import Cancelled, EstimationError
+from bodycap_batch.errors import BodycapError, Cancelled, EstimationError
 from bodycap_batch.formats.needs import require_libraries
 from bodycap_batch.pipeline.inputs import (
     all_cameras,
@@ -23,6 +23,7 @@ from bodycap_batch.pipeline.inputs import (
     key_of,
     one_camera,
 )
+from bodycap_batch.pipeline.made import Made, report_task
 from bodycap_batch.pipeline.settings import Settings, StageRecord
 from bodycap_batch.progress import Event
 from bodycap_batch.references import References, in_use
@@ -61,7 +62,6 @@ class Flow:
         with ExitStack() as opened:
             opened.enter_context(in_use(self._settings.store))
             opened.callback(self._runner.close)
-            self._digests = self._camera_digests()
             opened.callback(self._pool.shutdown, wait=True, cancel_futures=True)
             opened.callback(self._abort.set)
             self._open = opened.pop_all()
@@ -76,6 +76,7 @@ class Flow:
         Raises:
             BodycapError: The job, a video or a calibration cannot be used.
         """
+        self._digests = self._camera_digests()
         body = None
         if has_body(self._job):
             # What is installed can change between two runs: looked at each time, not kept with the check.
@@ -248,6 +249,12 @@ class Flow:
         }
         key = key_of("preview", {}, inputs)
         return self._one(Task(key=key, arguments=arguments, threads=self._settings.threads))
+
+    def report(self, made: Made, stopped_by: BodycapError | None = None) -> Artefact:
+        """The page a person reads, of all that was made."""
+        error = stopped_by or made.failure
+        failure = None if error is None else made.failed_at(error)
+        return self._one(report_task(self._job, made, self._digests, failure))
 
     def keep_only_this(self) -> None:
         """Let go of the artefacts that earlier runs with other options referred to."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -12,9 +12,10 @@ import yaml
 
 import bodycap_batch
 from bodycap_batch.config.models import Job
-from bodycap_batch.errors import EstimationError
+from bodycap_batch.errors import BodycapError, Cancelled, CaptureError, EstimationError, JobError
 from bodycap_batch.pipeline.flow import Flow
 from bodycap_batch.pipeline.inputs import has_body
+from bodycap_batch.pipeline.made import Made
 from bodycap_batch.pipeline.results import (
     PARTIAL,
     RUN_FILE,
@@ -28,6 +29,7 @@ from bodycap_batch.store import Artefact
 from bodycap_batch.tasks import RESULTS
 
 JOB_FILE = "job.yaml"
+REPORT_FILE = "report.html"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,59 +70,83 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
     settings.require_owner()
     made = Made()
     with Flow(job, settings, logs=out_dir / "logs") as flow:
-        for stage in run_stages(job, flow, made):
-            if stage == settings.until:
-                break
+        stopped_by = _run_until(job, flow, made, settings)
         summary = RunSummary(out_dir=out_dir, files=(), stages=tuple(flow.records), versions=_versions(flow))
-        if made.results:
-            files = tuple(name for name, _ in _result_files(made.results))
-            summary = replace(summary, files=files)
+        if made.exported is not None:
+            summary = replace(summary, files=tuple(_results(made)))
             settings.require_owner()
             _hand_over(job, made, summary, settings)
             if made.failure is None:
                 flow.keep_only_this()
-    if made.failure is not None:
-        raise made.failure
+        elif stopped_by is not None:
+            _tell_how_far(flow, made, stopped_by, out_dir)
+    if stopped_by or made.failure:
+        raise stopped_by or made.failure  # type: ignore[misc]
     return summary
-
-
-@dataclass(slots=True)
-class Made:
-    """What the stages gave: the artefacts with results, and why there is no skeleton among them."""
-
-    results: tuple[Artefact, ...] = ()
-    failure: EstimationError | None = None
 
 
 def run_stages(job: Job, flow: Flow, made: Made) -> Iterator[str]:
     """Run one stage after another; yields the name of each when it is done."""
     flow.check()
     yield "check"
-    keyframes = flow.keyframes()
+    made.stage = "keyframes"
+    made.keyframes = flow.keyframes()
     yield "keyframes"
-    scene = flow.map(keyframes)
+    made.stage = "map"
+    made.scene = scene = flow.map(made.keyframes)
     yield "map"
-    registrations = flow.registrations(scene, keyframes)
-    scene, registrations = flow.grow(scene, registrations, keyframes)
-    scene, registrations = flow.refine(scene, registrations, keyframes)
+    made.stage = "registration"
+    made.registrations = found = flow.registrations(scene, made.keyframes)
+    scene, found = flow.grow(scene, found, made.keyframes)
+    made.scene, made.registrations = flow.refine(scene, found, made.keyframes)
     yield "registration"
-    merged, made.failure = _merge(job, flow, scene, registrations)
+    made.stage = "merge"
+    made.merged, made.failure = _merge(job, flow, made.scene, made.registrations)
     yield "merge"
-    made.results = (flow.export(keyframes, scene, registrations, merged, made.failure),)
+    made.exported = flow.export(made.keyframes, made.scene, made.registrations, made.merged, made.failure)
     yield "export"
+    made.reported = flow.report(made)
+    yield "report"
     if job.export.preview:
-        made.results += (flow.preview(scene, registrations, merged, made.failure),)
+        made.previewed = flow.preview(made.scene, made.registrations, made.merged, made.failure)
         yield "preview"
+
+
+def _run_until(job: Job, flow: Flow, made: Made, settings: Settings) -> BodycapError | None:
+    """Run the stages up to the last one wanted; returns what stopped them, if a report can tell of it."""
+    try:
+        for stage in run_stages(job, flow, made):
+            if stage == settings.until:
+                break
+    except BodycapError as error:
+        # Results that are there are handed over although the page about them could not be written.
+        tellable = made.exported is not None or isinstance(error, JobError | CaptureError | EstimationError)
+        if isinstance(error, Cancelled) or not tellable:
+            raise
+        return error
+    return None
+
+
+def _tell_how_far(flow: Flow, made: Made, error: BodycapError, out_dir: Path) -> None:
+    """Publish the report of a job that broke off before there were results."""
+    try:
+        made.reported = flow.report(made, error)
+    except BodycapError as another:
+        error.add_note(f"and its report could not be written: {another.message}")
+        return
+    publish(dict(files_of(made.reported)), out_dir / PARTIAL)
+    told = f"how far it came: {out_dir / PARTIAL / REPORT_FILE}"
+    error.hint = f"{error.hint}; {told}" if error.hint else told
 
 
 def _hand_over(job: Job, made: Made, summary: RunSummary, settings: Settings) -> None:
     """Publish the results; those without a skeleton are set apart and called partial."""
     if made.failure is None:
-        _finish(job, made.results, summary, settings)
+        _finish(job, made, summary, settings)
         clear_partial(summary.out_dir)
         return
     partial = summary.out_dir / PARTIAL
-    _finish(job, made.results, replace(summary, out_dir=partial), settings)
+    _finish(job, made, replace(summary, out_dir=partial), settings)
     kept = f"the map, the cameras' paths and the frames are in {partial}"
     made.failure.hint = f"{made.failure.hint}; {kept}" if made.failure.hint else kept
 
@@ -137,10 +163,10 @@ def _merge(
         return None, error
 
 
-def _finish(job: Job, results: Sequence[Artefact], summary: RunSummary, settings: Settings) -> None:
+def _finish(job: Job, made: Made, summary: RunSummary, settings: Settings) -> None:
     """Results first, then the record of the run, so that the record never speaks of what is not there."""
     out_dir = summary.out_dir
-    publish(dict(_result_files(results)), out_dir)
+    publish(_results(made), out_dir)
     resolved = yaml.safe_dump(
         job.model_dump(mode="json", exclude_none=True), sort_keys=False, allow_unicode=True
     )
@@ -162,11 +188,16 @@ def _versions(flow: Flow) -> dict[str, str]:
     return {**own, **dict(sorted(flow.libraries.items()))}
 
 
-def _result_files(artefacts: Sequence[Artefact]) -> list[tuple[str, Path]]:
-    """Name in the results' folder and file in the store of each file that goes to the user."""
+def files_of(artefact: Artefact) -> list[tuple[str, Path]]:
+    """Name in the results' folder and file in the store of each file meant for the user."""
     return [
         (Path(name).relative_to(RESULTS).as_posix(), artefact.path / name)
-        for artefact in artefacts
         for name in artefact.files
         if name.startswith(f"{RESULTS}/")
     ]
+
+
+def _results(made: Made) -> dict[str, Path]:
+    """All files that go to the user."""
+    parts = (made.exported, made.reported, made.previewed)
+    return {name: path for part in parts if part is not None for name, path in files_of(part)}

@@ -12,6 +12,7 @@ from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE
 from bodycap_batch.tasks.merge import MERGE
 from bodycap_batch.tasks.preview import PREVIEW
 from bodycap_batch.tasks.registration import REGISTRATION
+from bodycap_batch.tasks.report import REPORT
 from bodycap_batch.tasks.stage import CAPTURE, RESULTS, SUMMARY, Stage, read_summary
 from bodycap_batch.tasks.synth import SYNTH
 
@@ -38,10 +39,11 @@ STAGES = {
     "registration": REGISTRATION,
     "merge": MERGE,
     "export": EXPORT,
+    "report": REPORT,
     "preview": PREVIEW,
 }
 
-StageName = Literal["check", "keyframes", "map", "registration", "merge", "export", "preview"]
+StageName = Literal["check", "keyframes", "map", "registration", "merge", "export", "report", "preview"]
 ORDER: tuple[StageName, ...] = get_args(StageName)
 """A job's stages one after another. While frames are registered the map may be extended and refined."""
 _DURING_REGISTRATION = {"extend", "refine"}

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.bench import batch, ours, peers, scaling, simulation, spool, uncertainty
+from tests.bench import batch, ours, peers, scaling, simulation, spool, uncertainty, viewer
 from tests.bench.rows import DATA, LAB, Row, row_of, rows_in
 
 _ON_POSES = {"simulation": simulation.main, "uncertainty": uncertainty.main}
@@ -30,9 +30,9 @@ def main() -> int:
     parser.add_argument(
         "only",
         nargs="*",
-        help="rows to run, or folders of captures with truth (default: all), `scaling`, `batch`, `spool`; "
-        "`simulation` or `uncertainty` first run the skeleton stage on simulated poses, with options of "
-        "their own",
+        help="rows to run, or folders of captures with truth (default: all), `scaling`, `batch`, `spool`, "
+        "`viewer`; `simulation` or `uncertainty` first run the skeleton stage on simulated poses, with options "
+        "of their own",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)
@@ -55,21 +55,29 @@ def main() -> int:
             if not options.no_peers and not row.name.startswith("cpl_lab_"):
                 for peer in peers.run_peers(row, work / row.name / "peers", 60 * options.peer_limit):
                     _tell(results, peer, peers.lines_of(peer, own))
-        if "scaling" in options.only:
-            for case in scaling.cases(work / "scaling"):
-                own = ours.run(case.row, work / case.row.name)
-                _tell(results, {**own, **case.size()}, scaling.lines_of(own, case))
-            _tell(results, {}, scaling.summary(results))
-        if "batch" in options.only:
-            done = batch.run(work / "batch")
-            _tell(results, done, list(batch.lines_of(done)))
-        if "spool" in options.only:
-            for measured in spool.run(work / "spool"):
-                _tell(results, measured, spool.lines_of(measured))
+        _run_by_name(options.only, work, results)
     if options.json:
         options.json.write_text(json.dumps([each for each in results if each], indent=1), encoding="utf-8")
     jobs = [result for result in results if result and "peer" not in result]
     return 0 if results and all(job.get("exit") == 0 for job in jobs) else 1
+
+
+def _run_by_name(only: Sequence[str], work: Path, results: list[dict[str, Any]]) -> None:
+    """What is no capture."""
+    if "scaling" in only:
+        for case in scaling.cases(work / "scaling"):
+            own = ours.run(case.row, work / case.row.name)
+            _tell(results, {**own, **case.size()}, scaling.lines_of(own, case))
+        _tell(results, {}, scaling.summary(results))
+    if "batch" in only:
+        done = batch.run(work / "batch")
+        _tell(results, done, list(batch.lines_of(done)))
+    if "spool" in only:
+        for measured in spool.run(work / "spool"):
+            _tell(results, measured, spool.lines_of(measured))
+    if "viewer" in only or not only:
+        seen = viewer.run()
+        _tell(results, {**seen, "exit": 0 if "fps" in seen else 1}, viewer.lines_of(seen))
 
 
 def _tell(results: list[dict[str, Any]], result: dict[str, Any], lines: Sequence[str]) -> None:
@@ -84,7 +92,7 @@ def _chosen(options: argparse.Namespace, work: Path) -> list[Row]:
     if not options.only:
         return known
     rows = [row for row in known if row.name in options.only]
-    names = {row.name for row in rows} | {"scaling", "batch", "spool"}
+    names = {row.name for row in rows} | {"scaling", "batch", "spool", "viewer"}
     rows += [
         row_of(Path(name).resolve()) for name in options.only if name not in names and Path(name).is_dir()
     ]

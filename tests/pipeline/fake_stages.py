@@ -66,7 +66,7 @@ def stage(name: str) -> Any:
 def videos(arguments: Json) -> list[str]:
     cameras = arguments.get("capture", {}).get("cameras", [])
     files = [Path(video) for camera in cameras for video in camera["video"]]
-    return [file.read_bytes().decode("utf-8", "replace") for file in files]
+    return [file.read_bytes().decode("utf-8", "replace") for file in files if file.exists()]
 
 
 def summary(options: Json, arguments: Json, files: Path) -> None:
@@ -97,6 +97,14 @@ def previewed(options: Json, arguments: Json, files: Path) -> None:
     (files / "results" / "preview.mp4").write_text(json.dumps(made_of(arguments), sort_keys=True))
 
 
+def reported(options: Json, arguments: Json, files: Path) -> None:
+    (files / "results").mkdir()
+    failure = arguments["failure"] or {"stage": "", "message": "all is well"}
+    made = [name for name in ("keyframes", "map", "registrations", "merge", "export") if arguments[name]]
+    text = f"{failure['stage']}: {failure['message']}; {' '.join(made)}"
+    (files / "results" / "report.html").write_text(text)
+
+
 def rendered(options: Json, arguments: Json, files: Path) -> None:
     capture = files / "capture"
     (capture / "gt").mkdir(parents=True)
@@ -105,7 +113,13 @@ def rendered(options: Json, arguments: Json, files: Path) -> None:
     (capture / "gt" / "torso.tum").write_text("0 0 0 0 0 0 0 1\n")
 
 
-EXTRA = {"registration": registered, "export": exported, "preview": previewed, "synth": rendered}
+EXTRA = {
+    "registration": registered,
+    "export": exported,
+    "report": reported,
+    "preview": previewed,
+    "synth": rendered,
+}
 NAMES = (
     "synth",
     "check",
@@ -117,6 +131,7 @@ NAMES = (
     "merge",
     "export",
     "preview",
+    "report",
 )
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from bodycap_batch.config.models import Job
-from bodycap_batch.errors import BodycapError, Cancelled, EstimationError
+from bodycap_batch.errors import BodycapError, Cancelled, CaptureError, EstimationError
 from bodycap_batch.pipeline import RunSummary, Settings, run_job
 from bodycap_batch.progress import Event
 from bodycap_batch.store import Store
@@ -111,7 +111,7 @@ def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done_once: Path) -> Be
 
 PER_CAMERA = ["keyframes left_palm", "keyframes torso"]
 REGISTERED = ["registration left_palm", "registration torso"]
-ALL = sorted(["check", *PER_CAMERA, "map", *REGISTERED, "merge", "export", "preview"])
+ALL = sorted(["check", *PER_CAMERA, "map", *REGISTERED, "merge", "export", "preview", "report"])
 
 
 def test_all_stages_run_and_the_results_are_there(bench: Bench) -> None:
@@ -154,19 +154,19 @@ def test_moving_the_capture_executes_nothing(done: Bench) -> None:
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"export": {"units": "m"}}, ["export"]),
+        ({"export": {"units": "m"}}, ["export", "report"]),
         ({"export": {"preview": False}}, []),
-        ({"merge": {"max_gap_s": 0.5}}, ["export", "merge", "preview"]),
-        ({"height_m": 1.8}, ["check", "export", "merge", "preview"]),
-        ({"activity": "walk"}, ["check", "export", "merge", "preview"]),
-        ({"torso": {"sigma_deg": 3.0}}, ["check", "export", "merge", "preview"]),
-        ({"registration": {"min_inliers": 20}}, ["export", "merge", "preview", *REGISTERED]),
+        ({"merge": {"max_gap_s": 0.5}}, ["export", "merge", "preview", "report"]),
+        ({"height_m": 1.8}, ["check", "export", "merge", "preview", "report"]),
+        ({"activity": "walk"}, ["check", "export", "merge", "preview", "report"]),
+        ({"torso": {"sigma_deg": 3.0}}, ["check", "export", "merge", "preview", "report"]),
+        ({"registration": {"min_inliers": 20}}, ["export", "merge", "preview", "report", *REGISTERED]),
         ({"registration": {"rounds": 1}}, []),
-        ({"map": {"features": 1024}}, ["export", "map", "merge", "preview", *REGISTERED]),
+        ({"map": {"features": 1024}}, ["export", "map", "merge", "preview", "report", *REGISTERED]),
         ({"keyframes": {"parallax_px": 50.0}}, sorted(set(ALL) - {"check"})),
         ({"torso": {"offset_s": 0.1}}, sorted(set(ALL) - {"keyframes left_palm"})),
         ({"capture": {"work_px": 640}}, ALL),
-        ({"name": "other", "out": "/elsewhere"}, []),
+        ({"name": "other", "out": "/elsewhere"}, ["report"]),
     ],
     ids=lambda value: str(value)[:40],
 )
@@ -202,7 +202,7 @@ def test_results_of_the_last_run_that_are_no_longer_made_vanish_and_other_files_
     assert (done.out / "my notes.txt").read_text() == "mine"
 
 
-@pytest.mark.parametrize("stage", ["check", "keyframes", "map", "registration", "merge", "export"])
+@pytest.mark.parametrize("stage", ["check", "keyframes", "map", "registration", "merge", "export", "report"])
 def test_a_corrupt_artefact_is_rebuilt(done: Bench, stage: str) -> None:
     before = done.results()
     folder = sorted((done.folder / "store" / "artefacts" / stage).iterdir())[0]
@@ -232,7 +232,26 @@ def test_a_failed_stage_leaves_earlier_results_intact(done: Bench) -> None:
     done.order(fail="map")
     with pytest.raises(EstimationError, match="map does not work out"):
         done.run(map={"features": 1024})
-    assert done.results() == before
+    told = done.results()
+    report = told.pop("partial/report.html")
+    assert told == before
+    assert report == b"map: map does not work out; keyframes"
+
+
+def test_a_missing_video_is_told_in_a_report_too(bench: Bench) -> None:
+    (bench.folder / "torso.mp4").unlink()
+    with pytest.raises(CaptureError, match="no such file") as caught:
+        bench.run()
+    report = bench.out / "partial" / "report.html"
+    assert str(report) in str(caught.value.hint)
+    assert report.read_text() == "check: there is no such file; "
+
+
+def test_results_are_there_although_their_report_failed(bench: Bench) -> None:
+    bench.order(fail="report")
+    with pytest.raises(EstimationError, match="report does not work out"):
+        bench.run()
+    assert {"metrics.json", "result.bvh"} <= set(bench.results())
 
 
 def test_without_a_skeleton_the_rest_is_kept_and_called_partial(done: Bench) -> None:
@@ -244,6 +263,8 @@ def test_without_a_skeleton_the_rest_is_kept_and_called_partial(done: Bench) -> 
     partial = done.out / "partial"
     assert str(partial) in str(caught.value.hint)
     assert json.loads((partial / "metrics.json").read_text()) == {"partial": True}
+    told = "merge: merge does not work out; keyframes map registrations export"
+    assert (partial / "report.html").read_text() == told
     assert (partial / "result.ply").exists()
     assert {name: data for name, data in done.results().items() if "partial" not in name} == complete
     done.order()

@@ -56,8 +56,8 @@ def artefacts(bench: Bench) -> set[str]:
     [
         ("check", ALL),
         ("keyframes", sorted(set(ALL) - {"check"})),
-        ("registration", ["export", "merge", "preview", *REGISTERED]),
-        ("export", ["export", "preview"]),
+        ("registration", ["export", "merge", "preview", "report", *REGISTERED]),
+        ("export", ["export", "preview", "report"]),
         ("preview", ["preview"]),
     ],
 )
@@ -74,7 +74,7 @@ def test_from_a_stage_it_and_all_after_it_are_done_again(
 def test_until_a_stage_nothing_after_it_is_done_and_no_result_is_written(bench: Bench) -> None:
     assert executed(bench, until="map") == sorted(["check", *PER_CAMERA, "map"])
     assert bench.results() == {}
-    assert bench.executed() == sorted(["export", "merge", "preview", *REGISTERED])
+    assert bench.executed() == sorted(["export", "merge", "preview", "report", *REGISTERED])
 
 
 def test_a_job_taken_over_publishes_nothing(done: Bench) -> None:
@@ -109,10 +109,10 @@ def test_why_a_finished_job_would_do_nothing(done: Bench) -> None:
             {"map": {"features": 1024}},
             "map",
             "features: 512 -> 1024",
-            ["registration", "merge", "export", "preview"],
+            ["registration", "merge", "export", "preview", "report"],
         ),
         ({"height_m": 1.8}, "check", "the body: height_m changed", None),
-        ({"export": {"units": "m"}}, "export", 'units: "cm" -> "m"', []),
+        ({"export": {"units": "m"}}, "export", 'units: "cm" -> "m"', ["report"]),
         ({"torso": {"offset_s": 0.1}}, "check", "the video, calibration, clock or window of torso", None),
     ],
 )
@@ -129,7 +129,9 @@ def test_why_names_the_change_and_what_follows(
 def test_why_of_a_job_never_run_and_of_a_damaged_artefact(bench: Bench) -> None:
     assert steps(bench) == {
         "check": "not computed before",
-        **dict.fromkeys(("keyframes", "map", "registration", "merge", "export", "preview"), "after check"),
+        **dict.fromkeys(
+            ("keyframes", "map", "registration", "merge", "export", "preview", "report"), "after check"
+        ),
     }
     bench.run()
     victim = next((bench.folder / "store" / "artefacts" / "merge").glob("*/made_of.txt"))
@@ -170,6 +172,7 @@ def test_garbage_is_what_no_finished_job_used(alone: Bench) -> None:
         "merge",
         "export",
         "preview",
+        "report",
     }
     assert dry.freed_bytes > 0
     assert artefacts(alone) > kept, "a dry run removes nothing"

@@ -1,0 +1,66 @@
+"""`bodycap report`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import typer
+
+from bodycap_batch.cli.base import app
+from bodycap_batch.cli.display import make_display
+from bodycap_batch.cli.run import (
+    HeightOption,
+    JobArgument,
+    OutOption,
+    SkeletonOption,
+    StoreOption,
+    ThreadsOption,
+    cores,
+    default_store,
+    results_folder,
+)
+from bodycap_batch.cli.stop import stoppable
+
+
+@app.command()
+def report(
+    job: JobArgument,
+    out: OutOption = None,
+    skeleton: SkeletonOption = None,
+    height: HeightOption = None,
+    threads: ThreadsOption = None,
+    store: StoreOption = None,
+) -> None:
+    """Write a job's report.html anew, from what the store holds.
+
+    Every run writes it; this does it again, with a newer bodycap for instance. JOB may also be the folder of
+    the results. No other stage is computed; of a job that broke off, the report says how far it came.
+
+    \b
+    Examples:
+      bodycap report out/my_walk
+      bodycap report my_walk/ --height 1.75
+    """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.config.job import Overrides, load_job
+    from bodycap_batch.pipeline import Settings, remake_report
+    from bodycap_batch.store import Store
+
+    file, folder = job_of(job)
+    resolved = load_job(file, Overrides(out=out or folder, skeleton=skeleton, height_m=height))
+    out_dir = results_folder(resolved)
+    with stoppable() as stop, make_display(as_json=False) as display:
+        settings = Settings(
+            store=Store(store or default_store(out_dir)),
+            threads=threads or cores(),
+            listener=display,
+            cancelled=stop.is_set,
+        )
+        path = remake_report(resolved, out_dir=out_dir, settings=settings)
+    typer.echo(f"report: {path}")
+
+
+def job_of(named: Path) -> tuple[Path, Path | None]:
+    """The job to load, and the results' folder where that is what was named."""
+    if (named / "run.json").is_file() and (named / "job.yaml").is_file():
+        return named / "job.yaml", named.resolve()
+    return named, None

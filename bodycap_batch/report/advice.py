@@ -1,0 +1,194 @@
+"""What to change next time: plain sentences, each tied to something that was measured in this job."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bodycap_batch.arrays import IntArray
+from bodycap_batch.report.inputs import ReportInputs
+from bodycap_batch.report.losses import Cause
+from bodycap_batch.scene import Map
+
+_MATTERS = 0.02
+"""Share of all frames from which a cause is worth a change of habit."""
+_FORWARD_DEG = 25.0
+_FORWARD_SHARE = 0.6
+_THIN_LINK = 0.03
+_NARROW_DEG = 3.0
+
+_DO = {
+    Cause.DARK: "Switch lights on or film by day, and keep sleeves and straps away from the lens.",
+    Cause.FAST: "Turn and swing more slowly, or film at 60 frames per second or more.",
+    Cause.BLUR: "Use more light and a shutter of 1/240 s or shorter: sharp frames at high gain beat "
+    "smooth ones.",
+    Cause.PLAIN: "Put up posters or patterned cloth where the cameras look, or turn the cameras away "
+    "from plain walls and ceilings.",
+    Cause.SHALLOW: "Turn the camera so that it sees something near as well as something far, spread over the "
+    "whole picture.",
+    Cause.UNKNOWN_PLACE: "Turn the camera so that less of the own body is in its picture, keep other people "
+    "out, and walk past each place more than once.",
+    Cause.NO_MAP: "Let every camera see the same places as the others: walk a loop and look around "
+    "in each place.",
+}
+_WAS = {
+    Cause.DARK: "hardly any light reached the camera",
+    Cause.FAST: "the camera turned more than 8° from one frame to the next",
+    Cause.BLUR: "the picture was blurred (sharpness below 60 % of the frames beside it)",
+    Cause.PLAIN: "the camera looked at plain surfaces (under 30 % of its usual corners)",
+    Cause.SHALLOW: "the points in view did not fix the position (too far, or bunched together)",
+    Cause.UNKNOWN_PLACE: "the picture was sharp and textured, but it showed what the map does not hold",
+    Cause.NO_MAP: "the camera has no map to stand on",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Advice:
+    """One change.
+
+    Attributes:
+        do: What to do.
+        because: What was measured.
+        weight: Larger comes first.
+    """
+
+    do: str
+    because: str
+    weight: float
+
+
+def advise(inputs: ReportInputs, lost: Mapping[str, Counter[Cause]]) -> list[Advice]:
+    """What would have helped most, first.
+
+    Args:
+        inputs: The results.
+        lost: Lost frames by camera and cause.
+    """
+    found = [*_of_losses(inputs, lost), *_of_overlap(inputs), *_of_motion(inputs), *_of_body(inputs)]
+    if inputs.failure is not None and inputs.failure.get("hint"):
+        found.append(
+            Advice(do=_sentence(str(inputs.failure["hint"])), because="the error says so", weight=9.0)
+        )
+    return sorted(found, key=lambda each: -each.weight)
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}{'' if text.endswith(('.', '!', '?')) else '.'}"
+
+
+def _of_losses(inputs: ReportInputs, lost: Mapping[str, Counter[Cause]]) -> Iterator[Advice]:
+    total = sum(len(each.trajectory.status) for each in inputs.registrations)
+    if not total:
+        return
+    everywhere: Counter[Cause] = sum(lost.values(), Counter())
+    for cause, frames in everywhere.most_common():
+        if frames < _MATTERS * total:
+            continue
+        where = [f"{counts[cause]} of {name}" for name, counts in sorted(lost.items()) if counts[cause]]
+        because = f"{frames} frames were lost where {_WAS[cause]} ({', '.join(where)})"
+        yield Advice(do=_DO[cause], because=because, weight=1.0 + frames / total)
+
+
+def shared_points(maps: tuple[Map, ...], cameras: tuple[str, ...]) -> IntArray:
+    """(C,C) points of the maps that both cameras see; the diagonal counts a camera's own."""
+    out = np.zeros((len(cameras), len(cameras)), dtype=np.int64)
+    number = {name: index for index, name in enumerate(cameras)}
+    for scene in maps:
+        owner = np.array([number.get(name, -1) for name in scene.keyframe_camera], dtype=np.int64)
+        seen = np.zeros((len(scene.points), len(cameras)), dtype=np.int64)
+        owners = owner[scene.obs_keyframe]
+        seen[scene.obs_point[owners >= 0], owners[owners >= 0]] = 1
+        out += seen.T @ seen
+    return out
+
+
+def _of_overlap(inputs: ReportInputs) -> Iterator[Advice]:
+    if len(inputs.cameras) < 2 or not inputs.maps:
+        return
+    shared = shared_points(inputs.maps, inputs.cameras)
+    for index, name in enumerate(inputs.cameras):
+        own = int(shared[index, index])
+        best = int(np.delete(shared[index], index).max(initial=0))
+        if own and best < _THIN_LINK * own:
+            yield Advice(
+                do=f"Let {name} see what the other cameras see: hold it forward for a few steps, and walk "
+                "the same places twice.",
+                because=f"it shares only {best:,} of its {own:,} points with any other camera",
+                weight=1.5,
+            )
+
+
+def _of_motion(inputs: ReportInputs) -> Iterator[Advice]:
+    forward = []
+    for registration in inputs.registrations:
+        poses = registration.trajectory.gauge_from_cam[registration.trajectory.localised]
+        # A tenth of a walk's steps: enough for a direction above the noise of neighbouring frames.
+        step = max(1, len(poses) // 40)
+        move = poses[step::step, :3, 3] - poses[:-step:step, :3, 3][: len(poses[step::step])]
+        length = np.linalg.norm(move, axis=1)
+        axis = poses[:-step:step, :3, 2][: len(move)]
+        cosine = np.abs((move * axis).sum(axis=1)) / np.maximum(length, 1e-12)
+        moving = length > 0.2 * np.median(length) if len(length) else np.zeros(0, dtype=bool)
+        if moving.sum() >= 5:
+            forward.append(float((cosine[moving] > np.cos(np.radians(_FORWARD_DEG))).mean()))
+    narrow = _median_triangulation_deg(inputs.maps[0]) if inputs.maps else None
+    straight = bool(forward) and min(forward) > _FORWARD_SHARE
+    if straight or (narrow is not None and narrow < _NARROW_DEG):
+        angle = "" if narrow is None else f"half of the map's points are seen under less than {narrow:.1f}°"
+        along = (
+            f"every camera moved along its own line of sight {min(forward):.0%} of the way"
+            if straight
+            else ""
+        )
+        yield Advice(
+            do="Start with a few steps to the side and an arc around something near: depth comes from "
+            "sideways movement.",
+            because=" and ".join(part for part in (along, angle) if part),
+            weight=1.2,
+        )
+
+
+def _median_triangulation_deg(scene: Map) -> float | None:
+    """Median over points of the widest angle between the rays of its first and any other observation."""
+    if len(scene.obs_point) == 0:
+        return None
+    rays = scene.map_from_cam[scene.obs_keyframe, :3, 3] - scene.points[scene.obs_point]
+    rays = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+    order = np.argsort(scene.obs_point, kind="stable")
+    point = scene.obs_point[order]
+    first = order[np.searchsorted(point, point)]
+    cosine = np.clip((rays[order] * rays[first]).sum(axis=1), -1.0, 1.0)
+    widest = np.full(len(scene.points), 1.0)
+    np.minimum.at(widest, point, cosine)
+    return float(np.degrees(np.arccos(np.median(widest[np.unique(point)]))))
+
+
+def _of_body(inputs: ReportInputs) -> Iterator[Advice]:
+    if inputs.merge is None:
+        return
+    report: Mapping[str, Any] = inputs.merge.report
+    scale = report.get("scale", {})
+    sigma = scale.get("relative_sigma")
+    if sigma is not None and sigma > 0.02 and scale.get("source") != "skeleton":
+        yield Advice(
+            do="Give the subject's own skeleton (--skeleton subject.bvh)"
+            + ("." if scale.get("source") == "height" else ", or at least the height (--height 1.75)."),
+            because=f"the metric scale rests on the {scale.get('source')} and is known to {sigma:.1%}: "
+            f"{100 * 0.6 * sigma:.1f} cm on the length of an arm",
+            weight=1.1 + sigma,
+        )
+    mounts = report.get("mounts", {})
+    loose = {name: mount["sigma_deg"] for name, mount in mounts.items() if mount["sigma_deg"] > 4.0}
+    if loose:
+        worst = max(loose, key=lambda name: loose[name])
+        yield Advice(
+            do="Bend the elbows and turn the trunk and the palms at the start of the take, or measure how "
+            "the cameras sit and state it (joint_from_cam).",
+            because=f"the mount of {worst} is known to {loose[worst]:.0f}° only"
+            + (f", and {len(loose) - 1} more to over 4°" if len(loose) > 1 else ""),
+            weight=1.05,
+        )

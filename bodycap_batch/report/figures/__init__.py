@@ -1,0 +1,1 @@
+"""Drawings as SVG and PNG, coloured by the page's style sheet so that they follow light and dark."""

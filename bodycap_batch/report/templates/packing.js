@@ -1,0 +1,84 @@
+// Arrays out of the page's data: base64 to numbers.
+const NONE = 65535;
+
+function bytesOf(text) {
+  const raw = atob(text);
+  const out = new Uint8Array(raw.length);
+  for (let i = 0; i < raw.length; i++) out[i] = raw.charCodeAt(i);
+  return out;
+}
+
+// 16-bit codes between each column's least and largest value; NaN where there is none.
+function scaled(block) {
+  const codes = new Uint16Array(bytesOf(block.u16).buffer);
+  const columns = block.low.length;
+  const out = new Float32Array(codes.length);
+  for (let i = 0; i < codes.length; i++) {
+    const column = i % columns;
+    out[i] = codes[i] === NONE ? NaN : block.low[column] + codes[i] * block.step[column];
+  }
+  return out;
+}
+
+// Index of the last of increasing times that is not after t (0 where all are).
+function before(times, t) {
+  let low = 0;
+  let high = times.length - 1;
+  while (low < high) {
+    const middle = (low + high + 1) >> 1;
+    if (times[middle] <= t) low = middle;
+    else high = middle - 1;
+  }
+  return low;
+}
+
+function nearest(times, t) {
+  const i = before(times, t);
+  return i + 1 < times.length && times[i + 1] - t < t - times[i] ? i + 1 : i;
+}
+
+function unpack(data) {
+  const body = data.solid.body;
+  return {
+    ...data,
+    points: scaled(data.solid.points),
+    colours: bytesOf(data.solid.colours.u8),
+    paths: data.solid.paths.map((path) => ({
+      camera: path.camera,
+      tone: data.tones[path.camera],
+      times: scaled(path.time),
+      centre: scaled(path.centre),
+      quat: scaled(path.quat),
+      keyframe: bytesOf(path.keyframe.u8),
+    })),
+    body: body && {
+      ...body,
+      count: body.parents.length,
+      centres: scaled(body.centres),
+      observed: bytesOf(body.observed.u8),
+      sigma: body.sigma && scaled(body.sigma),
+    },
+    pictures: data.pictures.map((each) => ({ ...each, times: each.frames.map((frame) => frame.t) })),
+  };
+}
+
+// Joint centres at a time, between the two ticks beside it; out is reused.
+function bodyAt(body, t, out) {
+  const i = before(body.time, t);
+  const j = Math.min(i + 1, body.time.length - 1);
+  const span = body.time[j] - body.time[i];
+  const share = span > 0 ? Math.min(Math.max((t - body.time[i]) / span, 0), 1) : 0;
+  const size = 3 * body.count;
+  for (let k = 0; k < size; k++) {
+    out[k] = body.centres[i * size + k] * (1 - share) + body.centres[j * size + k] * share;
+  }
+  return share < 0.5 ? i : j;
+}
+
+// A camera's pose index at a time, −1 where it has none there.
+function poseAt(path, t) {
+  if (!path.times.length) return -1;
+  const i = nearest(path.times, t);
+  const step = path.times.length > 1 ? (path.times[path.times.length - 1] - path.times[0]) / (path.times.length - 1) : 1;
+  return Math.abs(path.times[i] - t) <= step && Number.isFinite(path.centre[3 * i]) ? i : -1;
+}

@@ -1,0 +1,274 @@
+"""Is it good? Each criterion graded against thresholds that say why they stand where they do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+
+class Grade(IntEnum):
+    """How far a result can be relied on; the worst of its criteria counts."""
+
+    GOOD = 0
+    FAIR = 1
+    POOR = 2
+    NONE = 3
+
+    @property
+    def word(self) -> str:
+        """For a person."""
+        return ("good", "usable with care", "poor", "no result")[self]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Criterion:
+    """One graded figure.
+
+    Attributes:
+        about: ``cameras`` or ``body``: which half of the verdict it belongs to.
+        name: What is judged.
+        grade: How it is.
+        says: The figure in words.
+        why: Where the thresholds stand and for what reason.
+        metric: Where ``metrics.json`` holds the figure, dotted; "" for what is derived from several.
+        value: The figure itself.
+    """
+
+    about: str
+    name: str
+    grade: Grade
+    says: str
+    why: str
+    metric: str = ""
+    value: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """What a person reads first.
+
+    Attributes:
+        headline: One sentence.
+        grade: The worse of the two halves.
+        cameras: Cameras and room.
+        body: The motion; None where the job asks for none.
+        criteria: All that was judged.
+    """
+
+    headline: str
+    grade: Grade
+    cameras: Grade
+    body: Grade | None
+    criteria: tuple[Criterion, ...]
+
+
+def judge(metrics: Mapping[str, Any] | None, failure: Mapping[str, Any] | None) -> Verdict:
+    """Grade a job by its own figures.
+
+    Args:
+        metrics: The content of ``metrics.json``; None where the job did not come that far.
+        failure: What stopped it, as the error tells.
+    """
+    criteria = () if metrics is None else tuple(_all(metrics))
+    cameras = _worst(criteria, "cameras") if metrics is not None else Grade.NONE
+    body = _worst(criteria, "body") if metrics is not None and "merge" in metrics else None
+    if failure is not None and body is None:
+        body = Grade.NONE
+    grade = max(cameras, Grade.GOOD if body is None else body)
+    return Verdict(
+        headline=_headline(cameras, body, metrics, failure),
+        grade=grade,
+        cameras=cameras,
+        body=body,
+        criteria=criteria,
+    )
+
+
+def graded(value: float, good: float, fair: float, *, more_is_better: bool = False) -> Grade:
+    """Where a value stands between two bounds."""
+    if more_is_better:
+        value, good, fair = -value, -good, -fair
+    return Grade.GOOD if value <= good else Grade.FAIR if value <= fair else Grade.POOR
+
+
+def _worst(criteria: tuple[Criterion, ...], about: str) -> Grade:
+    return max((each.grade for each in criteria if each.about == about), default=Grade.NONE)
+
+
+def _headline(
+    cameras: Grade, body: Grade | None, metrics: Mapping[str, Any] | None, failure: Mapping[str, Any] | None
+) -> str:
+    if metrics is None:
+        return "The job stopped before there was a result."
+    words = ("are tracked well", "are tracked, with gaps or doubts", "are tracked poorly", "are not tracked")
+    first = f"The cameras {words[cameras]}"
+    if failure is not None:
+        return f"{first}; the body could not be solved."
+    if body is None:
+        return f"{first}. No body was asked for."
+    joint = "and" if (body == Grade.GOOD) == (cameras == Grade.GOOD) else "but"
+    ends = (
+        "the motion is good",
+        "the motion is usable with care",
+        "the motion is poor",
+        "there is no motion",
+    )
+    return f"{first}, {joint} {ends[body]}."
+
+
+def _all(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
+    yield from _of_frames(metrics)
+    yield from _of_map(metrics)
+    if "merge" in metrics:
+        yield from _of_body(metrics["merge"])
+
+
+def _of_frames(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
+    total = metrics["total"]
+    share = float(total["coverage"])
+    yield Criterion(
+        about="cameras",
+        name="Frames registered",
+        grade=graded(share, 0.98, 0.85, more_is_better=True),
+        says=f"{total['frames_registered']:,} of {total['frames']:,} frames ({share:.1%})",
+        why="From 98 % on only moments are missing, and the body's smoothness carries over them; below 85 % "
+        "more than one frame in seven rests on nothing that was seen.",
+        metric="total.coverage",
+        value=share,
+    )
+    name, worst = min(metrics["cameras"].items(), key=lambda item: item[1]["coverage"], default=("", None))
+    if worst is not None and len(metrics["cameras"]) > 1:
+        share = float(worst["coverage"])
+        yield Criterion(
+            about="cameras",
+            name="The worst camera",
+            grade=graded(share, 0.95, 0.75, more_is_better=True),
+            says=f"{name}: {worst['frames_registered']:,} of {worst['frames']:,} frames ({share:.1%})",
+            why="An average hides one bad camera, and a limb is as good as the camera on it.",
+            metric=f"cameras.{name}.coverage",
+            value=share,
+        )
+
+
+def _of_map(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
+    error = metrics["total"]["mean_reprojection_error_px"]
+    if error is not None:
+        yield Criterion(
+            about="cameras",
+            name="Map error",
+            grade=graded(float(error), 1.0, 2.0),
+            says=f"{error:.2f} px mean reprojection error",
+            why="Sharp corners are found to about half a pixel; above one the lens, the shutter or blur is "
+            "at work, above two the map is strained. A low value alone does not prove a right map.",
+            metric="total.mean_reprojection_error_px",
+            value=float(error),
+        )
+    apart = sorted(name for name, each in metrics["cameras"].items() if each["frame"] != metrics["frame"])
+    lost = sorted(name for name, each in metrics["cameras"].items() if not each["frames_registered"])
+    yield Criterion(
+        about="cameras",
+        name="One room",
+        grade=Grade.POOR if apart or lost else Grade.GOOD,
+        says=f"{', '.join(sorted({*apart, *lost}))} stands apart from the main map"
+        if apart or lost
+        else "all cameras are placed in one map",
+        why="A camera outside the main map has no known place in the room; nothing of it reaches the body.",
+    )
+    reach = metrics.get("mapping", {}).get("reach", {})
+    if reach.get("judged"):
+        share = float(reach["within_reach"])
+        yield Criterion(
+            about="cameras",
+            name="Cameras within the body's reach",
+            grade=graded(share, 0.98, 0.9, more_is_better=True),
+            says=f"{share:.1%} of {reach['distances']:,} distances between cameras",
+            why="Cameras on one body cannot be further apart than it reaches: a map folded over two places "
+            "that look alike shows here although its error in pixels is small.",
+            metric="mapping.reach.within_reach",
+            value=share,
+        )
+
+
+def _of_body(merge: Mapping[str, Any]) -> Iterator[Criterion]:
+    scale = merge.get("scale", {}).get("relative_sigma")
+    if scale is not None:
+        yield Criterion(
+            about="body",
+            name="Metric scale",
+            grade=graded(float(scale), 0.025, 0.10),
+            says=f"known to {scale:.1%} (one standard deviation)",
+            why="It stretches everything alike. 2.5 % is 1.5 cm on the length of an arm, about what the rest "
+            "of the chain leaves; 10 % is a short adult taken for a tall one.",
+            metric="merge.scale.relative_sigma",
+            value=float(scale),
+        )
+    cameras = merge.get("cameras", {})
+    yield from _of_gaps(cameras)
+    residuals = [float(each["residual_m"]["p95"]) for each in cameras.values()]
+    if residuals:
+        yield Criterion(
+            about="body",
+            name="Body against cameras",
+            grade=graded(max(residuals), 0.01, 0.03),
+            says=f"{100 * max(residuals):.1f} cm at the 95th percentile of the worst camera",
+            why="How far the solved body moves the cameras away from where the map saw them. 1 cm is a few "
+            "times a camera's own error; 3 cm can be seen as a hand that slides on what it holds.",
+        )
+    gaps = [float(each["p95"]) for each in merge.get("joint_gap_m", {}).values()]
+    if gaps:
+        yield Criterion(
+            about="body",
+            name="Joints hold together",
+            grade=graded(max(gaps), 0.01, 0.03),
+            says=f"{1000 * max(gaps):.1f} mm at the 95th percentile of the worst joint",
+            why="Bones that do not meet at their joint tell of a wrong bone length, mount or scale.",
+        )
+    yield from _of_mounts(merge.get("mounts", {}))
+    yield from _of_unused(merge.get("unused_cameras", {}))
+
+
+def _of_gaps(cameras: Mapping[str, Any]) -> Iterator[Criterion]:
+    name, worst = max(cameras.items(), key=lambda item: item[1]["longest_gap_s"], default=("", None))
+    if worst is None:
+        return
+    gap = float(worst["longest_gap_s"])
+    yield Criterion(
+        about="body",
+        name="Longest gap",
+        grade=graded(gap, 0.2, 0.6),
+        says=f"{gap:.2f} s without a measurement ({name})",
+        why="An arm swings there and back in about a second: over a fifth of it smoothness guesses right, "
+        "over more than half of it a whole swing can be missing.",
+        metric=f"merge.cameras.{name}.longest_gap_s",
+        value=gap,
+    )
+
+
+def _of_mounts(mounts: Mapping[str, Any]) -> Iterator[Criterion]:
+    name, worst = max(mounts.items(), key=lambda item: item[1]["sigma_deg"], default=("", None))
+    if worst is None:
+        return
+    sigma = float(worst["sigma_deg"])
+    yield Criterion(
+        about="body",
+        name="Mounts",
+        grade=graded(sigma, 4.0, 12.0),
+        says=f"known to {sigma:.1f}° and {100 * worst['sigma_m']:.1f} cm at worst ({name})",
+        why="The mount is a constant error of the bone that carries the camera. 4° is about how well a hand "
+        "is aimed by eye in animation; over 12° a palm visibly faces the wrong way.",
+        metric=f"merge.mounts.{name}.sigma_deg",
+        value=sigma,
+    )
+
+
+def _of_unused(unused: Mapping[str, Any]) -> Iterator[Criterion]:
+    if unused:
+        yield Criterion(
+            about="body",
+            name="Unused cameras",
+            grade=Grade.POOR,
+            says="; ".join(f"{name}: {reason}" for name, reason in sorted(unused.items())),
+            why="Their limbs are inferred, not measured.",
+        )

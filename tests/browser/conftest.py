@@ -1,0 +1,74 @@
+"""A real browser: Debian's Chromium, driven headless; tests are skipped where there is none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bodycap_batch.context import StageContext
+from bodycap_batch.report import ReportInputs, write_report
+from tests.bench.viewer import FLAGS, chromium
+from tests.reports import report_inputs
+
+NO_3D = ("--no-sandbox", "--disable-3d-apis")
+_HARMLESS = ("GL Driver Message",)
+"""What Chromium's software renderer says about reading pixels back; nothing the page could change."""
+
+
+class Pages:
+    """Opens files in one browser and keeps what their consoles say and what they fetch."""
+
+    def __init__(self, browser: Any) -> None:
+        self.browser = browser
+        self.said: list[str] = []
+        self.fetched: list[str] = []
+
+    def open(self, address: str, **options: Any) -> Any:
+        """A new page; options as Playwright's `new_context`."""
+        page = self.browser.new_context(**{"viewport": {"width": 1100, "height": 800}, **options}).new_page()
+        page.on("console", lambda line: self._hear(line.type, line.text))
+        page.on("pageerror", lambda error: self._hear("error", str(error)))
+        page.on("request", lambda request: self.fetched.append(request.url))
+        page.goto(address)
+        return page
+
+    def _hear(self, kind: str, text: str) -> None:
+        if kind in ("error", "warning") and not any(words in text for words in _HARMLESS):
+            self.said.append(f"{kind}: {text}")
+
+
+def launched(flags: tuple[str, ...]) -> Iterator[Any]:
+    path = chromium()
+    if path is None:
+        pytest.skip("no Chromium is installed (Debian: apt install chromium)")
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with sync_api.sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=path, args=list(flags))
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def browser(request: pytest.FixtureRequest) -> Iterator[Any]:
+    """A browser with software WebGL, or with the flags a module asks for by parametrising."""
+    yield from launched(getattr(request, "param", FLAGS))
+
+
+@pytest.fixture
+def pages(browser: Any) -> Pages:
+    return Pages(browser)
+
+
+@pytest.fixture(scope="session")
+def inputs() -> ReportInputs:
+    return report_inputs()
+
+
+@pytest.fixture(scope="session")
+def report(tmp_path_factory: pytest.TempPathFactory, inputs: ReportInputs) -> Path:
+    folder = tmp_path_factory.mktemp("report")
+    write_report(inputs, folder / "report.html", StageContext(work_dir=folder))
+    return folder / "report.html"

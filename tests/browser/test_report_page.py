@@ -1,0 +1,181 @@
+"""The report in a real browser: it draws, moves, says what is true, and needs no network."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bodycap_batch.context import StageContext
+from bodycap_batch.report import ReportInputs, write_report
+from bodycap_batch.report.tables import look_up
+from tests.browser.conftest import NO_3D, Pages
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+WEBGL = "Boolean(document.createElement('canvas').getContext('webgl2'))"
+
+
+def solid_pixels(page: Any) -> bytes:
+    """The 3D view as drawn, once the pending frame is through."""
+    page.wait_for_timeout(400)
+    return bytes(page.locator(".solid").screenshot())
+
+
+def test_it_draws_in_3d_without_a_word_of_complaint_or_the_network(pages: Pages, report: Path) -> None:
+    page = pages.open(report.as_uri())
+    assert page.evaluate(WEBGL), "the browser has no WebGL: the test would prove nothing"
+    page.wait_for_selector("section.viewer[data-mode=webgl]")
+    assert page.locator(".nogl").is_hidden()
+    assert len(set(solid_pixels(page))) > 100
+    assert pages.said == []
+    assert [url for url in pages.fetched if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert [url for url in pages.fetched if url.startswith("file:")] == [report.as_uri()]
+
+
+def test_the_slider_moves_the_skeleton(pages: Pages, report: Path) -> None:
+    page = pages.open(report.as_uri())
+    page.wait_for_selector("section.viewer[data-mode=webgl]")
+    for layer in ("points", "paths", "keyframes", "cameras"):
+        page.uncheck(f"[data-layer={layer}]")
+    first = solid_pixels(page)
+    assert solid_pixels(page) == first
+    page.locator("#time").focus()
+    page.keyboard.press("End")
+    last = solid_pixels(page)
+    assert last != first
+    page.keyboard.press("Home")
+    assert solid_pixels(page) == first
+    page.uncheck("[data-layer=body]")
+    assert solid_pixels(page) != first
+    assert page.locator("#clock").inner_text() == "5.00 s"
+
+
+def test_the_figures_on_the_page_are_those_of_the_metrics(
+    pages: Pages, report: Path, inputs: ReportInputs
+) -> None:
+    page = pages.open(report.as_uri())
+    assert inputs.metrics is not None
+    found = page.evaluate(
+        "[...document.querySelectorAll('[data-metric]')].map(e => [e.dataset.metric, e.dataset.value])"
+    )
+    assert len(found) > 40
+    for place, value in found:
+        assert float(value) == look_up(inputs.metrics, place)
+    registered = inputs.metrics["total"]["frames_registered"]
+    assert f"{registered:,}" in page.locator(".figures dd").first.inner_text()
+
+
+def test_it_plays_and_obeys_the_keyboard(pages: Pages, report: Path) -> None:
+    from playwright.sync_api import expect
+
+    page = pages.open(report.as_uri())
+    page.wait_for_selector("section.viewer[data-mode=webgl]")
+    page.locator(".solid").focus()
+    page.keyboard.press("Space")
+    assert page.locator("#play").inner_text() == "Pause"
+    expect(page.locator("#clock")).not_to_have_text("5.00 s")
+    page.keyboard.press("Space")
+    assert page.locator("#play").get_attribute("aria-pressed") == "false"
+    step = page.evaluate("bodycap.timeline.step")
+    page.keyboard.press(".")
+    assert page.evaluate("bodycap.timeline.step") == step + 1
+    before = page.evaluate("bodycap.view.orbit.azimuth")
+    page.keyboard.press("ArrowLeft")
+    assert page.evaluate("bodycap.view.orbit.azimuth") != before
+    box = page.locator(".solid").bounding_box()
+    page.mouse.move(box["x"] + 100, box["y"] + 100)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 160, box["y"] + 120)
+    page.mouse.up()
+    assert page.evaluate("bodycap.view.orbit.azimuth") < before
+
+
+def test_everything_can_be_reached_and_has_a_name(pages: Pages, report: Path) -> None:
+    page = pages.open(report.as_uri())
+    nameless = page.evaluate(
+        """[...document.querySelectorAll('button, input, select, svg[role=img], img, [role=application]')]
+        .filter(e => !e.closest('[hidden]') && !e.hidden)
+        .filter(e => !(e.labels?.length || e.getAttribute('aria-label') || e.textContent.trim()
+                       || e.getAttribute('alt'))).map(e => e.outerHTML.slice(0, 80))"""
+    )
+    assert nameless == []
+    reached = set()
+    for _ in range(30):
+        page.keyboard.press("Tab")
+        reached.add(page.evaluate("document.activeElement.id || document.activeElement.className"))
+    assert {"skip", "solid", "play", "time", "camera", "reset"} <= reached
+    assert page.evaluate("document.documentElement.lang") == "en"
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_words_stand_out_from_the_page_in_both_schemes(pages: Pages, report: Path, scheme: str) -> None:
+    page = pages.open(report.as_uri(), color_scheme=scheme)
+    # WCAG 2 relative luminance; 4.5 is its bound for text
+    contrast = page.evaluate(
+        """() => {
+          const pen = document.createElement('canvas').getContext('2d', {willReadFrequently: true});
+          const light = (css) => {
+            pen.clearRect(0, 0, 1, 1); pen.fillStyle = css; pen.fillRect(0, 0, 1, 1);
+            const [r, g, b] = [...pen.getImageData(0, 0, 1, 1).data].slice(0, 3)
+              .map(v => v / 255).map(v => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+            return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+          };
+          const style = getComputedStyle(document.documentElement);
+          const paper = light(style.getPropertyValue('--sheet'));
+          return ['--ink', '--soft', '--accent', '--good', '--fair', '--poor'].map(name => {
+            const ink = light(style.getPropertyValue(name));
+            return (Math.max(ink, paper) + 0.05) / (Math.min(ink, paper) + 0.05);
+          });
+        }"""
+    )
+    assert min(contrast) >= 4.5
+
+
+def test_it_fits_a_phone(pages: Pages, report: Path) -> None:
+    page = pages.open(report.as_uri(), viewport={"width": 360, "height": 740})
+    page.wait_for_selector("section.viewer[data-mode=webgl]")
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+
+
+def test_it_prints_without_its_controls(pages: Pages, report: Path) -> None:
+    page = pages.open(report.as_uri())
+    page.emulate_media(media="print")
+    assert page.locator(".controls").is_hidden()
+    assert page.locator("#verdict").is_visible()
+    assert page.pdf()[:4] == b"%PDF"
+
+
+def test_a_failed_job_says_what_stopped_it(pages: Pages, inputs: ReportInputs, tmp_path: Path) -> None:
+    failure = {"stage": "map", "type": "EstimationError", "message": "no pair to start from", "hint": "walk"}
+    failed = ReportInputs(name="x", cameras=inputs.cameras, selections=inputs.selections, failure=failure)
+    write_report(failed, tmp_path / "report.html", StageContext(work_dir=tmp_path))
+    page = pages.open((tmp_path / "report.html").as_uri())
+    assert "no pair to start from" in page.locator(".failure").inner_text()
+    assert page.locator("section.viewer").count() == 0
+    assert page.locator(".badge.good").count() == 0
+    assert pages.said == []
+
+
+@pytest.mark.parametrize("browser", [NO_3D], indirect=True)
+def test_without_webgl_it_says_so_and_draws_flat(pages: Pages, report: Path) -> None:
+    page = pages.open(report.as_uri())
+    assert not page.evaluate(WEBGL)
+    page.wait_for_selector("section.viewer[data-mode=flat]")
+    assert "no WebGL" in page.locator(".nogl").inner_text()
+    for layer in ("points", "paths", "keyframes", "cameras"):
+        page.uncheck(f"[data-layer={layer}]")
+    first = solid_pixels(page)
+    page.locator("#time").focus()
+    page.keyboard.press("End")
+    assert solid_pixels(page) != first
+    assert pages.said == []
+
+
+def test_uncertainty_is_drawn_where_it_is_known(pages: Pages, inputs: ReportInputs, tmp_path: Path) -> None:
+    write_report(replace(inputs, name="y"), tmp_path / "report.html", StageContext(work_dir=tmp_path))
+    page = pages.open((tmp_path / "report.html").as_uri())
+    known = page.evaluate("Boolean(bodycap.data.body.sigma)")
+    assert page.locator("[data-layer=sigma]").count() == int(known)

@@ -1,0 +1,188 @@
+"""A whole job's results for tests of the report: a walking body, three cameras, a map they saw, no videos."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from bodycap_batch.body import CameraClock
+from bodycap_batch.camera import Camera
+from bodycap_batch.export.inputs import ExportInputs
+from bodycap_batch.export.metrics import collect_metrics
+from bodycap_batch.export.projection import project_motion
+from bodycap_batch.geometry import Similarity, invert, transform_points
+from bodycap_batch.report import ReportInputs
+from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
+from tests.bodies import CAMERAS, merged, reaching
+
+LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
+GAUGE = "map-0"
+WORLD = Similarity(1.0, np.eye(3), np.zeros(3))
+_SEEN = 40
+
+
+def report_inputs(frames: int = 60, points: int = 400, *, lost: slice = slice(20, 25)) -> ReportInputs:
+    """Results of a job of so many frames a camera, `lost` of each without a pose.
+
+    The body walks for the whole length; each registered frame saw up to 40 points of the map.
+    """
+    result, clocks = merged(reaching(frames), world_from_map={GAUGE: WORLD})
+    rng = np.random.default_rng(5)
+    low, high = (
+        result.world_from_joint[..., :3, 3].min((0, 1)),
+        result.world_from_joint[..., :3, 3].max((0, 1)),
+    )
+    cloud = rng.uniform(low - 2.0, high + 2.0, size=(points, 3))
+    paths = tuple(_with_losses(path, lost) for path in result.trajectories)
+    report = {**result.report, **_told(paths)}
+    result = replace(result, trajectories=paths, report=report)
+    found = tuple(_registered(path, cloud, rng) for path in paths)
+    scene = _map(paths, cloud, rng)
+    selections = tuple(_selection(path, rng) for path in paths)
+    export = ExportInputs(
+        out_dir=None,  # type: ignore[arg-type]
+        maps=(scene,),
+        trajectories=tuple(replace(path, gauge=GAUGE) for path in paths),
+        clocks=clocks,
+        selections=selections,
+        merge=result,
+        log={"reach": {"judged": True, "distances": 90, "within_reach": 1.0}},
+    )
+    projected = project_motion(result, clocks) if frames <= 120 else None
+    motion, gap = (None, {}) if projected is None else (projected.motion, projected.gap)
+    return ReportInputs(
+        name="a walk <in> the lab",
+        cameras=tuple(CAMERAS),
+        maps=(scene,),
+        registrations=found,
+        clocks=clocks,
+        selections=selections,
+        merge=result,
+        mounts=result.mounts,
+        metrics=collect_metrics(export, motion, gap),
+    )
+
+
+def clock() -> CameraClock:
+    return CameraClock(nominal_fps=30.0)
+
+
+def _with_losses(path: Trajectory, lost: slice) -> Trajectory:
+    poses, status = path.gauge_from_cam.copy(), [FrameStatus.REGISTERED] * len(path.status)
+    kept = np.ones(len(status), dtype=bool)
+    kept[lost] = False
+    rng = np.random.default_rng(len(path.camera))
+    for index in np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)) & kept):
+        poses[index] = poses[index - 1] if np.isfinite(poses[index - 1]).all() else np.eye(4)
+    poses[~kept] = np.nan
+    for index in np.flatnonzero(~kept):
+        status[index] = FrameStatus.BLUR
+    for index in np.flatnonzero(kept)[::10]:
+        status[index] = FrameStatus.KEYFRAME
+    return replace(
+        path,
+        gauge_from_cam=poses,
+        covariance=np.where(kept[:, None, None], np.eye(6) * 1e-4, np.nan),
+        status=tuple(status),
+        inliers=np.where(kept, 80 + rng.integers(0, 40, len(kept)), 3),
+        error_px=np.where(kept, rng.uniform(0.4, 0.6, len(kept)), np.nan),
+    )
+
+
+def _told(paths: tuple[Trajectory, ...]) -> dict[str, object]:
+    """What merging's own report holds, for these paths."""
+    residual = {"p50": 0.001, "p95": 0.004}
+    mount = {"sigma_deg": 3.0, "sigma_m": 0.01, "from_prior_deg": 8.0, "from_prior_m": 0.02}
+    return {
+        "scale": {"source": "height", "relative_sigma": 0.045},
+        "mounts": {path.camera: {"role": CAMERAS[path.camera], **mount} for path in paths},
+        "cameras": {
+            path.camera: {
+                "measurements": int(path.localised.sum()),
+                "dropped_as_gross_errors": 0,
+                "down_weighted": 1,
+                "residual_m": residual,
+                "residual_deg": {"p50": 0.1, "p95": 0.4},
+                "longest_gap_s": 0.2,
+            }
+            for path in paths
+        },
+        "joint_gap_m": {"LeftHand": {"p50": 0.0002, "p95": 0.0006}},
+        "activity": {"name": "walk", "rules_active": {"Left palm below the shoulder": 0.125}},
+    }
+
+
+def _seen_by(pose: np.ndarray, cloud: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Up to 40 points in the picture and their pixels."""
+    near = transform_points(invert(pose), cloud)
+    px = LENS.project(near)
+    inside = np.flatnonzero((near[:, 2] > 0.2) & (np.abs(px / [640, 480] - 0.5) < 0.5).all(axis=1))
+    chosen = np.sort(rng.permutation(inside)[:_SEEN])
+    return chosen, px[chosen]
+
+
+def _registered(path: Trajectory, cloud: np.ndarray, rng: np.random.Generator) -> Registration:
+    """Tracks name their point as feature of the camera's first keyframe."""
+    first = path.status.index(FrameStatus.KEYFRAME)
+    rows = [
+        (index, *_seen_by(path.gauge_from_cam[index], cloud, rng)) for index in np.flatnonzero(path.localised)
+    ]
+    counts = [len(points) for _, points, _ in rows]
+    features = np.concatenate([points for _, points, _ in rows])
+    return Registration(
+        trajectory=replace(path, gauge=GAUGE),
+        obs_frame=np.repeat([index for index, _, _ in rows], counts),
+        obs_keyframe=np.full(len(features), first),
+        obs_feature=features,
+        obs_px=np.concatenate([px for _, _, px in rows]).astype(np.float32),
+        wanted_keyframes=np.zeros(0, np.int64),
+        tried_keyframes=np.zeros(0, np.int64),
+    )
+
+
+def _map(paths: tuple[Trajectory, ...], cloud: np.ndarray, rng: np.random.Generator) -> Map:
+    """Every keyframe sees its points; a camera's first one sees all, so any track has a feature there."""
+    names, frames, poses, keyframe, point, pixels = [], [], [], [], [], []
+    for path in paths:
+        keys = [index for index, status in enumerate(path.status) if status is FrameStatus.KEYFRAME]
+        for order, index in enumerate(keys):
+            chosen, px = _seen_by(path.gauge_from_cam[index], cloud, rng)
+            if order == 0:
+                chosen, px = np.arange(len(cloud)), np.zeros((len(cloud), 2))
+                px[:] = np.nan_to_num(
+                    LENS.project(transform_points(invert(path.gauge_from_cam[index]), cloud))
+                )
+            keyframe += [len(names)] * len(chosen)
+            point.append(chosen)
+            pixels.append(px)
+            names.append(path.camera)
+            frames.append(index)
+            poses.append(path.gauge_from_cam[index])
+    points = np.concatenate(point)
+    return Map(
+        gauge=GAUGE,
+        cameras=dict.fromkeys(CAMERAS, LENS),
+        keyframe_camera=tuple(names),
+        keyframe_frame=np.array(frames),
+        map_from_cam=np.stack(poses),
+        points=cloud,
+        colors=rng.integers(0, 256, size=cloud.shape).astype(np.uint8),
+        point_error_px=np.full(len(cloud), 0.5),
+        obs_keyframe=np.array(keyframe),
+        obs_point=points,
+        obs_feature=points,
+        obs_px=np.concatenate(pixels),
+    )
+
+
+def _selection(path: Trajectory, rng: np.random.Generator) -> KeyframeSelection:
+    keys = [index for index, status in enumerate(path.status) if status is FrameStatus.KEYFRAME]
+    sharp = np.where(path.localised, 10.0, 3.0) + rng.uniform(0, 1, len(path.status))
+    return KeyframeSelection(
+        camera=path.camera,
+        frames=np.array(keys),
+        frame_count=len(path.status),
+        sharpness=sharp,
+        noise_px=0.4,
+    )

@@ -1,0 +1,191 @@
+"""The report's content: figures, verdict, causes, what a broken-off job gets, and the size."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bodycap_batch.context import StageContext
+from bodycap_batch.report import ReportInputs, write_report
+from bodycap_batch.report.advice import advise, shared_points
+from bodycap_batch.report.losses import Cause, cause_of, find_losses
+from bodycap_batch.report.packing import NONE, Shown, pack_scaled, thinned
+from bodycap_batch.report.pictures import Look, Picture
+from bodycap_batch.report.placing import place
+from bodycap_batch.report.solid import solid_data
+from bodycap_batch.report.tables import look_up
+from bodycap_batch.report.verdict import Grade, judge
+from bodycap_batch.scene import FrameStatus
+from tests.reports import report_inputs
+
+
+@pytest.fixture(scope="module")
+def inputs() -> ReportInputs:
+    return report_inputs()
+
+
+def written(inputs: ReportInputs, folder: Path) -> str:
+    path = folder / "report.html"
+    write_report(inputs, path, StageContext(work_dir=folder))
+    return path.read_text(encoding="utf-8")
+
+
+class Figures(HTMLParser):
+    """Every figure that names its place in metrics.json, and all links to elsewhere."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[tuple[str, str]] = []
+        self.outside: list[str] = []
+        self.tags: Counter[str] = Counter()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        self.tags[tag] += 1
+        if "data-metric" in values:
+            self.found.append((values["data-metric"] or "", values["data-value"] or ""))
+        for name in ("src", "href"):
+            link = values.get(name) or ""
+            if link and not link.startswith(("data:", "#")):
+                self.outside.append(link)
+
+
+def read(text: str) -> Figures:
+    figures = Figures()
+    figures.feed(text)
+    return figures
+
+
+def test_every_figure_is_that_of_the_metrics_and_nothing_is_fetched(
+    inputs: ReportInputs, tmp_path: Path
+) -> None:
+    figures = read(written(inputs, tmp_path))
+    assert len(figures.found) > 40
+    assert inputs.metrics is not None
+    for place_, value in figures.found:
+        assert float(value) == look_up(inputs.metrics, place_), place_
+    assert {"total.frames_registered", "merge.scale.relative_sigma"} <= {name for name, _ in figures.found}
+    assert figures.outside == []
+
+
+def test_the_same_results_give_the_same_bytes(inputs: ReportInputs, tmp_path: Path) -> None:
+    assert written(inputs, tmp_path) == written(inputs, tmp_path)
+
+
+def test_a_name_cannot_break_the_page(inputs: ReportInputs, tmp_path: Path) -> None:
+    text = written(replace(inputs, name="</script><script>alert(1)</script>"), tmp_path)
+    assert "<script>alert" not in text
+    assert "a walk &lt;in&gt; the lab" in written(inputs, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("stage", "keeps"),
+    [
+        ("merge", {"maps", "registrations", "clocks", "selections", "metrics"}),
+        ("map", {"selections"}),
+        ("check", set()),
+    ],
+)
+def test_a_job_that_broke_off_gets_a_page_too(
+    inputs: ReportInputs, tmp_path: Path, stage: str, keeps: set[str]
+) -> None:
+    failure = {"stage": stage, "type": "EstimationError", "message": "too little <parallax>", "hint": "walk"}
+    kept = {name: getattr(inputs, name) for name in keeps}
+    if "metrics" in kept:
+        kept["metrics"] = {k: v for k, v in inputs.metrics.items() if k != "merge"}  # type: ignore[union-attr]
+    text = written(ReportInputs(name="x", cameras=inputs.cameras, failure=failure, **kept), tmp_path)
+    assert "too little &lt;parallax&gt;" in text
+    assert 'class="badge none"' in text
+    assert ('id="viewer-title"' in text) == (stage == "merge")
+    assert 'class="badge good"' not in text or stage == "merge"
+
+
+def test_the_verdict_takes_the_worst_of_its_criteria(inputs: ReportInputs) -> None:
+    assert inputs.metrics is not None
+    metrics = json.loads(json.dumps(inputs.metrics))
+    verdict = judge(metrics, None)
+    # 5 of 60 frames are lost and the scale is known to 4.5 %: both between their bounds.
+    assert (verdict.cameras, verdict.body) == (Grade.FAIR, Grade.FAIR)
+    metrics["total"]["mean_reprojection_error_px"] = 2.5
+    assert judge(metrics, None).cameras is Grade.POOR
+    metrics["merge"]["unused_cameras"] = {"left_palm": "no link"}
+    assert judge(metrics, None).body is Grade.POOR
+    assert judge(None, {"message": "x"}).grade is Grade.NONE
+
+
+def test_losses_are_found_with_what_was_measured_beside_them(inputs: ReportInputs) -> None:
+    losses = find_losses(inputs)
+    assert len(losses) == 3
+    for loss in losses:
+        assert (loss.first, loss.last, loss.frames) == (20, 24, 5)
+        assert loss.reason is FrameStatus.BLUR
+        # sharpness 3 to 4 in lost frames, 10 to 11 in the others
+        assert 0.27 < loss.sharpness < 0.4
+
+
+def test_causes_follow_the_measurements(inputs: ReportInputs) -> None:
+    loss = find_losses(inputs)[0]
+
+    def look(grey: float, corners: int) -> Look:
+        return Look(picture=Picture(index=22, jpeg="", width=1, height=1), grey=grey, corners=corners)
+
+    calm = replace(loss, turn_deg=1.0)
+    tracks = replace(calm, reason=FrameStatus.FEW_TRACKS, sharpness=1.0)
+    assert cause_of(calm, look(10.0, 100), 100.0) is Cause.DARK
+    assert cause_of(replace(loss, turn_deg=20.0), look(90.0, 100), 100.0) is Cause.FAST
+    assert cause_of(calm, look(90.0, 100), 100.0) is Cause.BLUR
+    assert cause_of(tracks, look(90.0, 10), 100.0) is Cause.PLAIN
+    assert cause_of(tracks, look(90.0, 90), 100.0) is Cause.UNKNOWN_PLACE
+    assert cause_of(replace(tracks, sharpness=0.4), None, None) is Cause.BLUR
+
+
+def test_advice_comes_from_what_was_measured(inputs: ReportInputs) -> None:
+    some = advise(inputs, {"torso": Counter({Cause.PLAIN: 30})})
+    assert "posters" in some[0].do
+    assert "30 of torso" in some[0].because
+    assert not any("posters" in each.do for each in advise(inputs, {"torso": Counter({Cause.PLAIN: 1})}))
+    assert any("skeleton" in each.do for each in some)
+
+
+def test_shared_points_count_what_both_cameras_see(inputs: ReportInputs) -> None:
+    counts = shared_points(inputs.maps, inputs.cameras)
+    scene = inputs.maps[0]
+    for index, name in enumerate(inputs.cameras):
+        mine = np.isin(scene.obs_keyframe, scene.keyframes_of(name))
+        assert counts[index, index] == len(np.unique(scene.obs_point[mine]))
+    assert (counts == counts.T).all()
+
+
+def test_packed_numbers_come_back_within_a_step() -> None:
+    values = np.array([[0.0, -3.0], [20.0, np.nan], [7.3, 5.0]])
+    packed = pack_scaled(values)
+    codes = np.frombuffer(__import__("base64").b64decode(packed["u16"]), "<u2").reshape(3, 2)
+    back = np.where(codes == NONE, np.nan, packed["low"] + codes * np.array(packed["step"]))
+    np.testing.assert_allclose(back, values, atol=0.51 * max(packed["step"]))
+
+
+def test_thinning_keeps_the_ends() -> None:
+    assert thinned(5, 10).tolist() == [0, 1, 2, 3, 4]
+    kept = thinned(1001, 11)
+    assert kept.tolist() == list(range(0, 1001, 100))
+
+
+def test_joint_uncertainty_is_shown_where_it_is_known(inputs: ReportInputs) -> None:
+    data = solid_data(inputs, place(inputs), Shown())
+    assert data["body"]["solved"].count(True) == int(inputs.merge.solved.sum())  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("frames", [1000, pytest.param(18_000, marks=pytest.mark.slow)])
+def test_the_page_stays_under_15_mb_at_any_length(frames: int, tmp_path: Path) -> None:
+    long = report_inputs(frames, points=4_000 if frames < 5_000 else 60_000, lost=slice(20, 25))
+    text = written(long, tmp_path)
+    assert len(text.encode()) <= 15_000_000
+    if frames > 5_000:
+        assert re.search(r"To keep it small it shows [\d,]+ of [\d,]+ ", text)
