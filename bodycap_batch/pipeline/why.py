@@ -81,7 +81,7 @@ def explain_job(job: Job, *, out_dir: Path, settings: Settings) -> list[Step]:
 def _follows(stage: str, first: str, job: Job) -> bool:
     """Whether a job has a later stage, and whether that stage uses what the first one gives."""
     if stage == "preview":
-        return job.export.preview and first != "export"
+        return job.export.preview and first not in ("export", "report")
     return stage != "merge" or has_body(job)
 
 

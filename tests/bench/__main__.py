@@ -31,8 +31,8 @@ def main() -> int:
         "only",
         nargs="*",
         help="rows to run, or folders of captures with truth (default: all), `scaling`, `batch`, `spool`, "
-        "`viewer`; `simulation` or `uncertainty` first run the skeleton stage on simulated poses, with options "
-        "of their own",
+        "`viewer`; `simulation` or `uncertainty` first run the skeleton stage on simulated poses, with "
+        "options of their own",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)
