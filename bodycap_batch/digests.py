@@ -15,6 +15,7 @@ from bodycap_batch.errors import CaptureError
 
 _BLOCK_BYTES = 1 << 20
 _SHA256 = re.compile(r"[0-9a-f]{64}")
+_TEMPORARY = re.compile(r"\.(\d+)\.\d+\.part$")
 _SETTLED_S = 1.0
 """A file changed this recently may change again within one tick of the file system's clock."""
 
@@ -43,7 +44,7 @@ def file_sha256(path: Path, on_bytes: Callable[[int], None] | None = None) -> st
 
 def write_atomically(path: Path, data: bytes) -> None:
     """Write a file so that a reader sees the old bytes or the new ones, also after a power cut."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{time.monotonic_ns()}.part")
+    temporary = temporary_beside(path)
     try:
         with temporary.open("wb") as stream:
             stream.write(data)
@@ -52,6 +53,29 @@ def write_atomically(path: Path, data: bytes) -> None:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def temporary_beside(path: Path) -> Path:
+    """A name in the same folder for a file that will be renamed to `path` when it is complete."""
+    return path.with_name(f".{path.name}.{os.getpid()}.{time.monotonic_ns()}.part")
+
+
+def remove_abandoned(folder: Path) -> None:
+    """Remove what killed processes of this machine left beside the files they were writing."""
+    for path in folder.glob(".*.part"):
+        named = _TEMPORARY.search(path.name)
+        if named is not None and not _is_alive(int(named.group(1))):
+            path.unlink(missing_ok=True)
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
 
 
 class FileDigests:

@@ -22,7 +22,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.digests import FileDigests, file_sha256, json_digest, set_digest, write_atomically
+from bodycap_batch.digests import (
+    FileDigests,
+    file_sha256,
+    json_digest,
+    remove_abandoned,
+    set_digest,
+    write_atomically,
+)
 from bodycap_batch.errors import StoreError
 
 MANIFEST = "manifest.json"
@@ -222,6 +229,8 @@ class Store:
         """Remove what killed processes left in the temporary folder; returns how many folders."""
         try:
             folders = list(self._temporary.iterdir())
+            for folder in (self.root / "digests", self.root / "references"):
+                remove_abandoned(folder)
         except OSError:  # the next draft says what is wrong with the folder
             return 0
         return sum(_remove_if_abandoned(folder) for folder in folders)

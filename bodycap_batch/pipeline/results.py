@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.digests import write_atomically
+from bodycap_batch.digests import remove_abandoned, temporary_beside, write_atomically
 from bodycap_batch.store import disk_errors, sync_folder
 
 RUN_FILE = "run.json"
@@ -26,16 +26,19 @@ def publish(files: Mapping[str, Path], folder: Path) -> None:
     Raises:
         StoreError: The folder cannot be written.
     """
-    placed = set[Path]()
+    placed, folders = set[Path](), {folder}
     with disk_errors(folder):
         for name, source in files.items():
             target = folder / name
             target.parent.mkdir(parents=True, exist_ok=True)
+            folders.add(target.parent)
             if not (target.exists() and target.samefile(source)):
                 _place(source, target)
                 placed.add(target.parent)
         for changed in placed:
             sync_folder(changed)
+        for each in folders:
+            remove_abandoned(each)
 
 
 def write_results_file(folder: Path, name: str, text: str) -> None:
@@ -61,8 +64,7 @@ def clear_partial(folder: Path) -> None:
 
 
 def _place(source: Path, target: Path) -> None:
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
-    temporary.unlink(missing_ok=True)
+    temporary = temporary_beside(target)
     try:
         try:
             os.link(source, temporary)

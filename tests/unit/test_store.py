@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from bodycap_batch.digests import FileDigests, file_sha256, json_digest
+from bodycap_batch.digests import FileDigests, file_sha256, json_digest, remove_abandoned
 from bodycap_batch.errors import CaptureError, StoreError
 from bodycap_batch.store import MANIFEST, Artefact, ArtefactKey, Store
 
@@ -231,6 +231,16 @@ def test_a_file_in_the_place_of_the_store_is_named(tmp_path: Path) -> None:
     (tmp_path / "store").write_text("a file")
     with pytest.raises(StoreError, match="store"):
         Store(tmp_path / "store")
+
+
+def test_only_what_dead_processes_left_is_removed(tmp_path: Path) -> None:
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    names = [f".motion.bvh.{dead.pid}.1.part", f".motion.bvh.{os.getpid()}.1.part", ".mine.part", "a.part"]
+    for name in names:
+        (tmp_path / name).touch()
+    remove_abandoned(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names[1:])
 
 
 def test_a_digest_is_remembered_until_the_file_changes(tmp_path: Path) -> None:
