@@ -36,7 +36,9 @@ def report_inputs(frames: int = 60, points: int = 400, *, lost: slice = slice(20
     cloud = rng.uniform(low - 2.0, high + 2.0, size=(points, 3))
     paths = tuple(_with_losses(path, lost) for path in result.trajectories)
     report = {**result.report, **_told(paths)}
-    result = replace(result, trajectories=paths, report=report)
+    spread = np.where(result.solved[:, None, None], np.diag([1e-4, 2e-4, 3e-4]), np.nan)
+    covariance = np.tile(spread, (frames, 1, 1, 1))
+    result = replace(result, trajectories=paths, report=report, joint_covariance_m2=covariance)
     found = tuple(_registered(path, cloud, rng) for path in paths)
     scene = _map(paths, cloud, rng)
     selections = tuple(_selection(path, rng) for path in paths)

@@ -20,6 +20,9 @@ _FORWARD_DEG = 25.0
 _FORWARD_SHARE = 0.6
 _THIN_LINK = 0.03
 _NARROW_DEG = 3.0
+_SCALE_WELL_KNOWN, _MOUNT_WELL_KNOWN_DEG, _ARM_M = 0.02, 4.0, 0.6
+_BETTER = "; to know it better, "
+"""Where merging's sentence about a constant turns to what would help."""
 
 _DO = {
     Cause.DARK: "Switch lights on or film by day, and keep sleeves and straps away from the lens.",
@@ -168,27 +171,27 @@ def _median_triangulation_deg(scene: Map) -> float | None:
 
 
 def _of_body(inputs: ReportInputs) -> Iterator[Advice]:
+    """What the solver itself says would make a constant better known."""
     if inputs.merge is None:
         return
     report: Mapping[str, Any] = inputs.merge.report
     scale = report.get("scale", {})
     sigma = scale.get("relative_sigma")
-    if sigma is not None and sigma > 0.02 and scale.get("source") != "skeleton":
+    if sigma is not None and sigma > _SCALE_WELL_KNOWN and scale.get("source") != "skeleton":
+        _, _, ways = str(scale.get("known_to", "")).partition(_BETTER)
+        skeleton = "give the subject's own skeleton (--skeleton subject.bvh)"
         yield Advice(
-            do="Give the subject's own skeleton (--skeleton subject.bvh)"
-            + ("." if scale.get("source") == "height" else ", or at least the height (--height 1.75)."),
+            do=_sentence(f"{ways}, or {skeleton}" if ways else skeleton),
             because=f"the metric scale rests on the {scale.get('source')} and is known to {sigma:.1%}: "
-            f"{100 * 0.6 * sigma:.1f} cm on the length of an arm",
+            f"{100 * _ARM_M * sigma:.1f} cm on the length of an arm",
             weight=1.1 + sigma,
         )
-    mounts = report.get("mounts", {})
-    loose = {name: mount["sigma_deg"] for name, mount in mounts.items() if mount["sigma_deg"] > 4.0}
-    if loose:
-        worst = max(loose, key=lambda name: loose[name])
-        yield Advice(
-            do="Bend the elbows and turn the trunk and the palms at the start of the take, or measure how "
-            "the cameras sit and state it (joint_from_cam).",
-            because=f"the mount of {worst} is known to {loose[worst]:.0f}° only"
-            + (f", and {len(loose) - 1} more to over 4°" if len(loose) > 1 else ""),
-            weight=1.05,
-        )
+    for name, mount in report.get("mounts", {}).items():
+        known, _, way = str(mount.get("known_to", "")).partition(_BETTER)
+        if way or mount["sigma_deg"] > _MOUNT_WELL_KNOWN_DEG:
+            state = f"state how {name} sits, measured (joint_from_cam)"
+            yield Advice(
+                do=_sentence(f"{way}; or {state}" if way else state),
+                because=known if way else f"the mount of {name} is known to {mount['sigma_deg']:.0f}° only",
+                weight=1.0 + mount["sigma_deg"] / 1000.0,
+            )

@@ -26,9 +26,9 @@ def pack_scaled(values: FloatArray) -> dict[str, Any]:
     """
     values = np.asarray(values, dtype=np.float64)
     finite = np.where(np.isfinite(values), values, np.nan)
-    some = bool(np.isfinite(finite).any())
-    low = np.nanmin(finite, axis=0, initial=np.inf) if some else np.zeros(values.shape[1])
-    high = np.nanmax(finite, axis=0, initial=-np.inf) if some else np.zeros(values.shape[1])
+    low = np.nanmin(finite, axis=0, initial=np.inf)
+    high = np.nanmax(finite, axis=0, initial=-np.inf)
+    low, high = np.where(low <= high, low, 0.0), np.where(low <= high, high, 0.0)
     span = np.where(high > low, high - low, 1.0)
     scaled = np.round((np.nan_to_num(finite) - low) / span * _LEVELS)
     codes = np.where(np.isfinite(finite), np.clip(scaled, 0, _LEVELS), NONE).astype("<u2")

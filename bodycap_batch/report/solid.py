@@ -112,9 +112,9 @@ def _body(merge: MergeResult, shown: Shown) -> dict[str, Any]:
 
 
 def joint_sigma_m(merge: MergeResult) -> FloatArray | None:
-    """(T,J) one-sigma radius of each joint's position, metres; None where the solver did not tell."""
-    sigma = getattr(merge, "joint_sigma_m", None)
-    return None if sigma is None else np.asarray(sigma, dtype=np.float64)
+    """(T,J) sigma per axis of each joint, metres, NaN where unknown; None where the solver told none."""
+    sigma = merge.joint_sigma_m()
+    return sigma if np.isfinite(sigma).any() else None
 
 
 def _view(placed: Placed, merge: MergeResult | None) -> dict[str, Any]:

@@ -90,7 +90,7 @@ def test_the_second_run_says_that_nothing_had_to_be_done(bench: Bench) -> None:
     bench.run("run", "my walk")
     code, out, _ = bench.run("run", "my walk")
     assert code == 0
-    assert "nothing to do, all 9 stages were done before" in out
+    assert "nothing to do, all 10 stages were done before" in out
 
 
 def test_results_elsewhere_have_their_store_beside_them(bench: Bench) -> None:

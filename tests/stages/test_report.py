@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 from collections import Counter
@@ -166,7 +167,7 @@ def test_shared_points_count_what_both_cameras_see(inputs: ReportInputs) -> None
 def test_packed_numbers_come_back_within_a_step() -> None:
     values = np.array([[0.0, -3.0], [20.0, np.nan], [7.3, 5.0]])
     packed = pack_scaled(values)
-    codes = np.frombuffer(__import__("base64").b64decode(packed["u16"]), "<u2").reshape(3, 2)
+    codes = np.frombuffer(base64.b64decode(packed["u16"]), "<u2").reshape(3, 2)
     back = np.where(codes == NONE, np.nan, packed["low"] + codes * np.array(packed["step"]))
     np.testing.assert_allclose(back, values, atol=0.51 * max(packed["step"]))
 
@@ -177,9 +178,16 @@ def test_thinning_keeps_the_ends() -> None:
     assert kept.tolist() == list(range(0, 1001, 100))
 
 
-def test_joint_uncertainty_is_shown_where_it_is_known(inputs: ReportInputs) -> None:
-    data = solid_data(inputs, place(inputs), Shown())
-    assert data["body"]["solved"].count(True) == int(inputs.merge.solved.sum())  # type: ignore[union-attr]
+def test_joint_uncertainty_is_shown_where_it_is_known(inputs: ReportInputs, tmp_path: Path) -> None:
+    assert inputs.merge is not None
+    data = solid_data(inputs, place(inputs), Shown())["body"]
+    codes = np.frombuffer(base64.b64decode(data["sigma"]["u16"]), "<u2").reshape(data["sigma"]["shape"])
+    assert ((codes != NONE) == inputs.merge.solved).all()
+    # the root of the mean variance of 1, 2 and 3 cm2
+    assert data["sigma"]["low"][int(np.argmax(inputs.merge.solved))] == pytest.approx(np.sqrt(2e-4))
+    assert "1.4 cm" in written(inputs, tmp_path)
+    unknown = replace(inputs, merge=replace(inputs.merge, joint_covariance_m2=None))
+    assert solid_data(unknown, place(unknown), Shown())["body"]["sigma"] is None
 
 
 @pytest.mark.parametrize("frames", [1000, pytest.param(18_000, marks=pytest.mark.slow)])
