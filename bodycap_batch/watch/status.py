@@ -6,7 +6,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -30,10 +30,17 @@ class StatusFile:
     Args:
         job: The job's folder.
         before: What was written there earlier.
+        may_write: Asked before each write; False once the job belongs to another watcher.
     """
 
-    def __init__(self, job: JobDir, before: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self,
+        job: JobDir,
+        before: Mapping[str, Any] | None = None,
+        may_write: Callable[[], bool] = lambda: True,
+    ) -> None:
         self._job = job
+        self._may_write = may_write
         self._lock = threading.Lock()
         self._written = 0.0
         now, before = time_text(), before or {}
@@ -110,7 +117,7 @@ class StatusFile:
     def _write(self) -> None:
         self.document["updated_at"] = time_text()
         self._written = time.monotonic()
-        if not self._job.path.is_dir():  # taken over, and filed away by its new owner
+        if not self._job.path.is_dir() or not self._may_write():  # taken over, perhaps filed away already
             return
         temporary = self._job.path / f".status.{os.getpid()}.{threading.get_ident()}.part"
         with disk_errors(self._job.path):
@@ -121,7 +128,8 @@ class StatusFile:
         text = event.what if event.kind == "note" else f"{event.label}: {event.kind}"
         if event.kind == "finished":
             text += f" in {event.seconds:.1f} s"
-        append_log(self._job, text)
+        if self._may_write():
+            append_log(self._job, text)
 
 
 def append_log(job: JobDir, text: str) -> None:

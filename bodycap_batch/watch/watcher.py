@@ -126,7 +126,9 @@ class Watcher:
             return
         drops = drops_in(self._spool.inbox)
         self._complete = collections.deque(self._settling.complete(drops))
-        self._waiting = any(str(drop.path) not in self._refused for drop in drops)
+        names = {str(drop.path) for drop in drops}
+        self._refused = {name: digest for name, digest in self._refused.items() if name in names}
+        self._waiting = bool(names - self._refused.keys())
         now = time.monotonic()
         self._look_at = now + _LOOK_SHARE * (now - started)
 

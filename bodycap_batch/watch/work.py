@@ -72,7 +72,7 @@ class Worker:
         before = read_status(claim.job)
         if before.get("state") in FINAL:  # all was said before its watcher ended, but for the move
             return self._file(claim, before["state"], _told(before), None)
-        status = StatusFile(claim.job, before)
+        status = StatusFile(claim.job, before, claim.guard.holds)
         try:
             if refused is not None:
                 raise refused

@@ -17,11 +17,13 @@ import yaml
 from bodycap_batch.cli import main
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.errors import JobError
+from bodycap_batch.progress import Event
 from bodycap_batch.references import collect_garbage
 from bodycap_batch.store import Store
 from bodycap_batch.watch import cancel_job, retry_job, rows_of
 from bodycap_batch.watch.claim import first_claim, take_over
 from bodycap_batch.watch.spool import JobDir
+from bodycap_batch.watch.status import StatusFile
 from tests.pipeline.fake_stages import ORDERS
 from tests.pipeline.spools import SpoolBench, wait_for
 from tests.pipeline.test_cli import gone
@@ -416,6 +418,20 @@ def test_a_watcher_that_was_suspended_gives_up_when_it_wakes(bench: SpoolBench) 
     assert "another watcher has taken it over" in err
     assert {path: path.stat().st_mtime_ns for path in bench.spool.done.rglob("*")} == before
     assert leftovers(bench) == []
+
+
+def test_an_owner_that_was_replaced_writes_nothing_more(bench: SpoolBench) -> None:
+    job = JobDir(bench.drop("walk").rename(bench.spool.running / "walk"))
+    first = first_claim(job)
+    status = StatusFile(job, None, first.guard.holds)
+    status.change(state="running")
+    status(Event(kind="started", stage="map"))
+    before = {path: path.read_bytes() for path in job.path.rglob("*") if path.is_file() and path != job.owner}
+    assert take_over(job) is not None
+    status(Event(kind="finished", stage="map"))
+    status.change(state="done")
+    status.finish("done", None, bench.spool.done / "walk", bench.spool.inbox)
+    assert {path: path.read_bytes() for path in before} == before
 
 
 def test_only_one_takes_a_job_over(bench: SpoolBench) -> None:

@@ -205,6 +205,21 @@ def test_a_port_in_use_is_named(bench: SpoolBench, page: LivePage) -> None:
         LivePage(bench.spool, page.access, Limits())
 
 
+def test_the_command_serves_the_page_and_ends_with_it(bench: SpoolBench) -> None:
+    process = bench.start("watch", "jobs/inbox", "--web", "127.0.0.1:0")
+    assert process.stderr is not None
+    lines = iter(process.stderr.readline, "")
+    url = next(line.split()[-1] for line in lines if "live page" in line)
+    connection = http.client.HTTPConnection(url.removeprefix("http://").rstrip("/"), timeout=30)
+    connection.request("GET", "/api/events")  # a stream that never ends by itself
+    assert connection.getresponse().status == 200
+    process.terminate()
+    assert process.wait(30) == 143
+    _, err = bench.start("watch", "jobs/inbox", "--web", "0.0.0.0:0").communicate(timeout=60)
+    assert "BODYCAP_WEB_TOKEN" in err
+    assert "Traceback" not in err
+
+
 @pytest.fixture
 def browser() -> Iterator[Any]:
     sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright")
