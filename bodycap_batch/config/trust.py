@@ -39,9 +39,7 @@ class PathPolicy:
         """
         for field, path in _named(job):
             if ".." in path.parts:
-                raise JobError(
-                    f"{path} climbs out of its folder", field=field, hint="a path without `..`, please"
-                )
+                raise JobError(f"{path} climbs out of its folder", field=field, hint=self._hint())
             self.require(base / path, field)
 
     def require_resolved(self, job: Job) -> None:
