@@ -21,7 +21,8 @@ def write_joint_table(path: Path, motion: Motion, sigma_m: FloatArray | None = N
     """Write one line a tick and joint, and return the path.
 
     Common time in seconds; position and orientation (world_from_joint) in the world, rotation in the parent;
-    whether cameras measured the joint; how well its centre is known relative to the root (empty: not known).
+    whether cameras measured the joint; one sigma per axis of its centre relative to the first solved joint's
+    (empty: not known).
 
     Args:
         path: The file.
@@ -34,7 +35,7 @@ def write_joint_table(path: Path, motion: Motion, sigma_m: FloatArray | None = N
     poses = motion.world_from_joint()
     world = continuous_quat_xyzw(poses[..., :3, :3])
     local = continuous_quat_xyzw(motion.local_rotation)
-    numbers = np.concatenate([poses[..., :3, 3], world, local], axis=-1) + 0.0
+    numbers = np.concatenate([poses[..., :3, 3], world, local], axis=-1).round(6) + 0.0
     line = "%s,%s," + "%.6f," * numbers.shape[-1] + "%d,%s\n"
     names = [f'"{name}"' if set(name) & set(',"\n') else name for name in motion.skeleton.joints]
     text = io.StringIO()

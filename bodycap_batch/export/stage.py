@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.body import MergeResult
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.export.inputs import ExportInputs
@@ -46,15 +48,16 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
     """
     require_libraries(options.formats)
     motion, gap = _project(inputs, options)
+    sigma_m = None if inputs.merge is None or motion is None else _sigma_m(inputs.merge, motion)
     steps: dict[str, Callable[[], list[Path]]] = {"tum": lambda: write_trajectories(inputs)}
     if inputs.maps:
         steps |= {"ply": lambda: write_maps(inputs), "colmap": lambda: write_colmap(inputs)}
     steps["csv"] = lambda: [write_frames(inputs.out_dir / "frames.csv", inputs)]
     if motion is not None:
-        steps |= _motion_steps(inputs.out_dir, motion, options)
+        steps |= _motion_steps(inputs.out_dir, motion, options, sigma_m)
         steps["csv"] = lambda: [
             write_frames(inputs.out_dir / "frames.csv", inputs),
-            write_joint_table(inputs.out_dir / "joints.csv", motion),
+            write_joint_table(inputs.out_dir / "joints.csv", motion, sigma_m),
         ]
     steps = {name: write for name, write in steps.items() if name in options.formats}
     steps["metrics"] = lambda: [_write_metrics(inputs, motion, gap)]
@@ -68,7 +71,7 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
 
 
 def _motion_steps(
-    folder: Path, motion: Motion, options: ExportOptions
+    folder: Path, motion: Motion, options: ExportOptions, sigma_m: FloatArray | None
 ) -> dict[str, Callable[[], list[Path]]]:
     """The files of the motion: for animation as it is laid out, for measuring as it was solved."""
     animated, centres = lay_out(motion, options), joint_centres(motion)
@@ -79,8 +82,14 @@ def _motion_steps(
         "usd": lambda: [write_stage(folder / "motion.usd", animated)],
         "c3d": lambda: [write_c3d(folder / "joints.c3d", centres)],
         "trc": lambda: [write_trc(folder / "joints.trc", centres)],
-        "npz": lambda: [write_joint_arrays(folder / "joints.npz", motion)],
+        "npz": lambda: [write_joint_arrays(folder / "joints.npz", motion, sigma_m)],
     }
+
+
+def _sigma_m(merge: MergeResult, motion: Motion) -> FloatArray:
+    """(T,J) how well each exported joint's centre is known, NaN where nothing measured it."""
+    kept = [merge.skeleton.joints.index(name) for name in motion.skeleton.joints]
+    return merge.joint_sigma_m()[:, kept]
 
 
 def _write_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[str, Any]) -> Path:

@@ -243,6 +243,24 @@ def test_further_formats_hold_the_same_joints(tmp_path: Path) -> None:
     assert np.abs(back.root_in_world_m[:, :2]).max() < 1e-6
 
 
+@pytest.mark.parametrize("hierarchy", ["full", "solved"])
+def test_how_well_joints_are_known_is_in_the_tables(tmp_path: Path, hierarchy: str) -> None:
+    inputs = inputs_of(tmp_path)
+    assert inputs.merge is not None
+    hand = inputs.merge.skeleton.index_of_role("LeftHand")
+    covariance = np.full((60, len(inputs.merge.solved), 3, 3), np.nan)
+    covariance[:, hand] = np.diag([1e-4, 4e-4, 7e-4])
+    merge = replace(inputs.merge, joint_covariance_m2=covariance)
+    run(replace(inputs, merge=merge), formats=("csv", "npz"), hierarchy=hierarchy)
+    arrays = np.load(inputs.out_dir / "joints.npz", allow_pickle=False)
+    known = arrays["names"] == "LeftHand"
+    np.testing.assert_allclose(arrays["sigma_m"][:, known], 0.02)
+    assert np.isnan(arrays["sigma_m"][:, ~known]).all()
+    with open(inputs.out_dir / "joints.csv", newline="") as handle:
+        told = {(row["joint"], row["sigma_m"]) for row in csv.DictReader(handle) if row["sigma_m"]}
+    assert told == {("LeftHand", "0.020000")}
+
+
 def test_a_missing_library_is_told_before_anything_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
