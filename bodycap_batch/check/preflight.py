@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera, open_camera
+from bodycap_batch.check.advice import advice_on
 from bodycap_batch.check.files import check_files
 from bodycap_batch.check.pictures import look_at_frames
 from bodycap_batch.check.report import CameraFinding, CheckReport
@@ -52,7 +54,8 @@ def require_ready(job: Job) -> CheckReport:
 
 def check_job(job: Job) -> CheckReport:
     """Check a resolved job: every video opened and looked at, calibration, clocks, skeleton, disk."""
-    return _checked(job, (*_ALWAYS, _check_disk))
+    report = _checked(job, (*_ALWAYS, _check_disk))
+    return replace(report, advice=tuple(advice_on(job, report.cameras))) if report.ready else report
 
 
 def _checked(job: Job, checks: Iterable[Callable[[Job, list[CameraFinding]], list[str]]]) -> CheckReport:
@@ -92,6 +95,7 @@ def _finding(camera: CaptureCamera, config: CameraConfig, notes: list[str]) -> C
         size_px=camera.videos[0].shown_size,
         work_size_px=(camera.camera.width_px, camera.camera.height_px),
         lens=_lens(camera),
+        guessed_lens=not camera.calibrated,
         notes=(
             *camera.notes,
             *notes,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import textwrap
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ from bodycap_batch.config.models import Job
 from bodycap_batch.errors import BodycapError
 
 _MANY_FILES = 3
+_LINE = 100
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,6 +32,7 @@ class CameraFinding:
         work_size_px: Width and height frames are worked at.
         lens: Calibration in words.
         notes: Worth telling, no error.
+        guessed_lens: True where there is no calibration.
     """
 
     name: str
@@ -45,6 +48,7 @@ class CameraFinding:
     work_size_px: tuple[int, int]
     lens: str
     notes: tuple[str, ...] = ()
+    guessed_lens: bool = False
 
     def lines(self) -> list[str]:
         """The finding as a person reads it."""
@@ -77,12 +81,14 @@ class CheckReport:
         cameras: One finding per camera that opened.
         notes: Worth telling about the job as a whole.
         errors: What stops the job.
+        advice: What would make it better; none where something stops it.
     """
 
     job: Job | None = None
     cameras: tuple[CameraFinding, ...] = ()
     notes: tuple[str, ...] = ()
     errors: tuple[BodycapError, ...] = ()
+    advice: tuple[str, ...] = ()
 
     @property
     def ready(self) -> bool:
@@ -99,6 +105,15 @@ class CheckReport:
         out = [line for camera in self.cameras for line in camera.lines()]
         out += [f"note: {note}" for note in self.notes]
         out += [f"problem: {error}" for error in self.errors]
+        for number, sentence in enumerate(self.advice, start=1):
+            mark = f"advice {number}: "
+            out += textwrap.wrap(
+                sentence,
+                _LINE,
+                initial_indent=mark,
+                subsequent_indent=" " * len(mark),
+                break_on_hyphens=False,
+            )
         if self.ready:
             out.append("ready to run" if self.cameras else "nothing stands in the way")
         else:
@@ -113,4 +128,5 @@ class CheckReport:
             "cameras": [dataclasses.asdict(camera) for camera in self.cameras],
             "notes": list(self.notes),
             "errors": [error.to_dict() for error in self.errors],
+            "advice": list(self.advice),
         }

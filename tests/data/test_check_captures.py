@@ -17,5 +17,9 @@ def test_a_right_capture_raises_no_alarm(data_root: Path, tmp_path: Path, name: 
     report = check_path(data_root / name, Overrides(out=tmp_path / "out"))
     assert report.ready
     notes = [note for camera in report.cameras for note in camera.notes]
-    # A palm buried in the own body is black for a while in room131: that one is worth telling.
-    assert [note for note in notes if "are black" not in note] == []
+    # room131's palms are buried in the own body for a while and see little but ceiling, and lose a third of
+    # their frames by it: that is worth telling.
+    hard = ("are black", "hold on to") if name == "room131" else ()
+    assert [note for note in notes if not any(word in note for word in hard)] == []
+    if hard:
+        assert {note for note in notes if "hold on to" in note}

@@ -27,8 +27,8 @@ LENS = {"model": "PINHOLE", "params": [40, 40, 32, 24], "width": 64, "height": 4
 def walk(tmp_path: Path) -> Path:
     """Two cameras, 2.5 s each."""
     root = tmp_path / "walk"
-    for name in ("torso", "left_palm"):
-        write_video(root / f"{name}.mp4", FRAMES)
+    write_video(root / "torso.mp4", FRAMES)
+    write_video(root / "left_palm.mp4", [frame[:, ::-1] for frame in FRAMES])
     (root / "calib.json").write_text(json.dumps(LENS))
     return root
 

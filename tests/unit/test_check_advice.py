@@ -1,0 +1,96 @@
+"""What `check` advises: tied to what the files show, and silent where there is nothing to say."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bodycap_batch.check import check_path
+from bodycap_batch.config.job import Overrides
+from tests.videos import write_video
+
+LENS = {"model": "PINHOLE", "params": [300, 300, 160, 120], "width": 320, "height": 240}
+
+
+def room(seed: int, *, brightness: float = 1.0, texture: bool = True) -> np.ndarray:
+    """A picture with hundreds of corners, or a wall."""
+    rng = np.random.default_rng(seed)
+    coarse = (
+        rng.integers(60, 220, (24, 32)) if texture else np.full((24, 32), 120) + rng.integers(0, 9, (24, 32))
+    )
+    return np.kron(brightness * coarse, np.ones((10, 10))).astype(np.uint8)
+
+
+def walk(
+    folder: Path, pictures: Callable[[int], np.ndarray] = room, *, frames: int = 75, fps: int = 30
+) -> Path:
+    write_video(folder / "torso.mp4", [room(index // 25) for index in range(75)], gop=5)
+    write_video(folder / "head.mp4", [pictures(7 + index // 25) for index in range(frames)], gop=5, fps=fps)
+    (folder / "calib.json").write_text(json.dumps(LENS))
+    return folder
+
+
+def advice(folder: Path, height_m: float | None = None) -> str:
+    report = check_path(folder, Overrides(height_m=height_m))
+    assert report.ready
+    return "\n".join(report.advice)
+
+
+def test_hand_started_cameras_are_asked_for_their_clap(tmp_path: Path) -> None:
+    assert "clap" in advice(walk(tmp_path))
+    (tmp_path / "job.yaml").write_text(
+        "capture:\n  calibration: calib.json\n  cameras:\n"
+        "    - {name: torso, video: torso.mp4}\n    - {name: head, video: head.mp4, offset_s: 0.2}\n"
+    )
+    assert advice(tmp_path / "job.yaml") == "", "nothing to say"
+
+
+def test_a_guessed_lens_and_a_bare_height_are_worth_a_word(tmp_path: Path) -> None:
+    walk(tmp_path)
+    assert "board" not in advice(tmp_path)
+    (tmp_path / "calib.json").unlink()
+    assert "the lens of head and torso will be estimated" in advice(tmp_path)
+    assert "--skeleton" in advice(tmp_path, height_m=1.75)
+
+
+def test_a_camera_that_ends_early_or_runs_slowly_is_named(tmp_path: Path) -> None:
+    walk(tmp_path, frames=30, fps=15)
+    assert "head runs at 15 frames a second" in advice(tmp_path)
+    write_video(tmp_path / "torso.mp4", [room(index // 25) for index in range(180)], gop=5)
+    assert "head ends 4.0 s before the others" in advice(tmp_path)
+
+
+def test_a_long_capture_says_what_it_will_cost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bodycap_batch.check.advice._LONG_S", 4.0)
+    assert "5 s of video in all: expect 1 to 1 minutes" in advice(walk(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("pictures", "said"),
+    [
+        (lambda seed: room(seed, texture=False), "hardly anything to hold on to"),
+        (lambda seed: room(seed, brightness=0.25), "dark pictures (median grey 3"),
+    ],
+)
+def test_bare_and_dark_pictures_are_told_of_that_camera_only(
+    tmp_path: Path, pictures: Callable[[int], np.ndarray], said: str
+) -> None:
+    head, torso = check_path(walk(tmp_path, pictures)).cameras
+    assert said in "\n".join(head.notes)
+    assert "hold on" not in "\n".join(torso.notes)
+    assert "dark" not in "\n".join(torso.notes)
+
+
+def test_advice_is_wrapped_and_numbered_and_in_the_json(tmp_path: Path) -> None:
+    (walk(tmp_path) / "calib.json").unlink()
+    report = check_path(tmp_path)
+    lines = report.lines()
+    assert any(line.startswith("advice 1: ") for line in lines)
+    assert any(line.startswith("advice 2: ") for line in lines)
+    assert report.to_dict()["advice"] == list(report.advice)
+    (tmp_path / "head.mp4").write_bytes(b"")
+    assert check_path(tmp_path).advice == (), "first things first"
