@@ -37,6 +37,7 @@ test: $(VENV)/.dev ## run the fast tests
 
 .PHONY: test-slow
 test-slow: $(VENV)/.dev ## run the slow tests and those on real captures
+	.ci/system-packages --browser
 	$(PYTEST) --dist loadfile -m "slow or data" --durations=20 $(ARGS)
 
 .PHONY: test-cluster

@@ -18,6 +18,7 @@ from bodycap_batch.cli import (
     skeleton,
     spool,
     synth,
+    view,
     watch,
     why,
 )
@@ -38,6 +39,7 @@ __all__ = [
     "skeleton",
     "spool",
     "synth",
+    "view",
     "watch",
     "why",
 ]

@@ -1,0 +1,92 @@
+"""A job's results as a recording for the Rerun viewer (``.rrd``)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray
+from bodycap_batch.errors import JobError, StoreError
+from bodycap_batch.formats.bvh import read_bvh
+from bodycap_batch.formats.tum import read_tum
+from bodycap_batch.skeleton import Motion
+
+
+def write_recording(results: Path, target: Path) -> None:
+    """Read a folder of results and write them as one recording: points, camera paths, moving skeleton.
+
+    Args:
+        results: Folder with ``map.ply``, ``trajectories`` and ``motion.bvh``; what is missing is left out.
+        target: The ``.rrd`` file.
+
+    Raises:
+        JobError: rerun-sdk is not installed, or the folder holds no results.
+        StoreError: The file cannot be written.
+    """
+    try:
+        import rerun as rr
+    except ImportError as error:
+        raise JobError(
+            "rerun-sdk is not installed", hint="install the extra: pip install 'bodycap_batch[viewer]'"
+        ) from error
+    paths = sorted((results / "trajectories").glob("*.tum"))
+    cloud = results / "map.ply"
+    if not paths and not cloud.is_file():
+        raise JobError("no results to record", path=results, hint="name the folder of a finished job")
+    stream = rr.RecordingStream("bodycap")
+    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    if cloud.is_file():
+        points, colours = _cloud(cloud)
+        stream.log(
+            "world/map", rr.Points3D(points, colors=colours, radii=rr.Radius.ui_points(1.5)), static=True
+        )
+    for path in paths:
+        _log_path(stream, path)
+    if (results / "motion.bvh").is_file():
+        motion = read_bvh(results / "motion.bvh")[1]
+        if motion is not None:
+            _log_motion(stream, motion)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        stream.save(target)
+    except OSError as error:
+        raise StoreError(
+            f"cannot be written: {error}", path=target, hint="name another file with --rerun"
+        ) from error
+
+
+def _cloud(path: Path) -> tuple[FloatArray, FloatArray]:
+    import open3d as o3d
+
+    cloud = o3d.io.read_point_cloud(path)
+    return np.asarray(cloud.points), np.asarray(cloud.colors)
+
+
+def _log_path(stream: object, path: Path) -> None:
+    import rerun as rr
+    from scipy.spatial.transform import Rotation
+
+    assert isinstance(stream, rr.RecordingStream)
+    found = read_tum(path)
+    name = f"world/cameras/{path.stem}"
+    centres = found.world_from_cam[:, :3, 3]
+    stream.log(f"{name}/path", rr.LineStrips3D([centres]), static=True)
+    quats = Rotation.from_matrix(found.world_from_cam[:, :3, :3]).as_quat()
+    stream.send_columns(
+        f"{name}/now",
+        indexes=[rr.TimeColumn("time", duration=found.times_ns * 1e-9)],
+        columns=rr.Transform3D.columns(translation=centres, quaternion=quats),
+    )
+    stream.log(f"{name}/now", rr.TransformAxes3D(0.1), static=True)
+
+
+def _log_motion(stream: object, motion: Motion) -> None:
+    import rerun as rr
+
+    assert isinstance(stream, rr.RecordingStream)
+    centres = motion.world_from_joint()[..., :3, 3]
+    bones = [(int(parent), joint) for joint, parent in enumerate(motion.skeleton.parents) if parent >= 0]
+    for tick, time_ns in enumerate(motion.times_ns()):
+        stream.set_time("time", duration=float(time_ns) * 1e-9)
+        stream.log("world/body", rr.LineStrips3D([centres[tick, pair] for pair in map(list, bones)]))

@@ -1,0 +1,162 @@
+"""The report with the job's real videos, served on this machine alone."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from dataclasses import dataclass
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bodycap_batch.capture import Capture
+from bodycap_batch.capture.cameras import CaptureCamera
+from bodycap_batch.errors import StoreError
+
+LOOPBACK = "127.0.0.1"
+_TYPES = {".mp4": "video/mp4", ".m4v": "video/mp4", ".mov": "video/mp4", ".mkv": "video/x-matroska"}
+_TYPES |= {".webm": "video/webm", ".avi": "video/x-msvideo"}
+_RANGE = re.compile(r"bytes=(\d+)-(\d*)")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Served:
+    """What may be asked for, and nothing else.
+
+    Attributes:
+        files: File by address, ``/report.html`` among them.
+        videos: What ``/videos.json`` answers: by camera, each chapter's address with the common time and
+            the time in the file of every frame.
+    """
+
+    files: dict[str, Path]
+    videos: dict[str, list[dict[str, Any]]]
+
+
+def what_to_serve(report: Path, capture: Capture) -> Served:
+    """The report and the videos of a capture, each under an address of its own."""
+    files, videos = {"/report.html": report}, {}
+    for number, camera in enumerate(capture.cameras):
+        chapters = _chapters(camera)
+        for index, chapter in enumerate(chapters):
+            chapter["url"] = f"video/{number}/{index}"
+            files[f"/{chapter['url']}"] = camera.chapters[index]
+        videos[camera.name] = [chapter for chapter in chapters if chapter["common"]]
+    return Served(files=files, videos=videos)
+
+
+def make_server(served: Served, port: int = 0) -> ThreadingHTTPServer:
+    """A server on the loopback address; port 0 takes a free one.
+
+    Raises:
+        StoreError: The port is taken.
+    """
+
+    class Handler(_Handler):
+        content = served
+
+    try:
+        return ThreadingHTTPServer((LOOPBACK, port), Handler)
+    except OSError as error:
+        raise StoreError(
+            f"port {port} cannot be used: {error.strerror}", hint="name another one with --port"
+        ) from error
+
+
+def _chapters(camera: CaptureCamera) -> list[dict[str, Any]]:
+    """By chapter, common time and time in the file of each used frame, seconds."""
+    common = camera.common_times_ns() * 1e-9
+    out, first = [], 0
+    for video in camera.videos:
+        numbers = camera.frame_numbers - first
+        mine = (numbers >= 0) & (numbers < len(video.pts))
+        seconds = (video.pts[numbers[mine]] - video.pts[0]) * float(video.time_base)
+        # The middle of a frame's time: at its very start a player may still show the one before.
+        half = 0.5 / video.fps if video.fps else 0.0
+        out.append(
+            {
+                "common": np.round(common[mine], 5).tolist(),
+                "container": np.round(seconds + half, 5).tolist(),
+            }
+        )
+        first += len(video.pts)
+    return out
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers GET and HEAD for known addresses, with byte ranges: players seek by them."""
+
+    content: Served
+    protocol_version = "HTTP/1.1"
+
+    def do_GET(self) -> None:
+        """Answer with the content."""
+        self._answer(body=True)
+
+    def do_HEAD(self) -> None:
+        """Answer without it."""
+        self._answer(body=False)
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the name the base class gives it
+        """Keep quiet."""
+
+    def _answer(self, *, body: bool) -> None:
+        # Another page's name can be made to point at this machine: only the machine's own names are served.
+        host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
+        if host not in (LOOPBACK, "localhost"):
+            self.send_error(HTTPStatus.FORBIDDEN)
+            return
+        address = self.path.partition("?")[0]
+        if address == "/videos.json":
+            self._send_text(json.dumps(self.content.videos), body=body)
+        elif address in self.content.files:
+            self._send_file(self.content.files[address], body=body)
+        else:
+            self.send_error(HTTPStatus.NOT_FOUND)
+
+    def _send_text(self, text: str, *, body: bool) -> None:
+        data = text.encode()
+        self._begin(HTTPStatus.OK, "application/json", len(data))
+        if body:
+            self.wfile.write(data)
+
+    def _send_file(self, path: Path, *, body: bool) -> None:
+        try:
+            stream = path.open("rb")
+        except OSError:
+            self.send_error(HTTPStatus.NOT_FOUND)
+            return
+        with stream:
+            size = path.stat().st_size
+            kind = _TYPES.get(path.suffix.lower(), "text/html; charset=utf-8")
+            wanted = _RANGE.fullmatch(self.headers.get("Range", ""))
+            if wanted is None:
+                self._begin(HTTPStatus.OK, kind, size)
+                if body:
+                    shutil.copyfileobj(stream, self.wfile)
+                return
+            start = int(wanted[1])
+            stop = min(int(wanted[2] or size - 1), size - 1) + 1
+            if start >= stop:
+                self.send_error(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE)
+                return
+            self._begin(HTTPStatus.PARTIAL_CONTENT, kind, stop - start, f"bytes {start}-{stop - 1}/{size}")
+            stream.seek(start)
+            left = stop - start if body else 0
+            while left and (part := stream.read(min(left, 1 << 18))):
+                self.wfile.write(part)
+                left -= len(part)
+
+    def _begin(self, status: HTTPStatus, kind: str, length: int, content_range: str = "") -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(length))
+        self.send_header("Accept-Ranges", "bytes")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        if content_range:
+            self.send_header("Content-Range", content_range)
+        self.end_headers()
