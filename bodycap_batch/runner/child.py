@@ -147,8 +147,9 @@ class _DiskWatch:
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         if isinstance(error, OSError) and error.errno in DISK_ERRORS:
             raise store_error(error, self._store.root) from error
-        unexplained = isinstance(error, Exception) and not isinstance(error, BodycapError)
-        if unexplained and self._store.free_bytes() < FULL_DISK_BYTES:
+        # A writer that met the full disk knows its own file, but not that the folder is the store's.
+        other = isinstance(error, Exception) and not isinstance(error, BodycapError)
+        if (other or isinstance(error, StoreError)) and self._store.free_bytes() < FULL_DISK_BYTES:
             raise disk_full(self._store.root) from error
 
 
