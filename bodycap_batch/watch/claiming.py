@@ -35,9 +35,10 @@ def claim_drop(
         StoreError: The drop cannot be moved.
     """
     place = JobDir(spool.running / f"{CLAIM_PREFIX}{uuid.uuid4().hex}")
-    place.path.mkdir()
-    claim = first_claim(place)
     try:
+        spool.running.mkdir(exist_ok=True)  # somebody may have tidied up
+        place.path.mkdir()
+        claim = first_claim(place)
         error = _prepare(place, drop, look, terms)
         if not _take(place, drop, look, terms):
             shutil.rmtree(place.path)

@@ -184,7 +184,7 @@ def move(
         try:
             os.rename(source, target)
         except OSError as error:
-            if error.errno not in _TAKEN:
+            if error.errno not in _TAKEN or not os.path.lexists(target):
                 raise
         else:
             return target

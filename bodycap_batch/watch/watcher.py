@@ -51,7 +51,7 @@ class Watcher:
         self._onlooker = Onlooker(options.stale_s)
         self._worker = Worker(spool, options, self._stop)
         self._running: dict[Future[Outcome], Claim] = {}
-        self._refused: dict[str, str] = {}
+        self._refused: dict[str, tuple[str, float]] = {}
         self._complete: collections.deque[tuple[Drop, Look]] = collections.deque()
         self._waiting = False
         self._look_at = 0.0
@@ -127,7 +127,7 @@ class Watcher:
         drops = drops_in(self._spool.inbox)
         self._complete = collections.deque(self._settling.complete(drops))
         names = {str(drop.path) for drop in drops}
-        self._refused = {name: digest for name, digest in self._refused.items() if name in names}
+        self._refused = {name: told for name, told in self._refused.items() if name in names}
         self._waiting = bool(names - self._refused.keys())
         now = time.monotonic()
         self._look_at = now + _LOOK_SHARE * (now - started)
@@ -140,15 +140,17 @@ class Watcher:
         future.add_done_callback(lambda _: self._woken.set())
 
     def _claim(self, drop: Drop, look: Look) -> tuple[Claim, BodycapError | None] | None:
-        """Claim a drop; one that cannot be moved is told once, and tried again when it changes."""
-        if self._refused.get(str(drop.path)) == look.digest:
+        """Claim a drop; one that cannot be moved is told once, and tried again later or when it changes."""
+        digest, until = self._refused.get(str(drop.path), ("", 0.0))
+        if digest == look.digest and time.monotonic() < until:
             return None
         try:
             return claim_drop(self._spool, drop, look, self._options.terms)
         except StoreError as error:
-            self._refused[str(drop.path)] = look.digest
+            self._refused[str(drop.path)] = (look.digest, time.monotonic() + self._options.stale_s)
             self._worst = max(self._worst, error.exit_code)
-            self._tell(f"{drop.name}: cannot be taken out of the inbox: {error}")
+            if digest != look.digest:
+                self._tell(f"{drop.name}: cannot be taken out of the inbox: {error}")
             return None
 
     def _orphans(self, most: int) -> list[Claim]:

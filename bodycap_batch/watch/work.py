@@ -157,6 +157,7 @@ class Worker:
                 status.finish(state, error, target, self._spool.inbox)
 
         before = claim.job.result
+        folder.mkdir(exist_ok=True)  # cleared away by somebody who has taken the results
         target = move(claim.job.path, folder, claim.job.name, last_word)
         move_references(self._store, before, JobDir(target).result)
         clear_claim(JobDir(target))

@@ -221,6 +221,50 @@ def test_names_that_are_no_text_are_refused(bench: SpoolBench) -> None:
     assert os.path.lexists(retry_job(bench.spool, "walk _"))
 
 
+def test_folders_that_were_cleared_away_are_made_again(bench: SpoolBench) -> None:
+    watcher = bench.watcher()
+    shutil.rmtree(bench.spool.done)
+    shutil.rmtree(bench.spool.running)
+    bench.drop("walk")
+    assert watcher.run() == 0, bench.told
+    assert bench.job("walk").path == bench.spool.done / "walk"
+
+
+def test_a_job_that_cannot_be_filed_away_is_told_and_filed_later(bench: SpoolBench) -> None:
+    bench.drop("walk")
+    watcher = bench.watcher(stale_s=1.0, once=False)
+    bench.spool.done.rmdir()
+    bench.spool.done.write_text("a file where a folder should be")
+    thread = threading.Thread(target=watcher.run)
+    thread.start()
+    try:
+        wait_for(lambda: any(line.startswith("walk: stuck") for line in bench.told))
+        assert (bench.spool.running / "walk" / "result" / "metrics.json").is_file()
+        bench.spool.done.unlink()
+        wait_for((bench.spool.done / "walk" / "status.json").is_file)
+    finally:
+        watcher.stop()
+        thread.join()
+
+
+def test_a_drop_that_cannot_be_taken_is_told_once_and_tried_again(bench: SpoolBench) -> None:
+    bench.drop("walk")
+    watcher = bench.watcher(stale_s=1.0, once=False)
+    shutil.rmtree(bench.spool.running)
+    bench.spool.running.write_text("a file where a folder should be")
+    thread = threading.Thread(target=watcher.run)
+    thread.start()
+    try:
+        wait_for(lambda: len(bench.told) > 0)
+        assert "cannot be taken" in bench.told[0]
+        bench.spool.running.unlink()
+        wait_for((bench.spool.done / "walk").is_dir)
+        assert sum("cannot be taken" in line for line in bench.told) == 1
+    finally:
+        watcher.stop()
+        thread.join()
+
+
 def test_what_is_no_job_stays_in_the_inbox_and_is_told(bench: SpoolBench) -> None:
     (bench.spool.inbox / "torso.mp4").write_text("a video without a folder")
     (bench.spool.inbox / ".hidden").mkdir()
