@@ -13,7 +13,7 @@ from bodycap_batch.cli.base import app
 @app.command()
 def init(
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="A folder of videos.", exists=True, file_okay=False)
+        Path, typer.Argument(metavar="FOLDER", help="A folder of videos.")
     ],
     force: Annotated[bool, typer.Option("--force", help="Write over a job file that is there.")] = False,
 ) -> None:
