@@ -96,15 +96,17 @@ class Place:
         process.communicate()
 
     def content(self) -> dict[str, bytes]:
-        """Results, and the digest of what each artefact holds."""
+        """Results, and the digest of what each artefact holds; the report tells of durations."""
         found = {
             path.relative_to(self.out).as_posix(): path.read_bytes()
             for path in sorted(self.out.rglob("*"))
             if path.is_file()
-            and path.name not in ("run.json", "job.yaml")
+            and path.name not in ("run.json", "job.yaml", "report.html")
             and not {"logs", ".store"} & set(path.relative_to(self.out).parts)
         }
         for path in self.manifests():
+            if path.parts[-3] == "report":
+                continue
             found[path.parent.relative_to(self.store).as_posix()] = json.loads(path.read_text())[
                 "digest"
             ].encode()
