@@ -12,9 +12,7 @@ from bodycap_batch.cli.base import app
 
 @app.command()
 def init(
-    folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="A folder of videos.")
-    ],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="A folder of videos.")],
     force: Annotated[bool, typer.Option("--force", help="Write over a job file that is there.")] = False,
 ) -> None:
     """Write a commented job.yaml for the videos found in a folder.
