@@ -20,6 +20,10 @@ _FOLDER = "references"
 _LOCK = "in-use"
 
 
+class StoreBusy(StoreError):
+    """The store is in use in a way that leaves no room for this; trying again later helps."""
+
+
 class References:
     """The artefacts one folder of results was made from.
 
@@ -143,7 +147,7 @@ def _locked(store: Store, kind: int, refusal: str, hint: str) -> Iterator[None]:
         try:
             fcntl.flock(handle, kind | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise StoreError(refusal, path=store.root, hint=hint) from None
+            raise StoreBusy(refusal, path=store.root, hint=hint) from None
         yield
     finally:
         os.close(handle)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from bodycap_batch.errors import BodycapError, Cancelled, JobError, StoreError, error_from_dict
 from bodycap_batch.pipeline import Settings, run_job
-from bodycap_batch.references import move_references
+from bodycap_batch.references import StoreBusy, move_references
 from bodycap_batch.store import Store
 from bodycap_batch.watch.claim import Claim, clear_claim
 from bodycap_batch.watch.intake import read_job, rewrite_results
@@ -79,6 +79,8 @@ class Worker:
             self._run(claim, status)
         except Cancelled as error:
             return self._interrupted(claim, status, error)
+        except StoreBusy as error:  # `bodycap gc` is at work: seconds
+            return self._leave(claim, status, error)
         except BodycapError as error:
             return self._end(claim, status, "failed", error)
         except Exception as error:  # noqa: BLE001 - the one place where a job's bugs are caught
@@ -132,11 +134,16 @@ class Worker:
         if claim.job.cancel.exists():
             error = Cancelled("cancelled; finished stages are kept", hint=f"`bodycap retry {name}` goes on")
             return self._end(claim, status, "cancelled", error)
+        return self._leave(claim, status, error)
+
+    def _leave(self, claim: Claim, status: StatusFile, error: BodycapError) -> Outcome:
+        """Leave the job where it is, for the next watcher or a later look of this one."""
         status.change(state="stopped", active={})
         claim.release()
-        return Outcome(
-            name=name, state="stopped", exit_code=error.exit_code, message="goes on at the next start"
+        message = (
+            "goes on at the next start" if isinstance(error, Cancelled) else f"goes on later: {error.message}"
         )
+        return Outcome(name=claim.job.name, state="stopped", exit_code=error.exit_code, message=message)
 
     def _end(self, claim: Claim, status: StatusFile, state: State, error: BodycapError | None) -> Outcome:
         if error is not None:

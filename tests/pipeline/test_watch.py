@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
@@ -219,6 +220,21 @@ def test_names_that_are_no_text_are_refused(bench: SpoolBench) -> None:
     assert "torso \\udcfe.mp4 is no UTF-8 text" in bench.status("other")["error"]["message"]
     assert main(["status"]) == 0
     assert os.path.lexists(retry_job(bench.spool, "walk _"))
+
+
+def test_a_job_waits_while_the_store_is_cleaned(bench: SpoolBench) -> None:
+    bench.drop("walk")
+    watcher = bench.watcher(once=False)
+    thread = threading.Thread(target=watcher.run)
+    with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
+        fcntl.flock(cleaning, fcntl.LOCK_EX)
+        thread.start()
+        wait_for(lambda: any("goes on later" in line for line in bench.told))
+    try:
+        wait_for((bench.spool.done / "walk").is_dir)
+    finally:
+        watcher.stop()
+        thread.join()
 
 
 def test_folders_that_were_cleared_away_are_made_again(bench: SpoolBench) -> None:
