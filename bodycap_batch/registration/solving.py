@@ -23,8 +23,8 @@ _POINT_VARIANCE = 6.0
 Without it and with 3, 6, 9: walk131 0.65, 0.59, 0.55, 0.55 cm; room131 3.1, 3.0, 2.9, 2.9; walk12 0.38 for
 all; room12 0.55, 0.55, 0.56, 0.56."""
 _UNCONFIRMED_WEIGHT = 0.01
-"""Weight of points that nothing confirms. With 1, 0.1, 0.03, 0.003: room131 1.86, 1.46, 1.42, 1.36 cm; a
-rendered capture with textured sleeves in view 1.00, 1.00, 0.78, 0.75 cm."""
+"""Weight of points that nothing confirms. With 1, 0.1, 0.03, 0.01: room131 1.86, 1.39, 1.38, 1.36 cm; a
+rendered capture with textured sleeves in view 1.00, 0.72, 0.61, 0.58 cm; room12 0.58, 0.60, 0.61, 0.61 cm."""
 _LEAST_CONFIRMED = 6
 """Confirmed inliers without which a pose is that of the wearer's sleeve."""
 _LONE_EVIDENCE = 4
