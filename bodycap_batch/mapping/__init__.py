@@ -16,6 +16,7 @@ from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import EstimationError
+from bodycap_batch.mapping.confirmed import drop_unconfirmed
 from bodycap_batch.mapping.consistency import require_consistent
 from bodycap_batch.mapping.convert import to_map
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, add_keyframes, image_ids
@@ -103,6 +104,7 @@ def build_map(
             context=context,
         )
         models[0], log["repair"] = repair(models[0], tried, shop)
+        log["unconfirmed_points"] = _without_unconfirmed(models, shop, capture)
     _require_coverage(models, len(refs), log.get("initial_candidates", ladder), options)
     write_models(workspace, models)
     given = {number: name for name, number in cameras.items() if capture.camera(name).calibrated}
@@ -112,6 +114,18 @@ def build_map(
     verdict = check_reach(result.maps[0], _common_ns(capture), reach).to_log() if reach else None
     require_consistent(log["repair"]["contradicted_share"], verdict)
     return replace(result, log={**result.log, "reach": verdict})
+
+
+def _without_unconfirmed(models: Sequence[Any], shop: Workshop, capture: Capture) -> int:
+    """Take unconfirmed points out of models, in place, and adjust what is left; how many."""
+    times_ns = _common_ns(capture)
+    total = 0
+    for model in models:
+        dropped = drop_unconfirmed(model, times_ns)
+        if dropped:
+            refine(model, shop.settings(), shop.constant)
+        total += dropped
+    return total
 
 
 def _starts(
@@ -198,8 +212,10 @@ def extend_map(
         model, names = cut_doubtful(place_again(model, inside, shop, len(known) + len(new)), shop)
         models.append(model)
         cut += names
+    dropped = _without_unconfirmed(models, shop, capture)
     write_models(workspace, models)
-    entry = {"new_keyframes": len(new), "placed_again": len(doubted), "cut": cut, **linked}
+    told = {"placed_again": len(doubted), "cut": cut, "unconfirmed_points": dropped}
+    entry = {"new_keyframes": len(new), **told, **linked}
     growth = [*previous.log.get("growth", []), entry]
     log = {**previous.log, "keyframes": len(known) + len(new), "growth": growth}
     return _result(models, workspace, log)

@@ -18,12 +18,13 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import JobError
 from bodycap_batch.geometry import align_points, invert, make_transform, so3_exp
+from bodycap_batch.mapping.confirmed import drop_unconfirmed
 from bodycap_batch.mapping.consistency import Link, doubtful, links_of
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, image_ids, write_image
 from bodycap_batch.mapping.initial import named_start, rank_starts
 from bodycap_batch.mapping.matching import match_pairs
 from bodycap_batch.mapping.repair import Workshop, cut_doubtful, place_again, repair
-from bodycap_batch.mapping.solve import mapper_options, reconstruct
+from bodycap_batch.mapping.solve import mapper_options, reconstruct, refine
 
 _LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
 _LENSES = {"cam": (_LENS, True)}
@@ -162,6 +163,25 @@ def test_keyframes_are_placed_again_against_the_rest(
     placed = place_again(wrong, {ids[frame] for frame in _MOVED}, shop, _KEYFRAMES)
     assert placed.num_reg_images() == _KEYFRAMES
     assert _rms(placed, poses) < 0.01
+
+
+def test_points_of_a_moment_are_dropped_where_others_carry_the_keyframes(
+    built: tuple[Any, FloatArray, Workshop, set[Any]],
+) -> None:
+    model, poses, shop, _ = built
+    seen_ns = np.arange(_KEYFRAMES) * 300_000_000
+    some = pycolmap.Reconstruction(model)
+    before = {image: some.image(image).num_points3D for image in some.reg_image_ids()}
+    dropped = drop_unconfirmed(some, {"cam": seen_ns})
+    assert 0 < dropped == model.num_points3D() - some.num_points3D()
+    # Points seen in keyframes more than three apart are confirmed; all others that can be spared are gone.
+    for image in some.reg_image_ids():
+        assert some.image(image).num_points3D >= min(20, before[image])
+    refine(some, shop.settings(), shop.constant)
+    assert _rms(some, poses) < 0.01
+    assert drop_unconfirmed(pycolmap.Reconstruction(model), {"cam": seen_ns * 10}) == 0
+    # All in one moment: nothing is confirmed, so nothing can be spared.
+    assert drop_unconfirmed(pycolmap.Reconstruction(model), {"cam": seen_ns // 100}) == 0
 
 
 def _with_moved_block(model: Any, ids: dict[int, int]) -> Any:
