@@ -20,6 +20,11 @@ BEGIN, END = "<!-- errors: made by `python -m tests.error_table --write` -->", "
 CODES = {"JobError": 2, "CaptureError": 3, "EstimationError": 4, "StoreError": 5}
 CODES |= {"Problem": 2, "error": 2}
 """Also what a job's rules find, and what the BVH parser says of a line."""
+DEFAULT_REMEDY = {
+    "Problem": "what the field means is printed with it",
+    "error": "export the skeleton again as BVH, or take a preset: `skeleton: upper_body`",
+}
+"""What these say where the code gives no remedy of its own."""
 
 
 @dataclass(frozen=True, order=True)
@@ -67,8 +72,9 @@ def _in_module(tree: ast.Module, where: str) -> Iterator[Message]:
             position = 1 if called == "Problem" else 0
             named = {word.arg: word.value for word in node.keywords}
             hint = named.get("hint", node.args[2] if called == "Problem" and len(node.args) > 2 else None)
+            remedy = _remedies(hint, known) or DEFAULT_REMEDY.get(called, "")
             for text in _texts(node.args[position], known):
-                yield Message(CODES[called], text, _remedies(hint, known), f"{where}:{node.lineno}")
+                yield Message(CODES[called], text, remedy, f"{where}:{node.lineno}")
 
 
 def _assigned(function: ast.AST) -> dict[str, ast.expr]:

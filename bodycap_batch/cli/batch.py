@@ -163,7 +163,11 @@ def _prioritised(jobs: Sequence[Path], priorities: Sequence[str]) -> list[BatchJ
     for text in priorities:
         name, _, number = text.rpartition("=")
         if Path(name) not in jobs or not number.lstrip("-").isdigit():
-            raise JobError(f"{text!r} is no JOB=NUMBER of a job of this batch", field="--priority")
+            raise JobError(
+                f"{text!r} is no JOB=NUMBER of a job of this batch",
+                field="--priority",
+                hint="as in --priority monday.yaml=5, with the job as it stands on the command line",
+            )
         known[Path(name)] = int(number)
     return [BatchJob(path=path, priority=known.get(path, 0)) for path in jobs]
 

@@ -100,7 +100,8 @@ def _more(settings: list[str]) -> dict[str, Any]:
         try:
             found[key.strip()] = yaml.safe_load(value)
         except yaml.YAMLError as error:
-            raise JobError(f"no value: {value!r}", field=f"--set {key}") from error
+            hint = "a number, a word, or a list in brackets"
+            raise JobError(f"no value: {value!r}", field=f"--set {key}", hint=hint) from error
     return found
 
 

@@ -111,7 +111,7 @@ def evaluate_motion(estimate: Path, truth: Path, options: MotionOptions | None =
     found = _read_truth(Path(truth))
     _, motion = read_bvh(estimate)
     if motion is None:
-        raise JobError("no frames in the file", path=estimate)
+        raise JobError("no frames in the file", path=estimate, hint="give the motion.bvh of a result")
     return _score(_from_motion(motion), found, options or MotionOptions())
 
 
@@ -124,7 +124,7 @@ def _read_truth(path: Path) -> _Joints:
     if path.suffix.lower() != ".npz":
         _, motion = read_bvh(path)
         if motion is None:
-            raise JobError("no frames in the file", path=path)
+            raise JobError("no frames in the file", path=path, hint="give a BVH file with its motion")
         return _from_motion(motion)
     try:
         with np.load(path, allow_pickle=False) as content:

@@ -57,7 +57,9 @@ def relative_camera_error(
     options = options or TrajectoryOptions()
     for name in (camera, reference):
         if name not in estimates or name not in truths:
-            raise JobError(f"camera {name!r} has no estimate or no truth")
+            raise JobError(
+                f"camera {name!r} has no estimate or no truth", hint="name a camera that both folders hold"
+            )
     times = estimates[camera].times_ns
     columns = [
         (estimates[camera].world_from_cam, np.ones(len(times), dtype=bool)),

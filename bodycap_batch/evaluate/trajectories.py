@@ -165,7 +165,10 @@ def score_trajectories(
         raise JobError(f"no truth for camera {', '.join(missing)}", hint=hint)
     empty = sorted(name for name in estimates if len(truths[name].times_ns) == 0)
     if empty:
-        raise JobError(f"the truth of camera {', '.join(empty)} holds no poses")
+        raise JobError(
+            f"the truth of camera {', '.join(empty)} holds no poses",
+            hint="a TUM file: time tx ty tz qx qy qz qw",
+        )
     pairs = {name: _pair(estimates[name], truths[name], options) for name in sorted(estimates)}
     alignment = _align(pairs, options.align)
     counts = frames or {}

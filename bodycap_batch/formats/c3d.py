@@ -80,7 +80,9 @@ def read_c3d(path: Path) -> Points:
     try:
         content = ezc3d.c3d(str(path))
     except (OSError, RuntimeError, ValueError) as error:
-        raise JobError(f"cannot be read as C3D: {error}", path=path) from error
+        raise JobError(
+            f"cannot be read as C3D: {error}", path=path, hint="run the job again; it writes the file anew"
+        ) from error
     group = content["parameters"]["POINT"]
     return Points(
         names=tuple(group["LABELS"]["value"]),

@@ -85,7 +85,12 @@ def _parse(path: Path, number: int, words: list[str]) -> tuple[int, list[float]]
     except (ValueError, InvalidOperation, OverflowError):
         raise JobError("not a number", path=path, line=number, hint=f"a line holds: {_COLUMNS}") from None
     if not np.isfinite(row).all() or abs(time_ns) >= 2**63:
-        raise JobError("NaN, infinity or a time out of range", path=path, line=number)
+        raise JobError(
+            "NaN, infinity or a time out of range",
+            path=path,
+            line=number,
+            hint="leave frames without a pose out",
+        )
     if np.linalg.norm(row[3:]) < 1e-6:
         raise JobError("the quaternion is zero", path=path, line=number, hint="order: qx qy qz qw")
     return time_ns, row

@@ -161,10 +161,10 @@ def read_usd(path: Path) -> Motion:
     try:
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
-        raise JobError("cannot be read as USD", path=path) from error
+        raise JobError("cannot be read as USD", path=path, hint="give the motion.usd of a result") from error
     skeleton, animation = UsdSkel.Skeleton.Get(stage, _SKELETON), UsdSkel.Animation.Get(stage, _MOTION)
     if not skeleton or not animation:
-        raise JobError("holds no skeleton with its motion", path=path)
+        raise JobError("holds no skeleton with its motion", path=path, hint="give the motion.usd of a result")
     frames = [float(frame) for frame in range(round(stage.GetEndTimeCode()) + 1)]
     tokens = list(animation.GetJointsAttr().Get())
     parents = [tokens.index(t.rpartition("/")[0]) if "/" in t else -1 for t in tokens]

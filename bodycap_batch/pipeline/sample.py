@@ -66,7 +66,10 @@ def _key(options: Mapping[str, Any], folder: Path, digests: FileDigests) -> Arte
         motion = digests.sha256(checked.motion) if checked.motion else None
     except OSError as error:
         field = "capture.synthetic.motion"
-        raise JobError(f"cannot be read: {error.strerror}", path=checked.motion, field=field) from error
+        hint = "the path of a BVH file, relative to the job"
+        raise JobError(
+            f"cannot be read: {error.strerror}", path=checked.motion, field=field, hint=hint
+        ) from error
     return key_of("synth", checked.model_dump(mode="json"), {"motion": motion})
 
 

@@ -26,6 +26,9 @@ from bodycap_batch.preview.viewpoint import Viewpoint, follow
 
 _BODY_REACH_M = 1.05
 """From the hips to what has to be seen: head, and a hand stretched out."""
+_PATH_PIECES = 1500
+"""A path is drawn in at most about twice so many pieces, however long the video."""
+_UNIX_S = 1e8
 _STROKES = "solid: measured · dashed: inferred"
 _DOTS = "dots: map points, green where they fit, red where not"
 
@@ -168,7 +171,8 @@ class _Room:
         room.draw_cloud(image, view, self.cloud)
         for tile in self.tiles:
             poses, frame = tile.poses(), int(tile.frames[index])
-            room.draw_path(image, view, poses[: frame + 1, :3, 3], tile.colour)
+            stride = max(1, len(poses) // _PATH_PIECES)
+            room.draw_path(image, view, poses[: frame + 1 : stride, :3, 3], tile.colour)
             if frame >= 0 and np.isfinite(poses[frame]).all():
                 room.draw_camera(image, view, poses[frame], self.camera_size, tile.colour)
         bones = None if self.body is None else self.body.at(now)
@@ -205,7 +209,10 @@ def _write_lines(image: room.Picture, inputs: PreviewInputs, timeline: Timeline,
     """Time and speed above the room; what the strokes mean below it."""
     seconds = timeline.times_ns[index] * 1e-9
     speed = "" if timeline.speed <= 1.001 else f"   shown {timeline.speed:.1f}× faster"
-    start = write(image, f"{seconds:.2f} s", (14, 30), size=20)
+    since = seconds - timeline.times_ns[0] * 1e-9
+    # Clocks that count from 1970 are shown from the start.
+    text = f"+{since:.2f} s" if seconds > _UNIX_S else f"{seconds:.2f} s"
+    start = write(image, text, (14, 30), size=20)
     write(image, speed, (start, 30), GREY, 16)
     if inputs.note:
         write(image, shortened(inputs.note, ROOM_WIDTH - 28), (14, 52), AMBER)

@@ -17,6 +17,18 @@ def test_the_table_holds_the_errors_of_the_code() -> None:
     assert {message.code for message in messages()} == set(CODES.values())
 
 
+WITHOUT_REMEDY = {
+    "holds a …, not a …",  # a store mixed up by hand; `run` rebuilds it
+    "no joint plays …",  # refused earlier, with the joints there are
+    "… are one keyframe",  # two init_frames of the same place
+}
+
+
+def test_every_error_says_what_to_do() -> None:
+    bare = [f"{each.where}: {each.text}" for each in messages() if not each.remedy]
+    assert not [line for line in bare if line.partition(": ")[2] not in WITHOUT_REMEDY]
+
+
 def test_the_readme_lists_them_all() -> None:
     readme = README.read_text(encoding="utf-8")
     if BEGIN not in readme:

@@ -29,10 +29,16 @@ def read_glb(path: Path | str) -> Motion:
     try:
         document = gl.GLTF2.load_binary(str(path))
         if document is None or len(document.skins) != 1 or len(document.animations) != 1:
-            raise JobError("holds no single skin with a single animation", path=path)
+            raise JobError(
+                "holds no single skin with a single animation",
+                path=path,
+                hint="give the motion.glb of a result",
+            )
         return _motion(document, Path(path).stem)
     except (OSError, struct.error, ValueError, LookupError, TypeError, AttributeError) as error:
-        raise JobError(f"cannot be read as GLB: {error}", path=path) from error
+        raise JobError(
+            f"cannot be read as GLB: {error}", path=path, hint="give the motion.glb of a result"
+        ) from error
 
 
 def _motion(document: Any, name: str) -> Motion:
