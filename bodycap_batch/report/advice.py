@@ -72,10 +72,6 @@ def advise(inputs: ReportInputs, lost: Mapping[str, Counter[Cause]]) -> list[Adv
         lost: Lost frames by camera and cause.
     """
     found = [*_of_losses(inputs, lost), *_of_overlap(inputs), *_of_motion(inputs), *_of_body(inputs)]
-    if inputs.failure is not None and inputs.failure.get("hint"):
-        found.append(
-            Advice(do=_sentence(str(inputs.failure["hint"])), because="the error says so", weight=9.0)
-        )
     return sorted(found, key=lambda each: -each.weight)
 
 

@@ -55,7 +55,7 @@ def page_content(
         "advice": advise(inputs, causes_by_camera(lost)),
         "tables": tables_of(inputs),
         "placed": placed,
-        "has_solid": bool(placed.paths or placed.maps or inputs.merge is not None),
+        "has_solid": placed.drawn,
         "has_body": inputs.merge is not None,
         "cameras": _cameras(inputs, lost, tones),
         "causes": {cause.value: words for cause, words in _CAUSES.items()},

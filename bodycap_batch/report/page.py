@@ -45,7 +45,7 @@ def render(context: Mapping[str, Any], data: Mapping[str, Any]) -> str:
         **context,
         style=(folder / "style.css").read_text(encoding="utf-8"),
         script="\n".join((folder / name).read_text(encoding="utf-8") for name in _SCRIPTS),
-        library=library(),
+        library=library() if context["has_solid"] else "",
         library_name=f"{LIBRARY} {metadata.version(LIBRARY)}",
         data=json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
     )

@@ -47,6 +47,11 @@ class Placed:
     paths: tuple[PlacedPath, ...]
     left_out: tuple[str, ...]
 
+    @property
+    def drawn(self) -> bool:
+        """True where there is anything to draw."""
+        return bool(self.maps or self.paths)
+
 
 def place(inputs: ReportInputs) -> Placed:
     """Bring maps and camera paths into one frame."""

@@ -38,7 +38,7 @@ def solid_data(inputs: ReportInputs, placed: Placed, shown: Shown) -> dict[str, 
         "colours": pack_bytes(colours),
         "paths": [_path(path, share, shown) for path in placed.paths],
         "body": None if inputs.merge is None else _body(inputs.merge, shown),
-        "view": _view(placed, inputs.merge),
+        "view": _view(placed, inputs.merge, points),
     }
 
 
@@ -117,7 +117,7 @@ def joint_sigma_m(merge: MergeResult) -> FloatArray | None:
     return sigma if np.isfinite(sigma).any() else None
 
 
-def _view(placed: Placed, merge: MergeResult | None) -> dict[str, Any]:
+def _view(placed: Placed, merge: MergeResult | None, points: FloatArray) -> dict[str, Any]:
     """Where to look from the start."""
     centres = _centres(placed)
     if merge is not None:
@@ -125,5 +125,8 @@ def _view(placed: Placed, merge: MergeResult | None) -> dict[str, Any]:
     if len(centres) == 0:
         return {"centre": [0.0, 0.0, 0.0], "radius": 1.0}
     low, high = np.percentile(centres, [2, 98], axis=0)
-    radius = max(0.6 * float(np.linalg.norm(high - low)), 1.2 if placed.metric else 1e-6)
-    return {"centre": [round(float(v), 4) for v in 0.5 * (low + high)], "radius": round(radius, 6)}
+    middle = 0.5 * (low + high)
+    room = np.percentile(np.linalg.norm(points - middle, axis=1), 75) if len(points) else 0.0
+    walked = 0.6 * float(np.linalg.norm(high - low))
+    radius = max(walked, 0.55 * float(room), 1.2 if placed.metric else 1e-6)
+    return {"centre": [round(float(value), 4) for value in middle], "radius": round(radius, 6)}

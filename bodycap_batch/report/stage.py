@@ -45,7 +45,7 @@ def write_report(inputs: ReportInputs, path: Path, context: StageContext) -> Non
         "name": inputs.name,
         "tones": tones,
         "solid": solid_data(inputs, placed, shown),
-        "pictures": _pictures(inputs, shown, context),
+        "pictures": _pictures(inputs, shown, context) if placed.drawn else [],
     }
     context.progress(1, 3, "figures")
     content = page_content(inputs, placed, lost, tones, shown)
