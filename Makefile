@@ -46,7 +46,7 @@ test-cluster: $(VENV)/.dev ## run jobs on a Dask scheduler and workers of this m
 
 .PHONY: test-blender
 test-blender: $(VENV)/.dev $(BLENDER)/.ready ## import the results into Blender; pictures in build/blender
-	BODYCAP_BLENDER=$(CURDIR)/$(BLENDER)/bin/python OMP_NUM_THREADS=1 \
+	BODYCAP_BLENDER=$(abspath $(BLENDER))/bin/python OMP_NUM_THREADS=1 \
 		$(BIN)/python -m pytest -m blender tests/blender $(ARGS)
 
 .PHONY: lint

@@ -6,7 +6,7 @@ joint's frame is aligned with the world in the zero pose.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,6 +28,8 @@ class SkeletonModel:
         roles: (J,) the anatomical (HumanIK) name of each joint, "" where it has none.
         bvh_channels: (J,) channel names as a file gave them, or () for the default order.
         tpose_rotation: (J,3,3) parent_from_joint rotations of the T-pose, where the zero pose is another one.
+        file_rotation: (J,3,3) how each joint of the file stands in this zero pose, where it is the file's
+            T-pose and not its zero pose (`in_tpose`).
     """
 
     name: str
@@ -38,14 +40,16 @@ class SkeletonModel:
     roles: tuple[str, ...]
     bvh_channels: tuple[tuple[str, ...], ...]
     tpose_rotation: FloatArray | None = None
+    file_rotation: FloatArray | None = None
 
     def __post_init__(self) -> None:
         count = len(self.joints)
         set_array(self, "parents", (count,), np.int64)
         set_array(self, "offsets_m", (count, 3))
         set_array(self, "end_offsets_m", (count, 3), finite=False)
-        if self.tpose_rotation is not None:
-            set_array(self, "tpose_rotation", (count, 3, 3))
+        for name in ("tpose_rotation", "file_rotation"):
+            if getattr(self, name) is not None:
+                set_array(self, name, (count, 3, 3))
         if len(self.roles) != count or len(self.bvh_channels) != count:
             raise ValueError("roles and bvh_channels need one entry per joint")
         if count == 0 or self.parents[0] != -1 or (self.parents[1:] >= np.arange(1, count)).any():
@@ -160,6 +164,39 @@ def rest_pose(skeleton: SkeletonModel) -> FloatArray:
         height = -float(min(tips[:, 2].min(), pose[:, 2, 3].min()))
     pose[:, 2, 3] += height
     return pose
+
+
+def in_tpose(skeleton: SkeletonModel) -> SkeletonModel:
+    """The same body with its T-pose as zero pose; `as_in_file` leads a motion of it back."""
+    if skeleton.tpose_rotation is None:
+        return skeleton
+    world: FloatArray = rest_pose(skeleton)[:, :3, :3]
+    above = np.concatenate([np.eye(3)[None], world[skeleton.parents[1:]]])
+    return replace(
+        skeleton,
+        offsets_m=np.einsum("jab,jb->ja", above, skeleton.offsets_m),
+        end_offsets_m=np.einsum("jab,jb->ja", world, skeleton.end_offsets_m),
+        tpose_rotation=None,
+        file_rotation=world,
+    )
+
+
+def as_in_file(motion: Motion) -> Motion:
+    """The same motion on the rig as its file has it, where that has another zero pose."""
+    skeleton = motion.skeleton
+    world = skeleton.file_rotation
+    if world is None:
+        return motion
+    above = np.concatenate([np.eye(3)[None], world[skeleton.parents[1:]]])
+    back = np.swapaxes(above, -1, -2)
+    rig = replace(
+        skeleton,
+        offsets_m=np.einsum("jab,jb->ja", back, skeleton.offsets_m),
+        end_offsets_m=np.einsum("jba,jb->ja", world, skeleton.end_offsets_m),
+        tpose_rotation=back @ world,
+        file_rotation=None,
+    )
+    return replace(motion, skeleton=rig, local_rotation=back @ motion.local_rotation @ world)
 
 
 def _chained(skeleton: SkeletonModel, parent_from_joint: FloatArray) -> FloatArray:

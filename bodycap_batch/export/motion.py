@@ -124,4 +124,5 @@ def _subset(skeleton: SkeletonModel, kept: BoolArray) -> SkeletonModel:
         end_offsets_m=ends[chosen],
         roles=tuple(skeleton.roles[joint] for joint in chosen),
         bvh_channels=tuple(skeleton.bvh_channels[joint] for joint in chosen),
+        tpose_rotation=None if skeleton.tpose_rotation is None else skeleton.tpose_rotation[chosen],
     )

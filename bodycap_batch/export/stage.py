@@ -24,7 +24,7 @@ from bodycap_batch.formats.fbx import write_fbx
 from bodycap_batch.formats.files import write_text
 from bodycap_batch.formats.needs import require_libraries
 from bodycap_batch.formats.trc import write_trc
-from bodycap_batch.skeleton import Motion
+from bodycap_batch.skeleton import Motion, as_in_file
 
 
 def export_results(inputs: ExportInputs, options: ExportOptions, context: StageContext) -> tuple[Path, ...]:
@@ -104,7 +104,7 @@ def _project(inputs: ExportInputs, options: ExportOptions) -> tuple[Motion | Non
     if inputs.merge is None:
         return None, {}
     projection = project_motion(inputs.merge, inputs.clocks, inputs.row_fraction)
-    motion = projection.motion
+    motion = as_in_file(projection.motion)
     if options.hierarchy == "solved":
         motion = only_solved(motion, inputs.merge.solved)
     return motion, dict(projection.gap)

@@ -51,9 +51,12 @@ def _place_above(skeleton: SkeletonModel, first: Bone, out: FloatArray, placed: 
     trunk = out[:, first.joint].copy()
     trunk[:, :3, :3] = trunk[:, :3, :3] @ first.mean_rotation.T
     pelvis = make_transform(_upright_facing(trunk[:, :3, :3]), np.zeros(3))
+    # Joints that play no role (helpers, mostly without length) stay at zero: they turn with their parent.
+    last = len(chain) - 1
+    bending = [step for step in range(1, len(chain)) if skeleton.roles[chain[step]] or step == last]
     for step in range(1, len(chain)):
         child, joint = chain[step - 1], chain[step]
-        share = np.full(len(out), step / (len(chain) - 1))
+        share = np.full(len(out), (np.searchsorted(bending, step) + 1) / len(bending))
         rotation = interpolate_pose(trunk, pelvis, share)[:, :3, :3]
         centre = out[:, child, :3, 3] - rotation @ skeleton.offsets_m[child]
         out[:, joint] = make_transform(rotation, centre)

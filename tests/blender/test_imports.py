@@ -60,7 +60,9 @@ class Seen:
         return np.array([self.report["rest"][name] for name in self.report["joints"]])
 
     def order(self, motion: Motion) -> list[int]:
-        return [self.report["joints"].index(name) for name in motion.skeleton.joints]
+        # Blender names bones by USD's tokens, which allow no colon.
+        known = [name.replace(":", "_") for name in self.report["joints"]]
+        return [known.index(name.replace(":", "_")) for name in motion.skeleton.joints]
 
     def joint_poses(self, motion: Motion) -> np.ndarray:
         """(T,J,4,4) world_from_joint in our convention: unturned at rest, without the file's scale."""

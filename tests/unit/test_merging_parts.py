@@ -342,6 +342,16 @@ def test_the_rest_of_the_body_stands_under_a_leaning_chest():
         assert_allclose(offset, skeleton.offsets_m[joint], atol=1e-9)
 
 
+def test_helpers_of_a_rig_stay_at_zero_under_a_leaning_chest():
+    plain = load_skeleton("upper_body", 1.75)
+    roles = tuple("" if role == "Spine" else role for role in plain.roles)
+    skeleton = replace(plain, roles=roles)
+    lean = make_transform(so3_exp([[0.3, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.225]]))
+    joints, _ = complete_body(skeleton, graph_bones(skeleton, ("Spine1",)), lean[:, None])
+    hips, helper = 0, plain.roles.index("Spine")
+    assert_allclose(joints[0, helper, :3, :3], joints[0, hips, :3, :3], atol=1e-12)
+
+
 def test_observed_needs_a_camera_or_cameras_on_both_sides():
     skeleton = load_skeleton("upper_body", 1.75)
     bones = graph_bones(skeleton, PAPER)

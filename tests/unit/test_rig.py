@@ -14,7 +14,7 @@ from bodycap_batch.errors import JobError
 from bodycap_batch.formats.bvh import RigOptions, read_bvh, read_rig, write_bvh
 from bodycap_batch.formats.bvh.mapping import direction_words, joint_lines, missing_roles, warnings
 from bodycap_batch.geometry import so3_exp
-from bodycap_batch.skeleton import Motion, SkeletonModel, rest_pose
+from bodycap_batch.skeleton import Motion, SkeletonModel, as_in_file, in_tpose, rest_pose
 from bodycap_batch.skeleton_presets import bone_vector, load_skeleton, nominal_mount, segment_axes
 from tests.bodies import reaching
 
@@ -131,3 +131,28 @@ def test_a_rig_with_a_t_pose_keeps_its_file_layout(tmp_path: Path) -> None:
     )
     assert first == second
     assert rig.tpose_rotation is not None
+
+
+def test_a_motion_solved_in_the_t_pose_goes_back_into_the_file(tmp_path: Path) -> None:
+    """Solved on a body whose zero pose is the T-pose, written on the rig as the file has it."""
+    write_bvh(tmp_path / "rig.bvh", folded())
+    rig, _ = read_rig(tmp_path / "rig.bvh", RigOptions(tpose_frame=1))
+    body = in_tpose(rig)
+    plain = load_skeleton("upper_body", 1.75)
+    np.testing.assert_allclose(body.offsets_m[1:], plain.offsets_m[1:], atol=1e-6)
+    np.testing.assert_allclose(rest_pose(body)[:, :3, :3], np.broadcast_to(np.eye(3), (21, 3, 3)))
+    solved = replace(reaching(20), skeleton=body)
+    back = as_in_file(solved)
+    np.testing.assert_allclose(back.skeleton.offsets_m, rig.offsets_m, atol=1e-12)
+    assert back.skeleton.file_rotation is None
+    ours, theirs = solved.world_from_joint(), back.world_from_joint()
+    np.testing.assert_allclose(theirs[..., :3, 3], ours[..., :3, 3], atol=1e-9)
+    # what nothing measured rests in the T-pose
+    assert rig.tpose_rotation is not None
+    leg = rig.roles.index("LeftLeg")
+    np.testing.assert_allclose(
+        back.local_rotation[:, leg], np.tile(rig.tpose_rotation[leg], (20, 1, 1)), atol=1e-9
+    )
+    write_bvh(tmp_path / "out.bvh", back)
+    first, second = ((tmp_path / name).read_text().partition("MOTION")[0] for name in ("rig.bvh", "out.bvh"))
+    assert first == second
