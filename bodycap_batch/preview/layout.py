@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from math import sqrt
 
 WIDTH, HEIGHT = 1280, 720
 ROOM_WIDTH = 660
@@ -32,7 +33,8 @@ def place_videos(aspects: Sequence[float]) -> list[tuple[Box, Box]]:
         aspects: Width over height of each video; the first gets a row of its own where that fits.
     """
     layouts = [_rows(aspects, ends) for ends in _partitions(len(aspects))]
-    return max(layouts, key=lambda boxes: sum(box.width * box.height for box, _ in boxes), default=[])
+    # Lengths, not areas, are summed: one large picture is not worth many that are too small to read.
+    return max(layouts, key=lambda boxes: sum(sqrt(box.width * box.height) for box, _ in boxes), default=[])
 
 
 def _partitions(count: int) -> list[tuple[int, ...]]:
@@ -40,7 +42,13 @@ def _partitions(count: int) -> list[tuple[int, ...]]:
     if count > _FREELY:
         return [tuple(sorted({*range(row, count, row), count})) for row in range(2, count + 1)]
     inner = range(1, count)
-    return [(*cuts, count) for size in range(count) for cuts in combinations(inner, size)]
+    ways = [(*cuts, count) for size in range(count) for cuts in combinations(inner, size)]
+    # No row is shorter than the one above it: the first video is never smaller than another.
+    return [ends for ends in ways if _lengths(ends) == sorted(_lengths(ends))]
+
+
+def _lengths(ends: tuple[int, ...]) -> list[int]:
+    return [end - start for start, end in zip((0, *ends[:-1]), ends, strict=True)]
 
 
 def _rows(aspects: Sequence[float], ends: tuple[int, ...]) -> list[tuple[Box, Box]]:

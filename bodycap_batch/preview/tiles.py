@@ -102,7 +102,9 @@ def draw_tile(image: Picture, tile: Tile, shown: Picture | None, frame: int, bod
     name = shortened(tile.camera.name, tile.bar.width // 2)
     start = write(image, name, (base[0] + 14, base[1])) + 10
     room = tile.bar.x + tile.bar.width - start
-    text = shortened(text, room)
+    text = next(
+        (each for each in (text, text.partition(",")[0]) if width_of(each) < room), shortened(text, room)
+    )
     write(image, text, (start + room - width_of(text) - 2, base[1]), colour)
 
 

@@ -70,6 +70,9 @@ def test_three_videos_are_one_large_over_two() -> None:
     first, second, third = (picture for picture, _ in place_videos([4 / 3] * 3))
     assert first.width > 1.9 * second.width
     assert second.y == third.y > first.y + first.height
+    five = [picture for picture, _ in place_videos([4 / 3] * 5)]
+    assert min(picture.width for picture in five) > 200, "none too small to read"
+    assert five[0].width > 1.9 * five[1].width, "the first is the largest"
     assert place_videos([]) == []
     assert isinstance(first, Box)
 
