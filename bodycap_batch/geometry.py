@@ -158,6 +158,12 @@ class Similarity:
             self.apply(source_from_body[..., :3, 3]),
         )
 
+    def after(self, first: Similarity) -> Similarity:
+        """Return this transform applied to what `first` gives."""
+        return Similarity(
+            self.scale * first.scale, self.rotation @ first.rotation, self.apply(first.translation)
+        )
+
     def inverse(self) -> Similarity:
         """Return source_from_target."""
         rotation = self.rotation.T

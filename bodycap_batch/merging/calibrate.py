@@ -26,8 +26,8 @@ from bodycap_batch.merging.graph import (
     read_mount,
 )
 from bodycap_batch.merging.initial import fill_gaps, pose_bones
-from bodycap_batch.merging.linear import linearise
-from bodycap_batch.merging.mount_spread import JOINED, MEASURED, SolvedMounts, kinds_of
+from bodycap_batch.merging.linear import Linear, linearise
+from bodycap_batch.merging.mount_spread import JOINED, MEASURED, Eliminated, SolvedMounts, kinds_of
 from bodycap_batch.merging.posture import Posture, PostureFactors, find_posture
 from bodycap_batch.merging.spread import (
     BETWEEN_SHARE,
@@ -51,6 +51,8 @@ MAP_ERROR_S = 1.0
 """Maps bend: camera paths are off by about this much for about this long, all poses of a stretch together.
 What repeats must not count as often as it was sampled, or the mounts follow the map (one by 10 cm)."""
 T_POSE_TICKS = 8
+_FLEETING = float(np.sqrt(1.0 - BETWEEN_SHARE**2))
+"""Of a joint's everyday range, what comes and goes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,7 +177,17 @@ class Calibration:
         self._slack_map = JOINT_SLACK_M * np.sqrt(samples.repeats) / provisional
         self._values: Any = None
         self._scale, self._first_joint = 1.0, 0
+        self.slack_factor = 1.0
         self.mounts = {name: np.array(priors[name].joint_from_cam) for name in samples.cameras}
+
+    @property
+    def samples(self) -> Samples:
+        """The camera poses in use."""
+        return self._samples
+
+    def move(self, samples: Samples) -> None:
+        """Use other camera poses of the same cameras and ticks; the last solution stays the start."""
+        self._samples = samples
 
     def solve(self, scale: float, iterations: int = 30) -> float:
         """Solve at a scale; return the cost (half the sum of squares, robust).
@@ -196,7 +208,12 @@ class Calibration:
             self.mounts[name] = read_mount(self._values, camera, points[camera])
         return float(graph.error(self._values))
 
-    def spread(self, sigma_log: float, slope: Mapping[str, FloatArray]) -> tuple[Spread, Spread]:
+    def spread(
+        self,
+        sigma_log: float,
+        slope: Mapping[str, FloatArray],
+        placed: Mapping[str, tuple[float, float]],
+    ) -> tuple[Spread, Spread]:
         """How far off the last solution may be, and what comes and goes while it is used.
 
         Constant are the noise's effect, the wearer's habits and the scale, and the mounts with them; a map's
@@ -205,24 +222,16 @@ class Calibration:
         Args:
             sigma_log: Sigma of the scale's logarithm.
             slope: By camera, change of joint_from_cam (4,4) per unit of log scale.
+            placed: By camera whose map was joined by the body, sigmas (rad, m) of where it lies.
         """
         samples, cameras = self._samples, self._samples.cameras
-        mounts = self._solved()
+        mounts = self.solved()
         solved = mounts.eliminated()
-        white = samples.white_share
-        bent = max(mounts.variance(solved, MEASURED) - white, 0.0)
-        # Rotations are weighed at the pose prior's widened sigmas; what comes and goes differs by sample.
-        fleeting = float(np.sqrt(1.0 - BETWEEN_SHARE**2))
-        factors = np.array(
-            [
-                1.0,
-                white + samples.repeats * bent,
-                mounts.variance(solved, JOINED),
-                (fleeting / PRIOR_SCALE) ** 2,
-            ]
-        )
+        factors = self.row_variance(mounts, solved)
+        bent = self._bent(mounts, solved)
         follow = {name: mount_slope(self.mounts[name], slope[name]) for name in cameras}
         bends = np.sqrt(bent) * np.stack([samples.sigma_rad, self._scale * samples.sigma_map], axis=1)
+        bends = np.hypot(bends, [placed.get(name, (0.0, 0.0)) for name in cameras])
         constant = joined(
             [
                 mounts.spread(solved, factors, habits(self._bones, cameras, BETWEEN_SHARE)),
@@ -230,12 +239,50 @@ class Calibration:
             ]
         )
         passing = [
-            habits(self._bones, cameras, fleeting),
+            habits(self._bones, cameras, _FLEETING),
             map_bends(self._bones, dict(zip(cameras, bends, strict=True))),
         ]
         return constant, joined(passing)
 
-    def _solved(self) -> SolvedMounts:
+    def _bent(self, mounts: SolvedMounts, solved: Eliminated) -> float:
+        """Variance of the measurements beyond their own noise, as a share of what was believed."""
+        return max(mounts.variance(solved, MEASURED) - self._samples.white_share, 0.0)
+
+    def row_variance(self, mounts: SolvedMounts, solved: Eliminated) -> FloatArray:
+        """Variance factor (4,) of each kind of the graph's rows, from the residuals."""
+        measured = self._samples.white_share + self._samples.repeats * self._bent(mounts, solved)
+        # Rotations are weighed at the pose prior's widened sigmas; what comes and goes differs by sample.
+        return np.array([1.0, measured, mounts.variance(solved, JOINED), (_FLEETING / PRIOR_SCALE) ** 2])
+
+    def measurement_shifts(self, linear: Linear, directions: FloatArray) -> FloatArray:
+        """How the residuals change as the measured cameras move: rows (R,P).
+
+        Args:
+            linear: Derivatives of the last solution.
+            directions: (C,K,P,6) turn (rad) and shift (m) of each camera, in the axes of the map.
+        """
+        samples, first = self._samples, 0
+        bones, all_points = self.poses(), samples.points(self._scale)
+        out = np.zeros((linear.matrix.shape[0], directions.shape[2]))
+        for camera in range(len(samples.cameras)):
+            first += 4  # the prior of the mount's four points
+            ticks = np.flatnonzero(samples.valid[camera])
+            rotation = samples.map_from_cam[camera, ticks, :3, :3]
+            for point, key in enumerate(mount_keys(camera)):
+                factors = first + point + 4 * np.arange(len(ticks))
+                arm = rotation @ all_points[camera].x_in_cam()[point]
+                shift = directions[camera, ticks, :, 3:] + np.cross(
+                    directions[camera, ticks, :, :3], arm[:, None]
+                )
+                in_bone = np.einsum("kji,kpj->kip", bones[ticks, samples.bones[camera], :3, :3], shift)
+                derivative = linear.blocks(factors, 3, [key] * len(ticks))[..., :3]
+                rows = linear.first_row[factors][:, None] + np.arange(3)
+                out[rows] = derivative @ in_bone
+            first += 4 * len(ticks)
+        return out
+
+    def solved(self) -> SolvedMounts:
+        """The last solution's derivatives, for what depends on it."""
         cameras = self._samples.cameras
         all_points = self._samples.points(self._scale)
         poses = self._samples.map_from_cam.copy()
@@ -298,7 +345,10 @@ class Calibration:
 
     def _joint_factors(self, scale: float) -> tuple[JointFactors, JointFactors]:
         """The body's factors at usual ticks, and in a T-pose (which counts once over all of its ticks)."""
-        limits, slack_m = hinges(self._skeleton, tuple(self._bones)), scale * self._slack_map
+        limits, slack_m = (
+            hinges(self._skeleton, tuple(self._bones)),
+            scale * self.slack_factor * self._slack_map,
+        )
         once = float(np.sqrt(max(self._samples.posture.t_pose.sum(), 1)))
         return (
             JointFactors(self._bones, limits, prior_scale=PRIOR_SCALE, slack_m=slack_m),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -39,10 +39,17 @@ through a table."""
 
 @dataclass(frozen=True, slots=True)
 class Cleaned:
-    """Cleaned tracks, the trunk's first, and a scale near the right one (metres per map unit)."""
+    """Cleaned tracks in one gauge.
+
+    Attributes:
+        tracks: The trunk's camera first.
+        provisional: A scale near the right one, metres per map unit.
+        placed: By camera whose map the body joined, sigmas (rad, m) of where it lies.
+    """
 
     tracks: Sequence[Track]
     provisional: float
+    placed: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,7 +110,7 @@ def calibrate_body(
         sigma = float(np.hypot(sigma, STATURE_SIGMA))
     if scale != estimate.scale:
         calibration.solve(scale)
-    constant, passing = calibration.spread(sigma, estimate.mount_slope)
+    constant, passing = calibration.spread(sigma, estimate.mount_slope, cleaned.placed)
     return Calibrated(
         scale=scale,
         sigma_log=sigma,
@@ -131,7 +138,7 @@ def _right_way_up(
     points_m = cleaned.provisional * points_around(inputs, trunk.camera)
     prior = inputs.mount_of(trunk.camera)
     roll, up = trunk_roll(
-        inputs, cleaned.tracks, lambda degrees: _early_up(bones, trunk, rolled(prior, degrees), points_m)
+        inputs, cleaned.tracks, lambda degrees: early_up(bones, trunk, rolled(prior, degrees), points_m)
     )
     inputs = _rolled(inputs, {trunk.camera: roll})
     rolls = search_rolls(inputs, cleaned.tracks, cleaned.provisional, (up, t_pose_ns), step)
@@ -159,7 +166,7 @@ def _t_pose(
     return find_t_pose(bones, cleaned.tracks, arm_span(bones, inputs.skeleton) / cleaned.provisional)
 
 
-def _early_up(bones: Sequence[Bone], trunk: Track, prior: Mount, points_m: FloatArray) -> FloatArray | None:
+def early_up(bones: Sequence[Bone], trunk: Track, prior: Mount, points_m: FloatArray) -> FloatArray | None:
     """The vertical (3,) where planes or the walk show it, before anything is solved."""
     hint = gauge.body_up_from_prior(bones, trunk, prior)
     found = gauge.find_up(points_m, hint, np.random.default_rng(0), trunk.map_from_cam[:, :3, 3])

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -20,7 +21,7 @@ from scipy.linalg import block_diag
 from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.merging.graph import bone_key, mount_keys
 from bodycap_batch.merging.linear import Linear
-from bodycap_batch.merging.spread import Body, Spread, joined, joint_shifts
+from bodycap_batch.merging.spread import BETWEEN_SHARE, Body, Spread, habits, joined, joint_shifts
 
 PRIOR, MEASURED, JOINED, POSED = range(4)
 """Kinds of rows: what is believed beforehand, camera points, gaps of joints and hinges, joint rotations."""
@@ -50,11 +51,17 @@ class SolvedMounts:
     kinds: IntArray
     first_joint: int
 
-    def eliminated(self) -> Eliminated:
-        """Solve every tick's body for given mounts, and keep what the residuals then say of the mounts."""
+    def eliminated(self, further: FloatArray | None = None) -> Eliminated:
+        """Solve every tick's body for given mounts, and keep what the residuals then say of the mounts.
+
+        Args:
+            further: (R,P) derivatives by unknowns that all ticks share beside the mounts.
+        """
         matrix = self.linear.matrix
         mounts = np.concatenate(list(self.mount_columns.values()))
         influence = matrix[:, mounts].toarray()
+        if further is not None:
+            influence = np.hstack([influence, further])
         own = np.zeros(matrix.shape[0])
         by_column = matrix.tocsc()
         for tick in range(len(self.world_from_bone)):
@@ -73,8 +80,15 @@ class SolvedMounts:
     def variance(self, solved: Eliminated, kind: int) -> float:
         """Variance factor of a kind of rows: 1 where they are as large as was believed."""
         mine = self.kinds == kind
-        redundancy = max(float(solved.redundancy[mine].sum()), 0.0)
+        # Four points hold twelve coordinates of a pose that has six: the others never disagree.
+        idle = 0.5 * mine.sum() if kind == MEASURED else 0.0
+        redundancy = max(float(solved.redundancy[mine].sum()) - idle, 0.0)
         return (_BELIEF + float((self.linear.right[mine] ** 2).sum())) / (_BELIEF + redundancy)
+
+    def habit_shifts(self) -> Any:
+        """How the residuals change with the wearer's habits: rows (R,M), sparse, one sigma each."""
+        bias = habits(self.body.bones, tuple(self.mount_columns), BETWEEN_SHARE)
+        return joint_shifts(self.linear, self.body, self.first_joint, self.world_from_bone, bias)
 
     def spread(self, solved: Eliminated, factors: FloatArray, bias: Spread) -> Spread:
         """How far off the mounts may be.

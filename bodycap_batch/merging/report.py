@@ -31,9 +31,9 @@ def build_report(
         calibrated: Scale, mounts and up.
         solution: The solved motion.
         tracks: The tracks that were used.
-        notes: ``dropped`` frames by camera, the ``floor``, the ``unused`` cameras, ``joint_gap_m`` and
-            ``hinge_m`` and ``uncertainty`` by role, how far the ``rules`` were pressed, and ``start_ns``,
-            the first tick.
+        notes: ``dropped`` frames by camera, the ``floor``, the ``unused`` and the ``joined`` cameras,
+            ``joint_gap_m`` and ``hinge_m`` and ``uncertainty`` by role, how far the ``rules`` were pressed,
+            and ``start_ns``, the first tick.
     """
     floor = notes["floor"]
     return {
@@ -60,6 +60,7 @@ def build_report(
             for track in tracks
         },
         "unused_cameras": dict(notes["unused"]),
+        "joined_cameras": notes["joined"],
         "joint_gap_m": {role: _percentiles(gap) for role, gap in notes["joint_gap_m"].items()},
         "joint_sigma_m": notes["uncertainty"],
         "hinge_off_plane_m": {role: _percentiles(off) for role, off in notes["hinge_m"].items()},

@@ -20,11 +20,12 @@ from bodycap_batch.merging.chunks import MAX_ITERATIONS, solve_motion
 from bodycap_batch.merging.complete import complete_body, observed_joints
 from bodycap_batch.merging.constants import Calibrated, Cleaned, calibrate_body, points_around
 from bodycap_batch.merging.initial import provisional_scale
+from bodycap_batch.merging.joining import use_together
 from bodycap_batch.merging.marginals import joints_in_axes, sigma_summary
 from bodycap_batch.merging.report import build_report
 from bodycap_batch.merging.rules import soft_rules
 from bodycap_batch.merging.solve import MotionGraph, Solution, hinge_errors, joint_gaps
-from bodycap_batch.merging.tracks import Track, adapt_psd, clean, make_track
+from bodycap_batch.merging.tracks import Track, adapt_psd, clean, in_gauge, make_track
 from bodycap_batch.scene import FrameStatus, Trajectory
 
 MIN_FRAMES = 15
@@ -53,12 +54,14 @@ class _Progress:
 def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> MergeResult:
     """See `bodycap_batch.merging.merge_trajectories`."""
     step = _Progress(context)
-    used, unused = choose_cameras(inputs)
+    main, further, unused = choose_cameras(inputs)
+    together = use_together(inputs, main, further, step)
+    used, unused = together.trajectories, {**unused, **together.unused}
     bones = graph_bones(inputs.skeleton, {inputs.mount_of(each.camera).role for each in used})
     fps = options.fps or inputs.clocks[used[0].camera].nominal_fps
     tick_times = timeline(inputs, fps)
     tracks, provisional, dropped = _clean_tracks(inputs, used, bones)
-    calibrated = calibrate_body(inputs, options, bones, Cleaned(tracks, provisional), step)
+    calibrated = calibrate_body(inputs, options, bones, Cleaned(tracks, provisional, together.sigmas), step)
     step.what = "solving"
     metric = [track.scaled(calibrated.scale) for track in tracks]
     rules = soft_rules(inputs.skeleton, bones, inputs.activity)
@@ -83,7 +86,7 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         world_from_joint=joints,
         solved=solved,
         observed=observed,
-        world_from_map={used[0].gauge: place},
+        world_from_map={gauge: place.after(here) for gauge, here in together.places.items()},
         trajectories=tuple(_in_world(each, place, dropped[each.camera]) for each in used),
         mounts=calibrated.mounts,
         unused_cameras=unused,
@@ -97,6 +100,7 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
                 "dropped": dropped,
                 "floor": floor,
                 "unused": unused,
+                "joined": together.report(),
                 "uncertainty": sigma_summary(inputs.skeleton.roles, covariance, observed),
                 "joint_gap_m": joint_gaps(bones, solution.world_from_bone),
                 "hinge_m": hinge_errors(inputs.skeleton, bones, solution.world_from_bone),
@@ -107,8 +111,8 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
     )
 
 
-def choose_cameras(inputs: MergeInputs) -> tuple[list[Trajectory], dict[str, str]]:
-    """Pick the cameras of the gauge the trunk's camera is in, the trunk's first; say why others are left out.
+def choose_cameras(inputs: MergeInputs) -> tuple[list[Trajectory], list[Trajectory], dict[str, str]]:
+    """Sort the cameras: those of the trunk's map, the trunk's first; those of other maps; and the useless.
 
     Raises:
         EstimationError: The trunk's camera was hardly localised.
@@ -127,17 +131,15 @@ def choose_cameras(inputs: MergeInputs) -> tuple[list[Trajectory], dict[str, str
             f"of {len(first.status)}; a skeleton needs {MIN_FRAMES}",
             hint="see frames.csv for the reasons; more texture, light or a slower start helps",
         )
-    used, unused = [], {}
+    main: list[Trajectory] = []
+    further: list[Trajectory] = []
+    unused = {}
     for trajectory in ranked:
         if counts[trajectory.camera] < MIN_FRAMES:
             unused[trajectory.camera] = f"{counts[trajectory.camera]} localised frames, {MIN_FRAMES} needed"
-        elif trajectory.gauge != first.gauge:
-            unused[trajectory.camera] = (
-                f"its map {trajectory.gauge} shares no view with {first.camera}'s {first.gauge}"
-            )
         else:
-            used.append(trajectory)
-    return used, unused
+            (main if trajectory.gauge == first.gauge else further).append(trajectory)
+    return main, further, unused
 
 
 def timeline(inputs: MergeInputs, fps: float) -> IntArray:
@@ -195,13 +197,10 @@ def _place(
 
 def _in_world(trajectory: Trajectory, world_from_map: Similarity, dropped: IntArray) -> Trajectory:
     """The trajectory in the world, without the poses that proved to be gross errors."""
-    unit = np.repeat([1.0, world_from_map.scale], 3)
-    poses = world_from_map.apply_to_poses(trajectory.gauge_from_cam)
-    covariance = trajectory.covariance * np.outer(unit, unit)
+    placed = in_gauge(trajectory, world_from_map, "world")
+    poses, covariance = np.array(placed.gauge_from_cam), np.array(placed.covariance)
     status = list(trajectory.status)
     poses[dropped], covariance[dropped] = np.nan, np.nan
     for frame in dropped.tolist():
         status[frame] = FrameStatus.POSE_JUMP
-    return replace(
-        trajectory, gauge="world", gauge_from_cam=poses, covariance=covariance, status=tuple(status)
-    )
+    return replace(placed, gauge_from_cam=poses, covariance=covariance, status=tuple(status))

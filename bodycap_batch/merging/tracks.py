@@ -9,7 +9,7 @@ import numpy as np
 
 from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.body import MergeInputs
-from bodycap_batch.geometry import interpolate_pose, so3_log
+from bodycap_batch.geometry import Similarity, interpolate_pose, so3_log
 from bodycap_batch.merging.bones import Bone
 from bodycap_batch.scene import Trajectory
 
@@ -101,6 +101,26 @@ def make_track(inputs: MergeInputs, trajectory: Trajectory, bone: int) -> Track:
         map_from_cam=trajectory.gauge_from_cam[frames][order],
         sigma_rad=np.sqrt(variances[:, :3].mean(axis=1)),
         sigma_map=np.sqrt(variances[:, 3:].mean(axis=1)),
+    )
+
+
+def moved(track: Track, target_from_map: Similarity) -> Track:
+    """The track in another map's gauge, or in metres."""
+    return replace(
+        track,
+        map_from_cam=target_from_map.apply_to_poses(track.map_from_cam),
+        sigma_map=target_from_map.scale * track.sigma_map,
+    )
+
+
+def in_gauge(trajectory: Trajectory, target_from_map: Similarity, gauge: str) -> Trajectory:
+    """The trajectory in another frame of that name."""
+    unit = np.repeat([1.0, target_from_map.scale], 3)
+    return replace(
+        trajectory,
+        gauge=gauge,
+        gauge_from_cam=target_from_map.apply_to_poses(trajectory.gauge_from_cam),
+        covariance=trajectory.covariance * np.outer(unit, unit),
     )
 
 

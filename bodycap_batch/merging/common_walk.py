@@ -1,0 +1,110 @@
+"""Where maps without a common view start: the walk their cameras share, and the body at ease."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from bodycap_batch.arrays import FloatArray, IntArray
+from bodycap_batch.errors import EstimationError
+from bodycap_batch.geometry import Similarity, invert, make_transform
+from bodycap_batch.merging.bones import Bone
+from bodycap_batch.merging.initial import provisional_scale
+from bodycap_batch.merging.tracks import Track, moved
+from bodycap_batch.skeleton import Mount
+
+_SMOOTHING_S = 0.75
+"""Half the time over which paths are averaged: a stride swings the arms once in about a second."""
+_EASE = 0.06
+"""Weight of the body's stance at ease beside the walk's shape, both of size one: 20 degrees against 15 cm on
+a walk of metres."""
+_COMMON_S = 4.0
+"""Four strides: less path than that has no shape to compare."""
+_ROUNDS = 3
+"""Of finding the start and the metric scale in turn; the first knows no lengths."""
+
+
+def starts_of(
+    bones: Sequence[Bone],
+    main: Sequence[Track],
+    others: Sequence[tuple[str, Sequence[Track]]],
+    mounts: Mapping[str, Mount],
+) -> tuple[dict[str, Similarity], float]:
+    """Where the maps start, and metres per unit of the main map: each helps to find the other."""
+    metric, starts = np.inf, {}
+    for _ in range(_ROUNDS):
+        starts = {gauge: start_of(bones, main[0], group, (mounts, metric)) for gauge, group in others}
+        placed = [moved(track, starts[gauge]) for gauge, group in others for track in group]
+        metric = provisional_scale(bones, [*main, *placed], mounts)
+    return starts, metric
+
+
+def start_of(
+    bones: Sequence[Bone], main: Track, group: Sequence[Track], body: tuple[Mapping[str, Mount], float]
+) -> Similarity:
+    """Place a map by the walk its cameras share with the trunk's, and by the body at ease.
+
+    Args:
+        bones: The graph's bones.
+        main: The trunk's camera in the main map.
+        group: The further map's cameras.
+        body: Where cameras usually sit, and metres per unit of the main map, infinite where unknown.
+    """
+    mounts, metric = body
+    at_ns = main.times_ns[:: max(1, round(0.25e9 / float(np.median(np.diff(main.times_ns)))))]
+    pairs, turns = [], []
+    for track in group:
+        at_ease = _at_ease(bones, mounts[main.camera], main.bone)
+        cam_from_cam = invert(at_ease) @ _at_ease(bones, mounts[track.camera], track.bone)
+        cam_from_cam[:3, 3] /= metric
+        expected = replace(main, map_from_cam=main.map_from_cam @ cam_from_cam)
+        target, path = _smooth(expected, at_ns), _smooth(track, at_ns)
+        seen = np.isfinite(target[:, 0]) & np.isfinite(path[:, 0])
+        if seen.sum() >= 3:
+            pairs.append((target[seen], path[seen]))
+        poses, valid = expected.at(track.times_ns, reach_ns=200_000_000)
+        turn = poses[valid, :3, :3] @ np.swapaxes(track.map_from_cam[valid, :3, :3], 1, 2)
+        turns.append(turn.mean(axis=0))
+    centred = [(mine - mine.mean(axis=0), path - path.mean(axis=0)) for mine, path in pairs]
+    mine, path = (np.concatenate(parts) for parts in zip(*centred, strict=True))
+    sizes = [float(np.sqrt((part**2).sum(axis=1).mean())) for part in (mine, path)]
+    walked = mine.T @ path / (len(mine) * sizes[0] * sizes[1])
+    u, _, vt = np.linalg.svd(walked + _EASE * np.mean(turns, axis=0))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    scale = sizes[0] / sizes[1]
+    shifts = [a.mean(axis=0) - scale * rotation @ b.mean(axis=0) for a, b in pairs]
+    return Similarity(scale, rotation, np.mean(shifts, axis=0))
+
+
+def require_common_time(main: Track, group: Sequence[Track]) -> None:
+    """Raise where no camera of a map was localised while the trunk's was for some seconds."""
+    for track in group:
+        seen = (main.times_ns >= track.times_ns[0]) & (main.times_ns <= track.times_ns[-1])
+        if seen.any() and np.ptp(main.times_ns[seen]) * 1e-9 >= _COMMON_S:
+            return
+    raise EstimationError(
+        f"{group[0].camera!r} and {main.camera!r} were localised together for less than {_COMMON_S:g} s",
+        hint="maps without a common view are joined by the walk; see frames.csv",
+    )
+
+
+def _smooth(track: Track, at_ns: IntArray) -> FloatArray:
+    """Mean position (N,3) of a track around given times; NaN where half of the stretch was not localised."""
+    total = np.vstack([np.zeros(3), np.cumsum(track.map_from_cam[:, :3, 3], axis=0)])
+    reach = round(_SMOOTHING_S * 1e9)
+    low, high = (np.searchsorted(track.times_ns, at_ns + sign * reach) for sign in (-1, 1))
+    count = high - low
+    usual = 2.0 * reach / float(np.median(np.diff(track.times_ns)))
+    mean = (total[high] - total[low]) / np.maximum(count, 1)[:, None]
+    return np.asarray(np.where((count > 0.5 * usual)[:, None], mean, np.nan))
+
+
+def _at_ease(bones: Sequence[Bone], mount: Mount, bone: int) -> FloatArray:
+    """Pose (4,4) of a camera in the first bone's frame while the body is at ease."""
+    pose, current = np.array(mount.joint_from_cam), bone
+    while bones[current].parent >= 0:
+        pose = make_transform(bones[current].mean_rotation, bones[current].offset_m) @ pose
+        current = bones[current].parent
+    return pose

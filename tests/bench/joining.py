@@ -1,0 +1,128 @@
+"""Whether the body puts maps together that share no view: where the cameras end up, over random walks.
+
+``python -m tests.bench joining``: the walker of ``bodycap synth --poses`` whose cameras' poses come in three
+maps, each with a scale and axes of its own; mounts and noise as in ``simulation``. A camera counts as placed
+when the median distance of its path from the true one, in the main map, is below 5 cm.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bodycap_batch.synthetic import SynthOptions
+from tests.bench.posed import Posed, posed
+from tests.bench.simulation import ARMS, PALMS
+
+SPLITS: Mapping[str, Mapping[str, str]] = {
+    "an arm each": {
+        "torso": "a",
+        "left_palm": "b",
+        "left_upper_arm": "b",
+        "right_palm": "c",
+        "right_upper_arm": "c",
+    },
+    "upper arms, palms": {
+        "torso": "a",
+        "left_upper_arm": "b",
+        "right_upper_arm": "b",
+        "left_palm": "c",
+        "right_palm": "c",
+    },
+    "a palm each": {"torso": "a", "left_palm": "b", "right_palm": "c"},
+}
+PLACED_M = 0.05
+
+
+def run_case(split: str, seed: int, seconds: float) -> dict[str, Any]:
+    """Draw one walk, place its maps, and compare with the truth."""
+    from bodycap_batch.merging.joining import use_together  # gtsam takes a second to import
+    from bodycap_batch.merging.stage import choose_cameras
+
+    cameras = ARMS if len(SPLITS[split]) == len(ARMS) else PALMS
+    options = SynthOptions(seconds=seconds, cameras=cameras, seed=seed, poses_only=True)
+    capture = posed(options, SPLITS[split])
+    started = time.process_time()
+    main, further, _ = choose_cameras(capture.inputs)
+    together = use_together(capture.inputs, main, further, lambda: None)
+    return {
+        "seconds": time.process_time() - started,
+        "off_m": _off(capture, together.places, main[0].gauge),
+        "sigma_m": {camera: shift for camera, (_, shift) in together.sigmas.items()},
+        "refused": dict(together.unused),
+    }
+
+
+def _off(capture: Posed, places: Mapping[str, Any], main: str) -> dict[str, float]:
+    """By camera of a further map, median distance (m) of its path from where it truly was."""
+    out = {}
+    for each in capture.inputs.trajectories:
+        if each.gauge != main and each.gauge in places:
+            true = capture.gauges[main].after(capture.gauges[each.gauge].inverse())
+            centres = each.gauge_from_cam[each.localised, :3, 3]
+            apart = np.linalg.norm(places[each.gauge].apply(centres) - true.apply(centres), axis=1)
+            out[each.camera] = float(np.median(apart)) / capture.gauges[main].scale
+    return out
+
+
+def summary(outcomes: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Share of cameras placed, refused, and how the errors compare with what was stated."""
+    off = [value for each in outcomes for value in each["off_m"].values()]
+    stated = [each["sigma_m"][camera] for each in outcomes for camera in each["off_m"]]
+    refused = sum(len(each["refused"]) for each in outcomes)
+    total = len(off) + refused
+    ratio = np.array(off) / (np.sqrt(3.0) * np.array(stated))
+    return {
+        "cameras": total,
+        "placed": float(np.mean([*(value < PLACED_M for value in off), *[False] * refused])),
+        "misplaced": sum(value >= PLACED_M for value in off),
+        "refused": refused,
+        "median_m": float(np.median(off)) if off else float("nan"),
+        "worst_m": max(off, default=float("nan")),
+        "stated_sigma_m": float(np.median(stated)) if stated else float("nan"),
+        "error_over_sigma": float(np.sqrt((ratio**2).mean())) if off else float("nan"),
+        "seconds": float(np.mean([each["seconds"] for each in outcomes])),
+    }
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run and print; one line per seed and one per split."""
+    parser = argparse.ArgumentParser(prog="python -m tests.bench joining", description=__doc__)
+    parser.add_argument("--splits", nargs="*", default=list(SPLITS), choices=list(SPLITS))
+    parser.add_argument("--seeds", type=int, default=24)
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=1000 / 30)
+    parser.add_argument("--json", type=Path, help="also write all figures here")
+    options = parser.parse_args(arguments)
+    figures: dict[str, Any] = {}
+    for split in options.splits:
+        outcomes = []
+        for seed in range(options.first_seed, options.first_seed + options.seeds):
+            outcomes.append(run_case(split, seed, options.seconds))
+            errors = " ".join(f"{name} {100 * off:.1f}" for name, off in outcomes[-1]["off_m"].items())
+            sigma = max(outcomes[-1]["sigma_m"].values(), default=float("nan"))
+            refused = "; ".join(sorted(set(outcomes[-1]["refused"].values())))
+            _tell(f"    {split}, seed {seed}: cm off: {errors} (sigma {100 * sigma:.1f}) {refused}")
+        found = figures[split] = summary(outcomes)
+        _tell(
+            f"{split}: {100 * found['placed']:.0f} % of {found['cameras']:.0f} cameras placed within 5 cm, "
+            f"{found['misplaced']:.0f} beyond, {found['refused']:.0f} refused; median "
+            f"{100 * found['median_m']:.1f} cm, worst {100 * found['worst_m']:.1f}; stated sigma "
+            f"{100 * found['stated_sigma_m']:.1f} cm per axis, error over it "
+            f"{found['error_over_sigma']:.2f}; {found['seconds']:.1f} s"
+        )
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=1), encoding="utf-8")
+    return 0
+
+
+def _tell(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()

@@ -1,0 +1,118 @@
+"""Maps that share no view, placed by the body: where they start, how residuals follow, where they end."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from bodycap_batch.geometry import Similarity, so3_exp
+from tests.stages.walker import ROLES, make_inputs, make_walk, record
+
+pytest.importorskip("gtsam")
+
+from bodycap_batch.merging.bones import graph_bones
+from bodycap_batch.merging.calibrate import Calibration, take_samples
+from bodycap_batch.merging.common_walk import start_of
+from bodycap_batch.merging.joining import use_together
+from bodycap_batch.merging.tracks import make_track
+
+FURTHER = Similarity(1.7, so3_exp([0.4, 1.1, -0.3]), np.array([0.5, -3.0, 1.0]))
+"""A further map from the main one, which is metric here."""
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return make_walk(np.random.default_rng(3), off_deg=8.0, off_m=0.03)
+
+
+@pytest.fixture(scope="module")
+def recorded(walk):
+    """Twelve seconds; the right palm's poses come in a map of its own."""
+    out = []
+    for number, name in enumerate(ROLES):
+        gauge = FURTHER if name == "right_palm" else None
+        path = record(walk, name, np.random.default_rng(number), seconds=12.0, gauge=gauge)
+        out.append(replace(path, gauge="map-1") if gauge else path)
+    return out
+
+
+def _tracks(walk, recorded):
+    inputs = make_inputs(walk, recorded)
+    bones = graph_bones(walk.skeleton, set(ROLES.values()))
+    index = {bone.role: place for place, bone in enumerate(bones)}
+    return inputs, bones, [make_track(inputs, each, index[ROLES[each.camera]]) for each in recorded]
+
+
+def _off_m(place: Similarity, track) -> float:
+    """Median distance of a track from its true place in the main map, metres."""
+    true = FURTHER.inverse().apply(track.map_from_cam[:, :3, 3])
+    return float(np.median(np.linalg.norm(place.apply(track.map_from_cam[:, :3, 3]) - true, axis=1)))
+
+
+def test_similarities_chain():
+    first = Similarity(0.5, so3_exp([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 3.0]))
+    x = np.array([[0.3, -0.2, 5.0]])
+    assert_allclose(FURTHER.after(first).apply(x), FURTHER.apply(first.apply(x)))
+    assert_allclose(FURTHER.after(FURTHER.inverse()).apply(x), x)
+
+
+def test_the_walk_and_the_stance_are_a_start(walk, recorded):
+    inputs, bones, tracks = _tracks(walk, recorded)
+    mounts = {mount.camera: mount for mount in inputs.mounts}
+    start = start_of(bones, tracks[0], [tracks[2]], (mounts, 1.0))
+    # A palm strays about half an upper arm from where it hangs at ease; the path itself is a few metres long.
+    assert _off_m(start, tracks[2]) < 0.25
+    assert start.scale * FURTHER.scale == pytest.approx(1.0, abs=0.1)
+
+
+def test_residuals_follow_moved_cameras_as_predicted(walk, recorded):
+    inputs, bones, tracks = _tracks(walk, recorded[:2])
+    mounts = {mount.camera: mount for mount in inputs.mounts}
+    samples = take_samples(tracks, 1.0, 12)
+    calibration = Calibration(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
+    calibration.solve(1.0)
+    before = calibration.solved().linear
+    twist = np.array([0.3, -0.2, 0.5, 0.1, 0.4, -0.3]) * 1e-5
+    directions = np.zeros((*samples.valid.shape, 1, 6))
+    directions[1, :, 0] = twist
+    predicted = calibration.measurement_shifts(before, directions)[:, 0]
+    poses = samples.map_from_cam.copy()
+    poses[1, :, :3, :3] = so3_exp(twist[:3]) @ poses[1, :, :3, :3]
+    poses[1, :, :3, 3] += twist[3:]
+    calibration.move(replace(samples, map_from_cam=poses))
+    after = calibration.solved().linear
+    # The right-hand side grows by what the movement asks for; robust weights change in second order.
+    assert np.abs(predicted).max() > 1e-4
+    assert_allclose(after.right - before.right, predicted, atol=0.15 * np.abs(predicted).max())
+
+
+def test_a_palms_map_is_placed_or_refused_by_its_sigma(walk, recorded):
+    inputs = make_inputs(walk, recorded)
+    together = use_together(inputs, recorded[:2], recorded[2:], lambda: None)
+    if "map-1" in together.places:
+        turn, shift = together.sigmas["right_palm"]
+        assert 0.0 < turn < np.radians(15.0)
+        # Three dimensions of the stated sigma, three times.
+        assert _off_m(together.places["map-1"], make_track(inputs, recorded[2], 0)) < 9.0 * shift
+        assert [each.gauge for each in together.trajectories] == ["map-0"] * 3
+    else:
+        assert "the body cannot place it" in together.unused["right_palm"]
+
+
+def test_a_map_that_fits_no_person_is_left_out_with_the_reason(walk, recorded):
+    far = replace(recorded[2], gauge_from_cam=recorded[2].gauge_from_cam[:, [1, 0, 2, 3]])
+    lost = replace(far, times_ns=far.times_ns + 10**12)
+    together = use_together(make_inputs(walk, recorded), recorded[:2], [lost], lambda: None)
+    assert list(together.places) == ["map-0"]
+    assert "map-1" in together.unused["right_palm"]
+    assert len(together.trajectories) == 2
+
+
+def test_without_further_maps_nothing_changes(walk, recorded):
+    together = use_together(make_inputs(walk, recorded[:2]), recorded[:2], [], lambda: None)
+    assert together.trajectories == tuple(recorded[:2])
+    assert together.places["map-0"].scale == 1.0
+    assert not together.unused
