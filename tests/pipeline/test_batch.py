@@ -42,6 +42,7 @@ def bench(tmp_path: Path) -> Bench:
     return Bench(tmp_path)
 
 
+@pytest.mark.slow
 def test_all_jobs_are_done_and_the_same_as_one_by_one(bench: Bench) -> None:
     code, out, err = bench.run("batch", *NAMES)
     assert code == 0, err
@@ -115,6 +116,7 @@ def test_wrong_options_are_told(
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_stopped_batch_ends_its_children_and_goes_on_later(bench: Bench) -> None:
     bench.order(hang="map")
     process = bench.start("batch", *NAMES)

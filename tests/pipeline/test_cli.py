@@ -107,6 +107,7 @@ def test_the_store_can_be_named_by_option_or_variable(bench: Bench) -> None:
     assert "nothing to do" in bench.run("run", "my walk", "--out", "elsewhere")[1]
 
 
+@pytest.mark.slow
 def test_stages_are_done_again_left_out_explained_and_cleaned_away(bench: Bench) -> None:
     code, out, _ = bench.run("run", "my walk", "--until", "keyframes")
     assert (code, out) == (0, "my_walk: stopped after keyframes, as asked; run it again for the rest\n")
@@ -192,6 +193,7 @@ def test_a_signal_stops_the_children_and_the_next_run_goes_on(
     assert "keyframes torso: already done" in err
 
 
+@pytest.mark.slow
 def test_kill_9_at_any_stage_costs_that_stage_only(bench: Bench) -> None:
     reference = Bench(_made(bench.folder / "reference"))
     reference.run("run", "my walk")
@@ -258,6 +260,7 @@ assert _results(out) != before
 """
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_leaves_earlier_results_intact(tmp_path: Path) -> None:
     mount = ["unshare", "--mount", "--propagation", "private", "sh", "-c"]
     if subprocess.run([*mount, "mount -t tmpfs none /mnt"], capture_output=True, check=False).returncode:

@@ -246,6 +246,7 @@ def test_folders_that_were_cleared_away_are_made_again(bench: SpoolBench) -> Non
     assert bench.job("walk").path == bench.spool.done / "walk"
 
 
+@pytest.mark.slow
 def test_a_job_that_cannot_be_filed_away_is_told_and_filed_later(bench: SpoolBench) -> None:
     bench.drop("walk")
     watcher = bench.watcher(stale_s=1.0, once=False)
