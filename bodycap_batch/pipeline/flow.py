@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -223,15 +223,12 @@ class Flow:
         key = key_of("export", options, inputs)
         return self._one(Task(key=key, arguments=arguments, threads=self._settings.threads))
 
-    def preview(
-        self,
-        scene: Artefact,
-        registrations: ByCamera,
-        merged: Artefact | None,
-        failure: EstimationError | None,
-    ) -> Artefact:
-        """The results as a video."""
-        reason = None if failure is None else failure.message
+    def start_preview(self, made: Made) -> Future[Artefact] | None:
+        """Begin the video of the results, beside what follows the merge; None where it is not wanted."""
+        if self._settings.until not in (None, "preview") or made.scene is None:
+            return None
+        scene, merged, registrations = made.scene, made.merged, made.registrations
+        reason = None if made.failure is None else made.failure.message
         inputs = {
             "cameras": self._digests,
             "map": scene.digest,
@@ -247,7 +244,9 @@ class Flow:
             "failure": reason,
         }
         key = key_of("preview", {}, inputs)
-        return self._one(Task(key=key, arguments=arguments, threads=self._settings.threads))
+        return self._pool.submit(
+            self._one, Task(key=key, arguments=arguments, threads=self._settings.threads)
+        )
 
     def report(self, made: Made, stopped_by: BodycapError | None = None) -> Artefact:
         """The page a person reads, of all that was made."""

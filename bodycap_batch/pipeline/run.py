@@ -103,12 +103,13 @@ def run_stages(job: Job, flow: Flow, made: Made) -> Iterator[str]:
     made.stage = "merge"
     made.merged, made.failure = _merge(job, flow, made.scene, made.registrations)
     yield "merge"
+    filming = flow.start_preview(made) if job.export.preview else None
     made.exported = flow.export(made.keyframes, made.scene, made.registrations, made.merged, made.failure)
     yield "export"
     made.reported = flow.report(made)
     yield "report"
-    if job.export.preview:
-        made.previewed = flow.preview(made.scene, made.registrations, made.merged, made.failure)
+    if filming is not None:
+        made.previewed = filming.result()
         yield "preview"
 
 
