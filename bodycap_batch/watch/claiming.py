@@ -43,10 +43,11 @@ def claim_drop(
         if not _take(place, drop, look, terms):
             shutil.rmtree(place.path)
             return None
+        settle_claim(spool, claim)
     except OSError as failed:
-        shutil.rmtree(place.path, ignore_errors=True)
+        with contextlib.suppress(OSError):  # else it stays claimed, and is adopted later
+            give_back(spool, place)
         raise store_error(failed, drop.path) from failed
-    settle_claim(spool, claim)
     return claim, error
 
 
@@ -63,9 +64,19 @@ def settle_claim(spool: Spool, claim: Claim) -> None:
     claim.moved_to(JobDir(move(claim.job.path, spool.running, spool.free_name(wanted), rename)))
 
 
-def has_input(place: JobDir) -> bool:
-    """True once something of the user's is in a claimed folder."""
-    return os.path.lexists(dropped_in(place))
+def discard_empty(place: JobDir) -> bool:
+    """Remove a folder that was made to claim something, if nothing was; False where a drop is in it.
+
+    It gets another name before it is looked at: whoever made it and wakes up now finds no place to put a
+    drop into.
+    """
+    hidden = JobDir(place.path.with_name(f"{CLAIM_PREFIX}{uuid.uuid4().hex}"))
+    os.rename(place.path, hidden.path)
+    if os.path.lexists(dropped_in(hidden)):
+        os.rename(hidden.path, place.path)
+        return False
+    shutil.rmtree(hidden.path, ignore_errors=True)
+    return True
 
 
 def dropped_in(place: JobDir) -> Path:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import collections
-import shutil
 import threading
 import time
 from collections.abc import Callable
@@ -12,7 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from bodycap_batch.errors import BodycapError, StoreError
 from bodycap_batch.watch.changes import Changes
 from bodycap_batch.watch.claim import Claim, Onlooker, take_over
-from bodycap_batch.watch.claiming import claim_drop, finish_retries, has_input, settle_claim
+from bodycap_batch.watch.claiming import claim_drop, discard_empty, finish_retries, settle_claim
 from bodycap_batch.watch.drops import Drop, Look, Settling, drops_in
 from bodycap_batch.watch.options import WatchOptions
 from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir, Spool, visible
@@ -169,12 +168,15 @@ class Watcher:
         return found
 
     def _adopt(self, job: JobDir) -> Claim | None:
-        claim = take_over(job)
-        if claim is None:
-            return None
-        if job.path.name.startswith(CLAIM_PREFIX):
-            if not has_input(job):  # ended before it had claimed anything
-                shutil.rmtree(job.path, ignore_errors=True)
+        """Take a job over; one that the disk does not let go of is tried again when it is stale anew."""
+        try:
+            claim = take_over(job)
+            if claim is None or not job.path.name.startswith(CLAIM_PREFIX):
+                return claim
+            if discard_empty(job):  # its watcher ended before it had claimed anything
                 return None
             settle_claim(self._spool, claim)
+        except (StoreError, OSError) as error:
+            self._tell(f"{job.name}: cannot be taken over: {error}")
+            return None
         return claim

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -17,13 +18,14 @@ import yaml
 
 from bodycap_batch.cli import main
 from bodycap_batch.config.limits import Limits
-from bodycap_batch.errors import JobError
+from bodycap_batch.errors import JobError, StoreError
 from bodycap_batch.progress import Event
 from bodycap_batch.references import collect_garbage
 from bodycap_batch.store import Store
-from bodycap_batch.watch import cancel_job, retry_job, rows_of
-from bodycap_batch.watch.claim import first_claim, take_over
-from bodycap_batch.watch.spool import JobDir
+from bodycap_batch.watch import Terms, cancel_job, claiming, retry_job, rows_of
+from bodycap_batch.watch.claim import Claim, first_claim, take_over
+from bodycap_batch.watch.drops import Drop, Look, look_at
+from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir
 from bodycap_batch.watch.status import StatusFile
 from tests.pipeline.fake_stages import ORDERS
 from tests.pipeline.spools import SpoolBench, wait_for
@@ -280,6 +282,53 @@ def test_a_drop_that_cannot_be_taken_is_told_once_and_tried_again(bench: SpoolBe
     finally:
         watcher.stop()
         thread.join()
+
+
+def test_footage_is_given_back_where_it_cannot_be_looked_at_any_more(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = {path.name: path.read_bytes() for path in bench.drop("walk").iterdir()}
+
+    def fail(*_: object) -> Look:  # a copying program renames a file just now, a network disk hiccups
+        raise FileNotFoundError(errno.ENOENT, "gone", "head.mp4")
+
+    terms = Terms()
+    drop = Drop(bench.spool.inbox / "walk")
+    look = look_at(drop, 100)
+    monkeypatch.setattr(claiming, "look_at", fail)
+    with pytest.raises(StoreError):
+        claiming.claim_drop(bench.spool, drop, look, terms)
+    assert {path.name: path.read_bytes() for path in drop.path.iterdir()} == before
+    assert leftovers(bench) == []
+
+
+def test_an_abandoned_claim_is_removed_only_while_nothing_is_in_it(bench: SpoolBench) -> None:
+    for name, dropped in (("empty", False), ("full", True)):
+        place = JobDir(bench.spool.running / f"{CLAIM_PREFIX}{name}")
+        place.path.mkdir()
+        first_claim(place).release()
+        if dropped:
+            bench.drop("walk").rename(place.input)
+            StatusFile(place).change(dropped="walk")
+    assert bench.work_off() == JobError.exit_code
+    assert bench.status("walk")["error"]["message"] == "the job was never read"
+    assert (bench.job("walk").input / "torso.mp4").is_file()
+    assert leftovers(bench) == []
+
+
+def test_a_job_that_cannot_be_taken_over_stops_no_watcher(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first_claim(JobDir(bench.drop("left").rename(bench.spool.running / "left"))).release()
+    bench.drop("walk")
+
+    def fail(*_: object) -> Claim:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("bodycap_batch.watch.watcher.take_over", fail)
+    assert bench.work_off() == 0
+    assert bench.status("walk")["state"] == "done"
+    assert any(line.startswith("left: cannot be taken over") for line in bench.told)
 
 
 def test_what_is_no_job_stays_in_the_inbox_and_is_told(bench: SpoolBench) -> None:
