@@ -357,9 +357,17 @@ class Flow:
         if missing := [error for error in failures if isinstance(error, NotStored)]:
             raise NotStored([task for error in missing for task in error.tasks], self._settings.store.root)
         if failures:
-            self._abort.set()
+            self._end(futures)
             raise next((error for error in failures if not isinstance(error, Cancelled)), failures[0])
         return {task.camera: future.result() for task, future in zip(ordered, futures, strict=True)}
+
+    def _end(self, futures: Sequence[Future[Artefact]]) -> None:
+        """Stop the tasks beside one that failed; what is done next (a report of it) may run."""
+        self._abort.set()
+        for future in futures:
+            future.cancel()
+        wait(futures)
+        self._abort.clear()
 
     def _camera_digests(self) -> dict[str, str]:
         capture, digests = self._job.capture, self._settings.store.digests

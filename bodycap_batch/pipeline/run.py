@@ -79,7 +79,7 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
             if made.failure is None:
                 flow.keep_only_this()
         elif stopped_by is not None:
-            _tell_how_far(flow, made, stopped_by, out_dir)
+            _tell_how_far(flow, made, stopped_by, out_dir, settings)
     if stopped_by or made.failure:
         raise stopped_by or made.failure  # type: ignore[misc]
     return summary
@@ -128,14 +128,15 @@ def _run_until(job: Job, flow: Flow, made: Made, settings: Settings) -> BodycapE
     return None
 
 
-def _tell_how_far(flow: Flow, made: Made, error: BodycapError, out_dir: Path) -> None:
+def _tell_how_far(flow: Flow, made: Made, error: BodycapError, out_dir: Path, settings: Settings) -> None:
     """Publish the report of a job that broke off before there were results."""
     try:
         made.reported = flow.report(made, error)
+        settings.require_owner()
+        publish(dict(files_of(made.reported)), out_dir / PARTIAL)
     except BodycapError as another:
         error.add_note(f"and its report could not be written: {another.message}")
         return
-    publish(dict(files_of(made.reported)), out_dir / PARTIAL)
     told = f"how far it came: {out_dir / PARTIAL / REPORT_FILE}"
     error.hint = f"{error.hint}; {told}" if error.hint else told
 

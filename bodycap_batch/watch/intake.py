@@ -13,6 +13,7 @@ from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.models import SKELETON_PRESETS, CameraConfig, Job
 from bodycap_batch.config.trust import PathPolicy
 from bodycap_batch.errors import CaptureError, JobError
+from bodycap_batch.pipeline.results import write_results_file
 from bodycap_batch.watch.drops import JOB_FILES, YAML_SUFFIXES, Drop, Look
 from bodycap_batch.watch.spool import JobDir, visible
 
@@ -123,13 +124,14 @@ def rewrite_results(place: JobDir, job: Job) -> None:
     Args:
         place: The job's folder.
         job: The job that was run.
+
+    Raises:
+        StoreError: The disk is full or fails.
     """
     for file in (place.result / "job.yaml", place.result / "partial" / "job.yaml"):
         if file.is_file():
             text = job_text(moved(job, lambda path, file=file: _up_from(path, place.path, file)))  # type: ignore[misc]
-            temporary = file.with_name(f".{file.name}.part")
-            temporary.write_text(text, encoding="utf-8")
-            temporary.replace(file)
+            write_results_file(file.parent, file.name, text)
 
 
 def moved(job: Job, change: Callable[[Path], Path]) -> Job:
