@@ -55,6 +55,8 @@ class Cluster:
         self._topic = f"bodycap-{uuid.uuid4().hex}"
         self._progress: dict[str, Callable[[int, int, str], None]] = {}
         self._lock = threading.Lock()
+        # Not the lock above: Dask's own thread waits for that one in `_hear`, and has to answer meanwhile.
+        self._asking = threading.Lock()
         self._largest, self._asked = 0.0, -math.inf
         self._client.subscribe_topic(self._topic, self._hear)
         self._client.run_on_scheduler(_allow_failures, _ALLOWED_FAILURES)
@@ -102,7 +104,7 @@ class Cluster:
 
     def _resources(self, task: Task) -> dict[str, float] | None:
         """What a task takes of a worker; one that wants more than any worker has takes all of one."""
-        with self._lock:
+        with self._asking:
             if time.monotonic() - self._asked > _ASK_AGAIN_S:
                 self._largest = max(
                     (found.get(MEMORY, 0.0) for found in self.workers().values()), default=0.0
