@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import sys
 import threading
 import time
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 _JOBS_ON_A_CLUSTER = 32
 """A job at work is a thread that waits; its tasks wait at the scheduler, in order of priority."""
 
+
+_INTEGER = re.compile(r"-?[0-9]{1,9}")
 
 _ExecutorOption = Annotated[
     str,
@@ -162,7 +165,7 @@ def _prioritised(jobs: Sequence[Path], priorities: Sequence[str]) -> list[BatchJ
     known: dict[Path, int] = {}
     for text in priorities:
         name, _, number = text.rpartition("=")
-        if Path(name) not in jobs or not number.lstrip("-").isdigit():
+        if Path(name) not in jobs or not _INTEGER.fullmatch(number):
             raise JobError(
                 f"{text!r} is no JOB=NUMBER of a job of this batch",
                 field="--priority",

@@ -101,6 +101,8 @@ def test_jobs_of_high_priority_go_first(bench: Bench) -> None:
     [
         (["--priority", "nobody=1"], "no JOB=NUMBER"),
         (["--priority", "monday=x"], "no JOB=NUMBER"),
+        (["--priority", "monday=--5"], "no JOB=NUMBER"),
+        (["--priority", "monday=²"], "no JOB=NUMBER"),
         (["--executor", "moon"], "there is no executor 'moon'"),
     ],
 )
