@@ -75,6 +75,14 @@ def test_elsewhere_a_token_is_needed_for_everything() -> None:
     assert code(OPEN, host="evil.example:8080", authorization=f"Bearer {TOKEN}") == 421
 
 
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "[::1]", "127.0.0.1:80"])
+def test_the_usual_port_is_not_named_by_browsers(host: str) -> None:
+    usual = Access(host="127.0.0.1", port=80)
+    assert code(usual, host=host) == 200
+    assert code(usual, "POST", host=host, origin=f"http://{host}") == 200
+    assert code(usual, host="evil.example") == 421
+
+
 def test_addresses_are_read() -> None:
     assert access_from("127.0.0.1:8080", "") == LOCAL
     assert access_from("[::1]:80", "").url == "http://[::1]:80/"

@@ -21,6 +21,8 @@ from bodycap_batch.errors import JobError
 COOKIE = "bodycap_token"
 _SAFE = ("GET", "HEAD")
 _SHORTEST_TOKEN = 16
+_PORT = re.compile(r":[0-9]+$")
+"""Browsers leave the usual port out."""
 _TOKEN = re.compile(rf"[A-Za-z0-9_\-]{{{_SHORTEST_TOKEN},200}}")
 _TOKEN_HINT = "python3 -c 'import secrets; print(secrets.token_urlsafe())' makes one"  # noqa: S105 - a remedy
 
@@ -71,7 +73,7 @@ class Access:
         return bool(self.token) and self._is_token(parse_qs(query).get("token", [""])[0])
 
     def _is_this_page(self, host: str) -> bool:
-        name, _, port = host.rpartition(":")
+        name, _, port = (host if _PORT.search(host) else f"{host}:80").rpartition(":")
         if not port.isdecimal() or int(port) != self.port:
             return False
         if is_loopback(self.host):
