@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import os
 import shutil
 import threading
 import time
@@ -198,6 +199,20 @@ def test_what_is_left_of_a_broken_upload_vanishes_with_the_page(bench: SpoolBenc
         connection.close()
         wait_for(lambda: not any(bench.spool.inbox.glob(".upload-*/*.part")))
     assert list(bench.spool.inbox.iterdir()) == []
+
+
+def test_a_page_that_starts_removes_only_what_killed_pages_left(bench: SpoolBench, client: Client) -> None:
+    client.begin("walk")
+    (mine,) = bench.spool.inbox.glob(".upload-*")
+    machine, pid, start, key = mine.name.removeprefix(".upload-").split("-")
+    killed = mine.with_name(f".upload-{machine}-{pid}-{int(start) - 1}-{key}")
+    elsewhere = mine.with_name(f".upload-another-{pid}-{start}-{key}")
+    forgotten = mine.with_name(f".upload-yesterday-{pid}-{start}-{key}")
+    for folder in (killed, elsewhere, forgotten):
+        folder.mkdir()
+    os.utime(forgotten, (time.time() - 90_000, time.time() - 90_000))
+    with LivePage(bench.spool, Access(host="127.0.0.1", port=0), Limits()):
+        assert set(bench.spool.inbox.iterdir()) == {mine, elsewhere}
 
 
 def test_a_port_in_use_is_named(bench: SpoolBench, page: LivePage) -> None:

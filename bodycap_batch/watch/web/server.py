@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import shutil
 import socket
 import threading
 from dataclasses import replace
@@ -12,7 +11,7 @@ from bodycap_batch.config.limits import Limits
 from bodycap_batch.errors import JobError
 from bodycap_batch.watch.spool import Spool
 from bodycap_batch.watch.web.access import Access
-from bodycap_batch.watch.web.uploads import PREFIX, Uploads
+from bodycap_batch.watch.web.uploads import Uploads, sweep
 
 _END_S = 2
 
@@ -46,8 +45,7 @@ class LivePage:
 
         from bodycap_batch.watch.web.app import make_app
 
-        for left in self._spool.inbox.glob(f"{PREFIX}*"):  # of a page that was killed
-            shutil.rmtree(left, ignore_errors=True)
+        sweep(self._spool.inbox)
         app = make_app(self._spool, self.access, self._uploads, self._stopped)
         config = uvicorn.Config(
             app,

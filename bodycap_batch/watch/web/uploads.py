@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import os
 import re
 import shutil
 import threading
@@ -15,10 +18,11 @@ from bodycap_batch.config.folder import VIDEO_SUFFIXES
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.errors import CaptureError, JobError, StoreError
 from bodycap_batch.store import disk_errors
+from bodycap_batch.watch.claim import host_key, start_of
 from bodycap_batch.watch.drops import JOB_FILES, READY
 from bodycap_batch.watch.spool import Spool, move, spool_name
 
-PREFIX = ".upload-"
+_PREFIX = ".upload-"
 _ALSO = ("calib.json", *JOB_FILES)
 _ALSO_SUFFIXES = (".timestamps.txt", ".bvh", ".png")
 _SMALL_BYTES = 64 << 20
@@ -69,7 +73,7 @@ class Uploads:
                     f"{_MOST_OPEN} folders are being sent already", hint="wait until one of them is there"
                 )
             key = uuid.uuid4().hex
-            folder = self._spool.inbox / f"{PREFIX}{key}"
+            folder = self._spool.inbox / f"{_PREFIX}{_sender()}-{key}"
             with disk_errors(folder):
                 folder.mkdir()
             self._open[key] = _Upload(name=spool_name(name), folder=folder, touched=time.monotonic())
@@ -162,6 +166,27 @@ class Uploads:
         now = time.monotonic()
         for key in [key for key, upload in self._open.items() if now - upload.touched > _STALE_S]:
             shutil.rmtree(self._open.pop(key).folder, ignore_errors=True)
+
+
+def sweep(inbox: Path) -> None:
+    """Remove what killed pages left; those of other watchers may be taking videos in just now."""
+    for folder in inbox.glob(f"{_PREFIX}*"):
+        with contextlib.suppress(OSError):
+            if _is_abandoned(folder):
+                shutil.rmtree(folder)
+
+
+def _sender() -> str:
+    """This process, unlike any other of any machine."""
+    machine = hashlib.sha256(host_key().encode()).hexdigest()[:12]
+    return f"{machine}-{os.getpid()}-{start_of(os.getpid())}"
+
+
+def _is_abandoned(folder: Path) -> bool:
+    machine, pid, start, *_ = [*folder.name.removeprefix(_PREFIX).split("-"), "", ""]
+    if machine == _sender().split("-", maxsplit=1)[0] and host_key() and pid.isdecimal():
+        return start_of(int(pid)) != start
+    return time.time() - folder.stat().st_mtime > _STALE_S
 
 
 async def _write(path: Path, size: int, chunks: AsyncIterator[bytes], upload: _Upload) -> int:
