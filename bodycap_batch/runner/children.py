@@ -95,16 +95,20 @@ class Children:
             BodycapError: What the child reported, `StoreError` for the disk, `Cancelled` when stopped.
         """
         log = making.logs / f"{task.file_stem}.log"
-        child = self._take(task.modules, making.logs)
-        child.loaded |= set(task.modules)
         with disk_errors(making.logs):
             making.logs.mkdir(parents=True, exist_ok=True)
             order = log.with_suffix(".task.json")
             order.write_text(json.dumps(task.to_json(making.store.root), indent=1), encoding="utf-8")
             log.write_bytes(b"")
-        self.prepare(making.logs, making.meanwhile)
-        child.order({"task": str(order), "log": str(log)})
-        last = child.follow(making.cancelled, lambda message: _answer(child, message, making))
+        child = self._take(task.modules, making.logs)
+        child.loaded |= set(task.modules)
+        try:
+            self.prepare(making.logs, making.meanwhile)
+            child.order({"task": str(order), "log": str(log)})
+            last = child.follow(making.cancelled, lambda message: _answer(child, message, making))
+        except BaseException:  # whoever listens to the progress failed: a full disk, a closed pipe
+            child.end(at_once=True)
+            raise
         stopped = making.cancelled()
         if last is not None and "ends" not in last and not stopped:
             with self._lock:

@@ -120,6 +120,21 @@ def test_a_child_that_failed_unexpectedly_is_not_used_again(bench: Bench, stage:
     assert pid_of(bench, "work", 2) != first
 
 
+def test_a_child_ends_with_its_task_where_nobody_can_be_told_of_it(bench: Bench) -> None:
+    first = pid_of(bench, "work", 1)
+
+    def tell(event: Event) -> None:
+        if event.kind == "progress":
+            raise OSError("the pipe is closed")
+
+    rules = Rules(cancelled=bench.stop.is_set)
+    runner = Runner(bench.store, bench.children, logs=bench.logs, listener=tell, rules=rules)
+    with pytest.raises(OSError, match="pipe"):
+        runner.run(a_task("work", 2))
+    assert not alive(first)
+    assert pid_of(bench, "work", 3) != first
+
+
 def test_each_task_has_a_log_of_its_own_though_they_share_a_child(bench: Bench) -> None:
     bench.runner.run(a_task("noisy", 1))
     bench.runner.run(a_task("work", 2))
