@@ -74,11 +74,11 @@ class Claim:
         with self._lock:
             if self._ended or self.lost.is_set():
                 return
-            if self.guard.holds():
-                with contextlib.suppress(OSError):  # a full disk: the job itself will say so
+            with contextlib.suppress(OSError):  # a full or absent disk: the job itself will say so
+                if self.guard.holds():
                     self._write()
-            else:
-                self.lost.set()
+                else:
+                    self.lost.set()
 
     def release(self) -> None:
         """Let the job be taken over at once."""

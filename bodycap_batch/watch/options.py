@@ -9,6 +9,9 @@ from pathlib import Path
 from bodycap_batch.runner import CHILD
 from bodycap_batch.watch.intake import Terms
 
+_BEAT_S = 5.0
+_BEATS = 4
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WatchOptions:
@@ -21,7 +24,6 @@ class WatchOptions:
         threads: Cores to keep busy, shared by these jobs.
         settle_s: How long a drop must stay as it is before it counts as complete.
         stale_s: How long another watcher's heartbeat may stand still before its jobs are taken over.
-        beat_s: Time between two heartbeats.
         poll: Look for changes by polling (network disks tell none); None: find out.
         once: Leave when nothing is left to do.
         command: The children's command line.
@@ -33,7 +35,11 @@ class WatchOptions:
     threads: int = 1
     settle_s: float = 10.0
     stale_s: float = 60.0
-    beat_s: float = 5.0
     poll: bool | None = None
     once: bool = False
     command: Sequence[str] = CHILD
+
+    @property
+    def beat_s(self) -> float:
+        """Time between two heartbeats: one that is late does not make a job look abandoned."""
+        return min(_BEAT_S, self.stale_s / _BEATS)

@@ -53,6 +53,7 @@ class Watcher:
         self._refused: dict[str, tuple[str, float]] = {}
         self._complete: collections.deque[tuple[Drop, Look]] = collections.deque()
         self._waiting = False
+        self._left = False
         self._look_at = 0.0
         self._orphans_at = 0.0
         self._worst = 0
@@ -80,7 +81,8 @@ class Watcher:
                     self._collect()
                     if not self._fill(pool) and self._options.once:
                         break
-                    self._woken.wait(_LOOK_S if self._settling.waiting or self._running else _IDLE_LOOK_S)
+                    soon = self._settling.waiting or self._running or self._left
+                    self._woken.wait(_LOOK_S if soon else _IDLE_LOOK_S)
             finally:
                 self._stop.set()
                 heart.join()
@@ -97,6 +99,7 @@ class Watcher:
         for future in [future for future in self._running if future.done()]:
             del self._running[future]
             outcome = future.result()
+            self._left |= outcome.state == "stopped"
             if outcome.state not in ("lost", "stopped"):
                 self._worst = max(self._worst, outcome.exit_code)
             where = f" -> {outcome.place}" if outcome.place is not None else ""
@@ -116,7 +119,7 @@ class Watcher:
             if (claimed := self._claim(*self._complete.popleft())) is not None:
                 self._start(pool, *claimed)
                 free -= 1
-        return bool(self._running or self._complete or self._waiting)
+        return bool(self._running or self._complete or self._waiting or self._left)
 
     def _look(self) -> None:
         """See what lies in the inbox; not so often that looking is all there is time for."""
@@ -165,6 +168,7 @@ class Watcher:
         for job in self._onlooker.abandoned([job for job in jobs if job.path not in mine]):
             if len(found) < most and (claim := self._adopt(job)) is not None:
                 found.append(claim)
+        self._left = bool(found)  # there may be more of them than there was room for
         return found
 
     def _adopt(self, job: JobDir) -> Claim | None:
@@ -177,6 +181,7 @@ class Watcher:
                 return None
             settle_claim(self._spool, claim)
         except (StoreError, OSError) as error:
+            self._worst = max(self._worst, StoreError.exit_code)
             self._tell(f"{job.name}: cannot be taken over: {error}")
             return None
         return claim

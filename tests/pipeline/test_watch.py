@@ -239,6 +239,26 @@ def test_a_job_waits_while_the_store_is_cleaned(bench: SpoolBench) -> None:
         thread.join()
 
 
+def test_a_watcher_that_works_off_what_is_there_leaves_no_job_behind(bench: SpoolBench) -> None:
+    for name in ("one", "two"):  # left by a watcher that had room for both
+        bench.drop(name)
+    bench.work_off()
+    for name in ("one", "two"):
+        place = JobDir(Path(shutil.move(bench.job(name).path, bench.spool.running / name)))
+        first_claim(place).release()
+    bench.drop("walk")
+    with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
+        fcntl.flock(cleaning, fcntl.LOCK_EX)
+        watcher = bench.watcher()
+        thread = threading.Thread(target=watcher.run)
+        thread.start()
+        wait_for(lambda: any("goes on later" in line for line in bench.told))
+    thread.join(30)
+    assert not thread.is_alive()
+    assert sorted(path.name for path in bench.spool.done.iterdir()) == ["one", "two", "walk"]
+    assert leftovers(bench) == []
+
+
 def test_folders_that_were_cleared_away_are_made_again(bench: SpoolBench) -> None:
     watcher = bench.watcher()
     shutil.rmtree(bench.spool.done)
@@ -326,7 +346,7 @@ def test_a_job_that_cannot_be_taken_over_stops_no_watcher(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("bodycap_batch.watch.watcher.take_over", fail)
-    assert bench.work_off() == 0
+    assert bench.work_off() == StoreError.exit_code
     assert bench.status("walk")["state"] == "done"
     assert any(line.startswith("left: cannot be taken over") for line in bench.told)
 

@@ -15,6 +15,7 @@ import pytest
 from bodycap_batch.watch.changes import Changes, on_network_disk
 from bodycap_batch.watch.claim import Onlooker, first_claim, take_over
 from bodycap_batch.watch.drops import Drop, Settling, drops_in, look_at
+from bodycap_batch.watch.options import WatchOptions
 from bodycap_batch.watch.spool import JobDir, Spool, move, spool_at, spool_name
 
 ROOT = Path(__file__).parents[2]
@@ -111,6 +112,11 @@ def test_a_heartbeat_counts_as_stopped_by_the_own_clock_alone(tmp_path: Path) ->
     assert onlooker.abandoned([job]) == []
     clock.now += 1
     assert onlooker.abandoned([job]) == [job]
+
+
+@pytest.mark.parametrize("stale_s", [1.0, 4.0, 60.0, 1000.0])
+def test_a_heart_beats_several_times_before_it_counts_as_stopped(stale_s: float) -> None:
+    assert WatchOptions(stale_s=stale_s).beat_s <= min(5.0, stale_s / 3)
 
 
 def test_an_owner_that_let_go_or_ended_on_this_machine_is_not_waited_for(tmp_path: Path) -> None:
