@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import platform
 import re
 import time
 from collections.abc import Callable, Mapping
@@ -15,7 +16,8 @@ from bodycap_batch.errors import CaptureError
 
 _BLOCK_BYTES = 1 << 20
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-_TEMPORARY = re.compile(r"\.(\d+)\.\d+\.part$")
+_TEMPORARY = re.compile(r"\.([0-9a-f]{8})\.(\d+)\.\d+\.part$")
+"""Ends with the machine, the process and a moment: machines may share the folder."""
 _SETTLED_S = 1.0
 """A file changed this recently may change again within one tick of the file system's clock."""
 
@@ -57,15 +59,19 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 def temporary_beside(path: Path) -> Path:
     """A name in the same folder for a file that will be renamed to `path` when it is complete."""
-    return path.with_name(f".{path.name}.{os.getpid()}.{time.monotonic_ns()}.part")
+    return path.with_name(f".{path.name}.{_machine()}.{os.getpid()}.{time.monotonic_ns()}.part")
 
 
 def remove_abandoned(folder: Path) -> None:
     """Remove what killed processes of this machine left beside the files they were writing."""
     for path in folder.glob(".*.part"):
         named = _TEMPORARY.search(path.name)
-        if named is not None and not _is_alive(int(named.group(1))):
+        if named is not None and named.group(1) == _machine() and not _is_alive(int(named.group(2))):
             path.unlink(missing_ok=True)
+
+
+def _machine() -> str:
+    return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
 
 def _is_alive(pid: int) -> bool:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from bodycap_batch.digests import FileDigests, file_sha256, json_digest, remove_abandoned
+from bodycap_batch.digests import FileDigests, file_sha256, json_digest, remove_abandoned, temporary_beside
 from bodycap_batch.errors import CaptureError, StoreError
 from bodycap_batch.store import MANIFEST, Artefact, ArtefactKey, Store
 
@@ -236,7 +236,12 @@ def test_a_file_in_the_place_of_the_store_is_named(tmp_path: Path) -> None:
 def test_only_what_dead_processes_left_is_removed(tmp_path: Path) -> None:
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
-    names = [f".motion.bvh.{dead.pid}.1.part", f".motion.bvh.{os.getpid()}.1.part", ".mine.part", "a.part"]
+    mine = temporary_beside(tmp_path / "motion.bvh").name
+    own = f".{os.getpid()}."
+    assert own in mine
+    machine = mine.split(own)[0].rpartition(".")[2]
+    elsewhere = mine.replace(own, f".{dead.pid}.").replace(machine, "0123abcd")
+    names = [mine.replace(own, f".{dead.pid}."), mine, elsewhere, ".mine.part", "a.part"]
     for name in names:
         (tmp_path / name).touch()
     remove_abandoned(tmp_path)
