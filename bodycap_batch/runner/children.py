@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable, Collection, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -102,13 +103,12 @@ class Children:
             log.write_bytes(b"")
         child = self._take(task.modules, making.logs)
         child.loaded |= set(task.modules)
-        try:
+        with ExitStack() as failing:  # whoever listens to the progress may: a full disk, a closed pipe
+            failing.callback(child.end, at_once=True)
             self.prepare(making.logs, making.meanwhile)
             child.order({"task": str(order), "log": str(log)})
             last = child.follow(making.cancelled, lambda message: _answer(child, message, making))
-        except BaseException:  # whoever listens to the progress failed: a full disk, a closed pipe
-            child.end(at_once=True)
-            raise
+            failing.pop_all()
         stopped = making.cancelled()
         if last is not None and "ends" not in last and not stopped:
             with self._lock:
