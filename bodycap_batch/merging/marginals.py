@@ -17,6 +17,8 @@ from bodycap_batch.merging.linear import Chain, Linear, linearise
 from bodycap_batch.merging.spread import Body, Spread, adjoint, joint_shifts
 from bodycap_batch.merging.tracks import Track
 
+_DIRECTIONS = 48
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolvedGraph:
@@ -61,23 +63,33 @@ def joint_covariance(solved: SolvedGraph, world_from_bone: FloatArray, spread: S
     chain = Chain((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
     shifts = _measurement_shifts(solved, linear, spread)
     shifts = shifts + joint_shifts(linear, solved.body, solved.first_joint, world_from_bone, spread)
-    moved = chain.solve((linear.matrix.T @ shifts).toarray())
+    rights = (linear.matrix.T @ shifts).tocsc()
     place = np.argsort(order)
     ticks, count = world_from_bone.shape[:2]
     out = np.zeros((ticks, count, 3, 3))
 
-    def read(tick: int, covariance: FloatArray) -> None:
+    def readers(tick: int) -> FloatArray:
+        """(B-1,3,n) from a tick's states to each joint's centre relative to the first bone's."""
         first = [
             int(place[linear.columns[bone_key(tick, bone)]]) - int(bounds[tick]) for bone in range(count)
         ]
+        reader = np.zeros((count - 1, 3, int(bounds[tick + 1] - bounds[tick])))
+        reader[:, :, first[0] + 3 : first[0] + 6] = -world_from_bone[tick, 0, :3, :3]
         for bone in range(1, count):
-            reader = np.zeros((3, len(covariance)))
-            reader[:, first[bone] + 3 : first[bone] + 6] = world_from_bone[tick, bone, :3, :3]
-            reader[:, first[0] + 3 : first[0] + 6] = -world_from_bone[tick, 0, :3, :3]
-            shift = reader @ moved[tick]
-            out[tick, bone] = reader @ covariance @ reader.T + shift @ shift.T
+            reader[bone - 1, :, first[bone] + 3 : first[bone] + 6] = world_from_bone[tick, bone, :3, :3]
+        return reader
+
+    def read(tick: int, covariance: FloatArray) -> None:
+        reader = readers(tick)
+        out[tick, 1:] += reader @ covariance @ reader.swapaxes(1, 2)
 
     chain.covariances(read)
+    for first in range(0, rights.shape[1], _DIRECTIONS):
+        # A few directions at a time: all of eleven cameras' at once take gigabytes.
+        moved = chain.solve(rights[:, first : first + _DIRECTIONS].toarray())
+        for tick, each in enumerate(moved):
+            shift = readers(tick) @ each
+            out[tick, 1:] += shift @ shift.swapaxes(1, 2)
     return out
 
 

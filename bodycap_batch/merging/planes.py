@@ -17,6 +17,8 @@ _SMALLEST = 25
 _MOST = 10
 _HYPOTHESES = 600
 _NEAR_M = 1.5
+_MOST_POINTS = 20_000
+"""Points that tell as much as all: a long capture's map has hundreds of thousands."""
 TILT_LIMIT_DEG = 20.0
 """How far the vertical may lie from the body's own: a chest's lean and its mount's error, three sigma."""
 _AGREE_DEG = 1.0
@@ -49,6 +51,8 @@ def find_planes(points_m: FloatArray, rng: np.random.Generator) -> list[Plane]:
     Source: M. A. Fischler, R. C. Bolles, "Random sample consensus", Communications of the ACM 24, 1981.
     """
     planes: list[Plane] = []
+    if len(points_m) > _MOST_POINTS:
+        points_m = points_m[rng.choice(len(points_m), _MOST_POINTS, replace=False)]
     left = points_m
     smallest = max(_SMALLEST, round(0.03 * len(points_m)))
     while len(planes) < _MOST and len(left) >= max(smallest, 4) and len(points_m) >= _MIN_POINTS:
@@ -63,7 +67,7 @@ def find_planes(points_m: FloatArray, rng: np.random.Generator) -> list[Plane]:
 def _fullest(points: FloatArray, rng: np.random.Generator) -> Plane | None:
     tree = cKDTree(points)
     seeds = rng.integers(len(points), size=_HYPOTHESES)
-    groups = [tree.query_ball_point(point, _NEAR_M) for point in points[seeds]]
+    groups = (np.array(tree.query_ball_point(point, _NEAR_M)) for point in points[seeds])
     triples = np.array(
         [
             [seed, *rng.choice(near, 2, replace=False)]
@@ -92,7 +96,7 @@ def _fullest(points: FloatArray, rng: np.random.Generator) -> Plane | None:
         inliers = points[np.abs(points @ normal - offset) < THICKNESS_M]
         if len(inliers) < 4:
             return None
-        normal = np.linalg.svd(inliers - inliers.mean(axis=0))[2][2]
+        normal = np.linalg.svd(inliers - inliers.mean(axis=0), full_matrices=False)[2][2]
         offset = float(inliers.mean(axis=0) @ normal)
     return Plane(normal, offset, int((np.abs(points @ normal - offset) < THICKNESS_M).sum()))
 
