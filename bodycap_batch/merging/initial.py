@@ -100,6 +100,9 @@ def anchor_and_reach(bones: Sequence[Bone], bone: int, other: int) -> tuple[Floa
     up, down = _ancestry(bones, other), _ancestry(bones, bone)
     shared = next(index for index in down if index in up)
     above = up[: up.index(shared)]
+    if above and split_side(bones[other].role)[1] == "Arm":
+        # An upper arm swings about every axis: where the trunk is from there it does not tell.
+        return None
     if any(split_side(bones[bones[index].parent].role)[1] in LIMB_LINKS for index in above):
         return None
     anchor, reach = -np.sum([bones[index].offset_m for index in above], axis=0) + np.zeros(3), 0.0

@@ -79,6 +79,10 @@ def find_scale(calibration: Calibration, provisional: float) -> ScaleEstimate:
                 break
             centre += step if high < low else -step
     cost(centre)
+    for side in (-_FINE, _FINE):
+        if not any((x - centre) * side > 0.0 for x in costs):
+            # The cost fell all the way to here.
+            cost(centre + side)
     before, after = (_mounts_beside(mounts, centre, sign * _FINE) for sign in (-1.0, 1.0))
     width = after[0] - before[0]
     slope = {name: (after[1][name] - before[1][name]) / width for name in after[1]}
