@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from bodycap_batch.arrays import BoolArray, FloatArray
 from bodycap_batch.body import MergeInputs
 from bodycap_batch.config.options import MergeOptions
+from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging import gauge
 from bodycap_batch.merging.bones import Bone
 from bodycap_batch.merging.calibrate import Calibration, take_samples
@@ -45,11 +46,13 @@ class Cleaned:
         tracks: The trunk's camera first.
         provisional: A scale near the right one, metres per map unit.
         placed: By camera whose map the body joined, sigmas (rad, m) of where it lies.
+        places: By gauge, where each used map lies in the tracks' gauge; None where all are in one map.
     """
 
     tracks: Sequence[Track]
     provisional: float
     placed: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    places: Mapping[str, Similarity] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,7 +107,8 @@ def calibrate_body(
     body_up = gauge.body_up(inputs.skeleton, bones, poses)
     up = gauge.find_up(estimate.scale * points, body_up, np.random.default_rng(0), path_m)
     height = _height_over_floor(inputs, bones, poses, up, (estimate.scale * points, path_m))
-    sources = _sources(inputs, options, bones, estimate, height)
+    known = known_distance(inputs, options, cleaned.places)
+    sources = _sources(inputs, bones, estimate, height, known)
     scale, sigma = combine(sources)
     if not inputs.skeleton_is_measured and inputs.height_m is None and sources[0].used:
         sigma = float(np.hypot(sigma, STATURE_SIGMA))
@@ -203,16 +207,15 @@ def _under(points_m: FloatArray, path_m: FloatArray, up: FloatArray) -> BoolArra
 
 def _sources(
     inputs: MergeInputs,
-    options: MergeOptions,
     bones: Sequence[Bone],
     estimate: ScaleEstimate,
     height_m: float | None,
+    known: ScaleSource | None,
 ) -> tuple[ScaleSource, ...]:
     """The bones, the floor and a measured distance; the last overrules the others."""
     name, spread = "skeleton", 0.0
     if not inputs.skeleton_is_measured:
         name, spread = "height" if inputs.height_m is not None else "mean stature", PROPORTION_SIGMA
-    known = known_distance(inputs, options)
     body = ScaleSource(
         name=name,
         scale=estimate.scale,

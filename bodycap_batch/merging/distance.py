@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from bodycap_batch.body import MergeInputs
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.errors import EstimationError, JobError
+from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging.scale import ScaleSource
 from bodycap_batch.merging.tracks import MIN_SIGMA_M
 from bodycap_batch.scene import Trajectory
@@ -16,12 +19,20 @@ _LEAST_SIGMA = 0.003
 """Nobody measures the way between two lenses better than to a few millimetres a metre."""
 
 
-def known_distance(inputs: MergeInputs, options: MergeOptions) -> ScaleSource | None:
+def known_distance(
+    inputs: MergeInputs, options: MergeOptions, places: Mapping[str, Similarity] | None = None
+) -> ScaleSource | None:
     """The scale from the job's known distance, None where it states none.
+
+    Args:
+        inputs: The trajectories, each in its own map's gauge.
+        options: ``known_distance``.
+        places: By gauge, where each used map lies in the main one; None where all are in one map.
 
     Raises:
         JobError: It names a camera or frame that is not there, or the two cameras share no map.
-        EstimationError: One of the frames was not localised, or both are at the same place.
+        EstimationError: One of the frames was not localised, or both are at the same place, or in a map that
+            was not placed in the main one.
     """
     if options.known_distance is None:
         return None
@@ -33,6 +44,13 @@ def known_distance(inputs: MergeInputs, options: MergeOptions) -> ScaleSource | 
             field=_FIELD,
             hint="name two frames of one camera",
         )
+    gauge = ends[0][0].gauge
+    if places is not None and gauge not in places:
+        raise EstimationError(
+            f"{first} and {second} are in map {gauge}, which the body cannot place",
+            hint="name two frames of a camera that is used; metrics.json tells which are not",
+        )
+    unit = 1.0 if places is None else places[gauge].scale
     centres = [trajectory.gauge_from_cam[index, :3, 3] for trajectory, index in ends]
     variance = sum(float(np.trace(trajectory.covariance[index, 3:, 3:])) / 3.0 for trajectory, index in ends)
     apart = float(np.linalg.norm(centres[1] - centres[0]))
@@ -43,7 +61,7 @@ def known_distance(inputs: MergeInputs, options: MergeOptions) -> ScaleSource | 
             hint="name two frames that are farther apart",
         )
     sigma = np.sqrt(variance / apart**2 + 2.0 * (MIN_SIGMA_M / metres) ** 2 + _LEAST_SIGMA**2)
-    return ScaleSource(name="known distance", scale=metres / apart, sigma_log=float(sigma))
+    return ScaleSource(name="known distance", scale=metres / (unit * apart), sigma_log=float(sigma))
 
 
 def _frame(inputs: MergeInputs, name: str) -> tuple[Trajectory, int]:

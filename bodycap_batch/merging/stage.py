@@ -61,7 +61,8 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
     fps = options.fps or inputs.clocks[used[0].camera].nominal_fps
     tick_times = timeline(inputs, fps)
     tracks, provisional, dropped = _clean_tracks(inputs, used, bones)
-    calibrated = calibrate_body(inputs, options, bones, Cleaned(tracks, provisional, together.sigmas), step)
+    cleaned = Cleaned(tracks, provisional, together.sigmas, together.places)
+    calibrated = calibrate_body(inputs, options, bones, cleaned, step)
     step.what = "solving"
     metric = [track.scaled(calibrated.scale) for track in tracks]
     rules = soft_rules(inputs.skeleton, bones, inputs.activity)
@@ -183,7 +184,8 @@ def _place(
     joints, solved = complete_body(inputs.skeleton, bones, turned)
     hips = joints[:, 0, :3, 3]
     standing = gauge.standing_height(inputs.skeleton, 0)
-    points = points_around(inputs, next(iter(solution.weights)))
+    # The first mount is the trunk camera's: in a long capture the first stretch may lack it.
+    points = points_around(inputs, calibrated.mounts[0].camera)
     heights = calibrated.scale * points @ rotation[2]
     expected = float(np.median(hips[:, 2])) - gauge.WALKING_HEIGHT * standing
     floor = gauge.find_floor(heights, calibrated.up, expected, standing)
