@@ -23,6 +23,7 @@ from bodycap_batch.merging.graph import (
     mount_change,
     mount_keys,
     optimise,
+    pose_values,
     read_mount,
 )
 from bodycap_batch.merging.initial import fill_gaps, pose_bones
@@ -40,7 +41,7 @@ from bodycap_batch.merging.spread import (
     scale_direction,
 )
 from bodycap_batch.merging.t_pose import t_posed
-from bodycap_batch.merging.tracks import MIN_SIGMA_M, MIN_SIGMA_RAD, SAMPLE_REACH_NS, Track
+from bodycap_batch.merging.tracks import MIN_SIGMA_M, MIN_SIGMA_RAD, SAMPLE_REACH_NS, Track, evenly
 from bodycap_batch.skeleton import Mount, SkeletonModel
 
 PRIOR_SCALE = 4.0
@@ -51,6 +52,8 @@ MAP_ERROR_S = 1.0
 """Maps bend: camera paths are off by about this much for about this long, all poses of a stretch together.
 What repeats must not count as often as it was sampled, or the mounts follow the map (one by 10 cm)."""
 T_POSE_TICKS = 8
+_FEWEST_SAMPLES = 10
+"""Samples each camera gets where it was measured so often, however seldom all were measured together."""
 _FLEETING = float(np.sqrt(1.0 - BETWEEN_SHARE**2))
 """Of a joint's everyday range, what comes and goes."""
 
@@ -122,11 +125,13 @@ def take_samples(
     wanted = np.flatnonzero(together >= min(2, len(tracks)))
     full = np.flatnonzero(together == together.max())
     pool = full if len(full) >= count else wanted
-    pick = pool[np.unique(np.linspace(0, len(pool) - 1, count).round().astype(np.int64))]
+    pick = evenly(pool, count)
     if t_pose_ns is not None:
         inside = np.flatnonzero((times_ns >= t_pose_ns[0]) & (times_ns <= t_pose_ns[1]) & (together >= 2))
-        chosen = inside[np.unique(np.linspace(0, len(inside) - 1, T_POSE_TICKS).round().astype(np.int64))]
-        pick = np.union1d(pick, chosen)
+        pick = np.union1d(pick, evenly(inside, T_POSE_TICKS))
+    for _, valid in looks:
+        if valid[pick].sum() < min(_FEWEST_SAMPLES, count):
+            pick = np.union1d(pick, evenly(np.flatnonzero(valid & (together >= 2)), _FEWEST_SAMPLES))
     seconds = 1e-9 * float(times_ns[pick[-1]] - times_ns[pick[0]])
     repeats = max(1.0, MAP_ERROR_S * len(pick) / max(seconds, 1e-3))
     white_rad = np.array([max(float(np.median(track.sigma_rad)), MIN_SIGMA_RAD) for track in tracks])
@@ -364,9 +369,10 @@ class Calibration:
             for camera, (name, bone) in reversed(
                 list(enumerate(zip(samples.cameras, samples.bones, strict=True)))
             )
+            if samples.valid[camera].any()
         }
         poses = pose_bones(self._skeleton, self._bones, measured)
-        return self._with_mounts(_pose_values(poses), scale)
+        return self._with_mounts(pose_values(poses), scale)
 
     def _with_mounts(self, values: Any, scale: float) -> Any:
         for camera, points in enumerate(self._samples.points(scale)):
@@ -378,7 +384,7 @@ class Calibration:
         poses = self.poses()
         shift = (ratio - 1.0) * poses[:, :1, :3, 3]
         poses[..., :3, 3] += shift
-        return _pose_values(poses)
+        return pose_values(poses)
 
     def poses(self) -> FloatArray:
         """World_from_bone (K,B,4,4) of the last solution."""
@@ -389,12 +395,3 @@ class Calibration:
                 for tick in range(ticks)
             ]
         )
-
-
-def _pose_values(poses: FloatArray) -> Any:
-    """Values of bone poses (T,B,4,4)."""
-    values = gtsam.Values()
-    for tick in range(poses.shape[0]):
-        for bone in range(poses.shape[1]):
-            values.insert(bone_key(tick, bone), gtsam.Pose3(poses[tick, bone]))
-    return values

@@ -12,7 +12,7 @@ from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import Similarity, invert, make_transform
 from bodycap_batch.merging.bones import Bone
 from bodycap_batch.merging.initial import provisional_scale
-from bodycap_batch.merging.tracks import Track, moved
+from bodycap_batch.merging.tracks import SAMPLE_REACH_NS, Track, moved
 from bodycap_batch.skeleton import Mount
 
 _SMOOTHING_S = 0.75
@@ -22,6 +22,9 @@ _EASE = 0.06
 a walk of metres."""
 _COMMON_S = 4.0
 """Four strides: less path than that has no shape to compare."""
+_INSTANTS = 3
+_TOGETHER = 10
+"""Points of the walk, and frames of both cameras, without which there is nothing to compare."""
 _ROUNDS = 3
 """Of finding the start and the metric scale in turn; the first knows no lengths."""
 
@@ -53,7 +56,7 @@ def start_of(
         body: Where cameras usually sit, and metres per unit of the main map, infinite where unknown.
     """
     mounts, metric = body
-    at_ns = main.times_ns[:: max(1, round(0.25e9 / float(np.median(np.diff(main.times_ns)))))]
+    at_ns = _instants(main)
     pairs, turns = [], []
     for track in group:
         at_ease = _at_ease(bones, mounts[main.camera], main.bone)
@@ -62,11 +65,11 @@ def start_of(
         expected = replace(main, map_from_cam=main.map_from_cam @ cam_from_cam)
         target, path = _smooth(expected, at_ns), _smooth(track, at_ns)
         seen = np.isfinite(target[:, 0]) & np.isfinite(path[:, 0])
-        if seen.sum() >= 3:
+        if seen.sum() >= _INSTANTS:
             pairs.append((target[seen], path[seen]))
         poses, valid = expected.at(track.times_ns, reach_ns=200_000_000)
         turn = poses[valid, :3, :3] @ np.swapaxes(track.map_from_cam[valid, :3, :3], 1, 2)
-        turns.append(turn.mean(axis=0))
+        turns.append(turn.mean(axis=0) if valid.any() else np.zeros((3, 3)))
     centred = [(mine - mine.mean(axis=0), path - path.mean(axis=0)) for mine, path in pairs]
     mine, path = (np.concatenate(parts) for parts in zip(*centred, strict=True))
     sizes = [float(np.sqrt((part**2).sum(axis=1).mean())) for part in (mine, path)]
@@ -80,14 +83,25 @@ def start_of(
 
 def require_common_time(main: Track, group: Sequence[Track]) -> None:
     """Raise where no camera of a map was localised while the trunk's was for some seconds."""
+    at_ns = _instants(main)
+    walked = np.isfinite(_smooth(main, at_ns)[:, 0])
     for track in group:
         seen = (main.times_ns >= track.times_ns[0]) & (main.times_ns <= track.times_ns[-1])
-        if seen.any() and np.ptp(main.times_ns[seen]) * 1e-9 >= _COMMON_S:
+        # A few frames here and there span a time, but show no path.
+        path = walked & np.isfinite(_smooth(track, at_ns)[:, 0])
+        together = track.at(main.times_ns, reach_ns=SAMPLE_REACH_NS)[1]
+        long = seen.any() and np.ptp(main.times_ns[seen]) * 1e-9 >= _COMMON_S
+        if long and path.sum() >= _INSTANTS and together.sum() >= _TOGETHER:
             return
     raise EstimationError(
         f"{group[0].camera!r} and {main.camera!r} were localised together for less than {_COMMON_S:g} s",
         hint="maps without a common view are joined by the walk; see frames.csv",
     )
+
+
+def _instants(track: Track) -> IntArray:
+    """About four instants a second at which a track was localised."""
+    return track.times_ns[:: max(1, round(0.25e9 / float(np.median(np.diff(track.times_ns)))))]
 
 
 def _smooth(track: Track, at_ns: IntArray) -> FloatArray:

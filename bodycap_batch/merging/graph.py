@@ -236,3 +236,12 @@ def optimise(
         if decrease <= 1e-5 * max(error, 1e-9):
             return optimizer.values(), count
     return optimizer.values(), iterations
+
+
+def pose_values(poses: FloatArray) -> Any:
+    """Values of bone poses (T,B,4,4)."""
+    values = gtsam.Values()
+    for tick in range(poses.shape[0]):
+        for bone in range(poses.shape[1]):
+            values.insert(bone_key(tick, bone), gtsam.Pose3(poses[tick, bone]))
+    return values

@@ -200,7 +200,7 @@ def join_maps(
                 f"the limbs' reach and the way the cameras move disagree on the scale by "
                 f"{100 * abs(problem.from_reach()) * _REACH_SIGMA:.0f} %; a longer walk with turns tells more"
             )
-        elif sigma_m > MAX_SIGMA_M:
+        elif not sigma_m <= MAX_SIGMA_M:
             why = (
                 f"the body tells it only to {100 * sigma_m:.0f} cm; turns in the walk, an upper arm's camera "
                 "or a common view settle it"

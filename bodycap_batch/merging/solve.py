@@ -207,7 +207,9 @@ class MotionGraph:
         measured = {}
         for track in reversed(self._tracks):
             poses, valid = track.at(self._times, reach_ns=200_000_000)
-            measured[track.bone] = fill_gaps(poses, valid) @ invert(self._mounts[track.camera])
+            # Frames that are all far apart are joined as they are.
+            whole = fill_gaps(poses, valid) if valid.any() else poses
+            measured[track.bone] = whole @ invert(self._mounts[track.camera])
         poses = pose_bones(self._skeleton, self._bones, measured)
         seconds = 1e-9 * (self._times - self._times[0])
         values = gtsam.Values()

@@ -207,3 +207,10 @@ def adapt_psd(bones: Sequence[Bone], tracks: Sequence[Track]) -> tuple[Bone, ...
     return tuple(
         replace(bone, psd=bone.psd * np.repeat(factor, 3)) for bone, factor in zip(bones, ratio, strict=True)
     )
+
+
+def evenly(pool: IntArray, count: int) -> IntArray:
+    """Up to `count` of the pool, evenly; none of an empty one."""
+    if not len(pool):
+        return pool
+    return np.asarray(pool[np.unique(np.linspace(0, len(pool) - 1, count).round().astype(np.int64))])

@@ -1,0 +1,144 @@
+"""The skeleton stage on odd captures: cameras never seen together, single frames, no scale."""
+
+from __future__ import annotations
+
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bodycap_batch.errors import EstimationError
+from tests.stages.walker import ROLES, make_inputs, make_walk, record
+
+pytest.importorskip("gtsam")
+
+from bodycap_batch.config.options import MergeOptions
+from bodycap_batch.geometry import Similarity
+from bodycap_batch.merging.bones import graph_bones
+from bodycap_batch.merging.calibrate import Calibration, take_samples
+from bodycap_batch.merging.common_walk import require_common_time
+from bodycap_batch.merging.distance import known_distance
+from bodycap_batch.merging.initial import anchor_and_reach
+from bodycap_batch.merging.planes import find_planes
+from bodycap_batch.merging.scale import find_scale
+from bodycap_batch.merging.solve import MotionGraph
+from bodycap_batch.merging.tracks import make_track
+from bodycap_batch.skeleton_presets import load_skeleton
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return make_walk(np.random.default_rng(3), off_deg=8.0, off_m=0.03)
+
+
+@pytest.fixture(scope="module")
+def recorded(walk):
+    return [
+        record(walk, name, np.random.default_rng(number), seconds=6.0) for number, name in enumerate(ROLES)
+    ]
+
+
+@pytest.fixture(scope="module")
+def body(walk, recorded):
+    """Inputs, bones, and each camera's track in metres."""
+    inputs = make_inputs(walk, recorded)
+    bones = graph_bones(walk.skeleton, set(ROLES.values()))
+    index = {bone.role: place for place, bone in enumerate(bones)}
+    return inputs, bones, [make_track(inputs, each, index[ROLES[each.camera]]) for each in recorded]
+
+
+def _only(track, from_s, to_s):
+    return track.keep((track.times_ns >= from_s * 1e9) & (track.times_ns < to_s * 1e9))
+
+
+def test_a_camera_seldom_seen_with_the_others_is_sampled(body):
+    trunk, left, right = body[2]
+    samples = take_samples([trunk, _only(left, 0.0, 5.5), _only(right, 5.6, 6.0)], 1.0, 12)
+    assert samples.valid[2].sum() >= 8
+    assert samples.valid[1].sum() >= 10
+
+
+def test_a_camera_never_seen_with_the_trunk_keeps_its_usual_mount(body):
+    inputs, bones, (trunk, left, right) = body
+    samples = take_samples([_only(trunk, 0.0, 3.0), left, _only(right, 3.5, 6.0)], 1.0, 12)
+    mounts = {mount.camera: mount for mount in inputs.mounts}
+    calibration = Calibration(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
+    assert np.isfinite(calibration.solve(1.0))
+    usual = mounts["right_palm"].joint_from_cam
+    assert np.abs(calibration.mounts["right_palm"] - usual).max() < 1e-3
+
+
+def test_a_t_pose_that_the_trunk_missed_adds_no_samples(body):
+    trunk, left, _ = body[2]
+    samples = take_samples([_only(trunk, 2.5, 6.0), left], 1.0, 12, None, (0, 2_000_000_000))
+    assert len(samples.times_ns) == 12
+    assert not samples.posture.t_pose.any()
+
+
+def test_frames_that_are_all_far_apart_are_a_start(walk, body):
+    inputs, bones, (trunk, left, right) = body
+    mounts = {mount.camera: mount.joint_from_cam for mount in inputs.mounts}
+    sparse = right.keep(np.arange(len(right.times_ns)) % 10 == 3)
+    one = left.keep(np.arange(len(left.times_ns)) == 20)
+    graph = MotionGraph(walk.skeleton, bones, trunk.times_ns[:60] + 5_000_000, [trunk, one, sparse], mounts)
+    assert np.isfinite(graph.solve(1, lambda: None).world_from_bone).all()
+
+
+def test_bursts_are_no_common_walk(body):
+    trunk, left, _ = body[2]
+    require_common_time(trunk, [left])
+    ends = left.keep((left.times_ns < 2.5e8) | (left.times_ns > 5.75e9))
+    with pytest.raises(EstimationError, match="less than 4 s"):
+        require_common_time(trunk, [ends])
+
+
+class _Sliding:
+    """A calibration whose cost falls without end."""
+
+    def __init__(self):
+        self.mounts = {"cam": np.eye(4)}
+
+    def solve(self, scale):
+        return 10.0 - float(np.log(scale))
+
+
+def test_a_cost_that_falls_without_end_leaves_the_scale_open():
+    estimate = find_scale(_Sliding(), 1.0)
+    assert estimate.sigma_log == 1.0
+    assert np.isfinite(estimate.mount_slope["cam"]).all()
+
+
+def test_a_known_distance_in_a_further_map_is_in_that_maps_units(body, recorded):
+    inputs = replace(
+        body[0],
+        trajectories=tuple(
+            replace(each, gauge="map-1") if each.camera == "right_palm" else each for each in recorded
+        ),
+    )
+    asked = MergeOptions(known_distance=("right_palm:0", "right_palm:90", 2.0))
+    half = Similarity(0.5, np.eye(3), np.zeros(3))
+    alone = known_distance(inputs, asked)
+    placed = known_distance(inputs, asked, {"map-0": half, "map-1": half})
+    assert placed.scale == pytest.approx(2.0 * alone.scale)
+    with pytest.raises(EstimationError, match="cannot place"):
+        known_distance(inputs, asked, {"map-0": half})
+
+
+def test_a_swinging_upper_arm_does_not_say_where_the_other_arm_is():
+    bones = graph_bones(load_skeleton("upper_body"), ("LeftArm", "LeftHand", "RightHand"))
+    index = {bone.role: place for place, bone in enumerate(bones)}
+    assert anchor_and_reach(bones, index["RightHand"], index["LeftArm"]) is None
+    assert anchor_and_reach(bones, index["LeftHand"], index["LeftArm"]) is not None
+
+
+def test_planes_of_a_long_captures_map_take_little_memory():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0.0, 5.0, (60_000, 3))
+    points[:40_000, 2] = 0.0
+    tracemalloc.start()
+    planes = find_planes(points, np.random.default_rng(0))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert abs(planes[0].normal[2]) > 0.999
+    assert peak < 400e6
