@@ -15,6 +15,10 @@ CHUNK_TICKS = 1500
 OVERLAP_TICKS = 90
 """Two solutions of a stretch differ by what lies beyond; three seconds of measurements forget it."""
 MAX_ITERATIONS = 20
+_SHORTEST_TICKS = 300
+_CHAIN_BYTES = 8e8
+"""Of a stretch's covariance: two square blocks a tick, of twelve unknowns for each bone and each camera whose
+frames lie between the ticks."""
 
 
 Part = tuple[Solution, Sequence[Track], tuple[int, int], int]
@@ -48,6 +52,12 @@ def solve_motion(
         solution = build(tick_times_ns[low:high], seen).solve(MAX_ITERATIONS, step, spread)
         parts.append((solution, seen, (first, last), low))
     return parts[0][0] if len(parts) == 1 else _joined(parts, tick_times_ns)
+
+
+def longest_stretch(bones: int, tracks: Sequence[Track]) -> int:
+    """Ticks that one stretch may have, so that its memory stays bounded however many cameras there are."""
+    block = 12 * (bones + len(tracks))
+    return int(np.clip(_CHAIN_BYTES / (16.0 * block**2), _SHORTEST_TICKS, CHUNK_TICKS))
 
 
 def stretches(tick_times_ns: IntArray, tracks: Sequence[Track], chunk_ticks: int) -> list[tuple[int, int]]:

@@ -16,7 +16,7 @@ from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging import gauge
 from bodycap_batch.merging.bones import Bone, graph_bones
-from bodycap_batch.merging.chunks import MAX_ITERATIONS, solve_motion
+from bodycap_batch.merging.chunks import MAX_ITERATIONS, longest_stretch, solve_motion
 from bodycap_batch.merging.complete import complete_body, observed_joints
 from bodycap_batch.merging.constants import Calibrated, Cleaned, calibrate_body, points_around
 from bodycap_batch.merging.initial import provisional_scale
@@ -73,6 +73,7 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         tick_times,
         metric,
         step,
+        chunk_ticks=longest_stretch(len(bones), tracks),
         spread=calibrated.spread,
     )
     world_from_solved, joints, solved, floor = _place(inputs, bones, solution, calibrated, fps)

@@ -17,6 +17,7 @@ from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.calibrate import Calibration, take_samples
+from bodycap_batch.merging.chunks import CHUNK_TICKS, longest_stretch
 from bodycap_batch.merging.common_walk import require_common_time
 from bodycap_batch.merging.distance import known_distance
 from bodycap_batch.merging.initial import anchor_and_reach
@@ -142,3 +143,9 @@ def test_planes_of_a_long_captures_map_take_little_memory():
     tracemalloc.stop()
     assert abs(planes[0].normal[2]) > 0.999
     assert peak < 400e6
+
+
+def test_stretches_get_shorter_with_many_cameras(body):
+    tracks = body[2]
+    assert longest_stretch(9, tracks) == CHUNK_TICKS
+    assert 300 <= longest_stretch(15, [*tracks, *tracks, *tracks, *tracks]) < 600
