@@ -95,9 +95,23 @@ def _with_losses(path: Trajectory, lost: slice) -> Trajectory:
 def _told(paths: tuple[Trajectory, ...]) -> dict[str, object]:
     """What merging's own report holds, for these paths."""
     residual = {"p50": 0.001, "p95": 0.004}
-    mount = {"sigma_deg": 3.0, "sigma_m": 0.01, "from_prior_deg": 8.0, "from_prior_m": 0.02}
+    mount = {"sigma_deg": 3.0, "sigma_m": 0.01, "from_prior_deg": 8.0, "from_prior_m": 0.02, "roll_deg": 90.0}
     return {
-        "scale": {"source": "height", "relative_sigma": 0.045},
+        "scale": {
+            "source": "height",
+            "relative_sigma": 0.045,
+            "sources": [{"name": "height", "relative_sigma": 0.045, "off": -0.012, "used": True}],
+            "chi2": 0.0,
+            "degrees_of_freedom": 0,
+            "limbs": {
+                "alone": [
+                    {"name": "Spine1-LeftHand", "relative_sigma": 0.05, "off": 0.031, "used": True},
+                    {"name": "Spine1-RightHand", "relative_sigma": 0.06, "off": -0.04, "used": True},
+                ],
+                "chi2": 2.4,
+                "degrees_of_freedom": 1,
+            },
+        },
         "mounts": {path.camera: {"role": CAMERAS[path.camera], **mount} for path in paths},
         "cameras": {
             path.camera: {
@@ -111,7 +125,13 @@ def _told(paths: tuple[Trajectory, ...]) -> dict[str, object]:
             for path in paths
         },
         "joint_gap_m": {"LeftHand": {"p50": 0.0002, "p95": 0.0006}},
-        "activity": {"name": "walk", "rules_active": {"Left palm below the shoulder": 0.125}},
+        "hinge_off_plane_m": {"LeftForeArm": {"p50": 0.001, "p95": 0.0071}},
+        "joined_cameras": {},
+        "activity": {
+            "name": "walk",
+            "rules_active": {"Left palm below the shoulder": 0.125, "Right palm below the shoulder": 0.0},
+            "rules_pressed_m": {"Left palm below the shoulder": {"p50": 0.011, "p95": 0.043}},
+        },
     }
 
 

@@ -55,7 +55,7 @@ def report_task(job: Job, made: Made, digests: Mapping[str, str], failure: Mappi
     """
     single = {"map": made.scene, "merge": made.merged, "export": made.exported}
     many = {"registrations": made.registrations, "keyframes": made.keyframes}
-    stated = {"name": job.name, "failure": failure}
+    stated = {"name": job.name, "failure": failure, "max_gap_s": job.merge.max_gap_s}
     body = body_arguments(job) if has_body(job) and made.merged is not None else None
     inputs = {
         **stated,

@@ -21,8 +21,6 @@ from bodycap_batch.report.tables import headline_figures, tables_of
 from bodycap_batch.report.verdict import Grade, judge
 
 _SHEET = 24
-_BRIDGED_S = 1.0
-"""The default of ``merge.max_gap_s``; longer gaps are not bridged."""
 _DONE = {
     "check": "no video was read",
     "keyframes": "the videos were opened, keyframes were being chosen",
@@ -88,7 +86,7 @@ def _came_to(inputs: ReportInputs) -> str:
 def _cameras(inputs: ReportInputs, lost: Sequence[LostFrame], tones: dict[str, str]) -> list[dict[str, Any]]:
     span = _span(inputs)
     causes = causes_by_camera(lost)
-    bridged = _BRIDGED_S if inputs.merge is not None else 0.0
+    used = set() if inputs.merge is None else {path.camera for path in inputs.merge.trajectories}
     out = []
     for name in inputs.cameras:
         losses = [each.loss for each in lost if each.loss.camera == name]
@@ -97,7 +95,7 @@ def _cameras(inputs: ReportInputs, lost: Sequence[LostFrame], tones: dict[str, s
             {
                 "name": name,
                 "tone": tones[name],
-                "strip": strip(inputs, name, span, losses, bridged),
+                "strip": strip(inputs, name, span, losses, inputs.max_gap_s if name in used else 0.0),
                 "frames": 0 if path is None else len(path.status),
                 "registered": 0 if path is None else int(path.localised.sum()),
                 "stretches": len(losses),

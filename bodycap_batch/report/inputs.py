@@ -28,6 +28,7 @@ class ReportInputs:
         metrics: The content of ``metrics.json``.
         capture: The videos; None where they cannot be opened.
         failure: What stopped the job: ``type``, ``message``, ``hint`` and more, as the error tells them.
+        max_gap_s: Holes between two measurements up to this long were bridged (``merge.max_gap_s``).
     """
 
     name: str
@@ -41,6 +42,7 @@ class ReportInputs:
     metrics: Mapping[str, Any] | None = None
     capture: Capture | None = None
     failure: Mapping[str, Any] | None = None
+    max_gap_s: float = 1.0
 
     def registration(self, camera: str) -> Registration | None:
         """One camera's frames, None where registration did not come that far."""

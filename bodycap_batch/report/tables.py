@@ -60,8 +60,12 @@ def tables_of(inputs: ReportInputs) -> dict[str, Table]:
         merge = metrics["merge"]
         found |= {
             "residuals": _residuals(merge),
-            "joints": _joints(merge),
+            "joints": _gaps(merge, "joint_gap_m", "How far apart bones meet at each joint"),
+            "hinges": _gaps(merge, "hinge_off_plane_m", "How far each hinge is bent sideways"),
             "mounts": _mounts(merge),
+            "joined": _joined(merge),
+            "scale": _scale(merge),
+            "limbs": _limbs(merge),
             "rules": _rules(merge),
             "sigma": _sigma(inputs),
         }
@@ -152,22 +156,22 @@ def _residuals(merge: Mapping[str, Any]) -> Table:
     return Table(caption="Residual of each camera against the solved body", heads=heads, rows=tuple(rows))
 
 
-def _joints(merge: Mapping[str, Any]) -> Table:
-    metrics, gaps = {"merge": merge}, merge.get("joint_gap_m", {})
+def _gaps(merge: Mapping[str, Any], key: str, caption: str) -> Table:
+    """Distances of each joint: median, and 95 % with a bar."""
+    metrics, gaps = {"merge": merge}, merge.get(key, {})
     most = max((each["p95"] for each in gaps.values()), default=0.0)
     rows = []
     for role in gaps:
-        last = figure(metrics, f"merge.joint_gap_m.{role}.p95", "{:.2f} mm", 1000.0)
+        last = figure(metrics, f"merge.{key}.{role}.p95", "{:.2f} mm", 1000.0)
         share = gaps[role]["p95"] / most if most else 0.0
         rows.append(
             (
                 Cell(says=role),
-                figure(metrics, f"merge.joint_gap_m.{role}.p50", "{:.2f} mm", 1000.0),
+                figure(metrics, f"merge.{key}.{role}.p50", "{:.2f} mm", 1000.0),
                 Cell(**{**_fields(last), "share": share}),
             )
         )
-    heads = ("Joint", "Gap, median", "Gap, 95 %")
-    return Table(caption="How far apart bones meet at each joint", heads=heads, rows=tuple(rows))
+    return Table(caption=caption, heads=("Joint", "Off, median", "Off, 95 %"), rows=tuple(rows))
 
 
 def _mounts(merge: Mapping[str, Any]) -> Table:
@@ -179,26 +183,100 @@ def _mounts(merge: Mapping[str, Any]) -> Table:
             (
                 Cell(says=name),
                 Cell(says=str(mount["role"])),
+                figure(metrics, f"{place}.roll_deg", "{:.0f}°"),
                 figure(metrics, f"{place}.from_prior_deg", "{:.1f}°"),
                 figure(metrics, f"{place}.from_prior_m", "{:.1f} cm", 100.0),
                 figure(metrics, f"{place}.sigma_deg", "± {:.1f}°"),
                 figure(metrics, f"{place}.sigma_m", "± {:.1f} cm", 100.0),
             )
         )
-    heads = ("Camera", "On", "Turned from assumed", "Moved from assumed", "Known to", "Known to")
+    heads = ("Camera", "On", "Roll", "Turned from assumed", "Moved from assumed", "Known to", "Known to")
     return Table(caption="Mounts found", heads=heads, rows=tuple(rows))
 
 
-def _rules(merge: Mapping[str, Any]) -> Table:
-    rules = merge.get("activity", {}).get("rules_active", {})
-    rows = []
-    for name, share in rules.items():
-        says = f"{share:.1%}" if isinstance(share, int | float) else str(share)
-        bar = float(share) if isinstance(share, int | float) else None
-        rows.append((Cell(says=str(name)), Cell(says=says, share=bar)))
+def _joined(merge: Mapping[str, Any]) -> Table:
+    metrics = {"merge": merge}
+    rows = tuple(
+        (
+            Cell(says=name),
+            figure(metrics, f"merge.joined_cameras.{name}.sigma_deg", "± {:.1f}°"),
+            figure(metrics, f"merge.joined_cameras.{name}.sigma_m", "± {:.1f} cm", 100.0),
+        )
+        for name in merge.get("joined_cameras", {})
+    )
     return Table(
-        caption="Soft rules: how often each one pressed",
-        heads=("Rule", "Share of the time"),
+        caption="Cameras placed by the body alone",
+        heads=("Camera", "Known to", "Known to"),
+        rows=rows,
+        note="Their map shares no view with the main one.",
+    )
+
+
+def _scale(merge: Mapping[str, Any]) -> Table:
+    scale = merge.get("scale", {})
+    rows = tuple(
+        (
+            *_source(merge, f"merge.scale.sources.{index}"),
+            Cell(says="used" if source["used"] else "not used"),
+        )
+        for index, source in enumerate(scale.get("sources", ()))
+    )
+    return Table(
+        caption="What the metric scale rests on",
+        heads=("Source", "Known to", "Off the scale taken", ""),
+        rows=rows,
+        note=_agreement(scale),
+    )
+
+
+def _limbs(merge: Mapping[str, Any]) -> Table:
+    limbs = merge.get("scale", {}).get("limbs", {})
+    rows = tuple(
+        _source(merge, f"merge.scale.limbs.alone.{index}") for index in range(len(limbs.get("alone", ())))
+    )
+    return Table(
+        caption="The scale each limb alone would give",
+        heads=("Limb", "Known to", "Off the scale taken"),
+        rows=rows,
+        note=_agreement(limbs),
+    )
+
+
+def _source(merge: Mapping[str, Any], place: str) -> tuple[Cell, ...]:
+    metrics = {"merge": merge}
+    return (
+        Cell(says=str(look_up(metrics, f"{place}.name"))),
+        figure(metrics, f"{place}.relative_sigma", "± {:.1%}"),
+        figure(metrics, f"{place}.off", "{:+.1%}"),
+    )
+
+
+def _agreement(told: Mapping[str, Any]) -> str:
+    """How far sources disagree, against what their own uncertainty lets expect."""
+    freedom = told.get("degrees_of_freedom")
+    if not freedom:
+        return ""
+    return f"χ² {told['chi2']:.1f}; about {freedom} is to be expected where all are right."
+
+
+def _rules(merge: Mapping[str, Any]) -> Table:
+    metrics, activity = {"merge": merge}, merge.get("activity", {})
+    rows = []
+    for name, share in activity.get("rules_active", {}).items():
+        often = figure(metrics, f"merge.activity.rules_active.{name}", "{:.1%}")
+        pressed = name in activity.get("rules_pressed_m", {})
+        place = f"merge.activity.rules_pressed_m.{name}"
+        far = [figure(metrics, f"{place}.{q}", "{:.1f} cm", 100.0) for q in ("p50", "p95")]
+        rows.append(
+            (
+                Cell(says=str(name)),
+                Cell(**{**_fields(often), "share": float(share)}),
+                *(far if pressed else (Cell(says="–"), Cell(says="–"))),
+            )
+        )
+    return Table(
+        caption="Soft rules: how often each one pressed, and how far off it was then",
+        heads=("Rule", "Share of the time", "Median", "95 %"),
         rows=tuple(rows),
         note="A rule that presses all the time fights the measurements: check the mount and the activity.",
     )

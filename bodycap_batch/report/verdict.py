@@ -131,7 +131,7 @@ def _of_frames(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
     yield Criterion(
         about="cameras",
         name="Frames registered",
-        grade=graded(share, 0.98, 0.85, more_is_better=True),
+        grade=graded(share, 0.98, 0.85, more_is_better=True) if share > 0.0 else Grade.NONE,
         says=f"{total['frames_registered']:,} of {total['frames']:,} frames ({share:.1%})",
         why="From 98 % on only moments are missing, and the body's smoothness carries over them; below 85 % "
         "more than one frame in seven rests on nothing that was seen.",
@@ -167,14 +167,21 @@ def _of_map(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
         )
     apart = sorted(name for name, each in metrics["cameras"].items() if each["frame"] != metrics["frame"])
     lost = sorted(name for name, each in metrics["cameras"].items() if not each["frames_registered"])
+    joined = sorted(metrics.get("merge", {}).get("joined_cameras", {}))
+    if apart or lost:
+        grade, says = Grade.POOR, f"apart from the main map: {', '.join(sorted({*apart, *lost}))}"
+    elif joined:
+        grade = Grade.FAIR
+        says = f"placed by the body alone, for no view is shared with the main map: {', '.join(joined)}"
+    else:
+        grade, says = Grade.GOOD, "all cameras are placed in one map"
     yield Criterion(
         about="cameras",
         name="One room",
-        grade=Grade.POOR if apart or lost else Grade.GOOD,
-        says=f"{', '.join(sorted({*apart, *lost}))} stands apart from the main map"
-        if apart or lost
-        else "all cameras are placed in one map",
-        why="A camera outside the main map has no known place in the room; nothing of it reaches the body.",
+        grade=grade,
+        says=says,
+        why="A camera outside the main map has no known place in the room; nothing of it reaches the body, "
+        "unless the body itself tells where it was, and then less exactly.",
     )
     reach = metrics.get("mapping", {}).get("reach", {})
     if reach.get("judged"):

@@ -48,6 +48,7 @@ def load_inputs(arguments: Json) -> ReportInputs:
         else json.loads((Path(exported) / RESULTS / "metrics.json").read_text(encoding="utf-8")),
         capture=_capture(arguments),
         failure=arguments["failure"],
+        max_gap_s=arguments["max_gap_s"],
     )
 
 

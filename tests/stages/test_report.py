@@ -121,6 +121,55 @@ def test_the_verdict_takes_the_worst_of_its_criteria(inputs: ReportInputs) -> No
     assert judge(None, {"message": "x"}).grade is Grade.NONE
 
 
+def test_a_verdict_names_cameras_that_only_the_body_places_and_a_job_without_any_pose(
+    inputs: ReportInputs,
+) -> None:
+    metrics = json.loads(json.dumps(inputs.metrics))
+    metrics["merge"]["joined_cameras"] = {"left_palm": {"sigma_deg": 2.0, "sigma_m": 0.01}}
+    room = next(each for each in judge(metrics, None).criteria if each.name == "One room")
+    assert room.grade is Grade.FAIR
+    assert "left_palm" in room.says
+    metrics["total"] |= {"frames_registered": 0, "coverage": 0.0}
+    assert judge(metrics, None).headline.startswith("The cameras are not tracked")
+
+
+def test_what_the_solver_tells_of_scale_hinges_rules_and_joined_maps_is_on_the_page(
+    inputs: ReportInputs, tmp_path: Path
+) -> None:
+    metrics = json.loads(json.dumps(inputs.metrics))
+    metrics["merge"]["joined_cameras"] = {"left_palm": {"sigma_deg": 2.0, "sigma_m": 0.013}}
+    text = written(replace(inputs, metrics=metrics), tmp_path)
+    shown = {name for name, _ in read(text).found}
+    assert {
+        "merge.scale.sources.0.off",
+        "merge.scale.limbs.alone.1.relative_sigma",
+        "merge.hinge_off_plane_m.LeftForeArm.p95",
+        "merge.activity.rules_pressed_m.Left palm below the shoulder.p95",
+        "merge.joined_cameras.left_palm.sigma_m",
+        "merge.mounts.left_palm.roll_deg",
+    } <= shown
+    for says in ("7.10 mm", "4.3 cm", "± 1.3 cm", "-4.0%", "χ² 2.4", "90°"):
+        assert says in text
+
+
+@pytest.mark.parametrize(("max_gap_s", "bridged"), [(0.21, True), (0.19, False)])
+def test_a_gap_counts_as_bridged_by_the_jobs_own_limit(
+    inputs: ReportInputs, tmp_path: Path, max_gap_s: float, bridged: bool
+) -> None:
+    # 5 frames of 30 a second are lost: 0.2 s from the measurement before to the one after
+    text = written(replace(inputs, max_gap_s=max_gap_s), tmp_path)
+    assert ("5 frames lost: BLUR, bridged" in text) == bridged
+    assert ("<title>5 frames lost: BLUR</title>" in text) != bridged
+
+
+def test_a_camera_whose_poses_lie_beside_the_motion_breaks_no_page(
+    inputs: ReportInputs, tmp_path: Path
+) -> None:
+    clocks = {name: replace(clock, offset_s=1000.0) for name, clock in inputs.clocks.items()}
+    text = written(replace(inputs, clocks=clocks), tmp_path)
+    assert "Before and after" not in text
+
+
 def test_losses_are_found_with_what_was_measured_beside_them(inputs: ReportInputs) -> None:
     losses = find_losses(inputs)
     assert len(losses) == 3

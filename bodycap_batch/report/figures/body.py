@@ -58,6 +58,8 @@ def before_optimisation(inputs: ReportInputs) -> list[Before]:
         left = np.maximum(right - 1, 0)
         nearest = np.where(np.abs(times[left] - ticks) <= np.abs(times[right] - ticks), left, right)
         near = np.flatnonzero(np.abs(times[nearest] - ticks) <= 0.5e9 / merge.fps)
+        if len(near) == 0:
+            continue
         bones = poses[nearest[near]] @ invert(mount.joint_from_cam)
         found.append(Before(camera=mount.camera, joint=joint, ticks=near, world_from_joint=bones))
     return found

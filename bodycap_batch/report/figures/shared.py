@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+
 from bodycap_batch.report.advice import shared_points
 from bodycap_batch.report.figures.svg import element, picture, text
 from bodycap_batch.report.inputs import ReportInputs
@@ -34,7 +36,7 @@ def shared(inputs: ReportInputs) -> str:
             parts.append(
                 element(
                     "rect",
-                    element("title", says),
+                    element("title", html.escape(says)),
                     class_="own" if row == column else "cell",
                     style=None if row == column else f"fill-opacity:{0.06 + 0.9 * min(share / 0.5, 1.0):.3f}",
                     x=x + 1.0,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +39,7 @@ def strip(
         camera: Whose.
         span_s: First and last common time of the axis.
         losses: The camera's lost stretches.
-        bridged_s: Gaps up to this long are bridged by the body's smoothness; 0 where there is no body.
+        bridged_s: Holes between two measurements up to this long are bridged by the body; 0: none are.
     """
     selection, path = inputs.selection(camera), inputs.path(camera)
     rows = [] if path is None else _rows_of(path)
@@ -123,10 +124,10 @@ def _status(
         x = float(at(times[index], span_s))
         parts.append(element("line", class_="key", x1=x, x2=x, y1=4.0, y2=4.0 + _STATUS_HEIGHT / 3))
     for loss in losses:
-        length = loss.end_s - loss.start_s + step
         # Smoothness carries over a gap between two measurements, not past the last one.
         inside = loss.first > 0 and loss.last < len(path.status) - 1
-        kind = "bridged" if inside and length <= bridged_s else "lost"
+        hole = float(times[loss.last + 1] - times[loss.first - 1]) if inside else np.inf
+        kind = "bridged" if hole <= bridged_s else "lost"
         what = f"{loss.frames} frames lost: {loss.reason.value}" + (
             ", bridged by the body's smoothness" if kind == "bridged" else ""
         )
@@ -138,7 +139,13 @@ def _bar(start_s: float, end_s: float, span_s: tuple[float, float], kind: str, s
     left, right = float(at(start_s, span_s)), float(at(end_s, span_s))
     width = max(right - left, 0.8)
     return element(
-        "rect", element("title", says), class_=kind, x=left, y=4.0, width=width, height=_STATUS_HEIGHT
+        "rect",
+        element("title", html.escape(says)),
+        class_=kind,
+        x=left,
+        y=4.0,
+        width=width,
+        height=_STATUS_HEIGHT,
     )
 
 
