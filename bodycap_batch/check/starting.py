@@ -56,7 +56,7 @@ def starting_job(folder: Path) -> str:
         "#   bodycap check job.yaml    says what would be used, and what is wrong with it",
         "#   bodycap run job.yaml      computes it",
         "",
-        f"name: {_safe(folder.resolve().name)}",
+        f"name: {_quoted(_safe(folder.resolve().name))}",
         "",
         *_body(folder),
         "",
@@ -112,7 +112,7 @@ def _places() -> list[str]:
 def _camera(name: str, files: Sequence[Path], folder: Path) -> list[str]:
     paths = [path.relative_to(folder).as_posix() for path in files]
     video = _quoted(paths[0]) if len(paths) == 1 else f"[{', '.join(map(_quoted, paths))}]"
-    lines = [f"    # {_found(files)}", f"    - name: {_safe(name)}", f"      video: {video}"]
+    lines = [f"    # {_found(files)}", f"    - name: {_quoted(_safe(name))}", f"      video: {video}"]
     if mount_of(name) is None:
         lines.append(f"      mount: {_quoted(UNKNOWN)}")
     if not list(folder.glob(f"{name}.timestamps.txt")):

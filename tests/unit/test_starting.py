@@ -32,6 +32,17 @@ def test_the_job_written_means_what_the_folder_means(folder: Path) -> None:
     assert load_job(path) == load_job(folder)
 
 
+@pytest.mark.parametrize("named", ["20261121", "1e5", "true", "null"])
+def test_names_that_look_like_numbers_stay_text(tmp_path: Path, named: str) -> None:
+    for video in ("torso.mp4", "2.mp4"):
+        write_video(tmp_path / named / video, FRAMES[:5])
+    path = write_starting_job(tmp_path / named)
+    path.write_text(path.read_text().replace(f'"{UNKNOWN}"', "head"))
+    job = load_job(path)
+    assert job.name == named
+    assert sorted(camera.name for camera in job.capture.cameras) == ["2", "torso"]
+
+
 def test_what_is_found_is_used_and_said(folder: Path) -> None:
     (folder / "subject.bvh").write_text(BVH)
     text = starting_job(folder)
