@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import csv
+import json
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.errors import JobError, StoreError
@@ -15,6 +18,9 @@ from bodycap_batch.skeleton import Motion
 
 def write_recording(results: Path, target: Path) -> None:
     """Read a folder of results and write them as one recording: points, camera paths, moving skeleton.
+
+    All of it is on the common clock, which ``frames.csv`` and ``metrics.json`` tell; without them every file
+    is taken to start on it.
 
     Args:
         results: Folder with ``map.ply``, ``trajectories`` and ``motion.bvh``; what is missing is left out.
@@ -41,12 +47,13 @@ def write_recording(results: Path, target: Path) -> None:
         stream.log(
             "world/map", rr.Points3D(points, colors=colours, radii=rr.Radius.ui_points(1.5)), static=True
         )
+    offsets = offsets_s(results)
     for path in paths:
-        _log_path(stream, path)
+        _log_path(stream, path, offsets.get(path.stem, 0.0))
     if (results / "motion.bvh").is_file():
         motion = read_bvh(results / "motion.bvh")[1]
         if motion is not None:
-            _log_motion(stream, motion)
+            _log_motion(stream, motion, bvh_start_s(results, motion.fps))
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         stream.save(target)
@@ -56,6 +63,29 @@ def write_recording(results: Path, target: Path) -> None:
         ) from error
 
 
+def offsets_s(results: Path) -> dict[str, float]:
+    """Common time less camera time, by camera; none without ``frames.csv``."""
+    try:
+        with (results / "frames.csv").open(encoding="utf-8", newline="") as stream:
+            return {
+                row["camera"]: float(row["common_time"]) - float(row["time"])
+                for row in csv.DictReader(stream)
+            }
+    except OSError:
+        return {}
+
+
+def bvh_start_s(results: Path, fps: float) -> float:
+    """Common time of the first frame of ``motion.bvh``, which holds no clock of its own."""
+    try:
+        metrics = json.loads((results / "metrics.json").read_text(encoding="utf-8"))
+        job = yaml.safe_load((results / "job.yaml").read_text(encoding="utf-8"))
+    except OSError:
+        return 0.0
+    start_s = float(metrics.get("motion", {}).get("start_s", 0.0))
+    return start_s - 1.0 / fps if job.get("export", {}).get("tpose") else start_s
+
+
 def _cloud(path: Path) -> tuple[FloatArray, FloatArray]:
     import open3d as o3d
 
@@ -63,7 +93,7 @@ def _cloud(path: Path) -> tuple[FloatArray, FloatArray]:
     return np.asarray(cloud.points), np.asarray(cloud.colors)
 
 
-def _log_path(stream: object, path: Path) -> None:
+def _log_path(stream: object, path: Path, offset_s: float) -> None:
     import rerun as rr
     from scipy.spatial.transform import Rotation
 
@@ -75,18 +105,18 @@ def _log_path(stream: object, path: Path) -> None:
     quats = Rotation.from_matrix(found.world_from_cam[:, :3, :3]).as_quat()
     stream.send_columns(
         f"{name}/now",
-        indexes=[rr.TimeColumn("time", duration=found.times_ns * 1e-9)],
+        indexes=[rr.TimeColumn("time", duration=found.times_ns * 1e-9 + offset_s)],
         columns=rr.Transform3D.columns(translation=centres, quaternion=quats),
     )
     stream.log(f"{name}/now", rr.TransformAxes3D(0.1), static=True)
 
 
-def _log_motion(stream: object, motion: Motion) -> None:
+def _log_motion(stream: object, motion: Motion, start_s: float) -> None:
     import rerun as rr
 
     assert isinstance(stream, rr.RecordingStream)
     centres = motion.world_from_joint()[..., :3, 3]
     bones = [(int(parent), joint) for joint, parent in enumerate(motion.skeleton.parents) if parent >= 0]
     for tick, time_ns in enumerate(motion.times_ns()):
-        stream.set_time("time", duration=float(time_ns) * 1e-9)
+        stream.set_time("time", duration=start_s + float(time_ns) * 1e-9)
         stream.log("world/body", rr.LineStrips3D([centres[tick, pair] for pair in map(list, bones)]))

@@ -19,7 +19,7 @@ from bodycap_batch.errors import StoreError
 
 LOOPBACK = "127.0.0.1"
 _TYPES = {".mp4": "video/mp4", ".m4v": "video/mp4", ".mov": "video/mp4", ".mkv": "video/x-matroska"}
-_TYPES |= {".webm": "video/webm", ".avi": "video/x-msvideo"}
+_TYPES |= {".webm": "video/webm", ".avi": "video/x-msvideo", ".html": "text/html; charset=utf-8"}
 _RANGE = re.compile(r"bytes=(\d+)-(\d*)")
 
 
@@ -95,14 +95,21 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer with the content."""
-        self._answer(body=True)
+        self._answer_patiently(body=True)
 
     def do_HEAD(self) -> None:
         """Answer without it."""
-        self._answer(body=False)
+        self._answer_patiently(body=False)
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the name the base class gives it
         """Keep quiet."""
+
+    def _answer_patiently(self, *, body: bool) -> None:
+        # Players break off what they are being sent whenever they seek.
+        try:
+            self._answer(body=body)
+        except ConnectionError:
+            self.close_connection = True
 
     def _answer(self, *, body: bool) -> None:
         # Another page's name can be made to point at this machine: only the machine's own names are served.
@@ -132,7 +139,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         with stream:
             size = path.stat().st_size
-            kind = _TYPES.get(path.suffix.lower(), "text/html; charset=utf-8")
+            kind = _TYPES.get(path.suffix.lower(), "application/octet-stream")
             wanted = _RANGE.fullmatch(self.headers.get("Range", ""))
             if wanted is None:
                 self._begin(HTTPStatus.OK, kind, size)

@@ -16,7 +16,7 @@ from bodycap_batch.config.models import CaptureConfig
 from bodycap_batch.errors import JobError
 from bodycap_batch.formats.bvh import write_bvh
 from bodycap_batch.report.recording import write_recording
-from bodycap_batch.report.serving import LOOPBACK, make_server, what_to_serve
+from bodycap_batch.report.serving import LOOPBACK, Served, make_server, what_to_serve
 from tests.bodies import reaching
 from tests.videos import textured_frame, write_video
 
@@ -65,6 +65,27 @@ def test_report_and_videos_are_served_with_ranges(port: int, tmp_path: Path) -> 
     assert ask(port, "/video/0/0", {"Range": f"bytes={len(whole)}-"}).status == 416
 
 
+def test_a_player_that_breaks_off_is_no_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    large = tmp_path / "torso.mts"
+    large.write_bytes(bytes(30_000_000))
+    server = make_server(Served(files={"/video/0/0": large}, videos={}))
+    server.daemon_threads = False
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    connection = http.client.HTTPConnection(LOOPBACK, server.server_port, timeout=10)
+    connection.request("GET", "/video/0/0")
+    answer = connection.getresponse()
+    # What no browser plays is at least not shown to it as a page.
+    assert answer.headers["Content-Type"] == "application/octet-stream"
+    answer.read(1000)
+    answer.close()
+    connection.close()
+    server.shutdown()
+    thread.join()
+    server.server_close()  # waits for the answer's thread
+    assert "Traceback" not in capsys.readouterr().err
+
+
 def test_times_of_both_chapters_are_on_the_common_clock(port: int) -> None:
     (chapters,) = json.loads(ask(port, "/videos.json").read()).values()
     for index, chapter in enumerate(chapters):
@@ -90,6 +111,35 @@ def test_a_recording_for_rerun_holds_the_motion(tmp_path: Path) -> None:
     write_bvh(tmp_path / "motion.bvh", reaching(10))
     write_recording(tmp_path, tmp_path / "out" / "walk.rrd")
     assert (tmp_path / "out" / "walk.rrd").read_bytes()[:3] == b"RRF"
+
+
+def test_a_recording_puts_cameras_and_body_on_the_common_clock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rr = pytest.importorskip("rerun", reason="needs the extra `viewer`")
+    (tmp_path / "trajectories").mkdir()
+    (tmp_path / "trajectories" / "torso.tum").write_text("1.0 0 0 1 0 0 0 1\n1.1 0 0 1 0 0 0 1\n")
+    (tmp_path / "frames.csv").write_text("camera,frame,time,common_time\ntorso,30,1.0,3.5\n")
+    (tmp_path / "metrics.json").write_text(json.dumps({"motion": {"start_s": 4.0}}))
+    (tmp_path / "job.yaml").write_text("export: {tpose: true}\n")
+    write_bvh(tmp_path / "motion.bvh", reaching(3))
+    told: dict[str, list[float]] = {"cameras": [], "body": []}
+    column, set_time = rr.TimeColumn, rr.RecordingStream.set_time
+
+    def spy_column(name: str, *, duration: np.ndarray) -> object:
+        told["cameras"] += duration.tolist()
+        return column(name, duration=duration)
+
+    def spy_time(stream: object, name: str, *, duration: float) -> None:
+        told["body"].append(duration)
+        set_time(stream, name, duration=duration)
+
+    monkeypatch.setattr(rr, "TimeColumn", spy_column)
+    monkeypatch.setattr(rr.RecordingStream, "set_time", spy_time)
+    write_recording(tmp_path, tmp_path / "walk.rrd")
+    np.testing.assert_allclose(told["cameras"], [3.5, 3.6])
+    # the T-pose stands one frame before the motion
+    np.testing.assert_allclose(told["body"], 4.0 + np.array([-1, 0, 1]) / reaching(3).fps, atol=1e-5)
 
 
 def test_a_folder_without_results_is_no_recording(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ class Picture {
     this.video.addEventListener("error", () => {
       this.videos = {};
       this.video.hidden = true;
+      this.overlay.style.visibility = "visible";
     });
   }
 
