@@ -16,6 +16,7 @@ import pytest
 from bodycap_batch.context import StageContext
 from bodycap_batch.report import ReportInputs, write_report
 from bodycap_batch.report.advice import advise, shared_points
+from bodycap_batch.report.figures.strips import strip
 from bodycap_batch.report.losses import Cause, cause_of, find_losses
 from bodycap_batch.report.packing import NONE, Shown, pack_scaled, thinned
 from bodycap_batch.report.pictures import SERIES_BUDGET, Look, Picture
@@ -160,6 +161,30 @@ def test_a_gap_counts_as_bridged_by_the_jobs_own_limit(
     text = written(replace(inputs, max_gap_s=max_gap_s), tmp_path)
     assert ("5 frames lost: BLUR, bridged" in text) == bridged
     assert ("<title>5 frames lost: BLUR</title>" in text) != bridged
+
+
+def test_a_strip_of_any_length_stays_small(inputs: ReportInputs) -> None:
+    # every other frame is lost: drawn one by one, the stretches alone would take 2 MB
+    count = 20_000
+    statuses = (FrameStatus.KEYFRAME, FrameStatus.BLUR) * (count // 2)
+    found = inputs.registrations[0]
+    kept = np.tile([True, False], count // 2)
+    path = replace(
+        found.trajectory,
+        times_ns=np.arange(count) * 33_333_333,
+        frame_numbers=np.arange(count),
+        gauge_from_cam=np.where(kept[:, None, None], np.eye(4), np.nan),
+        covariance=np.where(kept[:, None, None], np.eye(6), np.nan),
+        status=statuses,
+        inliers=np.full(count, 50),
+        error_px=np.where(kept, 0.5, np.nan),
+    )
+    long = replace(inputs, registrations=(replace(found, trajectory=path),), merge=None, selections=())
+    losses = find_losses(long)
+    assert len(losses) == count // 2
+    drawn = strip(long, path.camera, (0.0, count / 30.0), losses, 0.0)
+    assert len(drawn) < 150_000
+    assert f"{count // 2} frames lost: BLUR" in drawn
 
 
 def test_a_camera_whose_poses_lie_beside_the_motion_breaks_no_page(

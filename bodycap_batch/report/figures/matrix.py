@@ -124,5 +124,5 @@ def _band(name: str, image: str, top: float, height: float, tone: str) -> str:
 def _keyframes(scene: Map, name: str, count: int, top: float, height: float) -> str:
     """Keyframe rows as ticks on both sides and a faint line across."""
     rows = top + (scene.keyframe_frame[scene.keyframes_of(name)] + 0.5) / max(count, 1) * height
-    path = "".join(f"M{number(_LEFT)} {number(y)}H{number(_WIDTH - 12.0)}" for y in rows)
+    path = "".join(f"M{number(_LEFT)} {number(y)}H{number(_WIDTH - 12.0)}" for y in np.unique(rows.round(1)))
     return element("path", class_="keyrow", d=path) if path else ""

@@ -118,30 +118,63 @@ def _status(
     localised = path.localised
     parts = [text(LEFT - 8.0, 17.0, "status", class_="label", text_anchor="end")]
     edges = np.flatnonzero(np.diff(np.concatenate([[0], localised.astype(int), [0]])))
-    for first, stop in zip(edges[::2], edges[1::2], strict=True):
-        parts.append(_bar(times[first], times[stop - 1] + step, span_s, "reg", "registered"))
-    for index in np.flatnonzero([each is FrameStatus.KEYFRAME for each in path.status]):
-        x = float(at(times[index], span_s))
-        parts.append(element("line", class_="key", x1=x, x2=x, y1=4.0, y2=4.0 + _STATUS_HEIGHT / 3))
-    for loss in losses:
-        # Smoothness carries over a gap between two measurements, not past the last one.
-        inside = loss.first > 0 and loss.last < len(path.status) - 1
-        hole = float(times[loss.last + 1] - times[loss.first - 1]) if inside else np.inf
-        kind = "bridged" if hole <= bridged_s else "lost"
-        what = f"{loss.frames} frames lost: {loss.reason.value}" + (
-            ", bridged by the body's smoothness" if kind == "bridged" else ""
-        )
-        parts.append(_bar(loss.start_s, loss.end_s + step, span_s, kind, what))
+    runs = [
+        _Run("reg", float(times[first]), float(times[stop - 1] + step))
+        for first, stop in zip(edges[::2], edges[1::2], strict=True)
+    ]
+    parts += [_bar(run, span_s, "registered") for run in _seen_apart(runs, span_s)]
+    keys = np.array([each is FrameStatus.KEYFRAME for each in path.status], dtype=bool)
+    if keys.any():
+        places = np.unique(at(times[keys], span_s).round())
+        lines = "".join(f"M{number(x)} 4V{number(4.0 + _STATUS_HEIGHT / 3)}" for x in places)
+        parts.append(element("path", class_="key", d=lines))
+    lost = [_lost_run(loss, times, step, bridged_s) for loss in losses]
+    for run in _seen_apart(lost, span_s):
+        what = f"{run.frames} frames lost: {', '.join(run.reasons)}"
+        parts.append(_bar(run, span_s, f"{what}, bridged by the body" if run.kind == "bridged" else what))
     return "".join(parts)
 
 
-def _bar(start_s: float, end_s: float, span_s: tuple[float, float], kind: str, says: str) -> str:
-    left, right = float(at(start_s, span_s)), float(at(end_s, span_s))
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """A stretch of one kind, or several that a screen cannot tell apart."""
+
+    kind: str
+    start_s: float
+    end_s: float
+    frames: int = 0
+    reasons: tuple[str, ...] = ()
+
+
+def _lost_run(loss: Loss, times: FloatArray, step: float, bridged_s: float) -> _Run:
+    # Smoothness carries over a gap between two measurements, not past the last one.
+    inside = loss.first > 0 and loss.last < len(times) - 1
+    hole = float(times[loss.last + 1] - times[loss.first - 1]) if inside else np.inf
+    kind = "bridged" if hole <= bridged_s else "lost"
+    return _Run(kind, loss.start_s, loss.end_s + step, loss.frames, (loss.reason.value,))
+
+
+def _seen_apart(runs: list[_Run], span_s: tuple[float, float]) -> list[_Run]:
+    """Neighbours of one kind less than a pixel apart as one: hours of frames stay a page."""
+    pixel_s = (span_s[1] - span_s[0]) / (WIDTH - LEFT - RIGHT)
+    out: list[_Run] = []
+    for run in runs:
+        last = out[-1] if out else None
+        if last is not None and last.kind == run.kind and run.start_s - last.end_s < pixel_s:
+            reasons = tuple(dict.fromkeys((*last.reasons, *run.reasons)))
+            out[-1] = _Run(run.kind, last.start_s, run.end_s, last.frames + run.frames, reasons)
+        else:
+            out.append(run)
+    return out
+
+
+def _bar(run: _Run, span_s: tuple[float, float], says: str) -> str:
+    left, right = float(at(run.start_s, span_s)), float(at(run.end_s, span_s))
     width = max(right - left, 0.8)
     return element(
         "rect",
         element("title", html.escape(says)),
-        class_=kind,
+        class_=run.kind,
         x=left,
         y=4.0,
         width=width,
