@@ -123,6 +123,7 @@ def _all(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
     yield from _of_map(metrics)
     if "merge" in metrics:
         yield from _of_body(metrics["merge"])
+        yield from _of_measured(metrics.get("motion", {}).get("joints", {}))
 
 
 def _of_frames(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
@@ -278,4 +279,20 @@ def _of_unused(unused: Mapping[str, Any]) -> Iterator[Criterion]:
             grade=Grade.POOR,
             says="; ".join(f"{name}: {reason}" for name, reason in sorted(unused.items())),
             why="Their limbs are inferred, not measured.",
+        )
+
+
+def _of_measured(joints: Mapping[str, Any]) -> Iterator[Criterion]:
+    shares = {name: float(each["observed_share"]) for name, each in joints.items() if each["observed"]}
+    name, share = min(shares.items(), key=lambda item: item[1], default=("", None))
+    if share is not None:
+        yield Criterion(
+            about="body",
+            name="Time measured",
+            grade=graded(share, 0.95, 0.8, more_is_better=True),
+            says=f"{share:.1%} of the motion at the joint that was measured least ({name})",
+            why="A camera that starts late, ends early or is lost for long leaves its limb inferred, "
+            "and no other figure shows it: the longest gap is one between two measurements.",
+            metric="" if "." in name else f"motion.joints.{name}.observed_share",
+            value=share,
         )

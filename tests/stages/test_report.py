@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 
 from bodycap_batch.context import StageContext
+from bodycap_batch.geometry import interpolate_pose
 from bodycap_batch.report import ReportInputs, write_report
 from bodycap_batch.report.advice import advise, shared_points
+from bodycap_batch.report.figures.body import before_optimisation
 from bodycap_batch.report.figures.strips import strip
 from bodycap_batch.report.losses import Cause, cause_of, find_losses
 from bodycap_batch.report.packing import NONE, Shown, pack_scaled, thinned
@@ -24,7 +26,7 @@ from bodycap_batch.report.placing import place
 from bodycap_batch.report.solid import solid_data
 from bodycap_batch.report.tables import look_up
 from bodycap_batch.report.verdict import Grade, judge
-from bodycap_batch.scene import FrameStatus
+from bodycap_batch.scene import FrameStatus, Trajectory
 from tests.reports import report_inputs
 
 
@@ -134,6 +136,16 @@ def test_a_verdict_names_cameras_that_only_the_body_places_and_a_job_without_any
     assert judge(metrics, None).headline.startswith("The cameras are not tracked")
 
 
+def test_a_camera_that_ended_early_shows_in_the_verdict(inputs: ReportInputs) -> None:
+    metrics = json.loads(json.dumps(inputs.metrics))
+    assert next(c for c in judge(metrics, None).criteria if c.name == "Time measured").grade is Grade.GOOD
+    metrics["motion"]["joints"]["LeftHand"]["observed_share"] = 0.6
+    least = next(c for c in judge(metrics, None).criteria if c.name == "Time measured")
+    assert (least.grade, least.value) == (Grade.POOR, 0.6)
+    assert look_up(metrics, least.metric) == 0.6
+    assert judge(metrics, None).body is Grade.POOR
+
+
 def test_what_the_solver_tells_of_scale_hinges_rules_and_joined_maps_is_on_the_page(
     inputs: ReportInputs, tmp_path: Path
 ) -> None:
@@ -185,6 +197,33 @@ def test_a_strip_of_any_length_stays_small(inputs: ReportInputs) -> None:
     drawn = strip(long, path.camera, (0.0, count / 30.0), losses, 0.0)
     assert len(drawn) < 150_000
     assert f"{count // 2} frames lost: BLUR" in drawn
+
+
+def test_before_optimisation_means_the_same_for_a_camera_half_a_frame_late(inputs: ReportInputs) -> None:
+    assert inputs.merge is not None
+
+    def late(path: Trajectory) -> Trajectory:
+        poses = path.gauge_from_cam
+        kept = path.localised[:-1] & path.localised[1:]
+        between = np.full_like(poses[:-1], np.nan)
+        between[kept] = interpolate_pose(poses[:-1][kept], poses[1:][kept], 0.5)
+        return replace(
+            path,
+            gauge_from_cam=np.concatenate([between, poses[-1:]]),
+            times_ns=path.times_ns + np.append(np.full(len(between), 16_666_667), 0),
+            covariance=np.where(np.append(kept, True)[:, None, None], np.eye(6) * 1e-4, np.nan),
+            status=tuple(
+                status if good else FrameStatus.BLUR
+                for status, good in zip(path.status, [*kept, True], strict=True)
+            ),
+        )
+
+    merge = replace(inputs.merge, trajectories=tuple(late(path) for path in inputs.merge.trajectories))
+    for usual, shifted in zip(
+        before_optimisation(inputs), before_optimisation(replace(inputs, merge=merge)), strict=True
+    ):
+        # 5 mm of noise and slack; half a frame of walking at 1.1 m/s would be 18 mm more
+        assert abs(np.median(shifted.off_m(merge)) - np.median(usual.off_m(merge))) < 0.004
 
 
 def test_a_camera_whose_poses_lie_beside_the_motion_breaks_no_page(

@@ -8,11 +8,13 @@ import numpy as np
 
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.body import MergeResult
-from bodycap_batch.geometry import invert
+from bodycap_batch.geometry import interpolate_pose, invert
 from bodycap_batch.report.figures.svg import element, picture, polyline, text
 from bodycap_batch.report.inputs import ReportInputs
 
 _MOMENTS = 4
+_NEIGHBOURS_S = 0.1
+"""Poses further apart are not interpolated between: at this, three frames of a 30 fps camera."""
 _CELL_W, _CELL_H, _SCALE = 236.0, 250.0, 112.0
 
 
@@ -23,7 +25,7 @@ class Before:
     Attributes:
         camera: Camera name.
         joint: Index of the bone's joint.
-        ticks: (N,) ticks of the motion with a measured pose within half a tick.
+        ticks: (N,) ticks of the motion at or between two measured poses that follow each other.
         world_from_joint: (N,4,4) the bone.
     """
 
@@ -55,12 +57,15 @@ def before_optimisation(inputs: ReportInputs) -> list[Before]:
         if len(times) == 0:
             continue
         right = np.clip(np.searchsorted(times, ticks), 0, len(times) - 1)
-        left = np.maximum(right - 1, 0)
-        nearest = np.where(np.abs(times[left] - ticks) <= np.abs(times[right] - ticks), left, right)
-        near = np.flatnonzero(np.abs(times[nearest] - ticks) <= 0.5e9 / merge.fps)
+        left = np.where(times[right] == ticks, right, np.maximum(right - 1, 0))
+        span = times[right] - times[left]
+        inside = (ticks >= times[0]) & (ticks <= times[-1]) & (span <= _NEIGHBOURS_S * 1e9)
+        near = np.flatnonzero(inside)
         if len(near) == 0:
             continue
-        bones = poses[nearest[near]] @ invert(mount.joint_from_cam)
+        alpha = (ticks - times[left])[near] / np.maximum(span[near], 1)
+        measured = interpolate_pose(poses[left[near]], poses[right[near]], alpha)
+        bones = measured @ invert(mount.joint_from_cam)
         found.append(Before(camera=mount.camera, joint=joint, ticks=near, world_from_joint=bones))
     return found
 
