@@ -37,7 +37,7 @@ def write_joint_table(path: Path, motion: Motion, sigma_m: FloatArray | None = N
     local = continuous_quat_xyzw(motion.local_rotation)
     numbers = np.concatenate([poses[..., :3, 3], world, local], axis=-1).round(6) + 0.0
     line = "%s,%s," + "%.6f," * numbers.shape[-1] + "%d,%s\n"
-    names = [f'"{name}"' if set(name) & set(',"\n') else name for name in motion.skeleton.joints]
+    names = [_field(name) for name in motion.skeleton.joints]
     text = io.StringIO()
     text.write(COLUMNS + "\n")
     for tick, time_ns in enumerate(motion.times_ns().tolist()):
@@ -48,6 +48,12 @@ def write_joint_table(path: Path, motion: Motion, sigma_m: FloatArray | None = N
             text.write(line % (time, name, *numbers[tick, joint], motion.observed[tick, joint], known))
     write_text(path, text.getvalue())
     return path
+
+
+def _field(name: str) -> str:
+    """A joint's name as CSV takes it."""
+    doubled = name.replace('"', '""')
+    return f'"{doubled}"' if set(name) & set(',"\n') else name
 
 
 def write_joint_arrays(path: Path, motion: Motion, sigma_m: FloatArray | None = None) -> Path:

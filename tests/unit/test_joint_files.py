@@ -171,3 +171,11 @@ def test_blender_that_does_not_start(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     monkeypatch.setenv("BODYCAP_BLENDER", str(program))
     with pytest.raises(JobError, match=r"does not start: libX11"):
         blender.require_blender()
+
+
+def test_a_joints_name_survives_the_table(tmp_path: Path) -> None:
+    motion = reaching(1)
+    odd = ('Hips "A", low', *motion.skeleton.joints[1:])
+    write_joint_table(tmp_path / "joints.csv", replace(motion, skeleton=replace(motion.skeleton, joints=odd)))
+    with (tmp_path / "joints.csv").open(newline="") as stream:
+        assert tuple(row["joint"] for row in csv.DictReader(stream)) == odd
