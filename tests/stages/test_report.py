@@ -13,8 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bodycap_batch.config.models import Job
 from bodycap_batch.context import StageContext
 from bodycap_batch.geometry import interpolate_pose
+from bodycap_batch.pipeline.made import Made, report_task
 from bodycap_batch.report import ReportInputs, write_report
 from bodycap_batch.report.advice import advise, shared_points
 from bodycap_batch.report.figures.body import before_optimisation
@@ -27,6 +29,7 @@ from bodycap_batch.report.solid import solid_data
 from bodycap_batch.report.tables import look_up
 from bodycap_batch.report.verdict import Grade, judge
 from bodycap_batch.scene import FrameStatus, Trajectory
+from bodycap_batch.tasks.report import load_inputs
 from tests.reports import report_inputs
 
 
@@ -173,6 +176,13 @@ def test_a_gap_counts_as_bridged_by_the_jobs_own_limit(
     text = written(replace(inputs, max_gap_s=max_gap_s), tmp_path)
     assert ("5 frames lost: BLUR, bridged" in text) == bridged
     assert ("<title>5 frames lost: BLUR</title>" in text) != bridged
+
+
+def test_the_jobs_own_limit_is_handed_to_the_report() -> None:
+    camera = {"name": "torso", "video": ["torso.mp4"]}
+    job = Job.model_validate({"capture": {"cameras": [camera]}, "merge": {"max_gap_s": 0.4}})
+    task = report_task(job, Made(), {}, {"stage": "check", "message": "no video"})
+    assert load_inputs(task.arguments).max_gap_s == 0.4
 
 
 def test_a_strip_of_any_length_stays_small(inputs: ReportInputs) -> None:
