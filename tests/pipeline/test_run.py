@@ -238,6 +238,16 @@ def test_a_failed_stage_leaves_earlier_results_intact(done: Bench) -> None:
     assert report == b"map: map does not work out; keyframes"
 
 
+@pytest.mark.parametrize("stage", ["keyframes", "registration"])
+def test_one_camera_that_fails_is_told_in_a_report_too(bench: Bench, stage: str) -> None:
+    bench.order(fail=stage, on="left_palm")
+    with pytest.raises(EstimationError, match="does not work out") as caught:
+        bench.run()
+    assert not getattr(caught.value, "__notes__", [])
+    report = (bench.out / "partial" / "report.html").read_text()
+    assert report.startswith(f"{stage}: {stage} does not work out; ")
+
+
 def test_a_missing_video_is_told_in_a_report_too(bench: Bench) -> None:
     (bench.folder / "torso.mp4").unlink()
     with pytest.raises(CaptureError, match="no such file") as caught:
