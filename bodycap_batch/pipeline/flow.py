@@ -225,7 +225,7 @@ class Flow:
 
     def start_preview(self, made: Made) -> Future[Artefact] | None:
         """Begin the video of the results, beside what follows the merge; None where it is not wanted."""
-        if self._settings.until not in (None, "preview") or made.scene is None:
+        if self._settings.until not in ("", "preview") or made.scene is None:
             return None
         scene, merged, registrations = made.scene, made.merged, made.registrations
         reason = None if made.failure is None else made.failure.message
