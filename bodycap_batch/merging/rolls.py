@@ -119,6 +119,12 @@ def hanging(inputs: MergeInputs, tracks: Sequence[Track], up: FloatArray) -> flo
     return float(np.concatenate(cosines).mean()) if cosines else 0.0
 
 
+def _both_sides(inputs: MergeInputs, limbs: Sequence[Track]) -> bool:
+    """Whether limbs of both sides are seen: one hand alone lies beside the chest, which is no hanging."""
+    roles = [inputs.mount_of(track.camera).role for track in limbs]
+    return all(any(role.startswith(side) for role in roles) for side in ("Left", "Right"))
+
+
 def trunk_roll(
     inputs: MergeInputs, tracks: Sequence[Track], up_of: Callable[[float], FloatArray | None]
 ) -> tuple[float, FloatArray | None]:
@@ -131,7 +137,11 @@ def trunk_roll(
     """
     usual = up_of(0.0)
     hang = 0.0 if usual is None else hanging(inputs, tracks, usual)
-    if not is_open(inputs.mount_of(tracks[0].camera)) or hang > _HANGING:
+    if (
+        not is_open(inputs.mount_of(tracks[0].camera))
+        or hang > _HANGING
+        or not _both_sides(inputs, tracks[1:])
+    ):
         return 0.0, usual
     found = [
         (hanging(inputs, tracks, up), roll, up) for roll in ROLLS_DEG[1:] if (up := up_of(roll)) is not None

@@ -64,3 +64,13 @@ def test_the_runner_up_is_the_best_of_the_rest():
     search = RollSearch("cam", (0.0, -20.0, 3.0, -5.0), 90.0)
     assert search.runner_up() == (270.0, 15.0)
     assert ROLLS_DEG == (0.0, 90.0, 180.0, 270.0)
+
+
+def test_one_hand_alone_does_not_turn_the_trunk():
+    inputs, tracks = _worn({})
+    aside = tracks[0].map_from_cam[:, :3, :3].mean(axis=0)
+
+    def up_of(degrees):
+        return None if degrees == 0.0 else aside[:, 0] * (1.0 if degrees == 90.0 else -1.0)
+
+    assert trunk_roll(inputs, tracks[:2], up_of) == (0.0, None)
