@@ -71,7 +71,7 @@ lock: $(VENV)/.dev ## resolve the dependencies anew into the locks
 	$(LOCK) --output-file requirements.lock
 	$(LOCK) --extra formats --extra cluster --extra web --extra viewer --constraints requirements.lock \
 		--output-file requirements-extras.lock
-	$(LOCK) --group dev --extra formats --extra cluster --extra web --constraints requirements-extras.lock \
+	$(LOCK) --group dev --extra formats --extra cluster --extra web --extra viewer --constraints requirements-extras.lock \
 		--output-file requirements-dev.lock
 	$(COMPILE) --universal --python-version 3.11 --group blender --output-file requirements-blender.lock
 

@@ -96,13 +96,7 @@ def build_map(
         settings = mapper_options(options, constant, scale)
         models, log["better_lenses"] = _with_better_lenses(models, workspace, guessed, settings, context)
     if models:
-        shop = Workshop(
-            workspace=workspace,
-            lenses=_lenses(capture),
-            settings=lambda: mapper_options(options, constant, scale),
-            constant=constant,
-            context=context,
-        )
+        shop = _shop(workspace, capture, options, constant, context)
         models[0], log["repair"] = repair(models[0], tried, shop)
         log["unconfirmed_points"] = _without_unconfirmed(models, shop, capture)
     _require_coverage(models, len(refs), log.get("initial_candidates", ladder), options)
@@ -114,6 +108,20 @@ def build_map(
     verdict = check_reach(result.maps[0], _common_ns(capture), reach).to_log() if reach else None
     require_consistent(log["repair"]["contradicted_share"], verdict)
     return replace(result, log={**result.log, "reach": verdict})
+
+
+def _shop(
+    workspace: Path, capture: Capture, options: MapOptions, constant: Sequence[int], context: StageContext
+) -> Workshop:
+    """What mending a model takes: the workspace, the lenses and the mapper's settings."""
+    scale = _scale(capture)
+    return Workshop(
+        workspace=workspace,
+        lenses=_lenses(capture),
+        settings=lambda: mapper_options(options, constant, scale),
+        constant=constant,
+        context=context,
+    )
 
 
 def _without_unconfirmed(models: Sequence[Any], shop: Workshop, capture: Capture) -> int:
@@ -193,18 +201,11 @@ def extend_map(
         for name in sorted({ref.camera for ref in new})
     ]
     add_keyframes(workspace, wanted, options, context)
-    scale = _scale(capture)
     chooser = PairChooser(workspace, new, _common_ns(capture), options)
     _, linked = link_keyframes(chooser, workspace, _lenses(capture), context)
     constant = _constant(capture, cameras)
     doubted = {known[ref] for ref in _refs(extra_frames) if ref in known}
-    shop = Workshop(
-        workspace=workspace,
-        lenses=_lenses(capture),
-        settings=lambda: mapper_options(options, constant, scale),
-        constant=constant,
-        context=context,
-    )
+    shop = _shop(workspace, capture, options, constant, context)
     models, cut = [], []
     for number in range(len(previous.maps)):
         model = pycolmap.Reconstruction(str(workspace / MODELS_NAME / str(number)))

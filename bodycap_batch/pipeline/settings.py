@@ -10,19 +10,12 @@ from bodycap_batch.config.limits import Limits
 from bodycap_batch.errors import Cancelled
 from bodycap_batch.progress import Listener
 from bodycap_batch.runner import CHILD, Children, Executor, Rules, Runner, Task
+from bodycap_batch.runner.parent import allow, always
 from bodycap_batch.store import Store
-
-
-def _yes() -> bool:
-    return True
 
 
 def _no() -> bool:
     return False
-
-
-def _nothing(task: Task) -> None:
-    """Let every task be made."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,7 +42,7 @@ class Settings:
     threads: int
     listener: Listener
     cancelled: Callable[[], bool]
-    may_commit: Callable[[], bool] = _yes
+    may_commit: Callable[[], bool] = always
     command: Sequence[str] = CHILD
     executor: Executor | None = None
     compute: bool = True
@@ -59,7 +52,7 @@ class Settings:
     limits: Limits | None = None
 
     def runner(
-        self, logs: Path, also: Callable[[], bool] = _no, before: Callable[[Task], None] = _nothing
+        self, logs: Path, also: Callable[[], bool] = _no, before: Callable[[Task], None] = allow
     ) -> Runner:
         """A runner that stops when the user asks for it, or when `also` says so.
 

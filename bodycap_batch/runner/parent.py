@@ -27,11 +27,12 @@ class NotStored(StoreError):
         self.tasks = tuple(tasks)
 
 
-def _always() -> bool:
+def always() -> bool:
+    """Forbid nothing."""
     return True
 
 
-def _nothing(task: Task) -> None:
+def allow(task: Task) -> None:
     """Let every task be made."""
 
 
@@ -48,8 +49,8 @@ class Rules:
     """
 
     cancelled: Callable[[], bool]
-    may_commit: Callable[[], bool] = _always
-    before: Callable[[Task], None] = _nothing
+    may_commit: Callable[[], bool] = always
+    before: Callable[[Task], None] = allow
     compute: bool = True
     redo: frozenset[str] = frozenset()
 

@@ -44,7 +44,8 @@ def launched(flags: tuple[str, ...]) -> Iterator[Any]:
     path = chromium()
     if path is None:
         pytest.skip("no Chromium is installed (Debian: apt install chromium)")
-    sync_api = pytest.importorskip("playwright.sync_api")
+    from playwright import sync_api
+
     with sync_api.sync_playwright() as play:
         browser = play.chromium.launch(executable_path=path, args=list(flags))
         yield browser

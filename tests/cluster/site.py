@@ -14,6 +14,7 @@ from typing import Any
 
 from tests.pipeline.fake_stages import ORDERS
 from tests.processes import END_WITH_PARENT
+from tests.results import results_of
 
 ROOT = Path(__file__).parents[2]
 FAKE = (sys.executable, str(ROOT / "tests" / "pipeline" / "fake_bodycap.py"))
@@ -118,14 +119,7 @@ class Site:
         return next(name for name, process in self.processes.items() if process.pid == parent)
 
     def results(self, out: str = "out") -> dict[str, bytes]:
-        root = self.folder / out
-        return {
-            path.relative_to(root).as_posix(): path.read_bytes()
-            for path in sorted(root.rglob("*"))
-            if path.is_file()
-            and path.name not in ("run.json", "job.yaml")
-            and not {"logs", ".store"} & set(path.relative_to(root).parts)
-        }
+        return results_of(self.folder / out)
 
 
 def gone(pid: int) -> bool:

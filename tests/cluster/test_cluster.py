@@ -15,7 +15,6 @@ import pytest
 from tests.cluster.site import NAMES, REAL, Site, gone, wait_for
 from tests.pipeline.test_resume_proof import JOB
 
-pytest.importorskip("distributed", reason="needs the extra `cluster` (make extras)")
 pytestmark = pytest.mark.cluster
 
 

@@ -12,6 +12,7 @@ import pytest
 from bodycap_batch.cli import main
 from tests.pipeline.test_cli import Bench as Command
 from tests.pipeline.test_cli import gone
+from tests.results import results_of
 
 NAMES = ("monday", "tuesday")
 
@@ -27,14 +28,7 @@ class Bench(Command):
                 (folder / name / f"{camera}.mp4").write_text(f"frames of {camera} on {name}")
 
     def results(self, out: str = "out") -> dict[str, bytes]:
-        root = self.folder / out
-        return {
-            path.relative_to(root).as_posix(): path.read_bytes()
-            for path in sorted(root.rglob("*"))
-            if path.is_file()
-            and path.name not in ("run.json", "job.yaml")
-            and not {"logs", ".store"} & set(path.relative_to(root).parts)
-        }
+        return results_of(self.folder / out)
 
 
 @pytest.fixture

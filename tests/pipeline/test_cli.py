@@ -18,6 +18,7 @@ import pytest
 import bodycap_batch
 from bodycap_batch.cli import main
 from tests.pipeline.fake_stages import ORDERS
+from tests.results import results_of
 
 ROOT = Path(__file__).parents[2]
 BODYCAP = (sys.executable, str(Path(__file__).with_name("fake_bodycap.py")))
@@ -197,7 +198,7 @@ def test_a_signal_stops_the_children_and_the_next_run_goes_on(
 def test_kill_9_at_any_stage_costs_that_stage_only(bench: Bench) -> None:
     reference = Bench(_made(bench.folder / "reference"))
     reference.run("run", "my walk")
-    expected = _results(reference.folder / "out" / "my_walk")
+    expected = results_of(reference.folder / "out" / "my_walk")
     for stage in ("keyframes", "export"):
         (bench.folder / "started").unlink(missing_ok=True)
         bench.order(hang=stage)
@@ -211,16 +212,16 @@ def test_kill_9_at_any_stage_costs_that_stage_only(bench: Bench) -> None:
     assert code == 0, err
     for done in ("check", "map", "merge"):
         assert f"{done}: already done" in err
-    assert _results(bench.folder / "out" / "my_walk") == expected
+    assert results_of(bench.folder / "out" / "my_walk") == expected
 
 
 def test_the_same_job_run_twice_at_the_same_time_comes_out_right(bench: Bench) -> None:
     both = [bench.start("run", "my walk") for _ in range(2)]
     ends = [process.communicate(timeout=90) for process in both]
     assert [process.returncode for process in both] == [0, 0], ends
-    results = _results(bench.folder / "out" / "my_walk")
+    results = results_of(bench.folder / "out" / "my_walk")
     assert "nothing to do" in bench.run("run", "my walk")[1]
-    assert _results(bench.folder / "out" / "my_walk") == results
+    assert results_of(bench.folder / "out" / "my_walk") == results
     assert not any(name.endswith(".part") for name in results)
     assert list((bench.folder / "out" / ".store" / "tmp").iterdir()) == []
     assert list((bench.folder / "out" / ".store" / "corrupt").iterdir()) == []
@@ -231,32 +232,25 @@ def _made(folder: Path) -> Path:
     return folder
 
 
-def _results(folder: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file() and "logs" not in path.parts and path.name not in ("run.json", "job.yaml")
-    }
-
-
 _ON_A_SMALL_DISK = """
 import sys
 from pathlib import Path
-from tests.pipeline.test_cli import Bench, _results
+from tests.pipeline.test_cli import Bench
+from tests.results import results_of
 bench = Bench(Path(sys.argv[1]))
 out = bench.folder / "out" / "my_walk"
 assert bench.run("run", "my walk")[0] == 0
-before = _results(out)
+before = results_of(out)
 bench.order(fill="map")
 (bench.capture / "torso.mp4").write_text("other frames")
 code, _, err = bench.run("run", "my walk")
 assert code == 5, err
 assert "space" in err and "--store" in err and "Traceback" not in err, err
-assert _results(out) == before
+assert results_of(out) == before
 bench.order()
 code, _, err = bench.run("run", "my walk")
 assert code == 0 and "keyframes torso: already done" in err, err
-assert _results(out) != before
+assert results_of(out) != before
 """
 
 

@@ -13,6 +13,7 @@ import pytest
 from bodycap_batch.cli import main
 from bodycap_batch.evaluate import evaluate_trajectories
 from bodycap_batch.formats.bvh import read_bvh
+from tests.results import results_of
 
 pytestmark = pytest.mark.slow
 
@@ -35,17 +36,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "tiny.yaml").write_text(JOB)
     assert main(["run", str(folder / "tiny.yaml"), "--out", str(folder / "out")]) == 0
     return folder
-
-
-def results(folder: Path) -> dict[str, bytes]:
-    """All files whose bytes may not depend on when, where and how fast they were made."""
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-        and path.name not in ("run.json", "job.yaml")
-        and not {"logs", ".store"} & set(path.relative_to(folder).parts)
-    }
 
 
 def test_every_frame_is_placed_where_the_camera_was(folder: Path) -> None:
@@ -88,15 +78,15 @@ def test_frames_metrics_and_motion_agree(folder: Path) -> None:
 
 
 def test_a_finished_job_executes_nothing(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    before = results(folder / "out")
+    before = results_of(folder / "out")
     assert main(["run", str(folder / "tiny.yaml"), "--out", str(folder / "out")]) == 0
     assert "nothing to do" in capfd.readouterr().out
-    assert results(folder / "out") == before
+    assert results_of(folder / "out") == before
 
 
 def test_made_again_in_another_store_every_byte_is_the_same(folder: Path, tmp_path: Path) -> None:
     assert main(["run", str(folder / "tiny.yaml"), "--out", str(tmp_path / "out"), "--threads", "1"]) == 0
-    mine, theirs = results(tmp_path / "out"), results(folder / "out")
+    mine, theirs = results_of(tmp_path / "out"), results_of(folder / "out")
     assert mine.keys() == theirs.keys()
     assert [name for name in mine if mine[name] != theirs[name]] == []
 

@@ -22,6 +22,7 @@ import pytest
 from bodycap_batch.cli import main
 from tests.pipeline.hurt_bodycap import BALLAST, ORDERS, PIDS
 from tests.processes import END_WITH_PARENT
+from tests.results import results_of
 
 pytestmark = pytest.mark.slow
 
@@ -97,13 +98,7 @@ class Place:
 
     def content(self) -> dict[str, bytes]:
         """Results, and the digest of what each artefact holds; the report tells of durations."""
-        found = {
-            path.relative_to(self.out).as_posix(): path.read_bytes()
-            for path in sorted(self.out.rglob("*"))
-            if path.is_file()
-            and path.name not in ("run.json", "job.yaml", "report.html")
-            and not {"logs", ".store"} & set(path.relative_to(self.out).parts)
-        }
+        found = {name: data for name, data in results_of(self.out).items() if name != "report.html"}
         for path in self.manifests():
             if path.parts[-3] == "report":
                 continue

@@ -20,6 +20,7 @@ from bodycap_batch.pipeline import RunSummary, Settings, run_job
 from bodycap_batch.progress import Event
 from bodycap_batch.store import Store
 from tests.pipeline.fake_stages import ORDERS
+from tests.results import results_of
 
 CHILD = (sys.executable, str(Path(__file__).with_name("fake_stages.py")))
 CAMERAS = ("torso", "left_palm")
@@ -79,12 +80,7 @@ class Bench:
         return sorted(f"{s.stage} {s.camera}".strip() for s in summary.stages if not s.reused)
 
     def results(self) -> dict[str, bytes]:
-        skipped = {"run.json", "job.yaml"}
-        return {
-            path.relative_to(self.out).as_posix(): path.read_bytes()
-            for path in sorted(self.out.rglob("*"))
-            if path.is_file() and path.name not in skipped and "logs" not in path.parts
-        }
+        return results_of(self.out)
 
 
 @pytest.fixture

@@ -20,8 +20,6 @@ from bodycap_batch.watch.web import Access, LivePage
 from tests.pipeline.fake_stages import ORDERS
 from tests.pipeline.spools import SpoolBench, wait_for
 
-pytest.importorskip("starlette", reason="needs the extra web")
-pytest.importorskip("uvicorn", reason="needs the extra web")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
@@ -237,7 +235,8 @@ def test_the_command_serves_the_page_and_ends_with_it(bench: SpoolBench) -> None
 
 @pytest.fixture
 def browser() -> Iterator[Any]:
-    sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    from playwright import sync_api
+
     if CHROMIUM is None:
         pytest.skip("needs Chromium")
     with sync_api.sync_playwright() as driver:

@@ -221,8 +221,6 @@ def test_only_the_formats_asked_for(tmp_path: Path) -> None:
 
 
 def test_further_formats_hold_the_same_joints(tmp_path: Path) -> None:
-    pytest.importorskip("ezc3d")
-    pytest.importorskip("pxr")
     inputs = inputs_of(tmp_path)
     run(inputs, formats=("usd", "c3d", "trc", "npz", "csv"), names="mixamo", root="in_place")
     names = {path.name for path in inputs.out_dir.iterdir()}

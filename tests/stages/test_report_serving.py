@@ -104,7 +104,6 @@ def test_another_name_for_this_machine_is_refused(port: int) -> None:
 
 
 def test_a_recording_for_rerun_holds_the_motion(tmp_path: Path) -> None:
-    pytest.importorskip("rerun", reason="needs the extra `viewer`")
     (tmp_path / "trajectories").mkdir()
     lines = "".join(f"{0.1 * i:.3f} {i} 0 1 0 0 0 1\n" for i in range(5))
     (tmp_path / "trajectories" / "torso.tum").write_text(lines)
@@ -116,7 +115,8 @@ def test_a_recording_for_rerun_holds_the_motion(tmp_path: Path) -> None:
 def test_a_recording_puts_cameras_and_body_on_the_common_clock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rr = pytest.importorskip("rerun", reason="needs the extra `viewer`")
+    import rerun as rr
+
     (tmp_path / "trajectories").mkdir()
     (tmp_path / "trajectories" / "torso.tum").write_text("1.0 0 0 1 0 0 0 1\n1.1 0 0 1 0 0 0 1\n")
     (tmp_path / "frames.csv").write_text("camera,frame,time,common_time\ntorso,30,1.0,3.5\n")
@@ -143,6 +143,5 @@ def test_a_recording_puts_cameras_and_body_on_the_common_clock(
 
 
 def test_a_folder_without_results_is_no_recording(tmp_path: Path) -> None:
-    pytest.importorskip("rerun", reason="needs the extra `viewer`")
     with pytest.raises(JobError, match="no results"):
         write_recording(tmp_path, tmp_path / "x.rrd")

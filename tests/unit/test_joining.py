@@ -9,15 +9,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from bodycap_batch.geometry import Similarity, so3_exp
-from tests.stages.walker import ROLES, make_inputs, make_walk, record
-
-pytest.importorskip("gtsam")
-
 from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.calibrate import Calibration, take_samples
 from bodycap_batch.merging.common_walk import start_of
 from bodycap_batch.merging.joining import use_together
 from bodycap_batch.merging.tracks import make_track
+from tests.stages.walker import ROLES, make_inputs, make_walk, record
 
 FURTHER = Similarity(1.7, so3_exp([0.4, 1.1, -0.3]), np.array([0.5, -3.0, 1.0]))
 """A further map from the main one, which is metric here."""

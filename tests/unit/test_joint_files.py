@@ -15,7 +15,7 @@ from bodycap_batch.errors import JobError, StoreError
 from bodycap_batch.export.joint_tables import write_joint_arrays, write_joint_table
 from bodycap_batch.export.layout import lay_out
 from bodycap_batch.export.motion import joint_centres, motion_difference
-from bodycap_batch.formats import needs
+from bodycap_batch.formats import needs, usd
 from bodycap_batch.formats.c3d import Points, read_c3d, write_c3d
 from bodycap_batch.formats.fbx import blender
 from bodycap_batch.formats.trc import write_trc
@@ -25,7 +25,6 @@ from tests.bodies import reaching
 
 @pytest.mark.parametrize("options", [{}, {"names": "unreal", "root": "ground"}, {"names": "mixamo"}], ids=str)
 def test_usd_comes_back_and_complies(tmp_path: Path, options: dict[str, Any]) -> None:
-    usd = pytest.importorskip("bodycap_batch.formats.usd")
     from pxr import Usd, UsdGeom, UsdSkel, UsdValidation
 
     motion = lay_out(reaching(12), ExportOptions.model_validate(options))
@@ -50,7 +49,6 @@ def test_usd_comes_back_and_complies(tmp_path: Path, options: dict[str, Any]) ->
 
 def test_usd_skinning_moves_the_figure(tmp_path: Path) -> None:
     """USD's own skinning: the figure's corners land on our joints."""
-    usd = pytest.importorskip("bodycap_batch.formats.usd")
     from pxr import Usd, UsdSkel
 
     motion = reaching(12)
@@ -71,8 +69,6 @@ def test_usd_skinning_moves_the_figure(tmp_path: Path) -> None:
 
 
 def test_odd_joint_names_become_tokens_of_their_own(tmp_path: Path) -> None:
-    usd = pytest.importorskip("bodycap_batch.formats.usd")
-
     motion = reaching(2)
     names = ("Bip01 Pelvis", "9 lives", "a:b", "Spine.x", *motion.skeleton.joints[4:])
     odd = replace(motion, skeleton=replace(motion.skeleton, joints=names))
@@ -80,7 +76,8 @@ def test_odd_joint_names_become_tokens_of_their_own(tmp_path: Path) -> None:
 
 
 def test_c3d_is_in_millimetres_z_up(tmp_path: Path) -> None:
-    ezc3d = pytest.importorskip("ezc3d")
+    import ezc3d
+
     motion = reaching(25)
     write_c3d(tmp_path / "a.c3d", joint_centres(motion))
     raw = ezc3d.c3d(str(tmp_path / "a.c3d"))
@@ -94,7 +91,6 @@ def test_c3d_is_in_millimetres_z_up(tmp_path: Path) -> None:
 
 
 def test_c3d_refuses_what_does_not_come_back(tmp_path: Path) -> None:
-    pytest.importorskip("ezc3d")
     far = Points(names=("a",), fps=30.0, x_in_world_m=np.full((3, 1, 3), 123456.789))
     with pytest.raises(StoreError, match="read back"):
         write_c3d(tmp_path / "a.c3d", far)

@@ -5,23 +5,21 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 
+import gtsam
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy import sparse
 
 from bodycap_batch.geometry import make_transform, so3_exp
+from bodycap_batch.merging.bones import graph_bones
+from bodycap_batch.merging.graph import bone_key
 from bodycap_batch.merging.linear import Chain
+from bodycap_batch.merging.marginals import sigma_summary
+from bodycap_batch.merging.solve import MotionGraph, Solution
+from bodycap_batch.merging.spread import Spread, adjoint, joined
+from bodycap_batch.merging.tracks import make_track
 from tests.stages.walker import FPS, ROLES, make_inputs, make_walk, record
-
-gtsam = pytest.importorskip("gtsam")
-
-from bodycap_batch.merging.bones import graph_bones  # noqa: E402
-from bodycap_batch.merging.graph import bone_key  # noqa: E402
-from bodycap_batch.merging.marginals import sigma_summary  # noqa: E402
-from bodycap_batch.merging.solve import MotionGraph, Solution  # noqa: E402
-from bodycap_batch.merging.spread import Spread, adjoint, joined  # noqa: E402
-from bodycap_batch.merging.tracks import make_track  # noqa: E402
 
 
 def test_a_chain_of_blocks_is_the_dense_solution():

@@ -8,12 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.errors import EstimationError
-from tests.stages.walker import ROLES, make_inputs, make_walk, record
-
-pytest.importorskip("gtsam")
-
 from bodycap_batch.config.options import MergeOptions
+from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.calibrate import Calibration, take_samples
@@ -26,6 +22,7 @@ from bodycap_batch.merging.scale import find_scale
 from bodycap_batch.merging.solve import MotionGraph
 from bodycap_batch.merging.tracks import make_track
 from bodycap_batch.skeleton_presets import load_skeleton
+from tests.stages.walker import ROLES, make_inputs, make_walk, record
 
 
 @pytest.fixture(scope="module")

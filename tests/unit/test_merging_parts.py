@@ -223,7 +223,8 @@ def test_wild_motion_loosens_the_limb_above_the_camera():
 
 
 def test_mount_points_carry_exactly_the_pose_they_stand_for():
-    gtsam = pytest.importorskip("gtsam")
+    import gtsam
+
     points, mount = MountPoints(0.01, 0.005), make_transform(so3_exp([0.3, -0.2, 1.0]), [0.1, 0.02, -0.05])
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     add_mount_prior(graph, 0, mount, points, (0.2, 0.03))
@@ -400,7 +401,8 @@ def test_walking_palms_stay_low_and_on_their_side():
 
 
 def test_a_rule_pulls_only_outside_its_bounds():
-    gtsam = pytest.importorskip("gtsam")
+    import gtsam
+
     skeleton = load_skeleton("upper_body", 1.75)
     bones = graph_bones(skeleton, PAPER)
     rule = activity_rules(skeleton, bones, "walk")[0]

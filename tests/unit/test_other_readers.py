@@ -59,7 +59,6 @@ def test_bvhio_places_the_joints_where_we_do(tmp_path: Path, names: str, root: s
 def test_c3d_reads_our_points(tmp_path: Path) -> None:
     import c3d
 
-    pytest.importorskip("ezc3d")
     motion = reaching(25)
     write_c3d(tmp_path / "a.c3d", joint_centres(motion))
     with open(tmp_path / "a.c3d", "rb") as handle:
