@@ -24,7 +24,7 @@ STAGES = {
     "keyframes", "mapping", "registration", "merging", "export", "report", "evaluate", "synthetic", "check",
     "calibration", "preview",
 }  # fmt: skip
-KEEPING = {"errors", "digests", "identity", "progress"}
+KEEPING = {"errors", "digests", "identity", "progress", "disk_room"}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "arrays": set(),
@@ -42,9 +42,11 @@ MAY_IMPORT: dict[str, set[str]] = {
     "config": TYPES | {"formats", "skeleton_presets"},
     "capture": TYPES | {"config", "formats"},
     **dict.fromkeys(STAGES, MATERIAL),
+    "check": MATERIAL | {"disk_room"},
     "digests": {"errors"},
     "progress": {"errors"},
     "identity": set(),
+    "disk_room": {"errors"},
     "presets": set(),
     "store": KEEPING,
     "references": KEEPING | {"store"},

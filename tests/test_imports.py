@@ -29,6 +29,23 @@ assert (cv2.imread(str(folder / "image.png")) == image).all()
 numpy.savez_compressed(folder / "arrays.npz", image=image)
 assert (numpy.load(folder / "arrays.npz")["image"] == image).all()
 """
+# Copies of this process import one module each: the libraries, and the job's models, are loaded once.
+ALONE = """
+import importlib, os, sys, traceback, zlib
+import numpy, pydantic, scipy.spatial.transform, scipy.optimize, scipy.sparse, scipy.linalg, typer, yaml
+import bodycap_batch.config.models
+for name in sys.argv[1:]:
+    if pid := os.fork():
+        if os.waitpid(pid, 0)[1]:
+            print(name)
+        continue
+    try:
+        importlib.import_module(name)
+    except BaseException:
+        traceback.print_exc()
+        os._exit(1)
+    os._exit(0)
+"""
 # What costs tenths of seconds to seconds to load, or changes the process (pycolmap takes over SIGTERM).
 HEAVY = ("pycolmap", "open3d", "gtsam", "cv2", "av", "matplotlib", "pandas", "distributed", "pytest")
 
@@ -70,17 +87,25 @@ def failures(names: list[str], folder: Path) -> str:
         return "\n".join(filter(None, pool.map(failure, names)))
 
 
+@pytest.mark.slow
+def test_each_module_can_be_the_first_one() -> None:
+    """No circle of imports, wherever one enters it: each in a copy of an interpreter with the libraries."""
+    names = module_names()
+    assert {"bodycap_batch.geometry", "bodycap_batch.config.options"} <= set(names)
+    done = run_python("-c", ALONE, *names)
+    assert (done.returncode, done.stdout) == (0, ""), done.stdout + done.stderr
+
+
+def test_the_package_alone_leaves_compression_working(tmp_path: Path) -> None:
+    """Each module begins with the package's own `__init__`, so zlib comes first whichever it is."""
+    assert not failures(["bodycap_batch", "bodycap_batch.mapping", "bodycap_batch.cli"], tmp_path)
+
+
+@pytest.mark.slow
 def test_each_room_alone_leaves_compression_working(tmp_path: Path) -> None:
     rooms = [name for name in module_names() if name.count(".") <= 1]
     assert "bodycap_batch.geometry" in rooms
     assert not failures(rooms, tmp_path)
-
-
-@pytest.mark.slow
-def test_each_module_alone_leaves_compression_working(tmp_path: Path) -> None:
-    parts = [name for name in module_names() if name.count(".") > 1]
-    assert "bodycap_batch.config.options" in parts
-    assert not failures(parts, tmp_path)
 
 
 def test_heavy_libraries_load_when_needed() -> None:

@@ -3,7 +3,6 @@
 from bodycap_batch.check.limits import require_within
 from bodycap_batch.check.preflight import check_job, check_path, require_ready
 from bodycap_batch.check.report import CameraFinding, CheckReport
-from bodycap_batch.check.room import require_room
 
 __all__ = [
     "CameraFinding",
@@ -11,6 +10,5 @@ __all__ = [
     "check_job",
     "check_path",
     "require_ready",
-    "require_room",
     "require_within",
 ]

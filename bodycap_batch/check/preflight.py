@@ -13,13 +13,12 @@ from bodycap_batch.check.advice import advice_on
 from bodycap_batch.check.files import check_files
 from bodycap_batch.check.pictures import look_at_frames
 from bodycap_batch.check.report import CameraFinding, CheckReport
-from bodycap_batch.check.room import require_room
 from bodycap_batch.check.settings import setting_notes
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, Job
+from bodycap_batch.disk_room import require_room
 from bodycap_batch.errors import BodycapError, CaptureError, JobError
 from bodycap_batch.formats.bvh import RigOptions, read_rig
-from bodycap_batch.formats.fbx import require_blender
 from bodycap_batch.formats.needs import require_libraries
 
 # Frames whose distance differs by more than this share from the usual one make a variable rate.
@@ -220,6 +219,8 @@ def _check_formats(job: Job, _findings: list[CameraFinding]) -> list[str]:
         return []
     require_libraries(job.export.formats)
     if "fbx" in job.export.formats:
+        from bodycap_batch.formats.fbx import require_blender  # its writer takes as long to load as all else
+
         require_blender()
     if job.export.names != "hik" and job.skeleton not in SKELETON_PRESETS:
         raise JobError(

@@ -16,6 +16,7 @@ from bodycap_batch.cli.base import app
 from bodycap_batch.cli.display import Display, JsonLines, make_display
 from bodycap_batch.cli.stop import stoppable
 from bodycap_batch.errors import BodycapError, JobError
+from bodycap_batch.progress import Event
 from bodycap_batch.tasks import StageName, stages_from
 
 if TYPE_CHECKING:
@@ -109,7 +110,11 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
                 cancelled=stop.is_set,
                 redo=redo,
                 until=until or "",
+                results_ready=tell_results,
             )
+
+        def tell_results(folder: Path) -> None:
+            display(Event(kind="note", stage="", what=f"results are in {folder}, preview.mp4 follows"))
 
         def prepare(options: Mapping[str, Any], folder: Path) -> None:
             prepare_capture(options, folder, settings(default_store(out or default_out())))

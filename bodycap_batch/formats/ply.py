@@ -13,6 +13,7 @@ import numpy.typing as npt
 from bodycap_batch.arrays import FloatArray, set_array
 from bodycap_batch.errors import StoreError
 from bodycap_batch.formats.files import replacing
+from bodycap_batch.formats.open3d_library import load_open3d
 
 Colors = npt.NDArray[np.uint8]
 
@@ -77,8 +78,7 @@ def write_ply(path: Path, cloud: PointCloud) -> None:
     Raises:
         StoreError: The file cannot be written, or does not hold what was written.
     """
-    import open3d
-
+    open3d = load_open3d()
     content = open3d.geometry.PointCloud()
     content.points = open3d.utility.Vector3dVector(cloud.points.copy())
     content.colors = open3d.utility.Vector3dVector(cloud.colors / 255.0)
@@ -97,8 +97,7 @@ def write_ply(path: Path, cloud: PointCloud) -> None:
 
 def read_ply(path: Path) -> PointCloud:
     """Read a PLY's points and colours (black where it has none)."""
-    import open3d
-
+    open3d = load_open3d()
     content = open3d.io.read_point_cloud(path)
     points = np.asarray(content.points, dtype=np.float64)
     colors = np.asarray(content.colors, dtype=np.float64)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.config.models import CameraConfig, Job
+from bodycap_batch.disk_room import require_room
 from bodycap_batch.errors import BodycapError, Cancelled, EstimationError
 from bodycap_batch.formats.needs import require_libraries
 from bodycap_batch.pipeline.inputs import (
@@ -275,8 +276,6 @@ class Flow:
 
     def _require_room(self, task: Task) -> None:
         """Refuse to begin what will not fit on the disk; the space may have gone since the check was made."""
-        from bodycap_batch.check import require_room  # loads what looks at videos: not for a finished job
-
         if task.key.stage != "check":
             for folder in self._folders:
                 for note in require_room(folder, self._frames):

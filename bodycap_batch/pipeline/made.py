@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,6 +26,7 @@ class Made:
         merged: The skeleton.
         exported: The results.
         reported: The report.
+        filming: The results as a video, being made.
         previewed: The results as a video.
         failure: Why there is no skeleton among the results.
     """
@@ -36,6 +38,7 @@ class Made:
     merged: Artefact | None = None
     exported: Artefact | None = None
     reported: Artefact | None = None
+    filming: Future[Artefact] | None = None
     previewed: Artefact | None = None
     failure: EstimationError | None = None
 

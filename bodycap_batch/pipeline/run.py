@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import yaml
@@ -70,12 +70,10 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
     settings.require_owner()
     made = Made()
     with Flow(job, settings, logs=out_dir / "logs") as flow:
-        stopped_by = _run_until(job, flow, made, settings)
-        summary = RunSummary(out_dir=out_dir, files=(), stages=tuple(flow.records), versions=_versions(flow))
+        stopped_by = _run_until(job, flow, made, out_dir, settings)
+        summary = _summary(flow, made, out_dir)
         if made.exported is not None:
-            summary = replace(summary, files=tuple(_results(made)))
-            settings.require_owner()
-            _hand_over(job, made, summary, settings)
+            _hand_over(job, flow, made, out_dir, settings)
             if made.failure is None:
                 flow.keep_only_this()
         elif stopped_by is not None:
@@ -103,22 +101,28 @@ def run_stages(job: Job, flow: Flow, made: Made) -> Iterator[str]:
     made.stage = "merge"
     made.merged, made.failure = _merge(job, flow, made.scene, made.registrations)
     yield "merge"
-    filming = flow.start_preview(made) if job.export.preview else None
+    made.filming = flow.start_preview(made) if job.export.preview else None
     made.exported = flow.export(made.keyframes, made.scene, made.registrations, made.merged, made.failure)
     yield "export"
     made.reported = flow.report(made)
     yield "report"
-    if filming is not None:
-        made.previewed = filming.result()
+    if made.filming is not None:
+        made.previewed = made.filming.result()
         yield "preview"
 
 
-def _run_until(job: Job, flow: Flow, made: Made, settings: Settings) -> BodycapError | None:
-    """Run the stages up to the last one wanted; returns what stopped them, if a report can tell of it."""
+def _run_until(job: Job, flow: Flow, made: Made, out_dir: Path, settings: Settings) -> BodycapError | None:
+    """Run the stages up to the last one wanted; returns what stopped them, if a report can tell of it.
+
+    The results do not wait for their video.
+    """
     try:
         for stage in run_stages(job, flow, made):
             if stage == settings.until:
                 break
+            if stage == "report" and made.filming is not None and not made.filming.done():
+                _hand_over(job, flow, made, out_dir, settings)
+                settings.results_ready(out_dir)
     except BodycapError as error:
         # Results that are there are handed over although the page about them could not be written.
         tellable = made.exported is not None or isinstance(error, JobError | CaptureError | EstimationError)
@@ -141,16 +145,25 @@ def _tell_how_far(flow: Flow, made: Made, error: BodycapError, out_dir: Path, se
     error.hint = f"{error.hint}; {told}" if error.hint else told
 
 
-def _hand_over(job: Job, made: Made, summary: RunSummary, settings: Settings) -> None:
+def _summary(flow: Flow, made: Made, out_dir: Path) -> RunSummary:
+    """What is there by now."""
+    return RunSummary(
+        out_dir=out_dir, files=tuple(_results(made)), stages=tuple(flow.records), versions=_versions(flow)
+    )
+
+
+def _hand_over(job: Job, flow: Flow, made: Made, out_dir: Path, settings: Settings) -> None:
     """Publish the results; those without a skeleton are set apart and called partial."""
+    settings.require_owner()
     if made.failure is None:
-        _finish(job, made, summary, settings)
-        clear_partial(summary.out_dir)
+        _finish(job, made, _summary(flow, made, out_dir), settings)
+        clear_partial(out_dir)
         return
-    partial = summary.out_dir / PARTIAL
-    _finish(job, made, replace(summary, out_dir=partial), settings)
+    partial = out_dir / PARTIAL
+    _finish(job, made, _summary(flow, made, partial), settings)
     kept = f"the map, the cameras' paths and the frames are in {partial}"
-    made.failure.hint = f"{made.failure.hint}; {kept}" if made.failure.hint else kept
+    if kept not in (made.failure.hint or ""):
+        made.failure.hint = f"{made.failure.hint}; {kept}" if made.failure.hint else kept
 
 
 def _merge(

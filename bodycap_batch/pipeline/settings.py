@@ -18,6 +18,10 @@ def _no() -> bool:
     return False
 
 
+def _tell_nobody(_: Path) -> None:
+    """Whoever asked for the results waits for all of them."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """How a job is run; nothing here changes a result.
@@ -35,6 +39,7 @@ class Settings:
         redo: Stages that are computed anew although they are stored.
         until: Last stage to run; then there are no results. "" runs all.
         priority: Higher goes first where several jobs wait.
+        results_ready: Called with the folder of the results where they are there before their video.
         limits: How large the videos may be; None where they are the user's own.
     """
 
@@ -49,6 +54,7 @@ class Settings:
     redo: frozenset[str] = frozenset()
     until: str = ""
     priority: int = 0
+    results_ready: Callable[[Path], None] = _tell_nobody
     limits: Limits | None = None
 
     def runner(

@@ -12,6 +12,7 @@ import yaml
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.errors import JobError, StoreError
 from bodycap_batch.formats.bvh import read_bvh
+from bodycap_batch.formats.open3d_library import load_open3d
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.skeleton import Motion
 
@@ -87,9 +88,7 @@ def bvh_start_s(results: Path, fps: float) -> float:
 
 
 def _cloud(path: Path) -> tuple[FloatArray, FloatArray]:
-    import open3d as o3d
-
-    cloud = o3d.io.read_point_cloud(path)
+    cloud = load_open3d().io.read_point_cloud(path)
     return np.asarray(cloud.points), np.asarray(cloud.colors)
 
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 
 from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.formats.open3d_library import load_open3d
 
 NOTHING = -1
 """Index for a ray that meets no triangle."""
@@ -25,7 +23,7 @@ class RayScene:
     """
 
     def __init__(self, vertices: FloatArray, faces: npt.NDArray[np.uint32]) -> None:
-        open3d: Any = import_module("open3d")
+        open3d = load_open3d()
         self._tensor = open3d.core.Tensor
         self._scene = open3d.t.geometry.RaycastingScene(nthreads=1)
         self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(faces))

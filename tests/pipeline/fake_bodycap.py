@@ -1,20 +1,56 @@
-"""The `bodycap` command with stand-in stages."""
+"""The `bodycap` command with stand-in stages, as a process or within the test's."""
 
 from __future__ import annotations
 
 import functools
+import io
+import os
 import sys
+from collections.abc import Iterator, Mapping
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
+from unittest import mock
 
 from bodycap_batch import cluster, pipeline, watch
 from bodycap_batch.cli import main
 from bodycap_batch.runner import pool
 
 CHILD = (sys.executable, str(Path(__file__).with_name("fake_stages.py")))
+_STARTING_CHILDREN = (
+    (pipeline, "Settings"),
+    (watch, "WatchOptions"),
+    (pool, "LocalPool"),
+    (cluster, "Cluster"),
+)
+
+
+@contextmanager
+def stand_ins() -> Iterator[None]:
+    """Let the commands start children with stand-in stages."""
+    before = [(module, name, getattr(module, name)) for module, name in _STARTING_CHILDREN]
+    try:
+        for module, name, value in before:
+            setattr(module, name, functools.partial(value, command=CHILD))
+        yield
+    finally:
+        for module, name, value in before:
+            setattr(module, name, value)
+
+
+def run_here(folder: Path, environment: Mapping[str, str], *arguments: str) -> tuple[int, str, str]:
+    """Run the command in this process: exit code, standard output and standard error."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        stand_ins(),
+        chdir(folder),
+        mock.patch.dict(os.environ, environment, clear=True),
+        redirect_stdout(out),
+        redirect_stderr(err),
+    ):
+        code = main(arguments)
+    return code, out.getvalue(), err.getvalue()
+
 
 if __name__ == "__main__":
-    pipeline.Settings = functools.partial(pipeline.Settings, command=CHILD)  # type: ignore[assignment, misc]
-    watch.WatchOptions = functools.partial(watch.WatchOptions, command=CHILD)  # type: ignore[assignment, misc]
-    pool.LocalPool = functools.partial(pool.LocalPool, command=CHILD)  # type: ignore[assignment, misc]
-    cluster.Cluster = functools.partial(cluster.Cluster, command=CHILD)  # type: ignore[assignment, misc]
-    main()
+    with stand_ins():
+        main()

@@ -17,6 +17,7 @@ import pytest
 
 import bodycap_batch
 from bodycap_batch.cli import main
+from tests.pipeline.fake_bodycap import run_here
 from tests.pipeline.fake_stages import ORDERS
 from tests.results import results_of
 
@@ -51,9 +52,7 @@ class Bench:
         )
 
     def run(self, *arguments: str) -> tuple[int, str, str]:
-        process = self.start(*arguments)
-        out, err = process.communicate(timeout=60)
-        return process.returncode, out, err
+        return run_here(self.folder, self.environment, *arguments)
 
     def wait_until_started(self) -> int:
         end = time.monotonic() + 30
@@ -77,8 +76,9 @@ def gone(pid: int) -> bool:
 
 
 def test_a_folder_runs_without_a_job_and_the_last_line_names_the_results(bench: Bench) -> None:
-    code, out, err = bench.run("run", "my walk")
-    assert code == 0, err
+    process = bench.start("run", "my walk")
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
     results = bench.folder / "out" / "my_walk"
     assert out.splitlines()[-1] == f"results: {results}"
     assert (results / "metrics.json").is_file()

@@ -7,7 +7,7 @@ import os
 import shutil
 import sys
 import threading
-import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from bodycap_batch.pipeline import RunSummary, Settings, run_job
 from bodycap_batch.progress import Event
 from bodycap_batch.store import Store
 from tests.pipeline.fake_stages import ORDERS
+from tests.pipeline.spools import wait_for
 from tests.results import results_of
 
 CHILD = (sys.executable, str(Path(__file__).with_name("fake_stages.py")))
@@ -316,10 +317,9 @@ def test_a_rolling_shutter_is_taken_out_of_the_map_and_every_frame_solved_again(
     assert bench.executed() == []
 
 
-@pytest.mark.parametrize("stage", ["keyframes", "map", "merge", "export"])
-def test_a_stopped_run_goes_on_where_it_was(bench: Bench, stage: str) -> None:
-    bench.order(hang=stage)
-    failures: list[BaseException] = []
+def stopped_at_the_order(bench: Bench, meanwhile: Callable[[], None] = lambda: None) -> list[Cancelled]:
+    """Run in a thread until a stage hangs, as ordered, then stop it; returns how the run ended."""
+    failures: list[Cancelled] = []
 
     def run() -> None:
         try:
@@ -329,21 +329,44 @@ def test_a_stopped_run_goes_on_where_it_was(bench: Bench, stage: str) -> None:
 
     thread = threading.Thread(target=run)
     thread.start()
-    end = time.monotonic() + 30
-    while not (bench.folder / "started").exists():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-    bench.stop.set()
-    thread.join(30)
-    assert len(failures) == 1
-    assert bench.results() == {}
+    try:
+        wait_for((bench.folder / "started").exists)
+        meanwhile()
+    finally:
+        bench.stop.set()
+        thread.join(30)
     bench.stop.clear()
     bench.order()
+    return failures
+
+
+@pytest.mark.parametrize("stage", ["keyframes", "map", "merge", "export"])
+def test_a_stopped_run_goes_on_where_it_was(bench: Bench, stage: str) -> None:
+    bench.order(hang=stage)
+    failures = stopped_at_the_order(bench)
+    assert len(failures) == 1
+    assert bench.results() == {}
     executed = bench.executed()
     assert "check" not in executed
     assert any(name.startswith(stage) for name in executed)
     assert [name for name in ALL if not name.startswith(stage)] != executed
     assert "metrics.json" in bench.results()
+
+
+def test_the_results_do_not_wait_for_their_video(done: Bench) -> None:
+    shutil.rmtree(done.folder / "store")
+    (done.out / "result.bvh").write_text("of an earlier run")
+    done.order(hang="preview")
+    names = set(done.results())
+
+    def said() -> set[str]:
+        return set(json.loads((done.out / "run.json").read_text())["files"])
+
+    assert len(stopped_at_the_order(done, lambda: wait_for(lambda: "preview.mp4" not in said()))) == 1
+    assert set(done.results()) == said() == names - {"preview.mp4"}
+    assert done.results()["result.bvh"] != b"of an earlier run"
+    assert done.executed() == ["preview"]
+    assert set(done.results()) == said() == names
 
 
 def test_a_bug_in_a_stage_is_no_estimation_error(bench: Bench) -> None:

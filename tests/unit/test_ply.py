@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bodycap_batch.errors import StoreError
+from bodycap_batch.formats.open3d_library import load_open3d
 from bodycap_batch.formats.ply import PATH_COLORS, PointCloud, read_ply, with_paths, write_ply
 
 
@@ -51,11 +54,24 @@ def test_a_missing_folder_is_made_and_a_forbidden_one_named(tmp_path: Path) -> N
 def test_a_failing_writer_keeps_the_earlier_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "map.ply"
     path.write_text("earlier")
-    monkeypatch.setattr("open3d.io.write_point_cloud", lambda *_, **__: False)
+    monkeypatch.setattr(load_open3d().io, "write_point_cloud", lambda *_, **__: False)
     with pytest.raises(StoreError, match="could not write"):
         write_ply(path, cloud(5))
-    monkeypatch.setattr("open3d.io.write_point_cloud", lambda *_, **__: True)
+    monkeypatch.setattr(load_open3d().io, "write_point_cloud", lambda *_, **__: True)
     with pytest.raises(StoreError, match="differs"):
         write_ply(path, cloud(5))
     assert [p.name for p in tmp_path.iterdir()] == ["map.ply"]
     assert path.read_text() == "earlier"
+
+
+def test_open3d_loads_without_its_web_pages_which_come_when_they_are_asked_for() -> None:
+    code = """
+import sys
+from bodycap_batch.formats.open3d_library import load_open3d
+open3d = load_open3d()
+assert "dash" not in sys.modules
+cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector([[1.0, 2.0, 3.0]]))
+print(open3d.visualization.get_plotly_fig([cloud]).data[0].z.tolist())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, "[3.0]"), done.stderr
