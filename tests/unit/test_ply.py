@@ -64,6 +64,7 @@ def test_a_failing_writer_keeps_the_earlier_file(tmp_path: Path, monkeypatch: py
     assert path.read_text() == "earlier"
 
 
+@pytest.mark.slow
 def test_open3d_loads_without_its_web_pages_which_come_when_they_are_asked_for() -> None:
     code = """
 import sys
