@@ -81,13 +81,19 @@ class StoreError(BodycapError):
     exit_code = 5
 
 
+class DiskAway(StoreError):
+    """The disk does not answer (a network disk that is away, a failing one); trying again later may help."""
+
+
 class Cancelled(BodycapError):
     """The user stopped the work."""
 
     exit_code = EXIT_CANCELLED
 
 
-_TYPES = {cls.__name__: cls for cls in (JobError, CaptureError, EstimationError, StoreError, Cancelled)}
+_TYPES = {
+    cls.__name__: cls for cls in (JobError, CaptureError, EstimationError, StoreError, DiskAway, Cancelled)
+}
 
 
 def error_from_dict(data: dict[str, str | int | None]) -> BodycapError:

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from bodycap_batch.digests import (
     FileDigests,
@@ -30,16 +30,23 @@ from bodycap_batch.digests import (
     set_digest,
     write_atomically,
 )
-from bodycap_batch.errors import StoreError
+from bodycap_batch.errors import DiskAway, StoreError
 
 MANIFEST = "manifest.json"
-DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG})
+_AWAY = frozenset({
+    errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.ECONNRESET, errno.ECONNABORTED,
+    errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENETDOWN, errno.ENETUNREACH, errno.ENODEV, errno.ENXIO,
+})  # fmt: skip
+"""What a network disk answers while its server is away, and a disk that fails."""
+DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG}) | _AWAY
 _VOLATILE_SUFFIXES = (".db",)
 """A database differs from run to run although what it holds is the same: no part of the content."""
 _REMEMBER_BYTES = 1 << 20
 """When an artefact is looked up, files above this are hashed again only if their inode, size or times
 changed: a finished job of any length is found finished in a moment. What a task reads is hashed whole."""
+_Found = TypeVar("_Found")
 _LOCK = "lock"
+_SETTING_ASIDE = "setting-aside"
 _UNLOCKED = "new-"
 """Name of a draft between its making and its locking; swept only when it is older than a minute."""
 _STALE_S = 60.0
@@ -133,9 +140,7 @@ class Store:
             if not path.is_dir():
                 return None
             artefact = self._verified(path, key)
-            if artefact is None:
-                self._set_aside(path)
-            return artefact
+            return artefact or self._set_aside(path, lambda: self._verified(path, key))
 
     def verify(self, path: Path) -> None:
         """Hash all of an artefact that is about to be read; what does not hold is set aside.
@@ -147,13 +152,7 @@ class Store:
             StoreError: It is damaged, although nothing has written to it: the disk fails.
         """
         with disk_errors(self.root):
-            try:
-                files = json.loads((path / MANIFEST).read_text(encoding="utf-8"))["files"]
-                sound = all(file_sha256(path / name) == want for name, want in files.items())
-            except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
-                sound = False
-            if not sound:
-                self._set_aside(path)
+            if not _is_sound(path) and not self._set_aside(path, lambda: _is_sound(path)):
                 hint = "check the disk; run the job again, what was damaged is made anew"
                 raise StoreError("a stored artefact is damaged", path=path, hint=hint)
 
@@ -221,7 +220,7 @@ class Store:
             _sync_folders(draft.files)
             before()
             if replace:
-                with contextlib.suppress(FileNotFoundError):
+                with self._setting_aside(), contextlib.suppress(FileNotFoundError):
                     os.replace(self._path(key), draft.work.with_name("replaced"))
             return self._move_in(draft.files, key)
 
@@ -266,9 +265,10 @@ class Store:
             manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
             seal = manifest.pop("seal")
             sound = seal == json_digest(manifest) and manifest["key"] == _as_json(key.document())
+            sound = sound and all(self._holds(path / name, want) for name, want in manifest["files"].items())
         except (FileNotFoundError, NotADirectoryError, ValueError, KeyError, AttributeError, TypeError):
-            return None
-        if not sound or not all(self._holds(path / name, want) for name, want in manifest["files"].items()):
+            return None  # damaged, or just being set aside by another process
+        if not sound:
             return None
         return Artefact(path=path, digest=manifest["digest"], made=manifest["made"], files=manifest["files"])
 
@@ -278,12 +278,27 @@ class Store:
         large = path.stat().st_size > _REMEMBER_BYTES
         return (self.digests.sha256(path) if large else file_sha256(path)) == want
 
-    def _set_aside(self, path: Path) -> None:
-        target = self._corrupt / f"{path.parent.name}-{path.name}-{time.time_ns()}"
+    def _set_aside(self, path: Path, look: Callable[[], _Found]) -> _Found:
+        """Move a damaged artefact away, unless a last look finds a sound one: another process was quicker.
+
+        Nobody else moves it between that look and the move, so what was made anew is never taken away.
+        """
+        with self._setting_aside():
+            if not (found := look()):
+                target = self._corrupt / f"{path.parent.name}-{path.name}-{time.time_ns()}"
+                with contextlib.suppress(FileNotFoundError):
+                    os.replace(path, target)
+        return found
+
+    @contextmanager
+    def _setting_aside(self) -> Iterator[None]:
+        """Be the only process that takes artefacts from their places."""
+        handle = os.open(self.root / _SETTING_ASIDE, os.O_RDWR | os.O_CREAT, 0o666)
         try:
-            os.replace(path, target)
-        except FileNotFoundError:
-            return  # another process found it first
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(handle)
 
 
 @contextmanager
@@ -308,7 +323,19 @@ def store_error(error: OSError, path: Path) -> StoreError:
     where = error.filename if isinstance(error.filename, str) else path
     reason = os.strerror(error.errno) if error.errno else str(error)
     hint = hints.get(error.errno or 0, "check the disk; another folder can be named with --store")
+    if error.errno in _AWAY:
+        hint = "is the disk mounted, its server reachable? Another folder can be named with --store or --out"
+        return DiskAway(reason, path=where, hint=hint)
     return StoreError(reason, path=where, hint=hint)
+
+
+def _is_sound(path: Path) -> bool:
+    """True where every file of an artefact holds what its manifest says."""
+    try:
+        files = json.loads((path / MANIFEST).read_text(encoding="utf-8"))["files"]
+        return all(file_sha256(path / name) == want for name, want in files.items())
+    except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
+        return False
 
 
 def _as_json(value: Any) -> Any:

@@ -14,6 +14,29 @@ from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount
 CAMERAS = {"torso": "Spine1", "left_palm": "LeftHand", "right_palm": "RightHand"}
 ARMS = ("Spine1", "LeftArm", "LeftForeArm", "LeftHand", "RightArm", "RightForeArm", "RightHand")
 
+BVH_PAIR = """HIERARCHY
+ROOT Hips
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  JOINT LeftArm
+  {
+    OFFSET 20 0 0
+    CHANNELS 3 Zrotation Xrotation Yrotation
+    End Site
+    {
+      OFFSET 30 0 0
+    }
+  }
+}
+MOTION
+Frames: 2
+Frame Time: 0.0333333
+1 100 2 0 0 0 90 0 0
+1 100 2 0 0 90 0 0 0
+"""
+"""Two joints, two frames: the smallest file with all that a BVH file has."""
+
 
 def reaching(ticks: int = 60, skeleton: SkeletonModel | None = None) -> Motion:
     """A body that walks forward (−Y), turns and swings its arms; its legs stay at rest."""

@@ -17,7 +17,7 @@ import typer
 
 from bodycap_batch.cli.base import app
 from bodycap_batch.cli.display import sentence
-from bodycap_batch.cli.run import STORE_VARIABLE, cores, default_out, results_folder
+from bodycap_batch.cli.options import BatchOutOption, BatchStoreOption, cores, default_out, results_folder
 from bodycap_batch.cli.stop import stoppable
 from bodycap_batch.errors import Cancelled, JobError
 from bodycap_batch.progress import Event
@@ -40,27 +40,14 @@ _ExecutorOption = Annotated[
         help="Where tasks run: here, on a Dask scheduler's workers (tcp://HOST:8786), or in a queue.",
     ),
 ]
-_OutOption = Annotated[
-    Path | None,
-    typer.Option("--out", metavar="DIR", help="Folder for the jobs' folders of results (default: out)."),
-]
-_StoreOption = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="DIR",
-        help="Where finished stages are kept (default: .store in the folder of results).",
-        envvar=STORE_VARIABLE,
-        show_envvar=True,
-    ),
-]
 
 
 @app.command()
 def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
     jobs: Annotated[list[Path], typer.Argument(metavar="JOBS...", help="Job files and folders of videos.")],
     executor: _ExecutorOption = "local",
-    out: _OutOption = None,
-    store: _StoreOption = None,
+    out: BatchOutOption = None,
+    store: BatchStoreOption = None,
     max_jobs: Annotated[
         int | None, typer.Option(min=1, help="Most jobs at work at once.", show_default=False)
     ] = None,

@@ -8,7 +8,7 @@ import typer
 
 from bodycap_batch.cli.base import app
 from bodycap_batch.cli.display import make_display
-from bodycap_batch.cli.run import (
+from bodycap_batch.cli.options import (
     HeightOption,
     JobArgument,
     OutOption,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -14,6 +13,18 @@ import typer
 
 from bodycap_batch.cli.base import app
 from bodycap_batch.cli.display import Display, JsonLines, make_display
+from bodycap_batch.cli.options import (
+    HeightOption,
+    JobArgument,
+    OutOption,
+    SkeletonOption,
+    StoreOption,
+    ThreadsOption,
+    cores,
+    default_out,
+    default_store,
+    results_folder,
+)
 from bodycap_batch.cli.stop import stoppable
 from bodycap_batch.errors import BodycapError, JobError
 from bodycap_batch.progress import Event
@@ -22,38 +33,6 @@ from bodycap_batch.tasks import StageName, stages_from
 if TYPE_CHECKING:
     from bodycap_batch.config.models import Job
     from bodycap_batch.pipeline import RunSummary, Settings
-
-STORE_VARIABLE = "BODYCAP_STORE"
-JobArgument = Annotated[
-    Path,
-    typer.Argument(
-        metavar="JOB_OR_FOLDER",
-        help="A job file (YAML), or a folder of videos.",
-        readable=False,  # the loader says it better, with the remedy
-    ),
-]
-OutOption = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", help="Folder for the results (default: out/<job>).")
-]
-SkeletonOption = Annotated[
-    str | None,
-    typer.Option(metavar="NAME|FILE.bvh", help="none, upper_body, full_body, or the subject's own BVH file."),
-]
-HeightOption = Annotated[
-    float | None, typer.Option("--height", metavar="METRES", help="The subject's height, e.g. 1.75.")
-]
-ThreadsOption = Annotated[
-    int | None, typer.Option(min=1, max=1024, help="Cores to keep busy (default: all).", show_default=False)
-]
-StoreOption = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="DIR",
-        help="Where finished stages are kept for the next run (default: .store beside the results).",
-        envvar=STORE_VARIABLE,
-        show_envvar=True,
-    ),
-]
 
 
 @app.command()
@@ -134,27 +113,6 @@ def _told_to(display: Display) -> Iterator[None]:
         if isinstance(display, JsonLines):
             sys.stdout.write(json.dumps({"kind": "error", **error.to_dict()}) + "\n")
         raise
-
-
-def cores() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def default_out() -> Path:
-    """Folder of all results that are not put elsewhere."""
-    return Path.cwd() / "out"
-
-
-def results_folder(job: Job) -> Path:
-    """Where a job's results go."""
-    return job.out or default_out() / job.name
-
-
-def default_store(out_dir: Path) -> Path:
-    """One store for all of ``out/``; results put elsewhere have their own."""
-    shared = default_out()
-    return (shared if out_dir in (shared, shared / out_dir.name) else out_dir) / ".store"
 
 
 def _report(summary: RunSummary, job: Job, display: Display, *, verbose: bool) -> None:

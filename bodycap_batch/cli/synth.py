@@ -12,7 +12,7 @@ import typer
 
 from bodycap_batch.cli.base import app
 from bodycap_batch.cli.display import make_display
-from bodycap_batch.cli.run import ThreadsOption, cores
+from bodycap_batch.cli.options import ThreadsOption, cores
 from bodycap_batch.cli.stop import stoppable
 from bodycap_batch.errors import JobError
 from bodycap_batch.progress import Event

@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from bodycap_batch.cli.base import app
+from bodycap_batch.cli.options import JobArgument, OutOption, results_folder
 from bodycap_batch.cli.report import job_of
-from bodycap_batch.cli.run import JobArgument, OutOption, results_folder
 from bodycap_batch.errors import JobError
 
 _REPORT = ("report.html", "partial/report.html")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bodycap_batch.cli.base import app
-from bodycap_batch.cli.run import ThreadsOption, cores
+from bodycap_batch.cli.options import ThreadsOption, WatchStoreOption, cores
 from bodycap_batch.cli.stop import exit_code_of_stop, stoppable
 
 if TYPE_CHECKING:
@@ -56,10 +56,7 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
     ] = Path("jobs/inbox"),
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Jobs worked on side by side.")] = 1,
     threads: ThreadsOption = None,
-    store: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Where finished stages are kept (default: .store beside INBOX)."),
-    ] = None,
+    store: WatchStoreOption = None,
     root: RootOption = None,
     limit: LimitOption = None,
     settle: Annotated[

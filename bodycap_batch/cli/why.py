@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -10,9 +11,11 @@ from typing import Annotated
 import typer
 
 from bodycap_batch.cli.base import app
-from bodycap_batch.cli.run import (
+from bodycap_batch.cli.options import (
+    STORE_VARIABLE,
     HeightOption,
     JobArgument,
+    JsonOption,
     OutOption,
     SkeletonOption,
     StoreOption,
@@ -21,8 +24,6 @@ from bodycap_batch.cli.run import (
     results_folder,
 )
 from bodycap_batch.errors import StoreError
-
-JsonOption = Annotated[bool, typer.Option("--json", help="Print it as JSON.")]
 
 
 @app.command()
@@ -84,9 +85,6 @@ def gc(
     Example:
       bodycap gc out/.store --delete
     """  # noqa: D301 - \b keeps lines as they are
-    import os
-
-    from bodycap_batch.cli.run import STORE_VARIABLE
     from bodycap_batch.references import collect_garbage
     from bodycap_batch.store import Store
 

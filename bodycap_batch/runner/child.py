@@ -52,6 +52,7 @@ def main(arguments: Sequence[str], table: Mapping[str, TaskFunction] | None = No
             _import(order["import"])
             continue
         _send_prints_to(Path(order["log"]))
+        speak.say("begun")
         if _perform(Path(order["task"]), table, _Link(speak, orders, asks=True)) == EXIT_BUG:
             return EXIT_BUG
     return 0

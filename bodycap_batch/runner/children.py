@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,7 +82,7 @@ class Children:
         """
         taken = []
         for modules in work:
-            child = self._take(modules, logs)
+            child, _ = self._take(modules, logs)
             child.order({"import": list(modules)})
             child.loaded |= set(modules)
             taken.append(child)
@@ -101,14 +101,7 @@ class Children:
             order = log.with_suffix(".task.json")
             order.write_text(json.dumps(task.to_json(making.store.root), indent=1), encoding="utf-8")
             log.write_bytes(b"")
-        child = self._take(task.modules, making.logs)
-        child.loaded |= set(task.modules)
-        with ExitStack() as failing:  # whoever listens to the progress may: a full disk, a closed pipe
-            failing.callback(child.end, at_once=True)
-            self.prepare(making.logs, making.meanwhile)
-            child.order({"task": str(order), "log": str(log)})
-            last = child.follow(making.cancelled, lambda message: _answer(child, message, making))
-            failing.pop_all()
+        child, last = self._done_by(task, making, {"task": str(order), "log": str(log)})
         stopped = making.cancelled()
         if last is not None and "ends" not in last and not stopped:
             with self._lock:
@@ -120,8 +113,33 @@ class Children:
         if last is None or last["event"] == "error":
             raise _explained(task, last, child.returncode, (log, making.store))
 
-    def _take(self, modules: Collection[str], logs: Path) -> Child:
-        """The waiting child that has loaded most of `modules` and least else, or a new one."""
+    def _done_by(
+        self, task: Task, making: Making, order: Mapping[str, str]
+    ) -> tuple[Child, dict[str, Any] | None]:
+        """Let a child do a task; one that had died while it waited for work is replaced."""
+        ahead = making.meanwhile
+        while True:
+            child, is_new = self._take(task.modules, making.logs)
+            child.loaded |= set(task.modules)
+            heard: list[str] = []
+
+            def hear(message: dict[str, Any], child: Child = child, heard: list[str] = heard) -> None:
+                heard.append(message["event"])
+                _answer(child, message, making)
+
+            with ExitStack() as failing:  # whoever listens to the progress may: a full disk, a closed pipe
+                failing.callback(child.end, at_once=True)
+                self.prepare(making.logs, ahead)
+                child.order(order)
+                last = child.follow(making.cancelled, hear)
+                failing.pop_all()
+            if is_new or heard or last is not None or making.cancelled():
+                return child, last
+            child.end(at_once=False)
+            ahead = ()
+
+    def _take(self, modules: Collection[str], logs: Path) -> tuple[Child, bool]:
+        """The waiting child that has loaded most of `modules` and least else, or a new one (True)."""
         with self._lock:
             if self._idle:
                 wanted = set(modules)
@@ -129,17 +147,17 @@ class Children:
                     self._idle, key=lambda child: (len(wanted & child.loaded), -len(child.loaded - wanted))
                 )
                 self._idle.remove(best)
-                return best
+                return best, False
         with disk_errors(logs):
             logs.mkdir(parents=True, exist_ok=True)
             with (logs / CHILDREN_LOG).open("ab") as log:
-                return Child(self._command, log)
+                return Child(self._command, log), True
 
 
 def _answer(child: Child, message: dict[str, Any], making: Making) -> None:
     if message["event"] == "ready":
         child.order({"commit": making.may_commit()})
-    else:
+    elif message["event"] == "progress":
         making.progress(message["done"], message["total"], message.get("what", ""))
 
 

@@ -12,15 +12,8 @@ from bodycap_batch.check import check_path, require_ready
 from bodycap_batch.cli import main
 from bodycap_batch.config.job import load_job
 from bodycap_batch.errors import BodycapError
-from tests.broken import CASES, FRAMES, MIRRORED, Case, black, edit, sound
+from tests.broken import CASES, FRAMES, MIRRORED, Case, black, edit
 from tests.videos import textured_frame, write_video
-
-
-@pytest.fixture(scope="module")
-def sound_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("sound")
-    sound(folder)
-    return folder
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.broken import CASES, Case, sound
+from tests.broken import CASES, Case
 from tests.pipeline.fake_stages import ORDERS
 from tests.pipeline.spools import SpoolBench
 
@@ -25,12 +25,9 @@ def folder_of(case: Case) -> str:
 
 
 @pytest.fixture(scope="module")
-def worked_off(tmp_path_factory: pytest.TempPathFactory) -> SpoolBench:
+def worked_off(tmp_path_factory: pytest.TempPathFactory, sound_folder: Path) -> SpoolBench:
     """Two sound jobs with all broken ones between them; the videos are really looked at."""
     folder = tmp_path_factory.mktemp("spool")
-    sound_folder = folder / "sound"
-    sound_folder.mkdir()
-    sound(sound_folder)
     with pytest.MonkeyPatch.context() as monkeypatch:
         bench = SpoolBench(folder)
         bench.order(real=["check"])

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.broken import BVH, edit, sound
+from tests.broken import BVH, edit
 
 ROOT = Path(__file__).parents[2]
 COMMAND = str(Path(__file__).with_name("fake_bodycap.py"))
@@ -43,13 +43,6 @@ def bodycap(folder: Path, *arguments: str, before: tuple[str, ...] = ()) -> Told
     )
     assert "Traceback" not in done.stderr, done.stderr
     return Told(done.returncode, done.stdout + done.stderr)
-
-
-@pytest.fixture(scope="module")
-def sound_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("sound")
-    sound(folder)
-    return folder
 
 
 @pytest.fixture

@@ -17,6 +17,7 @@ from bodycap_batch.formats.bvh import read_bvh, write_bvh
 from bodycap_batch.formats.bvh.euler import continuous_angles, rotation_from_angles
 from bodycap_batch.geometry import rotation_angle_rad
 from bodycap_batch.skeleton import Motion, SkeletonModel
+from tests.bodies import BVH_PAIR
 
 ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
 
@@ -24,28 +25,6 @@ ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
 ANGLE_TOLERANCE_RAD = 3 * np.deg2rad(0.5e-6) + 2e-7
 # Half a unit of the sixth decimal of a centimetre on each of three axes.
 POSITION_TOLERANCE_M = 1e-8
-
-PAIR = """HIERARCHY
-ROOT Hips
-{
-  OFFSET 0 0 0
-  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
-  JOINT LeftArm
-  {
-    OFFSET 20 0 0
-    CHANNELS 3 Zrotation Xrotation Yrotation
-    End Site
-    {
-      OFFSET 30 0 0
-    }
-  }
-}
-MOTION
-Frames: 2
-Frame Time: 0.0333333
-1 100 2 0 0 0 90 0 0
-1 100 2 0 0 90 0 0 0
-"""
 
 
 @pytest.fixture
@@ -196,7 +175,7 @@ def test_rotation_order_agrees_with_scipy(order: str, rng: np.random.Generator) 
 
 def test_axes_and_units(tmp_path: Path) -> None:
     """File: Y up, faces +Z, left +X, cm. World: Z up, faces −Y, left +X, metres."""
-    model, moving = read_bvh(write(tmp_path, PAIR))
+    model, moving = read_bvh(write(tmp_path, BVH_PAIR))
     assert moving is not None
     np.testing.assert_allclose(moving.root_in_world_m[0], [0.01, -0.02, 1.0])
     np.testing.assert_allclose(model.offsets_m[1], [0.2, 0.0, 0.0])
@@ -219,7 +198,7 @@ def test_positions_agree_with_an_independent_reader(tmp_path: Path, rng: np.rand
 
 
 def test_a_files_hierarchy_offsets_and_channels_are_kept(tmp_path: Path) -> None:
-    text = PAIR.replace("OFFSET 20 0 0", "OFFSET 20.123456789 -0.1 1e-3")
+    text = BVH_PAIR.replace("OFFSET 20 0 0", "OFFSET 20.123456789 -0.1 1e-3")
     text = text.replace("3 Zrotation Xrotation Yrotation", "3 Yrotation Xrotation Zrotation")
     _, moving = read_bvh(write(tmp_path, text))
     assert moving is not None
@@ -247,7 +226,7 @@ def test_default_layout(tmp_path: Path, rng: np.random.Generator) -> None:
 
 
 def test_a_hinge_or_a_root_without_position_gets_what_it_lacks(tmp_path: Path) -> None:
-    text = PAIR.replace("6 Xposition Yposition Zposition Zrotation", "3 Zrotation")
+    text = BVH_PAIR.replace("6 Xposition Yposition Zposition Zrotation", "3 Zrotation")
     text = text.replace("3 Zrotation Xrotation Yrotation\n    End", "1 Xrotation\n    End")
     text = text.replace("1 100 2 0 0 0 90 0 0\n1 100 2 0 0 90 0 0 0", "0 0 0 90\n0 0 90 0")
     _, moving = read_bvh(write(tmp_path, text))
@@ -263,7 +242,7 @@ def test_a_hinge_or_a_root_without_position_gets_what_it_lacks(tmp_path: Path) -
 
 
 def test_position_channels_on_every_joint(tmp_path: Path) -> None:
-    text = PAIR.replace("3 Zrotation", "6 Xposition Yposition Zposition Zrotation")
+    text = BVH_PAIR.replace("3 Zrotation", "6 Xposition Yposition Zposition Zrotation")
     held = text.replace("90 0 0\n", "21 0 0 90 0 0\n").replace("90 0 0 0\n", "90 21 0 0 0 0 0\n")
     model, moving = read_bvh(write(tmp_path, held))
     assert moving is not None
@@ -274,7 +253,7 @@ def test_position_channels_on_every_joint(tmp_path: Path) -> None:
 
 
 def test_metres_are_recognised(tmp_path: Path) -> None:
-    text = PAIR.replace("OFFSET 20 0 0", "OFFSET 0.20 0 0").replace("1 100 2", "0.01 1.0 0.02")
+    text = BVH_PAIR.replace("OFFSET 20 0 0", "OFFSET 0.20 0 0").replace("1 100 2", "0.01 1.0 0.02")
     model, moving = read_bvh(write(tmp_path, text))
     assert moving is not None
     np.testing.assert_allclose(model.offsets_m[1], [0.2, 0, 0])
@@ -297,7 +276,7 @@ def test_metres_are_recognised(tmp_path: Path) -> None:
     ],
 )
 def test_odd_files_are_understood(tmp_path: Path, change: object, joints: int) -> None:
-    path = write(tmp_path, change(PAIR))  # type: ignore[operator]
+    path = write(tmp_path, change(BVH_PAIR))  # type: ignore[operator]
     model, moving = read_bvh(path)
     assert moving is not None
     assert (len(model.joints), len(moving.root_in_world_m), moving.fps) == (joints, 2, 30.0)
@@ -305,7 +284,7 @@ def test_odd_files_are_understood(tmp_path: Path, change: object, joints: int) -
 
 @pytest.mark.parametrize("tail", ["", "MOTION\n", "MOTION\nFrames: 0\nFrame Time: 0.03\n"])
 def test_no_motion(tmp_path: Path, tail: str) -> None:
-    path = write(tmp_path, PAIR.partition("MOTION")[0] + tail)
+    path = write(tmp_path, BVH_PAIR.partition("MOTION")[0] + tail)
     model, moving = read_bvh(path)
     assert model.joints == ("Hips", "LeftArm")
     assert moving is None
@@ -334,8 +313,8 @@ def test_no_motion(tmp_path: Path, tail: str) -> None:
     ],
 )
 def test_broken_files_are_named(tmp_path: Path, old: str, new: str, line: int, says: str) -> None:
-    assert old in PAIR
-    path = write(tmp_path, PAIR.replace(old, new, 1))
+    assert old in BVH_PAIR
+    path = write(tmp_path, BVH_PAIR.replace(old, new, 1))
     with pytest.raises(JobError, match=says) as caught:
         read_bvh(path)
     assert (caught.value.path, caught.value.line) == (str(path), line)
@@ -374,7 +353,7 @@ def test_a_very_deep_file_does_not_exhaust_the_stack(tmp_path: Path) -> None:
     ],
 )
 def test_nominal_rates(tmp_path: Path, written: str, fps: float) -> None:
-    _, moving = read_bvh(write(tmp_path, PAIR.replace("0.0333333", written)))
+    _, moving = read_bvh(write(tmp_path, BVH_PAIR.replace("0.0333333", written)))
     assert moving is not None
     assert moving.fps == pytest.approx(fps, rel=1e-12)
 
@@ -382,7 +361,7 @@ def test_nominal_rates(tmp_path: Path, written: str, fps: float) -> None:
 def test_a_full_disk_is_a_store_error_and_keeps_the_earlier_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _, moving = read_bvh(write(tmp_path, PAIR))
+    _, moving = read_bvh(write(tmp_path, BVH_PAIR))
     assert moving is not None
     (tmp_path / "a.bvh").write_text("earlier")
 
@@ -422,7 +401,7 @@ def test_damaged_files_are_read_or_refused_but_never_crash(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     """Lines dropped, doubled, swapped, cut, or sprinkled with noise."""
-    lines = PAIR.encode().split(b"\n")
+    lines = BVH_PAIR.encode().split(b"\n")
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(lines) - 1))
         kind = data.draw(st.sampled_from(["drop", "double", "cut", "noise", "truncate", "swap"]))

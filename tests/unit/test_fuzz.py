@@ -23,6 +23,7 @@ from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import Job
 from bodycap_batch.errors import BodycapError, CaptureError, JobError
 from bodycap_batch.formats.bvh import read_bvh
+from tests.bodies import BVH_PAIR
 
 FAST = settings(
     deadline=None, derandomize=True, database=None,
@@ -47,27 +48,6 @@ capture:
 keyframes: {parallax_px: 15.0}
 map: {features: 512, init_frames: [torso:10, torso:85]}
 export: {formats: [ply, bvh]}
-"""
-BVH = """HIERARCHY
-ROOT Hips
-{
-  OFFSET 0 90 0
-  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
-  JOINT LeftArm
-  {
-    OFFSET 10 40 0
-    CHANNELS 3 Zrotation Xrotation Yrotation
-    End Site
-    {
-      OFFSET 30 0 0
-    }
-  }
-}
-MOTION
-Frames: 2
-Frame Time: 0.0333333
-0 90 0 0 0 0 10 20 30
-0 91 0 1 2 3 11 21 31
 """
 CALIBRATION = {
     "cameras": {
@@ -259,7 +239,7 @@ CASES = {
     "job text": (job, mutations(JOB).map(utf8), 8_000),
     "job values": (job, replaced(all_job_blocks()).map(yaml_of), 3_000),
     "job bytes": (job, st.binary(max_size=300), 2_000),
-    "bvh text": (bvh, mutations(BVH).map(utf8), 20_000),
+    "bvh text": (bvh, mutations(BVH_PAIR).map(utf8), 20_000),
     "bvh bytes": (bvh, st.binary(max_size=300), 5_000),
     "calibration values": (calibration, replaced(CALIBRATION).map(json_of), 6_000),
     "calibration text": (calibration, mutations(json.dumps(CALIBRATION, indent=1)).map(utf8), 8_000),
@@ -301,7 +281,7 @@ def test_the_sound_files_are_read() -> None:
         "left_palm",
     ]
     assert len(read_calibration(FOLDER / "calib.json", "torso").calibration.params) == 8
-    (FOLDER / "sound.bvh").write_text(BVH)
+    (FOLDER / "sound.bvh").write_text(BVH_PAIR)
     skeleton, motion = read_bvh(FOLDER / "sound.bvh")
     assert skeleton.joints == ("Hips", "LeftArm")
     assert motion is not None

@@ -120,6 +120,20 @@ def test_a_child_that_failed_unexpectedly_is_not_used_again(bench: Bench, stage:
     assert pid_of(bench, "work", 2) != first
 
 
+def test_children_that_died_while_they_waited_are_replaced_silently(bench: Bench) -> None:
+    bench.children.prepare(bench.logs, [["wave"]])
+    first = pid_of(bench, "work", 1)  # the one that waits
+    bench.children.prepare(bench.logs, [["wave"], ["colorsys"]])  # it, and another
+    waiting = [child._process.pid for child in bench.children._idle]
+    assert len(waiting) == 2
+    assert first in waiting
+    for pid in waiting:
+        os.kill(pid, signal.SIGKILL)
+        wait_for(lambda pid=pid: not alive(pid))  # type: ignore[misc]
+    assert pid_of(bench, "work", 2) not in waiting
+    assert set(bench.kinds()) == {"started", "progress", "finished"}
+
+
 def test_a_child_ends_with_its_task_where_nobody_can_be_told_of_it(bench: Bench) -> None:
     first = pid_of(bench, "work", 1)
 

@@ -10,7 +10,9 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -142,6 +144,57 @@ def test_a_corrupt_rival_is_replaced(tmp_path: Path) -> None:
     found = store.find(key())
     assert found is not None
     assert (found.path / "a.txt").read_bytes() == b"good"
+
+
+@pytest.mark.parametrize("how", ["find", "verify"])
+def test_what_another_process_has_made_anew_is_not_set_aside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    slow, quick = Store(tmp_path), Store(tmp_path)
+    damaged = make(quick, key(), {"a.txt": b"good"}).path
+    (damaged / "a.txt").write_bytes(b"evil")
+    set_aside = slow._set_aside
+
+    def later(path: Path, look: Callable[[], Any]) -> Any:
+        """Between the first look and the last one, another process finds the damage and mends it."""
+        assert quick.find(key()) is None
+        make(quick, key(), {"a.txt": b"good"})
+        return set_aside(path, look)
+
+    monkeypatch.setattr(slow, "_set_aside", later)
+    if how == "find":
+        found = slow.find(key())
+        assert found is not None
+        assert found.path == damaged
+    else:
+        slow.verify(damaged)
+    assert (damaged / "a.txt").read_bytes() == b"good"
+    assert [(path / "a.txt").read_bytes() for path in (tmp_path / "corrupt").iterdir()] == [b"evil"]
+
+
+def test_one_process_at_a_time_takes_artefacts_from_their_places(tmp_path: Path) -> None:
+    stores = [Store(tmp_path) for _ in range(4)]
+    barrier = threading.Barrier(len(stores))
+    lost: list[str] = []
+
+    def mend(store: Store) -> None:
+        """Damage, find and make anew, over and over; what a commit returned must be there and sound."""
+        for _ in range(20):
+            barrier.wait()
+            if (found := store.find(key())) is None:
+                found = make(store, key(), {"a.txt": b"good"})
+            barrier.wait()
+            if (found.path / "a.txt").read_bytes() != b"good":
+                lost.append(str(found.path))
+            if barrier.wait() == 0:
+                (found.path / "a.txt").write_bytes(b"evil")
+
+    threads = [threading.Thread(target=mend, args=(store,)) for store in stores]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert lost == []
 
 
 _COMMIT = """
