@@ -17,7 +17,7 @@ from bodycap_batch.cli.options import ThreadsOption, WatchStoreOption, cores
 from bodycap_batch.cli.stop import exit_code_of_stop, stoppable
 
 if TYPE_CHECKING:
-    from bodycap_batch.watch import Spool, Watcher, WatchOptions
+    from bodycap_batch.watch import Watcher, WatchOptions
 
 
 RootOption = Annotated[
@@ -52,7 +52,10 @@ TokenOption = Annotated[
 @app.command()
 def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
     inbox: Annotated[
-        Path, typer.Argument(metavar="[INBOX]", help="The folder to watch.", show_default=True)
+        Path,
+        typer.Argument(
+            metavar="[INBOX]", help="The folder to watch, or the one that holds it.", show_default=True
+        ),
     ] = Path("jobs/inbox"),
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Jobs worked on side by side.")] = 1,
     threads: ThreadsOption = None,
@@ -110,7 +113,7 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
     with stoppable() as stop:
         watcher = Watcher(spool, options, _say)
         _say(f"watching {spool.inbox}; results go to {spool.done}")
-        with _live_page(spool, options, web, web_token):
+        with _live_page(watcher, options, web, web_token):
             worst = _run(watcher, stop)
     if stop.is_set():
         _say("stopped; running jobs go on at the next start")
@@ -130,14 +133,15 @@ def _run(watcher: Watcher, stop: threading.Event) -> int:
 
 
 @contextmanager
-def _live_page(spool: Spool, options: WatchOptions, address: str | None, token: str) -> Iterator[None]:
+def _live_page(watcher: Watcher, options: WatchOptions, address: str | None, token: str) -> Iterator[None]:
     """Serve the live page meanwhile, where an address is given."""
     if address is None:
         yield
         return
     from bodycap_batch.watch.web import LivePage, access_from
 
-    with LivePage(spool, access_from(address, token), options.terms.limits) as page:
+    access, limits = access_from(address, token), options.terms.limits
+    with LivePage(watcher.spool, access, limits, lambda: watcher.trouble.text) as page:
         _say(f"live page: {page.access.url}{'?token=…' if page.access.token else ''}")
         yield
 

@@ -9,7 +9,7 @@ import uuid
 from pathlib import Path
 
 from bodycap_batch.config.models import Job
-from bodycap_batch.errors import BodycapError
+from bodycap_batch.errors import BodycapError, StoreError
 from bodycap_batch.store import store_error
 from bodycap_batch.watch.claim import Claim, first_claim
 from bodycap_batch.watch.drops import Drop, Look, look_at
@@ -44,16 +44,16 @@ def claim_drop(
             shutil.rmtree(place.path)
             return None
         settle_claim(spool, claim)
-    except OSError as failed:
-        with contextlib.suppress(OSError):  # else it stays claimed, and is adopted later
+    except (OSError, StoreError) as failed:
+        with contextlib.suppress(OSError, StoreError):  # else it stays claimed, and is adopted later
             give_back(spool, place)
-        raise store_error(failed, drop.path) from failed
+        raise store_error(failed, drop.path) if isinstance(failed, OSError) else failed from failed
     return claim, error
 
 
 def settle_claim(spool: Spool, claim: Claim) -> None:
     """Give a claimed folder its name in `running`."""
-    before = read_status(claim.job)
+    before = read_status(claim.job, strict=True)
     status = StatusFile(claim.job, before)
     dropped = str(before.get("dropped") or "job")
     wanted = spool_name(Path(dropped).stem if before.get("kind") == "file" else dropped)
@@ -72,24 +72,33 @@ def discard_empty(place: JobDir) -> bool:
     """
     hidden = JobDir(place.path.with_name(f"{CLAIM_PREFIX}{uuid.uuid4().hex}"))
     os.rename(place.path, hidden.path)
-    if os.path.lexists(dropped_in(hidden)):
+    if is_there(dropped_in(hidden)):
         os.rename(hidden.path, place.path)
         return False
     shutil.rmtree(hidden.path, ignore_errors=True)
     return True
 
 
+def is_there(path: Path) -> bool:
+    """Whether a file, folder or link is there; a disk that does not answer raises `OSError`."""
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
+
+
 def dropped_in(place: JobDir) -> Path:
     """What was dropped: the folder, or the job file that came alone."""
-    document = read_status(place)
+    document = read_status(place, strict=True)
     return place.input / str(document.get("dropped")) if document.get("kind") == "file" else place.input
 
 
 def give_back(spool: Spool, place: JobDir) -> Path | None:
     """Put what was dropped back into the inbox and remove the rest; returns where it lies now."""
     dropped, target = dropped_in(place), None
-    if os.path.lexists(dropped):
-        name = str(read_status(place).get("dropped") or place.name)
+    if is_there(dropped):
+        name = str(read_status(place, strict=True).get("dropped") or place.name)
         target = move(dropped, spool.inbox, name, suffix=dropped.suffix if dropped != place.input else "")
     shutil.rmtree(place.path, ignore_errors=True)
     return target

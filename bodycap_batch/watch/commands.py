@@ -15,7 +15,7 @@ from bodycap_batch.errors import Cancelled, JobError
 from bodycap_batch.store import disk_errors
 from bodycap_batch.watch.claim import first_claim, host_key, start_of
 from bodycap_batch.watch.claiming import dropped_in, give_back, settle_claim
-from bodycap_batch.watch.drops import Drop, drops_in, look_at, strays_in
+from bodycap_batch.watch.drops import NO_JOB, Drop, drops_in, look_at, strays_in
 from bodycap_batch.watch.guard import read_owner
 from bodycap_batch.watch.spool import CLAIM_PREFIX, RETRY_PREFIX, JobDir, Spool, move, visible
 from bodycap_batch.watch.status import FINAL, StatusFile, read_status, time_text
@@ -70,7 +70,7 @@ def waiting_rows(spool: Spool) -> list[JobRow]:
         JobRow(
             name=path.name,
             state="ignored",
-            cause="no job: neither a folder nor a YAML file",
+            cause=NO_JOB,
             hint="put videos into a folder and drop that",
             path=str(path),
         )

@@ -13,6 +13,7 @@ from pathlib import Path
 from bodycap_batch.watch.spool import visible
 
 READY = "READY"
+NO_JOB = "no job: neither a folder nor a YAML file"
 JOB_FILES = ("job.yaml", "job.yml")
 YAML_SUFFIXES = (".yaml", ".yml")
 _PART = ".part"
@@ -119,6 +120,10 @@ class Settling:
         settle_s: How long names, sizes and times must stay as they are.
         most: How many files of a drop are looked at.
         clock: This process's own clock, seconds.
+
+    Attributes:
+        held: What keeps drops back that have not changed for as long: a copy that was broken off, no file.
+        unreadable: Those of them that cannot even be looked at.
     """
 
     def __init__(self, settle_s: float, most: int, clock: Callable[[], float] = time.monotonic) -> None:
@@ -126,22 +131,28 @@ class Settling:
         self._most = most
         self._clock = clock
         self._seen: dict[Path, tuple[str, float]] = {}
+        self.held: dict[Path, str] = {}
+        self.unreadable: dict[Path, str] = {}
 
     def complete(self, drops: list[Drop]) -> list[tuple[Drop, Look]]:
         """The drops that are complete now, those that have been so for longest first."""
         now = self._clock()
         found: list[tuple[float, Drop, Look]] = []
         before, self._seen = self._seen, {}
+        self.held, self.unreadable = {}, {}
         for drop in drops:
-            try:
-                look = look_at(drop, self._most)
-            except OSError:  # it is being moved away, or cannot be read; it is tried again
-                continue
-            digest, since = before.get(drop.path, ("", now))
-            since = since if digest == look.digest else now
-            self._seen[drop.path] = (look.digest, since)
-            if look.ready or (not look.waits_for and now - since >= self._settle_s):
+            look, error = _looked_at(drop, self._most)
+            state = error if look is None else look.digest
+            known, since = before.get(drop.path, ("", now))
+            since = since if known == state else now
+            self._seen[drop.path] = (state, since)
+            still = now - since >= self._settle_s
+            if look is not None and (look.ready or (still and not look.waits_for)):
                 found.append((since, drop, look))
+            elif still and (reason := error or (look.waits_for if look is not None else "")):
+                self.held[drop.path] = reason
+                if error:
+                    self.unreadable[drop.path] = error
         found.sort(key=lambda each: (each[0], each[1].path))
         return [(drop, look) for _, drop, look in found]
 
@@ -149,6 +160,16 @@ class Settling:
     def waiting(self) -> bool:
         """True where something has been seen that may still be copied."""
         return bool(self._seen)
+
+
+def _looked_at(drop: Drop, most: int) -> tuple[Look | None, str]:
+    """A look at a drop, or why there is none; "" where something is just being moved."""
+    try:
+        return look_at(drop, most), ""
+    except FileNotFoundError:
+        return None, ""
+    except OSError as error:
+        return None, error.strerror or str(error)
 
 
 def _is_drop(path: Path) -> bool:

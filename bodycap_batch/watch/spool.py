@@ -15,6 +15,7 @@ from bodycap_batch.errors import StoreError
 from bodycap_batch.store import disk_errors
 
 INBOX, RUNNING, DONE, FAILED = "inbox", "running", "done", "failed"
+_MOVED_TO = (RUNNING, DONE, FAILED)
 CLAIM_PREFIX, RETRY_PREFIX = ".claim-", ".retry-"
 """Folders between two states; a watcher that starts finishes what they were made for."""
 _NAME_BYTES = 200
@@ -149,15 +150,24 @@ class Spool:
 def spool_at(path: Path) -> Spool:
     """The spool a user means: its inbox, or the folder that holds it.
 
+    A folder under another name is an inbox only where `running`, `done` and `failed` lie beside it already.
+    Any other is the folder that will hold the inbox: nothing that lies in it is ever taken for a job.
+
     Raises:
-        StoreError: The path is a file.
+        StoreError: The path is a file, or one of the folders that jobs are moved to.
     """
     full = Path(os.path.abspath(path))
-    if full.exists() and not full.is_dir():
+    if os.path.lexists(full) and not full.is_dir():
         raise StoreError("no folder", path=full, hint="name the folder to watch, for example jobs/inbox")
-    if full.name != INBOX and (full / INBOX).is_dir():
-        return Spool(inbox=full / INBOX, root=full)
-    return Spool(inbox=full, root=full.parent)
+    if full.name == INBOX:
+        return Spool(inbox=full, root=full.parent)
+    if not (full / INBOX).is_dir():
+        if full.name in _MOVED_TO and (full.parent / INBOX).is_dir():
+            hint = f"name {full.parent / INBOX}, or {full.parent}"
+            raise StoreError("jobs are moved to this folder, none is dropped into it", path=full, hint=hint)
+        if all((full.parent / name).is_dir() for name in _MOVED_TO):
+            return Spool(inbox=full, root=full.parent)
+    return Spool(inbox=full / INBOX, root=full)
 
 
 def move(

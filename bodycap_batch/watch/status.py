@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
+from types import NoneType
 from typing import Any, Literal
 
 from bodycap_batch.errors import BodycapError
@@ -20,6 +21,15 @@ State = Literal["claimed", "running", "stopped", "done", "failed", "cancelled"]
 FINAL = ("done", "failed", "cancelled")
 _PERIOD_S = 0.5
 _MOST_NOTES = 100
+_EXPECTED: Mapping[str, tuple[type, ...]] = {
+    **dict.fromkeys(("kind", "dropped", "state", "stage", "camera"), (str,)),
+    **dict.fromkeys(("notes", "finished_stages"), (list,)),
+    "active": (dict,),
+    "attempts": (int,),
+    "progress": (int, float, NoneType),
+    "error": (dict, NoneType),
+}
+"""What somebody has put into the file by hand counts only where it is of the right kind."""
 _UNENDED = "reading videos"
 """No stage, so nobody tells its end: it is over when a stage begins."""
 
@@ -141,13 +151,24 @@ def append_log(job: JobDir, text: str) -> None:
                 stream.write(f"{time_text()} {text}\n")
 
 
-def read_status(job: JobDir) -> dict[str, Any]:
-    """What a job's `status.json` says; empty where there is none or it cannot be read."""
+def read_status(job: JobDir, *, strict: bool = False) -> dict[str, Any]:
+    """What a job's `status.json` says; empty where there is none or it is garbled.
+
+    Args:
+        job: The job's folder.
+        strict: Raise `OSError` where it is there but the disk does not give it, else empty then, too.
+    """
     try:
         found = json.loads(job.status.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (FileNotFoundError, NotADirectoryError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    except OSError:
+        if strict:
+            raise
+        return {}
+    if not isinstance(found, dict):
+        return {}
+    return {name: value for name, value in found.items() if isinstance(value, _EXPECTED.get(name, (object,)))}
 
 
 def time_text(seconds: float | None = None) -> str:

@@ -7,14 +7,16 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 
 from bodycap_batch.errors import BodycapError, StoreError
 from bodycap_batch.watch.changes import Changes
 from bodycap_batch.watch.claim import Claim, Onlooker, take_over
 from bodycap_batch.watch.claiming import claim_drop, discard_empty, finish_retries, settle_claim
-from bodycap_batch.watch.drops import Drop, Look, Settling, drops_in
+from bodycap_batch.watch.drops import NO_JOB, Drop, Look, Settling, drops_in, strays_in
 from bodycap_batch.watch.options import WatchOptions
 from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir, Spool, visible
+from bodycap_batch.watch.trouble import Trouble
 from bodycap_batch.watch.work import Outcome, Worker
 
 Teller = Callable[[str], None]
@@ -34,14 +36,18 @@ class Watcher:
         options: How they are watched.
         tell: Called with a line for the operator.
 
+    Attributes:
+        spool: The folders.
+        trouble: What keeps it from them, while something does.
+
     Raises:
         StoreError: The folders cannot be written, or do not lie on one file system.
     """
 
     def __init__(self, spool: Spool, options: WatchOptions, tell: Teller) -> None:
         spool.make()
-        finish_retries(spool)
-        self._spool = spool
+        self.trouble = Trouble(spool, tell)
+        self.spool = spool
         self._options = options
         self._tell = tell
         self._stop = threading.Event()
@@ -51,6 +57,7 @@ class Watcher:
         self._worker = Worker(spool, options, self._stop)
         self._running: dict[Future[Outcome], Claim] = {}
         self._refused: dict[str, tuple[str, float]] = {}
+        self._unreadable: dict[Path, str] = {}
         self._complete: collections.deque[tuple[Drop, Look]] = collections.deque()
         self._waiting = False
         self._left = False
@@ -66,28 +73,60 @@ class Watcher:
     def run(self) -> int:
         """Watch until stopped, or with `once` until nothing is left to do.
 
+        A disk that goes away is waited for, with growing pauses; with `once` no longer than a job of another
+        watcher is.
+
         Returns:
             The worst exit code of the jobs that ended.
         """
         heart = threading.Thread(target=self._beat, name="heartbeat")
         with (
-            Changes(self._spool.inbox, self._woken, poll=self._options.poll),
+            Changes(self.spool.inbox, self._woken, poll=self._options.poll),
             ThreadPoolExecutor(max_workers=self._options.jobs, thread_name_prefix="job") as pool,
         ):
             heart.start()
             try:
+                self._finish_retries()
                 while not self._stop.is_set():
                     self._woken.clear()
                     self._collect()
-                    if not self._fill(pool) and self._options.once:
+                    if (pause_s := self._step(pool)) is None:
                         break
-                    soon = self._settling.waiting or self._running or self._left
-                    self._woken.wait(_LOOK_S if soon else _IDLE_LOOK_S)
+                    self._woken.wait(pause_s)
             finally:
                 self._stop.set()
                 heart.join()
         self._collect()
         return self._worst
+
+    def _step(self, pool: ThreadPoolExecutor) -> float | None:
+        """Start what can be started; seconds until the next look, None where none is wanted."""
+        try:
+            busy = self._fill(pool)
+        except (OSError, StoreError) as error:
+            pause_s = self.trouble.met(error)
+            if not self._options.once or self.trouble.lasted_s < self._options.stale_s:
+                return pause_s
+            self._worst = max(self._worst, StoreError.exit_code)
+            return None
+        self.trouble.over()
+        if self._options.once and not busy:
+            self._tell_what_is_left()
+            return None
+        return _LOOK_S if self._settling.waiting or self._running or self._left else _IDLE_LOOK_S
+
+    def _finish_retries(self) -> None:
+        try:
+            finish_retries(self.spool)
+        except (OSError, StoreError) as error:
+            self._tell(f"a retry that was cut short is still in {self.spool.failed}: {error}")
+
+    def _tell_what_is_left(self) -> None:
+        """Say why something stays in the inbox although nothing is left to do."""
+        for path, reason in self._settling.held.items():
+            self._tell(f"{path.name}: left in the inbox: {reason}")
+        for path in strays_in(self.spool.inbox):
+            self._tell(f"{path.name}: left in the inbox: {NO_JOB}")
 
     def _beat(self) -> None:
         while not self._stop.wait(self._options.beat_s):
@@ -126,13 +165,26 @@ class Watcher:
         started = time.monotonic()
         if started < self._look_at:
             return
-        drops = drops_in(self._spool.inbox)
+        if not self.spool.inbox.is_dir():
+            raise StoreError(
+                "the inbox is gone", path=self.spool.inbox, hint="mount its disk, or make it again"
+            )
+        drops = drops_in(self.spool.inbox)
         self._complete = collections.deque(self._settling.complete(drops))
         names = {str(drop.path) for drop in drops}
         self._refused = {name: told for name, told in self._refused.items() if name in names}
-        self._waiting = bool(names - self._refused.keys())
+        self._waiting = bool(names - self._refused.keys() - set(map(str, self._settling.held)))
+        self._tell_unreadable()
         now = time.monotonic()
         self._look_at = now + _LOOK_SHARE * (now - started)
+
+    def _tell_unreadable(self) -> None:
+        """Say once what cannot even be looked at."""
+        found = self._settling.unreadable
+        for path in found.keys() - self._unreadable.keys():
+            self._worst = max(self._worst, StoreError.exit_code)
+            self._tell(f"{path.name}: cannot be looked at: {found[path]}")
+        self._unreadable = found
 
     def _start(self, pool: ThreadPoolExecutor, claim: Claim, refused: BodycapError | None) -> None:
         if refused is None:
@@ -147,7 +199,7 @@ class Watcher:
         if digest == look.digest and time.monotonic() < until:
             return None
         try:
-            return claim_drop(self._spool, drop, look, self._options.terms)
+            return claim_drop(self.spool, drop, look, self._options.terms)
         except StoreError as error:
             self._refused[str(drop.path)] = (look.digest, time.monotonic() + self._options.stale_s)
             self._worst = max(self._worst, error.exit_code)
@@ -160,10 +212,10 @@ class Watcher:
         now = time.monotonic()
         if most <= 0 or now < self._orphans_at:
             return []
-        self._orphans_at = now + _ORPHANS_S
         mine = {claim.job.path for claim in self._running.values()}
-        half_claimed = [JobDir(path) for path in sorted(self._spool.running.glob(f"{CLAIM_PREFIX}*"))]
-        jobs = [*half_claimed, *(JobDir(path) for path in visible(self._spool.running) if path.is_dir())]
+        half_claimed = [JobDir(path) for path in sorted(self.spool.running.glob(f"{CLAIM_PREFIX}*"))]
+        jobs = [*half_claimed, *(JobDir(path) for path in visible(self.spool.running) if path.is_dir())]
+        self._orphans_at = now + _ORPHANS_S
         found: list[Claim] = []
         for job in self._onlooker.abandoned([job for job in jobs if job.path not in mine]):
             if len(found) < most and (claim := self._adopt(job)) is not None:
@@ -179,7 +231,7 @@ class Watcher:
                 return claim
             if discard_empty(job):  # its watcher ended before it had claimed anything
                 return None
-            settle_claim(self._spool, claim)
+            settle_claim(self.spool, claim)
         except (StoreError, OSError) as error:
             self._worst = max(self._worst, StoreError.exit_code)
             self._tell(f"{job.name}: cannot be taken over: {error}")

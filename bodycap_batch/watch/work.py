@@ -5,18 +5,22 @@ from __future__ import annotations
 import socket
 import threading
 import traceback
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from bodycap_batch.errors import BodycapError, Cancelled, JobError, StoreError, error_from_dict
+from bodycap_batch.errors import BodycapError, Cancelled, DiskAway, JobError, StoreError, error_from_dict
 from bodycap_batch.pipeline import Settings, run_job
 from bodycap_batch.references import StoreBusy, move_references
-from bodycap_batch.store import Store
+from bodycap_batch.store import Store, store_error
 from bodycap_batch.watch.claim import Claim, clear_claim
 from bodycap_batch.watch.intake import read_job, rewrite_results
 from bodycap_batch.watch.options import WatchOptions
 from bodycap_batch.watch.spool import JobDir, Spool, move
 from bodycap_batch.watch.status import FINAL, State, StatusFile, append_log, read_status, time_text
+
+_MOST_SETBACKS = 5
+"""A job whose disk fails again and again, although the spool can be written, has failed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,6 +55,7 @@ class Worker:
         self._spool = spool
         self._options = options
         self._stop = stop
+        self._setbacks: Counter[str] = Counter()
         self._store = Store(options.store or spool.root / ".store")
 
     def work(self, claim: Claim, refused: BodycapError | None = None) -> Outcome:
@@ -62,14 +67,11 @@ class Worker:
         """
         try:
             return self._work(claim, refused)
-        except (BodycapError, OSError) as error:  # the spool's own disk; tried again once the claim is stale
-            claim.end()
-            return Outcome(
-                name=claim.job.name, state="stuck", exit_code=StoreError.exit_code, message=str(error)
-            )
+        except (BodycapError, OSError) as error:
+            return self._stuck(claim, error)
 
     def _work(self, claim: Claim, refused: BodycapError | None) -> Outcome:
-        before = read_status(claim.job)
+        before = read_status(claim.job, strict=True)
         if before.get("state") in FINAL:  # all was said before its watcher ended, but for the move
             return self._file(claim, before["state"], _told(before), None)
         status = StatusFile(claim.job, before, claim.guard.holds)
@@ -81,9 +83,14 @@ class Worker:
             return self._interrupted(claim, status, error)
         except StoreBusy as error:  # `bodycap gc` is at work: seconds
             return self._leave(claim, status, error)
+        except DiskAway as error:
+            return self._put_off(claim, status, error)
         except BodycapError as error:
             return self._end(claim, status, "failed", error)
         except Exception as error:  # noqa: BLE001 - the one place where a job's bugs are caught
+            away = store_error(error, claim.job.path) if isinstance(error, OSError) else None
+            if isinstance(away, DiskAway):
+                return self._put_off(claim, status, away)
             append_log(claim.job, traceback.format_exc())
             hint = "this is a bug in bodycap; please report it with this log and the job"
             bug = BodycapError(f"{type(error).__name__}: {error}", path=claim.job.log, hint=hint)
@@ -135,6 +142,24 @@ class Worker:
             error = Cancelled("cancelled; finished stages are kept", hint=f"`bodycap retry {name}` goes on")
             return self._end(claim, status, "cancelled", error)
         return self._leave(claim, status, error)
+
+    def _put_off(self, claim: Claim, status: StatusFile, error: DiskAway) -> Outcome:
+        """Begin again once the disk has had time: the claim beats no more, and is taken over when stale."""
+        name = claim.job.name
+        self._setbacks[name] += 1
+        if self._setbacks[name] > _MOST_SETBACKS:
+            del self._setbacks[name]
+            return self._end(claim, status, "failed", error)
+        claim.end()
+        append_log(claim.job, f"put off: {error}")
+        status.change(state="stopped", active={})
+        return self._stuck(claim, error)
+
+    def _stuck(self, claim: Claim, error: Exception) -> Outcome:
+        """The spool's own disk fails: tried again once the claim is stale."""
+        claim.end()
+        code, name = StoreError.exit_code, claim.job.name
+        return Outcome(name=name, state="stuck", exit_code=code, message=f"goes on later: {error}")
 
     def _leave(self, claim: Claim, status: StatusFile, error: BodycapError) -> Outcome:
         """Leave the job where it is, for the next watcher or a later look of this one."""

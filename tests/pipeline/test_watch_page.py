@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import http.client
 import json
+import math
 import os
 import shutil
 import threading
@@ -17,6 +19,7 @@ import pytest
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.errors import JobError
 from bodycap_batch.watch.web import Access, LivePage
+from bodycap_batch.watch.web.feed import Feed
 from tests.pipeline.fake_stages import ORDERS
 from tests.pipeline.spools import SpoolBench, wait_for
 
@@ -81,6 +84,26 @@ def test_jobs_logs_and_results_are_shown(bench: SpoolBench, client: Client) -> N
     assert (code, json.loads(data)) == (200, {"partial": False})
     assert "sandbox" in headers["content-security-policy"]
     assert "allow-same-origin" not in headers["content-security-policy"]
+
+
+def test_a_disk_that_does_not_answer_is_told_and_the_jobs_stay_in_sight(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.drop("walk")
+    told = [""]
+    feed = Feed(bench.spool, lambda: told[0])
+    assert json.loads(feed.text())["trouble"] == ""
+
+    def fail(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr("bodycap_batch.watch.web.feed.waiting_rows", fail)
+    for trouble, shown in (("", "Input/output error"), ("the inbox is gone", "the inbox is gone")):
+        told[0] = trouble
+        feed._read_at = -math.inf
+        found = json.loads(feed.text())
+        assert shown in found["trouble"]
+        assert [job["name"] for job in found["jobs"]] == ["walk"]
 
 
 def test_nothing_but_results_is_served(bench: SpoolBench, client: Client) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from bodycap_batch.errors import StoreError
 from bodycap_batch.watch.changes import Changes, on_network_disk
 from bodycap_batch.watch.claim import Onlooker, first_claim, take_over
 from bodycap_batch.watch.drops import Drop, Settling, drops_in, look_at
@@ -194,7 +195,29 @@ def test_the_spool_is_found_from_its_inbox_and_from_its_folder(tmp_path: Path) -
     want = Spool(inbox=tmp_path / "jobs" / "inbox", root=tmp_path / "jobs")
     assert spool_at(tmp_path / "jobs") == want
     assert spool_at(tmp_path / "jobs" / "inbox") == want
+
+
+def test_an_unknown_folder_holds_the_inbox_and_what_is_in_it_is_no_job(tmp_path: Path) -> None:
+    (tmp_path / "jobs").mkdir()
+    (tmp_path / "jobs" / "mine.yaml").touch()
+    for name in ("jobs", "not yet there"):
+        want = Spool(inbox=tmp_path / name / "inbox", root=tmp_path / name)
+        assert spool_at(tmp_path / name) == want
+    Spool(inbox=tmp_path / "drop", root=tmp_path).make()
     assert spool_at(tmp_path / "drop") == Spool(inbox=tmp_path / "drop", root=tmp_path)
+    with pytest.raises(StoreError, match="no folder"):
+        spool_at(tmp_path / "jobs" / "mine.yaml")
+    (tmp_path / "broken").symlink_to("nowhere")
+    with pytest.raises(StoreError, match="no folder"):
+        spool_at(tmp_path / "broken")
+
+
+def test_the_folders_that_jobs_are_moved_to_are_not_watched(tmp_path: Path) -> None:
+    spool = spool_at(tmp_path)
+    spool.make()
+    for folder in (spool.running, spool.done, spool.failed):
+        with pytest.raises(StoreError, match="moved to this folder"):
+            spool_at(folder)
 
 
 @pytest.mark.parametrize("poll", [False, True])

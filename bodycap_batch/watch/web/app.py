@@ -24,7 +24,7 @@ from starlette.routing import Route
 
 from bodycap_batch.errors import BodycapError, CaptureError, StoreError
 from bodycap_batch.watch.commands import cancel_job, retry_job
-from bodycap_batch.watch.spool import JobDir, Spool
+from bodycap_batch.watch.spool import JobDir
 from bodycap_batch.watch.web.access import COOKIE, Access
 from bodycap_batch.watch.web.feed import Feed, files_of, log_of
 from bodycap_batch.watch.web.uploads import Uploads
@@ -50,16 +50,16 @@ _ALWAYS = {
 }
 
 
-def make_app(spool: Spool, access: Access, uploads: Uploads, stopped: threading.Event) -> ASGIApp:
+def make_app(feed: Feed, access: Access, uploads: Uploads, stopped: threading.Event) -> ASGIApp:
     """The page as an ASGI application.
 
     Args:
-        spool: The spool it shows.
+        feed: The jobs that it shows.
         access: Who may use it.
         uploads: Takes what browsers send.
         stopped: Set when the watcher ends: streams end, too.
     """
-    page = _Page(spool, uploads, stopped)
+    page = _Page(feed, uploads, stopped)
     routes = [
         Route("/", page.index),
         Route("/{name:str}", page.asset),
@@ -107,11 +107,11 @@ class _Gate:
 class _Page:
     """The routes."""
 
-    def __init__(self, spool: Spool, uploads: Uploads, stopped: threading.Event) -> None:
-        self._spool = spool
+    def __init__(self, feed: Feed, uploads: Uploads, stopped: threading.Event) -> None:
+        self._spool = feed.spool
         self._uploads = uploads
         self._stopped = stopped
-        self._feed = Feed(spool)
+        self._feed = feed
 
     async def index(self, _: Request) -> Response:
         return self._static("index.html")

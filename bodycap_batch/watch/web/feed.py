@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,27 +24,35 @@ class Feed:
 
     Args:
         spool: The spool.
+        trouble: Asked what keeps the watcher from its folders at the moment.
     """
 
-    def __init__(self, spool: Spool) -> None:
-        self._spool = spool
+    def __init__(self, spool: Spool, trouble: Callable[[], str]) -> None:
+        self.spool = spool
+        self._trouble = trouble
+        self._known: dict[str, Any] = {"jobs": [], "more": 0}
         self._lock = threading.Lock()
         self._text, self._read_at = "", -_FRESH_S
         self._ended: dict[Path, tuple[int, dict[str, Any]]] = {}
 
     def text(self) -> str:
-        """All jobs as JSON text, not older than a second."""
+        """All jobs as JSON text, not older than a second; while the disk is away, those known before."""
         with self._lock:
             now = time.monotonic()
             if now - self._read_at >= _FRESH_S:
-                self._text, self._read_at = json.dumps(self._jobs()), now
+                trouble = self._trouble()
+                try:
+                    self._known = self._jobs()
+                except OSError as error:
+                    trouble = trouble or str(error)
+                self._text, self._read_at = json.dumps({**self._known, "trouble": trouble}), now
             return self._text
 
     def _jobs(self) -> dict[str, Any]:
-        waiting = [_public(row, None) for row in waiting_rows(self._spool)]
-        running = [_entry(JobDir(path)) for path in visible(self._spool.running) if path.is_dir()]
+        waiting = [_public(row, None) for row in waiting_rows(self.spool)]
+        running = [_entry(JobDir(path)) for path in visible(self.spool.running) if path.is_dir()]
         before, self._ended = self._ended, {}
-        paths = [path for folder in (self._spool.done, self._spool.failed) for path in visible(folder)]
+        paths = [path for folder in (self.spool.done, self.spool.failed) for path in visible(folder)]
         for path in paths:
             try:
                 changed = path.stat().st_mtime_ns

@@ -5,12 +5,14 @@ from __future__ import annotations
 import importlib.util
 import socket
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.errors import JobError
 from bodycap_batch.watch.spool import Spool
 from bodycap_batch.watch.web.access import Access
+from bodycap_batch.watch.web.feed import Feed
 from bodycap_batch.watch.web.uploads import Uploads, sweep
 
 _END_S = 2
@@ -23,12 +25,15 @@ class LivePage:
         spool: The spool it shows.
         access: Where it listens (port 0: any), and who may use it.
         limits: How much may be sent.
+        trouble: Asked what keeps the watcher from its folders at the moment.
 
     Raises:
         JobError: The extra `web` is not installed, or the address cannot be listened on.
     """
 
-    def __init__(self, spool: Spool, access: Access, limits: Limits) -> None:
+    def __init__(
+        self, spool: Spool, access: Access, limits: Limits, trouble: Callable[[], str] = str
+    ) -> None:
         missing = [name for name in ("starlette", "uvicorn") if importlib.util.find_spec(name) is None]
         if missing:
             hint = "pip install 'bodycap_batch[web]', or `make extras` in a clone"
@@ -38,6 +43,7 @@ class LivePage:
         self._spool = spool
         self._stopped = threading.Event()
         self._uploads = Uploads(spool, limits)
+        self._feed = Feed(spool, trouble)
 
     def __enter__(self) -> LivePage:
         """Start serving."""
@@ -46,7 +52,7 @@ class LivePage:
         from bodycap_batch.watch.web.app import make_app
 
         sweep(self._spool.inbox)
-        app = make_app(self._spool, self.access, self._uploads, self._stopped)
+        app = make_app(self._feed, self.access, self._uploads, self._stopped)
         config = uvicorn.Config(
             app,
             log_level="warning",

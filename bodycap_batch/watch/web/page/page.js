@@ -169,6 +169,7 @@ function show(feed) {
   for (const job of feed.jobs) count[job.state] = (count[job.state] || 0) + 1;
   const parts = Object.entries(count).map(([state, number]) => `${number} ${state}`);
   at("summary").textContent = parts.join(", ") || "No jobs yet.";
+  at("trouble").textContent = feed.trouble && `The watcher is held up: ${feed.trouble}`;
   at("more").textContent = feed.more ? `${feed.more} older jobs are not shown here.` : "";
 }
 

@@ -1,0 +1,224 @@
+"""A watched folder whose disk goes away, fails or refuses: the watcher waits, tells it, and loses nothing."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bodycap_batch.errors import DiskAway, StoreError
+from bodycap_batch.store import Store
+from bodycap_batch.watch import Watcher, claiming, rows_of
+from bodycap_batch.watch.spool import JobDir
+from bodycap_batch.watch.status import read_status
+from bodycap_batch.watch.trouble import Trouble
+from bodycap_batch.watch.work import Worker
+from tests.pipeline.fake_stages import ORDERS
+from tests.pipeline.spools import SpoolBench, wait_for
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SpoolBench]:
+    bench = SpoolBench(tmp_path)
+    monkeypatch.setenv(ORDERS, str(bench.orders))
+    monkeypatch.chdir(tmp_path)
+    yield bench
+    bench.close()
+
+
+@contextmanager
+def running(watcher: Watcher) -> Iterator[Watcher]:
+    thread = threading.Thread(target=watcher.run)
+    thread.start()
+    try:
+        yield watcher
+    finally:
+        watcher.stop()
+        thread.join(60)
+    assert not thread.is_alive()
+
+
+def failing(times: int, function: Callable[..., Any], number: int = errno.EIO) -> Callable[..., Any]:
+    """The function, which the disk fails under so many times."""
+    left = [times]
+
+    def fail(*arguments: Any, **values: Any) -> Any:
+        if left[0] > 0:
+            left[0] -= 1
+            raise OSError(number, os.strerror(number), "inbox")
+        return function(*arguments, **values)
+
+    return fail
+
+
+@pytest.mark.parametrize("name", ["drops_in", "visible"])
+def test_a_folder_that_cannot_be_read_for_a_while_is_waited_for(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """`visible` lists what is running, `drops_in` what is in the inbox."""
+    from bodycap_batch.watch import watcher as module
+
+    bench.drop("walk")
+    watcher = bench.watcher()
+    monkeypatch.setattr(module, name, failing(2, getattr(module, name)))
+    assert watcher.run() == 0, bench.told
+    assert bench.status("walk")["state"] == "done"
+    trouble = [line for line in bench.told if "Input/output error" in line]
+    assert len(trouble) == 1, "told once"
+    assert any("answers again" in line for line in bench.told)
+
+
+def test_an_inbox_that_vanishes_is_waited_for_and_not_made_anew(bench: SpoolBench) -> None:
+    away = bench.folder / "unmounted"
+    with running(bench.watcher(once=False)) as watcher:
+        bench.spool.inbox.rename(away)
+        wait_for(lambda: "the inbox is gone" in watcher.trouble.text)
+        assert not bench.spool.inbox.exists()
+        away.rename(bench.spool.inbox)
+        bench.drop("walk")
+        wait_for((bench.spool.done / "walk").is_dir)
+    assert watcher.trouble.text == ""
+    assert sum("the inbox is gone" in line for line in bench.told) == 1
+
+
+def test_a_watcher_that_is_to_leave_does_not_wait_for_ever(bench: SpoolBench) -> None:
+    watcher = bench.watcher(stale_s=1.0)
+    bench.spool.inbox.rmdir()
+    assert watcher.run() == StoreError.exit_code
+    assert any("the inbox is gone" in line for line in bench.told)
+
+
+def test_pauses_grow_and_each_cause_is_told_once(bench: SpoolBench) -> None:
+    now = [0.0]
+    trouble = Trouble(bench.spool, bench.told.append, lambda: now[0])
+    pauses = [trouble.met(OSError(errno.EIO, "x", "a")) for _ in range(9)]
+    assert pauses == [1, 2, 4, 8, 16, 32, 60, 60, 60]
+    trouble.met(OSError(errno.EACCES, "x", "a"))
+    now[0] = 90.0
+    trouble.over()
+    trouble.over()
+    assert len(bench.told) == 3
+    assert "after 90 s" in bench.told[-1]
+    assert trouble.met(OSError(errno.EIO, "x", "a")) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["in the watcher", "in a stage"])
+def test_a_job_whose_disk_goes_away_goes_on_later(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    from bodycap_batch.watch import work
+
+    bench.drop("walk")
+    error = DiskAway("Stale file handle", path="videos") if how == "in a stage" else None
+    run_job, left = work.run_job, [1]
+
+    def fail(*arguments: Any, **values: Any) -> Any:
+        if left.pop() if left else 0:
+            raise error or OSError(errno.ESTALE, os.strerror(errno.ESTALE), "videos")
+        return run_job(*arguments, **values)
+
+    monkeypatch.setattr(work, "run_job", fail)
+    with running(bench.watcher(once=False, stale_s=1.0)):
+        wait_for((bench.spool.done / "walk").is_dir)
+    (told,) = [line for line in bench.told if line.startswith("walk: stuck")]
+    assert "Stale file handle" in told
+    assert "put off" in bench.job("walk").log.read_text()
+    assert bench.status("walk")["attempts"] == 2
+
+
+def test_a_job_whose_disk_never_answers_has_failed_in_the_end(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise DiskAway("Input/output error", path="videos", hint="is the disk mounted?")
+
+    monkeypatch.setattr("bodycap_batch.watch.work.run_job", fail)
+    worker = Worker(bench.spool, bench.options(), threading.Event())
+    look = claiming.look_at(drop := claiming.Drop(bench.drop("walk")), 100)
+    claim, _ = claiming.claim_drop(bench.spool, drop, look, bench.options().terms) or pytest.fail("no claim")
+    states = []
+    while not states or states[-1] == "stuck":
+        states.append(worker.work(claim).state)
+        if states[-1] == "stuck":
+            claim = claiming.Claim(claim.job, claim.generation, claim._token)
+    assert states == ["stuck"] * 5 + ["failed"]
+    assert bench.status("walk")["error"]["message"] == "Input/output error"
+
+
+def test_footage_is_never_removed_because_the_disk_did_not_answer(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = JobDir(bench.spool.running / ".claim-1")
+    place.path.mkdir()
+    bench.drop("walk").rename(place.input)
+    monkeypatch.setattr(Path, "lstat", failing(1, Path.lstat))
+    with pytest.raises(OSError, match="Input/output"):
+        claiming.give_back(bench.spool, place)
+    assert (place.input / "torso.mp4").is_file()
+    assert claiming.give_back(bench.spool, place) == bench.spool.inbox / ".claim-1"
+
+
+def test_what_stays_in_the_inbox_is_told_when_a_watcher_leaves(bench: SpoolBench) -> None:
+    (bench.spool.inbox / "empty").mkdir()
+    (bench.drop("copied", ready=False) / "head.mp4.part").touch()
+    (bench.spool.inbox / "torso.mp4").touch()
+    bench.drop("walk")
+    assert bench.work_off(settle_s=0.5) == 0
+    assert bench.status("walk")["state"] == "done"
+    left = dict(line.split(": left in the inbox: ") for line in bench.told if "left in the inbox" in line)
+    assert left == {
+        "empty": "the folder is empty",
+        "copied": "head.mp4.part is being copied",
+        "torso.mp4": "no job: neither a folder nor a YAML file",
+    }
+    assert (bench.spool.inbox / "copied" / "head.mp4.part").exists()
+
+
+def test_a_folder_that_cannot_be_looked_at_is_told_and_holds_nobody_up(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.drop("locked")
+    bench.drop("walk")
+    scandir = os.scandir
+
+    def refuse(path: Any) -> Any:
+        if str(path).endswith("locked"):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    assert bench.work_off() == StoreError.exit_code
+    assert bench.status("walk")["state"] == "done"
+    assert "locked: cannot be looked at: Permission denied" in bench.told
+    assert "locked: left in the inbox: Permission denied" in bench.told
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{",
+        '{"attempts": "many", "notes": 3, "error": "x", "active": 1, "dropped": 5, "progress": "a"}',
+    ],
+)
+def test_a_status_that_somebody_garbled_harms_nothing(bench: SpoolBench, text: str) -> None:
+    bench.drop("walk")
+    bench.work_off()
+    job = bench.job("walk")
+    job.status.write_text(text)
+    assert [row.name for row in rows_of(bench.spool)] == ["walk"]
+    left = JobDir(job.path.rename(bench.spool.running / "walk"))
+    claiming.first_claim(left).release()
+    assert bench.work_off() == 0, bench.told
+    assert json.loads(bench.job("walk").status.read_text())["attempts"] in (1, 2)
+    assert read_status(bench.job("walk"))["state"] == "done"
+    assert Store(bench.spool.root / ".store").root.is_dir()
