@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,56 +30,80 @@ class References:
     Args:
         store: Where the artefacts are.
         owner: The folder of results. When it is gone, so is its claim.
+        also: Where else it may lie, as it is being moved: its claim lasts while something is at one of them.
     """
 
-    def __init__(self, store: Store, owner: Path) -> None:
+    def __init__(self, store: Store, owner: Path, also: Iterable[Path] = ()) -> None:
         self._root = store.root
-        self._owner = owner.resolve()
+        self._places = [str(place) for place in dict.fromkeys((owner.resolve(), *also))]
         self._lock = threading.Lock()
-        self._named = set(_read(self._path)[1])
+        self.named = set(_read(self._path)[1])
 
     @property
     def _path(self) -> Path:
-        return self._root / _FOLDER / f"{json_digest(str(self._owner))[:32]}.json"
+        return self._root / _FOLDER / f"{json_digest(self._places[0])[:32]}.json"
 
     def add(self, artefact: Path) -> None:
         """Keep one artefact more. Raises `StoreError`."""
         name = artefact.relative_to(self._root).as_posix()
         with self._lock:
-            if name not in self._named:
-                self._named.add(name)
+            if name not in self.named:
+                self.named.add(name)
                 self._write()
 
     def keep_only(self, artefacts: Iterable[str]) -> None:
         """Keep these (folders relative to the store) and no other. Raises `StoreError`."""
         with self._lock:
-            before, self._named = self._named, set(artefacts)
-            if before != self._named:
+            before, self.named = self.named, set(artefacts)
+            if before != self.named:
                 self._write()
 
+    def take_over(self, artefacts: Iterable[str]) -> None:
+        """Keep these, too, and say anew where the folder may lie. Raises `StoreError`."""
+        with self._lock:
+            self.named |= set(artefacts)
+            self._write()
+
+    def forget(self) -> None:
+        """Keep nothing. Raises `StoreError`."""
+        with disk_errors(self._root):
+            self._path.unlink(missing_ok=True)
+
     def _write(self) -> None:
-        content = {"owner": str(self._owner), "artefacts": sorted(self._named)}
+        content = {"owner": self._places[0], "also": self._places[1:], "artefacts": sorted(self.named)}
         with disk_errors(self._root):
             self._path.parent.mkdir(exist_ok=True)
             write_atomically(self._path, json.dumps(content, indent=1).encode())
 
 
-def move_references(store: Store, before: Path, after: Path) -> None:
-    """A folder of results was moved: what it was made from is kept for its new place.
+@contextlib.contextmanager
+def moving(store: Store, before: Path) -> Iterator[Callable[..., None]]:
+    """Keep what a folder of results was made from while its job is moved, also if this process is killed.
 
     Args:
         store: Where the artefacts are.
-        before: Where the folder was when its job ran.
-        after: Where it is now.
+        before: Where the folder is.
+
+    Yields:
+        To be called as ``to(after, *others)`` just before the move: where the folder (or what it will be made
+        from again) will lie, and where else it may lie after that.
 
     Raises:
         StoreError: The disk fails.
     """
-    # The old folder may be gone, but its parents are where they were: the path resolves as it did then.
-    old = References(store, before)
-    References(store, after).keep_only(old._named)
-    with disk_errors(store.root):
-        old._path.unlink(missing_ok=True)
+    with in_use(store, wait=True):
+        old = References(store, before)
+        bound: list[tuple[Path, ...]] = []
+
+        def to(after: Path, *others: Path) -> None:
+            if old.named:
+                References(store, after, (*others, before)).take_over(old.named)
+                bound.append((after, *others))
+
+        yield to
+        for after, *others in bound[-1:]:
+            References(store, after, others).take_over(())
+            old.forget()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,11 +126,10 @@ class Garbage:
 
 
 @contextlib.contextmanager
-def in_use(store: Store) -> Iterator[None]:
-    """Keep `collect_garbage` from this store meanwhile. Raises `StoreError` while it is at work."""
-    with _locked(
-        store, fcntl.LOCK_SH, "the store is being cleaned", "start again when `bodycap gc` has ended"
-    ):
+def in_use(store: Store, *, wait: bool = False) -> Iterator[None]:
+    """Keep `collect_garbage` from this store meanwhile; while it is at work, wait or raise `StoreBusy`."""
+    kind = fcntl.LOCK_SH if wait else fcntl.LOCK_SH | fcntl.LOCK_NB
+    with _locked(store, kind, "the store is being cleaned", "start again when `bodycap gc` has ended"):
         yield
 
 
@@ -117,9 +140,9 @@ def collect_garbage(store: Store, *, delete: bool) -> Garbage:
         StoreError: A job is using the store, or the disk fails.
     """
     busy = "a job is running on this store", "wait until it has ended"
-    with _locked(store, fcntl.LOCK_EX, *busy), disk_errors(store.root):
+    with _locked(store, fcntl.LOCK_EX | fcntl.LOCK_NB, *busy), disk_errors(store.root):
         lists = {path: _read(path) for path in sorted((store.root / _FOLDER).glob("*.json"))}
-        gone = {path: owner for path, (owner, _) in lists.items() if not Path(owner).is_dir()}
+        gone = {path: places[0] for path, (places, _) in lists.items() if not any(map(_is_there, places))}
         wanted = {name for path, (_, names) in lists.items() if path not in gone for name in names}
         found = [path for path in sorted((store.root / "artefacts").glob("*/*")) if path.is_dir()]
         unused = [path for path in found if path.relative_to(store.root).as_posix() not in wanted]
@@ -145,7 +168,7 @@ def _locked(store: Store, kind: int, refusal: str, hint: str) -> Iterator[None]:
         handle = os.open(store.root / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         try:
-            fcntl.flock(handle, kind | fcntl.LOCK_NB)
+            fcntl.flock(handle, kind)
         except BlockingIOError:
             raise StoreBusy(refusal, path=store.root, hint=hint) from None
         yield
@@ -153,13 +176,19 @@ def _locked(store: Store, kind: int, refusal: str, hint: str) -> Iterator[None]:
         os.close(handle)
 
 
-def _read(path: Path) -> tuple[str, list[str]]:
-    """Owner and artefacts of a list; a list that cannot be read claims nothing."""
+def _read(path: Path) -> tuple[list[str], list[str]]:
+    """Places and artefacts of a list; a list that cannot be read claims nothing."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        return str(content["owner"]), [str(name) for name in content["artefacts"]]
-    except (FileNotFoundError, ValueError, KeyError, TypeError):
-        return "", []
+        places = [content["owner"], *content.get("also", ())]
+        return [str(place) for place in places], [str(name) for name in content["artefacts"]]
+    except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
+        return [""], []
+
+
+def _is_there(place: str) -> bool:
+    """Whether something lies there; a disk that does not answer raises `OSError`: nothing is removed then."""
+    return bool(place) and Path(place).exists()
 
 
 def _freed_bytes(folder: Path) -> int:

@@ -70,11 +70,13 @@ def cancel(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
     Example:
       bodycap cancel kitchen_walk
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.watch import cancel_job
+    from bodycap_batch.watch import cancel_job, read_status
 
     place = cancel_job(_spool(spool), name)
     if place is None:
         _print(f"{name}: no watcher has stopped it yet; it is cancelled when one looks")
+    elif (state := read_status(place).get("state")) != "cancelled":
+        _print(f"{name}: it ended before it could be stopped: {state}, {place.path}")
     else:
         _print(f"cancelled: {place.path}")
 

@@ -4,6 +4,7 @@ from bodycap_batch.watch.commands import JobRow, cancel_job, retry_job, rows_of
 from bodycap_batch.watch.intake import Terms
 from bodycap_batch.watch.options import WatchOptions
 from bodycap_batch.watch.spool import Spool, spool_at
+from bodycap_batch.watch.status import read_status
 from bodycap_batch.watch.watcher import Watcher
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "WatchOptions",
     "Watcher",
     "cancel_job",
+    "read_status",
     "retry_job",
     "rows_of",
     "spool_at",

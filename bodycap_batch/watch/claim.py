@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import socket
@@ -39,6 +40,27 @@ def start_of(pid: int) -> str:
         return ""
     words = fields.split()
     return "" if words[0] in ("Z", "X") else words[19]
+
+
+def process_mark() -> str:
+    """This process, unlike any other of any machine, as part of a file's name."""
+    return f"{_machine_mark()}-{os.getpid()}-{start_of(os.getpid())}"
+
+
+def is_at_work(marked: str) -> bool:
+    """Whether the process whose `process_mark` a name begins with is a running one of this machine."""
+    machine, pid, start, *_ = [*marked.split("-"), "", ""]
+    here = bool(host_key()) and machine == _machine_mark()
+    return here and pid.isdecimal() and bool(start) and start_of(int(pid)) == start
+
+
+def is_of_this_machine(marked: str) -> bool:
+    """Whether a process of this machine, as long as it has been up, wrote that `process_mark`."""
+    return bool(host_key()) and marked.split("-", maxsplit=1)[0] == _machine_mark()
+
+
+def _machine_mark() -> str:
+    return hashlib.sha256(host_key().encode()).hexdigest()[:12]
 
 
 class Claim:

@@ -6,12 +6,13 @@ import contextlib
 import os
 import shutil
 import uuid
+from collections.abc import Callable
 from pathlib import Path
 
 from bodycap_batch.config.models import Job
 from bodycap_batch.errors import BodycapError, StoreError
 from bodycap_batch.store import store_error
-from bodycap_batch.watch.claim import Claim, first_claim
+from bodycap_batch.watch.claim import Claim, first_claim, is_at_work
 from bodycap_batch.watch.drops import Drop, Look, look_at
 from bodycap_batch.watch.intake import Terms, other_job_files, read_drop, write_job
 from bodycap_batch.watch.spool import CLAIM_PREFIX, RETRY_PREFIX, JobDir, Spool, move, spool_name
@@ -94,12 +95,22 @@ def dropped_in(place: JobDir) -> Path:
     return place.input / str(document.get("dropped")) if document.get("kind") == "file" else place.input
 
 
-def give_back(spool: Spool, place: JobDir) -> Path | None:
-    """Put what was dropped back into the inbox and remove the rest; returns where it lies now."""
+def give_back(spool: Spool, place: JobDir, before: Callable[[Path], None] | None = None) -> Path | None:
+    """Put what was dropped back into the inbox and remove the rest.
+
+    Args:
+        spool: The spool.
+        place: The job's folder.
+        before: Called with the target just before the move.
+
+    Returns:
+        Where it lies now; None where nothing had been dropped, or another process has put it back.
+    """
     dropped, target = dropped_in(place), None
     if is_there(dropped):
         name = str(read_status(place, strict=True).get("dropped") or place.name)
-        target = move(dropped, spool.inbox, name, suffix=dropped.suffix if dropped != place.input else "")
+        suffix = dropped.suffix if dropped != place.input else ""
+        target = move(dropped, spool.inbox, name, before, suffix=suffix)
     shutil.rmtree(place.path, ignore_errors=True)
     return target
 
@@ -107,8 +118,9 @@ def give_back(spool: Spool, place: JobDir) -> Path | None:
 def finish_retries(spool: Spool) -> None:
     """Finish moves back into the inbox that a killed `retry` began."""
     for path in sorted(spool.failed.glob(f"{RETRY_PREFIX}*")):
-        with contextlib.suppress(FileNotFoundError):  # it is just being done
-            give_back(spool, JobDir(path))
+        if not is_at_work(path.name.removeprefix(RETRY_PREFIX)):
+            with contextlib.suppress(FileNotFoundError):  # another watcher is just doing it
+                give_back(spool, JobDir(path))
 
 
 def _prepare(place: JobDir, drop: Drop, look: Look, terms: Terms) -> BodycapError | None:

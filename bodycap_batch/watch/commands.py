@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import os
+import shutil
 import time
 import unicodedata
 import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from bodycap_batch.errors import Cancelled, JobError
-from bodycap_batch.store import disk_errors
-from bodycap_batch.watch.claim import first_claim, host_key, start_of
-from bodycap_batch.watch.claiming import dropped_in, give_back, settle_claim
+from bodycap_batch.references import moving
+from bodycap_batch.store import Store, disk_errors
+from bodycap_batch.watch.claim import clear_claim, first_claim, host_key, process_mark, start_of
+from bodycap_batch.watch.claiming import dropped_in, give_back, is_there, settle_claim
 from bodycap_batch.watch.drops import NO_JOB, Drop, drops_in, look_at, strays_in
 from bodycap_batch.watch.guard import read_owner
-from bodycap_batch.watch.spool import CLAIM_PREFIX, RETRY_PREFIX, JobDir, Spool, move, visible
+from bodycap_batch.watch.spool import CLAIM_PREFIX, RETRY_PREFIX, JobDir, Spool, move, spool_name, visible
 from bodycap_batch.watch.status import FINAL, StatusFile, read_status, time_text
 
 _MANY_FILES = 1000
@@ -86,47 +90,93 @@ def retry_job(spool: Spool, name: str) -> Path:
         Where its input lies now.
 
     Raises:
-        JobError: There is no such job, or it has not failed.
+        JobError: There is no such job, or it has not failed, or it is being retried already.
     """
     job = spool.find(name)
     if job is None or job.path.parent != spool.failed:
         raise _no_such(spool, name, "has not failed", [path.name for path in visible(spool.failed)])
-    if not os.path.lexists(dropped_in(job)):
-        raise JobError("its input is gone", path=job.path, hint="drop the videos again")
     with disk_errors(job.path):
-        hidden = JobDir(spool.failed / f"{RETRY_PREFIX}{uuid.uuid4().hex}")
-        os.rename(job.path, hidden.path)
-        target = give_back(spool, hidden)
-    assert target is not None
-    return target
+        if not is_there(dropped_in(job)):
+            raise JobError("its input is gone", path=job.path, hint="drop the videos again")
+        dropped = str(read_status(job).get("dropped") or job.name)
+        hidden = JobDir(spool.failed / f"{RETRY_PREFIX}{process_mark()}-{uuid.uuid4().hex}")
+        with _stages_kept(job, hidden, spool) as keep_for:
+            keep_for(spool.inbox / dropped)
+            try:
+                os.rename(job.path, hidden.path)
+            except FileNotFoundError:
+                hint = "`bodycap status` lists all jobs"
+                raise JobError(f"job {name!r} is just being retried", path=job.path, hint=hint) from None
+            target = give_back(spool, hidden, keep_for)
+    return target or spool.inbox / dropped
+
+
+@contextmanager
+def _stages_kept(job: JobDir, hidden: JobDir, spool: Spool) -> Iterator[Callable[[Path], None]]:
+    """Keep a job's artefacts in the store on its way through the inbox, until it is at work again."""
+    store = read_status(job).get("store")
+    if not store or not (Path(store) / "artefacts").is_dir():
+        yield lambda _: None  # it never got as far as a stage
+        return
+    with moving(Store(Path(store)), job.result) as keep_for:
+
+        def bound_for(target: Path) -> None:
+            names = {job.name, spool_name(target.name), spool_name(target.stem)}
+            later = [folder / name for folder in (spool.running, spool.failed) for name in sorted(names)]
+            keep_for(target, hidden.path, *later)
+
+        yield bound_for
 
 
 def cancel_job(spool: Spool, name: str, wait_s: float = 5.0) -> JobDir | None:
     """Cancel a job that waits or runs; what its finished stages gave stays in the store.
 
     Returns:
-        Where it lies now, None while no watcher has noticed: it is filed away when one does.
+        Where it lies now (it may have come to its end before it could be stopped: `read_status` tells), None
+        while no watcher has noticed: it is filed away when one does.
 
     Raises:
         JobError: There is no such job, or it has ended.
     """
+    end = time.monotonic() + wait_s
+    with disk_errors(spool.root):
+        while (asked := _ask_to_cancel(spool, name)) is None:
+            # A watcher is just claiming it: neither in the inbox nor under its name among the running ones.
+            if time.monotonic() > end:
+                return None
+            time.sleep(_LOOK_S)
+    if asked.path.parent != spool.running:
+        return asked
+    while asked.path.exists() and time.monotonic() < end:
+        time.sleep(_LOOK_S)
+    return None if asked.path.exists() else spool.find(name)
+
+
+def _ask_to_cancel(spool: Spool, name: str) -> JobDir | None:
+    """Cancel a job that waits, mark one that runs; None where it is on its way from the one to the other."""
     waiting = [drop for drop in drops_in(spool.inbox) if _same(drop.name, name)]
     job = spool.find(name)
-    with disk_errors(spool.root):
-        if waiting and (job is None or job.path.parent != spool.running):
+    try:
+        if job is not None and job.path.parent == spool.running:
+            job.cancel.touch()
+            return job
+        if waiting:
             return _cancel_waiting(spool, waiting[0])
-        if job is None or job.path.parent != spool.running:
-            names = [drop.name for drop in drops_in(spool.inbox)]
-            raise _no_such(spool, name, "is not waiting or running", names)
-        job.cancel.touch()
-    end = time.monotonic() + wait_s
-    while job.path.exists() and time.monotonic() < end:
-        time.sleep(_LOOK_S)
-    return None if job.path.exists() else spool.find(name)
+    except FileNotFoundError:  # it has just been claimed, or filed away
+        return None
+    if any(name in _names_of(JobDir(path)) for path in spool.running.glob(f"{CLAIM_PREFIX}*")):
+        return None
+    raise _no_such(spool, name, "is not waiting or running", [drop.name for drop in drops_in(spool.inbox)])
+
+
+def _names_of(place: JobDir) -> tuple[str, ...]:
+    """What a job that is just being claimed was called in the inbox."""
+    dropped = str(read_status(place).get("dropped", ""))
+    return dropped, Path(dropped).stem
 
 
 def _cancel_waiting(spool: Spool, drop: Drop) -> JobDir:
-    """Move a drop that nobody has claimed to the failed jobs."""
+    """Move a drop that nobody has claimed to the failed jobs; `FileNotFoundError` where somebody just has."""
     place = JobDir(spool.running / f"{CLAIM_PREFIX}{uuid.uuid4().hex}")
     place.path.mkdir()
     claim = first_claim(place)
@@ -134,7 +184,11 @@ def _cancel_waiting(spool: Spool, drop: Drop) -> JobDir:
     status.change(kind="file" if drop.is_file else "folder", dropped=drop.path.name)
     if drop.is_file:
         place.input.mkdir()
-    os.rename(drop.path, dropped_in(place))
+    try:
+        os.rename(drop.path, dropped_in(place))
+    except FileNotFoundError:
+        shutil.rmtree(place.path)
+        raise
     settle_claim(spool, claim)
     status.moved_to(claim.job)
     error = Cancelled("cancelled before it was started", hint=f"`bodycap retry {claim.job.name}` starts it")
@@ -144,6 +198,7 @@ def _cancel_waiting(spool: Spool, drop: Drop) -> JobDir:
         claim.job.name,
         lambda path: status.finish("cancelled", error, path, spool.inbox),
     )
+    clear_claim(JobDir(target))
     return JobDir(target)
 
 

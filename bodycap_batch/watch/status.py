@@ -23,6 +23,7 @@ _PERIOD_S = 0.5
 _MOST_NOTES = 100
 _EXPECTED: Mapping[str, tuple[type, ...]] = {
     **dict.fromkeys(("kind", "dropped", "state", "stage", "camera"), (str,)),
+    "store": (str, NoneType),
     **dict.fromkeys(("notes", "finished_stages"), (list,)),
     "active": (dict,),
     "attempts": (int,),
@@ -72,6 +73,7 @@ class StatusFile:
             "attempts": int(before.get("attempts", 0)),
             "host": None,
             "generation": None,
+            "store": before.get("store"),
             "exit_code": None,
             "error": None,
         }

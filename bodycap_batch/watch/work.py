@@ -11,7 +11,7 @@ from pathlib import Path
 
 from bodycap_batch.errors import BodycapError, Cancelled, DiskAway, JobError, StoreError, error_from_dict
 from bodycap_batch.pipeline import Settings, run_job
-from bodycap_batch.references import StoreBusy, move_references
+from bodycap_batch.references import StoreBusy, moving
 from bodycap_batch.store import Store, store_error
 from bodycap_batch.watch.claim import Claim, clear_claim
 from bodycap_batch.watch.intake import read_job, rewrite_results
@@ -106,6 +106,7 @@ class Worker:
             attempts=status.document["attempts"] + 1,
             host=socket.gethostname(),
             generation=claim.generation,
+            store=str(self._store.root),
         )
         if not place.job.is_file():  # its watcher ended before the job was written down
             raise JobError("the job was never read", path=place.input, hint="retry it: it is read anew")
@@ -179,19 +180,19 @@ class Worker:
         self, claim: Claim, state: State, error: BodycapError | None, status: StatusFile | None
     ) -> Outcome:
         """Say the last word and move the job where it belongs."""
-        claim.end()
-        if not claim.guard.holds():
-            return Outcome(name=claim.job.name, state="lost", message="another watcher has taken it over")
         folder = self._spool.done if state == "done" else self._spool.failed
+        with moving(self._store, claim.job.result) as keep_for:
+            claim.end()
+            if not claim.guard.holds():
+                return Outcome(name=claim.job.name, state="lost", message="another watcher has taken it over")
 
-        def last_word(target: Path) -> None:
-            if status is not None:
-                status.finish(state, error, target, self._spool.inbox)
+            def last_word(target: Path) -> None:
+                keep_for(JobDir(target).result)
+                if status is not None:
+                    status.finish(state, error, target, self._spool.inbox)
 
-        before = claim.job.result
-        folder.mkdir(exist_ok=True)  # cleared away by somebody who has taken the results
-        target = move(claim.job.path, folder, claim.job.name, last_word)
-        move_references(self._store, before, JobDir(target).result)
+            folder.mkdir(exist_ok=True)  # cleared away by somebody who has taken the results
+            target = move(claim.job.path, folder, claim.job.name, last_word)
         clear_claim(JobDir(target))
         return Outcome(
             name=target.name,

@@ -15,8 +15,8 @@ import pytest
 
 from bodycap_batch.errors import Cancelled, StoreError
 from bodycap_batch.pipeline import Settings, explain_job, run_job
-from bodycap_batch.references import collect_garbage, in_use
-from bodycap_batch.store import Store
+from bodycap_batch.references import References, collect_garbage, in_use, moving
+from bodycap_batch.store import ArtefactKey, Store
 from bodycap_batch.tasks import StageName, stages_from
 from tests.pipeline.test_run import ALL, CHILD, PER_CAMERA, REGISTERED, Bench, bench, done, done_once
 
@@ -263,3 +263,37 @@ def test_no_store_no_garbage(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert main(["gc", str(tmp_path)]) == 5
     assert "there is no store" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_folder_is_made_from_is_kept_while_it_is_moved(tmp_path: Path) -> None:
+    """At each moment, and also if the process that moves it is killed there."""
+    store = Store(tmp_path / "store")
+    key = ArtefactKey(stage="map", algorithm="1", options={}, inputs={}, libraries={})
+    with store.draft(key) as draft:
+        (draft.files / "a.txt").write_text("long work")
+        made = store.commit(draft, key, {})
+    here, there, taken = tmp_path / "running", tmp_path / "done", tmp_path / "taken"
+    here.mkdir()
+    References(store, here).add(made.path)
+
+    def unused() -> tuple[str, ...]:
+        return collect_garbage(Store(tmp_path / "store"), delete=False).artefacts
+
+    moves = moving(store, here)
+    keep_for = moves.__enter__()
+    with pytest.raises(StoreError, match="a job is running"):
+        unused()
+    keep_for(taken)  # a name that somebody else takes first
+    keep_for(there)
+    moves.gen.close()  # type: ignore[attr-defined] - killed before the move
+    assert unused() == ()
+    here.rename(there)  # or killed just after it
+    assert unused() == ()
+    with moving(store, there) as keep_for:
+        keep_for(here)
+        there.rename(here)
+    assert unused() == ()
+    here.rmdir()
+    assert len(unused()) == 1
+    assert len(collect_garbage(store, delete=True).gone) == 2
+    assert list((store.root / "references").iterdir()) == []

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import os
 import re
 import shutil
 import threading
@@ -18,7 +16,7 @@ from bodycap_batch.config.folder import VIDEO_SUFFIXES
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.errors import CaptureError, JobError, StoreError
 from bodycap_batch.store import disk_errors
-from bodycap_batch.watch.claim import host_key, start_of
+from bodycap_batch.watch.claim import is_at_work, is_of_this_machine, process_mark
 from bodycap_batch.watch.drops import JOB_FILES, READY
 from bodycap_batch.watch.spool import Spool, move, spool_name
 
@@ -73,7 +71,7 @@ class Uploads:
                     f"{_MOST_OPEN} folders are being sent already", hint="wait until one of them is there"
                 )
             key = uuid.uuid4().hex
-            folder = self._spool.inbox / f"{_PREFIX}{_sender()}-{key}"
+            folder = self._spool.inbox / f"{_PREFIX}{process_mark()}-{key}"
             with disk_errors(folder):
                 folder.mkdir()
             self._open[key] = _Upload(name=spool_name(name), folder=folder, touched=time.monotonic())
@@ -176,16 +174,10 @@ def sweep(inbox: Path) -> None:
                 shutil.rmtree(folder)
 
 
-def _sender() -> str:
-    """This process, unlike any other of any machine."""
-    machine = hashlib.sha256(host_key().encode()).hexdigest()[:12]
-    return f"{machine}-{os.getpid()}-{start_of(os.getpid())}"
-
-
 def _is_abandoned(folder: Path) -> bool:
-    machine, pid, start, *_ = [*folder.name.removeprefix(_PREFIX).split("-"), "", ""]
-    if machine == _sender().split("-", maxsplit=1)[0] and host_key() and pid.isdecimal():
-        return start_of(int(pid)) != start
+    marked = folder.name.removeprefix(_PREFIX)
+    if is_of_this_machine(marked):
+        return not is_at_work(marked)
     return time.time() - folder.stat().st_mtime > _STALE_S
 
 

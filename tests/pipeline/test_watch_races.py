@@ -1,0 +1,177 @@
+"""What people ask of a spool while a watcher, a cleaner or another person is at the same job."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bodycap_batch.cli import main
+from bodycap_batch.errors import JobError
+from bodycap_batch.references import collect_garbage
+from bodycap_batch.store import Store
+from bodycap_batch.watch import cancel_job, claiming, commands, retry_job
+from bodycap_batch.watch.claim import process_mark
+from bodycap_batch.watch.drops import Drop, look_at
+from bodycap_batch.watch.spool import RETRY_PREFIX, JobDir
+from tests.pipeline.fake_stages import ORDERS
+from tests.pipeline.spools import SpoolBench
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SpoolBench]:
+    bench = SpoolBench(tmp_path)
+    monkeypatch.setenv(ORDERS, str(bench.orders))
+    monkeypatch.chdir(tmp_path)
+    yield bench
+    bench.close()
+
+
+def kept(bench: SpoolBench) -> bool:
+    """Whether `gc --delete` would leave every finished stage alone just now."""
+    return collect_garbage(Store(bench.spool.root / ".store"), delete=True).artefacts == ()
+
+
+def between(function: Callable[..., Any], action: Callable[[], None]) -> Callable[..., Any]:
+    """The function, and something that happens just before it."""
+
+    def both(*arguments: Any, **values: Any) -> Any:
+        action()
+        return function(*arguments, **values)
+
+    return both
+
+
+def test_a_retried_jobs_finished_stages_are_kept_until_it_has_run_again(bench: SpoolBench) -> None:
+    bench.order(fail="merge")
+    bench.drop("walk")
+    bench.work_off()
+    for _ in range(2):
+        retry_job(bench.spool, "walk")
+        assert kept(bench)
+        place = cancel_job(bench.spool, "walk")  # and it stays so on every way back
+        assert place is not None
+        assert kept(bench)
+    retry_job(bench.spool, "walk")
+    bench.order()
+    drop = Drop(bench.spool.inbox / "walk")
+    claim, _ = claiming.claim_drop(
+        bench.spool, drop, look_at(drop, 100), bench.options().terms
+    ) or pytest.fail("not claimed")
+    assert kept(bench), "claimed, but not yet at work"
+    claim.release()
+    assert bench.work_off() == 0
+    fresh = {
+        stage["stage"].split()[0] for stage in bench.status("walk")["finished_stages"] if not stage["reused"]
+    }
+    assert fresh.isdisjoint({"check", "keyframes", "map", "registration"})
+
+
+def test_the_store_is_not_cleaned_in_the_middle_of_a_retry(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.order(fail="merge")
+    bench.drop("walk")
+    bench.work_off()
+    told = []
+    store = str(bench.spool.root / ".store")
+    for name in ("os.rename", "give_back"):
+        *_, last = name.split(".")
+        module = commands.os if name.startswith("os") else commands  # type: ignore[attr-defined]
+        action = between(getattr(module, last), lambda: told.append(main(["gc", store, "--delete"])))
+        monkeypatch.setattr(module, last, action)
+    retry_job(bench.spool, "walk")
+    monkeypatch.undo()
+    assert set(told) == {5}, "it is told to wait"
+    assert kept(bench)
+
+
+def test_of_two_who_retry_a_job_one_is_told(bench: SpoolBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
+    assert bench.work_off() == 2
+    rename = commands.os.rename  # type: ignore[attr-defined]
+    first: list[Path] = []
+
+    def other() -> None:
+        monkeypatch.setattr(commands.os, "rename", rename)  # type: ignore[attr-defined]
+        first.append(retry_job(bench.spool, "walk"))
+
+    monkeypatch.setattr(commands.os, "rename", between(rename, other))  # type: ignore[attr-defined]
+    with pytest.raises(JobError, match="just being retried"):
+        retry_job(bench.spool, "walk")
+    assert first == [bench.spool.inbox / "walk.yaml"]
+    assert first[0].read_text() == "capture: {}"
+
+
+def test_a_watcher_that_starts_leaves_a_retry_under_way_alone_and_ends_a_killed_one(
+    bench: SpoolBench,
+) -> None:
+    (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
+    assert bench.work_off() == 2
+    job = bench.job("walk")
+    alive = JobDir(job.path.rename(bench.spool.failed / f"{RETRY_PREFIX}{process_mark()}-1"))
+    claiming.finish_retries(bench.spool)
+    assert alive.input.is_dir()
+    machine, pid, start = process_mark().split("-")
+    alive.path.rename(bench.spool.failed / f"{RETRY_PREFIX}{machine}-{pid}-{int(start) - 1}-1")
+    claiming.finish_retries(bench.spool)
+    assert [path.name for path in bench.spool.inbox.iterdir()] == ["walk.yaml"]
+    assert list(bench.spool.failed.iterdir()) == []
+
+
+@pytest.mark.parametrize("moment", ["before it is taken", "while it has no name"])
+def test_a_job_that_is_claimed_while_it_is_cancelled_is_cancelled(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, moment: str
+) -> None:
+    drop = Drop(bench.drop("walk"))
+    look, terms = look_at(drop, 100), bench.options().terms
+    asked = threading.Event()
+    cancelled: list[JobDir | None] = []
+
+    def cancel() -> None:
+        cancelled.append(cancel_job(bench.spool, "walk", wait_s=1.0))
+
+    if moment == "before it is taken":  # it waits when it is looked for, and is gone when it is moved
+
+        def claim() -> None:
+            monkeypatch.undo()
+            monkeypatch.chdir(bench.folder)
+            assert claiming.claim_drop(bench.spool, drop, look, terms) is not None
+
+        rename = commands.os.rename  # type: ignore[attr-defined]
+        monkeypatch.setattr(commands.os, "rename", between(rename, claim))  # type: ignore[attr-defined]
+        cancel()
+    else:
+        thread = threading.Thread(target=cancel)
+
+        def ask() -> None:
+            thread.start()
+            asked.wait(0.5)  # some looks find neither a drop nor a job
+
+        monkeypatch.setattr(claiming, "settle_claim", between(claiming.settle_claim, ask))
+        assert claiming.claim_drop(bench.spool, drop, look, terms) is not None
+        thread.join()
+    assert cancelled == [None], "no watcher has noticed yet"
+    assert bench.job("walk").cancel.exists()
+    assert [path.name for path in bench.spool.running.iterdir()] == ["walk"]
+
+
+def test_a_job_that_ends_while_it_is_cancelled_is_not_called_cancelled(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    bench.drop("walk")
+    bench.work_off()
+    job = bench.job("walk")
+    left = job.path.rename(bench.spool.running / "walk")
+    touch = Path.touch
+
+    def end(path: Path, **values: Any) -> None:
+        touch(path, **values)
+        left.rename(job.path)
+
+    monkeypatch.setattr(Path, "touch", end)
+    assert main(["cancel", "walk"]) == 0
+    assert "it ended before it could be stopped: done" in capfd.readouterr().out
