@@ -10,8 +10,8 @@ VENV := .venv
 BLENDER := .venv-blender
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
-# More than one test at a time; each of them in one thread.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 8
+# More than one test at a time, each in one thread; those of a file share what they need, so they stay together.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 8 --dist loadfile
 COMPILE := $(BIN)/uv pip compile --quiet --generate-hashes --no-emit-index-url --custom-compile-command "make lock"
 LOCK := $(COMPILE) --universal --python-version 3.11 --fork-strategy fewest pyproject.toml --group build
 
@@ -38,7 +38,7 @@ test: $(VENV)/.dev ## run the fast tests
 .PHONY: test-slow
 test-slow: $(VENV)/.dev ## run the slow tests and those on real captures
 	.ci/system-packages --browser
-	$(PYTEST) --dist loadfile -m "slow or data" --durations=20 $(ARGS)
+	$(PYTEST) -m "slow or data" --durations=20 $(ARGS)
 
 .PHONY: test-cluster
 test-cluster: $(VENV)/.dev ## run jobs on a Dask scheduler and workers of this machine, killing some

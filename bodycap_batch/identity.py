@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from functools import cache
 from importlib import metadata
 from pathlib import Path
+from typing import NamedTuple
 
 _PACKAGE = Path(__file__).parent
 _MENTION = re.compile(r"\bbodycap_batch(?:\.| import )(\w+(?:\.\w+)*)")
@@ -29,7 +30,7 @@ def algorithm_version(module: str) -> str:
     digest = hashlib.sha256()
     for path in sorted(_closure(module)):
         digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")
-        digest.update(path.read_bytes() + b"\0")
+        digest.update(_source(path).content + b"\0")
     return digest.hexdigest()[:16]
 
 
@@ -54,18 +55,33 @@ def _closure(module: str) -> set[Path]:
     while waiting:
         new = set(_files(waiting.pop())) - found
         found |= new
-        waiting.extend(part for path in new if path.suffix == ".py" for part in _imports(path))
+        waiting.extend(part for path in new for part in _source(path).mentions)
     return found
 
 
-def _imports(path: Path) -> Iterator[str]:
-    for match in _MENTION.finditer(path.read_text(encoding="utf-8")):
-        if match.group(1) not in _NOT_COMPUTING:
-            yield match.group(1)
+class _Source(NamedTuple):
+    """A file's bytes, and the modules of this package that it imports."""
+
+    content: bytes
+    mentions: frozenset[str]
 
 
-def _files(name: str) -> Iterator[Path]:
+@cache
+def _source(path: Path) -> _Source:
+    """Read a file once, however many stages it is part of."""
+    content = path.read_bytes()
+    if path.suffix != ".py":
+        return _Source(content, frozenset())
+    return _Source(content, frozenset(_MENTION.findall(content.decode())) - _NOT_COMPUTING)
+
+
+@cache
+def _files(name: str) -> tuple[Path, ...]:
     """Files of a module; a package's are all files in it, data included."""
+    return tuple(_files_of(name))
+
+
+def _files_of(name: str) -> Iterator[Path]:
     path = _PACKAGE.joinpath(*name.split("."))
     if path.is_dir():
         yield from (

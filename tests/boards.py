@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 
@@ -35,7 +37,7 @@ def board_clip(camera, picture, views, rng, *, whole):
         whole: True keeps the board inside the picture, False lets its edges leave it.
     """
     fine = camera.scaled(camera.width_px * _FINER, camera.height_px * _FINER)
-    rays = ray_grid(fine).in_cam.reshape(-1, 3).astype(np.float32)
+    rays = _rays(fine.model, fine.width_px, fine.height_px, tuple(fine.params.tolist()))
     picture = cv2.GaussianBlur(picture, (0, 0), 0.7)
     height, width = picture.shape
     away, nearest = (0.17, 1.5) if whole else (0.3, 0.75)
@@ -60,6 +62,13 @@ def board_clip(camera, picture, views, rng, *, whole):
         noisy = small + 2.0 * rng.standard_normal(small.shape, dtype=np.float32)
         out.append(np.clip(noisy, 0, 255).astype(np.uint8))
     return out
+
+
+@cache
+def _rays(model, width_px, height_px, params):
+    """(H·W,3) viewing rays; clips through the same lens share them."""
+    lens = Camera(model=model, width_px=width_px, height_px=height_px, params=params)
+    return ray_grid(lens).in_cam.reshape(-1, 3).astype(np.float32)
 
 
 PINHOLE_LENS = Camera(

@@ -19,6 +19,7 @@ _NEWTON_STEPS = 30
 _DERIVATIVE_STEP = 1e-6
 _CONVERGED = 1e-9
 _BRANCH_SAMPLES = 8
+_BLOCK = 1 << 13
 _SINGLE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 Distortion = Callable[[FloatArray], FloatArray]
@@ -139,6 +140,17 @@ def undistort(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray, B
     Returns:
         The ideal points (N,2), and (N,) True where the inverse exists on the branch around the centre.
     """
+    found = [
+        _undistorted(distort, distorted[start : start + _BLOCK]) for start in range(0, len(distorted), _BLOCK)
+    ]
+    if not found:
+        return distorted.copy(), np.zeros(0, dtype=bool)
+    planes, valid = zip(*found, strict=True)
+    return np.concatenate(planes), np.concatenate(valid)
+
+
+def _undistorted(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """`undistort` for so many points that the processor's cache holds them."""
     plane = distorted.copy()
     with np.errstate(all="ignore"):
         for _ in range(_NEWTON_STEPS):
@@ -146,7 +158,7 @@ def undistort(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray, B
             if np.nanmax(np.abs(residual), initial=0.0) < 1e-14:
                 break
             jacobian = _jacobian(distort, plane)
-            det = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
+            det = _determinant(jacobian)
             det = np.where(np.abs(det) < 1e-12, 1e-12, det)
             step_x = (jacobian[:, 1, 1] * residual[:, 0] - jacobian[:, 0, 1] * residual[:, 1]) / det
             step_y = (jacobian[:, 0, 0] * residual[:, 1] - jacobian[:, 1, 0] * residual[:, 0]) / det
@@ -155,8 +167,13 @@ def undistort(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray, B
             plane = plane - step * np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))
         valid = np.abs(distort(plane) - distorted).max(axis=-1, initial=0.0) < _CONVERGED
         for fraction in np.linspace(1.0 / _BRANCH_SAMPLES, 1.0, _BRANCH_SAMPLES):
-            valid &= np.linalg.det(np.nan_to_num(_jacobian(distort, plane * fraction))) > 0
+            valid &= _determinant(_jacobian(distort, plane * fraction)) > 0
     return plane, np.asarray(valid)
+
+
+def _determinant(matrices: FloatArray) -> FloatArray:
+    """Determinants of (N,2,2)."""
+    return np.asarray(matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0])
 
 
 def ray_grid(camera: Camera) -> RayGrid:

@@ -16,19 +16,25 @@ PACKAGE = Path(identity.__file__).parent
 IGNORED = {"errors", "context", "progress"}
 
 
+def forget() -> None:
+    """What was read of the sources."""
+    for remembered in (identity.algorithm_version, identity._source, identity._files):
+        remembered.cache_clear()
+
+
 @pytest.fixture
 def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The package's sources in a folder of their own, where they may be changed."""
     folder = tmp_path / "bodycap_batch"
     shutil.copytree(PACKAGE, folder, ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(identity, "_PACKAGE", folder)
-    identity.algorithm_version.cache_clear()
+    forget()
     yield folder
-    identity.algorithm_version.cache_clear()
+    forget()
 
 
 def versions() -> dict[str, str]:
-    identity.algorithm_version.cache_clear()
+    forget()
     return {name: identity.algorithm_version(stage.code) for name, stage in STAGES.items()}
 
 

@@ -26,8 +26,15 @@ def _body_shares(options, camera, times_s):
     return np.array(shares)
 
 
-@pytest.mark.parametrize("seed", [0, 3])
-@pytest.mark.parametrize("camera", ["left_palm", "right_palm"])
+@pytest.mark.parametrize(
+    ("camera", "seed"),
+    [
+        ("left_palm", 0),
+        pytest.param("left_palm", 3, marks=pytest.mark.slow),
+        pytest.param("right_palm", 0, marks=pytest.mark.slow),
+        ("right_palm", 3),
+    ],
+)
 def test_a_camera_pressed_to_the_chest_sees_the_wearer_alone(seed, camera):
     options = SynthOptions(**SMALL, seed=seed, pressed_s={camera: (2.0, 3.0)})
     shares = _body_shares(options, camera, [0.5, 2.0, 2.5, 3.0, 4.5])
