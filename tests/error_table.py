@@ -45,8 +45,10 @@ def messages() -> list[Message]:
     """All errors of the package, by exit code, then by text; equal ones once."""
     found: dict[tuple[int, str, str], Message] = {}
     for path in sorted(PACKAGE.rglob("*.py")):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        for message in _in_module(tree, path.relative_to(ROOT).as_posix()):
+        text = path.read_text(encoding="utf-8")
+        if not any(f"{name}(" in text for name in CODES):
+            continue
+        for message in _in_module(ast.parse(text), path.relative_to(ROOT).as_posix()):
             found.setdefault((message.code, message.text, message.remedy), message)
     return sorted(found.values())
 

@@ -86,6 +86,7 @@ def test_residuals_follow_moved_cameras_as_predicted(walk, recorded):
     assert_allclose(after.right - before.right, predicted, atol=0.15 * np.abs(predicted).max())
 
 
+@pytest.mark.slow
 def test_a_palms_map_is_placed_or_refused_by_its_sigma(walk, recorded):
     inputs = make_inputs(walk, recorded)
     together = use_together(inputs, recorded[:2], recorded[2:], lambda: None)

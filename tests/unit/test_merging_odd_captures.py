@@ -130,6 +130,7 @@ def test_a_swinging_upper_arm_does_not_say_where_the_other_arm_is():
     assert anchor_and_reach(bones, index["LeftHand"], index["LeftArm"]) is not None
 
 
+@pytest.mark.slow
 def test_planes_of_a_long_captures_map_take_little_memory():
     rng = np.random.default_rng(0)
     points = rng.uniform(0.0, 5.0, (60_000, 3))

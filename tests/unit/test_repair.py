@@ -208,6 +208,7 @@ def test_starts_prefer_what_moved_sideways(built: tuple[Any, FloatArray, Worksho
     assert "parallax" in replace(best[0], parallax_rad=0.001).doubt
 
 
+@pytest.mark.slow
 def test_a_named_start_is_used(built: tuple[Any, FloatArray, Workshop, set[Any]]) -> None:
     _, poses, shop, _ = built
     start = named_start(shop.workspace, ("cam:2", "cam:6"), _LENSES)
