@@ -51,6 +51,11 @@ def scale_sentence(calibrated: Calibrated) -> str:
     if calibrated.sigma_log <= 0.02 or "known distance" in used:
         return text
     ways = ["name a known distance (merge.known_distance)"]
+    if len({mount.role for mount in calibrated.mounts}) == 1:
+        return (
+            f"{text}: all cameras sit on one bone, so that only their distance on it tells; to know it "
+            f"better, wear one on another bone as well (a hand, an upper arm or the head), or {ways[0]}"
+        )
     if "mean stature" in used:
         ways.insert(0, "give the subject's height (height_m)")
     if calibrated.t_pose_ns is None:

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.errors import EstimationError
+from bodycap_batch.arrays import FloatArray
 from bodycap_batch.geometry import invert
 from bodycap_batch.merging.bones import JOINT_SLACK_M, Bone, hinges
 from bodycap_batch.merging.graph import (
     JointFactors,
-    MountPoints,
     add_mount_measurement,
     add_mount_prior,
     bone_key,
@@ -29,7 +26,8 @@ from bodycap_batch.merging.graph import (
 from bodycap_batch.merging.initial import fill_gaps, pose_bones
 from bodycap_batch.merging.linear import Linear, linearise
 from bodycap_batch.merging.mount_spread import JOINED, MEASURED, Eliminated, SolvedMounts, kinds_of
-from bodycap_batch.merging.posture import Posture, PostureFactors, find_posture
+from bodycap_batch.merging.posture import PostureFactors
+from bodycap_batch.merging.samples import Samples
 from bodycap_batch.merging.spread import (
     BETWEEN_SHARE,
     Body,
@@ -41,116 +39,12 @@ from bodycap_batch.merging.spread import (
     scale_direction,
 )
 from bodycap_batch.merging.t_pose import t_posed
-from bodycap_batch.merging.tracks import MIN_SIGMA_M, MIN_SIGMA_RAD, SAMPLE_REACH_NS, Track, evenly
 from bodycap_batch.skeleton import Mount, SkeletonModel
 
 PRIOR_SCALE = 4.0
 """The pose prior counts once per tick here; its sigmas are widened, or it would outvote the cameras."""
-MAP_ERROR_M = 0.01
-MAP_ERROR_RAD = float(np.radians(0.5))
-MAP_ERROR_S = 1.0
-"""Maps bend: camera paths are off by about this much for about this long, all poses of a stretch together.
-What repeats must not count as often as it was sampled, or the mounts follow the map (one by 10 cm)."""
-T_POSE_TICKS = 8
-_FEWEST_SAMPLES = 10
-"""Samples each camera gets where it was measured so often, however seldom all were measured together."""
 _FLEETING = float(np.sqrt(1.0 - BETWEEN_SHARE**2))
 """Of a joint's everyday range, what comes and goes."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Samples:
-    """Camera poses at the ticks the calibration uses.
-
-    Attributes:
-        times_ns: (K,) common clock.
-        cameras: Names, in the order of the other fields.
-        bones: Index of each camera's bone.
-        map_from_cam: (C,K,4,4).
-        valid: (C,K) where a camera was measured.
-        sigma_rad: (C,) rotation sigma of each camera's measurements.
-        sigma_map: (C,) centre sigma, map units.
-        repeats: How many samples share one error of the map, 1 or more.
-        white_share: Of the measurements' variance, what is not the map's error.
-        posture: What is known of the body at the ticks.
-    """
-
-    times_ns: IntArray
-    cameras: tuple[str, ...]
-    bones: tuple[int, ...]
-    map_from_cam: FloatArray
-    valid: BoolArray
-    sigma_rad: FloatArray
-    sigma_map: FloatArray
-    repeats: float
-    white_share: float
-    posture: Posture
-
-    def points(self, scale: float) -> list[MountPoints]:
-        """The points that stand for each camera's mount at a scale."""
-        return [
-            MountPoints(float(r), float(scale * m))
-            for r, m in zip(self.sigma_rad, self.sigma_map, strict=True)
-        ]
-
-
-def take_samples(
-    tracks: Sequence[Track],
-    provisional: float,
-    count: int,
-    up: FloatArray | None = None,
-    t_pose_ns: tuple[int, int] | None = None,
-) -> Samples:
-    """Pick up to `count` times, evenly among those where most cameras were measured together.
-
-    Args:
-        tracks: Cleaned tracks, the trunk's first.
-        provisional: Metres per map unit.
-        count: Most times to take.
-        up: (3,) the vertical in the map where it is known.
-        t_pose_ns: From when to when a T-pose stands; a few more times are taken in it.
-
-    Raises:
-        EstimationError: The trunk's camera never saw the map together with another one.
-    """
-    times_ns = tracks[0].times_ns
-    looks = [track.at(times_ns, reach_ns=SAMPLE_REACH_NS) for track in tracks]
-    together = np.sum([valid for _, valid in looks], axis=0)
-    if len(tracks) > 1 and (together >= 2).sum() < 10:
-        raise EstimationError(
-            f"camera {tracks[0].camera!r} was localised together with another camera in only "
-            f"{(together >= 2).sum()} frames",
-            hint="10 are needed to find how the cameras sit on the body; see frames.csv",
-        )
-    wanted = np.flatnonzero(together >= min(2, len(tracks)))
-    full = np.flatnonzero(together == together.max())
-    pool = full if len(full) >= count else wanted
-    pick = evenly(pool, count)
-    if t_pose_ns is not None:
-        inside = np.flatnonzero((times_ns >= t_pose_ns[0]) & (times_ns <= t_pose_ns[1]) & (together >= 2))
-        pick = np.union1d(pick, evenly(inside, T_POSE_TICKS))
-    for _, valid in looks:
-        if valid[pick].sum() < min(_FEWEST_SAMPLES, count):
-            pick = np.union1d(pick, evenly(np.flatnonzero(valid & (together >= 2)), _FEWEST_SAMPLES))
-    seconds = 1e-9 * float(times_ns[pick[-1]] - times_ns[pick[0]])
-    repeats = max(1.0, MAP_ERROR_S * len(pick) / max(seconds, 1e-3))
-    white_rad = np.array([max(float(np.median(track.sigma_rad)), MIN_SIGMA_RAD) for track in tracks])
-    white_map = np.array(
-        [max(float(np.median(track.sigma_map)), MIN_SIGMA_M / provisional) for track in tracks]
-    )
-    sigma_map = np.sqrt(white_map**2 + repeats * (MAP_ERROR_M / provisional) ** 2)
-    return Samples(
-        times_ns=times_ns[pick],
-        cameras=tuple(track.camera for track in tracks),
-        bones=tuple(track.bone for track in tracks),
-        map_from_cam=np.array([poses[pick] for poses, _ in looks]),
-        valid=np.array([valid[pick] for _, valid in looks]),
-        sigma_rad=np.sqrt(white_rad**2 + repeats * MAP_ERROR_RAD**2),
-        sigma_map=sigma_map,
-        repeats=repeats,
-        white_share=float(((white_map / sigma_map) ** 2).mean()),
-        posture=find_posture(tracks[0].scaled(provisional), times_ns[pick], up, t_pose_ns),
-    )
 
 
 class Calibration:

@@ -12,7 +12,7 @@ from bodycap_batch.merging.spread import Spread
 from bodycap_batch.merging.tracks import Track
 
 CHUNK_TICKS = 1500
-OVERLAP_TICKS = 90
+OVERLAP_S = 3.0
 """Two solutions of a stretch differ by what lies beyond; three seconds of measurements forget it."""
 MAX_ITERATIONS = 20
 _SHORTEST_TICKS = 300
@@ -46,12 +46,20 @@ def solve_motion(
     """
     parts: list[Part] = []
     for first, last in stretches(tick_times_ns, tracks, chunk_ticks):
-        low, high = max(first - OVERLAP_TICKS, 0), min(last + OVERLAP_TICKS, len(tick_times_ns))
+        low, high = with_overlap(tick_times_ns, first, last)
         inside = [_between(track, tick_times_ns, low, high) for track in tracks]
         seen = [track for track in inside if len(track.times_ns)]
         solution = build(tick_times_ns[low:high], seen).solve(MAX_ITERATIONS, step, spread)
         parts.append((solution, seen, (first, last), low))
     return parts[0][0] if len(parts) == 1 else _joined(parts, tick_times_ns)
+
+
+def with_overlap(tick_times_ns: IntArray, first: int, last: int) -> tuple[int, int]:
+    """First tick, and the one after the last, of a stretch with what it shares with its neighbours."""
+    reach_ns = round(OVERLAP_S * 1e9)
+    low = int(np.searchsorted(tick_times_ns, tick_times_ns[first] - reach_ns))
+    high = int(np.searchsorted(tick_times_ns, tick_times_ns[last - 1] + reach_ns, side="right"))
+    return low, high
 
 
 def longest_stretch(bones: int, tracks: Sequence[Track]) -> int:

@@ -14,10 +14,11 @@ from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging import gauge
 from bodycap_batch.merging.bones import Bone
-from bodycap_batch.merging.calibrate import Calibration, take_samples
+from bodycap_batch.merging.calibrate import Calibration
 from bodycap_batch.merging.distance import known_distance
 from bodycap_batch.merging.limbs import limb_scales
 from bodycap_batch.merging.rolls import RollSearch, rolled, search_rolls, trunk_roll
+from bodycap_batch.merging.samples import take_samples
 from bodycap_batch.merging.scale import ScaleEstimate, ScaleSource, combine, find_scale, floor_source
 from bodycap_batch.merging.spread import Spread, joined
 from bodycap_batch.merging.t_pose import arm_span, find_t_pose
@@ -171,7 +172,12 @@ def _t_pose(
 
 
 def early_up(bones: Sequence[Bone], trunk: Track, prior: Mount, points_m: FloatArray) -> FloatArray | None:
-    """The vertical (3,) where planes or the walk show it, before anything is solved."""
+    """The vertical (3,) where planes or the walk show it, before anything is solved.
+
+    None from a limb's camera: a swinging arm tells neither the vertical nor the way the body faces.
+    """
+    if split_side(bones[trunk.bone].role)[0]:
+        return None
     hint = gauge.body_up_from_prior(bones, trunk, prior)
     found = gauge.find_up(points_m, hint, np.random.default_rng(0), trunk.map_from_cam[:, :3, 3])
     return None if found.source == "body" else found.up

@@ -18,10 +18,11 @@ from bodycap_batch.body import MergeInputs
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import Similarity, so3_exp
 from bodycap_batch.merging.bones import Bone, graph_bones
-from bodycap_batch.merging.calibrate import Calibration, take_samples
+from bodycap_batch.merging.calibrate import Calibration
 from bodycap_batch.merging.common_walk import require_common_time, starts_of
 from bodycap_batch.merging.constants import early_up, points_around
 from bodycap_batch.merging.mount_spread import PRIOR
+from bodycap_batch.merging.samples import take_samples
 from bodycap_batch.merging.tracks import Track, clean, in_gauge, make_track, moved
 from bodycap_batch.scene import Trajectory
 
@@ -151,9 +152,17 @@ def _joined(
     try:
         return join_maps(inputs, bones, tracks, step), unused
     except EstimationError as error:
-        for gauge in [name for name in tracks if name != main]:
+        if len(tracks) == 2:
+            leave(next(name for name in tracks if name != main), error.message)
+            return (), unused
+    # One map that fits no body spoils all of the others' places: each on its own.
+    found: tuple[Joined, ...] = ()
+    for gauge in [name for name in tracks if name != main]:
+        try:
+            found += join_maps(inputs, bones, {main: tracks[main], gauge: tracks[gauge]}, step)
+        except EstimationError as error:
             leave(gauge, error.message)
-        return (), unused
+    return found, unused
 
 
 def _cannot(gauge: str, trunk: tuple[str, str], why: str) -> str:
@@ -176,7 +185,8 @@ def join_maps(
         step: Called after each iteration; may raise to stop.
 
     Raises:
-        EstimationError: The cameras' distances fit no person, or they were hardly localised together.
+        EstimationError: The cameras' distances or their movement fit no person, or they were hardly localised
+            together.
     """
     mounts = {mount.camera: mount for mount in inputs.mounts}
     (_, main), *others = tracks.items()
@@ -191,16 +201,17 @@ def join_maps(
     names = {gauge: tuple(track.camera for track in group) for gauge, group in others}
     problem = Placing(calibration, list(names.values()), provisional)
     problem.solve()
+    strain = abs(problem.from_reach())
+    if strain > _MAX_STRAIN:
+        raise EstimationError(
+            f"the limbs' reach and the way the cameras move disagree on the scale by "
+            f"{100 * strain * _REACH_SIGMA:.0f} %; a longer walk with turns tells more"
+        )
     out = []
     for index, (gauge, cameras) in enumerate(names.items()):
         sigma_rad, sigma_m = problem.sigmas(index)
         why = None
-        if abs(problem.from_reach()) > _MAX_STRAIN:
-            why = (
-                f"the limbs' reach and the way the cameras move disagree on the scale by "
-                f"{100 * abs(problem.from_reach()) * _REACH_SIGMA:.0f} %; a longer walk with turns tells more"
-            )
-        elif not sigma_m <= MAX_SIGMA_M:
+        if not sigma_m <= MAX_SIGMA_M:
             why = (
                 f"the body tells it only to {100 * sigma_m:.0f} cm; turns in the walk, an upper arm's camera "
                 "or a common view settle it"
@@ -261,7 +272,8 @@ class Placing:
         """Sigma per axis of a map's rotation (rad) and its cameras' positions (m), over the samples."""
         centres, middle = self._centres(index)
         mine = slice(1 + 7 * index, 8 + 7 * index)
-        half = np.linalg.cholesky(self._covariance[mine, mine] + 1e-18 * np.eye(7))
+        values, vectors = np.linalg.eigh(self._covariance[mine, mine])
+        half = vectors * np.sqrt(np.maximum(values, 0.0))
         off = (centres - middle)[:, :, None]
         arms = np.cross(half[None, :3].swapaxes(1, 2), off.swapaxes(1, 2)).swapaxes(1, 2)
         shifts = arms + off * half[None, 3:4] + half[None, 4:]
@@ -285,13 +297,13 @@ class Placing:
         right = np.append(mounts.linear.right, -self.from_reach())
         normal = influence.T @ influence
         variance = self._calibration.row_variance(mounts, solved)[np.append(mounts.kinds, PRIOR)]
-        gain = np.linalg.solve(normal, influence.T)
+        gain = _solved(normal, influence.T)
         # A posture that is the wearer's habit, not the prior's, bends mounts and maps alike.
         habit = (mounts.habit_shifts().T @ gain[:, :-1].T).T
         covariance = (gain * variance) @ gain.T + habit @ habit.T
         free = np.arange(len(normal) - count, len(normal))
         normal[free, free] *= 1.0 + damping
-        change = np.linalg.solve(normal, influence.T @ right)[-count:]
+        change = _solved(normal, influence.T @ right)[-count:]
         return np.asarray(change, dtype=np.float64), np.asarray(covariance[-count:, -count:])
 
     def _cost(self) -> float:
@@ -331,3 +343,18 @@ class Placing:
             self.moved[index] = update.after(self.moved[index])
         self._calibration.move(replace(samples, map_from_cam=poses))
         self._scale *= float(np.exp(change[0]))
+
+
+def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve the normal equations of the maps' places.
+
+    Raises:
+        EstimationError: They are singular.
+    """
+    try:
+        return np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
+    except np.linalg.LinAlgError as error:
+        raise EstimationError(
+            "the body's movement does not determine where the map lies",
+            hint="turns in the walk, an upper arm's camera or a common view settle it",
+        ) from error

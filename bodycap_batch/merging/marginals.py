@@ -57,10 +57,17 @@ def joint_covariance(solved: SolvedGraph, world_from_bone: FloatArray, spread: S
         solved: The graph.
         world_from_bone: (T,B,4,4) its solution.
         spread: How far off the calibration may be.
+
+    Returns:
+        NaN throughout where the graph's equations are singular.
     """
     linear = linearise(solved.graph, solved.values)
     order, bounds = _blocks(solved, linear)
-    chain = Chain((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
+    try:
+        chain = Chain((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
+    except np.linalg.LinAlgError:
+        # A state that nothing holds: the solution stands, how well it is known cannot be told.
+        return np.full((*world_from_bone.shape[:2], 3, 3), np.nan)
     shifts = _measurement_shifts(solved, linear, spread)
     shifts = shifts + joint_shifts(linear, solved.body, solved.first_joint, world_from_bone, spread)
     rights = (linear.matrix.T @ shifts).tocsc()

@@ -19,6 +19,7 @@ from scipy import sparse
 from scipy.linalg import block_diag
 
 from bodycap_batch.arrays import FloatArray, IntArray
+from bodycap_batch.errors import EstimationError
 from bodycap_batch.merging.graph import bone_key, mount_keys
 from bodycap_batch.merging.linear import Linear
 from bodycap_batch.merging.spread import BETWEEN_SHARE, Body, Spread, habits, joined, joint_shifts
@@ -56,7 +57,19 @@ class SolvedMounts:
 
         Args:
             further: (R,P) derivatives by unknowns that all ticks share beside the mounts.
+
+        Raises:
+            EstimationError: The equations are singular.
         """
+        try:
+            return self._eliminated(further)
+        except np.linalg.LinAlgError as error:
+            raise EstimationError(
+                f"the cameras do not determine how they sit on the body ({error})",
+                hint="a longer capture with more movement, or fewer cameras, helps",
+            ) from error
+
+    def _eliminated(self, further: FloatArray | None) -> Eliminated:
         matrix = self.linear.matrix
         mounts = np.concatenate(list(self.mount_columns.values()))
         influence = matrix[:, mounts].toarray()

@@ -11,7 +11,8 @@ from bodycap_batch.arrays import FloatArray
 from bodycap_batch.body import MergeInputs
 from bodycap_batch.geometry import make_transform, so3_exp
 from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.calibrate import Calibration, take_samples
+from bodycap_batch.merging.calibrate import Calibration
+from bodycap_batch.merging.samples import take_samples
 from bodycap_batch.merging.tracks import SAMPLE_REACH_NS, Track
 from bodycap_batch.skeleton import Mount
 from bodycap_batch.skeleton_presets import NOMINAL_SIGMA_RAD, split_side

@@ -12,25 +12,20 @@ from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.body import MergeInputs, MergeResult
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.context import StageContext
-from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging import gauge
 from bodycap_batch.merging.bones import Bone, graph_bones
+from bodycap_batch.merging.choosing import bring_together
 from bodycap_batch.merging.chunks import MAX_ITERATIONS, longest_stretch, solve_motion
 from bodycap_batch.merging.complete import complete_body, observed_joints
 from bodycap_batch.merging.constants import Calibrated, Cleaned, calibrate_body, points_around
 from bodycap_batch.merging.initial import provisional_scale
-from bodycap_batch.merging.joining import use_together
 from bodycap_batch.merging.marginals import joints_in_axes, sigma_summary
 from bodycap_batch.merging.report import build_report
 from bodycap_batch.merging.rules import soft_rules
 from bodycap_batch.merging.solve import MotionGraph, Solution, hinge_errors, joint_gaps
-from bodycap_batch.merging.tracks import Track, adapt_psd, clean, in_gauge, make_track
+from bodycap_batch.merging.tracks import Track, adapt_psd, clean, in_gauge, loosened, make_track
 from bodycap_batch.scene import FrameStatus, Trajectory
-
-MIN_FRAMES = 15
-"""Localised frames below which a camera tells nothing about a motion: half a second at 30 fps."""
-_TRUNK = ("Spine1", "Spine", "Hips", "Neck", "Head")
 
 
 class _Progress:
@@ -54,12 +49,11 @@ class _Progress:
 def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> MergeResult:
     """See `bodycap_batch.merging.merge_trajectories`."""
     step = _Progress(context)
-    main, further, unused = choose_cameras(inputs)
-    together = use_together(inputs, main, further, step)
-    used, unused = together.trajectories, {**unused, **together.unused}
+    together = bring_together(inputs, step)
+    used = together.trajectories
     bones = graph_bones(inputs.skeleton, {inputs.mount_of(each.camera).role for each in used})
     fps = options.fps or inputs.clocks[used[0].camera].nominal_fps
-    tick_times = timeline(inputs, fps)
+    tick_times = timeline(inputs, used, fps)
     tracks, provisional, dropped = _clean_tracks(inputs, used, bones)
     cleaned = Cleaned(tracks, provisional, together.sigmas, together.places)
     calibrated = calibrate_body(inputs, options, bones, cleaned, step)
@@ -71,7 +65,7 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
     solution = solve_motion(
         lambda ticks, seen: MotionGraph(inputs.skeleton, psd_bones, ticks, seen, mounts, rules),
         tick_times,
-        metric,
+        [loosened(track, mount) for track, mount in zip(metric, calibrated.mounts, strict=True)],
         step,
         chunk_ticks=longest_stretch(len(bones), tracks),
         spread=calibrated.spread,
@@ -91,7 +85,7 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         world_from_map={gauge: place.after(here) for gauge, here in together.places.items()},
         trajectories=tuple(_in_world(each, place, dropped[each.camera]) for each in used),
         mounts=calibrated.mounts,
-        unused_cameras=unused,
+        unused_cameras=together.unused,
         report=build_report(
             inputs,
             calibrated,
@@ -101,7 +95,7 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
                 "start_ns": int(tick_times[0]),
                 "dropped": dropped,
                 "floor": floor,
-                "unused": unused,
+                "unused": together.unused,
                 "joined": together.report(),
                 "uncertainty": sigma_summary(inputs.skeleton.roles, covariance, observed),
                 "joint_gap_m": joint_gaps(bones, solution.world_from_bone),
@@ -113,44 +107,9 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
     )
 
 
-def choose_cameras(inputs: MergeInputs) -> tuple[list[Trajectory], list[Trajectory], dict[str, str]]:
-    """Sort the cameras: those of the trunk's map, the trunk's first; those of other maps; and the useless.
-
-    Raises:
-        EstimationError: The trunk's camera was hardly localised.
-    """
-    counts = {each.camera: int(each.localised.sum()) for each in inputs.trajectories}
-
-    def rank(trajectory: Trajectory) -> tuple[int, int]:
-        role = inputs.mount_of(trajectory.camera).role
-        return (_TRUNK.index(role) if role in _TRUNK else len(_TRUNK), -counts[trajectory.camera])
-
-    ranked = sorted(inputs.trajectories, key=rank)
-    first = ranked[0]
-    if counts[first.camera] < MIN_FRAMES:
-        raise EstimationError(
-            f"camera {first.camera!r}, which carries the body, has {counts[first.camera]} localised frames "
-            f"of {len(first.status)}; a skeleton needs {MIN_FRAMES}",
-            hint="see frames.csv for the reasons; more texture, light or a slower start helps",
-        )
-    main: list[Trajectory] = []
-    further: list[Trajectory] = []
-    unused = {}
-    for trajectory in ranked:
-        if counts[trajectory.camera] < MIN_FRAMES:
-            unused[trajectory.camera] = f"{counts[trajectory.camera]} localised frames, {MIN_FRAMES} needed"
-        else:
-            (main if trajectory.gauge == first.gauge else further).append(trajectory)
-    return main, further, unused
-
-
-def timeline(inputs: MergeInputs, fps: float) -> IntArray:
-    """Ticks (T,) on the common clock, from the capture's earliest timestamp to its latest."""
-    times = [
-        inputs.clocks[each.camera].common_times_ns(each.times_ns)
-        for each in inputs.trajectories
-        if len(each.times_ns)
-    ]
+def timeline(inputs: MergeInputs, used: Sequence[Trajectory], fps: float) -> IntArray:
+    """Ticks (T,) on the common clock, from the earliest timestamp of the cameras in use to their latest."""
+    times = [inputs.clocks[each.camera].common_times_ns(each.times_ns) for each in used]
     start, end = min(int(each.min()) for each in times), max(int(each.max()) for each in times)
     count = int(np.floor((end - start) * 1e-9 * fps + 1e-6)) + 1
     return np.asarray(start + np.round(np.arange(count) * (1e9 / fps)), dtype=np.int64)

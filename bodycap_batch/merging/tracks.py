@@ -12,6 +12,8 @@ from bodycap_batch.body import MergeInputs
 from bodycap_batch.geometry import Similarity, interpolate_pose, so3_log
 from bodycap_batch.merging.bones import Bone
 from bodycap_batch.scene import Trajectory
+from bodycap_batch.skeleton import Mount
+from bodycap_batch.skeleton_presets import NOMINAL_SIGMA_RAD
 
 CLEAN_HALF_WINDOW = 6
 CLEAN_LIMIT_M = 0.12
@@ -20,6 +22,12 @@ CLEAN_LIMIT_M = 0.12
 MIN_SIGMA_M = 0.004
 MIN_SIGMA_RAD = float(np.radians(0.4))
 """Floors of a pose's sigma: PnP's covariance knows image noise, not the map's error or a strap's give."""
+
+_UNTOLD_RAD = 0.95 * NOMINAL_SIGMA_RAD
+"""A mount known less well than this was not calibrated: its name alone promises as much."""
+
+_WILDEST = 100.0
+"""Largest factor on a motion model's density: accelerations ten times the table's."""
 
 SAMPLE_REACH_NS = 100_000_000
 """Longest hole between two frames that is interpolated for a sample."""
@@ -204,8 +212,24 @@ def adapt_psd(bones: Sequence[Bone], tracks: Sequence[Track]) -> tuple[Bone, ...
     for index in range(len(bones) - 1, 0, -1):
         if bones[index].parent not in measured:
             ratio[bones[index].parent] = np.maximum(ratio[bones[index].parent], ratio[index].max())
+    ratio = np.minimum(ratio, _WILDEST)
     return tuple(
         replace(bone, psd=bone.psd * np.repeat(factor, 3)) for bone, factor in zip(bones, ratio, strict=True)
+    )
+
+
+def loosened(track: Track, mount: Mount) -> Track:
+    """The track (metres) at the uncertainty of its mount, where the motion told next to nothing of it.
+
+    A camera never seen together with others keeps the mount its name promises: 15° and 4 cm. At its poses'
+    own millimetres it would bend the body to that guess.
+    """
+    if mount.sigma_rad < _UNTOLD_RAD:
+        return track
+    return replace(
+        track,
+        sigma_rad=np.hypot(track.sigma_rad, mount.sigma_rad),
+        sigma_map=np.hypot(track.sigma_map, mount.sigma_m),
     )
 
 

@@ -15,10 +15,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.bench import batch, joining, ours, peers, scaling, simulation, spool, uncertainty, viewer
+from tests.bench import batch, joining, ours, peers, scaling, simulation, solving, spool, uncertainty, viewer
 from tests.bench.rows import DATA, LAB, Row, row_of, rows_in
 
-_ON_POSES = {"simulation": simulation.main, "uncertainty": uncertainty.main, "joining": joining.main}
+_ON_POSES = {
+    "simulation": simulation.main,
+    "uncertainty": uncertainty.main,
+    "joining": joining.main,
+    "solving": solving.main,
+}
 """Benchmarks of the skeleton stage alone; they take options of their own."""
 
 
@@ -31,8 +36,8 @@ def main() -> int:
         "only",
         nargs="*",
         help="rows to run, or folders of captures with truth (default: all), `scaling`, `batch`, `spool`, "
-        "`viewer`; `simulation`, `uncertainty` or `joining` first run the skeleton stage on simulated poses, "
-        "with options of their own",
+        "`viewer`; `simulation`, `uncertainty`, `joining` or `solving` first run the skeleton stage on "
+        "simulated poses, with options of their own",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)

@@ -43,14 +43,14 @@ PLACED_M = 0.05
 
 def run_case(split: str, seed: int, seconds: float) -> dict[str, Any]:
     """Draw one walk, place its maps, and compare with the truth."""
-    from bodycap_batch.merging.joining import use_together  # gtsam takes a second to import
-    from bodycap_batch.merging.stage import choose_cameras
+    from bodycap_batch.merging.choosing import choices  # gtsam takes a second to import
+    from bodycap_batch.merging.joining import use_together
 
     cameras = ARMS if len(SPLITS[split]) == len(ARMS) else PALMS
     options = SynthOptions(seconds=seconds, cameras=cameras, seed=seed, poses_only=True)
     capture = posed(options, SPLITS[split])
     started = time.process_time()
-    main, further, _ = choose_cameras(capture.inputs)
+    main, further = choices(capture.inputs)[0]
     together = use_together(capture.inputs, main, further, lambda: None)
     return {
         "seconds": time.process_time() - started,

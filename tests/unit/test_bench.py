@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.bench import ours, peers, scaling
+from tests.bench import ours, peers, scaling, solving
 from tests.bench.peer_pairs import AWAY_NS, FROM_OTHER, OWN_AGAIN, STEPS, pairs_of
 from tests.bench.rows import Row, row_of
 
@@ -101,3 +101,19 @@ def test_a_folder_is_a_row(tmp_path):
     row = row_of(tmp_path)
     assert row.truth == tmp_path / "gt"
     assert row.reference == "torso"
+
+
+def test_solving_compares_a_longer_capture_with_the_first():
+    first = {
+        "frames": 1000,
+        "bones": 9,
+        "cameras": 3,
+        "seconds": 8.0,
+        "motion_seconds": 5.0,
+        "before_mb": 200,
+        "peak_mb": 700,
+    }
+    longer = {**first, "frames": 10_000, "seconds": 84.0}
+    assert solving.lines_of(first, first).endswith("peak 700 MB (200 before)")
+    assert "10.5 times the seconds of the first, for 10.0 times its frames" in solving.lines_of(longer, first)
+    assert "times" not in solving.lines_of({**longer, "bones": 15}, first)

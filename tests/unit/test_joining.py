@@ -10,9 +10,10 @@ from numpy.testing import assert_allclose
 
 from bodycap_batch.geometry import Similarity, so3_exp
 from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.calibrate import Calibration, take_samples
+from bodycap_batch.merging.calibrate import Calibration
 from bodycap_batch.merging.common_walk import start_of
 from bodycap_batch.merging.joining import use_together
+from bodycap_batch.merging.samples import take_samples
 from bodycap_batch.merging.tracks import make_track
 from tests.stages.walker import ROLES, make_inputs, make_walk, record
 

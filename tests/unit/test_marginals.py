@@ -13,9 +13,9 @@ from scipy import sparse
 
 from bodycap_batch.geometry import make_transform, so3_exp
 from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.graph import bone_key
+from bodycap_batch.merging.graph import bone_key, optimise
 from bodycap_batch.merging.linear import Chain
-from bodycap_batch.merging.marginals import sigma_summary
+from bodycap_batch.merging.marginals import joint_covariance, sigma_summary
 from bodycap_batch.merging.solve import MotionGraph, Solution
 from bodycap_batch.merging.spread import Spread, adjoint, joined
 from bodycap_batch.merging.tracks import make_track
@@ -44,6 +44,18 @@ def test_a_chain_of_blocks_is_the_dense_solution():
     chain.covariances(found.setdefault)
     for block, (start, end) in enumerate(pairwise(bounds.tolist())):
         assert_allclose(found[block], inverse[start:end, start:end], atol=1e-9)
+
+
+def test_a_graph_that_holds_nothing_states_no_covariance(walk):
+    graph, bones, _ = _graph(walk)
+    values, _ = optimise(graph._graph, graph._start(), iterations=1)
+    loose = replace(graph._solved(values), graph=gtsam.NonlinearFactorGraph())
+    poses = np.tile(np.eye(4), (round(FPS), len(bones), 1, 1))
+    nothing = np.zeros((len(bones), 3, 0))
+    spread = Spread(mounts={}, log_scale=np.zeros(0), rest=nothing, offsets_m=nothing)
+    covariance = joint_covariance(loose, poses, spread)
+    assert covariance.shape == (*poses.shape[:2], 3, 3)
+    assert np.isnan(covariance).all()
 
 
 def test_the_adjoint_is_gtsams():

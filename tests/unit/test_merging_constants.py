@@ -1,6 +1,7 @@
 """What fixes the scale beside the bones, and what is said about how well constants are known."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.errors import EstimationError, JobError
 from bodycap_batch.geometry import Similarity, so3_exp
-from bodycap_batch.merging.advice import mount_sentence
+from bodycap_batch.merging.advice import mount_sentence, scale_sentence
 from bodycap_batch.merging.distance import known_distance
 from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount
 from tests.stages.walker import make_inputs, make_walk, record
@@ -79,3 +80,20 @@ def test_every_mount_has_a_movement_that_tells_more():
         assert "T-pose" not in mount_sentence(mount, t_pose=True)
         known = replace(mount, sigma_rad=0.03, sigma_m=0.01)
         assert "better" not in mount_sentence(known, t_pose=False)
+
+
+@pytest.mark.parametrize(
+    ("roles", "advice"), [(("Spine1", "LeftHand"), "T-pose"), (("Spine1",) * 2, "another bone")]
+)
+def test_the_scales_advice_follows_from_where_cameras_sit(roles, advice):
+    skeleton = load_skeleton("upper_body", 1.75)
+    calibrated = SimpleNamespace(
+        mounts=[nominal_mount(f"camera_{number}", role, skeleton) for number, role in enumerate(roles)],
+        sigma_log=0.27,
+        sources=[],
+        t_pose_ns=None,
+    )
+    sentence = scale_sentence(calibrated)
+    assert "known to 27.0 % (1 sigma)" in sentence
+    assert advice in sentence
+    assert "merge.known_distance" in sentence

@@ -12,15 +12,16 @@ from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.calibrate import Calibration, take_samples
-from bodycap_batch.merging.chunks import CHUNK_TICKS, longest_stretch
+from bodycap_batch.merging.calibrate import Calibration
+from bodycap_batch.merging.chunks import CHUNK_TICKS, longest_stretch, with_overlap
 from bodycap_batch.merging.common_walk import require_common_time
 from bodycap_batch.merging.distance import known_distance
 from bodycap_batch.merging.initial import anchor_and_reach
 from bodycap_batch.merging.planes import find_planes
+from bodycap_batch.merging.samples import take_samples
 from bodycap_batch.merging.scale import find_scale
 from bodycap_batch.merging.solve import MotionGraph
-from bodycap_batch.merging.tracks import make_track
+from bodycap_batch.merging.tracks import loosened, make_track
 from bodycap_batch.skeleton_presets import load_skeleton
 from tests.stages.walker import ROLES, make_inputs, make_walk, record
 
@@ -57,14 +58,37 @@ def test_a_camera_seldom_seen_with_the_others_is_sampled(body):
     assert samples.valid[1].sum() >= 10
 
 
-def test_a_camera_never_seen_with_the_trunk_keeps_its_usual_mount(body):
+def test_a_camera_never_seen_with_others_keeps_its_usual_mount_and_weighs_as_little(body):
     inputs, bones, (trunk, left, right) = body
-    samples = take_samples([_only(trunk, 0.0, 3.0), left, _only(right, 3.5, 6.0)], 1.0, 12)
+    tracks = [_only(trunk, 0.0, 3.0), _only(left, 0.0, 3.2), _only(right, 3.5, 6.0)]
+    samples = take_samples(tracks, 1.0, 12)
+    assert not samples.valid[2].any()
     mounts = {mount.camera: mount for mount in inputs.mounts}
     calibration = Calibration(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
     assert np.isfinite(calibration.solve(1.0))
     usual = mounts["right_palm"].joint_from_cam
     assert np.abs(calibration.mounts["right_palm"] - usual).max() < 1e-3
+    constant, _ = calibration.spread(0.05, {name: np.zeros((4, 4)) for name in ROLES}, {})
+    solved = {mount.camera: mount for mount in calibration.solved_mounts(constant)}
+    loose = loosened(tracks[2], solved["right_palm"])
+    assert (loose.sigma_rad > np.radians(14.0)).all()
+    assert (loose.sigma_map > 0.039).all()
+    assert loosened(tracks[1], solved["left_palm"]) is tracks[1]
+
+
+def test_a_camera_never_seen_with_the_trunk_is_sampled_beside_another(body):
+    trunk, left, right = body[2]
+    samples = take_samples([_only(trunk, 0.0, 3.0), left, _only(right, 3.5, 6.0)], 1.0, 12)
+    alone = ~samples.valid[0]
+    assert (samples.valid[1:, alone]).all()
+    assert samples.valid[2].sum() == alone.sum() == 10
+    assert (np.diff(samples.times_ns) > 0).all()
+
+
+def test_cameras_never_seen_together_are_refused(body):
+    trunk, left, right = body[2]
+    with pytest.raises(EstimationError, match="'torso' was localised together with another camera in only 0"):
+        take_samples([_only(trunk, 0.0, 2.0), _only(left, 2.5, 4.0), _only(right, 4.5, 6.0)], 1.0, 12)
 
 
 def test_a_t_pose_that_the_trunk_missed_adds_no_samples(body):
@@ -141,6 +165,13 @@ def test_planes_of_a_long_captures_map_take_little_memory():
     tracemalloc.stop()
     assert abs(planes[0].normal[2]) > 0.999
     assert peak < 400e6
+
+
+@pytest.mark.parametrize("fps", [30, 60, 120])
+def test_stretches_share_three_seconds_at_any_rate(fps):
+    ticks = np.round(np.arange(20 * fps) * 1e9 / fps).astype(np.int64)
+    assert with_overlap(ticks, 8 * fps, 12 * fps) == (5 * fps, 15 * fps)
+    assert with_overlap(ticks, 0, 19 * fps) == (0, 20 * fps)
 
 
 def test_stretches_get_shorter_with_many_cameras(body):

@@ -220,6 +220,12 @@ def test_wild_motion_loosens_the_limb_above_the_camera():
     assert ratio[4] == pytest.approx(146 / 30, rel=0.3)
     assert ratio[3] == ratio[2] == ratio[4]
     assert ratio[0] == ratio[7] == ratio[8] == 1.0
+    leaps = [tracks[0], _track(rng.normal(size=(90, 3)), 4), tracks[2]]
+    # A metre from frame to frame is no motion of anybody: the model stays one.
+    assert (
+        max(each.psd[3] / bone.psd[3] for bone, each in zip(bones, adapt_psd(bones, leaps), strict=True))
+        == 100
+    )
 
 
 def test_mount_points_carry_exactly_the_pose_they_stand_for():

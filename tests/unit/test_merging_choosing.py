@@ -1,0 +1,158 @@
+"""Which camera leads, which map is the main one, which ticks are solved, and what a bad map may spoil."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bodycap_batch.errors import EstimationError
+from bodycap_batch.geometry import Similarity
+from bodycap_batch.merging import choosing, joining
+from bodycap_batch.merging.choosing import bring_together, choices, seldom_localised
+from bodycap_batch.merging.constants import early_up
+from bodycap_batch.merging.joining import Joined, use_together
+from bodycap_batch.merging.stage import timeline
+from bodycap_batch.merging.tracks import make_track
+from bodycap_batch.scene import FrameStatus
+from bodycap_batch.synthetic import SynthOptions
+from tests.bench.posed import posed
+
+CAMERAS = ("torso", "head", "left_palm", "right_palm", "left_upper_arm")
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return posed(SynthOptions(seconds=6.0, cameras=CAMERAS, seed=2, poses_only=True))
+
+
+def _lose(inputs, camera, kept):
+    """The inputs with all but the first frames of a camera lost."""
+    changed = []
+    for each in inputs.trajectories:
+        if each.camera == camera:
+            poses, covariance = np.array(each.gauge_from_cam), np.array(each.covariance)
+            last = int(np.flatnonzero(each.localised)[kept])
+            poses[last:], covariance[last:] = np.nan, np.nan
+            status = (*each.status[:last], *[FrameStatus.FEW_TRACKS] * (len(poses) - last))
+            each = replace(each, gauge_from_cam=poses, covariance=covariance, status=status)  # noqa: PLW2901
+        changed.append(each)
+    return replace(inputs, trajectories=tuple(changed))
+
+
+def _in_maps(inputs, maps):
+    return replace(
+        inputs,
+        trajectories=tuple(
+            replace(each, gauge=maps.get(each.camera, each.gauge)) for each in inputs.trajectories
+        ),
+    )
+
+
+def _names(trajectories):
+    return [each.camera for each in trajectories]
+
+
+def test_the_trunk_leads_then_the_head(capture):
+    assert _names(choices(capture.inputs)[0][0])[:2] == ["torso", "head"]
+    lost = _lose(capture.inputs, "torso", 6)
+    assert _names(choices(lost)[0][0])[0] == "head"
+    assert seldom_localised(lost) == {"torso": f"6 localised frames of {6 * 30}, 15 needed"}
+
+
+def test_a_trunk_that_was_hardly_localised_does_not_lead(capture):
+    (main, further), *others = choices(_lose(capture.inputs, "torso", 30))
+    assert _names(main)[0] == "head"
+    assert _names(main)[-1] == "torso"
+    assert not further
+    assert not others
+
+
+def test_a_trunk_alone_in_a_small_map_is_a_further_map(capture):
+    short = _in_maps(_lose(capture.inputs, "torso", 30), {"torso": "small"})
+    first, second = choices(short)
+    assert "torso" not in _names(first[0])
+    assert _names(first[1]) == ["torso"]
+    assert _names(second[0]) == ["torso"]
+
+
+def test_a_map_that_makes_no_body_gives_way_to_one_that_does(capture, monkeypatch):
+    alone = _in_maps(capture.inputs, {"torso": "own"})
+    monkeypatch.setattr(
+        joining, "join_maps", lambda *_: (_ for _ in ()).throw(EstimationError("nowhere to be placed"))
+    )
+    together = bring_together(alone, lambda: None)
+    assert "torso" not in _names(together.trajectories)
+    assert len(together.trajectories) == len(CAMERAS) - 1
+    assert "nowhere to be placed" in together.unused["torso"]
+
+
+def test_hands_alone_make_no_body_and_the_error_says_what_is_missing(capture):
+    hands = replace(
+        capture.inputs,
+        trajectories=tuple(
+            each
+            for each in capture.inputs.trajectories
+            if each.camera in ("torso", "left_palm", "right_palm")
+        ),
+    )
+    with pytest.raises(
+        EstimationError, match=r"no two cameras .*'left_palm', 'right_palm' can be used; 'torso'"
+    ):
+        bring_together(_lose(hands, "torso", 6), lambda: None)
+    nobody = replace(hands, trajectories=hands.trajectories[:1])
+    with pytest.raises(EstimationError, match="none can be used"):
+        bring_together(_lose(nobody, "torso", 6), lambda: None)
+
+
+def test_a_limbs_camera_tells_no_vertical(capture):
+    inputs = capture.inputs
+    bones = choosing.graph_bones(inputs.skeleton, {mount.role for mount in inputs.mounts})
+    arm = next(mount for mount in inputs.mounts if mount.camera == "left_upper_arm")
+    place = [bone.role for bone in bones].index(arm.role)
+    trajectory = next(each for each in inputs.trajectories if each.camera == arm.camera)
+    assert early_up(bones, make_track(inputs, trajectory, place), arm, np.zeros((0, 3))) is None
+
+
+def test_the_timeline_is_that_of_the_cameras_in_use(capture):
+    used = capture.inputs.trajectories[:3]
+    far = replace(capture.inputs.trajectories[3], times_ns=capture.inputs.trajectories[3].times_ns + 10**13)
+    inputs = replace(capture.inputs, trajectories=(*used, far))
+    ticks = timeline(inputs, used, 30.0)
+    assert len(ticks) == 180
+    assert ticks[0] == min(int(each.times_ns[0]) for each in used)
+
+
+def test_one_bad_map_does_not_take_the_others_with_it(capture, monkeypatch):
+    inputs = _in_maps(capture.inputs, {"left_palm": "good", "right_palm": "bad"})
+    asked = []
+
+    def place(_inputs, _bones, tracks, _step):
+        asked.append(tuple(tracks))
+        if "bad" in tracks:
+            raise EstimationError("fits no person")
+        here = Similarity(1.0, np.eye(3), np.zeros(3))
+        return (
+            Joined(
+                gauge="good",
+                cameras=("left_palm",),
+                main_from_gauge=here,
+                sigma_rad=0.01,
+                sigma_m=0.01,
+                reason=None,
+            ),
+        )
+
+    monkeypatch.setattr(joining, "join_maps", place)
+    main, further = choices(inputs)[0]
+    together = use_together(inputs, main, further, lambda: None)
+    assert asked == [("map-0", "good", "bad"), ("map-0", "good"), ("map-0", "bad")]
+    assert "left_palm" in _names(together.trajectories)
+    assert "fits no person" in together.unused["right_palm"]
+    assert list(together.unused) == ["right_palm"]
+
+
+def test_equations_without_an_answer_are_an_estimation_error():
+    with pytest.raises(EstimationError, match="does not determine"):
+        joining._solved(np.zeros((2, 2)), np.ones(2))
