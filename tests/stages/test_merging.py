@@ -234,7 +234,7 @@ def test_a_lost_torso_is_refused_with_numbers(walk, context):
         merge_trajectories(make_inputs(walk, recorded), MergeOptions(), context)
 
 
-@pytest.mark.parametrize("kept", [6, 24])
+@pytest.mark.parametrize("kept", [6, pytest.param(24, marks=pytest.mark.slow)])
 def test_a_head_carries_the_body_where_the_torso_is_lost(tmp_path, kept):
     cameras = ("torso", "head", "left_palm", "right_palm")
     capture = posed(SynthOptions(seconds=8.0, cameras=cameras, seed=5, poses_only=True))
