@@ -205,7 +205,8 @@ def join_maps(
     if strain > _MAX_STRAIN:
         raise EstimationError(
             f"the limbs' reach and the way the cameras move disagree on the scale by "
-            f"{100 * strain * _REACH_SIGMA:.0f} %; a longer walk with turns tells more"
+            f"{100 * strain * _REACH_SIGMA:.0f} %",
+            hint="a longer walk with turns tells more",
         )
     out = []
     for index, (gauge, cameras) in enumerate(names.items()):
