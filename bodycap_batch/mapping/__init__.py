@@ -31,6 +31,7 @@ from bodycap_batch.mapping.solve import (
     mapper_options,
     reconstruct,
     refine,
+    settle,
     write_models,
 )
 from bodycap_batch.scene import KeyframeSelection, MapResult, Trajectory
@@ -98,7 +99,7 @@ def build_map(
     if models:
         shop = _shop(workspace, capture, options, constant, context)
         models[0], log["repair"] = repair(models[0], tried, shop)
-        log["unconfirmed_points"] = _without_unconfirmed(models, shop, capture)
+        log["unconfirmed_points"] = _settled(models, shop, capture)
     _require_coverage(models, len(refs), log.get("initial_candidates", ladder), options)
     write_models(workspace, models)
     given = {number: name for name, number in cameras.items() if capture.camera(name).calibrated}
@@ -124,15 +125,13 @@ def _shop(
     )
 
 
-def _without_unconfirmed(models: Sequence[Any], shop: Workshop, capture: Capture) -> int:
-    """Take unconfirmed points out of models, in place, and adjust what is left; how many."""
+def _settled(models: Sequence[Any], shop: Workshop, capture: Capture) -> int:
+    """Take unconfirmed points out of models, in place, and adjust what is left once more; how many."""
     times_ns = _common_ns(capture)
     total = 0
     for model in models:
-        dropped = drop_unconfirmed(model, times_ns)
-        if dropped:
-            refine(model, shop.settings(), shop.constant)
-        total += dropped
+        total += drop_unconfirmed(model, times_ns)
+        settle(model, shop.settings(), shop.constant)
     return total
 
 
@@ -213,7 +212,7 @@ def extend_map(
         model, names = cut_doubtful(place_again(model, inside, shop, len(known) + len(new)), shop)
         models.append(model)
         cut += names
-    dropped = _without_unconfirmed(models, shop, capture)
+    dropped = _settled(models, shop, capture)
     write_models(workspace, models)
     told = {"placed_again": len(doubted), "cut": cut, "unconfirmed_points": dropped}
     entry = {"new_keyframes": len(new), **told, **linked}
@@ -273,6 +272,7 @@ def refine_map(
         if readout_s:
             moved = rolling.moved(readout_s)
             refine(moved, settings, constant)
+            settle(moved, settings, constant)
             rolling.move(moved, {})
             model = moved
         models.append(model)

@@ -11,9 +11,9 @@ import numpy as np
 
 from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.capture import CaptureCamera
-from bodycap_batch.geometry import make_transform
 from bodycap_batch.mapping.convert import lens_of
 from bodycap_batch.mapping.database import ImageRef
+from bodycap_batch.mapping.residuals import image_residuals
 from bodycap_batch.mapping.solve import adjust, part_of
 from bodycap_batch.rolling_shutter import at_mid_row, image_velocity
 from bodycap_batch.scene import Trajectory
@@ -196,24 +196,18 @@ class RollingModel:
         )
         return _Keypoints(image_id, ref.camera, feature, px, velocity)
 
-    def _points(self, image: Any, feature: IntArray, model: Any = None) -> FloatArray:
-        source = self._model if model is None else model
+    def _points(self, image: Any, feature: IntArray) -> FloatArray:
         points = image.points2D
-        return np.array([source.point3D(points[index].point3D_id).xyz for index in feature.tolist()]).reshape(
-            -1, 3
-        )
+        return np.array(
+            [self._model.point3D(points[index].point3D_id).xyz for index in feature.tolist()]
+        ).reshape(-1, 3)
 
     def _residuals(self, model: pycolmap.Reconstruction) -> dict[str, FloatArray]:
         """Observed minus projected, in the same order for every copy, by camera."""
         out: dict[str, list[FloatArray]] = {name: [] for name in self._lenses}
         for item in self._keypoints:
-            image = model.image(item.image_id)
-            pose = np.asarray(image.cam_from_world().matrix())
-            cam_from_map = make_transform(pose[:, :3], pose[:, 3])
-            x_in_cam = self._points(image, item.feature, model) @ cam_from_map[:3, :3].T + cam_from_map[:3, 3]
-            observed = np.array([image.points2D[index].xy for index in item.feature.tolist()]).reshape(-1, 2)
-            projected = lens_of(image.camera).project(x_in_cam)
-            out[item.camera].append(np.nan_to_num(observed - projected, nan=1e3).ravel())
+            found = image_residuals(model, model.image(item.image_id), item.feature)
+            out[item.camera].append(found.ravel())
         return {name: np.concatenate([np.zeros(0), *parts]) for name, parts in out.items()}
 
 
