@@ -206,18 +206,75 @@ def test_uploads_are_counted_and_swept(bench: SpoolBench, client: Client) -> Non
     assert client.ask("PUT", "/api/uploads/unknown/torso.mp4", b"x")[0] == 400
 
 
+class Slow:
+    """A file of 1,000 bytes of which the first half has been sent."""
+
+    def __init__(self, client: Client, key: str, name: str) -> None:
+        self.connection = http.client.HTTPConnection(client.host, timeout=30)
+        self.connection.putrequest("PUT", f"/api/uploads/{key}/{name}")
+        self.connection.putheader("Origin", f"http://{client.host}")
+        self.connection.putheader("Content-Length", "1000")
+        self.connection.endheaders()
+        self.connection.send(b"x" * 500)
+
+    def rest(self) -> tuple[int, bytes]:
+        self.connection.send(b"x" * 500)
+        answer = self.connection.getresponse()
+        found = answer.status, answer.read()
+        self.connection.close()
+        return found
+
+
+@pytest.mark.parametrize("name", ["torso.mp4", "TORSO.mp4"])
+def test_a_file_that_is_being_sent_is_not_sent_by_another_request(
+    bench: SpoolBench, client: Client, name: str
+) -> None:
+    key = client.begin("walk")
+    slow = Slow(client, key, "torso.mp4")
+    wait_for(lambda: any(bench.spool.inbox.glob(".upload-*/*.part")))
+    code, data, _ = client.ask("PUT", f"/api/uploads/{key}/{name}", b"y" * 1000)
+    assert (code, json.loads(data)["message"]) == (400, f"{name} was sent twice")
+    code, data, _ = client.ask("PUT", f"/api/uploads/{key}/torso.mp4/a.mp4", b"y")
+    assert (code, json.loads(data)["message"]) == (400, "torso.mp4/a.mp4 is a file and a folder")
+    assert slow.rest()[0] == 200
+    assert client.json("POST", f"/api/uploads/{key}/finish")["name"] == "walk"
+    assert (bench.spool.inbox / "walk" / "torso.mp4").read_bytes() == b"x" * 1000
+
+
+def test_a_folder_is_not_finished_while_a_file_is_being_sent(bench: SpoolBench, client: Client) -> None:
+    key = client.begin("walk")
+    client.json("PUT", f"/api/uploads/{key}/head.mp4", b"frames of head")
+    slow = Slow(client, key, "torso.mp4")
+    wait_for(lambda: any(bench.spool.inbox.glob(".upload-*/*.part")))
+    code, data, _ = client.ask("POST", f"/api/uploads/{key}/finish")
+    assert (code, json.loads(data)["message"]) == (400, "torso.mp4: still being sent")
+    assert slow.rest()[0] == 200
+    client.json("POST", f"/api/uploads/{key}/finish")
+    code, _, _ = client.ask("POST", f"/api/uploads/{key}/finish")
+    assert code == 400, "it is known no more"
+    files = sorted(path.name for path in (bench.spool.inbox / "walk").iterdir())
+    assert files == ["READY", "head.mp4", "torso.mp4"]
+
+
+def test_a_folder_that_is_dropped_while_a_file_is_being_sent_is_gone(
+    bench: SpoolBench, client: Client
+) -> None:
+    key = client.begin("walk")
+    slow = Slow(client, key, "torso.mp4")
+    wait_for(lambda: any(bench.spool.inbox.glob(".upload-*/*.part")))
+    assert client.ask("DELETE", f"/api/uploads/{key}")[0] == 200
+    code, data = slow.rest()
+    assert (code, json.loads(data)["message"]) == (400, "this upload is not known (any more)")
+    assert list(bench.spool.inbox.iterdir()) == []
+
+
 def test_what_is_left_of_a_broken_upload_vanishes_with_the_page(bench: SpoolBench) -> None:
     with LivePage(bench.spool, Access(host="127.0.0.1", port=0), Limits()) as page:
         client = Client(page)
         key = client.begin("walk")
-        connection = http.client.HTTPConnection(client.host, timeout=30)
-        connection.putrequest("PUT", f"/api/uploads/{key}/torso.mp4")
-        connection.putheader("Origin", f"http://{client.host}")
-        connection.putheader("Content-Length", "1000")
-        connection.endheaders()
-        connection.send(b"x" * 500)
+        slow = Slow(client, key, "torso.mp4")
         wait_for(lambda: any(bench.spool.inbox.glob(".upload-*/*.part")))
-        connection.close()
+        slow.connection.close()
         wait_for(lambda: not any(bench.spool.inbox.glob(".upload-*/*.part")))
     assert list(bench.spool.inbox.iterdir()) == []
 

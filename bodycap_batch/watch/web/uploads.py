@@ -33,12 +33,23 @@ _STALE_S = 86_400.0
 
 @dataclass(slots=True)
 class _Upload:
-    """A folder being sent."""
+    """A folder being sent.
+
+    Attributes:
+        name: What the job will be called.
+        folder: Where it is written to.
+        touched: When something came last.
+        files: Files that are there.
+        coming: Files that are being sent just now, with their bytes.
+        dropped: Nobody wants it any more.
+    """
 
     name: str
     folder: Path
     touched: float
     files: set[str] = field(default_factory=set)
+    coming: dict[str, int] = field(default_factory=dict)
+    dropped: bool = False
 
 
 class Uploads:
@@ -91,42 +102,47 @@ class Uploads:
             CaptureError: More bytes than allowed, or not as many as were announced.
             StoreError: The disk is full.
         """
-        upload = self._get(key)
-        target = upload.folder / self._checked(upload, name, size)
-        with disk_errors(target):
-            target.parent.mkdir(exist_ok=True)
-            partial = target.with_name(f"{target.name}.part")
-            try:
-                written = await _write(partial, size, chunks, upload)
-                if written != size:
-                    hint = "send it again"
-                    raise CaptureError(f"{written} bytes came, {size} were announced", path=name, hint=hint)
-                partial.rename(target)
-            finally:
-                partial.unlink(missing_ok=True)
+        upload, path = self._reserved(key, name, size)
+        target = upload.folder / path
+        try:
+            with disk_errors(target):
+                await _take_in(target, size, chunks, upload)
+        except (CaptureError, StoreError):
+            self._require_wanted(upload)
+            raise
+        finally:
+            with self._lock:
+                del upload.coming[name]
+                if upload.dropped:
+                    shutil.rmtree(upload.folder, ignore_errors=True)
         upload.files.add(name)
 
     def finish(self, key: str) -> str:
         """Drop the folder into the inbox; returns the name it has there.
 
         Raises:
-            JobError: There is no video in it.
+            JobError: There is no video in it, or one is still being sent.
         """
-        upload = self._get(key)
-        if not any(PurePosixPath(name).suffix.lower() in VIDEO_SUFFIXES for name in upload.files):
-            raise JobError("no video was sent", hint="name them torso.mp4, left_palm.mp4, right_palm.mp4 …")
-        with disk_errors(upload.folder), self._lock:
-            (upload.folder / READY).touch()
-            target = move(upload.folder, self._spool.inbox, upload.name)
+        with self._lock:
+            upload = self._get(key)
+            if upload.coming:
+                some = ", ".join(sorted(upload.coming)[:3])
+                raise JobError(f"{some}: still being sent", hint="finish when every file is there")
+            if not any(PurePosixPath(name).suffix.lower() in VIDEO_SUFFIXES for name in upload.files):
+                raise JobError(
+                    "no video was sent", hint="name them torso.mp4, left_palm.mp4, right_palm.mp4 …"
+                )
+            with disk_errors(upload.folder):
+                (upload.folder / READY).touch()
+                target = move(upload.folder, self._spool.inbox, upload.name)
             del self._open[key]
         return target.name
 
     def drop(self, key: str) -> None:
         """Forget a folder that will not be completed."""
         with self._lock:
-            upload = self._open.pop(key, None)
-        if upload is not None:
-            shutil.rmtree(upload.folder, ignore_errors=True)
+            if (upload := self._open.pop(key, None)) is not None:
+                self._remove(upload)
 
     def clear(self) -> None:
         """Remove what is not complete: the page ends, nobody can go on with it."""
@@ -135,8 +151,29 @@ class Uploads:
 
     def _get(self, key: str) -> _Upload:
         if key not in self._open:
-            raise JobError("this upload is not known (any more)", hint="drop the folder again")
+            raise _unknown()
         return self._open[key]
+
+    def _reserved(self, key: str, name: str, size: int) -> tuple[_Upload, PurePosixPath]:
+        """The upload, with a place in it that no other request can have."""
+        with self._lock:
+            upload = self._get(key)
+            with disk_errors(upload.folder):
+                path = self._checked(upload, name, size)
+            upload.coming[name] = size
+            return upload, path
+
+    @staticmethod
+    def _require_wanted(upload: _Upload) -> None:
+        """Tell of a folder that was dropped while a file came, rather than of the file."""
+        if upload.dropped:
+            raise _unknown() from None
+
+    @staticmethod
+    def _remove(upload: _Upload) -> None:
+        """Take a folder away; whoever is still writing to it notices, and takes the rest away."""
+        upload.dropped = True
+        shutil.rmtree(upload.folder, ignore_errors=True)
 
     def _checked(self, upload: _Upload, name: str, size: int) -> PurePosixPath:
         path = PurePosixPath(name)
@@ -146,15 +183,21 @@ class Uploads:
         if not video and path.name not in _ALSO and not path.name.lower().endswith(_ALSO_SUFFIXES):
             known = ", ".join((*_ALSO, *_ALSO_SUFFIXES))
             raise JobError(f"{path.name} is no video, nor any of {known}", hint="leave it out")
-        if name in upload.files or (upload.folder / path).exists():
+        sent = {*upload.files, *upload.coming}
+        # Not by the disk alone: some of them do not tell upper from lower case.
+        if name.lower() in {other.lower() for other in sent} or (upload.folder / path).exists():
             raise JobError(f"{name} was sent twice", hint="give each file its own name")
-        if len(upload.files) >= self._limits.files:
+        if any(str(path.parent) == other or str(PurePosixPath(other).parent) == name for other in sent):
+            raise JobError(f"{name} is a file and a folder", hint="give each its own name")
+        if len(sent) >= self._limits.files:
             raise CaptureError(f"more than {self._limits.files:g} files", hint="one folder per recording")
         most = 1e9 * self._limits.video_gb if video else _SMALL_BYTES
         if not 0 < size <= most:
             hint = "cut the recording, or ask the operator to raise --limit video_gb"
             raise CaptureError(f"{size / 1e9:.3g} GB, the limit is {most / 1e9:.3g}", path=name, hint=hint)
-        if shutil.disk_usage(upload.folder).free - size < _KEEP_FREE_BYTES:
+        # What others have announced may not be there yet: rather too careful than a full disk.
+        coming = sum(sum(other.coming.values()) for other in self._open.values())
+        if shutil.disk_usage(upload.folder).free - coming - size < _KEEP_FREE_BYTES:
             raise StoreError(
                 "too little room on the disk", path=self._spool.inbox, hint="make room, then try again"
             )
@@ -163,7 +206,11 @@ class Uploads:
     def _forget_stale(self) -> None:
         now = time.monotonic()
         for key in [key for key, upload in self._open.items() if now - upload.touched > _STALE_S]:
-            shutil.rmtree(self._open.pop(key).folder, ignore_errors=True)
+            self._remove(self._open.pop(key))
+
+
+def _unknown() -> JobError:
+    return JobError("this upload is not known (any more)", hint="drop the folder again")
 
 
 def sweep(inbox: Path) -> None:
@@ -179,6 +226,20 @@ def _is_abandoned(folder: Path) -> bool:
     if is_of_this_machine(marked):
         return not is_at_work(marked)
     return time.time() - folder.stat().st_mtime > _STALE_S
+
+
+async def _take_in(target: Path, size: int, chunks: AsyncIterator[bytes], upload: _Upload) -> None:
+    """Write what comes beside its place; it gets its name when all of it is there."""
+    target.parent.mkdir(exist_ok=True)
+    partial = target.with_name(f"{target.name}.part")
+    try:
+        written = await _write(partial, size, chunks, upload)
+        if written != size:
+            wrong = f"{written} bytes came, {size} were announced"
+            raise CaptureError(wrong, path=target.name, hint="send it again")
+        partial.rename(target)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 async def _write(path: Path, size: int, chunks: AsyncIterator[bytes], upload: _Upload) -> int:
