@@ -46,6 +46,12 @@ def main() -> int:
     parser.add_argument(
         "--peer-limit", type=float, default=15.0, metavar="MINUTES", help="a peer is stopped then (15)"
     )
+    parser.add_argument(
+        "--jobs", type=int, metavar="N", help="jobs of `batch` (8) and `spool` (1000): fewer for a quick try"
+    )
+    parser.add_argument(
+        "--repeat", type=int, default=1, metavar="N", help="rounds of `batch`, the best counts"
+    )
     parser.add_argument("--json", type=Path, help="also write all figures here")
     options = parser.parse_args()
     results: list[dict[str, Any]] = []
@@ -60,25 +66,26 @@ def main() -> int:
             if not options.no_peers and not row.name.startswith("cpl_lab_"):
                 for peer in peers.run_peers(row, work / row.name / "peers", 60 * options.peer_limit):
                     _tell(results, peer, peers.lines_of(peer, own))
-        _run_by_name(options.only, work, results)
+        _run_by_name(options, work, results)
     if options.json:
         options.json.write_text(json.dumps([each for each in results if each], indent=1), encoding="utf-8")
     jobs = [result for result in results if result and "peer" not in result]
     return 0 if results and all(job.get("exit") == 0 for job in jobs) else 1
 
 
-def _run_by_name(only: Sequence[str], work: Path, results: list[dict[str, Any]]) -> None:
+def _run_by_name(options: argparse.Namespace, work: Path, results: list[dict[str, Any]]) -> None:
     """What is no capture."""
+    only = options.only
     if "scaling" in only:
         for case in scaling.cases(work / "scaling"):
             own = ours.run(case.row, work / case.row.name)
             _tell(results, {**own, **case.size()}, scaling.lines_of(own, case))
         _tell(results, {}, scaling.summary(results))
     if "batch" in only:
-        done = batch.run(work / "batch")
+        done = batch.run(work / "batch", options.jobs or batch.JOBS, options.repeat)
         _tell(results, done, list(batch.lines_of(done)))
     if "spool" in only:
-        for measured in spool.run(work / "spool"):
+        for measured in spool.run(work / "spool", options.jobs or spool.JOBS):
             _tell(results, measured, spool.lines_of(measured))
     if "viewer" in only or not only:
         seen = viewer.run()

@@ -34,17 +34,22 @@ LAYOUTS = (
 )
 
 
-def run(folder: Path) -> dict[str, Any]:
-    """Time eight jobs on each layout of workers, and a hundred empty tasks."""
+def run(folder: Path, jobs: int = JOBS, rounds: int = 1) -> dict[str, Any]:
+    """Time the jobs on each layout of workers, the layouts in turns, and a hundred empty tasks."""
     folder.mkdir(parents=True)
     options = ["--seconds", "2", "--size", "320x240", "--cameras", "torso,left_palm"]
     if main(["synth", str(folder / "capture"), *options]) != 0:
         return {"row": "batch", "exit": 1}
-    for index in range(JOBS):
+    for index in range(jobs):
         text = JOB.format(name=f"job{index}", start=f"{index * 1e-6:.6f}")
         (folder / f"job{index}.yaml").write_text(text)
-    seconds = {name: _batch(folder, workers, threads) for name, workers, threads in LAYOUTS}
-    return {"row": "batch", "exit": 0, "jobs": JOBS, "seconds": seconds, **_overhead(folder / "overhead")}
+    tried = [
+        {name: _batch(folder, f"out-{turn}", jobs, workers, threads) for name, workers, threads in LAYOUTS}
+        for turn in range(rounds)
+    ]
+    seconds = {name: min(times[name] for times in tried) for name, *_ in LAYOUTS}
+    sizes = {"jobs": jobs, "rounds": rounds}
+    return {"row": "batch", "exit": 0, **sizes, "seconds": seconds, **_overhead(folder / "overhead")}
 
 
 def lines_of(result: dict[str, Any]) -> Iterator[str]:
@@ -53,7 +58,8 @@ def lines_of(result: dict[str, Any]) -> Iterator[str]:
         yield "batch: the capture could not be rendered"
         return
     both, one, threads = result["seconds"].values()
-    yield f"batch of {result['jobs']} short jobs"
+    rounds = f", the best of {result['rounds']} rounds" if result["rounds"] > 1 else ""
+    yield f"batch of {result['jobs']} short jobs{rounds}"
     for name, value in result["seconds"].items():
         yield f"  {name}: {value:.1f} s"
     yield f"  two workers / one worker: {one / both:.2f} times as fast (aim 1.8)"
@@ -65,17 +71,21 @@ def lines_of(result: dict[str, Any]) -> Iterator[str]:
     )
 
 
-def _batch(folder: Path, workers: int, threads: int) -> float:
+def _batch(folder: Path, name: str, jobs: int, workers: int, threads: int) -> float:
+    from distributed import Client
+
     site = Site(folder)
     try:
         address = site.scheduler()
         for index in range(workers):
             site.worker(f"worker{index}", "--nthreads", "1")
-        out = folder / f"out-{workers}-{threads}"
-        jobs = [f"job{index}.yaml" for index in range(JOBS)]
+        with Client(address, set_as_default=False) as client:
+            client.wait_for_workers(workers, timeout=60)
+        out = folder / f"{name}-{workers}-{threads}"
+        files = [f"job{index}.yaml" for index in range(jobs)]
         begun = time.perf_counter()
         code, _, err = site.run(
-            *jobs, "--executor", address, "--out", str(out), "--threads", str(threads), command=REAL
+            *files, "--executor", address, "--out", str(out), "--threads", str(threads), command=REAL
         )
         assert code == 0, err
         return time.perf_counter() - begun
