@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -58,12 +58,14 @@ def explain_job(job: Job, *, out_dir: Path, settings: Settings) -> list[Step]:
     """
     looking = replace(settings, compute=False)
     missing: tuple[Task, ...] = ()
+    made = Made()
     with Flow(job, looking, logs=out_dir / "logs") as flow:
         try:
-            for _ in run_stages(job, flow, Made()):
+            for _ in run_stages(job, flow, made):
                 pass
         except NotStored as error:
-            missing = error.tasks
+            beside = [task for task in _preview_missing(made) if task not in error.tasks]
+            missing = (*error.tasks, *beside)
         records = tuple(flow.records)
     steps = [
         Step(stage=label_of(item.stage, item.camera, item.round), stored=True)
@@ -76,6 +78,14 @@ def explain_job(job: Job, *, out_dir: Path, settings: Settings) -> list[Step]:
         later = [name for name in ORDER if _place(name) > after and _follows(name, first, job)]
         steps += [Step(stage=name, stored=False, reason=f"after {first}") for name in later]
     return steps
+
+
+def _preview_missing(made: Made) -> Sequence[Task]:
+    """The preview's task where it would run: it is looked up beside the export and the report."""
+    if made.filming is None:
+        return ()
+    failure = made.filming.exception()
+    return failure.tasks if isinstance(failure, NotStored) else ()
 
 
 def _follows(stage: str, first: str, job: Job) -> bool:

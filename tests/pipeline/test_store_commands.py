@@ -126,6 +126,14 @@ def test_why_names_the_change_and_what_follows(
     assert done.executed() == [], "asking computes nothing"
 
 
+def test_why_tells_of_the_preview_that_is_made_beside_the_export(done: Bench) -> None:
+    shutil.rmtree(done.folder / "store" / "artefacts" / "preview")
+    assert steps(done)["preview"] == "not computed before"
+    found = steps(done, export={"units": "m"})
+    assert [name for name, why in found.items() if why] == ["export", "preview", "report"]
+    assert not (done.folder / "store" / "artefacts" / "preview").exists(), "asking computes nothing"
+
+
 def test_why_of_a_job_never_run_and_of_a_damaged_artefact(bench: Bench) -> None:
     assert steps(bench) == {
         "check": "not computed before",
