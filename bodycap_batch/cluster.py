@@ -30,9 +30,9 @@ QUEUES = ("slurm", "pbs")
 MEMORY = "memory"
 """Name of the resource (MB) by which a worker says what tasks may use together."""
 _POLL_S = 0.2
-_CONNECT_S = 30.0
 _ASK_AGAIN_S = 2.0
 """Workers come and go; asking the scheduler for each task takes longer than handing it over."""
+_LEFT = ("closing", "closed")
 _ENDING = ("closing", "closed", "failed")
 _ALLOWED_FAILURES = 1
 """A task whose worker dies is done once more elsewhere; one that kills two workers is given up."""
@@ -57,7 +57,8 @@ class Cluster:
         self._lock = threading.Lock()
         # Not the lock above: Dask's own thread waits for that one in `_hear`, and has to answer meanwhile.
         self._asking = threading.Lock()
-        self._largest, self._asked = 0.0, -math.inf
+        self._largest: float | None = None
+        self._asked = -math.inf
         self._client.subscribe_topic(self._topic, self._hear)
         self._client.run_on_scheduler(_allow_failures, _ALLOWED_FAILURES)
 
@@ -92,7 +93,7 @@ class Cluster:
                 key=key,
                 pure=False,
                 priority=task.priority,
-                resources=self._resources(task),
+                resources=self._resources(task, making),
             )
             _raise_error_in(self._wait(future, task, making))
         finally:
@@ -102,15 +103,31 @@ class Cluster:
     def close(self, logs: Path) -> None:
         """A job has ended; the workers' children wait for those of other jobs."""
 
-    def _resources(self, task: Task) -> dict[str, float] | None:
-        """What a task takes of a worker; one that wants more than any worker has takes all of one."""
+    def _resources(self, task: Task, making: Making) -> dict[str, float] | None:
+        """What a task takes of a worker; one that wants more than any worker has takes all of one.
+
+        Waits for the first worker: what is handed over before knows no limits, and large tasks would meet.
+        """
+        while (largest := self._largest_worker(task)) is None:
+            if making.cancelled():
+                raise Cancelled(STOPPED, hint="run it again to go on")
+            making.progress(0, 0, "waiting for a worker")
+            time.sleep(_POLL_S)
+        return {MEMORY: min(float(task.memory_mb), largest)} if largest else None
+
+    def _largest_worker(self, task: Task) -> float | None:
+        """Memory (MB) that the largest worker declares, 0 where none does; None while there is no worker."""
         with self._asking:
-            if time.monotonic() - self._asked > _ASK_AGAIN_S:
-                self._largest = max(
-                    (found.get(MEMORY, 0.0) for found in self.workers().values()), default=0.0
-                )
+            if self._largest is None or time.monotonic() - self._asked > _ASK_AGAIN_S:
+                if self._client.status in _LEFT:
+                    raise _lost(task)
+                try:
+                    known = self.workers()
+                except OSError as error:
+                    raise _lost(task) from error
+                self._largest = max((found.get(MEMORY, 0.0) for found in known.values()), default=None)
                 self._asked = time.monotonic()
-            return {MEMORY: min(float(task.memory_mb), self._largest)} if self._largest else None
+            return self._largest
 
     def _wait(self, future: Any, task: Task, making: Making) -> dict[str, Any]:
         ended = threading.Event()
@@ -119,7 +136,7 @@ class Cluster:
             if making.cancelled():
                 future.cancel()
                 raise Cancelled(STOPPED, hint="run it again to go on")
-            if self._client.status in ("closing", "closed"):
+            if self._client.status in _LEFT:
                 raise _lost(task)
         if future.status == "finished":
             return dict(future.result())
@@ -181,8 +198,8 @@ def _connect(address: str) -> Client:
     except ImportError as error:
         raise _not_installed() from error
     try:
-        # TLS certificates come from Dask's configuration.
-        return Client(address, timeout=_CONNECT_S, set_as_default=False)
+        # TLS certificates come from Dask's configuration, as does the time to wait for an answer (30 s).
+        return Client(address, set_as_default=False)
     except TypeError as error:  # Dask has no SSL context to give
         raise JobError(
             f"no certificates to talk to {address} with",

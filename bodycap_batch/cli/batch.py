@@ -23,6 +23,7 @@ from bodycap_batch.errors import Cancelled, JobError
 from bodycap_batch.progress import Event
 
 if TYPE_CHECKING:
+    from bodycap_batch.cluster import Cluster
     from bodycap_batch.config.models import Job
     from bodycap_batch.pipeline import BatchJob, Outcome, Settings
     from bodycap_batch.runner import Executor
@@ -120,12 +121,10 @@ def _executor(kind: str, threads: int, workers: int, memory_mb: int) -> Iterator
             start_queue(kind, workers, threads, memory_mb) as queue,
             Cluster(queue.scheduler_address) as cluster,
         ):
-            _quieten_dask()
-            yield cluster, _JOBS_ON_A_CLUSTER
+            yield _ready(cluster), _JOBS_ON_A_CLUSTER
     elif kind.startswith(SCHEMES):
         with Cluster(kind) as cluster:
-            _quieten_dask()
-            yield cluster, _JOBS_ON_A_CLUSTER
+            yield _ready(cluster), _JOBS_ON_A_CLUSTER
     else:
         raise JobError(
             f"there is no executor {kind!r}",
@@ -134,10 +133,16 @@ def _executor(kind: str, threads: int, workers: int, memory_mb: int) -> Iterator
         )
 
 
-def _quieten_dask() -> None:
-    """What becomes of the jobs is told; Dask's own view of a lost connection is a page of traceback."""
+def _ready(cluster: Cluster) -> Cluster:
+    """Say so where nobody is there to work yet.
+
+    What becomes of the jobs is told; Dask's own view of a lost connection is a page of traceback.
+    """
+    if not cluster.workers():
+        sys.stderr.write("no worker is there yet; the batch begins when one is\n")
     for name in ("distributed", "distributed.client", "distributed.core"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # Dask sets their levels when it is loaded
+    return cluster
 
 
 def _results_folder(job: Job, folder: Path) -> Path:

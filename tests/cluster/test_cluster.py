@@ -127,13 +127,21 @@ def test_a_stopped_batch_ends_its_task_on_the_worker(site: Site) -> None:
     assert site.run(*NAMES, "--executor", address)[0] == 0, "the worker takes further tasks"
 
 
-def test_two_large_tasks_do_not_meet_on_a_small_worker(site: Site) -> None:
+def test_two_large_tasks_do_not_meet_on_a_small_worker_though_it_comes_late(site: Site) -> None:
     address = site.scheduler()
-    site.worker("one", "--nthreads", "2", "--resources", "memory=2000")  # a map declares 1,500 MB
     site.order(hang="map")
-    process = site.start("monday", "tuesday", "--executor", address)
+    process = site.start("monday", "tuesday", "--executor", address, "--json")
+    assert process.stderr is not None
+    assert process.stdout is not None
+    assert "no worker is there yet" in process.stderr.readline()
+    site.worker("one", "--nthreads", "2", "--resources", "memory=2000")  # a map declares 1,500 MB
+    begun = set()
+    while len(begun) < 2:
+        event = json.loads(process.stdout.readline())
+        if (event.get("stage"), event["kind"]) == ("map", "started"):  # handed over; it may still wait
+            begun.add(event["job"])
     child = site.hanging()
-    time.sleep(3.0)
+    time.sleep(3.0)  # the other job's map would start in a tenth of that
     assert site.hanging() == child, "the other job's map waits"
     process.send_signal(signal.SIGTERM)
     process.communicate(timeout=60)

@@ -1,4 +1,4 @@
-"""A message of a worker that arrives while the scheduler is asked for its workers."""
+"""How the scheduler is asked for its workers: while messages arrive, and before any worker is there."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from bodycap_batch import cluster
+from bodycap_batch.errors import BodycapError, Cancelled
 from bodycap_batch.runner import Making, Task
 from bodycap_batch.store import ArtefactKey, Store
 
@@ -35,25 +36,57 @@ class Client:
         loop.start()
         loop.join(5.0)
         self.answered.append(not loop.is_alive())
-        return {"workers": {}}
+        return {"workers": {"one": {"resources": {"memory": 2000.0}}} if len(self.answered) > 1 else {}}
 
-    def submit(self, *_: object, **__: object) -> None:
-        raise RuntimeError("far enough")
+    def submit(self, *_: object, resources: object, **__: object) -> None:
+        raise RuntimeError(f"handed over with {resources}")
 
 
-def test_a_message_does_not_wait_for_the_answer_that_waits_for_it(
+def make(client: Client, folder: Path, told: list[str], *, cancelled: bool = False) -> None:
+    """Hand a map, which declares 1,500 MB, over."""
+    key = ArtefactKey(stage="map", algorithm="1", options={}, inputs={}, libraries={})
+    making = Making(
+        store=Store(folder),
+        logs=folder,
+        progress=lambda done, total, what: told.append(what),
+        cancelled=lambda: cancelled,
+        may_commit=lambda: True,
+    )
+    cluster.Cluster("tcp://nowhere:1").make(Task(key=key, memory_mb=1500), making)
+
+
+def test_a_task_waits_for_the_first_worker_so_that_its_limits_are_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And a message of another worker does not wait for the answer that waits for it."""
+    client, told = Client(), list[str]()
+    monkeypatch.setattr(cluster, "_connect", lambda _: client)
+    with pytest.raises(RuntimeError, match=r"handed over with {'memory': 1500.0}"):
+        make(client, tmp_path, told)
+    assert client.answered == [True, True]
+    assert told == ["waiting for a worker"]
+
+
+def test_waiting_for_a_worker_can_be_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    client = Client()
+    monkeypatch.setattr(cluster, "_connect", lambda _: client)
+    with pytest.raises(Cancelled):
+        make(client, tmp_path, [], cancelled=True)
+
+
+@pytest.mark.parametrize("how", ["closed", "no answer"])
+def test_a_scheduler_that_is_lost_while_it_is_asked_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     client = Client()
     monkeypatch.setattr(cluster, "_connect", lambda _: client)
-    task = Task(key=ArtefactKey(stage="map", algorithm="1", options={}, inputs={}, libraries={}))
-    making = Making(
-        store=Store(tmp_path),
-        logs=tmp_path,
-        progress=lambda *_: None,
-        cancelled=lambda: False,
-        may_commit=lambda: True,
-    )
-    with pytest.raises(RuntimeError, match="far enough"):
-        cluster.Cluster("tcp://nowhere:1").make(task, making)
-    assert client.answered == [True]
+
+    def fail() -> None:
+        raise OSError("the connection is closed")
+
+    if how == "closed":
+        client.status = "closed"
+    else:
+        monkeypatch.setattr(client, "scheduler_info", fail)
+    with pytest.raises(BodycapError, match="the scheduler was lost"):
+        make(client, tmp_path, [])
