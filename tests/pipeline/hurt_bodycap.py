@@ -2,13 +2,15 @@
 
 Orders come in a JSON file named by the environment:
 
-- ``{"kill": "before" | "after", "done": file}``: at the first renaming of a file or folder that no earlier
-  run was killed at, the command and all its children get SIGKILL, just before or just after it happens.
+- ``{"kill": "before" | "after", "at": text, "done": file}``: at the first renaming of a file or folder that
+  no earlier run was killed at, the command and all its children get SIGKILL, just before or just after it
+  happens. Only renamings whose target holds the text count.
 - ``{"fill": stage, "disk": folder}``: the disk is filled to the last byte when this stage begins.
 """
 
 from __future__ import annotations
 
+import fcntl
 import functools
 import json
 import os
@@ -47,18 +49,22 @@ def kill_everything() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def deadly(rename: Callable[..., None], when: str, done: Path) -> Callable[..., None]:
+def deadly(rename: Callable[..., None], orders: Mapping[str, str]) -> Callable[..., None]:
     def wrapped(source: Any, target: Any, **values: Any) -> None:
         place = place_of(Path(target))
-        fresh = place not in done.read_text().splitlines()
-        if fresh:
-            with done.open("a") as stream:
-                stream.write(place + "\n")
-        if fresh and when == "before":
-            kill_everything()
-        rename(source, target, **values)
-        if fresh and when == "after":
-            kill_everything()
+        if orders["at"] not in place:
+            return rename(source, target, **values)
+        with Path(orders["done"]).open("a+") as done:
+            # Children work side by side: a second one that gets here waits for its end.
+            fcntl.flock(done, fcntl.LOCK_EX)
+            done.seek(0)
+            if place not in done.read().splitlines():
+                done.write(place + "\n")
+                done.flush()
+                if orders["kill"] == "after":
+                    rename(source, target, **values)
+                kill_everything()
+        return rename(source, target, **values)
 
     return wrapped
 
@@ -91,9 +97,8 @@ def hurt() -> dict[str, TaskFunction]:
     table = {name: stage.function for name, stage in STAGES.items()}
     (Path(os.environ[PIDS]) / str(os.getpid())).touch()
     if "kill" in orders:
-        done = Path(orders["done"])
-        os.replace = deadly(os.replace, orders["kill"], done)
-        os.rename = deadly(os.rename, orders["kill"], done)
+        os.replace = deadly(os.replace, orders)
+        os.rename = deadly(os.rename, orders)
     if "fill" in orders:
         table[orders["fill"]] = filling(orders["fill"], Path(orders["disk"]))
     return table

@@ -140,11 +140,9 @@ def same(mine: Place, reference: Place) -> None:
     assert mine.leftovers() == []
 
 
-@pytest.mark.parametrize("when", ["before", "after"])
-def test_killed_at_every_renaming_it_ends_with_the_same_bytes(
-    place: Place, reference: Place, when: str
-) -> None:
-    place.order(kill=when, done=str(place.folder / "done.txt"))
+def killed_at(place: Place, when: str, what: str = "") -> list[str]:
+    """Run until it is killed at no renaming any more; returns those it was killed at, one a run."""
+    place.order(kill=when, at=what, done=str(place.folder / "done.txt"))
     kills = 0
     while (end := place.run())[0] == -signal.SIGKILL:
         kills += 1
@@ -152,11 +150,22 @@ def test_killed_at_every_renaming_it_ends_with_the_same_bytes(
     assert end[0] == 0, end[2]
     points = (place.folder / "done.txt").read_text().splitlines()
     assert len(points) == kills
+    return points
+
+
+def test_killed_before_every_renaming_it_ends_with_the_same_bytes(place: Place, reference: Place) -> None:
+    points = killed_at(place, "before")
     committed = [line for line in points if "/artefacts/" in line]
     assert len(committed) == len(place.manifests()) >= 8
     assert sum(line.endswith("/files/manifest.json") for line in points) >= len(STAGES)
     published = {Path(line).relative_to(place.out).as_posix() for line in points if ".store" not in line}
     assert published >= {"motion.bvh", "frames.csv", "metrics.json", "run.json", "trajectories/torso.tum"}
+    same(place, reference)
+
+
+def test_killed_after_every_commit_it_ends_with_the_same_bytes(place: Place, reference: Place) -> None:
+    """After a renaming that is no commit nothing is different until just before the next one."""
+    assert len(killed_at(place, "after", "/artefacts/")) == len(place.manifests()) >= 8
     same(place, reference)
 
 
