@@ -30,21 +30,28 @@ def status(
     spool: SpoolArgument = Path("jobs"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the rows as JSON.")] = False,
 ) -> None:
-    """List the jobs of a watched folder: state, stage, progress, age, cause of failure.
+    """List the jobs of a watched folder: state, stage, progress, age, cause of failure; and who watches it.
 
     \b
     Examples:
       bodycap status
       bodycap status /mnt/nas/jobs --json
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.watch import rows_of
+    from bodycap_batch.store import disk_errors
+    from bodycap_batch.watch import rows_of, watchers_of
 
-    rows = rows_of(_spool(spool))
+    place = _spool(spool)
+    with disk_errors(place.root):
+        rows, watchers = rows_of(place), watchers_of(place)
     if as_json:
         _print(json.dumps([row.to_dict() for row in rows], indent=1))
         return
     for line in _table(rows):
         _print(line)
+    for watching in watchers:
+        _print(str(watching))
+    if not watchers and any(row.state in ("waiting", "interrupted", "stopped") for row in rows):
+        _print(f"no watcher is at work here: `bodycap watch {place.inbox}` starts one")
 
 
 @app.command()

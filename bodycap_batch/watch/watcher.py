@@ -15,6 +15,7 @@ from bodycap_batch.watch.claim import Claim, Onlooker, take_over
 from bodycap_batch.watch.claiming import claim_drop, discard_empty, finish_retries, settle_claim
 from bodycap_batch.watch.drops import NO_JOB, Drop, Look, Settling, drops_in, strays_in
 from bodycap_batch.watch.options import WatchOptions
+from bodycap_batch.watch.presence import Presence
 from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir, Spool, visible
 from bodycap_batch.watch.trouble import Trouble
 from bodycap_batch.watch.work import Outcome, Worker
@@ -129,9 +130,13 @@ class Watcher:
             self._tell(f"{path.name}: left in the inbox: {NO_JOB}")
 
     def _beat(self) -> None:
+        presence = Presence(self.spool)
+        presence.tell(self.trouble.text)
         while not self._stop.wait(self._options.beat_s):
+            presence.tell(self.trouble.text)
             for claim in list(self._running.values()):
                 claim.beat()
+        presence.end()
 
     def _collect(self) -> None:
         """Tell how the jobs ended that have."""

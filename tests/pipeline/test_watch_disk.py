@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,9 +14,11 @@ from typing import Any
 
 import pytest
 
+from bodycap_batch.cli import main
 from bodycap_batch.errors import DiskAway, StoreError
 from bodycap_batch.store import Store
-from bodycap_batch.watch import Watcher, claiming, rows_of
+from bodycap_batch.watch import Watcher, claiming, rows_of, watchers_of
+from bodycap_batch.watch.presence import Presence
 from bodycap_batch.watch.spool import JobDir
 from bodycap_batch.watch.status import read_status
 from bodycap_batch.watch.trouble import Trouble
@@ -222,3 +225,42 @@ def test_a_status_that_somebody_garbled_harms_nothing(bench: SpoolBench, text: s
     assert json.loads(bench.job("walk").status.read_text())["attempts"] in (1, 2)
     assert read_status(bench.job("walk"))["state"] == "done"
     assert Store(bench.spool.root / ".store").root.is_dir()
+
+
+def test_who_watches_and_what_holds_it_up_is_told_with_the_jobs(
+    bench: SpoolBench, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def told() -> list[str]:
+        capfd.readouterr()
+        assert main(["status"]) == 0
+        return [line for line in capfd.readouterr().out.splitlines() if "watche" in line]
+
+    bench.drop("walk", ready=False)
+    assert told() == [f"no watcher is at work here: `bodycap watch {bench.spool.inbox}` starts one"]
+    with running(bench.watcher(once=False, settle_s=1000.0, stale_s=1.0)):
+        wait_for(lambda: any(f"(process {os.getpid()}) since" in line for line in told()))
+        assert len(told()) == 1
+        away = bench.spool.inbox.rename(bench.folder / "unmounted")
+        wait_for(lambda: any("held up" in line and "the inbox is gone" in line for line in told()))
+        away.rename(bench.spool.inbox)
+        wait_for(lambda: not any("held up" in line for line in told()))
+    assert told() == [f"no watcher is at work here: `bodycap watch {bench.spool.inbox}` starts one"]
+    assert list(bench.spool.running.iterdir()) == []
+
+
+def test_a_killed_watcher_is_not_taken_for_one_at_work(bench: SpoolBench) -> None:
+    presence = Presence(bench.spool)
+    presence.tell("")
+    (mine,) = bench.spool.running.glob(".watcher-*")
+    machine, pid, start, *rest = mine.name.removeprefix(".watcher-").split("-")
+    text = mine.read_text()
+    for name in (f"{machine}-{pid}-{int(start) - 1}", f"elsewhere-{pid}-{start}", f"yesterday-{pid}-{start}"):
+        mine.with_name("-".join((f".watcher-{name}", *rest))).write_text(text)
+    old = time.time() - 90_000
+    (yesterday,) = bench.spool.running.glob(".watcher-yesterday*")
+    os.utime(yesterday, (old, old))
+    (bench.spool.running / ".watcher-garbled.json").write_text("{")
+    assert [bool(found.seen) for found in watchers_of(bench.spool)] == [False, True]
+    presence.end()
+    assert [bool(found.seen) for found in watchers_of(bench.spool)] == [True]
+    assert not yesterday.exists()
