@@ -69,7 +69,8 @@ class PairChooser:
                     )
                     for ref in self._images
                 ]
-                self._alike = dict(zip(self._new, likeness(images, self._new), strict=True))
+                alike = likeness(images, self._new, [ref.camera for ref in self._images])
+                self._alike = dict(zip(self._new, alike, strict=True))
         self._times = np.array([common_ns[ref.camera][ref.frame] for ref in self._images], dtype=np.int64)
         self._cameras = np.array([ref.camera for ref in self._images])
         self._row = {ref: row for row, ref in enumerate(self._images)}

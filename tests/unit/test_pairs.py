@@ -10,7 +10,7 @@ import pytest
 
 from bodycap_batch.config import MapOptions
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef
-from bodycap_batch.mapping.likeness import CHANCE, largest, likeness
+from bodycap_batch.mapping.likeness import CHANCE, _clear, largest, likeness
 from bodycap_batch.mapping.pairs import PairChooser
 
 
@@ -33,12 +33,40 @@ def test_two_views_of_a_place_are_alike_and_others_not() -> None:
         noisy = np.clip(descriptors + rng.normal(0, 4, descriptors.shape), 0, 255).astype(np.uint8)
         images += [largest(descriptors, keypoints), largest(noisy, keypoints)]
     rows = list(range(0, 80, 7))
-    alike = likeness(images, rows)
+    alike = likeness(images, rows, ["a"] * 80)
     partner = np.array(rows) ^ 1
     assert (alike[np.arange(len(rows)), partner] >= 50).all()
     alike[np.arange(len(rows)), partner] = 0
     assert (alike < CHANCE).mean() > 0.99
-    assert not likeness([largest(_rooted(rng, 0), _keypoints(rng, 0))] * 2, [0]).any()
+    assert not likeness([largest(_rooted(rng, 0), _keypoints(rng, 0))] * 2, [0], ["a", "a"]).any()
+
+
+def test_what_could_be_alike_is_found_without_looking_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(2)
+    monkeypatch.setattr("bodycap_batch.mapping.likeness._SHORTLIST", 12)
+    monkeypatch.setattr("bodycap_batch.mapping.likeness._SHORTLIST_OF_EACH", 2)
+    looked: list[int] = []
+
+    def counted(alike: np.ndarray) -> np.ndarray:
+        looked.append(alike.shape[1])
+        return _clear(alike)
+
+    monkeypatch.setattr("bodycap_batch.mapping.likeness._clear", counted)
+    images, cameras = [], []
+    for number in range(120):
+        descriptors, keypoints = _rooted(rng, 80), _keypoints(rng, 80)
+        # Half of what an image shows is seen from somewhere else too, by another camera.
+        other = np.vstack([descriptors[:40], _rooted(rng, 40)])
+        noisy = np.clip(other + rng.normal(0, 4, other.shape), 0, 255).astype(np.uint8)
+        images += [largest(descriptors, keypoints), largest(noisy, keypoints)]
+        cameras += ["a", "b" if number else "c"]
+    rows = list(range(240))
+    alike = likeness(images, rows, cameras)
+    partner = np.array(rows) ^ 1
+    assert (alike[rows, partner] >= 20).mean() > 0.99
+    assert (alike == alike.T).all()
+    # 12 of all and 2 of each of three cameras.
+    assert sum(looked) <= 18 * len(rows)
 
 
 def _database(folder: Path, keyframes: int) -> dict[str, np.ndarray]:
