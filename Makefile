@@ -87,7 +87,8 @@ clean: ## delete the environment, caches and results
 	find bodycap_batch tests examples -name __pycache__ -prune -exec rm -rf {} +
 
 # Stamps: a re-run with nothing changed does nothing. The project itself cannot be part of a hash-checked
-# install, so it follows without dependencies, built by the backend the lock brought.
+# install, so it follows without dependencies, built by the backend the lock brought. It is compiled like what
+# pip installs: where Python is told to write no bytecode (containers), each stage's process would compile it anew.
 $(VENV)/.created: .ci/system-packages
 	.ci/system-packages
 	"$$(.ci/system-packages --python)" -m venv $(VENV)
@@ -99,6 +100,7 @@ $(VENV)/.run: $(VENV)/.created requirements.lock
 
 $(VENV)/.project: $(VENV)/.run pyproject.toml
 	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	$(BIN)/python -m compileall -q bodycap_batch
 	touch $@
 
 $(VENV)/.extras: $(VENV)/.project requirements-extras.lock

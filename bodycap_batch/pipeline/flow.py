@@ -101,9 +101,9 @@ class Flow:
                 key=key_of("keyframes", options, {"camera": self._digests[camera.name]}),
                 arguments={"capture": one_camera(capture, camera)},
                 camera=camera.name,
-                threads=self._share,
+                threads=threads,
             )
-            for camera in capture.cameras
+            for camera, threads in zip(capture.cameras, self._shares(), strict=True)
         )
 
     def map(self, keyframes: ByCamera) -> Artefact:
@@ -135,8 +135,8 @@ class Flow:
     ) -> ByCamera:
         """Every frame of every camera against the map."""
         return self._all(
-            self._registration(camera, scene, keyframes, previous, map_round)
-            for camera in self._job.capture.cameras
+            replace(self._registration(camera, scene, keyframes, previous, map_round), threads=threads)
+            for camera, threads in zip(self._job.capture.cameras, self._shares(), strict=True)
         )
 
     def grow(
@@ -259,12 +259,14 @@ class Flow:
         """Let go of the artefacts that earlier runs with other options referred to."""
         self._references.keep_only(record.artefact for record in self.records)
 
-    @property
-    def _share(self) -> int:
-        """Threads for each of the tasks that run side by side, one per camera."""
+    def _shares(self) -> list[int]:
+        """Threads of each of the tasks that run side by side, one per camera; the last ones share all."""
+        cameras = len(self._job.capture.cameras)
         if self._settings.executor is not None:
-            return self._settings.threads
-        return max(1, self._settings.threads // len(self._job.capture.cameras))
+            return [self._settings.threads] * cameras
+        last = cameras % self._side_by_side or self._side_by_side
+        first = [max(1, self._settings.threads // self._side_by_side)] * (cameras - last)
+        return first + [max(1, self._settings.threads // last)] * last
 
     @property
     def _side_by_side(self) -> int:
@@ -309,7 +311,7 @@ class Flow:
         # How often the map may grow decides which rounds are run, not what one of them gives.
         options = self._job.registration.model_dump(mode="json", exclude={"rounds"})
         key = key_of("registration", options, inputs)
-        return Task(key=key, arguments=arguments, camera=name, round=map_round, threads=self._share)
+        return Task(key=key, arguments=arguments, camera=name, round=map_round)
 
     def _extend(self, scene: Artefact, wanted: Mapping[str, list[int]], map_round: int) -> Artefact:
         inputs = {"cameras": self._digests, "map": scene.digest, "extra": wanted}

@@ -53,7 +53,7 @@ def test_browsers_can_play_it_from_its_first_bytes(filmed: Path, estimated: Esti
         assert stream.codec_context.name == "h264"
         assert stream.codec_context.pix_fmt == "yuv420p"
         assert (stream.codec_context.width, stream.codec_context.height) == (1280, 720)
-        assert stream.frames == len(estimated.capture.cameras[0].times_ns)
+        assert stream.frames == -(-len(estimated.capture.cameras[0].times_ns) // 2), "15 of 30 a second"
     data = filmed.read_bytes()
     assert data.index(b"moov") < data.index(b"mdat"), "the index comes first"
 
@@ -72,13 +72,14 @@ def test_a_lost_frame_is_marked_in_red_and_says_why(filmed: Path, estimated: Est
     status = estimated.registrations[palm].trajectory.status
     lost = [index for index in DARK if not status[index].localised]
     assert len(lost) >= 4, "frames without light"
+    lost = [index // 2 for index in lost if index % 2 == 0]  # every second frame is shown
 
     def reddish(index: int) -> int:
         line = shown[index][bar.y : bar.y + bar.height, bar.x + bar.width // 3 : bar.x + bar.width]
         return int(((line[..., 0] > 120) & (line[..., 0] > line[..., 1] + 50)).sum())
 
     assert min(reddish(index) for index in lost) > 50
-    assert reddish(10) < 10, "a found frame has nothing red"
+    assert reddish(5) < 10, "a found frame has nothing red"
 
 
 def test_the_body_moves_in_its_room(estimated: Estimated, tmp_path: Path) -> None:
@@ -90,8 +91,8 @@ def test_the_body_moves_in_its_room(estimated: Estimated, tmp_path: Path) -> Non
     world = tuple(dataclasses.replace(view, frame="world") for view in inputs.views)
     inputs = dataclasses.replace(inputs, views=world, frame="world")
     shown = pictures(render_preview(inputs, context(tmp_path)))
-    assert len(shown) == 20, "as long as the motion"
-    first, last = (shown[index][:, :640].astype(int) for index in (0, 19))
+    assert len(shown) == 10, "as long as the motion, every second tick"
+    first, last = (shown[index][:, :640].astype(int) for index in (0, 9))
     orange = (first[..., 0] > 180) & (np.abs(first[..., 1] - 150) < 50) & (first[..., 2] < 90)
     blue = (first[..., 2] > 180) & (first[..., 0] < 140)
     assert orange.sum() > 200, "the right side"
