@@ -1,4 +1,8 @@
-"""`bodycap batch --executor tcp://…`: a real scheduler and real workers, each a process on loopback."""
+"""`bodycap batch --executor tcp://…`: a real scheduler and real workers, each a process on loopback.
+
+`make test-cluster` runs all of them, `make test-slow` (and so CI) those marked slow: a worker killed, a
+scheduler lost, a job that crashes, two tasks too large for one worker.
+"""
 
 from __future__ import annotations
 
@@ -41,6 +45,7 @@ def test_two_workers_give_the_same_as_this_machine(site: Site) -> None:
     assert (code, out.count("nothing to do")) == (0, 3)
 
 
+@pytest.mark.slow
 def test_a_killed_workers_task_is_done_elsewhere_with_the_same_bytes(site: Site) -> None:
     assert site.run(*NAMES, "--out", "here")[0] == 0
     address = site.scheduler()
@@ -77,6 +82,7 @@ def test_a_task_that_kills_two_workers_is_given_up_and_the_other_jobs_are_done(s
     assert out.splitlines()[-1] == "2 of 3 jobs done"
 
 
+@pytest.mark.slow
 def test_a_crash_and_a_refusal_end_their_jobs_only(site: Site) -> None:
     address = site.scheduler()
     site.worker("one")
@@ -92,6 +98,7 @@ def test_a_crash_and_a_refusal_end_their_jobs_only(site: Site) -> None:
     assert "hint: film more" in err
 
 
+@pytest.mark.slow
 def test_after_the_scheduler_is_lost_the_batch_goes_on_with_another(site: Site) -> None:
     address = site.scheduler()
     site.worker("one")
@@ -127,6 +134,7 @@ def test_a_stopped_batch_ends_its_task_on_the_worker(site: Site) -> None:
     assert site.run(*NAMES, "--executor", address)[0] == 0, "the worker takes further tasks"
 
 
+@pytest.mark.slow
 def test_two_large_tasks_do_not_meet_on_a_small_worker_though_it_comes_late(site: Site) -> None:
     address = site.scheduler()
     site.order(hang="map")

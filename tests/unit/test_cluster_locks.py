@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -90,3 +91,18 @@ def test_a_scheduler_that_is_lost_while_it_is_asked_is_told(
         monkeypatch.setattr(client, "scheduler_info", fail)
     with pytest.raises(BodycapError, match="the scheduler was lost"):
         make(client, tmp_path, [])
+
+
+@pytest.mark.parametrize(("threads", "tasks_at_once", "want"), [(6, 4, 2), (1, 4, 1), (6, 16, 1), (6, 1, 6)])
+def test_the_tasks_of_a_worker_share_its_cores(
+    monkeypatch: pytest.MonkeyPatch, threads: int, tasks_at_once: int, want: int
+) -> None:
+    worker = SimpleNamespace(
+        get_current_task=lambda: "key", state=SimpleNamespace(nthreads=tasks_at_once, tasks={})
+    )
+    monkeypatch.setattr("distributed.get_worker", lambda: worker)
+    monkeypatch.setattr(cluster.os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(cluster, "perform", lambda order, *_: order["task"])
+    answer = cluster._on_worker({"task": {"threads": threads}}, "topic")
+    assert answer["threads"] == want
+    assert answer["threads"] * tasks_at_once <= max(8, tasks_at_once)
