@@ -110,7 +110,11 @@ def give_back(spool: Spool, place: JobDir, before: Callable[[Path], None] | None
     if is_there(dropped):
         name = str(read_status(place, strict=True).get("dropped") or place.name)
         suffix = dropped.suffix if dropped != place.input else ""
-        target = move(dropped, spool.inbox, name, before, suffix=suffix)
+        try:
+            target = move(dropped, spool.inbox, name, before, suffix=suffix)
+        except FileNotFoundError:
+            if is_there(dropped):
+                raise
     shutil.rmtree(place.path, ignore_errors=True)
     return target
 

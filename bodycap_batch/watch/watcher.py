@@ -60,6 +60,7 @@ class Watcher:
         self._refused: dict[str, tuple[str, float]] = {}
         self._unreadable: dict[Path, str] = {}
         self._complete: collections.deque[tuple[Drop, Look]] = collections.deque()
+        self._retry_told = False
         self._waiting = False
         self._left = False
         self._look_at = 0.0
@@ -87,7 +88,6 @@ class Watcher:
         ):
             heart.start()
             try:
-                self._finish_retries()
                 while not self._stop.is_set():
                     self._woken.clear()
                     self._collect()
@@ -120,7 +120,9 @@ class Watcher:
         try:
             finish_retries(self.spool)
         except (OSError, StoreError) as error:
-            self._tell(f"a retry that was cut short is still in {self.spool.failed}: {error}")
+            if not self._retry_told:
+                self._tell(f"a retry that was cut short is still in {self.spool.failed}: {error}")
+            self._retry_told = True
 
     def _tell_what_is_left(self) -> None:
         """Say why something stays in the inbox although nothing is left to do."""
@@ -220,6 +222,7 @@ class Watcher:
         mine = {claim.job.path for claim in self._running.values()}
         half_claimed = [JobDir(path) for path in sorted(self.spool.running.glob(f"{CLAIM_PREFIX}*"))]
         jobs = [*half_claimed, *(JobDir(path) for path in visible(self.spool.running) if path.is_dir())]
+        self._finish_retries()
         self._orphans_at = now + _ORPHANS_S
         found: list[Claim] = []
         for job in self._onlooker.abandoned([job for job in jobs if job.path not in mine]):

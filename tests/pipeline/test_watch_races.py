@@ -18,7 +18,7 @@ from bodycap_batch.watch.claim import process_mark
 from bodycap_batch.watch.drops import Drop, look_at
 from bodycap_batch.watch.spool import RETRY_PREFIX, JobDir
 from tests.pipeline.fake_stages import ORDERS
-from tests.pipeline.spools import SpoolBench
+from tests.pipeline.spools import SpoolBench, wait_for
 
 
 @pytest.fixture
@@ -119,6 +119,41 @@ def test_a_watcher_that_starts_leaves_a_retry_under_way_alone_and_ends_a_killed_
     alive.path.rename(bench.spool.failed / f"{RETRY_PREFIX}{machine}-{pid}-{int(start) - 1}-1")
     claiming.finish_retries(bench.spool)
     assert [path.name for path in bench.spool.inbox.iterdir()] == ["walk.yaml"]
+    assert list(bench.spool.failed.iterdir()) == []
+
+
+def test_a_retry_that_is_killed_while_a_watcher_runs_is_ended_by_it(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
+    watcher = bench.watcher(once=False)
+    thread = threading.Thread(target=watcher.run)
+    thread.start()
+    try:
+        wait_for((bench.spool.failed / "walk" / "status.json").is_file)
+        (bench.spool.failed / "walk").rename(bench.spool.failed / f"{RETRY_PREFIX}killed-1-1-x")
+        wait_for((bench.spool.failed / "walk" / "status.json").is_file)  # it was tried again
+    finally:
+        watcher.stop()
+        thread.join()
+    assert sum(line.startswith("walk: failed") for line in bench.told) == 2
+
+
+def test_two_who_put_a_drop_back_do_it_once(bench: SpoolBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = JobDir(bench.spool.failed / f"{RETRY_PREFIX}1")
+    place.path.mkdir()
+    bench.drop("walk").rename(place.input)
+    move = claiming.move
+    first: list[Path | None] = []
+
+    def other() -> None:
+        monkeypatch.setattr(claiming, "move", move)
+        first.append(claiming.give_back(bench.spool, place))
+
+    monkeypatch.setattr(claiming, "move", between(move, other))
+    assert claiming.give_back(bench.spool, place) is None
+    assert first == [bench.spool.inbox / place.name]
+    assert (bench.spool.inbox / place.name / "torso.mp4").is_file()
     assert list(bench.spool.failed.iterdir()) == []
 
 
