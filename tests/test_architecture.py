@@ -15,7 +15,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "bodycap_batch"
 
 # A room is a module or package directly below bodycap_batch. Each may import the rooms named and no other.
-GROUND = {"errors", "arrays", "context", "geometry"}
+GROUND = {"errors", "arrays", "context", "geometry", "shares"}
 TYPES = GROUND | {"camera", "scene", "skeleton", "body"}
 MATERIAL = TYPES | {
     "capture", "config", "formats", "skeleton_presets", "tracking", "rolling_shutter", "overlay",
@@ -28,6 +28,7 @@ KEEPING = {"errors", "digests", "identity", "progress", "disk_room"}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "arrays": set(),
+    "shares": set(),
     "context": {"errors"},
     "geometry": {"errors", "arrays"},
     "camera": GROUND,

@@ -24,6 +24,8 @@ FILE = "job.yaml"
 UNKNOWN = "<where on the body?>"
 _STAGES = ("keyframes", "map", "registration", "merge", "export")
 _WIDTH = 34
+_LONGEST = 60
+"""A camera's name may have 64 characters, and a number may follow."""
 
 
 def write_starting_job(folder: Path, *, replace: bool = False) -> Path:
@@ -68,8 +70,8 @@ def starting_job(folder: Path) -> str:
         *(_places() if any(mount_of(name) is None for name, _ in recordings) else ()),
         "  cameras:",
     ]
-    for name, files in recordings:
-        lines += _camera(name, files, folder)
+    for safe, (name, files) in zip(_names([name for name, _ in recordings]), recordings, strict=True):
+        lines += _camera(safe, name, files, folder)
     lines += [
         "",
         "# What follows are the defaults of every stage: change what you need, leave the rest.",
@@ -109,12 +111,13 @@ def _places() -> list[str]:
     return ["  # Where a camera can be worn (`mount:`):", *(f"  #   {line}" for line in listed)]
 
 
-def _camera(name: str, files: Sequence[Path], folder: Path) -> list[str]:
+def _camera(safe: str, name: str, files: Sequence[Path], folder: Path) -> list[str]:
     paths = [path.relative_to(folder).as_posix() for path in files]
     video = _quoted(paths[0]) if len(paths) == 1 else f"[{', '.join(map(_quoted, paths))}]"
-    lines = [f"    # {_found(files)}", f"    - name: {_quoted(_safe(name))}", f"      video: {video}"]
-    if mount_of(name) is None:
-        lines.append(f"      mount: {_quoted(UNKNOWN)}")
+    lines = [f"    # {_found(files)}", f"    - name: {_quoted(safe)}", f"      video: {video}"]
+    found = mount_of(name)
+    if found is None or mount_of(safe) != found:
+        lines.append(f"      mount: {_quoted(UNKNOWN if found is None else found[0])}")
     if not list(folder.glob(f"{name}.timestamps.txt")):
         lines.append("      # offset_s: 0.0          # common time = camera time + offset_s: from the clap")
     return lines
@@ -164,6 +167,19 @@ def _quoted(text: str) -> str:
     return text if plain else json.dumps(text, ensure_ascii=False)
 
 
+def _names(found: Sequence[str]) -> list[str]:
+    """A name for each camera, none of them twice: "cam 1" and "cam_1" would be one folder of results."""
+    out: list[str] = []
+    taken: set[str] = set()
+    for plain in map(_safe, found):
+        name, number = plain, 2
+        while name.lower() in taken:
+            name, number = f"{plain}_{number}", number + 1
+        taken.add(name.lower())
+        out.append(name)
+    return out
+
+
 def _safe(text: str) -> str:
     """A name that the results' files can carry."""
-    return re.sub(r"[^A-Za-z0-9_\-]+", "_", text).strip("_-") or "walk"
+    return re.sub(r"[^A-Za-z0-9_\-]+", "_", text).strip("_-")[:_LONGEST] or "walk"

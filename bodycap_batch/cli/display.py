@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Protocol, Self
 
 from bodycap_batch.progress import Event
+from bodycap_batch.shares import percent
 
 if TYPE_CHECKING:
     from rich.progress import Progress, Task, TaskID
@@ -105,7 +106,7 @@ class _Pace:
         seconds, done = now - self._first[0], event.done - self._first[1]
         rate = done / seconds if seconds > 0 and done > 0 else None
         text = f"{event.label}: {event.done}"
-        text += f" of {event.total} {event.what} ({share:.0%})" if event.total else f" {event.what}"
+        text += f" of {event.total} {event.what} ({percent(share)})" if event.total else f" {event.what}"
         if rate is not None:
             text += f", {rate:.3g}/s"
             if event.done < event.total:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import threading
 import webbrowser
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from bodycap_batch.cli.base import app
-from bodycap_batch.cli.options import JobArgument, OutOption, results_folder
+from bodycap_batch.cli.options import JobArgument, OutOption, StoreOption, default_store, results_folder
 from bodycap_batch.cli.report import job_of
-from bodycap_batch.errors import JobError
+from bodycap_batch.errors import BodycapError, JobError
+
+if TYPE_CHECKING:
+    from bodycap_batch.config.models import Job
+    from bodycap_batch.report.inputs import ReportInputs
+    from bodycap_batch.report.marks import Marks
 
 _REPORT = ("report.html", "partial/report.html")
 
@@ -26,11 +32,13 @@ def view(
         Path | None,
         typer.Option(metavar="FILE.rrd", help="Write a recording for the Rerun viewer instead, and end."),
     ] = None,
+    store: StoreOption = None,
 ) -> None:
     """Look at a finished job in the browser, with its real videos in sync.
 
     Serves the report on this machine alone (127.0.0.1) until Ctrl-C. JOB may be the folder of the results.
     The report itself, report.html, needs no server; it shows small pictures in the place of the videos.
+    What is drawn over every frame comes from the store; without it, over the stored pictures only.
 
     \b
     Examples:
@@ -45,17 +53,54 @@ def view(
     file, folder = job_of(job)
     resolved = load_job(file, Overrides(out=out or folder))
     out_dir = results_folder(resolved)
+    store = store or default_store(out_dir)
     if rerun is not None:
-        write_recording(out_dir, rerun)
+        write_recording(_stored_inputs(resolved, out_dir, store), rerun)
         typer.echo(f"recording: {rerun}")
         return
     page = next((out_dir / name for name in _REPORT if (out_dir / name).is_file()), None)
     if page is None:
         raise JobError("there is no report", path=out_dir, hint="run the job, or `bodycap report` it")
-    server = make_server(what_to_serve(page, open_capture(resolved.capture)), port)
+    server = make_server(
+        what_to_serve(page, open_capture(resolved.capture), _StoredMarks(resolved, out_dir, store)), port
+    )
     address = f"http://{LOOPBACK}:{server.server_port}/report.html?videos"
     typer.echo(f"{address}  (Ctrl-C ends)")
     if browser:
         webbrowser.open(address)
     with server:
         server.serve_forever()
+
+
+def _stored_inputs(job: Job, out_dir: Path, store: Path) -> ReportInputs:
+    """What the store holds of a job."""
+    from bodycap_batch.pipeline import Settings, stored_for_report
+    from bodycap_batch.store import Store
+    from bodycap_batch.tasks.report import load_inputs
+
+    settings = Settings(store=Store(store), threads=1, listener=lambda _: None, cancelled=lambda: False)
+    return load_inputs(stored_for_report(job, out_dir=out_dir, settings=settings))
+
+
+class _StoredMarks:
+    """What is drawn over any frame, read from the store when it is first asked for."""
+
+    def __init__(self, job: Job, out_dir: Path, store: Path) -> None:
+        self._of = (job, out_dir, store)
+        self._lock = threading.Lock()
+        self._marks: Marks | None = None
+        self._missing = False
+
+    def __call__(self, camera: str, first: int) -> list[dict[str, Any]]:
+        """Marks of a part of a camera's frames; none where the store does not hold them."""
+        from bodycap_batch.report.marks import Marks
+        from bodycap_batch.report.serving import MARKS_EACH
+
+        with self._lock:
+            if self._marks is None and not self._missing:
+                try:
+                    self._marks = Marks(_stored_inputs(*self._of))
+                except BodycapError as error:
+                    self._missing = True
+                    typer.echo(f"only the stored pictures are drawn over: {error.message}", err=True)
+            return [] if self._marks is None else self._marks.part(camera, first, MARKS_EACH)

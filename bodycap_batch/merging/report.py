@@ -33,7 +33,8 @@ def build_report(
         tracks: The tracks that were used.
         notes: ``dropped`` frames by camera, the ``floor``, the ``unused`` and the ``joined`` cameras,
             ``joint_gap_m`` and ``hinge_m`` and ``uncertainty`` by role, how far the ``rules`` were pressed,
-            and ``start_ns``, the first tick.
+            and ``start_ns`` and ``end_ns``, the first
+            and the last tick.
     """
     floor = notes["floor"]
     return {
@@ -55,7 +56,7 @@ def build_report(
                 "down_weighted": int((solution.weights[track.camera] < 0.25).sum()),
                 "residual_m": _percentiles(solution.residual_m[track.camera]),
                 "residual_deg": _percentiles(np.degrees(solution.residual_rad[track.camera])),
-                "longest_gap_s": _longest_gap_s(track),
+                "longest_gap_s": longest_gap_s(track, notes["start_ns"], notes["end_ns"]),
             }
             for track in tracks
         },
@@ -161,5 +162,7 @@ def _percentiles(values: FloatArray) -> dict[str, float]:
     return {f"p{q}": round(float(np.percentile(values, q)), 5) for q in (50, 95)}
 
 
-def _longest_gap_s(track: Track) -> float:
-    return round(float(np.diff(track.times_ns).max(initial=0)) * 1e-9, 4)
+def longest_gap_s(track: Track, start_ns: int, end_ns: int) -> float:
+    """Longest time without a measurement; that before the first one and after the last one count, too."""
+    times = np.concatenate([[start_ns], np.clip(track.times_ns, start_ns, end_ns), [end_ns]])
+    return round(float(np.diff(times).max()) * 1e-9, 4)

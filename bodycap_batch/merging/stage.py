@@ -93,6 +93,7 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
             tracks,
             {
                 "start_ns": int(tick_times[0]),
+                "end_ns": int(tick_times[-1]),
                 "dropped": dropped,
                 "floor": floor,
                 "unused": together.unused,

@@ -1,7 +1,7 @@
 """A job from its videos to its results: the stages in order."""
 
 from bodycap_batch.pipeline.batch import Batch, BatchJob, Outcome
-from bodycap_batch.pipeline.reporting import remake_report
+from bodycap_batch.pipeline.reporting import remake_report, stored_for_report
 from bodycap_batch.pipeline.run import RunSummary, run_job
 from bodycap_batch.pipeline.sample import prepare_capture
 from bodycap_batch.pipeline.settings import Settings, StageRecord
@@ -19,4 +19,5 @@ __all__ = [
     "prepare_capture",
     "remake_report",
     "run_job",
+    "stored_for_report",
 ]

@@ -2,17 +2,53 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from bodycap_batch.config.models import Job
 from bodycap_batch.errors import BodycapError
 from bodycap_batch.pipeline.flow import Flow
-from bodycap_batch.pipeline.made import Made
+from bodycap_batch.pipeline.made import Made, report_task
 from bodycap_batch.pipeline.results import PARTIAL, publish
 from bodycap_batch.pipeline.run import files_of, run_stages
 from bodycap_batch.pipeline.settings import Settings
 from bodycap_batch.runner import NotStored
+
+
+def stored_for_report(job: Job, *, out_dir: Path, settings: Settings) -> Mapping[str, Any]:
+    """Where the store holds what a job's report is made of; nothing is computed.
+
+    Args:
+        job: A resolved job.
+        out_dir: Folder of its results.
+        settings: Store, threads, listener, cancellation.
+
+    Returns:
+        The arguments of the report's task, for `bodycap_batch.tasks.report.load_inputs`.
+
+    Raises:
+        BodycapError: The videos cannot be read, the disk fails, or nothing of the job is stored.
+    """
+    made, stopped_by = _stored(job, out_dir, settings)
+    error = stopped_by or made.failure
+    return report_task(job, made, {}, None if error is None else made.failed_at(error)).arguments
+
+
+def _stored(job: Job, out_dir: Path, settings: Settings) -> tuple[Made, BodycapError | None]:
+    """The finished stages up to the results, and what the store lacks of them."""
+    made = Made()
+    with Flow(job, replace(settings, compute=False, redo=frozenset()), logs=out_dir / "logs") as looking:
+        try:
+            for stage in run_stages(job, looking, made):
+                if stage == "export":
+                    break
+        except NotStored as error:
+            if not looking.records:
+                raise
+            return made, error
+    return made, None
 
 
 def remake_report(job: Job, *, out_dir: Path, settings: Settings) -> Path:
@@ -29,17 +65,7 @@ def remake_report(job: Job, *, out_dir: Path, settings: Settings) -> Path:
     Raises:
         BodycapError: The videos cannot be read, the disk fails, or nothing of the job is stored.
     """
-    made = Made()
-    stopped_by: BodycapError | None = None
-    with Flow(job, replace(settings, compute=False, redo=frozenset()), logs=out_dir / "logs") as looking:
-        try:
-            for stage in run_stages(job, looking, made):
-                if stage == "export":
-                    break
-        except NotStored as error:
-            if not looking.records:
-                raise
-            stopped_by = error
+    made, stopped_by = _stored(job, out_dir, settings)
     again = replace(settings, redo=settings.redo | {"report"})
     with Flow(job, again, logs=out_dir / "logs") as flow:
         flow.check()

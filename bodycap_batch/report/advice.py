@@ -12,13 +12,17 @@ import numpy as np
 from bodycap_batch.arrays import IntArray
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.losses import Cause
+from bodycap_batch.report.placing import common_times_s
 from bodycap_batch.scene import Map
+from bodycap_batch.shares import percent
 
 _MATTERS = 0.02
 """Share of all frames from which a cause is worth a change of habit."""
 _FORWARD_DEG = 25.0
 _FORWARD_SHARE = 0.6
 _THIN_LINK = 0.03
+_END_S = 0.6
+"""From here on the verdict calls a gap poor."""
 _NARROW_DEG = 3.0
 _SCALE_WELL_KNOWN, _MOUNT_WELL_KNOWN_DEG, _ARM_M = 0.02, 4.0, 0.6
 _BETTER = "; to know it better, "
@@ -71,7 +75,13 @@ def advise(inputs: ReportInputs, lost: Mapping[str, Counter[Cause]]) -> list[Adv
         inputs: The results.
         lost: Lost frames by camera and cause.
     """
-    found = [*_of_losses(inputs, lost), *_of_overlap(inputs), *_of_motion(inputs), *_of_body(inputs)]
+    found = [
+        *_of_losses(inputs, lost),
+        *_of_overlap(inputs),
+        *_of_motion(inputs),
+        *_of_ends(inputs),
+        *_of_body(inputs),
+    ]
     return sorted(found, key=lambda each: -each.weight)
 
 
@@ -139,7 +149,7 @@ def _of_motion(inputs: ReportInputs) -> Iterator[Advice]:
     if straight or (narrow is not None and narrow < _NARROW_DEG):
         angle = "" if narrow is None else f"half of the map's points are seen under less than {narrow:.1f}°"
         along = (
-            f"every camera moved along its own line of sight {min(forward):.0%} of the way"
+            f"every camera moved along its own line of sight {percent(min(forward))} of the way"
             if straight
             else ""
         )
@@ -148,6 +158,32 @@ def _of_motion(inputs: ReportInputs) -> Iterator[Advice]:
             "sideways movement.",
             because=" and ".join(part for part in (along, angle) if part),
             weight=1.2,
+        )
+
+
+def _of_ends(inputs: ReportInputs) -> Iterator[Advice]:
+    """Cameras that were not there yet when the motion begins, or no longer when it ends."""
+    merge = inputs.merge
+    if merge is None or not merge.trajectories:
+        return
+    ends = merge.times_ns()[[0, -1]] * 1e-9
+    seen = {}
+    for path in merge.trajectories:
+        times = common_times_s(inputs, path.camera, path.times_ns)[path.localised]
+        if len(times):
+            seen[path.camera] = (float(times[0]), float(times[-1]))
+    late = {name: first for name, (first, _) in seen.items() if first - ends[0] > _END_S}
+    early = {name: last for name, (_, last) in seen.items() if ends[1] - last > _END_S}
+    cuts = [f"start_s: {max(late.values()):.2f}"] if late else []
+    cuts += [f"end_s: {min(early.values()):.2f}"] if early else []
+    missing = [f"{name} has no measurement before {time:.2f} s" for name, time in late.items()]
+    missing += [f"{name} has none after {time:.2f} s" for name, time in early.items()]
+    if cuts:
+        yield Advice(
+            do="Start all cameras before the movement and stop them after it; this capture can be cut with "
+            f"{' and '.join(cuts)} under `capture`.",
+            because=f"the motion runs from {ends[0]:.2f} s to {ends[1]:.2f} s, but {', '.join(missing)}",
+            weight=1.4,
         )
 
 

@@ -11,7 +11,7 @@ from bodycap_batch.report.advice import advise
 from bodycap_batch.report.figures.body import before_and_after, before_optimisation
 from bodycap_batch.report.figures.matrix import matrix
 from bodycap_batch.report.figures.shared import shared
-from bodycap_batch.report.figures.strips import strip
+from bodycap_batch.report.figures.strips import COLUMNS, columns_at, strip
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.losses import Cause
 from bodycap_batch.report.lost import LostFrame, causes_by_camera
@@ -55,11 +55,11 @@ def page_content(
         "placed": placed,
         "has_solid": placed.drawn,
         "has_body": inputs.merge is not None,
-        "cameras": _cameras(inputs, lost, tones),
+        "cameras": _cameras(inputs, lost, tones, shown),
         "causes": {cause.value: words for cause, words in _CAUSES.items()},
-        "sheet": _sheet(lost),
+        "sheet": _sheet(lost, shown.of(_SHEET)),
         "sheet_of": len(lost),
-        "matrix": matrix(inputs, tones),
+        "matrix": matrix(inputs, tones, shown.share),
         "shared": shared(inputs),
         "bodies": before_and_after(inputs, tones),
         "before": _before(inputs),
@@ -83,11 +83,15 @@ def _came_to(inputs: ReportInputs) -> str:
     return _DONE.get(stage, "")
 
 
-def _cameras(inputs: ReportInputs, lost: Sequence[LostFrame], tones: dict[str, str]) -> list[dict[str, Any]]:
+def _cameras(
+    inputs: ReportInputs, lost: Sequence[LostFrame], tones: dict[str, str], shown: Shown
+) -> list[dict[str, Any]]:
     span = _span(inputs)
     causes = causes_by_camera(lost)
     used = set() if inputs.merge is None else {path.camera for path in inputs.merge.trajectories}
     out = []
+    if shown.share < 1.0:
+        shown.note("points of each curve over time", columns_at(shown.share), COLUMNS)
     for name in inputs.cameras:
         losses = [each.loss for each in lost if each.loss.camera == name]
         path = inputs.path(name)
@@ -95,7 +99,9 @@ def _cameras(inputs: ReportInputs, lost: Sequence[LostFrame], tones: dict[str, s
             {
                 "name": name,
                 "tone": tones[name],
-                "strip": strip(inputs, name, span, losses, inputs.max_gap_s if name in used else 0.0),
+                "strip": strip(
+                    inputs, name, span, losses, inputs.max_gap_s if name in used else 0.0, shown.share
+                ),
                 "frames": 0 if path is None else len(path.status),
                 "registered": 0 if path is None else int(path.localised.sum()),
                 "stretches": len(losses),
@@ -119,10 +125,10 @@ def _span(inputs: ReportInputs) -> tuple[float, float]:
     return (min(ends), max(ends)) if ends else (0.0, 1.0)
 
 
-def _sheet(lost: Sequence[LostFrame]) -> list[dict[str, Any]]:
+def _sheet(lost: Sequence[LostFrame], most: int) -> list[dict[str, Any]]:
     """The longest losses with a picture, in the order they happened."""
     seen = sorted((each for each in lost if each.look is not None), key=lambda each: -each.loss.frames)
-    chosen = sorted(seen[:_SHEET], key=lambda each: (each.loss.start_s, each.loss.camera))
+    chosen = sorted(seen[:most], key=lambda each: (each.loss.start_s, each.loss.camera))
     return [
         {
             "camera": each.loss.camera,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from bodycap_batch.body import MergeResult
 from bodycap_batch.overlay import Body, CameraView, bone_lines, camera_views
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.packing import pack_scaled
-from bodycap_batch.report.pictures import Picture
+from bodycap_batch.scene import Trajectory
 
 _MAX_INLIERS = 120
 _LINE_POINTS = 6
@@ -20,29 +20,37 @@ _LINE_POINTS = 6
 
 
 class Marks:
-    """The marks of every camera's pictures.
+    """What is drawn over every camera's pictures.
 
     Args:
         inputs: The results.
     """
 
     def __init__(self, inputs: ReportInputs) -> None:
+        self._inputs = inputs
         views = camera_views(inputs.registrations, inputs.maps, inputs.clocks, inputs.merge)
         self._views = {view.camera: view for view in views}
         self._body = None if inputs.merge is None else solved_body(inputs.merge)
 
-    def over(self, camera: str, pictures: Sequence[Picture]) -> list[dict[str, Any]]:
-        """Inliers and bones over each picture, in fractions of its width and height."""
-        view = self._views.get(camera)
-        if view is None:
-            return [{"inliersAt": pack_scaled(np.zeros((0, 2))), "bones": []} for _ in pictures]
+    def over(self, camera: str, frames: Iterable[int]) -> list[dict[str, Any]]:
+        """What is known of frames of a camera: index, status, inliers and error, and what to draw over them.
+
+        Points and bones in fractions of the picture's width and height.
+        """
+        view, path = self._views.get(camera), self._inputs.path(camera)
         return [
             {
-                "inliersAt": pack_scaled(_inliers(view, picture.index)),
-                "bones": self._bones(view, picture.index),
+                **_told(path, index),
+                "inliersAt": pack_scaled(np.zeros((0, 2)) if view is None else _inliers(view, index)),
+                "bones": [] if view is None else self._bones(view, index),
             }
-            for picture in pictures
+            for index in frames
         ]
+
+    def part(self, camera: str, first: int, count: int) -> list[dict[str, Any]]:
+        """`over` so many frames from the first one on; fewer where the camera ends, none behind its end."""
+        path = self._inputs.path(camera)
+        return [] if path is None else self.over(camera, range(first, min(first + count, len(path.status))))
 
     def _bones(self, view: CameraView, index: int) -> list[list[float]]:
         pose = view.cam_from_frame(index)
@@ -55,6 +63,19 @@ class Marks:
             points = line.px[np.linspace(0, len(line.px) - 1, _LINE_POINTS).round().astype(int)] / size
             lines.append([round(float(value), 4) for value in points.ravel()])
         return lines
+
+
+def _told(path: Trajectory | None, index: int) -> dict[str, Any]:
+    """What registration says of a frame."""
+    if path is None:
+        return {"i": index, "status": "", "inliers": 0, "error": None}
+    error = float(path.error_px[index])
+    return {
+        "i": index,
+        "status": path.status[index].value,
+        "inliers": int(path.inliers[index]),
+        "error": round(error, 3) if np.isfinite(error) else None,
+    }
 
 
 def solved_body(merge: MergeResult) -> Body:

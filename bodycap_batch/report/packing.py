@@ -67,10 +67,16 @@ class Shown:
     """What the page shows of what there is.
 
     Attributes:
+        share: Part of every budget that may be used; below 1 where the page would be too large.
         counts: By what is counted, how many are shown of how many.
     """
 
+    share: float = 1.0
     counts: dict[str, tuple[int, int]] = field(default_factory=dict)
+
+    def of(self, budget: float) -> int:
+        """What is left of a budget."""
+        return int(budget * self.share)
 
     def note(self, what: str, shown: int, total: int) -> None:
         """Add to the account."""

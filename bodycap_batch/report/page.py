@@ -15,7 +15,16 @@ from bodycap_batch.errors import StoreError
 LIBRARY = "k3d"
 """The package whose browser bundle, with all of three.js in it, is written into the page."""
 _BUNDLE = "k3d/static/standalone.js"
-_SCRIPTS = ("packing.js", "timeline.js", "orbit.js", "solid.js", "flat.js", "picture.js", "main.js")
+_SCRIPTS = (
+    "packing.js",
+    "timeline.js",
+    "orbit.js",
+    "solid.js",
+    "flat.js",
+    "film.js",
+    "picture.js",
+    "main.js",
+)
 
 
 def render(context: Mapping[str, Any], data: Mapping[str, Any]) -> str:

@@ -79,10 +79,15 @@ def place(inputs: ReportInputs) -> Placed:
 
 
 def common_times_s(inputs: ReportInputs, camera: str, times_ns: IntArray) -> FloatArray:
-    """Common time (N,) of a camera's own timestamps (N,), seconds."""
+    """Common time (N,) of a camera's own timestamps (N,), seconds.
+
+    A camera that was never registered has no clock yet: its offset is what the capture states.
+    """
     clock = inputs.clocks.get(camera)
-    common = times_ns if clock is None else clock.common_times_ns(times_ns)
-    return np.asarray(common * 1e-9, dtype=np.float64)
+    if clock is not None:
+        return np.asarray(clock.common_times_ns(times_ns) * 1e-9, dtype=np.float64)
+    offset_s = 0.0 if inputs.capture is None else inputs.capture.camera(camera).offset_s
+    return np.asarray(times_ns * 1e-9 + offset_s, dtype=np.float64)
 
 
 def _path(inputs: ReportInputs, path: Trajectory, drawn_from_gauge: Similarity | None) -> PlacedPath:

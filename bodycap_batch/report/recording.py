@@ -2,33 +2,37 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import yaml
 
 from bodycap_batch.arrays import FloatArray
+from bodycap_batch.body import MergeResult
 from bodycap_batch.errors import JobError, StoreError
-from bodycap_batch.formats.bvh import read_bvh
-from bodycap_batch.formats.open3d_library import load_open3d
-from bodycap_batch.formats.tum import read_tum
-from bodycap_batch.skeleton import Motion
+from bodycap_batch.geometry import quat_xyzw_from_rotation
+from bodycap_batch.report.inputs import ReportInputs
+from bodycap_batch.report.marks import solved_body
+from bodycap_batch.report.placing import Placed, PlacedPath, place
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+_AXES_M = 0.1
 
 
-def write_recording(results: Path, target: Path) -> None:
-    """Read a folder of results and write them as one recording: points, camera paths, moving skeleton.
+def write_recording(inputs: ReportInputs, target: Path) -> None:
+    """Write a job's results as one recording: points, camera paths, the solved skeleton.
 
-    All of it is on the common clock, which ``frames.csv`` and ``metrics.json`` tell; without them every file
-    is taken to start on it.
+    All of it is in the world (without a body: in the largest map, set upright) and on the common clock. The
+    motion is the one that was solved, whatever root, rate or names the files of the motion have.
 
     Args:
-        results: Folder with ``map.ply``, ``trajectories`` and ``motion.bvh``; what is missing is left out.
+        inputs: The results, as far as the job came.
         target: The ``.rrd`` file.
 
     Raises:
-        JobError: rerun-sdk is not installed, or the folder holds no results.
+        JobError: rerun-sdk is not installed, or there is nothing to show.
         StoreError: The file cannot be written.
     """
     try:
@@ -37,24 +41,18 @@ def write_recording(results: Path, target: Path) -> None:
         raise JobError(
             "rerun-sdk is not installed", hint="install the extra: pip install 'bodycap_batch[viewer]'"
         ) from error
-    paths = sorted((results / "trajectories").glob("*.tum"))
-    cloud = results / "map.ply"
-    if not paths and not cloud.is_file():
-        raise JobError("no results to record", path=results, hint="name the folder of a finished job")
-    stream = rr.RecordingStream("bodycap")
-    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    if cloud.is_file():
-        points, colours = _cloud(cloud)
-        stream.log(
-            "world/map", rr.Points3D(points, colors=colours, radii=rr.Radius.ui_points(1.5)), static=True
+    placed = place(inputs)
+    if not placed.drawn:
+        raise JobError(
+            f"the store holds neither map nor camera paths of {inputs.name}", hint="run the job again"
         )
-    offsets = offsets_s(results)
-    for path in paths:
-        _log_path(stream, path, offsets.get(path.stem, 0.0))
-    if (results / "motion.bvh").is_file():
-        motion = read_bvh(results / "motion.bvh")[1]
-        if motion is not None:
-            _log_motion(stream, motion, bvh_start_s(results, motion.fps))
+    stream = rr.RecordingStream("bodycap", recording_id=inputs.name)
+    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    _log_maps(stream, placed)
+    for path in placed.paths:
+        _log_path(stream, path)
+    if inputs.merge is not None:
+        _log_body(stream, inputs.merge)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         stream.save(target)
@@ -64,58 +62,40 @@ def write_recording(results: Path, target: Path) -> None:
         ) from error
 
 
-def offsets_s(results: Path) -> dict[str, float]:
-    """Common time less camera time, by camera; none without ``frames.csv``."""
-    try:
-        with (results / "frames.csv").open(encoding="utf-8", newline="") as stream:
-            return {
-                row["camera"]: float(row["common_time"]) - float(row["time"])
-                for row in csv.DictReader(stream)
-            }
-    except OSError:
-        return {}
-
-
-def bvh_start_s(results: Path, fps: float) -> float:
-    """Common time of the first frame of ``motion.bvh``, which holds no clock of its own."""
-    try:
-        metrics = json.loads((results / "metrics.json").read_text(encoding="utf-8"))
-        job = yaml.safe_load((results / "job.yaml").read_text(encoding="utf-8"))
-    except OSError:
-        return 0.0
-    start_s = float(metrics.get("motion", {}).get("start_s", 0.0))
-    return start_s - 1.0 / fps if job.get("export", {}).get("tpose") else start_s
-
-
-def _cloud(path: Path) -> tuple[FloatArray, FloatArray]:
-    cloud = load_open3d().io.read_point_cloud(path)
-    return np.asarray(cloud.points), np.asarray(cloud.colors)
-
-
-def _log_path(stream: object, path: Path, offset_s: float) -> None:
+def _log_maps(stream: rr.RecordingStream, placed: Placed) -> None:
     import rerun as rr
-    from scipy.spatial.transform import Rotation
 
-    assert isinstance(stream, rr.RecordingStream)
-    found = read_tum(path)
-    name = f"world/cameras/{path.stem}"
-    centres = found.world_from_cam[:, :3, 3]
-    stream.log(f"{name}/path", rr.LineStrips3D([centres]), static=True)
-    quats = Rotation.from_matrix(found.world_from_cam[:, :3, :3]).as_quat()
+    for number, scene in enumerate(placed.maps):
+        points = placed.drawn_from_map[scene.gauge].apply(scene.points)
+        cloud = rr.Points3D(points, colors=scene.colors, radii=rr.Radius.ui_points(1.5))
+        stream.log(f"world/map_{number}", cloud, static=True)
+
+
+def _log_path(stream: rr.RecordingStream, path: PlacedPath) -> None:
+    """The stretches of a path between its gaps, and the camera moving along it."""
+    import rerun as rr
+
+    posed = np.isfinite(path.poses).all(axis=(1, 2))
+    if not posed.any():
+        return
+    centres, name = path.poses[posed, :3, 3], f"world/cameras/{path.camera}"
+    gaps = np.flatnonzero(np.diff(np.flatnonzero(posed)) > 1) + 1
+    stretches = [each for each in np.split(centres, gaps) if len(each)]
+    stream.log(f"{name}/path", rr.LineStrips3D(stretches), static=True)
     stream.send_columns(
         f"{name}/now",
-        indexes=[rr.TimeColumn("time", duration=found.times_ns * 1e-9 + offset_s)],
-        columns=rr.Transform3D.columns(translation=centres, quaternion=quats),
+        indexes=[rr.TimeColumn("time", duration=path.times_s[posed])],
+        columns=rr.Transform3D.columns(
+            translation=centres, quaternion=quat_xyzw_from_rotation(path.poses[posed, :3, :3])
+        ),
     )
-    stream.log(f"{name}/now", rr.TransformAxes3D(0.1), static=True)
+    stream.log(f"{name}/now", rr.TransformAxes3D(_AXES_M), static=True)
 
 
-def _log_motion(stream: object, motion: Motion, start_s: float) -> None:
+def _log_body(stream: rr.RecordingStream, merge: MergeResult) -> None:
     import rerun as rr
 
-    assert isinstance(stream, rr.RecordingStream)
-    centres = motion.world_from_joint()[..., :3, 3]
-    bones = [(int(parent), joint) for joint, parent in enumerate(motion.skeleton.parents) if parent >= 0]
-    for tick, time_ns in enumerate(motion.times_ns()):
-        stream.set_time("time", duration=start_s + float(time_ns) * 1e-9)
-        stream.log("world/body", rr.LineStrips3D([centres[tick, pair] for pair in map(list, bones)]))
+    body = solved_body(merge)
+    for time_ns, ends in zip(body.times_ns.tolist(), body.ends_in_world, strict=True):
+        stream.set_time("time", duration=1e-9 * time_ns)
+        stream.log("world/body", rr.LineStrips3D(list[FloatArray](ends)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -20,7 +21,11 @@ from bodycap_batch.errors import StoreError
 LOOPBACK = "127.0.0.1"
 _TYPES = {".mp4": "video/mp4", ".m4v": "video/mp4", ".mov": "video/mp4", ".mkv": "video/x-matroska"}
 _TYPES |= {".webm": "video/webm", ".avi": "video/x-msvideo", ".html": "text/html; charset=utf-8"}
+MARKS_EACH = 60
+"""Frames in each ``/marks/<camera>/<part>.json``: one or two seconds, loaded ahead of what plays."""
+MarksOf = Callable[[str, int], list[dict[str, Any]]]
 _RANGE = re.compile(r"bytes=(\d+)-(\d*)")
+_MARKS = re.compile(r"/marks/(\d{1,4})/(\d{1,7})\.json", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,16 +34,26 @@ class Served:
 
     Attributes:
         files: File by address, ``/report.html`` among them.
-        videos: What ``/videos.json`` answers: by camera, each chapter's address with the common time and
-            the time in the file of every frame.
+        videos: What ``/videos.json`` answers: by camera, each chapter's address, the index of its first
+            frame in the camera, half a frame's time, and of every frame the common time and the time in
+            the file, at the middle of what a player shows it for.
+        marks: What is known of frames of a camera, from the first index on, and what is drawn over them;
+            None where that is not to be had. Asked in parts of `MARKS_EACH` frames.
     """
 
     files: dict[str, Path]
     videos: dict[str, list[dict[str, Any]]]
+    marks: MarksOf | None = None
 
 
-def what_to_serve(report: Path, capture: Capture) -> Served:
-    """The report and the videos of a capture, each under an address of its own."""
+def what_to_serve(report: Path, capture: Capture, marks: MarksOf | None = None) -> Served:
+    """The report and the videos of a capture, each under an address of its own.
+
+    Args:
+        report: The page.
+        capture: Whose videos.
+        marks: As `Served.marks`.
+    """
     files, videos = {"/report.html": report}, {}
     for number, camera in enumerate(capture.cameras):
         chapters = _chapters(camera)
@@ -46,7 +61,7 @@ def what_to_serve(report: Path, capture: Capture) -> Served:
             chapter["url"] = f"video/{number}/{index}"
             files[f"/{chapter['url']}"] = camera.chapters[index]
         videos[camera.name] = [chapter for chapter in chapters if chapter["common"]]
-    return Served(files=files, videos=videos)
+    return Served(files=files, videos=videos, marks=marks)
 
 
 def make_server(served: Served, port: int = 0) -> ThreadingHTTPServer:
@@ -79,6 +94,8 @@ def _chapters(camera: CaptureCamera) -> list[dict[str, Any]]:
         half = 0.5 / video.fps if video.fps else 0.0
         out.append(
             {
+                "first": int(np.argmax(mine)),
+                "half": half,
                 "common": np.round(common[mine], 5).tolist(),
                 "container": np.round(seconds + half, 5).tolist(),
             }
@@ -119,9 +136,20 @@ class _Handler(BaseHTTPRequestHandler):
             return
         address = self.path.partition("?")[0]
         if address == "/videos.json":
-            self._send_text(json.dumps(self.content.videos), body=body)
+            videos = {"each": MARKS_EACH, "cameras": self.content.videos}
+            self._send_text(json.dumps(videos), body=body)
         elif address in self.content.files:
             self._send_file(self.content.files[address], body=body)
+        elif (part := _MARKS.fullmatch(address)) and self.content.marks is not None:
+            self._send_marks(self.content.marks, int(part[1]), int(part[2]), body=body)
+        else:
+            self.send_error(HTTPStatus.NOT_FOUND)
+
+    def _send_marks(self, marks: MarksOf, camera: int, part: int, *, body: bool) -> None:
+        names = list(self.content.videos)
+        found = marks(names[camera], part * MARKS_EACH) if camera < len(names) else []
+        if found:
+            self._send_text(json.dumps(found, allow_nan=False), body=body)
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
 

@@ -31,7 +31,7 @@ def solid_data(inputs: ReportInputs, placed: Placed, shown: Shown) -> dict[str, 
         shown: Told how much was thinned.
     """
     points, colours = _points(placed, shown)
-    share = _PATH_BUDGET // max(1, len(placed.paths))
+    share = shown.of(_PATH_BUDGET) // max(1, len(placed.paths))
     return {
         "metric": placed.metric,
         "points": pack_scaled(points),
@@ -51,7 +51,7 @@ def _points(placed: Placed, shown: Shown) -> tuple[FloatArray, np.ndarray[Any, n
         centre, radius = _extent(placed, points)
         keep = np.flatnonzero(np.abs(points - centre).max(axis=1) < _REACH * radius)
     # In random order: the viewer draws the first of them only while it moves on a slow machine.
-    keep = np.random.default_rng(0).permutation(keep)[:MAX_POINTS]
+    keep = np.random.default_rng(0).permutation(keep)[: shown.of(MAX_POINTS)]
     shown.note("points of the map", len(keep), len(points))
     return points[keep], np.asarray(colours[keep], dtype=np.uint8)
 
@@ -94,7 +94,7 @@ def _body(merge: MergeResult, shown: Shown) -> dict[str, Any]:
     joints, extra = len(skeleton.joints), len(ends)
     sigma = joint_sigma_m(merge)
     columns = 3 * (joints + extra) + joints // 2 + (0 if sigma is None else joints)
-    keep = thinned(len(times), affordable(_MOTION_BUDGET, 2 * columns))
+    keep = thinned(len(times), affordable(shown.of(_MOTION_BUDGET), 2 * columns))
     shown.note("ticks of the motion", len(keep), len(times))
     poses = merge.world_from_joint[keep]
     tips = np.einsum("tnij,nj->tni", poses[:, ends][..., :3, :3], skeleton.end_offsets_m[ends])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.solid import joint_sigma_m
+from bodycap_batch.shares import percent
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,13 +73,23 @@ def tables_of(inputs: ReportInputs) -> dict[str, Table]:
     return {name: table for name, table in found.items() if table.rows}
 
 
-def figure(metrics: Mapping[str, Any], dotted: str, form: str = "{:,}", factor: float = 1.0) -> Cell:
+def figure(
+    metrics: Mapping[str, Any],
+    dotted: str,
+    form: str | Callable[[float], str] = "{:,}",
+    factor: float = 1.0,
+) -> Cell:
     """A figure of ``metrics.json`` as a cell; a dash where it is not known."""
     value = look_up(metrics, dotted)
     if value is None:
         return Cell(says="–", metric=dotted)
     shown = value if factor == 1.0 else factor * value
-    return Cell(says=form.format(shown), metric=dotted, value=value)
+    says = form.format(shown) if isinstance(form, str) else form(shown)
+    return Cell(says=says, metric=dotted, value=value)
+
+
+def _share(value: float) -> str:
+    return percent(value, 1)
 
 
 def _frames(metrics: Mapping[str, Any]) -> Table:
@@ -90,7 +101,7 @@ def _frames(metrics: Mapping[str, Any]) -> Table:
                 Cell(says=name),
                 figure(metrics, f"{place}.frames"),
                 figure(metrics, f"{place}.frames_registered"),
-                figure(metrics, f"{place}.coverage", "{:.1%}"),
+                figure(metrics, f"{place}.coverage", _share),
                 figure(metrics, f"{place}.keyframes"),
                 figure(metrics, f"{place}.registration.median_inliers", "{:.0f}")
                 if place != "total"
@@ -263,7 +274,7 @@ def _rules(merge: Mapping[str, Any]) -> Table:
     metrics, activity = {"merge": merge}, merge.get("activity", {})
     rows = []
     for name, share in activity.get("rules_active", {}).items():
-        often = figure(metrics, f"merge.activity.rules_active.{name}", "{:.1%}")
+        often = figure(metrics, f"merge.activity.rules_active.{name}", _share)
         pressed = name in activity.get("rules_pressed_m", {})
         place = f"merge.activity.rules_pressed_m.{name}"
         far = [figure(metrics, f"{place}.{q}", "{:.1f} cm", 100.0) for q in ("p50", "p95")]
@@ -313,7 +324,7 @@ def _fields(cell: Cell) -> dict[str, Any]:
 def headline_figures(metrics: Mapping[str, Any]) -> Iterable[tuple[str, Cell]]:
     """The few figures that stand at the top of the page."""
     yield "frames registered", figure(metrics, "total.frames_registered")
-    yield "of all frames", figure(metrics, "total.coverage", "{:.1%}")
+    yield "of all frames", figure(metrics, "total.coverage", _share)
     yield "map error", figure(metrics, "total.mean_reprojection_error_px", "{:.2f} px")
     yield "points in the map", figure(metrics, "total.points")
     if "merge" in metrics:

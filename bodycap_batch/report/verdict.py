@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
+from bodycap_batch.shares import percent
+
 
 class Grade(IntEnum):
     """How far a result can be relied on; the worst of its criteria counts."""
@@ -133,7 +135,7 @@ def _of_frames(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
         about="cameras",
         name="Frames registered",
         grade=graded(share, 0.98, 0.85, more_is_better=True) if share > 0.0 else Grade.NONE,
-        says=f"{total['frames_registered']:,} of {total['frames']:,} frames ({share:.1%})",
+        says=f"{total['frames_registered']:,} of {total['frames']:,} frames ({percent(share, 1)})",
         why="From 98 % on only moments are missing, and the body's smoothness carries over them; below 85 % "
         "more than one frame in seven rests on nothing that was seen.",
         metric="total.coverage",
@@ -146,7 +148,8 @@ def _of_frames(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
             about="cameras",
             name="The worst camera",
             grade=graded(share, 0.95, 0.75, more_is_better=True),
-            says=f"{name}: {worst['frames_registered']:,} of {worst['frames']:,} frames ({share:.1%})",
+            says=f"{name}: {worst['frames_registered']:,} of {worst['frames']:,} frames "
+            f"({percent(share, 1)})",
             why="An average hides one bad camera, and a limb is as good as the camera on it.",
             metric=f"cameras.{name}.coverage",
             value=share,
@@ -191,7 +194,7 @@ def _of_map(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
             about="cameras",
             name="Cameras within the body's reach",
             grade=graded(share, 0.98, 0.9, more_is_better=True),
-            says=f"{share:.1%} of {reach['distances']:,} distances between cameras",
+            says=f"{percent(share, 1)} of {reach['distances']:,} distances between cameras",
             why="Cameras on one body cannot be further apart than it reaches: a map folded over two places "
             "that look alike shows here although its error in pixels is small.",
             metric="mapping.reach.within_reach",
@@ -248,7 +251,8 @@ def _of_gaps(cameras: Mapping[str, Any]) -> Iterator[Criterion]:
         grade=graded(gap, 0.2, 0.6),
         says=f"{gap:.2f} s without a measurement ({name})",
         why="An arm swings there and back in about a second: over a fifth of it smoothness guesses right, "
-        "over more than half of it a whole swing can be missing.",
+        "over more than half of it a whole swing can be missing. The time before a camera's first "
+        "measurement and after its last one counts.",
         metric=f"merge.cameras.{name}.longest_gap_s",
         value=gap,
     )
@@ -290,9 +294,9 @@ def _of_measured(joints: Mapping[str, Any]) -> Iterator[Criterion]:
             about="body",
             name="Time measured",
             grade=graded(share, 0.95, 0.8, more_is_better=True),
-            says=f"{share:.1%} of the motion at the joint that was measured least ({name})",
+            says=f"{percent(share, 1)} of the motion at the joint that was measured least ({name})",
             why="A camera that starts late, ends early or is lost for long leaves its limb inferred, "
-            "and no other figure shows it: the longest gap is one between two measurements.",
+            "and an average over all joints would hide it.",
             metric="" if "." in name else f"motion.joints.{name}.observed_share",
             value=share,
         )

@@ -1,4 +1,4 @@
-"""`bodycap view`: the report and the real videos, on this machine alone; and the Rerun recording."""
+"""`bodycap view`: the report, the real videos and their marks, on this machine alone."""
 
 from __future__ import annotations
 
@@ -13,11 +13,9 @@ import pytest
 
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config.models import CaptureConfig
-from bodycap_batch.errors import JobError
-from bodycap_batch.formats.bvh import write_bvh
-from bodycap_batch.report.recording import write_recording
-from bodycap_batch.report.serving import LOOPBACK, Served, make_server, what_to_serve
-from tests.bodies import reaching
+from bodycap_batch.report.marks import Marks
+from bodycap_batch.report.serving import LOOPBACK, MARKS_EACH, Served, make_server, what_to_serve
+from tests.reports import report_inputs
 from tests.videos import textured_frame, write_video
 
 OFFSET_S = 2.5
@@ -54,7 +52,7 @@ def ask(port: int, path: str, headers: dict[str, str] | None = None) -> http.cli
 
 def test_report_and_videos_are_served_with_ranges(port: int, tmp_path: Path) -> None:
     assert ask(port, "/report.html?videos").read() == b"<p>the report</p>"
-    (chapters,) = json.loads(ask(port, "/videos.json").read()).values()
+    (chapters,) = json.loads(ask(port, "/videos.json").read())["cameras"].values()
     assert [chapter["url"] for chapter in chapters] == ["video/0/0", "video/0/1"]
     whole = (tmp_path / "a.mp4").read_bytes()
     answer = ask(port, "/video/0/0")
@@ -87,7 +85,8 @@ def test_a_player_that_breaks_off_is_no_error(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_times_of_both_chapters_are_on_the_common_clock(port: int) -> None:
-    (chapters,) = json.loads(ask(port, "/videos.json").read()).values()
+    (chapters,) = json.loads(ask(port, "/videos.json").read())["cameras"].values()
+    assert [chapter["first"] for chapter in chapters] == [0, 12]
     for index, chapter in enumerate(chapters):
         # 12 frames at 30 fps a chapter; the file's own time starts anew, in the middle of the first frame
         np.testing.assert_allclose(chapter["common"][0], OFFSET_S + index * 0.4, atol=1e-4)
@@ -103,45 +102,43 @@ def test_another_name_for_this_machine_is_refused(port: int) -> None:
     assert ask(port, "/report.html", {"Host": f"evil.example:{port}"}).status == 403
 
 
-def test_a_recording_for_rerun_holds_the_motion(tmp_path: Path) -> None:
-    (tmp_path / "trajectories").mkdir()
-    lines = "".join(f"{0.1 * i:.3f} {i} 0 1 0 0 0 1\n" for i in range(5))
-    (tmp_path / "trajectories" / "torso.tum").write_text(lines)
-    write_bvh(tmp_path / "motion.bvh", reaching(10))
-    write_recording(tmp_path, tmp_path / "out" / "walk.rrd")
-    assert (tmp_path / "out" / "walk.rrd").read_bytes()[:3] == b"RRF"
+def test_marks_of_every_frame_are_served_in_parts(tmp_path: Path) -> None:
+    asked: list[tuple[str, int]] = []
+
+    def marks(camera: str, first: int) -> list[dict[str, object]]:
+        asked.append((camera, first))
+        return [{"i": first}] if first < 2 * MARKS_EACH else []
+
+    served = Served(files={}, videos={"torso": [], "head": []}, marks=marks)
+    server = make_server(served)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        answer = ask(server.server_port, "/marks/1/1.json")
+        assert (answer.status, json.loads(answer.read())) == (200, [{"i": MARKS_EACH}])
+        assert ask(server.server_port, "/marks/1/2.json").status == 404
+        assert ask(server.server_port, "/marks/2/0.json").status == 404
+        assert ask(server.server_port, "/marks/x/0.json").status == 404
+        assert json.loads(ask(server.server_port, "/videos.json").read())["each"] == MARKS_EACH
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+    assert asked == [("head", MARKS_EACH), ("head", 2 * MARKS_EACH)]
 
 
-def test_a_recording_puts_cameras_and_body_on_the_common_clock(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import rerun as rr
-
-    (tmp_path / "trajectories").mkdir()
-    (tmp_path / "trajectories" / "torso.tum").write_text("1.0 0 0 1 0 0 0 1\n1.1 0 0 1 0 0 0 1\n")
-    (tmp_path / "frames.csv").write_text("camera,frame,time,common_time\ntorso,30,1.0,3.5\n")
-    (tmp_path / "metrics.json").write_text(json.dumps({"motion": {"start_s": 4.0}}))
-    (tmp_path / "job.yaml").write_text("export: {tpose: true}\n")
-    write_bvh(tmp_path / "motion.bvh", reaching(3))
-    told: dict[str, list[float]] = {"cameras": [], "body": []}
-    column, set_time = rr.TimeColumn, rr.RecordingStream.set_time
-
-    def spy_column(name: str, *, duration: np.ndarray) -> object:
-        told["cameras"] += duration.tolist()
-        return column(name, duration=duration)
-
-    def spy_time(stream: object, name: str, *, duration: float) -> None:
-        told["body"].append(duration)
-        set_time(stream, name, duration=duration)
-
-    monkeypatch.setattr(rr, "TimeColumn", spy_column)
-    monkeypatch.setattr(rr.RecordingStream, "set_time", spy_time)
-    write_recording(tmp_path, tmp_path / "walk.rrd")
-    np.testing.assert_allclose(told["cameras"], [3.5, 3.6])
-    # the T-pose stands one frame before the motion
-    np.testing.assert_allclose(told["body"], 4.0 + np.array([-1, 0, 1]) / reaching(3).fps, atol=1e-5)
+def test_no_marks_are_served_where_the_store_holds_none(port: int) -> None:
+    assert ask(port, "/marks/0/0.json").status == 404
 
 
-def test_a_folder_without_results_is_no_recording(tmp_path: Path) -> None:
-    with pytest.raises(JobError, match="no results"):
-        write_recording(tmp_path, tmp_path / "x.rrd")
+def test_marks_of_a_part_are_those_of_its_frames() -> None:
+    inputs = report_inputs(70)
+    marks = Marks(inputs)
+    part = marks.part("torso", 60, 60)
+    assert [each["i"] for each in part] == list(range(60, 70))
+    assert part == marks.over("torso", range(60, 70))
+    assert marks.part("torso", 120, 60) == []
+    path = inputs.path("torso")
+    assert path is not None
+    assert [each["inliers"] for each in part] == path.inliers[60:].tolist()
+    assert all(each["inliersAt"]["shape"][0] for each in part)

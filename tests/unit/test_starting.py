@@ -43,6 +43,19 @@ def test_names_that_look_like_numbers_stay_text(tmp_path: Path, named: str) -> N
     assert sorted(camera.name for camera in job.capture.cameras) == ["2", "torso"]
 
 
+def test_no_name_is_given_twice(tmp_path: Path) -> None:
+    for video in ("cam 1.mp4", "cam_1.mp4", "CAM-1.mp4", "left palm.mp4", "left_palm.mp4", f"{'x' * 80}.mp4"):
+        write_video(tmp_path / video, FRAMES[:5])
+    cameras = yaml.safe_load(starting_job(tmp_path))["capture"]["cameras"]
+    names = [camera["name"] for camera in cameras]
+    assert len({name.lower() for name in names}) == len(names) == 6
+    assert {"cam_1", "cam_1_2", "left_palm", "left_palm_2"} <= set(names)
+    assert max(map(len, names)) <= 64
+    # what the file's name says of the place is not asked for again
+    assert [camera["name"] for camera in cameras if "mount" in camera and camera["mount"] != UNKNOWN] == []
+    assert sum(camera.get("mount") == UNKNOWN for camera in cameras) == 4
+
+
 def test_what_is_found_is_used_and_said(folder: Path) -> None:
     (folder / "subject.bvh").write_text(BVH)
     text = starting_job(folder)

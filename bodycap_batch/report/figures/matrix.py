@@ -20,12 +20,13 @@ _LEAST_BAND = 60.0
 _MISSING = -1
 
 
-def matrix(inputs: ReportInputs, tones: dict[str, str]) -> str:
+def matrix(inputs: ReportInputs, tones: dict[str, str], detail: float = 1.0) -> str:
     """Draw the matrix of all registered cameras against the largest map.
 
     Args:
         inputs: The results.
         tones: Colour of each camera, ``#rrggbb``.
+        detail: Share of the pixels that may be used.
     """
     if not inputs.maps or not inputs.registrations:
         return ""
@@ -45,7 +46,8 @@ def matrix(inputs: ReportInputs, tones: dict[str, str]) -> str:
         count = len(registration.trajectory.status)
         share = count / sum(len(each.trajectory.status) for each in inputs.registrations)
         height = max(_LEAST_BAND, share * _MAX_ROWS)
-        image = _image(frames, order[points], (count, len(scene.points)), round(height), tones[name])
+        pixels = (max(1, round(height * detail**0.5)), max(1, round(_MAX_COLUMNS * detail**0.5)))
+        image = _image(frames, order[points], (count, len(scene.points)), pixels, tones[name])
         parts.append(_band(name, image, top, height, tones[name]))
         parts.append(_keyframes(scene, name, count, top, height))
         top += height + 8.0
@@ -82,11 +84,13 @@ def _by_first_sight(seen: list[tuple[IntArray, IntArray]], count: int) -> IntArr
     return column
 
 
-def _image(frames: IntArray, columns: IntArray, size: tuple[int, int], height: int, tone: str) -> str:
+def _image(
+    frames: IntArray, columns: IntArray, size: tuple[int, int], pixels: tuple[int, int], tone: str
+) -> str:
     """A PNG whose opacity says how many of a cell's observations there are."""
     import cv2
 
-    rows_px, columns_px = min(height, size[0]), min(_MAX_COLUMNS, size[1])
+    rows_px, columns_px = min(pixels[0], size[0]), min(pixels[1], size[1])
     row = (frames * rows_px // max(size[0], 1)).astype(np.int64)
     column = (columns * columns_px // max(size[1], 1)).astype(np.int64)
     counts = np.bincount(row * columns_px + column, minlength=rows_px * columns_px)

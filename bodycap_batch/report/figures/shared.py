@@ -7,13 +7,16 @@ import html
 from bodycap_batch.report.advice import shared_points
 from bodycap_batch.report.figures.svg import element, picture, text
 from bodycap_batch.report.inputs import ReportInputs
+from bodycap_batch.shares import percent
 
 _CELL, _LEFT, _TOP = 74.0, 130.0, 26.0
+_MOST = 24
+"""More cameras than this make a square that nobody reads, and one that grows with their square."""
 
 
 def shared(inputs: ReportInputs) -> str:
     """Cameras against cameras; the shade is the share of the row camera's own points."""
-    names = inputs.cameras
+    names = inputs.cameras[:_MOST]
     if len(names) < 2 or not inputs.maps:
         return ""
     counts = shared_points(inputs.maps, names)
@@ -30,7 +33,7 @@ def shared(inputs: ReportInputs) -> str:
             says = (
                 f"{name} sees {counts[row, row]:,} points"
                 if row == column
-                else f"{name} and {other} share {counts[row, column]:,} points, {share:.0%} of {name}'s"
+                else f"{name} and {other} share {counts[row, column]:,} points, {percent(share)} of {name}'s"
             )
             x = _LEFT + column * _CELL
             parts.append(
@@ -54,13 +57,14 @@ def shared(inputs: ReportInputs) -> str:
                     text(
                         middle,
                         y + 0.3 * _CELL + 13.0,
-                        f"{share:.0%}",
+                        f"{percent(share)}",
                         class_=f"{tone} small",
                         text_anchor="middle",
                     )
                 )
     size = len(names)
-    title = "Landmarks shared between cameras"
+    first = f" (the first {_MOST} of {len(inputs.cameras)})" if len(inputs.cameras) > _MOST else ""
+    title = f"Landmarks shared between cameras{first}"
     return picture(
         _LEFT + size * _CELL + 8.0, _TOP + size * 0.6 * _CELL + 6.0, "".join(parts), title, class_="shared"
     )

@@ -17,7 +17,9 @@ from bodycap_batch.scene import FrameStatus, Trajectory
 
 WIDTH, LEFT, RIGHT = 960.0, 92.0, 12.0
 _STATUS_HEIGHT, _ROW_HEIGHT, _GAP = 18.0, 44.0, 10.0
-_COLUMNS = 480
+COLUMNS = 480
+"""Of each curve: two of its points are two pixels apart on a wide screen."""
+_LEAST_COLUMNS = 12
 _STATUS_CLASS = {FrameStatus.KEYFRAME: "key", FrameStatus.REGISTERED: "reg"}
 
 
@@ -30,7 +32,12 @@ class _Row:
 
 
 def strip(
-    inputs: ReportInputs, camera: str, span_s: tuple[float, float], losses: list[Loss], bridged_s: float
+    inputs: ReportInputs,
+    camera: str,
+    span_s: tuple[float, float],
+    losses: list[Loss],
+    bridged_s: float,
+    detail: float = 1.0,
 ) -> str:
     """Draw one camera.
 
@@ -40,7 +47,9 @@ def strip(
         span_s: First and last common time of the axis.
         losses: The camera's lost stretches.
         bridged_s: Holes between two measurements up to this long are bridged by the body; 0: none are.
+        detail: Share of the columns that are drawn.
     """
+    columns = columns_at(detail)
     selection, path = inputs.selection(camera), inputs.path(camera)
     rows = [] if path is None else _rows_of(path)
     times = np.zeros(0) if path is None else common_times_s(inputs, camera, path.times_ns)
@@ -53,10 +62,12 @@ def strip(
         return ""
     parts, top = [], 4.0
     if path is not None:
-        parts.append(_status(path, times, span_s, losses, bridged_s))
+        parts.append(
+            _status(path, times, span_s, [_lost_run(loss, times, bridged_s) for loss in losses], columns)
+        )
         top += _STATUS_HEIGHT + _GAP
     for row in rows:
-        parts.append(_curve(row, times, span_s, top))
+        parts.append(_curve(row, times, span_s, top, columns))
         top += _ROW_HEIGHT + _GAP
     parts.append(_axis(span_s, top))
     parts.append(element("line", class_="now", x1=LEFT, x2=LEFT, y1=2.0, y2=top))
@@ -71,6 +82,11 @@ def strip(
         data_start=f"{span_s[0]:.6f}",
         data_end=f"{span_s[1]:.6f}",
     )
+
+
+def columns_at(detail: float) -> int:
+    """How many points of each curve are drawn at a share of the detail."""
+    return max(_LEAST_COLUMNS, int(COLUMNS * detail))
 
 
 def at(time_s: float | FloatArray, span_s: tuple[float, float]) -> FloatArray:
@@ -107,14 +123,11 @@ def _rows_of(path: Trajectory) -> list[_Row]:
 
 
 def _status(
-    path: Trajectory,
-    times: FloatArray,
-    span_s: tuple[float, float],
-    losses: list[Loss],
-    bridged_s: float,
+    path: Trajectory, times: FloatArray, span_s: tuple[float, float], lost: list[_Run], columns: int
 ) -> str:
     """Runs of equal status as bars; a lost one says why, and whether the body bridges it."""
-    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.03
+    step = _step_s(times)
+    apart_s = (span_s[1] - span_s[0]) / (2 * columns)
     localised = path.localised
     parts = [text(LEFT - 8.0, 17.0, "status", class_="label", text_anchor="end")]
     edges = np.flatnonzero(np.diff(np.concatenate([[0], localised.astype(int), [0]])))
@@ -122,14 +135,14 @@ def _status(
         _Run("reg", float(times[first]), float(times[stop - 1] + step))
         for first, stop in zip(edges[::2], edges[1::2], strict=True)
     ]
-    parts += [_bar(run, span_s, "registered") for run in _seen_apart(runs, span_s)]
+    parts += [_bar(run, span_s, "registered") for run in _seen_apart(runs, apart_s)]
     keys = np.array([each is FrameStatus.KEYFRAME for each in path.status], dtype=bool)
     if keys.any():
-        places = np.unique(at(times[keys], span_s).round())
+        grain = (WIDTH - LEFT - RIGHT) / (2 * columns)
+        places = np.unique((at(times[keys], span_s) / grain).round()) * grain
         lines = "".join(f"M{number(x)} 4V{number(4.0 + _STATUS_HEIGHT / 3)}" for x in places)
         parts.append(element("path", class_="key", d=lines))
-    lost = [_lost_run(loss, times, step, bridged_s) for loss in losses]
-    for run in _seen_apart(lost, span_s):
+    for run in _seen_apart(lost, apart_s):
         what = f"{run.frames} frames lost: {', '.join(run.reasons)}"
         parts.append(_bar(run, span_s, f"{what}, bridged by the body" if run.kind == "bridged" else what))
     return "".join(parts)
@@ -146,21 +159,24 @@ class _Run:
     reasons: tuple[str, ...] = ()
 
 
-def _lost_run(loss: Loss, times: FloatArray, step: float, bridged_s: float) -> _Run:
+def _step_s(times: FloatArray) -> float:
+    return float(np.median(np.diff(times))) if len(times) > 1 else 0.03
+
+
+def _lost_run(loss: Loss, times: FloatArray, bridged_s: float) -> _Run:
     # Smoothness carries over a gap between two measurements, not past the last one.
     inside = loss.first > 0 and loss.last < len(times) - 1
     hole = float(times[loss.last + 1] - times[loss.first - 1]) if inside else np.inf
     kind = "bridged" if hole <= bridged_s else "lost"
-    return _Run(kind, loss.start_s, loss.end_s + step, loss.frames, (loss.reason.value,))
+    return _Run(kind, loss.start_s, loss.end_s + _step_s(times), loss.frames, (loss.reason.value,))
 
 
-def _seen_apart(runs: list[_Run], span_s: tuple[float, float]) -> list[_Run]:
-    """Neighbours of one kind less than a pixel apart as one: hours of frames stay a page."""
-    pixel_s = (span_s[1] - span_s[0]) / (WIDTH - LEFT - RIGHT)
+def _seen_apart(runs: list[_Run], apart_s: float) -> list[_Run]:
+    """Neighbours of one kind that nobody could tell apart as one: hours of frames stay a page."""
     out: list[_Run] = []
     for run in runs:
         last = out[-1] if out else None
-        if last is not None and last.kind == run.kind and run.start_s - last.end_s < pixel_s:
+        if last is not None and last.kind == run.kind and run.start_s - last.end_s < apart_s:
             reasons = tuple(dict.fromkeys((*last.reasons, *run.reasons)))
             out[-1] = _Run(run.kind, last.start_s, run.end_s, last.frames + run.frames, reasons)
         else:
@@ -182,9 +198,9 @@ def _bar(run: _Run, span_s: tuple[float, float], says: str) -> str:
     )
 
 
-def _curve(row: _Row, times: FloatArray, span_s: tuple[float, float], top: float) -> str:
+def _curve(row: _Row, times: FloatArray, span_s: tuple[float, float], top: float, most: int) -> str:
     """Median line over the range of each column; long takes are binned, short ones drawn frame by frame."""
-    columns = bins(row.values, min(_COLUMNS, len(row.values)))
+    columns = bins(row.values, min(most, len(row.values)))
     middles = np.interp(
         np.linspace(0, len(times) - 1, len(columns)) if len(columns) > 1 else [0.0],
         np.arange(len(times)),

@@ -94,22 +94,22 @@ function wireControls(view, timeline) {
 }
 
 function wirePicture(data, timeline) {
-  const picture = new Picture(section.querySelector(".picture"), data);
   const chooser = document.getElementById("camera");
   const now = document.getElementById("now");
+  const picture = new Picture(section.querySelector(".picture"), data, (words) => (now.textContent = words));
   for (const camera of Object.keys(data.tones)) chooser.add(new Option(camera, camera));
   const first = data.pictures.find((each) => each.frames.length);
   if (first) chooser.value = first.camera;
   chooser.addEventListener("change", () => {
-    picture.choose(chooser.value, timeline.time);
+    picture.choose(chooser.value);
     timeline.go(timeline.step);
   });
-  picture.choose(chooser.value, timeline.time);
+  picture.choose(chooser.value);
+  timeline.pace = () => picture.film.now();
   timeline.onChange(() => {
-    const says = picture.go(timeline.time);
     // Read out when it stands still; a running commentary would be noise.
     now.setAttribute("aria-live", timeline.playing ? "off" : "polite");
-    now.textContent = says;
+    picture.go(timeline.time, timeline.playing, timeline.speed);
   });
   return picture;
 }

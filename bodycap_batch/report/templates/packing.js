@@ -37,6 +37,14 @@ function nearest(times, t) {
   return i + 1 < times.length && times[i + 1] - t < t - times[i] ? i + 1 : i;
 }
 
+// The value at t of a curve through (xs, ys), xs increasing; straight on beyond its ends.
+function between(xs, ys, t) {
+  const i = Math.min(before(xs, t), Math.max(xs.length - 2, 0));
+  const j = Math.min(i + 1, xs.length - 1);
+  const span = xs[j] - xs[i];
+  return span > 0 ? ys[i] + ((t - xs[i]) / span) * (ys[j] - ys[i]) : ys[i];
+}
+
 function unpack(data) {
   const body = data.solid.body;
   return {

@@ -2,21 +2,38 @@
 const SVG = "http://www.w3.org/2000/svg";
 
 class Picture {
-  constructor(figure, data) {
-    this.figure = figure;
+  constructor(figure, data, say) {
     this.data = data;
+    this.say = say;
     this.frame = figure.querySelector(".frame");
     this.image = figure.querySelector("img");
-    this.video = figure.querySelector("video");
     this.overlay = figure.querySelector("svg");
     this.missing = figure.querySelector(".nopicture");
-    this.videos = {};
+    this.noFilm = figure.querySelector(".nofilm");
+    this.lines = Object.fromEntries(["edge", "inlier", "bone"].map((name) => [name, this.line(name)]));
+    this.videos = { each: 1, cameras: {} };
     this.shown = null;
+    this.film = new Film(
+      figure.querySelector("video"),
+      (index) => this.filmed(index),
+      () => {
+        delete this.videos.cameras[this.camera];
+        this.noFilm.textContent = `This browser does not play the video of ${this.camera}: small pictures are shown instead.`;
+        this.noFilm.hidden = false;
+      },
+    );
   }
 
-  choose(camera, time) {
+  line(name) {
+    const path = document.createElementNS(SVG, "path");
+    path.setAttribute("class", name);
+    this.overlay.append(path);
+    return path;
+  }
+
+  choose(camera) {
+    this.camera = camera;
     this.series = this.data.pictures.find((each) => each.camera === camera && each.frames.length);
-    this.shown = null;
     const [width, height] = this.series ? this.series.size : [4, 3];
     this.frame.style.aspectRatio = `${width} / ${height}`;
     this.aspect = height / width;
@@ -24,71 +41,78 @@ class Picture {
     this.overlay.setAttribute("preserveAspectRatio", "none");
     this.image.hidden = !this.series;
     this.missing.hidden = Boolean(this.series);
-    this.overlay.replaceChildren();
-    this.video.hidden = true;
-    this.go(time);
+    this.mark(null);
+    this.noFilm.hidden = true;
+    this.marks = new Map();
+    this.film.load((this.series && this.videos.cameras[camera]) || []);
   }
 
-  // Real videos, where `bodycap view` serves them: common and container time of a few frames each.
+  // Real videos, and marks for their frames in parts of so many.
   offer(videos) {
     this.videos = videos;
-    this.video.addEventListener("error", () => {
-      this.videos = {};
-      this.video.hidden = true;
-      this.overlay.style.visibility = "visible";
-    });
+    this.choose(this.camera);
   }
 
-  go(time) {
-    if (!this.series) return "";
+  go(time, playing, speed) {
+    if (!this.series) return;
+    if (this.film.active) {
+      this.film.go(time, playing, speed);
+      return;
+    }
     const frame = this.series.frames[nearest(this.series.times, time)];
-    if (frame !== this.shown) {
-      this.shown = frame;
-      this.image.src = `data:image/jpeg;base64,${frame.jpeg}`;
-      this.image.alt = `${this.series.camera}, frame ${frame.i}`;
-      this.mark(frame);
-    }
-    this.play(time);
-    const pose = frame.status === "" ? "" : `, ${frame.status.toLowerCase().replaceAll("_", " ")}`;
-    const numbers = frame.inliers && frame.error !== null ? `, ${frame.inliers} inliers, ${frame.error.toFixed(2)} px` : "";
-    return `${this.series.camera}: picture of frame ${frame.i + 1} of ${this.series.count} at ${frame.t.toFixed(2)} s${pose}${numbers}`;
+    if (frame === this.shown) return;
+    this.image.src = `data:image/jpeg;base64,${frame.jpeg}`;
+    this.image.alt = `${this.camera}, frame ${frame.i}`;
+    this.mark(frame);
   }
 
-  play(time) {
-    const parts = this.videos[this.series.camera];
-    if (!parts) return;
-    const part = parts.findLast((each) => each.common[0] <= time) || parts[0];
-    if (this.part !== part) {
-      this.part = part;
-      this.video.src = part.url;
-    }
-    this.video.hidden = false;
-    const i = Math.min(before(part.common, time), Math.max(part.common.length - 2, 0));
-    const j = Math.min(i + 1, part.common.length - 1);
-    const span = part.common[j] - part.common[i];
-    const share = span > 0 ? (time - part.common[i]) / span : 0;
-    this.video.currentTime = part.container[i] + share * (part.container[j] - part.container[i]);
-    const step = this.series.times.length > 1 ? 0.02 : 0;
-    this.overlay.style.visibility = Math.abs(this.shown.t - time) <= step ? "visible" : "hidden";
+  // The video shows a frame: its own marks, else those of the stored picture of the same frame, else none.
+  filmed(index) {
+    if (!this.film.active) return;
+    this.index = index;
+    const part = Math.floor(index / this.videos.each);
+    for (const each of [part, part + 1]) this.fetchMarks(each);
+    const found = this.marks.get(part);
+    const known = Array.isArray(found) ? found[index - part * this.videos.each] : null;
+    this.mark(known || this.series.frames.find((frame) => frame.i === index) || { i: index });
+  }
+
+  fetchMarks(part) {
+    const { marks, camera } = this;
+    if (marks.has(part) || part * this.videos.each >= this.series.count) return;
+    marks.set(part, null);
+    const number = Object.keys(this.videos.cameras).indexOf(camera);
+    fetch(`marks/${number}/${part}.json`)
+      .then((answer) => (answer.ok ? answer.json() : null))
+      .then((found) => {
+        marks.set(part, found);
+        if (found && this.marks === marks && Math.floor(this.index / this.videos.each) === part) this.filmed(this.index);
+      });
   }
 
   mark(frame) {
-    const marks = [];
-    const inliers = scaled(frame.inliersAt);
-    for (let i = 0; i < inliers.length; i += 2) {
-      const dot = document.createElementNS(SVG, "circle");
-      dot.setAttribute("class", "inlier");
-      dot.setAttribute("cx", inliers[i]);
-      dot.setAttribute("cy", inliers[i + 1] * this.aspect);
-      dot.setAttribute("r", 0.006);
-      marks.push(dot);
+    if (frame === this.shown) return;
+    this.shown = frame;
+    const at = (x, y) => `${x.toFixed(4)} ${(y * this.aspect).toFixed(4)}`;
+    const [dots, bones] = [[], []];
+    const inliers = frame && frame.inliersAt ? scaled(frame.inliersAt) : [];
+    // A line of no length with round ends is a dot.
+    for (let i = 0; i < inliers.length; i += 2) dots.push(`M${at(inliers[i], inliers[i + 1])}h0`);
+    for (const bone of (frame && frame.bones) || []) {
+      for (let i = 0; i < bone.length; i += 2) bones.push(`${i ? "L" : "M"}${at(bone[i], bone[i + 1])}`);
     }
-    for (const bone of frame.bones) {
-      const line = document.createElementNS(SVG, "polyline");
-      line.setAttribute("class", "bone");
-      line.setAttribute("points", bone.map((value, i) => (i % 2 ? value * this.aspect : value)).join(" "));
-      marks.push(line);
-    }
-    this.overlay.replaceChildren(...marks);
+    for (const name of ["edge", "inlier"]) this.lines[name].setAttribute("d", dots.join(""));
+    this.lines.bone.setAttribute("d", bones.join(""));
+    if (frame) this.frame.dataset.index = frame.i;
+    if (frame) this.say(this.words(frame));
+  }
+
+  words(frame) {
+    const what = this.film.active ? "frame" : "picture of frame";
+    const when = frame.t === undefined ? "" : ` at ${frame.t.toFixed(2)} s`;
+    const pose = frame.status ? `, ${frame.status.toLowerCase().replaceAll("_", " ")}` : "";
+    const known = frame.inliers && frame.error !== null;
+    const numbers = known ? `, ${frame.inliers} inliers, ${frame.error.toFixed(2)} px` : "";
+    return `${this.camera}: ${what} ${frame.i + 1} of ${this.series.count}${when}${pose}${numbers}`;
   }
 }

@@ -8,6 +8,7 @@ class Timeline {
     this.speed = 1;
     this.playing = false;
     this.listeners = [];
+    this.pace = () => null;
   }
 
   get time() {
@@ -42,6 +43,9 @@ class Timeline {
     if (!this.playing) return;
     if (this.last !== null) this.carry += ((now - this.last) / 1000) * this.fps * this.speed;
     this.last = now;
+    // Where a video plays, its clock is the one that counts.
+    const paced = this.pace();
+    if (paced !== null) this.carry = Math.max(0, (paced - this.start) * this.fps - this.step);
     const whole = Math.floor(this.carry);
     this.carry -= whole;
     if (whole) {

@@ -1,0 +1,86 @@
+// The real video of a camera, where `bodycap view` serves it. While it plays the page follows its clock:
+// no seek for each frame. What is drawn over it belongs to the frame that is on the screen.
+const SLACK_S = 0.15;
+
+class Film {
+  constructor(video, onFrame, onFailure) {
+    this.video = video;
+    this.onFrame = onFrame;
+    this.parts = [];
+    this.part = null;
+    this.wanted = null;
+    for (const event of ["seeked", "loadeddata"]) video.addEventListener(event, () => this.settle());
+    video.addEventListener("error", () => {
+      if (!this.part) return;
+      this.load([]);
+      onFailure();
+    });
+    this.watch();
+  }
+
+  get active() {
+    return this.parts.length > 0;
+  }
+
+  // The chapters of a camera: of each frame the common time and the time in the file.
+  load(parts) {
+    this.parts = parts;
+    this.part = null;
+    this.wanted = null;
+    this.video.hidden = !parts.length;
+    this.video.removeAttribute("src");
+    this.video.load();
+  }
+
+  watch() {
+    const { video } = this;
+    const look = (seconds) => {
+      if (this.part && video.readyState >= 2) {
+        this.onFrame(this.part.first + nearest(this.part.container, seconds));
+      }
+      this.watch();
+    };
+    if (video.requestVideoFrameCallback) {
+      video.requestVideoFrameCallback((_, frame) => look(frame.mediaTime + (this.part ? this.part.half : 0)));
+    } else requestAnimationFrame(() => look(video.currentTime));
+  }
+
+  go(time, playing, speed) {
+    const part = this.parts.findLast((each) => each.common[0] <= time) || this.parts[0];
+    if (!part) return;
+    if (part !== this.part) {
+      this.part = part;
+      this.video.src = part.url;
+    }
+    const there = between(part.common, part.container, time);
+    const inside = time >= part.common[0] && time <= part.common.at(-1) + 2 * part.half;
+    if (!playing || !inside) {
+      this.video.pause();
+      this.seek(there);
+      return;
+    }
+    this.video.playbackRate = speed;
+    if (Math.abs(this.video.currentTime - there) > SLACK_S) this.seek(there);
+    // Refused where a pause or another chapter comes between; the next step asks again.
+    if (this.video.paused && !this.video.ended) this.video.play().catch(() => {});
+  }
+
+  seek(seconds) {
+    if (this.video.seeking || this.video.readyState < 1) this.wanted = seconds;
+    else if (Math.abs(this.video.currentTime - seconds) > 1e-4) this.video.currentTime = seconds;
+  }
+
+  settle() {
+    const { wanted } = this;
+    this.wanted = null;
+    if (wanted !== null) this.seek(wanted);
+  }
+
+  // The common time the video is at; null while it does not play, so that the page goes by its own clock.
+  now() {
+    const { video, part } = this;
+    if (!part || video.paused || video.ended) return null;
+    if (video.seeking || video.readyState < 2) return -Infinity;
+    return between(part.container, part.common, video.currentTime);
+  }
+}

@@ -1,0 +1,103 @@
+"""The recording for the Rerun viewer: the solved motion, in the world and on the common clock."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+
+from bodycap_batch.errors import JobError, StoreError
+from bodycap_batch.report import ReportInputs
+from bodycap_batch.report.marks import solved_body
+from bodycap_batch.report.recording import write_recording
+from tests.reports import report_inputs
+
+
+@pytest.fixture(scope="module")
+def inputs() -> ReportInputs:
+    return report_inputs(40)
+
+
+class Told:
+    """What is logged, by entity."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.strips: dict[str, list[list[np.ndarray]]] = {}
+        self.times: list[float] = []
+        self.columns: list[np.ndarray] = []
+        self._last: list[np.ndarray] = []
+        strips, column, set_time, log = (
+            rr.LineStrips3D,
+            rr.TimeColumn,
+            rr.RecordingStream.set_time,
+            rr.RecordingStream.log,
+        )
+
+        def spy_strips(lines: list[np.ndarray]) -> object:
+            self._last = lines
+            return strips(lines)
+
+        def spy_column(name: str, *, duration: np.ndarray) -> object:
+            self.columns.append(duration)
+            return column(name, duration=duration)
+
+        def spy_time(stream: object, name: str, *, duration: float) -> None:
+            self.times.append(duration)
+            set_time(stream, name, duration=duration)
+
+        def spy_log(stream: object, name: str, thing: object, **options: bool) -> None:
+            if isinstance(thing, strips):
+                self.strips.setdefault(name, []).append(self._last)
+            log(stream, name, thing, **options)
+
+        monkeypatch.setattr(rr, "LineStrips3D", spy_strips)
+        monkeypatch.setattr(rr, "TimeColumn", spy_column)
+        monkeypatch.setattr(rr.RecordingStream, "set_time", spy_time)
+        monkeypatch.setattr(rr.RecordingStream, "log", spy_log)
+
+
+def test_a_recording_is_written(inputs: ReportInputs, tmp_path: Path) -> None:
+    write_recording(inputs, tmp_path / "out" / "walk.rrd")
+    assert (tmp_path / "out" / "walk.rrd").read_bytes()[:3] == b"RRF"
+
+
+def test_the_body_is_the_one_that_was_solved(
+    inputs: ReportInputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = Told(monkeypatch)
+    write_recording(inputs, tmp_path / "walk.rrd")
+    assert inputs.merge is not None
+    np.testing.assert_allclose(told.times, inputs.merge.times_ns() * 1e-9)
+    np.testing.assert_array_equal(told.strips["world/body"], solved_body(inputs.merge).ends_in_world)
+    # 1.1 m/s ahead for 39 ticks of a thirtieth: an animation in place would stay where it is
+    bones = np.array(told.strips["world/body"])
+    assert np.linalg.norm(bones[-1] - bones[0], axis=-1).min() > 1.0
+
+
+def test_camera_paths_are_on_the_common_clock_and_broken_at_their_gaps(
+    inputs: ReportInputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = Told(monkeypatch)
+    clocks = {name: replace(clock, offset_s=2.5) for name, clock in inputs.clocks.items()}
+    write_recording(replace(inputs, clocks=clocks, merge=None), tmp_path / "walk.rrd")
+    for registration, times in zip(inputs.registrations, told.columns, strict=True):
+        path = registration.trajectory
+        np.testing.assert_allclose(times, path.times_ns[path.localised] * 1e-9 + 2.5)
+    # frames 20 to 24 are lost
+    (stretches,) = told.strips["world/cameras/torso/path"]
+    assert [len(each) for each in stretches] == [20, 15]
+    assert "world/body" not in told.strips
+
+
+def test_nothing_stored_is_no_recording(tmp_path: Path) -> None:
+    with pytest.raises(JobError, match="neither map nor camera paths"):
+        write_recording(ReportInputs(name="x"), tmp_path / "x.rrd")
+
+
+def test_a_place_that_takes_no_file_is_told(inputs: ReportInputs, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="cannot be written"):
+        write_recording(inputs, tmp_path / "file" / "x.rrd")
