@@ -10,8 +10,8 @@ VENV := .venv
 BLENDER := .venv-blender
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
-# More than one test at a time, each in one thread; those of a file share what they need, so they stay together.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 8 --dist loadfile
+# More than one test at a time, each in one thread; those of a file stay together (see `apart`).
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 8 --dist loadgroup
 COMPILE := $(BIN)/uv pip compile --quiet --generate-hashes --no-emit-index-url --custom-compile-command "make lock"
 LOCK := $(COMPILE) --universal --python-version 3.11 --fork-strategy fewest pyproject.toml --group build
 

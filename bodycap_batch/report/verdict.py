@@ -187,8 +187,8 @@ def _of_map(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
         why="A camera outside the main map has no known place in the room; nothing of it reaches the body, "
         "unless the body itself tells where it was, and then less exactly.",
     )
-    reach = metrics.get("mapping", {}).get("reach", {})
-    if reach.get("judged"):
+    reach = metrics.get("mapping", {}).get("reach")  # None without a body, whose reach is unknown then
+    if reach and reach["judged"]:
         share = float(reach["within_reach"])
         yield Criterion(
             about="cameras",

@@ -91,6 +91,15 @@ def test_made_again_in_another_store_every_byte_is_the_same(folder: Path, tmp_pa
     assert [name for name in mine if mine[name] != theirs[name]] == []
 
 
+def test_without_a_body_there_are_map_paths_report_and_video(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = ["--skeleton", "none", "--out", str(out), "--store", str(folder / "out" / ".store")]
+    assert main(["run", str(folder / "tiny.yaml"), *words]) == 0
+    names = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
+    assert {"map.ply", "frames.csv", "report.html", "preview.mp4", "trajectories/torso.tum"} <= names
+    assert "motion.bvh" not in names
+
+
 def test_the_truth_of_the_mounts_is_not_used(folder: Path) -> None:
     artefacts = folder / "out" / ".store" / "artefacts"
     manifests = [path.read_text() for path in artefacts.glob("[!s]*/*/manifest.json")]

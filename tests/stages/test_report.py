@@ -9,6 +9,7 @@ from collections import Counter
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -206,6 +207,15 @@ def test_every_link_of_the_page_leads_somewhere(inputs: ReportInputs, tmp_path: 
         )
         assert links <= sections | {"main"}
         assert sections - links <= {"verdict", "about"}
+
+
+@pytest.mark.parametrize("reach", [None, {"judged": False, "reason": "3 distances are too few"}])
+def test_a_map_that_no_body_was_held_against_has_no_reach_to_judge(
+    inputs: ReportInputs, reach: dict[str, Any] | None
+) -> None:
+    metrics = json.loads(json.dumps(inputs.metrics))
+    metrics["mapping"]["reach"] = reach
+    assert not [each for each in judge(metrics, None).criteria if "reach" in each.name]
 
 
 def test_a_camera_that_ended_early_shows_in_the_verdict(inputs: ReportInputs) -> None:
