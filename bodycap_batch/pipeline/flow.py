@@ -117,7 +117,7 @@ class Flow:
             "selections": [str(artefact.path) for artefact in keyframes.values()],
             "reach": reach,
         }
-        later = [name for name in ("merge", "export") if name == "export" or has_body(self._job)]
+        later = [*(["merge"] if has_body(self._job) else []), "export", "report"]
         # The mapper keeps one core busy; on another the libraries of the last stages load.
         meanwhile = [[module for name in later for module in STAGES[name].modules]]
         task = Task(key=key, arguments=arguments, threads=self._settings.threads)
@@ -193,8 +193,9 @@ class Flow:
             "registrations": [str(artefact.path) for artefact in registrations.values()],
             **body_arguments(self._job),
         }
-        key = key_of("merge", options, inputs)
-        return self._one(Task(key=key, arguments=arguments, threads=self._settings.threads))
+        task = Task(key=key_of("merge", options, inputs), arguments=arguments, threads=self._settings.threads)
+        filming = self._job.export.preview and self._settings.threads > 1
+        return self._one(task, [STAGES["preview"].modules] if filming else [])
 
     def export(
         self,

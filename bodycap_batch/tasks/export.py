@@ -36,5 +36,11 @@ def _export(options: Json, arguments: Json, context: StageContext, files: Path) 
 EXPORT = Stage(
     function=_export,
     libraries=("numpy", "scipy", "open3d-cpu|open3d", "pygltflib", "usd-core", "ezc3d"),
-    modules=("bodycap_batch.export", "open3d", "scipy.spatial.transform"),
+    modules=(
+        "bodycap_batch.export",
+        "bodycap_batch.formats.open3d_loaded",
+        "pycolmap",
+        "pygltflib",
+        "scipy.spatial.transform",
+    ),
 )

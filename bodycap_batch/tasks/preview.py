@@ -82,5 +82,5 @@ def _trunk_first(capture: Capture, merge: MergeResult | None) -> Capture:
 PREVIEW = Stage(
     function=_preview,
     libraries=(*VISION, "scipy", "pycolmap"),
-    modules=(*SEEING, "pycolmap", "scipy.spatial.transform"),
+    modules=(*SEEING, "bodycap_batch.export", "bodycap_batch.preview", "pycolmap", "scipy.spatial.transform"),
 )

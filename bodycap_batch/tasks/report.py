@@ -74,5 +74,5 @@ def _capture(arguments: Json) -> Capture | None:
 REPORT = Stage(
     function=_report,
     libraries=(*VISION, "jinja2", "k3d", "pycolmap", "scipy"),
-    modules=(*SEEING, "bodycap_batch.report", "jinja2", "pycolmap"),
+    modules=(*SEEING, "bodycap_batch.report", "jinja2", "pycolmap", "scipy.spatial.transform"),
 )

@@ -1,4 +1,4 @@
-"""How a job's tasks share the cores."""
+"""How a job's tasks share the cores, and what is loaded while one of them is idle."""
 
 from __future__ import annotations
 
@@ -7,9 +7,14 @@ from pathlib import Path
 import pytest
 
 from bodycap_batch.config.models import Job
-from bodycap_batch.pipeline import Settings
+from bodycap_batch.pipeline import Settings, run_job
 from bodycap_batch.pipeline.flow import Flow
+from bodycap_batch.runner import Children, Making, Task
 from bodycap_batch.store import Store
+from bodycap_batch.tasks import STAGES
+from tests.pipeline.test_run import CHILD, Bench, bench
+
+__all__ = ["bench"]
 
 
 @pytest.mark.parametrize(
@@ -33,3 +38,33 @@ def test_the_last_cameras_share_all_threads(
         store=Store(tmp_path), threads=threads, listener=lambda _: None, cancelled=lambda: False
     )
     assert Flow(job, settings, logs=tmp_path / "out" / "logs")._shares() == expected
+
+
+class Watched(Children):
+    """Children that note what others were to load meanwhile, by stage."""
+
+    def __init__(self) -> None:
+        super().__init__(CHILD)
+        self.meanwhile: dict[str, set[str]] = {}
+
+    def make(self, task: Task, making: Making) -> None:
+        self.meanwhile[task.key.stage] = {name for modules in making.meanwhile for name in modules}
+        super().make(task, making)
+
+
+@pytest.mark.parametrize(("threads", "skeleton"), [(2, "upper_body"), (2, "none"), (1, "upper_body")])
+def test_what_comes_later_is_loaded_while_a_core_is_idle(bench: Bench, threads: int, skeleton: str) -> None:
+    children = Watched()
+    settings = Settings(
+        store=Store(bench.folder / "store"),
+        threads=threads,
+        listener=bench.events.append,
+        cancelled=bench.stop.is_set,
+        executor=children,
+    )
+    run_job(bench.job(skeleton=skeleton), out_dir=bench.out, settings=settings)
+    later = {"export", "report"} | ({"merge"} if skeleton != "none" else set())
+    wanted = {name for stage in later for name in STAGES[stage].modules}
+    assert children.meanwhile["map"] == (wanted if threads > 1 else set())
+    if skeleton != "none":
+        assert children.meanwhile["merge"] == (set(STAGES["preview"].modules) if threads > 1 else set())
