@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from tests.cluster.site import NAMES, REAL, Site, gone, wait_for
-from tests.pipeline.test_resume_proof import JOB
+from tests.pipeline.tiny_job import JOB
 
 pytestmark = pytest.mark.cluster
 

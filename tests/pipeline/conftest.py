@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from bodycap_batch.cli import main
 from tests.broken import sound
+from tests.pipeline.tiny_job import STAGES, Place
 
 
 @pytest.fixture(scope="session")
@@ -15,3 +17,19 @@ def sound_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sound")
     sound(folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Place:
+    """The job has been run, uninterrupted."""
+    place = Place(tmp_path_factory.mktemp("reference"))
+    assert main(["run", str(place.folder / "tiny.yaml"), "--out", str(place.out)]) == 0
+    names = set(place.content())
+    assert {"motion.bvh", "frames.csv", "metrics.json", "trajectories/torso.tum"} <= names
+    assert {name.split("/")[1] for name in names if name.startswith("artefacts/")} >= set(STAGES)
+    return place
+
+
+@pytest.fixture
+def place(tmp_path: Path, reference: Place) -> Place:
+    return Place(tmp_path / "job", reference.folder / "capture")
