@@ -103,11 +103,11 @@ def _processors() -> Look:
 def _memory() -> Look:
     total_mb = _total_memory_mb()
     if total_mb is None:
-        return Look(what="memory", state="note", found="unknown", remedy=f"{_MEMORY_MB} MB are enough")
-    found = f"{total_mb} MB"
+        return Look(what="memory", state="note", found="unknown", remedy=f"{_MEMORY_MB / 1000:g} GB are enough")
+    found = f"{total_mb / 1024:.1f} GB"
     if total_mb >= _MEMORY_MB:
         return Look(what="memory", state="ok", found=found)
-    remedy = f"long captures take {_MEMORY_MB} MB: cut them with start_s and end_s, or lower work_px"
+    remedy = f"long captures take {_MEMORY_MB / 1000:g} GB: cut them with start_s and end_s, or lower work_px"
     return Look(what="memory", state="note", found=found, remedy=remedy)
 
 
@@ -163,7 +163,7 @@ def _video() -> Look:
 def _disk(folder: Path) -> Look:
     place = _nearest(folder)
     free_mb = shutil.disk_usage(place).free >> 20
-    found = f"{free_mb} MB free at {place}"
+    found = f"{free_mb / 1024:.1f} GB free at {place}"
     if free_mb >= _DISK_MB:
         return Look(what="disk", state="ok", found=found)
     remedy = "free some, or name another place with --out and --store; `bodycap gc` drops what no job needs"

@@ -336,4 +336,4 @@ def headline_figures(metrics: Mapping[str, Any]) -> Iterable[tuple[str, Cell]]:
         if worst is not None:
             place = f"merge.cameras.{worst[0]}.longest_gap_s"
             yield "longest gap", figure(metrics, place, "{:.2f} s")
-        yield "scale known to", figure(metrics, "merge.scale.relative_sigma", "{:.1%}")
+        yield "metric scale", figure(metrics, "merge.scale.relative_sigma", "± {:.1%}")

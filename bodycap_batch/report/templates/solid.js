@@ -189,7 +189,7 @@ class Solid {
     this.centres = new Float32Array(3 * data.body.count);
     this.bones = parents.map((parent, child) => [parent, child]).filter(([parent]) => parent >= 0);
     const known = (joint) => (joint < solved.length ? solved[joint] : solved[parents[joint]]);
-    const bone = new three.CylinderGeometry(0.012, 0.024, 1, 6, 1, true);
+    const bone = new three.CylinderGeometry(0.022, 0.038, 1, 6, 1, true);
     bone.translate(0, 0.5, 0);
     const balls = parents.map((_, joint) => joint).filter((joint) => joint < joints.length);
     const material = new three.MeshLambertMaterial();
@@ -199,7 +199,7 @@ class Solid {
       bonesSure: this.bones.map(([parent, child]) => known(parent) && known(child)),
       ballsSure: balls.map(known),
       boneMesh: this.layer("body", new three.InstancedMesh(bone, material, this.bones.length)),
-      ballMesh: this.layer("body", new three.InstancedMesh(new three.SphereGeometry(0.03, 8, 6), material, balls.length)),
+      ballMesh: this.layer("body", new three.InstancedMesh(new three.SphereGeometry(0.045, 8, 6), material, balls.length)),
     };
     this.skin.boneMesh.frustumCulled = this.skin.ballMesh.frustumCulled = false;
     if (sigma) {
