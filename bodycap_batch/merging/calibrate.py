@@ -26,7 +26,7 @@ from bodycap_batch.merging.graph import (
 from bodycap_batch.merging.initial import fill_gaps, pose_bones
 from bodycap_batch.merging.linear import Linear, linearise
 from bodycap_batch.merging.mount_spread import JOINED, MEASURED, Eliminated, SolvedMounts, kinds_of
-from bodycap_batch.merging.posture import PostureFactors
+from bodycap_batch.merging.posture import PostureFactors, widened
 from bodycap_batch.merging.samples import Samples
 from bodycap_batch.merging.spread import (
     BETWEEN_SHARE,
@@ -72,6 +72,7 @@ class Calibration:
         step: Callable[[], None],
     ) -> None:
         self._skeleton, self._bones, self._samples = skeleton, bones, samples
+        self._at_ease = tuple(bones)
         self._priors, self._step = priors, step
         self._slack_map = JOINT_SLACK_M * np.sqrt(samples.repeats) / provisional
         self._values: Any = None
@@ -107,6 +108,12 @@ class Calibration:
             self.mounts[name] = read_mount(self._values, camera, points[camera])
         return float(graph.error(self._values))
 
+    def widen_postures(self) -> None:
+        """Believe less in the usual postures where the last solution shows unusual ones; see `widened`."""
+        times_ns = self._samples.times_ns
+        seconds = 1e-9 * float(times_ns[-1] - times_ns[0])
+        self._at_ease = widened(self._skeleton, self._bones, self.poses(), seconds)
+
     def spread(
         self,
         sigma_log: float,
@@ -133,7 +140,7 @@ class Calibration:
         bends = np.hypot(bends, [placed.get(name, (0.0, 0.0)) for name in cameras])
         constant = joined(
             [
-                mounts.spread(solved, factors, habits(self._bones, cameras, BETWEEN_SHARE)),
+                mounts.spread(solved, factors, habits(self._at_ease, cameras, BETWEEN_SHARE)),
                 scale_direction(self._bones, sigma_log, follow),
             ]
         )
@@ -188,7 +195,7 @@ class Calibration:
         poses[..., :3, 3] *= self._scale
         graph = self._graph(poses, self._scale)
         linear = linearise(graph, self._values)
-        body = Body(bones=self._bones, hinges=hinges(self._skeleton, tuple(self._bones)))
+        body = Body(bones=self._at_ease, hinges=hinges(self._skeleton, tuple(self._bones)))
         each, last = body.factors_per_tick, self._samples.valid.shape[1]
         posed = np.flatnonzero(self._samples.posture.t_pose)
         stated = (self._first_joint + each * posed[:, None] + np.arange(each)).reshape(-1)
@@ -250,7 +257,7 @@ class Calibration:
         )
         once = float(np.sqrt(max(self._samples.posture.t_pose.sum(), 1)))
         return (
-            JointFactors(self._bones, limits, prior_scale=PRIOR_SCALE, slack_m=slack_m),
+            JointFactors(self._at_ease, limits, prior_scale=PRIOR_SCALE, slack_m=slack_m),
             JointFactors(t_posed(self._skeleton, self._bones), limits, prior_scale=once, slack_m=slack_m),
         )
 

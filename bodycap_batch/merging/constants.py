@@ -102,6 +102,8 @@ def calibrate_body(
     priors = {mount.camera: mount for mount in inputs.mounts}
     samples = take_samples(tracks, provisional, _CALIBRATION_TICKS, known_up, t_pose_ns)
     calibration = Calibration(inputs.skeleton, bones, samples, priors, provisional, step)
+    calibration.solve(provisional)
+    calibration.widen_postures()
     estimate = find_scale(calibration, provisional)
     poses = calibration.poses()
     path_m = estimate.scale * tracks[0].map_from_cam[:, :3, 3]

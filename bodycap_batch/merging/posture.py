@@ -14,9 +14,12 @@ import gtsam
 import numpy as np
 
 from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.merging.bones import Bone
+from bodycap_batch.geometry import so3_log
+from bodycap_batch.merging.bones import Bone, proper_axes
 from bodycap_batch.merging.graph import bone_key
+from bodycap_batch.merging.spread import BETWEEN_SHARE
 from bodycap_batch.merging.tracks import Track
+from bodycap_batch.skeleton import SkeletonModel
 
 WALKING_M_PER_S = 0.5
 _STRIDE_NS = 500_000_000
@@ -33,6 +36,8 @@ _NARROWEST_M = 0.3
 """Standard deviation of the path across: at 0.3 m, steps whose bounce is 2 cm tilt the plane of ten of them
 by a degree."""
 _OFF_BODY_RAD = float(np.radians(30.0))
+GESTURE_S = 4.0
+"""A posture tells little of the one within two seconds before or after it: gestures last about as long."""
 _TRUNK = ("Spine1", "Spine", "Hips")
 
 
@@ -137,6 +142,35 @@ class PostureFactors:
 def _once(sigma: float, count: int) -> Any:
     """Noise of a rule that is applied `count` times and counts once."""
     return gtsam.noiseModel.Isotropic.Sigma(2, sigma * float(np.sqrt(max(count, 1))))
+
+
+def widened(
+    skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray, seconds: float
+) -> tuple[Bone, ...]:
+    """Bones whose everyday range is wider by what a capture happens to show.
+
+    A joint's mean over a capture differs from its ease by the person's habit, a share of its everyday range,
+    and by the gestures that fall into the capture: their spread over the root of how many there were.
+
+    Args:
+        skeleton: The body.
+        bones: The graph's bones.
+        world_from_bone: (K,B,4,4) poses solved at the sampled ticks.
+        seconds: What the ticks span.
+    """
+    few = min(1.0, GESTURE_S / max(seconds, 1e-3))
+    out = []
+    for index, bone in enumerate(bones):
+        if bone.parent < 0:
+            out.append(bone)
+            continue
+        turn = np.swapaxes(world_from_bone[:, bone.parent, :3, :3], 1, 2) @ world_from_bone[:, index, :3, :3]
+        axes = proper_axes(skeleton, bone.role)
+        gestures = (so3_log(bone.mean_rotation.T @ turn) @ axes).std(axis=0) ** 2
+        usual = np.diagonal(axes.T @ bone.rotation_covariance @ axes)
+        spread = np.diag(usual + gestures * few / BETWEEN_SHARE**2)
+        out.append(replace(bone, rotation_covariance=axes @ spread @ axes.T))
+    return tuple(out)
 
 
 def walking_plane(path_m: FloatArray, body: FloatArray) -> FloatArray | None:

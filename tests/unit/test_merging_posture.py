@@ -7,8 +7,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from bodycap_batch.geometry import make_transform, so3_exp
-from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.posture import find_posture, walking_plane
+from bodycap_batch.merging.bones import graph_bones, proper_axes
+from bodycap_batch.merging.posture import GESTURE_S, find_posture, walking_plane, widened
+from bodycap_batch.merging.spread import BETWEEN_SHARE
 from bodycap_batch.merging.t_pose import arm_span, find_t_pose, t_posed
 from bodycap_batch.merging.tracks import Track
 from bodycap_batch.skeleton import forward_kinematics
@@ -183,3 +184,25 @@ def test_the_t_pose_of_a_rig_whose_arms_hang_lifts_them():
     assert_allclose(lifted, [np.linalg.norm(lifted), 0.0, 0.0], atol=1e-9)
     lifted = bones["RightArm"].mean_rotation @ bones["RightForeArm"].offset_m
     assert_allclose(lifted, [-np.linalg.norm(lifted), 0.0, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(("seconds", "few"), [(2.0, 1.0), (10.0 * GESTURE_S, 0.1)])
+def test_what_a_capture_happens_to_show_widens_a_joints_range(seconds, few):
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = graph_bones(skeleton, ROLES)
+    elbow = [bone.role for bone in bones].index("LeftForeArm")
+    axes = proper_axes(skeleton, "LeftForeArm")
+    # Thirty degrees to either side of a posture that is itself twenty off the usual one.
+    flexion = np.radians(20.0 + 30.0 * np.tile([1.0, -1.0], 10))
+    poses = np.tile(np.eye(4), (20, len(bones), 1, 1))
+    for index, bone in enumerate(bones):
+        if bone.parent >= 0:
+            turn = so3_exp(np.outer(flexion if index == elbow else 0.0 * flexion, axes[:, 2]))
+            poses[:, index, :3, :3] = poses[:, bone.parent, :3, :3] @ bone.mean_rotation @ turn
+    wider = widened(skeleton, bones, poses, seconds)
+    grown = axes.T @ (wider[elbow].rotation_covariance - bones[elbow].rotation_covariance) @ axes
+    expected = np.diag([0.0, 0.0, few * np.radians(30.0) ** 2 / BETWEEN_SHARE**2])
+    assert_allclose(grown, expected, atol=1e-9)
+    for index, (bone, other) in enumerate(zip(bones, wider, strict=True)):
+        assert index == elbow or np.allclose(bone.rotation_covariance, other.rotation_covariance)
+        assert (bone.mean_rotation == other.mean_rotation).all()
