@@ -6,9 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from bodycap_batch.arrays import BoolArray, FloatArray
+from bodycap_batch.arrays import FloatArray
 from bodycap_batch.body import MergeInputs
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.geometry import Similarity
@@ -27,16 +26,13 @@ from bodycap_batch.skeleton import Mount
 from bodycap_batch.skeleton_presets import split_side
 
 _CALIBRATION_TICKS = 80
+_ENOUGH_WALKING = 10
 PROPORTION_SIGMA = 0.04
 """Spread of a limb's share of the stature between people, so also of a scale that rests on it (standard
 deviations of segment lengths over stature are 3 to 5 %: Winter's table gives means only; C. C. Gordon et al.,
 "2012 Anthropometric Survey of U.S. Army Personnel", Natick 2014)."""
 STATURE_SIGMA = 0.055
 """Spread of adults' stature about one mean for both sexes (7 cm within each, means 14 cm apart)."""
-_UNDER_THE_WALK_M = 0.4
-_WALKED_OVER = 5
-"""A floor is walked over: this many of its points lie so near to the path, seen from above. Nobody walks
-through a table."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +105,10 @@ def calibrate_body(
     path_m = estimate.scale * tracks[0].map_from_cam[:, :3, 3]
     body_up = gauge.body_up(inputs.skeleton, bones, poses)
     up = gauge.find_up(estimate.scale * points, body_up, np.random.default_rng(0), path_m)
-    height = _height_over_floor(inputs, bones, poses, up, (estimate.scale * points, path_m))
+    walking = samples.posture.walking
+    # Who bends down or sits is not as tall as who walks.
+    erect = poses[walking] if walking.sum() >= _ENOUGH_WALKING else poses
+    height = _height_over_floor(inputs, bones, erect, up, (estimate.scale * points, path_m))
     known = known_distance(inputs, options, cleaned.places)
     sources = _sources(inputs, bones, estimate, height, known)
     scale, sigma = combine(sources)
@@ -194,23 +193,12 @@ def _height_over_floor(
 ) -> float | None:
     """Median height of the trunk's first solved joint over the walked floor, None if none was seen."""
     points_m, path_m = around
-    if split_side(bones[0].role)[0] or not len(points_m):
+    if split_side(bones[0].role)[0]:
         return None
     height = float(np.median(poses[:, 0, :3, 3] @ up.up))
     standing = gauge.standing_height(inputs.skeleton, bones[0].joint)
-    heights = points_m @ up.up
-    floor = gauge.find_floor(heights, up, height - gauge.WALKING_HEIGHT * standing, standing)
-    inside = np.abs(heights - floor.height_m) < gauge.SLAB_M
-    if floor.source != "map" or (inside & _under(points_m, path_m, up.up)).sum() < _WALKED_OVER:
-        return None
-    return height - floor.height_m
-
-
-def _under(points_m: FloatArray, path_m: FloatArray, up: FloatArray) -> BoolArray:
-    """Which points (P,) lie below or above a path (N,3)."""
-    level = np.linalg.svd(up[None])[2][1:].T
-    distance, _ = cKDTree(path_m @ level).query(points_m @ level)
-    return np.asarray(distance < _UNDER_THE_WALK_M)
+    floor = gauge.walked_floor(points_m, path_m, up, height - gauge.WALKING_HEIGHT * standing, standing)
+    return None if floor is None else height - floor.height_m
 
 
 def _sources(

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from bodycap_batch.arrays import BoolArray, FloatArray
@@ -25,6 +26,11 @@ SLAB_M = 0.03
 _MIN_POINTS = 100
 _MIN_FLOOR_POINTS = 30
 _MOST_BELOW = 0.02
+_FLOOR_REACH = 0.25
+"""How far off the body's own idea of it the floor is looked for, as a share of the trunk's height."""
+_BESIDE_M = 0.8
+_WALKED_OVER = 5
+"""A floor shows beside the walk, seen from above, in so many points of a slab, and in half of all there."""
 _LEGLESS_HIP_M = 0.9
 _ANKLE_OVER_LEG = 0.039 / 0.491
 """Ankle height over leg length (Drillis and Contini), for rigs whose feet end at the ankle."""
@@ -114,7 +120,7 @@ def find_floor(heights_m: FloatArray, up: Direction, expected_m: float, standing
         standing_m: Height of a trunk joint above the soles; sets how far off the floor may be.
     """
     if up.source == "map" and len(heights_m) >= _MIN_POINTS:
-        reach = 0.25 * standing_m
+        reach = _FLOOR_REACH * standing_m
         edges = np.arange(expected_m - reach, expected_m + reach, 0.25 * SLAB_M)
         inside = (heights_m >= edges[:, None]) & (heights_m < edges[:, None] + SLAB_M)
         below = (heights_m < edges[:, None] - 2.0 * SLAB_M).mean(axis=1)
@@ -125,6 +131,34 @@ def find_floor(heights_m: FloatArray, up: Direction, expected_m: float, standing
             slab = heights_m[np.abs(heights_m - edges[best] - 0.5 * SLAB_M) < SLAB_M]
             return Floor(float(np.median(slab)), "map", len(slab))
     return Floor(expected_m, "standing hip height", 0)
+
+
+def walked_floor(
+    points_m: FloatArray, path_m: FloatArray, up: Direction, expected_m: float, standing_m: float
+) -> Floor | None:
+    """Find the floor in the few points beside the walk: nobody walks through a table.
+
+    Args:
+        points_m: (P,3) map points in the solved frame.
+        path_m: (N,3) path of the trunk.
+        up: The vertical; two degrees of tilt smear a floor over a decimetre, so that only the map's will do.
+        expected_m: Height of the soles from the body alone.
+        standing_m: Height of a trunk joint above the soles; sets how far off the floor may be.
+    """
+    if up.source != "map" or not len(points_m):
+        return None
+    level = np.linalg.svd(up.up[None])[2][1:].T
+    beside = cKDTree(path_m @ level).query(points_m @ level)[0] < _BESIDE_M
+    heights = np.sort(points_m[beside] @ up.up)
+    heights = heights[np.abs(heights - expected_m) < _FLOOR_REACH * standing_m]
+    if not len(heights):
+        return None
+    ends = np.searchsorted(heights, heights + 2.0 * SLAB_M, side="right")
+    first = int(np.argmax(ends - np.arange(len(heights))))
+    slab = heights[first : ends[first]]
+    if len(slab) < max(_WALKED_OVER, 0.5 * len(heights)):
+        return None
+    return Floor(float(np.median(slab)), "map", len(slab))
 
 
 def feet_floor(skeleton: SkeletonModel, world_from_joint: FloatArray, solved: BoolArray) -> Floor | None:

@@ -147,9 +147,11 @@ def _place(
     standing = gauge.standing_height(inputs.skeleton, 0)
     # The first mount is the trunk camera's: in a long capture the first stretch may lack it.
     points = points_around(inputs, calibrated.mounts[0].camera)
-    heights = calibrated.scale * points @ rotation[2]
+    points_m, path_m = calibrated.scale * points, solution.world_from_bone[:, 0, :3, 3]
     expected = float(np.median(hips[:, 2])) - gauge.WALKING_HEIGHT * standing
-    floor = gauge.find_floor(heights, calibrated.up, expected, standing)
+    floor = gauge.walked_floor(points_m, path_m, calibrated.up, expected, standing) or gauge.find_floor(
+        points_m @ rotation[2], calibrated.up, expected, standing
+    )
     if floor.source != "map":
         floor = gauge.feet_floor(inputs.skeleton, joints, solved) or floor
     forward = -joints[:, 0, :3, 1]

@@ -22,6 +22,7 @@ from bodycap_batch.merging.gauge import (
     place,
     standing_height,
     upright,
+    walked_floor,
 )
 from bodycap_batch.merging.graph import (
     MountPoints,
@@ -267,6 +268,38 @@ def test_walls_and_floor_give_the_vertical_and_the_floor():
     assert floor_found.source == "map"
     assert floor_found.height_m == pytest.approx(0.0, abs=0.01)
     assert find_floor(room @ UP, Direction(UP, "body", None, 0.0), 0.08, 1.2).height_m == 0.08
+
+
+def _beside_a_walk(rng, floor, clutter):
+    """A path of four metres, points of the floor and of clutter beside it, and a room further away."""
+    path = np.column_stack([np.linspace(0.0, 4.0, 60), np.zeros(60), np.full(60, 1.2)])
+    return path, np.vstack(
+        [
+            rng.uniform([0.0, -0.7, -0.01], [4.0, 0.7, 0.01], (floor, 3)),
+            rng.uniform([0.0, -0.7, -0.25], [4.0, 0.7, 0.35], (clutter, 3)),
+            rng.uniform([0.0, 1.0, 0.05], [4.0, 3.0, 2.5], (900, 3)),
+        ]
+    )
+
+
+@pytest.mark.parametrize("expected", [-0.15, 0.0, 0.2])
+def test_a_few_points_beside_the_walk_are_the_floor_where_a_room_hides_it(expected):
+    path, points = _beside_a_walk(np.random.default_rng(1), 8, 3)
+    found = walked_floor(points, path, Direction(UP, "map", 0.0, 1.0), expected, 1.2)
+    assert found.source == "map"
+    assert 8 <= found.support <= 11
+    # Points within a centimetre of it, one of clutter among them at most moves the median by as much.
+    assert found.height_m == pytest.approx(0.0, abs=0.01)
+    assert find_floor(points @ UP, Direction(UP, "map", 0.0, 1.0), expected, 1.2).source != "map"
+
+
+@pytest.mark.parametrize(
+    ("floor", "clutter", "source"), [(4, 0, "map"), (8, 20, "map"), (8, 3, "walk"), (0, 0, "map")]
+)
+def test_clutter_beside_the_walk_is_no_floor(floor, clutter, source):
+    path, points = _beside_a_walk(np.random.default_rng(1), floor, clutter)
+    assert walked_floor(points, path, Direction(UP, source, 0.0, 1.0), 0.0, 1.2) is None
+    assert walked_floor(points[:0], path, Direction(UP, source, 0.0, 1.0), 0.0, 1.2) is None
 
 
 def test_one_wall_does_not_fix_the_vertical():
