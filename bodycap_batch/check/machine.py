@@ -103,7 +103,9 @@ def _processors() -> Look:
 def _memory() -> Look:
     total_mb = _total_memory_mb()
     if total_mb is None:
-        return Look(what="memory", state="note", found="unknown", remedy=f"{_MEMORY_MB / 1000:g} GB are enough")
+        return Look(
+            what="memory", state="note", found="unknown", remedy=f"{_MEMORY_MB / 1000:g} GB are enough"
+        )
     found = f"{total_mb / 1024:.1f} GB"
     if total_mb >= _MEMORY_MB:
         return Look(what="memory", state="ok", found=found)
