@@ -7,6 +7,7 @@ before anything becomes visible: a commit to the store, a result, a move.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ from typing import Any
 from bodycap_batch.errors import Cancelled
 
 MARKER = ".generation-"
+_EXPECTED: Mapping[str, type] = {"pid": int, "generation": int, "token": str, "machine": str, "process": str}
+"""What somebody has put into the file by hand counts only where it is of the right kind."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +41,7 @@ class Guard:
         found = read_owner(self.owner)
         # An owner that was taken over from may have woken up in the middle of its last heartbeat.
         outdated = int(found.get("generation", 0)) < self.generation
-        return outdated or (found.get("token") == self.token and found["generation"] == self.generation)
+        return outdated or (found.get("token"), found.get("generation")) == (self.token, self.generation)
 
     def require(self) -> None:
         """Raise `Cancelled` where another watcher has taken the job over."""
@@ -61,4 +64,6 @@ def read_owner(path: Path) -> dict[str, Any]:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    if not isinstance(found, dict):
+        return {}
+    return {name: value for name, value in found.items() if isinstance(value, _EXPECTED.get(name, object))}
