@@ -19,6 +19,8 @@ SERIES_BUDGET = 6_000_000
 """Characters of all series together, some tenths of it the marks drawn into them."""
 _MARKS_EACH = 1_300
 _SERIES_PX = 320
+_LARGEST = 50_000
+"""Characters of 320×240 of nothing but noise: where such fit, none is decoded to see how large they are."""
 _SHEET_PX = 240
 _QUALITY = 60
 _PROBES = 6
@@ -82,12 +84,14 @@ def series(
     count = len(camera.frame_numbers)
     if count == 0:
         return ()
-    probes = _read(camera, thinned(count, _PROBES), _SERIES_PX, context)
-    if not probes:
-        return ()
-    each = float(np.mean([len(picture.jpeg) for picture in probes])) + _MARKS_EACH
     length_s = float(times_s[-1] - times_s[0])
-    most = min(int(0.95 * budget / each), 1 + int(_PER_SECOND * length_s))
+    most = 1 + int(_PER_SECOND * length_s)
+    if most * (_LARGEST + _MARKS_EACH) > budget:
+        probes = _read(camera, thinned(count, _PROBES), _SERIES_PX, context)
+        if not probes:
+            return ()
+        each = float(np.mean([len(picture.jpeg) for picture in probes])) + _MARKS_EACH
+        most = min(int(0.95 * budget / each), most)
     pictures = _read(camera, _cheap(camera, thinned(count, most)), _SERIES_PX, context)
     return tuple(_within(pictures, budget))
 
