@@ -89,18 +89,28 @@ class _StoredMarks:
         self._of = (job, out_dir, store)
         self._lock = threading.Lock()
         self._marks: Marks | None = None
-        self._missing = False
+        self._looked = False
 
     def __call__(self, camera: str, first: int) -> list[dict[str, Any]]:
         """Marks of a part of a camera's frames; none where the store does not hold them."""
-        from bodycap_batch.report.marks import Marks
         from bodycap_batch.report.serving import MARKS_EACH
 
         with self._lock:
-            if self._marks is None and not self._missing:
-                try:
-                    self._marks = Marks(_stored_inputs(*self._of))
-                except BodycapError as error:
-                    self._missing = True
-                    typer.echo(f"only the stored pictures are drawn over: {error.message}", err=True)
+            if not self._looked:
+                self._looked = True
+                self._marks = self._stored()
             return [] if self._marks is None else self._marks.part(camera, first, MARKS_EACH)
+
+    def _stored(self) -> Marks | None:
+        from bodycap_batch.report.marks import Marks
+
+        try:
+            inputs = _stored_inputs(*self._of)
+        except BodycapError as error:
+            lacking = error.message
+        else:
+            if inputs.registrations:
+                return Marks(inputs)
+            lacking = "the store no longer holds this job's camera paths (run it again)"
+        typer.echo(f"points and skeleton are drawn over the stored pictures only: {lacking}", err=True)
+        return None

@@ -232,3 +232,19 @@ def test_fbx_is_the_same_twice(case: Case, tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_fbx(tmp_path / f"{name}.fbx", case.motion)
     assert (tmp_path / "a.fbx").read_bytes() == (tmp_path / "b.fbx").read_bytes()
+
+
+def test_the_example_puts_the_body_into_its_room(blender: Path, case: Case, tmp_path: Path) -> None:
+    scene = tmp_path / "scene.blend"
+    words = [str(REPOSITORY / "examples" / "blender_import.py"), "--", str(case.folder), str(scene)]
+    counted = (
+        "import bpy, sys; bpy.ops.wm.open_mainfile(filepath=sys.argv[-1]);"
+        "print('found', *sorted(f'{each.type}:{len(each.data.bones)}' if each.type == 'ARMATURE'"
+        " else f'{each.type}:{len(each.data.vertices) > 0}' for each in bpy.data.objects))"
+    )
+    for command in (words, ["-c", counted, str(scene)]):
+        done = subprocess.run(
+            [str(blender), *command], capture_output=True, text=True, check=False, timeout=300, env=clean()
+        )
+        assert done.returncode == 0, done.stderr[-2000:]
+    assert f"found ARMATURE:{len(case.motion.skeleton.joints)} MESH:True" in done.stdout

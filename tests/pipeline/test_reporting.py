@@ -1,0 +1,50 @@
+"""What a report is made of, found again in the store: for `bodycap view` and its recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from bodycap_batch.cli.view import _StoredMarks
+from bodycap_batch.pipeline import Settings, stored_for_report
+from bodycap_batch.store import Store
+from tests.pipeline.test_run import CAMERAS, Bench
+
+
+def looking(bench: Bench) -> Settings:
+    """Whatever would be computed fails."""
+    return Settings(
+        store=Store(bench.folder / "store"),
+        threads=1,
+        listener=lambda _: None,
+        cancelled=lambda: False,
+        command=("false",),
+    )
+
+
+def test_the_finished_stages_are_found_and_nothing_is_computed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(tmp_path, monkeypatch)
+    bench.run()
+    found = stored_for_report(bench.job(), out_dir=bench.out, settings=looking(bench))
+    assert all(Path(found[name]).is_dir() for name in ("map", "merge", "export"))
+    assert len(found["registrations"]) == len(found["keyframes"]) == len(CAMERAS)
+    assert found["failure"] is None
+    # another option of the skeleton: its stage and the export are not there, what comes before is
+    found = stored_for_report(bench.job(merge={"max_gap_s": 0.5}), out_dir=bench.out, settings=looking(bench))
+    assert found["merge"] is None
+    assert found["export"] is None
+    assert len(found["registrations"]) == len(CAMERAS)
+    assert found["failure"]["stage"] == "merge"
+
+
+def test_an_empty_store_gives_no_marks_and_is_told_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = Bench(tmp_path, monkeypatch)
+    marks = _StoredMarks(bench.job(), bench.out, tmp_path / "nothing")
+    assert marks("torso", 0) == []
+    assert marks("torso", 60) == []
+    assert capsys.readouterr().err.count("over the stored pictures only") == 1
