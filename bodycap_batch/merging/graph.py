@@ -19,6 +19,8 @@ MAX_BONES = 64
 GEMAN_MCCLURE_C = 6.0
 """In sigmas of a six-dimensional residual, whose typical length is 2.4: at 3 the motion model wins over right
 measurements of violent motion (palm 6.4 cm off instead of 0.6); gross errors have been dropped before."""
+_LEAST_DAMPING = 1e-5
+"""Damping is raised tenfold from here until the error falls; each try is a solve, at the end all in vain."""
 _AXIS_WEIGHT = 0.1
 """Information of a mount's axis points over its centre's: small, so that turning and moving decouple."""
 
@@ -208,8 +210,9 @@ def optimise(
     iterations: int,
     last: Sequence[int] = (),
     step: Callable[[], None] | None = None,
+    tolerance: float = 1e-5,
 ) -> tuple[Any, int]:
-    """Run Levenberg-Marquardt to a relative decrease of 1e-5.
+    """Run Levenberg-Marquardt until the error hardly falls.
 
     Args:
         graph: The factors.
@@ -217,13 +220,14 @@ def optimise(
         iterations: Most steps.
         last: Keys eliminated last (calibration shared by all ticks).
         step: Called after each iteration; may raise to stop.
+        tolerance: Relative decrease of the error below which an iteration was the last.
 
     Returns:
         The solution and the iterations taken.
     """
     params = gtsam.LevenbergMarquardtParams()
-    params.setRelativeErrorTol(1e-5)
     params.setMaxIterations(iterations)
+    params.setlambdaLowerBound(_LEAST_DAMPING)
     if last:
         params.setOrdering(gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, list(last)))
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
@@ -233,7 +237,7 @@ def optimise(
         if step is not None:
             step()
         decrease, error = error - optimizer.error(), optimizer.error()
-        if decrease <= 1e-5 * max(error, 1e-9):
+        if decrease <= tolerance * max(error, 1e-9):
             return optimizer.values(), count
     return optimizer.values(), iterations
 
