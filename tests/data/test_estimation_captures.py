@@ -20,12 +20,13 @@ from bodycap_batch.registration import register_frames
 
 pytestmark = [pytest.mark.data, pytest.mark.slow]
 
-# A pixel is 7 mm at the 3 m of this room; a plain implementation reaches 0.4 cm, the project asks for 0.6.
+# A pixel is 7 mm at the 3 m of this room; a map adjusted with squares leads to 0.38 cm. The project asks
+# for 0.35.
 # Below 0.1 cm the truth would have leaked into the estimate.
-MAX_ATE_M, MIN_ATE_M = 0.006, 0.001
+MAX_ATE_M, MIN_ATE_M = 0.0035, 0.001
 
 
-def test_walk12_is_registered_whole_and_to_six_millimetres(data_root: Path, tmp_path: Path) -> None:
+def test_walk12_is_registered_whole_and_to_half_a_pixel(data_root: Path, tmp_path: Path) -> None:
     capture = open_capture(load_job(data_root / "walk12").capture)
     context = StageContext(work_dir=tmp_path, threads=2)
     with ThreadPoolExecutor(2) as pool:
