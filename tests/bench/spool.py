@@ -43,7 +43,7 @@ def lines_of(result: dict[str, Any]) -> list[str]:
         ]
     return [
         f"{jobs} folders dropped at once, {seconds}: {result['lost']} lost",
-        f"  {result['done']} done, {result['answered']} of them answered by the store",
+        f"  {result['done']} done, {result['answered']} of them answered by the store but for the report",
         f"  {result['refused']} refused by pre-flight: {result['refused_by_name']} by what the job says, "
         f"{result['refused_by_check']} by a look at the videos",
     ]
@@ -95,7 +95,7 @@ def at_once(work: Path, jobs: int) -> dict[str, Any]:
     count = Counter(
         s["name"].split()[0] for s in found if right[s["name"].split()[0]] == (s["state"], s["exit_code"])
     )
-    answered = sum(s["state"] == "done" and all(x["reused"] for x in s["finished_stages"]) for s in found)
+    answered = sum(s["state"] == "done" and _computed(s) <= {"report"} for s in found)
     lost = jobs - sum(count.values())
     left = [path for name in ("inbox", "running") for path in (work / "jobs" / name).iterdir()]
     return {
@@ -110,6 +110,11 @@ def at_once(work: Path, jobs: int) -> dict[str, Any]:
         "refused_by_check": count["unreadable"],
         "lost": lost,
     }
+
+
+def _computed(status: dict[str, Any]) -> set[str]:
+    """Stages that the store did not answer; the report bears the job's name, so each job has its own."""
+    return {stage["stage"] for stage in status["finished_stages"] if not stage["reused"]}
 
 
 def _inbox(work: Path) -> Path:
