@@ -19,6 +19,7 @@ _SCRIPTS = (
     "packing.js",
     "timeline.js",
     "orbit.js",
+    "splat.js",
     "solid.js",
     "flat.js",
     "film.js",

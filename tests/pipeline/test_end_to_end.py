@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -27,6 +30,23 @@ capture:
 height_m: 1.75
 """
 FRAMES = {"torso": 60, "left_palm": 60}
+
+
+def example(name: str, *words: str, cwd: Path) -> str:
+    """Run a script of ``examples/`` as a user would; returns what it printed."""
+    root = Path(__file__).resolve().parents[2]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run(
+        [sys.executable, str(root / "examples" / name), *words],
+        env=environment,
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +102,32 @@ def test_a_finished_job_executes_nothing(folder: Path, capfd: pytest.CaptureFixt
     assert main(["run", str(folder / "tiny.yaml"), "--out", str(folder / "out")]) == 0
     assert "nothing to do" in capfd.readouterr().out
     assert results_of(folder / "out") == before
+
+
+def test_the_python_example_runs_the_job_and_reads_its_results(folder: Path) -> None:
+    # the same job under another name; the stages lie in the store beside its results
+    (folder / "api.yaml").write_text(f"out: out/api\n{JOB}")
+    said = example("python_api.py", str(folder / "api.yaml"), cwd=folder)
+    assert "reused map" in said
+    assert "started map" not in said
+    for words in (
+        "frames by status",
+        "torso travelled",
+        "left_palm travelled",
+        "joints, ",
+        "m over the floor",
+    ):
+        assert words in said
+
+
+def test_the_drawing_example_draws_the_results(folder: Path, tmp_path: Path) -> None:
+    import cv2
+
+    example("draw_result.py", str(folder / "out"), str(tmp_path / "picture.png"), cwd=folder)
+    picture = cv2.imread(str(tmp_path / "picture.png"))
+    assert picture is not None
+    # a blank sheet has one colour; points, paths and bones have many
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
 
 
 def test_made_again_in_another_store_every_byte_is_the_same(folder: Path, tmp_path: Path) -> None:

@@ -35,16 +35,18 @@ class Solid {
     this.layers = {};
     this.dirty = true;
     this.follow = false;
-    this.renderer = new three.WebGLRenderer({ antialias: false, powerPreference: "high-performance" });
+    this.renderer = new three.WebGLRenderer({ antialias: false, alpha: true, powerPreference: "high-performance" });
     this.renderer.outputColorSpace = three.LinearSRGBColorSpace;
     const gl = this.renderer.getContext();
     const info = gl.getExtension("WEBGL_debug_renderer_info");
     this.gpu = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
     this.renderer.setPixelRatio(SOFTWARE.test(this.gpu) ? 1 : Math.min(window.devicePixelRatio || 1, 2));
+    if (SOFTWARE.test(this.gpu)) this.splat = new Splat(holder, data.points, data.colours);
     holder.append(this.renderer.domElement);
     this.scene = new three.Scene();
     this.camera = new three.PerspectiveCamera(42, 16 / 9, 0.01, 1000);
     this.camera.up.set(0, 0, 1);
+    this.clip = new three.Matrix4();
     this.scene.add(new three.HemisphereLight(0xffffff, 0x777777, 2.2));
     const sun = new three.DirectionalLight(0xffffff, 1.2);
     sun.position.set(2, -3, 5);
@@ -88,11 +90,14 @@ class Solid {
 
   addPoints() {
     const { three, data } = this;
-    const cloud = new three.BufferGeometry();
-    cloud.setAttribute("position", this.buffer(data.points, 3));
-    cloud.setAttribute("color", this.buffer(data.colours, 3, true));
-    this.cloud = cloud;
-    this.layer("points", new three.Points(cloud, this.dots(2))).frustumCulled = false;
+    if (this.splat) this.layers.points = [this.splat];
+    else {
+      const cloud = new three.BufferGeometry();
+      cloud.setAttribute("position", this.buffer(data.points, 3));
+      cloud.setAttribute("color", this.buffer(data.colours, 3, true));
+      this.cloud = cloud;
+      this.layer("points", new three.Points(cloud, this.dots(2))).frustumCulled = false;
+    }
     if (data.solid.metric) {
       const [x, y] = data.solid.view.centre;
       const side = 2 * Math.ceil(2 * data.solid.view.radius);
@@ -210,7 +215,7 @@ class Solid {
   }
 
   dress() {
-    this.renderer.setClearColor(styleColour("--view"));
+    this.renderer.setClearColor(styleColour("--view"), this.splat ? 0 : 1);
     if (this.skin) {
       const read = (name) => new this.three.Color().setStyle(styleColour(name), this.three.LinearSRGBColorSpace);
       const [ink, guess] = [read("--bone"), read("--guess")];
@@ -225,6 +230,7 @@ class Solid {
     const { clientWidth: width, clientHeight: height } = this.holder;
     if (!width || !height) return;
     this.renderer.setSize(width, height, false);
+    if (this.splat) this.splat.resize(width, height);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
     this.dirty = true;
@@ -283,7 +289,8 @@ class Solid {
     }
     const count = this.data.points.length / 3;
     this.thin = moving && this.adapts && this.share < 1;
-    this.cloud.setDrawRange(0, this.thin ? Math.ceil(count * this.share) : count);
+    const drawn = this.thin ? Math.ceil(count * this.share) : count;
+    if (this.cloud) this.cloud.setDrawRange(0, drawn);
     this.drawn = now;
     this.dirty = false;
     const { camera, orbit } = this;
@@ -293,5 +300,9 @@ class Solid {
     camera.far = orbit.distance + 40 * orbit.radius;
     camera.updateProjectionMatrix();
     this.renderer.render(this.scene, camera);
+    if (this.splat) {
+      const clip = this.clip.multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse);
+      this.splat.draw(clip.elements, drawn);
+    }
   }
 }
