@@ -77,12 +77,13 @@ class References:
 
 
 @contextlib.contextmanager
-def moving(store: Store, before: Path) -> Iterator[Callable[..., None]]:
+def moving(store: Store, before: Path, *, wait: bool = True) -> Iterator[Callable[..., None]]:
     """Keep what a folder of results was made from while its job is moved, also if this process is killed.
 
     Args:
         store: Where the artefacts are.
         before: Where the folder is.
+        wait: Wait while the store is being cleaned, or raise `StoreBusy`.
 
     Yields:
         To be called as ``to(after, *others)`` just before the move: where the folder (or what it will be made
@@ -91,7 +92,7 @@ def moving(store: Store, before: Path) -> Iterator[Callable[..., None]]:
     Raises:
         StoreError: The disk fails.
     """
-    with in_use(store, wait=True):
+    with in_use(store, wait=wait):
         old = References(store, before)
         bound: list[tuple[Path, ...]] = []
 

@@ -67,6 +67,8 @@ class Worker:
         """
         try:
             return self._work(claim, refused)
+        except StoreBusy as error:
+            return self._release(claim, error)
         except (BodycapError, OSError) as error:
             return self._stuck(claim, error)
 
@@ -165,6 +167,9 @@ class Worker:
     def _leave(self, claim: Claim, status: StatusFile, error: BodycapError) -> Outcome:
         """Leave the job where it is, for the next watcher or a later look of this one."""
         status.change(state="stopped", active={})
+        return self._release(claim, error)
+
+    def _release(self, claim: Claim, error: BodycapError) -> Outcome:
         claim.release()
         message = (
             "goes on at the next start" if isinstance(error, Cancelled) else f"goes on later: {error.message}"
@@ -181,7 +186,8 @@ class Worker:
     ) -> Outcome:
         """Say the last word and move the job where it belongs."""
         folder = self._spool.done if state == "done" else self._spool.failed
-        with moving(self._store, claim.job.result) as keep_for:
+        # What has just been run waits for a cleaner, lest it is run again; what was run before need not.
+        with moving(self._store, claim.job.result, wait=status is not None) as keep_for:
             claim.end()
             if not claim.guard.holds():
                 return Outcome(name=claim.job.name, state="lost", message="another watcher has taken it over")
