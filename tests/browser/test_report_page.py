@@ -179,3 +179,34 @@ def test_uncertainty_is_drawn_where_it_is_known(pages: Pages, inputs: ReportInpu
     page = pages.open((tmp_path / "report.html").as_uri())
     known = page.evaluate("Boolean(bodycap.data.body.sigma)")
     assert page.locator("[data-layer=sigma]").count() == int(known)
+
+
+def test_without_a_graphics_card_points_stand_where_the_renderer_would_put_them(
+    pages: Pages, report: Path
+) -> None:
+    page = pages.open(report.as_uri())
+    page.wait_for_selector("section.viewer[data-mode=webgl]")
+    with_points = solid_pixels(page)
+    inside, drawn = page.evaluate(
+        """() => {
+          const { three, camera, splat, data } = bodycap.view, { width, height } = splat.canvas;
+          let [inside, drawn] = [0, 0];
+          for (let i = 0; i < data.points.length; i += 3) {
+            const seen = new three.Vector3(...data.points.slice(i, i + 3)).project(camera);
+            if (!(Math.abs(seen.x) < 0.99 && Math.abs(seen.y) < 0.99 && seen.z < 1)) continue;
+            const [x, y] = [(seen.x + 1) / 2 * width - 0.5, (1 - seen.y) / 2 * height - 0.5].map(Math.floor);
+            inside += 1;
+            drawn += splat.pixels[y * width + x] !== 0;
+          }
+          return [inside, drawn];
+        }"""
+    )
+    assert inside > 50
+    # rounding may put a point on the edge of a pixel into the next one
+    assert drawn >= 0.97 * inside
+    page.uncheck("[data-layer=points]")
+    assert solid_pixels(page) != with_points
+    assert page.evaluate("bodycap.view.splat.pixels.every((pixel) => pixel === 0)")
+    page.check("[data-layer=points]")
+    page.wait_for_timeout(400)
+    assert page.evaluate("bodycap.view.splat.pixels.some(Boolean)")
