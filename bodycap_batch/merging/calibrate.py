@@ -110,9 +110,11 @@ class Calibration:
 
     def widen_postures(self) -> None:
         """Believe less in the usual postures where the last solution shows unusual ones; see `widened`."""
-        times_ns = self._samples.times_ns
-        seconds = 1e-9 * float(times_ns[-1] - times_ns[0])
-        self._at_ease = widened(self._skeleton, self._bones, self.poses(), seconds)
+        # A T-pose is asked for: it has a prior of its own, and says nothing about the posture at other ticks.
+        usual = ~self._samples.posture.t_pose
+        if usual.any():
+            poses, times_ns = self.poses()[usual], self._samples.times_ns[usual]
+            self._at_ease = widened(self._skeleton, self._bones, poses, times_ns)
 
     def spread(
         self,

@@ -145,7 +145,7 @@ def _once(sigma: float, count: int) -> Any:
 
 
 def widened(
-    skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray, seconds: float
+    skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray, times_ns: IntArray
 ) -> tuple[Bone, ...]:
     """Bones whose everyday range is wider by what a capture happens to show.
 
@@ -155,10 +155,10 @@ def widened(
     Args:
         skeleton: The body.
         bones: The graph's bones.
-        world_from_bone: (K,B,4,4) poses solved at the sampled ticks.
-        seconds: What the ticks span.
+        world_from_bone: (K,B,4,4) poses solved at sampled ticks, none of them in a T-pose.
+        times_ns: (K,) the ticks, increasing.
     """
-    few = min(1.0, GESTURE_S / max(seconds, 1e-3))
+    few = 1.0 / _gestures(times_ns)
     out = []
     for index, bone in enumerate(bones):
         if bone.parent < 0:
@@ -171,6 +171,13 @@ def widened(
         spread = np.diag(usual + gestures * few / BETWEEN_SHARE**2)
         out.append(replace(bone, rotation_covariance=axes @ spread @ axes.T))
     return tuple(out)
+
+
+def _gestures(times_ns: IntArray) -> float:
+    """How many gestures ticks (K,) can have seen: those of the time they span, less where no tick fell."""
+    apart_ns = round(1e9 * GESTURE_S)
+    since_ns = times_ns - times_ns[0]
+    return max(1.0, min(float(since_ns[-1]) / apart_ns, float(len(np.unique(since_ns // apart_ns)))))
 
 
 def walking_plane(path_m: FloatArray, body: FloatArray) -> FloatArray | None:

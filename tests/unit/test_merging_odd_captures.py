@@ -11,6 +11,7 @@ import pytest
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import Similarity
+from bodycap_batch.merging import calibrate
 from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.calibrate import Calibration
 from bodycap_batch.merging.chunks import CHUNK_TICKS, longest_stretch, with_overlap
@@ -96,6 +97,26 @@ def test_a_t_pose_that_the_trunk_missed_adds_no_samples(body):
     samples = take_samples([_only(trunk, 2.5, 6.0), left], 1.0, 12, None, (0, 2_000_000_000))
     assert len(samples.times_ns) == 12
     assert not samples.posture.t_pose.any()
+
+
+def test_a_t_pose_is_no_gesture(body, monkeypatch):
+    inputs, bones, tracks = body
+    mounts = {mount.camera: mount for mount in inputs.mounts}
+    samples = take_samples(tracks, 1.0, 12, None, (0, 2_000_000_000))
+    posed = samples.posture.t_pose
+    calibration = Calibration(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
+    calibration.solve(1.0, iterations=1)
+    asked = []
+    monkeypatch.setattr(calibrate, "widened", lambda *args: asked.append(args[2:]) or bones)
+    calibration.widen_postures()
+    ((poses, times_ns),) = asked
+    assert 0 < len(times_ns) < len(posed)
+    assert (times_ns == samples.times_ns[~posed]).all()
+    assert (poses == calibration.poses()[~posed]).all()
+    nothing_else = replace(samples.posture, t_pose=np.ones_like(posed))
+    calibration.move(replace(samples, posture=nothing_else))
+    calibration.widen_postures()
+    assert len(asked) == 1
 
 
 def test_frames_that_are_all_far_apart_are_a_start(walk, body):

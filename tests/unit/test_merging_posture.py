@@ -186,8 +186,16 @@ def test_the_t_pose_of_a_rig_whose_arms_hang_lifts_them():
     assert_allclose(lifted, [-np.linalg.norm(lifted), 0.0, 0.0], atol=1e-9)
 
 
-@pytest.mark.parametrize(("seconds", "few"), [(2.0, 1.0), (10.0 * GESTURE_S, 0.1)])
-def test_what_a_capture_happens_to_show_widens_a_joints_range(seconds, few):
+@pytest.mark.parametrize(
+    ("times_s", "few"),
+    [
+        (np.linspace(5.0, 7.0, 20), 1.0),
+        (np.linspace(5.0, 5.0 + 10.0 * GESTURE_S, 20), 0.1),
+        # Two glimpses a long time apart show two gestures.
+        (np.concatenate([np.linspace(0.0, 1.0, 10), np.linspace(60.0, 61.0, 10)]), 0.5),
+    ],
+)
+def test_what_a_capture_happens_to_show_widens_a_joints_range(times_s, few):
     skeleton = load_skeleton("upper_body", 1.75)
     bones = graph_bones(skeleton, ROLES)
     elbow = [bone.role for bone in bones].index("LeftForeArm")
@@ -199,7 +207,7 @@ def test_what_a_capture_happens_to_show_widens_a_joints_range(seconds, few):
         if bone.parent >= 0:
             turn = so3_exp(np.outer(flexion if index == elbow else 0.0 * flexion, axes[:, 2]))
             poses[:, index, :3, :3] = poses[:, bone.parent, :3, :3] @ bone.mean_rotation @ turn
-    wider = widened(skeleton, bones, poses, seconds)
+    wider = widened(skeleton, bones, poses, np.round(1e9 * times_s).astype(np.int64))
     grown = axes.T @ (wider[elbow].rotation_covariance - bones[elbow].rotation_covariance) @ axes
     expected = np.diag([0.0, 0.0, few * np.radians(30.0) ** 2 / BETWEEN_SHARE**2])
     assert_allclose(grown, expected, atol=1e-9)
