@@ -177,11 +177,13 @@ def _of_ends(inputs: ReportInputs) -> Iterator[Advice]:
     cuts = [f"start_s: {max(late.values()):.2f}"] if late else []
     cuts += [f"end_s: {min(early.values()):.2f}"] if early else []
     missing = [f"{name} has no measurement before {time:.2f} s" for name, time in late.items()]
-    missing += [f"{name} has none after {time:.2f} s" for name, time in early.items()]
-    if cuts:
+    missing += [f"{name} has no measurement after {time:.2f} s" for name, time in early.items()]
+    # One camera may have ended before another began: no cut helps then.
+    left = min(early.values(), default=ends[1]) - max(late.values(), default=ends[0])
+    cut = f"; this capture can be cut with {' and '.join(cuts)} under `capture`" if left > 0.0 else ""
+    if missing:
         yield Advice(
-            do="Start all cameras before the movement and stop them after it; this capture can be cut with "
-            f"{' and '.join(cuts)} under `capture`.",
+            do=f"Start all cameras before the movement and stop them after it{cut}.",
             because=f"the motion runs from {ends[0]:.2f} s to {ends[1]:.2f} s, but {', '.join(missing)}",
             weight=1.4,
         )

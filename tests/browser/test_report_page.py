@@ -210,3 +210,18 @@ def test_without_a_graphics_card_points_stand_where_the_renderer_would_put_them(
     page.check("[data-layer=points]")
     page.wait_for_timeout(400)
     assert page.evaluate("bodycap.view.splat.pixels.some(Boolean)")
+
+
+def test_without_a_graphics_card_a_view_that_has_no_size_at_first_is_drawn_when_it_has(
+    pages: Pages, report: Path, tmp_path: Path
+) -> None:
+    hidden = tmp_path / "hidden.html"
+    text = report.read_text(encoding="utf-8")
+    hidden.write_text(text.replace("</style>", ".solid { display: none; }</style>", 1), encoding="utf-8")
+    page = pages.open(hidden.as_uri())
+    page.wait_for_selector("section.viewer[data-mode=webgl]")
+    page.wait_for_timeout(400)
+    page.add_style_tag(content=".solid { display: block !important; }")
+    page.wait_for_timeout(400)
+    assert page.evaluate("bodycap.view.splat.pixels.some(Boolean)")
+    assert pages.said == []

@@ -182,6 +182,12 @@ def test_cameras_that_come_late_or_leave_early_are_told_where_to_cut(inputs: Rep
     assert f"start_s: {start + 1.0:.2f} and end_s: {start + 39 / 30:.2f}" in ends.do
     assert f"{left.camera} has no measurement before" in ends.because
 
+    paths = (torso, without(left, slice(0, 40)), without(right, slice(20, None)))
+    never = advise(replace(inputs, merge=replace(inputs.merge, trajectories=paths)), {})
+    (ends,) = (each for each in never if "Start all cameras" in each.do)
+    assert ends.do.endswith("stop them after it.")  # nothing is left between 1.33 and 0.63 s
+    assert f"{right.camera} has no measurement after" in ends.because
+
 
 def test_a_camera_without_a_clock_stands_where_its_offset_puts_it(
     inputs: ReportInputs, tmp_path: Path

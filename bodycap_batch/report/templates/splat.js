@@ -11,6 +11,8 @@ class Splat {
     this.canvas = document.createElement("canvas");
     this.pen = this.canvas.getContext("2d");
     holder.append(this.canvas);
+    // Its holder may have no size yet.
+    this.resize(1, 1);
   }
 
   resize(width, height) {
