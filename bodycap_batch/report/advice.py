@@ -211,15 +211,18 @@ def _of_body(inputs: ReportInputs) -> Iterator[Advice]:
     report: Mapping[str, Any] = inputs.merge.report
     scale = report.get("scale", {})
     sigma = scale.get("relative_sigma")
-    if sigma is not None and sigma > _SCALE_WELL_KNOWN and scale.get("source") != "skeleton":
-        _, _, ways = str(scale.get("known_to", "")).partition(_BETTER)
-        skeleton = "give the subject's own skeleton (--skeleton subject.bvh)"
-        yield Advice(
-            do=_sentence(f"{ways}, or {skeleton}" if ways else skeleton),
-            because=f"the metric scale rests on the {scale.get('source')} and is known to {sigma:.1%}: "
-            f"{100 * _ARM_M * sigma:.1f} cm on the length of an arm",
-            weight=1.1 + sigma,
-        )
+    if sigma is not None and sigma > _SCALE_WELL_KNOWN:
+        _, _, better = str(scale.get("known_to", "")).partition(_BETTER)
+        ways = [better] if better else []
+        if all(source["name"] != "skeleton" for source in scale.get("sources", ())):
+            ways.append("give the subject's own skeleton (--skeleton subject.bvh)")
+        if ways:
+            yield Advice(
+                do=_sentence(", or ".join(ways)),
+                because=f"the metric scale rests on the {scale.get('source')} and is known to {sigma:.1%}: "
+                f"{100 * _ARM_M * sigma:.1f} cm on the length of an arm",
+                weight=1.1 + sigma,
+            )
     for name, mount in report.get("mounts", {}).items():
         known, _, way = str(mount.get("known_to", "")).partition(_BETTER)
         if way or mount["sigma_deg"] > _MOUNT_WELL_KNOWN_DEG:

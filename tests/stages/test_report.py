@@ -363,6 +363,25 @@ def test_advice_comes_from_what_was_measured(inputs: ReportInputs) -> None:
     assert any("skeleton" in each.do for each in some)
 
 
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [
+        ("height", "Name a known distance, or give the subject's own skeleton (--skeleton subject.bvh)."),
+        ("skeleton", "Name a known distance."),
+    ],
+)
+def test_nobody_is_asked_for_a_skeleton_that_was_given(inputs: ReportInputs, source: str, says: str) -> None:
+    assert inputs.merge is not None
+    scale = {
+        "source": f"{source} and floor",
+        "relative_sigma": 0.03,
+        "known_to": "the metric scale is known to 3.0 % (1 sigma); to know it better, name a known distance",
+        "sources": [{"name": source}, {"name": "floor"}],
+    }
+    told = replace(inputs, merge=replace(inputs.merge, report={"scale": scale}))
+    assert [each.do for each in advise(told, {}) if "metric scale" in each.because] == [says]
+
+
 def test_shared_points_count_what_both_cameras_see(inputs: ReportInputs) -> None:
     counts = shared_points(inputs.maps, inputs.cameras)
     scene = inputs.maps[0]
