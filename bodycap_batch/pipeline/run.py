@@ -59,12 +59,14 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
 
     Args:
         job: A resolved job.
-        out_dir: Folder of the results; what an earlier run left there stays until this one succeeds.
+        out_dir: Folder of the results; what an earlier run left there stays until this one has results, which
+            is before their video is made.
         settings: Store, threads, listener, cancellation.
 
     Raises:
         BodycapError: A stage failed. Where the skeleton could not be solved, the map, the cameras' paths
-            and the frames are in ``<out_dir>/partial``.
+            and the frames are in ``<out_dir>/partial``. Where it was the report or the video, the other
+            results are there.
     """
     settings.store.sweep()
     settings.require_owner()
@@ -73,7 +75,9 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
         stopped_by = _run_until(job, flow, made, out_dir, settings)
         summary = _summary(flow, made, out_dir)
         if made.exported is not None:
-            _hand_over(job, flow, made, out_dir, settings)
+            place = _hand_over(job, flow, made, out_dir, settings)
+            if stopped_by is not None:
+                _add_hint(stopped_by, f"the other results are in {place}")
             if made.failure is None:
                 flow.keep_only_this()
         elif stopped_by is not None:
@@ -121,8 +125,7 @@ def _run_until(job: Job, flow: Flow, made: Made, out_dir: Path, settings: Settin
             if stage == settings.until:
                 break
             if stage == "report" and made.filming is not None and not made.filming.done():
-                _hand_over(job, flow, made, out_dir, settings)
-                settings.results_ready(out_dir)
+                settings.results_ready(_hand_over(job, flow, made, out_dir, settings))
     except BodycapError as error:
         # Results that are there are handed over although the page about them could not be written.
         tellable = made.exported is not None or isinstance(error, JobError | CaptureError | EstimationError)
@@ -141,8 +144,13 @@ def _tell_how_far(flow: Flow, made: Made, error: BodycapError, out_dir: Path, se
     except BodycapError as another:
         error.add_note(f"and its report could not be written: {another.message}")
         return
-    told = f"how far it came: {out_dir / PARTIAL / REPORT_FILE}"
-    error.hint = f"{error.hint}; {told}" if error.hint else told
+    _add_hint(error, f"how far it came: {out_dir / PARTIAL / REPORT_FILE}")
+
+
+def _add_hint(error: BodycapError, text: str) -> None:
+    """Say one thing more, once."""
+    if text not in (error.hint or ""):
+        error.hint = f"{error.hint}; {text}" if error.hint else text
 
 
 def _summary(flow: Flow, made: Made, out_dir: Path) -> RunSummary:
@@ -152,18 +160,17 @@ def _summary(flow: Flow, made: Made, out_dir: Path) -> RunSummary:
     )
 
 
-def _hand_over(job: Job, flow: Flow, made: Made, out_dir: Path, settings: Settings) -> None:
-    """Publish the results; those without a skeleton are set apart and called partial."""
+def _hand_over(job: Job, flow: Flow, made: Made, out_dir: Path, settings: Settings) -> Path:
+    """Publish the results and return their folder; those without a skeleton are set apart, called partial."""
     settings.require_owner()
     if made.failure is None:
         _finish(job, made, _summary(flow, made, out_dir), settings)
         clear_partial(out_dir)
-        return
+        return out_dir
     partial = out_dir / PARTIAL
     _finish(job, made, _summary(flow, made, partial), settings)
-    kept = f"the map, the cameras' paths and the frames are in {partial}"
-    if kept not in (made.failure.hint or ""):
-        made.failure.hint = f"{made.failure.hint}; {kept}" if made.failure.hint else kept
+    _add_hint(made.failure, f"the map, the cameras' paths and the frames are in {partial}")
+    return partial
 
 
 def _merge(

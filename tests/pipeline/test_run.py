@@ -8,6 +8,7 @@ import shutil
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -65,15 +66,17 @@ class Bench:
             }
         )
 
-    def run(self, **changes: Any) -> RunSummary:
-        settings = Settings(
+    def settings(self) -> Settings:
+        return Settings(
             store=Store(self.folder / "store"),
             threads=2,
             listener=self.events.append,
             cancelled=self.stop.is_set,
             command=CHILD,
         )
-        return run_job(self.job(**changes), out_dir=self.out, settings=settings)
+
+    def run(self, **changes: Any) -> RunSummary:
+        return run_job(self.job(**changes), out_dir=self.out, settings=self.settings())
 
     def executed(self, **changes: Any) -> list[str]:
         """Run, and list what was not taken from the store."""
@@ -254,11 +257,14 @@ def test_a_missing_video_is_told_in_a_report_too(bench: Bench) -> None:
     assert report.read_text() == "check: there is no such file; "
 
 
-def test_results_are_there_although_their_report_failed(bench: Bench) -> None:
-    bench.order(fail="report")
-    with pytest.raises(EstimationError, match="report does not work out"):
+@pytest.mark.parametrize("stage", ["report", "preview"])
+def test_results_are_there_although_their_report_or_video_failed(bench: Bench, stage: str) -> None:
+    bench.order(fail=stage)
+    with pytest.raises(EstimationError, match=f"{stage} does not work out") as caught:
         bench.run()
     assert {"metrics.json", "result.bvh"} <= set(bench.results())
+    assert caught.value.hint == f"film more; the other results are in {bench.out}"
+    assert set(json.loads((bench.out / "run.json").read_text())["files"]) == set(bench.results())
 
 
 def test_without_a_skeleton_the_rest_is_kept_and_called_partial(done: Bench) -> None:
@@ -367,6 +373,21 @@ def test_the_results_do_not_wait_for_their_video(done: Bench) -> None:
     assert done.results()["result.bvh"] != b"of an earlier run"
     assert done.executed() == ["preview"]
     assert set(done.results()) == said() == names
+
+
+@pytest.mark.parametrize("failed", ["", "merge"])
+def test_where_the_results_are_that_come_before_their_video_is_told(bench: Bench, failed: str) -> None:
+    told: list[Path] = []
+
+    def stop(folder: Path) -> None:
+        told.append(folder)
+        bench.stop.set()
+
+    bench.order(hang="preview", fail=failed)
+    with pytest.raises(Cancelled):
+        run_job(bench.job(), out_dir=bench.out, settings=replace(bench.settings(), results_ready=stop))
+    assert told == [bench.out / "partial" if failed else bench.out]
+    assert (told[0] / "metrics.json").is_file()
 
 
 def test_a_bug_in_a_stage_is_no_estimation_error(bench: Bench) -> None:
