@@ -153,7 +153,10 @@ def cancel_job(spool: Spool, name: str, wait_s: float = 5.0) -> JobDir | None:
 
 
 def _ask_to_cancel(spool: Spool, name: str) -> JobDir | None:
-    """Cancel a job that waits, mark one that runs; None where it is on its way from the one to the other."""
+    """Cancel a job that waits, mark one that runs; None where it is on its way from the one to the other.
+
+    On its way it is marked, too; but the mark is lost where what was dropped is put back.
+    """
     waiting = [drop for drop in drops_in(spool.inbox) if _same(drop.name, name)]
     job = spool.find(name)
     try:
@@ -162,9 +165,11 @@ def _ask_to_cancel(spool: Spool, name: str) -> JobDir | None:
             return job
         if waiting:
             return _cancel_waiting(spool, waiting[0])
+        for place in map(JobDir, spool.running.glob(f"{CLAIM_PREFIX}*")):
+            if name in _names_of(place):  # whoever claims it may be gone: the next watcher goes on with it
+                place.cancel.touch()
+                return None
     except FileNotFoundError:  # it has just been claimed, or filed away
-        return None
-    if any(name in _names_of(JobDir(path)) for path in spool.running.glob(f"{CLAIM_PREFIX}*")):
         return None
     raise _no_such(spool, name, "is not waiting or running", [drop.name for drop in drops_in(spool.inbox)])
 

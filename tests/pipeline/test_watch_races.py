@@ -16,7 +16,8 @@ from bodycap_batch.store import Store
 from bodycap_batch.watch import cancel_job, claiming, commands, retry_job
 from bodycap_batch.watch.claim import process_mark
 from bodycap_batch.watch.drops import Drop, look_at
-from bodycap_batch.watch.spool import RETRY_PREFIX, JobDir
+from bodycap_batch.watch.spool import CLAIM_PREFIX, RETRY_PREFIX, JobDir
+from bodycap_batch.watch.status import StatusFile
 from tests.pipeline.fake_stages import ORDERS
 from tests.pipeline.spools import SpoolBench, wait_for
 
@@ -192,6 +193,18 @@ def test_a_job_that_is_claimed_while_it_is_cancelled_is_cancelled(
     assert cancelled == [None], "no watcher has noticed yet"
     assert bench.job("walk").cancel.exists()
     assert [path.name for path in bench.spool.running.iterdir()] == ["walk"]
+
+
+def test_a_job_whose_watcher_was_killed_while_it_claimed_it_can_be_cancelled(bench: SpoolBench) -> None:
+    place = JobDir(bench.spool.running / f"{CLAIM_PREFIX}1")
+    place.path.mkdir()
+    claiming.first_claim(place).release()
+    bench.drop("walk").rename(place.input)
+    StatusFile(place).change(dropped="walk")
+    assert cancel_job(bench.spool, "walk", wait_s=0.0) is None, "no watcher has noticed yet"
+    bench.work_off()
+    assert bench.status("walk")["state"] == "cancelled"
+    assert (bench.job("walk").input / "torso.mp4").is_file()
 
 
 def test_a_job_that_ends_while_it_is_cancelled_is_not_called_cancelled(
