@@ -35,7 +35,8 @@ class Trouble:
     @property
     def text(self) -> str:
         """What is wrong at the moment; "" where nothing is."""
-        return "" if self.now is None else f"{self.now.path}: {self.now.message}"
+        now = self.now  # another thread asks, and it may be over at any moment
+        return "" if now is None else f"{now.path}: {now.message}"
 
     @property
     def lasted_s(self) -> float:

@@ -89,11 +89,11 @@ class Watcher:
             heart.start()
             try:
                 while not self._stop.is_set():
-                    self._woken.clear()
                     self._collect()
                     if (pause_s := self._step(pool)) is None:
                         break
                     self._woken.wait(pause_s)
+                    self._woken.clear()  # and only then look whether to stop: `stop` says so before it wakes
             finally:
                 self._stop.set()
                 heart.join()
@@ -103,7 +103,9 @@ class Watcher:
     def _step(self, pool: ThreadPoolExecutor) -> float | None:
         """Start what can be started; seconds until the next look, None where none is wanted."""
         try:
-            busy = self._fill(pool)
+            over = not self._fill(pool) and self._options.once
+            if over:
+                self._tell_what_is_left()
         except (OSError, StoreError) as error:
             pause_s = self.trouble.met(error)
             if not self._options.once or self.trouble.lasted_s < self._options.stale_s:
@@ -111,8 +113,7 @@ class Watcher:
             self._worst = max(self._worst, StoreError.exit_code)
             return None
         self.trouble.over()
-        if self._options.once and not busy:
-            self._tell_what_is_left()
+        if over:
             return None
         return _LOOK_S if self._settling.waiting or self._running or self._left else _IDLE_LOOK_S
 

@@ -67,8 +67,6 @@ class Worker:
         """
         try:
             return self._work(claim, refused)
-        except StoreBusy as error:
-            return self._release(claim, error)
         except (BodycapError, OSError) as error:
             return self._stuck(claim, error)
 
@@ -184,10 +182,22 @@ class Worker:
     def _file(
         self, claim: Claim, state: State, error: BodycapError | None, status: StatusFile | None
     ) -> Outcome:
-        """Say the last word and move the job where it belongs."""
-        folder = self._spool.done if state == "done" else self._spool.failed
-        # What has just been run waits for a cleaner, lest it is run again; what was run before need not.
-        with moving(self._store, claim.job.result, wait=status is not None) as keep_for:
+        """Say the last word and move the job where it belongs; while the store is cleaned, leave the move."""
+        try:
+            return self._move(claim, state, error, status)
+        except StoreBusy as busy:
+            if status is not None:
+                status.finish(state, error, self._folder(state) / claim.job.name, self._spool.inbox)
+            return self._release(claim, busy)
+
+    def _folder(self, state: State) -> Path:
+        return self._spool.done if state == "done" else self._spool.failed
+
+    def _move(
+        self, claim: Claim, state: State, error: BodycapError | None, status: StatusFile | None
+    ) -> Outcome:
+        folder = self._folder(state)
+        with moving(self._store, claim.job.result, wait=False) as keep_for:
             claim.end()
             if not claim.guard.holds():
                 return Outcome(name=claim.job.name, state="lost", message="another watcher has taken it over")

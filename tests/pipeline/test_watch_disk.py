@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import os
 import threading
@@ -20,7 +21,7 @@ from bodycap_batch.store import Store
 from bodycap_batch.watch import Watcher, claiming, rows_of, watchers_of
 from bodycap_batch.watch.presence import Presence
 from bodycap_batch.watch.spool import JobDir
-from bodycap_batch.watch.status import read_status
+from bodycap_batch.watch.status import StatusFile, read_status
 from bodycap_batch.watch.trouble import Trouble
 from bodycap_batch.watch.work import Worker
 from tests.pipeline.fake_stages import ORDERS
@@ -61,11 +62,11 @@ def failing(times: int, function: Callable[..., Any], number: int = errno.EIO) -
     return fail
 
 
-@pytest.mark.parametrize("name", ["drops_in", "visible"])
+@pytest.mark.parametrize("name", ["drops_in", "visible", "strays_in"])
 def test_a_folder_that_cannot_be_read_for_a_while_is_waited_for(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    """`visible` lists what is running, `drops_in` what is in the inbox."""
+    """`visible` lists what is running, `drops_in` what is in the inbox, `strays_in` what stays there."""
     from bodycap_batch.watch import watcher as module
 
     bench.drop("walk")
@@ -110,6 +111,75 @@ def test_pauses_grow_and_each_cause_is_told_once(bench: SpoolBench) -> None:
     assert len(bench.told) == 3
     assert "after 90 s" in bench.told[-1]
     assert trouble.met(OSError(errno.EIO, "x", "a")) == 1
+
+
+def test_trouble_that_ends_while_it_is_asked_for_stops_no_heartbeat(bench: SpoolBench) -> None:
+    trouble = Trouble(bench.spool, bench.told.append)
+    trouble.met(OSError(errno.EIO, "x", "a"))
+
+    class Over(Trouble):
+        """The disk answers again as soon as somebody has looked."""
+
+        @property
+        def now(self) -> StoreError | None:
+            found, trouble.now = trouble.now, None
+            return found
+
+        @now.setter
+        def now(self, _: StoreError | None) -> None: ...
+
+    assert Over(bench.spool, bench.told.append).text == "a: Input/output error"
+
+
+def test_a_watcher_that_is_told_to_stop_at_any_moment_does_not_sleep(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watcher = bench.watcher(once=False)
+    woken, clear = watcher._woken, watcher._woken.clear
+    overslept: list[bool] = []
+
+    def stop_then_clear() -> None:
+        watcher.stop()
+        clear()
+
+    monkeypatch.setattr(woken, "clear", stop_then_clear)
+    monkeypatch.setattr(
+        woken, "wait", lambda _: overslept.append(watcher._stop.is_set() and not woken.is_set())
+    )
+    watcher.run()
+    assert overslept == [False]
+
+
+def test_a_full_disk_while_the_store_is_cleaned_stops_no_watcher(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To clean up is what one does about a full disk; just then a job has only to be filed away."""
+    claim = claiming.first_claim(JobDir(bench.drop("walk").rename(bench.spool.running / "walk")))
+    StatusFile(claim.job).change(state="done")
+    worker = Worker(bench.spool, bench.options(), threading.Event())
+    monkeypatch.setattr(claiming.Claim, "release", failing(1, claiming.Claim.release, errno.ENOSPC))
+    with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
+        fcntl.flock(cleaning, fcntl.LOCK_EX)
+        outcome = worker.work(claim)
+    assert (outcome.state, outcome.exit_code) == ("stuck", StoreError.exit_code)
+    assert worker.work(claim).place == bench.spool.done / "walk"
+
+
+def test_a_job_that_ends_while_the_store_is_cleaned_holds_nobody_up(bench: SpoolBench) -> None:
+    (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
+    drop = claiming.Drop(bench.spool.inbox / "walk.yaml")
+    claimed = claiming.claim_drop(bench.spool, drop, claiming.look_at(drop, 100), bench.options().terms)
+    assert claimed is not None
+    worker = Worker(bench.spool, bench.options(), threading.Event())
+    with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
+        fcntl.flock(cleaning, fcntl.LOCK_EX)
+        outcome = worker.work(*claimed)
+    assert (outcome.state, outcome.message) == ("stopped", "goes on later: the store is being cleaned")
+    before = bench.status("walk")
+    assert bench.work_off() == 2
+    assert bench.job("walk").path == bench.spool.failed / "walk"
+    assert bench.status("walk") == before, "all was said"
+    assert bench.status("walk")["error"]["path"] == str(bench.job("walk").input / "walk.yaml")
 
 
 @pytest.mark.slow
