@@ -10,8 +10,10 @@ VENV := .venv
 BLENDER := .venv-blender
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
-# More than one test at a time, each in one thread; those of a file stay together (see `apart`).
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 8 --dist loadgroup
+# More than one test at a time, each in one thread; those of a file share what they need, so they stay together.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 8 --dist loadfile
+# Slow tests wait for processes of their own half of the time: one more of them than there are cores.
+SLOW := $(subst -n logical,-n $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1),$(PYTEST))
 COMPILE := $(BIN)/uv pip compile --quiet --generate-hashes --no-emit-index-url --custom-compile-command "make lock"
 LOCK := $(COMPILE) --universal --python-version 3.11 --fork-strategy fewest pyproject.toml --group build
 
@@ -38,7 +40,11 @@ test: $(VENV)/.dev ## run the fast tests
 .PHONY: test-slow
 test-slow: $(VENV)/.dev ## run the slow tests and those on real captures
 	.ci/system-packages --browser
-	$(PYTEST) -m "slow or data" --durations=20 $(ARGS)
+	$(SLOW) -m "slow or data" --durations=20 $(ARGS)
+
+.PHONY: fuzz
+fuzz: $(VENV)/.dev ## give 52,000 broken inputs to the readers of jobs, BVH files and calibrations
+	BODYCAP_FUZZ_SHARE=1 $(PYTEST) -m slow tests/unit/test_fuzz.py $(ARGS)
 
 .PHONY: test-cluster
 test-cluster: $(VENV)/.dev ## run jobs on a Dask scheduler and workers of this machine, killing some

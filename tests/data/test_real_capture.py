@@ -27,6 +27,8 @@ pytestmark = [pytest.mark.data, pytest.mark.slow]
 # bending is the truth's own noise of a few millimetres and its clock.
 MAX_ATE_M = 0.006
 MAX_GAP_S = 0.05
+# More than the default 512, for a map above COLMAP's threshold below.
+OPTIONS = MapOptions(features=640)
 
 
 @dataclass(frozen=True)
@@ -49,9 +51,9 @@ def outcome(data_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Outcom
         return StageContext(work_dir=tmp_path_factory.mktemp("work"), threads=2)
 
     selection = select_keyframes(camera, KeyframeOptions(), context())
-    first, again = (build_map(capture, [selection], MapOptions(), context()) for _ in range(2))
+    first, again = (build_map(capture, [selection], OPTIONS, context()) for _ in range(2))
     before = register_frames(camera, first.maps, selection, RegistrationOptions(), context())
-    refined = refine_map(capture, first, [before.trajectory], MapOptions(), context())
+    refined = refine_map(capture, first, [before.trajectory], OPTIONS, context())
     after = register_frames(camera, refined.maps, selection, RegistrationOptions(), context(), before)
     return Outcome(camera, (first, again), before, refined, after)
 

@@ -16,7 +16,7 @@ from bodycap_batch.errors import EstimationError
 from bodycap_batch.evaluate import TrajectoryReport, evaluate_trajectories
 from bodycap_batch.synthetic import SynthOptions, synthesise
 
-pytestmark = [pytest.mark.slow, pytest.mark.apart]
+pytestmark = pytest.mark.slow
 
 SMALL: dict[str, Any] = {"seconds": 4.0, "width": 480, "height": 360, "seed": 5}
 FISHEYE = {"lens": "OPENCV_FISHEYE", "lens_params": (225.0, 225.0, 241.5, 178.5, 0.03, -0.01, 0.004, -0.001)}
