@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from bodycap_batch.body import CameraClock
 from bodycap_batch.camera import Camera
+from bodycap_batch.context import StageContext
 from bodycap_batch.export.inputs import ExportInputs
 from bodycap_batch.export.metrics import collect_metrics
 from bodycap_batch.export.projection import project_motion
 from bodycap_batch.geometry import Similarity, invert, transform_points
-from bodycap_batch.report import ReportInputs
+from bodycap_batch.report import ReportInputs, write_report
 from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 from tests.bodies import CAMERAS, merged, reaching
 
@@ -208,3 +210,10 @@ def _selection(path: Trajectory, rng: np.random.Generator) -> KeyframeSelection:
         sharpness=sharp,
         noise_px=0.4,
     )
+
+
+def written(inputs: ReportInputs, folder: Path) -> str:
+    """The text of the page that is written into the folder."""
+    path = folder / "report.html"
+    write_report(inputs, path, StageContext(work_dir=folder))
+    return path.read_text(encoding="utf-8")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from bodycap_batch.cli import main
 from tests.broken import sound
+from tests.pipeline.fake_stages import ORDERS
+from tests.pipeline.spools import SpoolBench
 from tests.pipeline.tiny_job import STAGES, Place
 
 
@@ -33,3 +36,13 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Place:
 @pytest.fixture
 def place(tmp_path: Path, reference: Place) -> Place:
     return Place(tmp_path / "job", reference.folder / "capture")
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SpoolBench]:
+    """A watched folder with stand-in stages; the working directory is beside it."""
+    bench = SpoolBench(tmp_path)
+    monkeypatch.setenv(ORDERS, str(bench.orders))
+    monkeypatch.chdir(tmp_path)
+    yield bench
+    bench.close()

@@ -17,19 +17,11 @@ import pytest
 from bodycap_batch.cli import main
 from bodycap_batch.evaluate import evaluate_trajectories
 from bodycap_batch.formats.bvh import read_bvh
+from tests.pipeline.tiny_job import JOB
 from tests.results import results_of
 
 pytestmark = pytest.mark.slow
 
-JOB = """
-capture:
-  cameras:
-    - {name: torso, video: capture/torso.mp4}
-    - {name: left_palm, video: capture/left_palm.mp4}
-  calibration: capture/calib.json
-  synthetic: {seconds: 2, width: 320, height: 240, cameras: [torso, left_palm]}
-height_m: 1.75
-"""
 FRAMES = {"torso": 60, "left_palm": 60}
 
 

@@ -10,7 +10,6 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -27,18 +26,8 @@ from bodycap_batch.watch.claim import Claim, first_claim, take_over
 from bodycap_batch.watch.drops import Drop, Look, look_at
 from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir
 from bodycap_batch.watch.status import StatusFile
-from tests.pipeline.fake_stages import ORDERS
 from tests.pipeline.spools import SpoolBench, wait_for
 from tests.pipeline.test_cli import gone
-
-
-@pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SpoolBench]:
-    bench = SpoolBench(tmp_path)
-    monkeypatch.setenv(ORDERS, str(bench.orders))
-    monkeypatch.chdir(tmp_path)
-    yield bench
-    bench.close()
 
 
 def leftovers(bench: SpoolBench) -> list[str]:

@@ -24,17 +24,7 @@ from bodycap_batch.watch.spool import JobDir
 from bodycap_batch.watch.status import StatusFile, read_status
 from bodycap_batch.watch.trouble import Trouble
 from bodycap_batch.watch.work import Worker
-from tests.pipeline.fake_stages import ORDERS
 from tests.pipeline.spools import SpoolBench, wait_for
-
-
-@pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SpoolBench]:
-    bench = SpoolBench(tmp_path)
-    monkeypatch.setenv(ORDERS, str(bench.orders))
-    monkeypatch.chdir(tmp_path)
-    yield bench
-    bench.close()
 
 
 @contextmanager

@@ -11,7 +11,6 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,7 +19,6 @@ from bodycap_batch.config.limits import Limits
 from bodycap_batch.errors import JobError
 from bodycap_batch.watch.web import Access, LivePage
 from bodycap_batch.watch.web.feed import Feed
-from tests.pipeline.fake_stages import ORDERS
 from tests.pipeline.spools import SpoolBench, wait_for
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -51,13 +49,6 @@ class Client:
 
     def begin(self, name: str) -> str:
         return str(self.json("POST", "/api/uploads", {"name": name})["key"])
-
-
-@pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SpoolBench:
-    bench = SpoolBench(tmp_path)
-    monkeypatch.setenv(ORDERS, str(bench.orders))
-    return bench
 
 
 @pytest.fixture

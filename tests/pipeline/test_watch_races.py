@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +18,7 @@ from bodycap_batch.watch.claim import process_mark
 from bodycap_batch.watch.drops import Drop, look_at
 from bodycap_batch.watch.spool import CLAIM_PREFIX, RETRY_PREFIX, JobDir
 from bodycap_batch.watch.status import StatusFile
-from tests.pipeline.fake_stages import ORDERS
 from tests.pipeline.spools import SpoolBench, wait_for
-
-
-@pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SpoolBench]:
-    bench = SpoolBench(tmp_path)
-    monkeypatch.setenv(ORDERS, str(bench.orders))
-    monkeypatch.chdir(tmp_path)
-    yield bench
-    bench.close()
 
 
 def kept(bench: SpoolBench) -> bool:

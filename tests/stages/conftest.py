@@ -14,7 +14,9 @@ from bodycap_batch.context import StageContext
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build_map
 from bodycap_batch.registration import register_frames
+from bodycap_batch.report import ReportInputs
 from bodycap_batch.scene import KeyframeSelection, MapResult, Registration
+from tests.reports import report_inputs
 from tests.rooms import stroll, write_capture
 
 FRAMES = 60
@@ -59,3 +61,9 @@ def estimated(stroll_capture: Capture, tmp_path_factory: pytest.TempPathFactory)
         for camera, selection in zip(stroll_capture.cameras, selections, strict=True)
     )
     return Estimated(stroll_capture, stroll(FRAMES), selections, result, registrations)
+
+
+@pytest.fixture(scope="session")
+def inputs() -> ReportInputs:
+    """What a report is made of: a whole job's results, without videos."""
+    return report_inputs()

@@ -16,10 +16,9 @@ import pytest
 
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config.models import CaptureConfig, Job
-from bodycap_batch.context import StageContext
 from bodycap_batch.geometry import interpolate_pose
 from bodycap_batch.pipeline.made import Made, report_task
-from bodycap_batch.report import ReportInputs, write_report
+from bodycap_batch.report import ReportInputs
 from bodycap_batch.report.advice import advise, shared_points
 from bodycap_batch.report.figures.body import before_optimisation
 from bodycap_batch.report.figures.strips import strip
@@ -32,19 +31,8 @@ from bodycap_batch.report.tables import look_up
 from bodycap_batch.report.verdict import Grade, judge
 from bodycap_batch.scene import FrameStatus, Trajectory
 from bodycap_batch.tasks.report import load_inputs
-from tests.reports import report_inputs
+from tests.reports import written
 from tests.videos import textured_frame, write_video
-
-
-@pytest.fixture(scope="module")
-def inputs() -> ReportInputs:
-    return report_inputs()
-
-
-def written(inputs: ReportInputs, folder: Path) -> str:
-    path = folder / "report.html"
-    write_report(inputs, path, StageContext(work_dir=folder))
-    return path.read_text(encoding="utf-8")
 
 
 class Figures(HTMLParser):

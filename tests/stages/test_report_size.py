@@ -9,22 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodycap_batch.context import StageContext
-from bodycap_batch.report import ReportInputs, page, stage, write_report
+from bodycap_batch.report import ReportInputs, page, stage
 from bodycap_batch.report.packing import pack_scaled
 from bodycap_batch.report.pictures import SERIES_BUDGET
-from tests.reports import report_inputs
-
-
-@pytest.fixture(scope="module")
-def inputs() -> ReportInputs:
-    return report_inputs()
-
-
-def written(inputs: ReportInputs, folder: Path) -> str:
-    path = folder / "report.html"
-    write_report(inputs, path, StageContext(work_dir=folder))
-    return path.read_text(encoding="utf-8")
+from tests.reports import report_inputs, written
 
 
 def many_pictures(inputs: ReportInputs, each: int, length: int) -> list[dict[str, object]]:
