@@ -13,7 +13,7 @@ from bodycap_batch.geometry import invert
 from bodycap_batch.merging.bones import JOINT_SLACK_M, Bone, hinges
 from bodycap_batch.merging.graph import (
     JointFactors,
-    add_mount_measurement,
+    add_mount_measurements,
     add_mount_prior,
     bone_key,
     insert_mount,
@@ -72,7 +72,8 @@ class Calibration:
         step: Callable[[], None],
     ) -> None:
         self._skeleton, self._bones, self._samples = skeleton, bones, samples
-        self._at_ease = tuple(bones)
+        self._at_ease, self._t_posed = tuple(bones), t_posed(skeleton, bones)
+        self._hinges = hinges(skeleton, tuple(bones))
         self._priors, self._step = priors, step
         self._slack_map = JOINT_SLACK_M * np.sqrt(samples.repeats) / provisional
         self._values: Any = None
@@ -197,7 +198,7 @@ class Calibration:
         poses[..., :3, 3] *= self._scale
         graph = self._graph(poses, self._scale)
         linear = linearise(graph, self._values)
-        body = Body(bones=self._at_ease, hinges=hinges(self._skeleton, tuple(self._bones)))
+        body = Body(bones=self._at_ease, hinges=self._hinges)
         each, last = body.factors_per_tick, self._samples.valid.shape[1]
         posed = np.flatnonzero(self._samples.posture.t_pose)
         stated = (self._first_joint + each * posed[:, None] + np.arange(each)).reshape(-1)
@@ -239,9 +240,9 @@ class Calibration:
         for camera, name in enumerate(samples.cameras):
             prior, points = self._priors[name], all_points[camera]
             add_mount_prior(graph, camera, prior.joint_from_cam, points, (prior.sigma_rad, prior.sigma_m))
-            for tick in np.flatnonzero(samples.valid[camera]).tolist():
-                key = bone_key(tick, samples.bones[camera])
-                add_mount_measurement(graph, key, camera, world_from_cam[camera, tick], points)
+            ticks = np.flatnonzero(samples.valid[camera])
+            measured = [bone_key(tick, samples.bones[camera]) for tick in ticks.tolist()]
+            add_mount_measurements(graph, measured, camera, world_from_cam[camera, ticks], points)
         usual, t_pose = self._joint_factors(scale)
         self._first_joint = int(graph.size())
         for tick in range(samples.valid.shape[1]):
@@ -253,14 +254,11 @@ class Calibration:
 
     def _joint_factors(self, scale: float) -> tuple[JointFactors, JointFactors]:
         """The body's factors at usual ticks, and in a T-pose (which counts once over all of its ticks)."""
-        limits, slack_m = (
-            hinges(self._skeleton, tuple(self._bones)),
-            scale * self.slack_factor * self._slack_map,
-        )
+        slack_m = scale * self.slack_factor * self._slack_map
         once = float(np.sqrt(max(self._samples.posture.t_pose.sum(), 1)))
         return (
-            JointFactors(self._at_ease, limits, prior_scale=PRIOR_SCALE, slack_m=slack_m),
-            JointFactors(t_posed(self._skeleton, self._bones), limits, prior_scale=once, slack_m=slack_m),
+            JointFactors(self._at_ease, self._hinges, prior_scale=PRIOR_SCALE, slack_m=slack_m),
+            JointFactors(self._t_posed, self._hinges, prior_scale=once, slack_m=slack_m),
         )
 
     def _start(self, world_from_cam: FloatArray, scale: float) -> Any:

@@ -124,23 +124,25 @@ def _joint_noise(bone: Bone, prior_scale: float, slack_m: float) -> Any:
     return gtsam.noiseModel.Gaussian.Covariance(covariance)
 
 
-def add_mount_measurement(
-    graph: Any, bone: int, camera: int, world_from_cam: FloatArray, points: MountPoints
+def add_mount_measurements(
+    graph: Any, bones: Sequence[int], camera: int, world_from_cam: FloatArray, points: MountPoints
 ) -> None:
     """Measure a bone through a camera whose mount is unknown.
 
     Args:
         graph: Receives the factors.
-        bone: Key of the bone's pose.
+        bones: Keys of the bone's poses (N).
         camera: Index of the camera, for its mount's keys.
-        world_from_cam: (4,4) measured pose.
+        world_from_cam: (N,4,4) measured poses.
         points: The points that stand for the mount.
     """
-    x_in_world = points.x_in_cam() @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
+    x_in_world = points.x_in_cam() @ world_from_cam[:, :3, :3].swapaxes(1, 2) + world_from_cam[:, None, :3, 3]
     sigmas = (points.sigma_m, points.axis_sigma_m, points.axis_sigma_m, points.axis_sigma_m)
-    for key, x, sigma in zip(mount_keys(camera), x_in_world, sigmas, strict=True):
-        noise = robust(gtsam.noiseModel.Isotropic.Sigma(3, sigma))
-        graph.add(gtsam.GPSFactorArmCalib(bone, key, x, noise))
+    noises = [robust(gtsam.noiseModel.Isotropic.Sigma(3, sigma)) for sigma in sigmas]
+    keys = mount_keys(camera)
+    for bone, measured in zip(bones, x_in_world, strict=True):
+        for key, x, noise in zip(keys, measured, noises, strict=True):
+            graph.add(gtsam.GPSFactorArmCalib(bone, key, x, noise))
 
 
 def add_mount_prior(
@@ -240,6 +242,44 @@ def optimise(
         if decrease <= tolerance * max(error, 1e-9):
             return optimizer.values(), count
     return optimizer.values(), iterations
+
+
+def optimise_from_near(
+    graph: Any, values: Any, *, iterations: int, step: Callable[[], None], tolerance: float
+) -> tuple[Any, int]:
+    """Gauss-Newton steps while each lowers the error, what is left by `optimise`.
+
+    A step without damping takes two thirds of a damped one's time: damping is a factor more for every state.
+
+    Args:
+        graph: The factors.
+        values: The start, near the solution.
+        iterations: Most steps.
+        step: Called after each iteration; may raise to stop.
+        tolerance: Relative decrease of the error below which an iteration was the last.
+
+    Returns:
+        The solution and the iterations taken.
+    """
+    optimizer = gtsam.GaussNewtonOptimizer(graph, values, gtsam.GaussNewtonParams())
+    error = optimizer.error()
+    for count in range(1, iterations + 1):
+        try:
+            optimizer.iterate()
+        except RuntimeError:
+            # A state that only damping holds.
+            break
+        step()
+        decrease, error = error - optimizer.error(), optimizer.error()
+        if not decrease >= 0.0:
+            break
+        values = optimizer.values()
+        if decrease <= tolerance * max(error, 1e-9):
+            return values, count
+    found, more = optimise(
+        graph, values, iterations=max(iterations - count, 1), step=step, tolerance=tolerance
+    )
+    return found, count + more
 
 
 def pose_values(poses: FloatArray) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from scipy import sparse
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from bodycap_batch.arrays import FloatArray, IntArray
 
@@ -67,6 +67,22 @@ def linearise(graph: Any, values: Any) -> Linear:
     return Linear(matrix, columns, np.asarray(first_row, dtype=np.int64), right)
 
 
+def _factor(matrix: FloatArray) -> FloatArray:
+    """Lower Cholesky factor of a small block; LAPACK itself, whose wrapper takes longer than the block."""
+    lower, failed = dpotrf(matrix, lower=1)
+    if failed:
+        raise np.linalg.LinAlgError(f"not positive definite at {failed}")
+    return np.asarray(lower)
+
+
+def _solve(lower: FloatArray, right: FloatArray, *, transposed: bool = False) -> FloatArray:
+    """Solve with a lower factor, or with its transpose."""
+    if not right.size:
+        return np.zeros_like(right)
+    found, _ = dtrtrs(lower, right, lower=1, trans=int(transposed))
+    return np.asarray(found)
+
+
 class Chain:
     """Normal equations whose unknowns are linked within a block and with the next block only.
 
@@ -88,8 +104,8 @@ class Chain:
             after = self._bounds[min(block + 2, len(self._bounds) - 1)]
             dense = ordered[start:end, start:after].toarray()
             own = dense[:, : end - start] if carried is None else dense[:, : end - start] - carried
-            lower = cholesky(own, lower=True, check_finite=False)
-            link = solve_triangular(lower, dense[:, end - start :], lower=True, check_finite=False)
+            lower = _factor(own)
+            link = _solve(lower, dense[:, end - start :])
             carried = link.T @ link
             self._lower.append(lower)
             self._links.append(link)
@@ -102,11 +118,11 @@ class Chain:
             own = right[self._bounds[block] : self._bounds[block + 1]]
             if below:
                 own = own - self._links[block - 1].T @ below[-1]
-            below.append(solve_triangular(lower, own, lower=True, check_finite=False))
+            below.append(_solve(lower, own))
         out: list[FloatArray] = []
         for lower, link, own in zip(self._lower[::-1], self._links[::-1], below[::-1], strict=True):
             known = own - link @ out[-1] if out else own
-            out.append(solve_triangular(lower, known, lower=True, trans="T", check_finite=False))
+            out.append(_solve(lower, known, transposed=True))
         return out[::-1]
 
     def covariances(self, read: Callable[[int, FloatArray], None]) -> None:
@@ -115,7 +131,7 @@ class Chain:
         for block in range(len(self._lower) - 1, -1, -1):
             lower, link = self._lower[block], self._links[block]
             spread = np.eye(len(lower)) if later is None else np.eye(len(lower)) + link @ later @ link.T
-            half = solve_triangular(lower, spread, lower=True, trans="T", check_finite=False)
-            covariance = solve_triangular(lower, half.T, lower=True, trans="T", check_finite=False)
+            half = _solve(lower, spread, transposed=True)
+            covariance = _solve(lower, half.T, transposed=True)
             later = 0.5 * (covariance + covariance.T)
             read(block, later)

@@ -18,7 +18,7 @@ from bodycap_batch.merging.graph import (
     MAX_BONES,
     JointFactors,
     bone_key,
-    optimise,
+    optimise_from_near,
     robust,
     velocity_key,
 )
@@ -107,7 +107,7 @@ class MotionGraph:
             step: Called after each; may raise to stop.
             spread: How far off the calibration may be; None leaves the joints' covariance out.
         """
-        values, count = optimise(
+        values, count = optimise_from_near(
             self._graph, self._start(), iterations=iterations, step=step, tolerance=_TOLERANCE
         )
         poses = np.array(

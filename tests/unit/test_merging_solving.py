@@ -1,0 +1,74 @@
+"""The optimiser's full steps: the same answer as damped ones, and damping where full steps fail."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from bodycap_batch.geometry import make_transform, so3_exp
+from bodycap_batch.merging.graph import optimise, optimise_from_near
+
+TURNED = make_transform(so3_exp([0.3, -0.2, 0.4]), [0.1, 0.2, -0.3])
+
+
+def _start(pose=None):
+    values = gtsam.Values()
+    values.insert(0, gtsam.Pose3(np.eye(4) if pose is None else pose))
+    return values
+
+
+def _pose_prior():
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(TURNED), gtsam.noiseModel.Isotropic.Sigma(6, 0.01)))
+    return graph
+
+
+def test_full_steps_end_where_damped_ones_do():
+    steps = []
+    damped, _ = optimise(_pose_prior(), _start(), iterations=30)
+    found, count = optimise_from_near(
+        _pose_prior(), _start(), iterations=30, step=lambda: steps.append(1), tolerance=1e-5
+    )
+    # Both stop a step after the error falls by less than 1e-5 of itself, at a residual of zero.
+    assert_allclose(found.atPose3(0).matrix(), damped.atPose3(0).matrix(), atol=1e-6)
+    assert len(steps) == count
+
+
+def test_what_nothing_holds_is_left_to_damping():
+    graph = gtsam.NonlinearFactorGraph()
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, 0.01)
+    graph.add(gtsam.PoseTranslationPrior3D(0, gtsam.Pose3(TURNED), noise))
+    found, _ = optimise_from_near(graph, _start(), iterations=30, step=lambda: None, tolerance=1e-5)
+    assert_allclose(found.atPose3(0).translation(), TURNED[:3, 3], atol=1e-4)
+    assert_allclose(found.atPose3(0).rotation().matrix(), np.eye(3), atol=1e-6)
+
+
+def test_a_full_step_that_makes_it_worse_is_not_taken():
+    # Beside the middle between two points, their ranges hardly feel a step across: the full one is 50 m.
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    values.insert(0, np.array([0.5, 1e-3, 0.0]))
+    graph.add(gtsam.PriorFactorPoint3(0, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 1e3)))
+    for key, anchor in enumerate(([0.0, 0.0, 0.0], [1.0, 0.0, 0.0]), start=1):
+        graph.add(gtsam.PriorFactorPoint3(key, np.array(anchor), gtsam.noiseModel.Isotropic.Sigma(3, 1e-4)))
+        graph.add(gtsam.RangeFactor3(0, key, 0.6, gtsam.noiseModel.Isotropic.Sigma(1, 0.01)))
+        values.insert(key, np.array(anchor))
+    full = gtsam.GaussNewtonOptimizer(graph, values, gtsam.GaussNewtonParams())
+    before = full.error()
+    full.iterate()
+    assert full.error() > before, "the case is no case: the full step helps"
+    found, _ = optimise_from_near(graph, values, iterations=50, step=lambda: None, tolerance=1e-9)
+    # 0.6² - 0.5² across, up to the weak prior's share of a millionth.
+    assert_allclose(np.hypot(*found.atPoint3(0)[1:]), np.sqrt(0.11), atol=1e-4)
+
+
+def test_a_stop_in_between_is_passed_on():
+    class Stop(Exception):
+        pass
+
+    def stop():
+        raise Stop
+
+    with pytest.raises(Stop):
+        optimise_from_near(_pose_prior(), _start(), iterations=30, step=stop, tolerance=1e-5)
