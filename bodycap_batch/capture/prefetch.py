@@ -1,11 +1,14 @@
-"""Run a generator ahead of its consumer, in one thread with a bounded queue."""
+"""Run a generator ahead of its consumer, in one thread with a bounded queue, where there is a core for it."""
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
+
+from bodycap_batch.context import THREADS_VARIABLE
 
 Item = TypeVar("Item")
 
@@ -17,8 +20,12 @@ def prefetched(source: Generator[Item, None, None], ahead: int = _AHEAD) -> Gene
 
     Decoding and resizing release the interpreter's lock, so they overlap with the consumer's work.
     The thread starts with the first item asked for and ends with the generator, also an abandoned
-    one. An error of the source is raised where its item would have come.
+    one. An error of the source is raised where its item would have come. A task that was given one
+    thread makes each item when it is asked for: its neighbours have the other cores.
     """
+    if os.environ.get(THREADS_VARIABLE) == "1":
+        yield from source
+        return
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="decode") as pool:
         pending = deque(pool.submit(next, source, None) for _ in range(ahead))
         try:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +17,7 @@ from bodycap_batch.check.pictures import look_at_frames
 from bodycap_batch.check.report import CameraFinding, CheckReport
 from bodycap_batch.check.settings import setting_notes
 from bodycap_batch.config.job import Overrides, load_job
-from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, Job
+from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, CaptureConfig, Job
 from bodycap_batch.disk_room import require_room
 from bodycap_batch.errors import BodycapError, CaptureError, JobError
 from bodycap_batch.formats.bvh import RigOptions, read_rig
@@ -40,12 +42,13 @@ def check_path(path: Path, overrides: Overrides | None = None) -> CheckReport:
     return check_job(job)
 
 
-def require_ready(job: Job) -> CheckReport:
+def require_ready(job: Job, threads: int = 1) -> CheckReport:
     """Check a resolved job and raise its first error, if any (before hours of work).
 
-    The room on the disk is left out: it is another one at any moment.
+    The room on the disk is left out: it is another one at any moment. As many cameras are looked at side by
+    side as there are threads.
     """
-    report = _checked(job, _ALWAYS)
+    report = _checked(job, _ALWAYS, threads)
     if report.errors:
         raise report.errors[0]
     return report
@@ -53,17 +56,20 @@ def require_ready(job: Job) -> CheckReport:
 
 def check_job(job: Job) -> CheckReport:
     """Check a resolved job: every video opened and looked at, calibration, clocks, skeleton, disk."""
-    report = _checked(job, (*_ALWAYS, _check_disk))
+    report = _checked(job, (*_ALWAYS, _check_disk), os.cpu_count() or 1)
     return replace(report, advice=tuple(advice_on(job, report.cameras))) if report.ready else report
 
 
-def _checked(job: Job, checks: Iterable[Callable[[Job, list[CameraFinding]], list[str]]]) -> CheckReport:
+def _checked(
+    job: Job, checks: Iterable[Callable[[Job, list[CameraFinding]], list[str]]], threads: int
+) -> CheckReport:
     errors: list[BodycapError] = []
     findings: list[CameraFinding] = []
-    for config in job.capture.cameras:
+    with ThreadPoolExecutor(max_workers=threads) as pool:
+        looks = [pool.submit(_look_at, job.capture, config) for config in job.capture.cameras]
+    for look in looks:
         try:
-            camera = open_camera(job.capture, config)
-            findings.append(_finding(camera, config, look_at_frames(camera)))
+            findings.append(look.result())
         except CaptureError as error:
             errors.append(error)
     notes = _body_notes(job)
@@ -73,6 +79,11 @@ def _checked(job: Job, checks: Iterable[Callable[[Job, list[CameraFinding]], lis
         except BodycapError as error:
             errors.append(error)
     return CheckReport(job=job, cameras=tuple(findings), notes=tuple(notes), errors=tuple(errors))
+
+
+def _look_at(capture: CaptureConfig, config: CameraConfig) -> CameraFinding:
+    camera = open_camera(capture, config)
+    return _finding(camera, config, look_at_frames(camera))
 
 
 def _finding(camera: CaptureCamera, config: CameraConfig, notes: list[str]) -> CameraFinding:

@@ -47,7 +47,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
         StageName | None, typer.Option("--from", help="Do this stage and all after it again.")
     ] = None,
     until: Annotated[
-        StageName | None, typer.Option(help="Stop after this stage; no results are written.")
+        StageName | None, typer.Option(help="Stop after this stage; no results are written before the last.")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Do every stage again.")] = False,
     json_progress: Annotated[

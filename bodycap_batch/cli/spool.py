@@ -29,7 +29,7 @@ _CAUSE_CHARACTERS = 200
 @app.command()
 def status(
     spool: SpoolArgument = Path("jobs"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print the rows as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print jobs and watchers as JSON.")] = False,
 ) -> None:
     """List the jobs of a watched folder: state, stage, progress, age, cause of failure; and who watches it.
 
@@ -45,7 +45,8 @@ def status(
     with disk_errors(place.root):
         rows, watchers = rows_of(place), watchers_of(place)
     if as_json:
-        _print(json.dumps([row.to_dict() for row in rows], indent=1))
+        found = {"jobs": [row.to_dict() for row in rows], "watchers": [each.to_dict() for each in watchers]}
+        _print(json.dumps(found, indent=1))
         return
     for line in _table(rows):
         _print(line)

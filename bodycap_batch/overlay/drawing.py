@@ -62,19 +62,21 @@ def draw_overlay(
 
 
 def _draw_points(image: Picture, points: SeenPoints, scale: float, bad_px: float) -> None:
-    """One call for all points of a shade: a dot is a line of no length."""
+    """One call for all points of a shade: a dot is a line of no length, and hides a hair that ends in it."""
     import cv2
 
     shade = np.round(np.clip(points.error_px / bad_px, 0.0, 1.0) * (_SHADES - 1)).astype(int)
     there, seen = _fixed(points.px, scale), _fixed(points.observed_px, scale)
     width = 1 + 2 * max(1, round(image.shape[1] / 480))
+    outside = np.linalg.norm(seen - there, axis=1) > 0.5 * width * (1 << _SUBPIXEL)
     for step in range(_SHADES):
         mine = shade == step
         if not mine.any():
             continue
         share = step / (_SHADES - 1)
         colour = np.round((1.0 - share) * _GOOD + share * _BAD).astype(int).tolist()
-        hairs, dots = (np.stack([there[mine], to[mine]], axis=1) for to in (seen, there))
+        hairs = np.stack([there, seen], axis=1)[mine & outside]
+        dots = np.stack([there[mine], there[mine]], axis=1)
         cv2.polylines(image, list(hairs), False, colour, 1, cv2.LINE_AA, _SUBPIXEL)
         cv2.polylines(image, list(dots), False, colour, width, cv2.LINE_AA, _SUBPIXEL)
 

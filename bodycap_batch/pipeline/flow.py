@@ -86,7 +86,8 @@ class Flow:
         bounds = {} if limits is None else {"limits": asdict(limits)}
         files = self._job.export.model_dump(mode="json", include={"formats", "names"})
         key = key_of("check", {}, {"cameras": self._digests, "body": body, "files": files, **bounds})
-        task = Task(key=key, arguments={"job": self._job.model_dump(mode="json"), **bounds})
+        arguments = {"job": self._job.model_dump(mode="json"), **bounds}
+        task = Task(key=key, arguments=arguments, threads=self._settings.threads)
         artefact = self._one(task, [STAGES["keyframes"].modules] * (self._side_by_side - 1))
         self._frames = int(read_summary(artefact.path)["frames"])
         for note in read_summary(artefact.path)["notes"]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import yaml
@@ -26,7 +26,7 @@ from bodycap_batch.pipeline.results import (
 )
 from bodycap_batch.pipeline.settings import Settings, StageRecord
 from bodycap_batch.store import Artefact
-from bodycap_batch.tasks import RESULTS
+from bodycap_batch.tasks import ORDER, RESULTS
 
 JOB_FILE = "job.yaml"
 REPORT_FILE = "report.html"
@@ -70,11 +70,11 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
     """
     settings.store.sweep()
     settings.require_owner()
-    made = Made()
+    made, whole = Made(), settings.until in ("", ORDER[-1])
     with Flow(job, settings, logs=out_dir / "logs") as flow:
         stopped_by = _run_until(job, flow, made, out_dir, settings)
         summary = _summary(flow, made, out_dir)
-        if made.exported is not None:
+        if whole and made.exported is not None:
             place = _hand_over(job, flow, made, out_dir, settings)
             if stopped_by is not None:
                 _add_hint(stopped_by, f"the other results are in {place}")
@@ -82,9 +82,9 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
                 flow.keep_only_this()
         elif stopped_by is not None:
             _tell_how_far(flow, made, stopped_by, out_dir, settings)
-    if stopped_by or made.failure:
-        raise stopped_by or made.failure  # type: ignore[misc]
-    return summary
+    if (error := _first_of(made.failure, stopped_by)) is not None:
+        raise error
+    return summary if whole else replace(summary, files=())
 
 
 def run_stages(job: Job, flow: Flow, made: Made) -> Iterator[str]:
@@ -133,6 +133,16 @@ def _run_until(job: Job, flow: Flow, made: Made, out_dir: Path, settings: Settin
             raise
         return error
     return None
+
+
+def _first_of(failure: EstimationError | None, stopped_by: BodycapError | None) -> BodycapError | None:
+    """What a job ends with: that there is no skeleton, unless the machine failed; the other is its hint."""
+    if failure is None or stopped_by is None:
+        return failure or stopped_by
+    of_data = isinstance(stopped_by, JobError | CaptureError | EstimationError)
+    first, second = (failure, stopped_by) if of_data else (stopped_by, failure)
+    _add_hint(first, f"besides: {second.message}")
+    return first
 
 
 def _tell_how_far(flow: Flow, made: Made, error: BodycapError, out_dir: Path, settings: Settings) -> None:

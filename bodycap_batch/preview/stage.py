@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -76,9 +76,7 @@ def render_preview(inputs: PreviewInputs, context: StageContext) -> Path:
         streams = [opened.enter_context(closing(tile.images())) for tile in tiles]
         temporary = opened.enter_context(replacing(inputs.path))
         video = opened.enter_context(VideoWriter(temporary, float(timeline.fps), (WIDTH, HEIGHT), "small"))
-        # The encoder lets go of the interpreter: the next picture is drawn meanwhile.
-        encoder = opened.enter_context(ThreadPoolExecutor(max_workers=1))
-        encoding: Future[None] | None = None
+        add = opened.enter_context(_encoder(video, context.threads))
         for index, now in enumerate(timeline.times_ns.tolist()):
             context.check_cancelled()
             if index % 15 == 0:
@@ -88,13 +86,30 @@ def render_preview(inputs: PreviewInputs, context: StageContext) -> Path:
             for tile, stream in zip(tiles, streams, strict=True):
                 draw_tile(image, tile, next(stream), int(tile.frames[index]), inputs.body)
             _write_lines(image, inputs, timeline, index)
-            if encoding is not None:
-                encoding.result()
-            encoding = encoder.submit(video.add, image)
-        if encoding is not None:
-            encoding.result()
+            add(image)
     context.progress(count, count, "")
     return inputs.path
+
+
+@contextmanager
+def _encoder(video: VideoWriter, threads: int) -> Iterator[Callable[[room.Picture], None]]:
+    """What takes the pictures; with a second thread the next one is drawn while one is encoded."""
+    if threads == 1:
+        yield video.add
+        return
+    # The encoder lets go of the interpreter.
+    with ThreadPoolExecutor(max_workers=1) as pool:
+        encoding: Future[None] | None = None
+
+        def add(image: room.Picture) -> None:
+            nonlocal encoding
+            if encoding is not None:
+                encoding.result()
+            encoding = pool.submit(video.add, image)
+
+        yield add
+        if encoding is not None:
+            encoding.result()
 
 
 def _timeline(inputs: PreviewInputs) -> Timeline:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from bodycap_batch.context import StageContext
+from bodycap_batch.context import THREADS_VARIABLE, StageContext
 from bodycap_batch.errors import EXIT_BUG, BodycapError, Cancelled, StoreError
 from bodycap_batch.runner.task import Task, TaskFunction, task_from_json
 from bodycap_batch.store import DISK_ERRORS, Store, store_error
@@ -107,7 +107,7 @@ def _send_prints_to(log: Path) -> None:
 
 def _run(task: Task, store: Store, function: TaskFunction, link: _Link) -> None:
     started = time.monotonic()
-    _pin_opencv(task.threads)
+    _pin_threads(task.threads)
     _forget_peak_memory()
     for artefact in store.artefacts_in(task.arguments):
         store.verify(artefact)
@@ -172,8 +172,9 @@ def _report_unexpected(error: Exception, root: Path, speak: _Speaker) -> int:
     return EXIT_BUG
 
 
-def _pin_opencv(threads: int) -> None:
+def _pin_threads(threads: int) -> None:
     """OpenCV's pool follows the task; the other libraries' pools are off, their threads are a stage's own."""
+    os.environ[THREADS_VARIABLE] = str(threads)
     os.environ["OPENCV_FOR_THREADS_NUM"] = str(threads)
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(threads)

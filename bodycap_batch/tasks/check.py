@@ -17,7 +17,7 @@ def _check(_: Json, arguments: Json, context: StageContext, files: Path) -> None
     job = Job.model_validate(arguments["job"])
     if (limits := arguments.get("limits")) is not None:
         require_within(job, Limits(**limits))
-    report = require_ready(job)
+    report = require_ready(job, context.threads)
     notes = [f"{camera.name}: {note}" for camera in report.cameras for note in camera.notes]
     frames = sum(camera.used_frames for camera in report.cameras)
     write_summary(files, notes=[*notes, *report.notes], frames=frames)

@@ -7,8 +7,9 @@ import json
 import os
 import socket
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from bodycap_batch.digests import write_atomically
 from bodycap_batch.watch.claim import is_at_work, is_of_this_machine, process_mark
@@ -37,6 +38,10 @@ class Watching:
     since: str
     seen: str = ""
     trouble: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The watcher as plain JSON values."""
+        return asdict(self)
 
     def __str__(self) -> str:
         sign = f", last sign {self.seen}" if self.seen else ""

@@ -61,6 +61,7 @@ class Watcher:
         self._unreadable: dict[Path, str] = {}
         self._complete: collections.deque[tuple[Drop, Look]] = collections.deque()
         self._retry_told = False
+        self._held_up: dict[str, str] = {}
         self._waiting = False
         self._left = False
         self._look_at = 0.0
@@ -149,11 +150,16 @@ class Watcher:
             self._left |= outcome.state == "stopped"
             if outcome.state not in ("lost", "stopped"):
                 self._worst = max(self._worst, outcome.exit_code)
-            where = f" -> {outcome.place}" if outcome.place is not None else ""
-            self._tell(
-                f"{outcome.name}: {outcome.state}{where}"
-                + (f": {outcome.message}" if outcome.message else "")
-            )
+            self._tell_end(outcome)
+
+    def _tell_end(self, outcome: Outcome) -> None:
+        """Say how a job ended; what holds it up time and again only once."""
+        where = f" -> {outcome.place}" if outcome.place is not None else ""
+        line = f"{outcome.name}: {outcome.state}{where}" + (f": {outcome.message}" if outcome.message else "")
+        if line != self._held_up.pop(outcome.name, ""):
+            self._tell(line)
+        if outcome.state in ("stopped", "stuck"):
+            self._held_up[outcome.name] = line
 
     def _fill(self, pool: ThreadPoolExecutor) -> bool:
         """Start jobs while there is room; False where nothing runs and nothing is to come."""
@@ -195,7 +201,7 @@ class Watcher:
         self._unreadable = found
 
     def _start(self, pool: ThreadPoolExecutor, claim: Claim, refused: BodycapError | None) -> None:
-        if refused is None:
+        if refused is None and claim.job.name not in self._held_up:
             self._tell(f"{claim.job.name}: started")
         future = pool.submit(self._worker.work, claim, refused)
         self._running[future] = claim

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import threading
 import traceback
@@ -20,7 +21,7 @@ from bodycap_batch.watch.spool import JobDir, Spool, move
 from bodycap_batch.watch.status import FINAL, State, StatusFile, append_log, read_status, time_text
 
 _MOST_SETBACKS = 5
-"""A job whose disk fails again and again, although the spool can be written, has failed."""
+"""A job whose disk fails again and again, although it can be looked at in between, has failed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +82,8 @@ class Worker:
             self._run(claim, status)
         except Cancelled as error:
             return self._interrupted(claim, status, error)
-        except StoreBusy as error:  # `bodycap gc` is at work: seconds
+        except StoreBusy as error:  # `bodycap gc` is at work: seconds, and nothing has been attempted
+            status.document["attempts"] = int(before.get("attempts", 0))
             return self._leave(claim, status, error)
         except DiskAway as error:
             return self._put_off(claim, status, error)
@@ -147,13 +149,15 @@ class Worker:
     def _put_off(self, claim: Claim, status: StatusFile, error: DiskAway) -> Outcome:
         """Begin again once the disk has had time: the claim beats no more, and is taken over when stale."""
         name = claim.job.name
-        self._setbacks[name] += 1
+        if any(not stage["reused"] for stage in status.document["finished_stages"]):
+            del self._setbacks[name]  # it has come further since
+        if _answers(Path(error.path or claim.job.path)):
+            self._setbacks[name] += 1
         if self._setbacks[name] > _MOST_SETBACKS:
-            del self._setbacks[name]
             return self._end(claim, status, "failed", error)
         claim.end()
         append_log(claim.job, f"put off: {error}")
-        status.change(state="stopped", active={})
+        status.change(state="stopped", active={}, error=error.to_dict())
         return self._stuck(claim, error)
 
     def _stuck(self, claim: Claim, error: Exception) -> Outcome:
@@ -164,7 +168,8 @@ class Worker:
 
     def _leave(self, claim: Claim, status: StatusFile, error: BodycapError) -> Outcome:
         """Leave the job where it is, for the next watcher or a later look of this one."""
-        status.change(state="stopped", active={})
+        held_up_by = None if isinstance(error, Cancelled) else error.to_dict()
+        status.change(state="stopped", active={}, error=held_up_by)
         return self._release(claim, error)
 
     def _release(self, claim: Claim, error: BodycapError) -> Outcome:
@@ -175,6 +180,7 @@ class Worker:
         return Outcome(name=claim.job.name, state="stopped", exit_code=error.exit_code, message=message)
 
     def _end(self, claim: Claim, status: StatusFile, state: State, error: BodycapError | None) -> Outcome:
+        del self._setbacks[claim.job.name]
         if error is not None:
             append_log(claim.job, f"{state}: {error}")
         return self._file(claim, state, error, status)
@@ -217,6 +223,19 @@ class Worker:
             message="" if error is None else error.message,
             place=target,
         )
+
+
+def _answers(path: Path) -> bool:
+    """Whether the disk of a file that could not be read lets itself be looked at: the file is at fault then.
+
+    One that does not is away, and is waited for however long that takes.
+    """
+    try:
+        os.statvfs(path.parent)
+        os.listdir(path.parent)
+    except OSError as error:
+        return not isinstance(store_error(error, path), DiskAway)
+    return True
 
 
 def _told(document: dict[str, object]) -> BodycapError | None:

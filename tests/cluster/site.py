@@ -19,6 +19,12 @@ from tests.results import results_of
 ROOT = Path(__file__).parents[2]
 FAKE = (sys.executable, str(ROOT / "tests" / "pipeline" / "fake_bodycap.py"))
 REAL = (sys.executable, "-c", "from bodycap_batch.cli import main; main()")
+CALM = {
+    "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
+    "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "500ms",
+    "DASK_DISTRIBUTED__ADMIN__SYSTEM_MONITOR__INTERVAL": "5s",
+}
+"""What the README advises on small machines."""
 NAMES = ("monday", "tuesday", "wednesday")
 
 
@@ -41,6 +47,7 @@ class Site:
             "PYTHONPATH": str(ROOT),
             ORDERS: str(folder / "orders.json"),
             "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "5s",
+            **CALM,
         }
         self.environment.pop("BODYCAP_STORE", None)
         self.order()

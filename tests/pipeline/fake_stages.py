@@ -19,7 +19,8 @@ from bodycap_batch.tasks import STAGES
 Json = Mapping[str, Any]
 ORDERS = "BODYCAP_FAKE_ORDERS"
 """Path of a JSON file: {"fail" | "crash" | "hang" | "fill": stage, "on": text in its videos,
-"wanted" | "localised": [a value per round], "rolling": true, "real": [stages that are no stand-ins]}."""
+"wanted" | "localised": [a value per round], "rolling": true, "real": [stages that are no stand-ins]}.
+"fail" may be a list of stages."""
 
 
 def orders() -> dict[str, Any]:
@@ -50,7 +51,7 @@ def stage(name: str) -> Any:
             Path(orders()["started"]).write_text(str(os.getpid()))
             while True:
                 time.sleep(0.05)
-        if orders().get("fail") == name and meant:
+        if name in as_list(orders().get("fail")) and meant:
             raise EstimationError(f"{name} does not work out", hint="film more")
         if name == "check" and any("unreadable" in text for text in videos(arguments["job"])):
             raise CaptureError("not a readable video", hint="copy it again")
@@ -64,6 +65,10 @@ def stage(name: str) -> Any:
         return None
 
     return run
+
+
+def as_list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
 
 
 def videos(arguments: Json) -> list[str]:

@@ -286,6 +286,21 @@ def test_without_a_skeleton_the_rest_is_kept_and_called_partial(done: Bench) -> 
     assert json.loads((done.out / "metrics.json").read_text()) == {"partial": False}
 
 
+def test_of_two_failures_both_are_told(bench: Bench) -> None:
+    bench.order(fail=["merge", "preview"])
+    with pytest.raises(EstimationError, match="merge does not work out") as caught:
+        bench.run()
+    assert "besides: preview does not work out" in str(caught.value.hint)
+    assert str(bench.out / "partial") in str(caught.value.hint)
+
+
+def test_a_machine_that_fails_is_told_before_a_skeleton_that_was_not_found(bench: Bench) -> None:
+    bench.order(fail="merge", crash="preview")
+    with pytest.raises(BodycapError, match="SIGSEGV") as caught:
+        bench.run()
+    assert "besides: merge does not work out" in str(caught.value.hint)
+
+
 def test_the_map_grows_until_nothing_is_wanted(bench: Bench) -> None:
     bench.order(wanted=[[5], [7]], localised=[5, 8, 9])
     executed = bench.executed()

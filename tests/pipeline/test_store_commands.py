@@ -77,6 +77,17 @@ def test_until_a_stage_nothing_after_it_is_done_and_no_result_is_written(bench: 
     assert bench.executed() == sorted(["export", "merge", "preview", "report", *REGISTERED])
 
 
+@pytest.mark.parametrize("stage", ["export", "report"])
+def test_until_a_stage_before_the_last_no_result_is_touched(done: Bench, stage: str) -> None:
+    before = done.results()
+    options = {"map": {"features": 1024}}
+    summary = run_job(done.job(**options), out_dir=done.out, settings=settings(done, until=stage))
+    assert (summary.files, summary.stages[-1].stage) == ((), stage)
+    assert done.results() == before
+    done.run(**options)
+    assert done.results() != before
+
+
 def test_a_job_taken_over_publishes_nothing(done: Bench) -> None:
     before = done.results()
     with pytest.raises(Cancelled, match="taken over"):

@@ -23,6 +23,7 @@ from bodycap_batch.references import collect_garbage
 from bodycap_batch.store import Store
 from bodycap_batch.watch import Terms, cancel_job, claiming, retry_job, rows_of
 from bodycap_batch.watch.claim import Claim, first_claim, take_over
+from bodycap_batch.watch.commands import claimed_row
 from bodycap_batch.watch.drops import Drop, Look, look_at
 from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir
 from bodycap_batch.watch.status import StatusFile
@@ -223,11 +224,31 @@ def test_a_job_waits_while_the_store_is_cleaned(bench: SpoolBench) -> None:
         fcntl.flock(cleaning, fcntl.LOCK_EX)
         thread.start()
         wait_for(lambda: any("goes on later" in line for line in bench.told))
+        told = claimed_row(bench.job("walk"))
     try:
         wait_for((bench.spool.done / "walk").is_dir)
     finally:
         watcher.stop()
         thread.join()
+    assert (told.state, told.cause) == ("stopped", "the store is being cleaned")
+    assert bench.status("walk")["attempts"] == 1
+    message = "walk: stopped: goes on later: the store is being cleaned"
+    assert bench.told == ["walk: started", message, f"walk: done -> {bench.spool.done / 'walk'}"]
+
+
+def test_a_job_that_waits_for_a_cleaner_says_so_once(bench: SpoolBench) -> None:
+    bench.drop("walk")
+    watcher, thread = bench.watcher(once=False), None
+    with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
+        fcntl.flock(cleaning, fcntl.LOCK_EX)
+        thread = threading.Thread(target=watcher.run)
+        thread.start()
+        try:
+            wait_for(lambda: bool(bench.told) and bench.generation("walk") > 2)
+        finally:
+            watcher.stop()
+            thread.join()
+    assert [line.partition(": goes on")[0] for line in bench.told] == ["walk: started", "walk: stopped"]
 
 
 def test_a_watcher_that_works_off_what_is_there_leaves_no_job_behind(bench: SpoolBench) -> None:
@@ -633,7 +654,9 @@ def test_the_table_of_jobs_is_for_people_and_for_programs(
         assert words["next"].split()[1] == "waiting"
         assert "the folder is empty" in words["empty"]
     assert main(["status", "--json"]) == 0
-    rows = {row["name"]: row for row in json.loads(capfd.readouterr().out)}
+    found = json.loads(capfd.readouterr().out)
+    rows = {row["name"]: row for row in found["jobs"]}
+    assert found["watchers"] == []
     assert rows["bad"]["hint"].startswith("film more")
     assert rows["good"]["path"] == str(bench.spool.done / "good")
     assert main(["retry", "bda"]) == 2

@@ -17,6 +17,7 @@ import pytest
 
 from bodycap_batch.cli import main
 from bodycap_batch.errors import DiskAway, StoreError
+from bodycap_batch.progress import Event
 from bodycap_batch.store import Store
 from bodycap_batch.watch import Watcher, claiming, rows_of, watchers_of
 from bodycap_batch.watch.presence import Presence
@@ -216,6 +217,50 @@ def test_a_job_whose_disk_never_answers_has_failed_in_the_end(
     assert bench.status("walk")["error"]["message"] == "Input/output error"
 
 
+@pytest.mark.parametrize("away", [True, False])
+def test_a_job_whose_footage_is_away_waits_as_long_as_that_takes(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], away: bool
+) -> None:
+    """While the disk answers a fault counts, unless the job has come further since the one before."""
+    footage = bench.folder / "footage"
+    footage.mkdir()
+    listdir = os.listdir
+
+    def look(path: Any) -> list[str]:
+        if away and Path(path) == footage:
+            raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(path))
+        return listdir(path)
+
+    def fail(*_: Any, settings: Any, **__: Any) -> None:
+        if not away:
+            settings.listener(Event(kind="finished", stage="keyframes"))
+        raise DiskAway("Stale file handle", path=footage / "torso.mp4", hint="is the disk mounted?")
+
+    monkeypatch.setattr("bodycap_batch.watch.work.os.listdir", look)
+    monkeypatch.setattr("bodycap_batch.watch.work.run_job", fail)
+    worker = Worker(bench.spool, bench.options(), threading.Event())
+    look_ = claiming.look_at(drop := claiming.Drop(bench.drop("walk")), 100)
+    claim, _ = claiming.claim_drop(bench.spool, drop, look_, bench.options().terms) or pytest.fail("no claim")
+    for _ in range(20):
+        assert worker.work(claim).state == "stuck"
+        claim = claiming.Claim(claim.job, claim.generation, claim._token)
+    assert main(["status"]) == 0
+    assert "Stale file handle" in capfd.readouterr().out
+
+
+def test_what_holds_a_job_up_again_and_again_is_told_once(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from bodycap_batch.watch import work
+
+    bench.drop("walk")
+    monkeypatch.setattr(work, "run_job", failing(2, work.run_job, errno.ESTALE))
+    with running(bench.watcher(once=False, stale_s=0.2)):
+        wait_for((bench.spool.done / "walk").is_dir)
+    assert sum("Stale file handle" in line for line in bench.told) == 1
+    assert bench.told.count("walk: started") == 1
+
+
 def test_footage_is_never_removed_because_the_disk_did_not_answer(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -302,6 +347,9 @@ def test_who_watches_and_what_holds_it_up_is_told_with_the_jobs(
     with running(bench.watcher(once=False, settle_s=1000.0, stale_s=1.0)):
         wait_for(lambda: any(f"(process {os.getpid()}) since" in line for line in told()))
         assert len(told()) == 1
+        assert main(["status", "--json"]) == 0
+        (watching,) = json.loads(capfd.readouterr().out)["watchers"]
+        assert (watching["pid"], watching["trouble"]) == (os.getpid(), "")
         away = bench.spool.inbox.rename(bench.folder / "unmounted")
         wait_for(lambda: any("held up" in line and "the inbox is gone" in line for line in told()))
         away.rename(bench.spool.inbox)

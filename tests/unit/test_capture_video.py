@@ -16,6 +16,7 @@ from bodycap_batch.capture.images import turn_upright
 from bodycap_batch.capture.indexing import index_video
 from bodycap_batch.capture.prefetch import prefetched
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
+from bodycap_batch.context import THREADS_VARIABLE
 from bodycap_batch.errors import CaptureError
 from tests.videos import textured_frame, write_tone, write_video
 
@@ -142,6 +143,25 @@ def test_an_error_ahead_arrives_in_its_place() -> None:
     assert [next(stream), next(stream)] == [1, 2]
     with pytest.raises(KeyError, match="third"):
         next(stream)
+
+
+def test_one_thread_decodes_what_is_asked_for_and_nothing_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+    closed: list[str] = []
+
+    def source():  # type: ignore[no-untyped-def]
+        try:
+            for k in range(1000):
+                made.append(k)
+                yield k
+        finally:
+            closed.append(threading.current_thread().name)
+
+    monkeypatch.setenv(THREADS_VARIABLE, "1")
+    stream = prefetched(source())
+    assert [next(stream) for _ in range(5)] == made == list(range(5))
+    stream.close()
+    assert closed == [threading.current_thread().name]
 
 
 def remuxed(source: Path, target: Path, shift: int = 0, skip: int = 0, **options: str) -> Path:
