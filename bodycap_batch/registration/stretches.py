@@ -122,7 +122,17 @@ def _joined(stretches: list[tuple[int | None, int | None]], count: int) -> list[
 
 
 def _inside(tracks: Tracks, stretches: list[tuple[int | None, int | None]], count: int) -> Tracks:
-    inside = np.zeros(count, dtype=bool)
+    """Tracks from a keyframe at an end of one of the stretches to where they lie in it.
+
+    A keyframe ends two stretches: what was tracked into it across one that is tracked again is left out, or
+    it would count twice.
+    """
+    reach = np.zeros((count, 2), dtype=np.int64)  # how far back and ahead of a keyframe its tracks are kept
     for first, last in stretches:
-        inside[(0 if first is None else first) : (count if last is None else last + 1)] = True
-    return tracks.select(inside[tracks.frame])
+        if first is not None:
+            reach[first, 1] = (count if last is None else last) - first
+        if last is not None:
+            reach[last, 0] = last - (0 if first is None else first)
+    ahead = tracks.frame - tracks.keyframe
+    back, forth = reach[tracks.keyframe].T
+    return tracks.select((-back <= ahead) & (ahead <= forth))

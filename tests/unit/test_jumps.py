@@ -35,6 +35,15 @@ def test_a_sudden_stop_is_no_jump() -> None:
     assert not pose_jumps(noisy, SIGMA).any()
 
 
+def test_a_jerk_is_no_jump_however_exactly_it_is_seen() -> None:
+    # 2 m/s to nothing within one frame: bent by 3 cm, 100 sigmas, where nothing else bends.
+    centres = np.cumsum(np.where(np.arange(60) < 30, 0.067, 0.0))[:, None] * np.array([1.0, 0.2, 0.0])
+    noisy = centres + np.random.default_rng(5).normal(0, 0.0002, (60, 3))
+    assert not pose_jumps(noisy, 0.0003 * np.ones(60)).any()
+    noisy[12] += [0.0, 0.033, 0.0]
+    assert np.flatnonzero(pose_jumps(noisy, 0.0003 * np.ones(60))).tolist() == [12]
+
+
 def test_wide_covariance_and_gaps_are_no_evidence() -> None:
     rng = np.random.default_rng(3)
     centres = _swing(1.0) + rng.normal(0, 0.004, (60, 3))

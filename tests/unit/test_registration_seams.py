@@ -76,6 +76,18 @@ def test_tracks_that_slipped_condemn_no_keyframe() -> None:
     assert len(misplaced("cam", scene_map, slipped, _LIMITS)) == 0
 
 
+def test_tracks_that_lead_to_where_a_keyframe_stands_do_not_speak_against_it() -> None:
+    """Half of the tracks slipped: the others' one pose is the keyframe's own."""
+    scene_map, tracks = _map(np.array([], dtype=np.int64), 0.0)
+    px = tracks.px.copy()
+    gap = (tracks.frame == 5 * _STEP) & (tracks.keyframe == 4 * _STEP)
+    gap |= (tracks.frame == 4 * _STEP) & (tracks.keyframe == 5 * _STEP)
+    half = np.flatnonzero(gap & (tracks.feature % 2 == 0))
+    px[half] += np.random.default_rng(1).uniform(40.0, 120.0, (len(half), 2)).astype(np.float32)
+    slipped = Tracks(tracks.frame, tracks.keyframe, tracks.feature, px)
+    assert len(misplaced("cam", scene_map, slipped, _LIMITS)) == 0
+
+
 def test_a_bent_but_whole_map_is_left_alone() -> None:
     # 0.03 m are 4 px, two limits.
     scene_map, tracks = _map(np.array([4, 5, 6]), 0.03)

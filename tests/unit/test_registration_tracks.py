@@ -14,7 +14,7 @@ import pytest
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import Cancelled
-from bodycap_batch.registration.stretches import all_tracks
+from bodycap_batch.registration.stretches import Known, all_tracks
 from bodycap_batch.registration.tracks import Anchor, Tracks, track_stretch
 
 STEP_PX = np.array([3.5, -1.25])
@@ -94,6 +94,17 @@ def test_tracks_end_where_the_mask_begins() -> None:
     moved = tracks.frame != tracks.keyframe
     assert moved.sum() > 1000
     assert tracks.px[moved, 0].max() < 400.0 + STEP_PX[0] * 16
+
+
+def test_a_keyframe_taken_out_and_put_back_leaves_no_track_twice() -> None:
+    video, anchors = _video(), _anchors([4, 14, 24, 40])
+    fresh = all_tracks(video, anchors, None, CONTEXT)
+    rest = {frame: anchor for frame, anchor in anchors.items() if frame != 24}
+    without = all_tracks(video, rest, Known(fresh, sorted(anchors)), CONTEXT)
+    again = all_tracks(video, anchors, Known(without, sorted(rest)), CONTEXT)
+    for found, wanted in ((without, all_tracks(video, rest, None, CONTEXT)), (again, fresh)):
+        for name in ("frame", "keyframe", "feature", "px"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
 
 
 def test_threads_find_the_same_tracks_and_tell_growing_progress() -> None:
