@@ -42,6 +42,9 @@ if TYPE_CHECKING:
 
 __all__ = ["build_map", "extend_map", "refine_map"]
 
+_STARTS = 3
+"""Pairs tried before COLMAP's own search, which verifies hundreds of pairs where few have its 16 degrees
+between rays (5 of 25 CPU seconds on tum_fr1_xyz, 1.4 of 11 on walk12). Maps are as exact."""
 _CANDIDATES_TOLD = 5
 """Pairs told of, with what speaks against each, where the first start did not hold."""
 
@@ -138,12 +141,13 @@ def _settled(models: Sequence[Any], shop: Workshop, capture: Capture) -> int:
 def _starts(
     workspace: Path, options: MapOptions, lenses: Mapping[str, tuple[Camera, bool]]
 ) -> tuple[list[Start], dict[str, object]]:
-    """The pair the user named, if it can be used, and what to tell of it."""
+    """The pair the user named, if it can be used, then the best ranked; what to tell of the first."""
+    ranked = [start for start in rank_starts(workspace, lenses)[:_STARTS] if start.usable]
     if options.init_frames is None:
-        return [], {}
+        return ranked, {}
     start = named_start(workspace, options.init_frames, lenses)
     told = {"failed": "no verified matches"} if start is None else start.to_log()
-    return [] if start is None else [start], {"named_initial_pair": told}
+    return ranked if start is None else [start, *ranked], {"named_initial_pair": told}
 
 
 def _with_better_lenses(

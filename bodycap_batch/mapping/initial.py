@@ -19,12 +19,17 @@ if TYPE_CHECKING:
     import pycolmap
 
 _LOOKED_AT = 200
-"""Pairs with the most matches that are looked at closely."""
-_ENOUGH_MATCHES = 150
-_ENOUGH_PARALLAX_RAD = float(np.radians(8.0))
-"""Beyond these more of the same makes a start no better."""
+"""Pairs that are looked at closely."""
+_MANY_MATCHES = 50
+"""Pairs with so many are looked at, evenly from those with most to those with fewest: the most matches have
+neighbours, which hardly moved apart."""
+_ENOUGH_MATCHES = 100
+_ENOUGH_PARALLAX_RAD = float(np.radians(16.0))
+"""Beyond these more of the same makes a start no better. The first pair then has 16, 18, 8 and 21 degrees
+between its rays (walk12, room12, tum_fr1_xyz, walk131); with 150 and 8 on tum_fr1_xyz 5."""
 _CELLS = 4
 _LEAST_PARALLAX_RAD = float(np.radians(1.5))
+_LEAST_SPREAD = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +60,16 @@ class Start:
         )
 
     @property
+    def usable(self) -> bool:
+        """Whether its cameras moved apart and its matches are more than a patch of the images."""
+        return self.parallax_rad >= _LEAST_PARALLAX_RAD and self.spread >= _LEAST_SPREAD
+
+    @property
     def doubt(self) -> str:
         """What speaks against it, for the log."""
         if self.parallax_rad < _LEAST_PARALLAX_RAD:
             return f"the cameras hardly moved apart ({np.degrees(self.parallax_rad):.1f} degrees of parallax)"
-        if self.spread < 0.3:
+        if self.spread < _LEAST_SPREAD:
             return f"the matches fill {self.spread:.0%} of the images"
         return f"{self.matches} matches were too few or their geometry too weak"
 
@@ -79,8 +89,10 @@ def rank_starts(workspace: Path, lenses: Mapping[str, tuple[Camera, bool]]) -> l
 
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         pairs, counts = database.read_two_view_geometry_num_inliers()
-        order = np.argsort(-np.asarray(counts), kind="stable")[:_LOOKED_AT]
-        ids = [pycolmap.pair_id_to_image_pair(pairs[row]) for row in order]
+        order = np.argsort(-np.asarray(counts), kind="stable")
+        many = order[: max(_LOOKED_AT, int((np.asarray(counts) >= _MANY_MATCHES).sum()))]
+        even = np.linspace(0, len(many) - 1, min(_LOOKED_AT, len(many))).round().astype(int)
+        ids = [pycolmap.pair_id_to_image_pair(pairs[row]) for row in many[even]]
         out = [_start(database, (int(a), int(b)), lenses) for a, b in ids]
     return sorted(out, key=lambda start: (-start.score, start.ids))
 

@@ -154,12 +154,14 @@ def mutual_matches(first: Descriptors, second: Descriptors) -> IntArray:
     row = np.arange(len(first))
     nearest = alike.argmax(axis=1)
     best = alike[row, nearest]
-    alike[row, nearest] = -1.0
-    near = np.flatnonzero(best > np.cos(_MAX_ANGLE_RAD) * _NORM**2)
+    mutual = best == alike.max(axis=0)[nearest]
+    near = np.flatnonzero(mutual & (best > np.cos(_MAX_ANGLE_RAD) * _NORM**2))
+    alike[near, nearest[near]] = -1.0
     second_best = alike[near].max(axis=1, initial=-1.0)
     near = near[_angle(best[near]) < _MAX_RATIO * _angle(second_best)]
-    back = (second[nearest[near]] @ first.T).argmax(axis=1) if len(near) else near
-    near = near[back == near]
+    # Two features can be equally near to a third: the first has it.
+    _, once = np.unique(nearest[near], return_index=True)
+    near = near[np.sort(once)]
     return np.column_stack([near, nearest[near]])
 
 

@@ -27,6 +27,8 @@ _LADDER = (
 """Demands on the initial pair, relaxed step by step; the first are COLMAP's own."""
 
 _MIN_MODEL_KEYFRAMES = 3
+_SEARCH_TRIALS = 200
+"""Pairs that COLMAP's own search looks at: its default."""
 _MIN_STANDING = 0.25
 """Share of the keyframes that a map from a chosen pair must reach; else the next pair is tried."""
 _ADJUSTMENT_TOLERANCE = 1e-5
@@ -115,8 +117,10 @@ def reconstruct(
         for name, value in step.items():
             setattr(settings.mapper, name, value)
         for start in (*starts, None):
-            settings.init_image_id1, settings.init_image_id2 = start.ids if start else (-1, -1)
-            models = _run(workspace, settings, context, total)
+            if start is None:
+                models = _search(workspace, settings, context, total)
+            else:
+                models = _from_start(start, workspace, settings, context, total)
             entry = {**step, "models": [model.num_reg_images() for model in models]}
             steps.append({**entry, **start.to_log()} if start else entry)
             if models and models[0].num_reg_images() >= _MIN_STANDING * total:
@@ -126,6 +130,41 @@ def reconstruct(
             elif models:
                 return models, steps
     return [], steps
+
+
+def _search(
+    workspace: Path, settings: pycolmap.IncrementalPipelineOptions, context: StageContext, total: int
+) -> list[Any]:
+    """Models from the pairs that COLMAP finds."""
+    settings.init_image_id1, settings.init_image_id2 = -1, -1
+    settings.init_num_trials, settings.multiple_models = _SEARCH_TRIALS, True
+    return _run(workspace, settings, context, total)
+
+
+def _from_start(
+    start: Start,
+    workspace: Path,
+    settings: pycolmap.IncrementalPipelineOptions,
+    context: StageContext,
+    total: int,
+) -> list[Any]:
+    """The model from a chosen pair, and those of the keyframes it does not hold."""
+    import pycolmap
+
+    settings.init_image_id1, settings.init_image_id2 = start.ids
+    # COLMAP would try the same pair again and again, and start every further model from it, too.
+    settings.init_num_trials, settings.multiple_models = 1, False
+    models = _run(workspace, settings, context, total)
+    if not models or models[0].num_reg_images() < _MIN_STANDING * total:
+        return models
+    held = {models[0].image(number).name for number in models[0].reg_image_ids()}
+    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+        left = sorted({image.name for image in database.read_all_images()} - held)
+    if len(left) >= _MIN_MODEL_KEYFRAMES:
+        settings.image_names = left
+        models += _search(workspace, settings, context, total)
+        settings.image_names = []
+    return sorted(models, key=_size)
 
 
 def extend(
@@ -168,7 +207,12 @@ def _run(
     )
     shutil.rmtree(target, ignore_errors=True)
     context.check_cancelled()
-    return sorted(found.values(), key=lambda each: (-each.num_reg_images(), -each.num_points3D()))
+    return sorted(found.values(), key=_size)
+
+
+def _size(model: Any) -> tuple[int, int]:
+    """Sorts the largest model first."""
+    return -model.num_reg_images(), -model.num_points3D()
 
 
 def _ticker(context: StageContext, token: pycolmap.CancellationToken, total: int) -> Callable[[], None]:

@@ -169,7 +169,7 @@ def inliers_of(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> Boo
     out = np.zeros(len(views.rays), dtype=bool)
     for some in _chunks(views):
         rows, _, owner = _gather(views, some)
-        residual, _, _ = linearise(views, rows, cam_from_gauge[some][owner])
+        residual, _, _ = _residuals(views, rows, cam_from_gauge[some][owner])
         out[rows] = np.hypot(residual[0], residual[1]) < limit_px
     return out
 
@@ -227,19 +227,34 @@ def linearise(
         rows: N of its rows.
         cam_from_gauge: (N,4,4) a pose for each row.
     """
+    residual, (a, b, inverse, z), lens = _residuals(views, rows, cam_from_gauge)
+    jacobian = np.empty((2, 6, len(a)))
+    for derivative, (by_a, by_b) in zip(jacobian, lens, strict=True):
+        along = by_a * a + by_b * b
+        derivative[0] = -(b * along + by_b)
+        derivative[1] = a * along + by_a
+        derivative[2] = by_b * a - by_a * b
+        derivative[3] = by_a * inverse
+        derivative[4] = by_b * inverse
+        derivative[5] = -along * inverse
+    return residual, jacobian, z
+
+
+def _residuals(
+    views: Views, rows: IntArray, cam_from_gauge: FloatArray
+) -> tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]:
+    """Residuals (2,N) as `linearise` has them; x/z, y/z, 1/z, z; the lens (2,2,N), 0 where unusable."""
     x, y, z = transform_points(cam_from_gauge, views.points[rows]).T
     front = z > 1e-9
     inverse = 1.0 / np.where(front, z, 1.0)
     a, b = x * inverse, y * inverse
-    zero = np.zeros_like(a)
-    by_a = np.stack([-a * b, 1.0 + a * a, -b, inverse, zero, -a * inverse])
-    by_b = np.stack([-(1.0 + b * b), a * b, a, zero, inverse, -b * inverse])
-    lens, seen = views.px_from_ray[rows], views.rays[rows]
-    off_a, off_b = a - seen[:, 0], b - seen[:, 1]
-    residual = np.stack([lens[:, k, 0] * off_a + lens[:, k, 1] * off_b for k in range(2)])
-    jacobian = np.stack([lens[:, k, 0] * by_a + lens[:, k, 1] * by_b for k in range(2)])
+    lens = np.ascontiguousarray(views.px_from_ray[rows].transpose(1, 2, 0))
+    off_a, off_b = a - views.rays[rows, 0], b - views.rays[rows, 1]
+    residual = np.stack([by_a * off_a + by_b * off_b for by_a, by_b in lens])
     usable = front & np.isfinite(residual).all(axis=0)
-    return np.where(usable, residual, _FAR), np.where(usable, jacobian, 0.0), z
+    if not usable.all():
+        residual, lens = np.where(usable, residual, _FAR), np.where(usable, lens, 0.0)
+    return residual, (a, b, inverse, z), lens
 
 
 def _normal_equations(

@@ -88,12 +88,14 @@ def solve_frames(
         path = matrices(poses)
         posed = np.asarray(np.isfinite(path).all(axis=(1, 2)))[seen.frame]
         share = agreement(inliers_of(views, invert(path), limits.max_error_px), posed, seen.point)
-        px = seen.px
+        start = np.where(np.isfinite(path), invert(path), start)
+        px, weight = seen.px, known * share**2
         if readout_s:
             velocity = image_velocity(lens, path, camera.times_ns, seen.frame, points)
             px = at_mid_row(lens, px, velocity, readout_s)
-        start = np.where(np.isfinite(path), invert(path), start)
-        views = make_views(lens, bounds, points, px, known * share**2)
+            views = make_views(lens, bounds, points, px, weight)
+        else:
+            views = replace(views, weight=weight)
         poses = solve_poses(lens, views, px, start, limits)
     agrees = inliers_of(views, invert(matrices(poses)), limits.max_error_px) & confirmed[seen.point]
     poses = _with_evidence(poses, np.bincount(seen.frame[agrees], minlength=count))

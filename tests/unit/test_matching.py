@@ -37,6 +37,14 @@ def test_a_feature_with_two_likenesses_is_left_out() -> None:
     assert sorted(found[:, 0]) == list(range(10, 40))
 
 
+def test_of_two_features_equally_near_to_a_third_the_first_has_it() -> None:
+    rng = np.random.default_rng(4)
+    second = _unit_bytes(rng, 40)
+    first = np.concatenate([second[:1], second])
+    found = mutual_matches(first, second)
+    assert found.tolist() == [[0, 0], *([row + 1, row] for row in range(1, 40))]
+
+
 def test_the_order_of_sums_does_not_matter() -> None:
     rng = np.random.default_rng(2)
     first, second = _unit_bytes(rng, 50), _unit_bytes(rng, 50)

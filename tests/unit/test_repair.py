@@ -230,6 +230,20 @@ def test_starts_prefer_what_moved_sideways(built: tuple[Any, FloatArray, Worksho
     assert "parallax" in replace(best[0], parallax_rad=0.001).doubt
 
 
+def test_keyframes_that_a_chosen_start_does_not_reach_make_a_model_of_their_own(tmp_path: Path) -> None:
+    poses = _workspace(tmp_path)
+    context = StageContext(work_dir=tmp_path, threads=1)
+    halves = [[ImageRef("cam", frame) for frame in half] for half in (range(8), range(8, _KEYFRAMES))]
+    match_pairs(tmp_path, [(a, b) for half in halves for a in half for b in half if a < b], _LENSES, context)
+    start = rank_starts(tmp_path, _LENSES)[0]
+    settings = mapper_options(MapOptions(), [1], 1.0)
+    models, ladder = reconstruct(tmp_path, settings, context, _KEYFRAMES, [start])
+    assert ladder == [{**ladder[0], "models": [8, 8], "pair": list(start.names)}]
+    held = [{model.image(number).name for number in model.reg_image_ids()} for model in models]
+    assert sorted(map(sorted, held)) == [[ref.name for ref in half] for half in halves]
+    assert max(_rms(model, poses) for model in models) < 0.01
+
+
 @pytest.mark.slow
 def test_a_named_start_is_used(built: tuple[Any, FloatArray, Workshop, set[Any]]) -> None:
     _, poses, shop, _ = built
