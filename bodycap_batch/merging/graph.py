@@ -270,12 +270,16 @@ def optimise_from_near(
             # A state that only damping holds.
             break
         step()
-        decrease, error = error - optimizer.error(), optimizer.error()
+        decrease = error - optimizer.error()
+        if decrease >= 0.0:
+            # What `values` gives lives in the optimiser until its next step.
+            values = gtsam.Values(optimizer.values())
+        if abs(decrease) <= tolerance * max(error, 1e-9):
+            # Robust weights let full steps end a hair above the best one.
+            return values, count
         if not decrease >= 0.0:
             break
-        values = optimizer.values()
-        if decrease <= tolerance * max(error, 1e-9):
-            return values, count
+        error -= decrease
     found, more = optimise(
         graph, values, iterations=max(iterations - count, 1), step=step, tolerance=tolerance
     )
