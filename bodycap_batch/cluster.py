@@ -21,6 +21,7 @@ from bodycap_batch.errors import BodycapError, Cancelled, JobError, error_from_d
 from bodycap_batch.runner import CHILD, Making, Task
 from bodycap_batch.runner.children import STOPPED
 from bodycap_batch.runner.remote import order_of, perform
+from bodycap_batch.runner.turns import Turns
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -55,6 +56,7 @@ class Cluster:
         self._topic = f"bodycap-{uuid.uuid4().hex}"
         self._progress: dict[str, Callable[[int, int, str], None]] = {}
         self._lock = threading.Lock()
+        self._turns = Turns()
         # Not the lock above: Dask's own thread waits for that one in `_hear`, and has to answer meanwhile.
         self._asking = threading.Lock()
         self._largest: float | None = None
@@ -80,6 +82,11 @@ class Cluster:
         Raises:
             BodycapError: What the child reported; `Cancelled` when stopped; the scheduler was lost.
         """
+        with self._turns.taken(task, making) as made:
+            if not made:
+                self._hand_over(task, making)
+
+    def _hand_over(self, task: Task, making: Making) -> None:
         if not making.may_commit():
             raise Cancelled("the job was stopped or taken over; finished stages are kept")
         key = f"{task.file_stem}-{uuid.uuid4().hex}"

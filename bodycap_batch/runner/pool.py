@@ -7,7 +7,7 @@ import itertools
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from bodycap_batch.errors import Cancelled
 from bodycap_batch.runner.children import STOPPED, Children, Making
 from bodycap_batch.runner.process import CHILD
 from bodycap_batch.runner.task import Task
+from bodycap_batch.runner.turns import Turns
 
 _POLL_S = 0.1
 
@@ -82,12 +83,14 @@ class LocalPool:
         self.slots = Slots(cores, memory_mb or machine_memory_mb() * 4 // 5)
         self._children = Children(command)
         self._logs: set[Path] = set()
+        self._turns = Turns()
 
     def make(self, task: Task, making: Making) -> None:
         """Make and commit the task's artefact when there is room for it. Raises `BodycapError`."""
-        with self.slots.taken(task, making.cancelled):
-            if not task.again and making.store.find(task.key) is not None:
-                return  # another job made it meanwhile
+        with self._turns.taken(task, making) as made, ExitStack() as held:
+            if made:
+                return
+            held.enter_context(self.slots.taken(task, making.cancelled))
             self._logs.add(making.logs)
             self._children.make(task, replace(making, meanwhile=()))
 

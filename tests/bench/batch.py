@@ -19,13 +19,13 @@ TASKS = 100
 JOB = """
 name: {name}
 capture:
-  # Another microsecond: the same work, nothing shared in the store.
+  # Another microsecond, another millimetre: the same work, nothing shared in the store.
   start_s: {start}
   calibration: capture/calib.json
   cameras:
     - {{name: torso, video: capture/torso.mp4}}
     - {{name: left_palm, video: capture/left_palm.mp4}}
-height_m: 1.75
+height_m: {height}
 """
 LAYOUTS = (
     ("two workers, one thread each", 2, 1),
@@ -41,7 +41,7 @@ def run(folder: Path, jobs: int = JOBS, rounds: int = 1) -> dict[str, Any]:
     if main(["synth", str(folder / "capture"), *options]) != 0:
         return {"row": "batch", "exit": 1}
     for index in range(jobs):
-        text = JOB.format(name=f"job{index}", start=f"{index * 1e-6:.6f}")
+        text = JOB.format(name=f"job{index}", start=f"{index * 1e-6:.6f}", height=1.75 + 1e-3 * index)
         (folder / f"job{index}.yaml").write_text(text)
     tried = [
         {name: _batch(folder, f"out-{turn}", jobs, workers, threads) for name, workers, threads in LAYOUTS}

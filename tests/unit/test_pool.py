@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from bodycap_batch.errors import Cancelled
-from bodycap_batch.runner import Task
+from bodycap_batch.runner import Making, Task
 from bodycap_batch.runner.pool import Slots, machine_memory_mb
-from bodycap_batch.store import ArtefactKey
+from bodycap_batch.runner.turns import Turns
+from bodycap_batch.store import ArtefactKey, Store
 
 
 def a_task(threads: int = 1, memory_mb: int = 100, priority: int = 0) -> Task:
@@ -104,3 +107,55 @@ def test_a_task_that_waits_can_be_stopped_and_leaves_no_trace() -> None:
 
 def test_this_machine_has_memory() -> None:
     assert machine_memory_mb() > 256
+
+
+def making_in(store: Store, cancelled: threading.Event | None = None) -> Making:
+    return Making(
+        store=store,
+        logs=store.root,
+        progress=lambda *_: None,
+        cancelled=(cancelled or threading.Event()).is_set,
+        may_commit=lambda: True,
+    )
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_what_two_jobs_need_is_made_once_unless_it_is_to_be_made_again(tmp_path: Path, again: bool) -> None:
+    turns, store, task = Turns(), Store(tmp_path), replace(a_task(), again=again)
+    made: list[int] = []
+
+    def work(number: int) -> None:
+        with turns.taken(task, making_in(store)) as there:
+            if there:
+                return
+            made.append(number)
+            time.sleep(0.05)
+            with store.draft(task.key) as draft:
+                (draft.files / "made_by").write_text(str(number))
+                store.commit(draft, task.key, {}, replace=again)
+
+    threads = [threading.Thread(target=work, args=[number]) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(10)
+    assert len(made) == (4 if again else 1)
+    assert (store.find(task.key) or pytest.fail("lost")).path.joinpath("made_by").read_text() == str(made[-1])
+
+
+def test_who_waits_for_another_job_can_be_stopped_or_takes_over_where_that_failed(tmp_path: Path) -> None:
+    turns, store, stop = Turns(), Store(tmp_path), threading.Event()
+    stop.set()
+
+    def fail_while_another_is_stopped() -> None:
+        with turns.taken(a_task(), making_in(store)) as there:
+            assert not there
+            with pytest.raises(Cancelled), turns.taken(a_task(), making_in(store, stop)):
+                pytest.fail("two at once")
+            with turns.taken(replace(a_task(), key=replace(a_task().key, stage="merge")), making_in(store)):
+                raise RuntimeError("no map")
+
+    with pytest.raises(RuntimeError, match="no map"):
+        fail_while_another_is_stopped()
+    with turns.taken(a_task(), making_in(store)) as there:
+        assert not there
