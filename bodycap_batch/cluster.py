@@ -31,6 +31,8 @@ QUEUES = ("slurm", "pbs")
 MEMORY = "memory"
 """Name of the resource (MB) by which a worker says what tasks may use together."""
 _POLL_S = 0.2
+_TELL_EVERY_S = 1.0
+"""A line of progress passes through worker, scheduler and client: a few milliseconds of each."""
 _ASK_AGAIN_S = 2.0
 """Workers come and go; asking the scheduler for each task takes longer than handing it over."""
 _LEFT = ("closing", "closed")
@@ -238,8 +240,12 @@ def _on_worker(order: Mapping[str, Any], topic: str) -> dict[str, Any]:
     worker = get_worker()
     key = worker.get_current_task()
 
+    told = [-math.inf]
+
     def progress(done: int, total: int, what: str) -> None:
-        worker.log_event(topic, {"key": key, "done": done, "total": total, "what": what})
+        if (now := time.monotonic()) - told[0] >= _TELL_EVERY_S:
+            told[0] = now
+            worker.log_event(topic, {"key": key, "done": done, "total": total, "what": what})
 
     def cancelled() -> bool:
         # A task nobody waits for any more: its client is gone or has cancelled it, or the scheduler is gone.

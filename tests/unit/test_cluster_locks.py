@@ -106,3 +106,29 @@ def test_the_tasks_of_a_worker_share_its_cores(
     answer = cluster._on_worker({"task": {"threads": threads}}, "topic")
     assert answer["threads"] == want
     assert answer["threads"] * tasks_at_once <= max(8, tasks_at_once)
+
+
+def test_a_worker_tells_its_progress_not_more_often_than_once_a_second(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told: list[int] = []
+    now = [100.0]
+    worker = SimpleNamespace(
+        get_current_task=lambda: "key",
+        state=SimpleNamespace(nthreads=1, tasks={}),
+        log_event=lambda _, message: told.append(message["done"]),
+    )
+    monkeypatch.setattr("distributed.get_worker", lambda: worker)
+    monkeypatch.setattr(cluster.time, "monotonic", lambda: now[0])
+
+    def perform(_: object, progress: Callable[[int, int, str], None], __: object) -> dict[str, Any]:
+        for done in range(10):  # five a second, as a child does
+            progress(done, 10, "frames")
+            now[0] += 0.2
+        return {}
+
+    monkeypatch.setattr(cluster, "perform", perform)
+    cluster._on_worker({"task": {"threads": 1}}, "topic")
+    assert told[0] == 0
+    # 2 s, rounding of the clock's steps aside.
+    assert len(told) == 2
