@@ -235,6 +235,9 @@ def claimed_row(job: JobDir) -> JobRow:
     )
     running = state == "running"
     cause = str(error.get("message", ""))
+    if state == "stopped" and cause:  # a disk that is away, a cleaner at work
+        where = error.get("path")
+        cause = f"goes on later: {f'{where}: ' if where else ''}{cause}"
     if state == "interrupted":
         cause = "its watcher is gone; it goes on when one starts"
     return JobRow(
