@@ -11,6 +11,12 @@ _TIMES_USUAL = 10.0
 """A jump stands out of the bends of the path around it, whatever the scale and the speed."""
 _ANSWERED = 0.5
 """How much of a frame's bend its two neighbours' bends undo: all of it at a jump, nothing at a jerk."""
+_GAP_SIGMAS = 4.0
+_GAP_TIMES_USUAL = 5.0
+"""The same for the ends of lost stretches. On 14 results with truth six of some 150 such ends bend the path
+so much: five beside poses that are off by 6 to 16 cm, one beside a pose off by 3 cm."""
+_SURELY_FIRST, _SURELY_SECOND = 0.25, 0.45
+"""Answers of the third pose's bend to the second's between which either may be wrong."""
 _AROUND = 12
 _LONE_RUN = 2
 _LONE_GAP = 3
@@ -21,7 +27,8 @@ def pose_jumps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
 
     The bend of a frame is its offset from the middle of the frames before and after it. A jump bends itself
     by its full height and both neighbours by half of it, the other way; a body that stops dead or starts with
-    a jerk bends one frame and its neighbours hardly.
+    a jerk bends one frame and its neighbours hardly. Beside a lost stretch one side is all there is to judge
+    by, and more poses are wrong.
 
     Args:
         centres: (N,3) camera centres; NaN where there is no pose.
@@ -30,14 +37,9 @@ def pose_jumps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
     Returns:
         (N,) True where the pose is to be refused. Scaling the map changes nothing.
     """
-    count = len(centres)
-    offset = np.full((count, 3), np.nan)
-    noise = np.full(count, np.nan)
-    if count >= 3:
-        offset[1:-1] = centres[1:-1] - 0.5 * (centres[:-2] + centres[2:])
-        noise[1:-1] = np.sqrt(sigma[1:-1] ** 2 + 0.25 * (sigma[:-2] ** 2 + sigma[2:] ** 2))
+    offset, noise = _bends(centres, sigma)
     bend = np.linalg.norm(offset, axis=1)
-    out = np.zeros(count, dtype=bool)
+    out = np.zeros(len(centres), dtype=bool)
     for frame in np.flatnonzero(np.isfinite(bend) & (bend > _SIGMAS * noise)).tolist():
         three = bend[max(0, frame - 1) : frame + 2]
         # Without both neighbours' own bends the wrong one of the three could be blamed.
@@ -50,6 +52,38 @@ def pose_jumps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
         near = np.concatenate([before, bend[frame + 2 : frame + _AROUND + 1]])
         if np.isfinite(near).sum() >= _AROUND // 2:
             out[frame] = bend[frame] > _TIMES_USUAL * np.nanmedian(near)
+    backwards = _jumps_after_gaps(centres[::-1], sigma[::-1])[::-1]
+    return np.asarray(out | _jumps_after_gaps(centres, sigma) | backwards)
+
+
+def _bends(centres: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Offsets (N,3) from the middle of both neighbours, and the standard deviation (N,) of such a one."""
+    offset, noise = np.full((len(centres), 3), np.nan), np.full(len(centres), np.nan)
+    if len(centres) >= 3:
+        offset[1:-1] = centres[1:-1] - 0.5 * (centres[:-2] + centres[2:])
+        noise[1:-1] = np.sqrt(sigma[1:-1] ** 2 + 0.25 * (sigma[:-2] ** 2 + sigma[2:] ** 2))
+    return offset, noise
+
+
+def _jumps_after_gaps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
+    """Wrong poses (N,) that come first or second after a lost stretch.
+
+    The first one bends the second by half of its height and the third not at all; the second one bends itself
+    by all of it and the third by half, the other way. Where that does not tell them apart both are refused.
+    """
+    offset, noise = _bends(centres, sigma)
+    bend = np.linalg.norm(offset, axis=1)
+    out = np.zeros(len(centres), dtype=bool)
+    posed: BoolArray = np.asarray(np.isfinite(centres).all(axis=1), dtype=bool)
+    for first in (1 + np.flatnonzero(posed[1:] & ~posed[:-1])).tolist():
+        second, third = first + 1, first + 2
+        near = bend[third + 1 : third + 1 + _AROUND]
+        if not np.isfinite(bend[second : third + 1]).all() or np.isfinite(near).sum() < _AROUND // 2:
+            continue
+        if bend[second] > max(_GAP_SIGMAS * noise[second], _GAP_TIMES_USUAL * np.nanmedian(near)):
+            answer = -offset[third] @ offset[second] / bend[second] ** 2
+            out[first] |= answer < _SURELY_SECOND
+            out[second] |= answer > _SURELY_FIRST
     return out
 
 

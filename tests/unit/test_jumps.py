@@ -50,8 +50,26 @@ def test_wide_covariance_and_gaps_are_no_evidence() -> None:
     centres[31] += 0.2
     assert not pose_jumps(centres, np.where(np.arange(60) == 31, 0.1, SIGMA)).any()
     centres[30] = np.nan
+    assert not pose_jumps(centres, np.where(np.arange(60) == 31, 0.1, SIGMA)).any()
+    assert np.flatnonzero(pose_jumps(centres, SIGMA)).tolist() == [31]
+    centres[33] = np.nan
     assert not pose_jumps(centres, SIGMA).any()
     assert pose_jumps(centres[:2], SIGMA[:2]).tolist() == [False, False]
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("wrong", [30, 31])
+def test_a_wrong_pose_beside_a_lost_stretch_is_told_from_its_neighbour(
+    *, wrong: int, backwards: bool
+) -> None:
+    centres = _swing(1.0) + np.random.default_rng(4).normal(0, 0.004, (60, 3))
+    centres[20:30] = np.nan
+    if backwards:
+        centres = centres[::-1].copy()
+    assert not pose_jumps(centres, SIGMA).any()
+    frame = 59 - wrong if backwards else wrong
+    centres[frame] += [0.0, 0.2, -0.1]
+    assert np.flatnonzero(pose_jumps(centres, SIGMA)).tolist() == [frame]
 
 
 @pytest.mark.parametrize(
