@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import Similarity, invert, make_transform
 from bodycap_batch.merging.bones import Bone
-from bodycap_batch.merging.initial import provisional_scale
+from bodycap_batch.merging.initial import anchor_and_reach, provisional_scale, related
 from bodycap_batch.merging.tracks import SAMPLE_REACH_NS, Track, moved
 from bodycap_batch.skeleton import Mount
 
@@ -29,19 +29,55 @@ _ROUNDS = 3
 """Of finding the start and the metric scale in turn; the first knows no lengths."""
 
 
+@dataclass(frozen=True, slots=True)
+class Starts:
+    """Where further maps start.
+
+    Attributes:
+        places: By gauge, main_from_gauge.
+        metric: Metres per unit of the main map.
+        told: Whether anything but the limbs' reach from one map to another tells `metric`.
+    """
+
+    places: dict[str, Similarity]
+    metric: float
+    told: bool
+
+
 def starts_of(
     bones: Sequence[Bone],
     main: Sequence[Track],
     others: Sequence[tuple[str, Sequence[Track]]],
     mounts: Mapping[str, Mount],
-) -> tuple[dict[str, Similarity], float]:
-    """Where the maps start, and metres per unit of the main map: each helps to find the other."""
+) -> Starts:
+    """Where the maps start, and metres per unit of the main map: each helps to find the other.
+
+    How far a hand reaches from a shoulder in another map does not tell the scale: the hand was put there by
+    the length of an arm at ease, and the less there is of the scale, the less its swinging adds to that.
+    """
+    guessed, told = _guessed(bones, [main, *(group for _, group in others)])
     metric, starts = np.inf, {}
     for _ in range(_ROUNDS):
         starts = {gauge: start_of(bones, main[0], group, (mounts, metric)) for gauge, group in others}
         placed = [moved(track, starts[gauge]) for gauge, group in others for track in group]
-        metric = provisional_scale(bones, [*main, *placed], mounts)
-    return starts, metric
+        telling = [track for track in (*main, *placed) if not told or track.camera not in guessed]
+        metric = provisional_scale(bones, telling, mounts)
+    return Starts(starts, metric, told)
+
+
+def _guessed(bones: Sequence[Bone], groups: Sequence[Sequence[Track]]) -> tuple[set[str], bool]:
+    """Cameras known by their reach from another map only, and whether others tell the scale."""
+    where = {track.camera: index for index, group in enumerate(groups) for track in group}
+    guessed, told = set(), False
+    for track, other in related(bones, [track for group in groups for track in group]):
+        geometry = anchor_and_reach(bones, track.bone, other.bone)
+        if geometry is None:
+            continue
+        if geometry[1] > 0.0 and where[track.camera] != where[other.camera]:
+            guessed.add(track.camera)
+        else:
+            told = True
+    return guessed, told
 
 
 def start_of(

@@ -61,7 +61,12 @@ def _pairs(
     bones: Sequence[Bone], tracks: Sequence[Track], mounts: Mapping[str, Mount]
 ) -> list[tuple[FloatArray, FloatArray, float] | None]:
     """Per camera and its nearest measured relative up the tree: centre differences, mount parts, reach."""
-    out: list[tuple[FloatArray, FloatArray, float] | None] = []
+    return [_pair(bones, track, other, mounts) for track, other in related(bones, tracks)]
+
+
+def related(bones: Sequence[Bone], tracks: Sequence[Track]) -> list[tuple[Track, Track]]:
+    """Each camera with its nearest measured relative up the tree, else with the one nearest to the root."""
+    out = []
     by_bone = {track.bone: track for track in reversed(tracks)}
     root = next((track for track in tracks if track.bone == min(by_bone)), tracks[0])
     for track in tracks:
@@ -70,7 +75,7 @@ def _pairs(
             above = bones[above].parent
         other = by_bone.get(above, root)
         if other is not track:
-            out.append(_pair(bones, track, other, mounts))
+            out.append((track, other))
     return out
 
 

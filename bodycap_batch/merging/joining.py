@@ -35,6 +35,9 @@ _STEPS = 8
 _REACH_SIGMA = 0.05
 """Of the log of the scale that the limbs' reach gives: walking elbows keep 15 to 30 degrees of flexion. With
 maps of their own, mounts and scale can make up for each other."""
+_UNTOLD_SIGMA = 0.4
+"""The same where no two cameras of a limb are in one map, nor an upper arm's is there: palms alone gave 0.69
+and 0.72 of the true scale, and lay 20 to 30 cm too low at 5 cm stated."""
 _MAX_STRAIN = 2.0
 """Sigmas between that scale and the solved one above which the body does not tell where the maps lie."""
 
@@ -190,7 +193,8 @@ def join_maps(
     """
     mounts = {mount.camera: mount for mount in inputs.mounts}
     (_, main), *others = tracks.items()
-    starts, provisional = starts_of(bones, main, others, mounts)
+    start = starts_of(bones, main, others, mounts)
+    starts, provisional = start.places, start.metric
     together = [*main, *(moved(track, starts[gauge]) for gauge, group in others for track in group)]
     together = [clean(each, provisional, inputs.clocks[each.camera].nominal_fps)[0] for each in together]
     trunk = together[0].scaled(provisional)
@@ -199,13 +203,14 @@ def join_maps(
     samples = take_samples(together, provisional, _SAMPLES, known_up)
     calibration = Calibration(inputs.skeleton, bones, samples, mounts, provisional, step)
     names = {gauge: tuple(track.camera for track in group) for gauge, group in others}
-    problem = Placing(calibration, list(names.values()), provisional)
+    reach_sigma = _REACH_SIGMA if start.told else _UNTOLD_SIGMA
+    problem = Placing(calibration, list(names.values()), provisional, reach_sigma=reach_sigma)
     problem.solve()
     strain = abs(problem.from_reach())
     if strain > _MAX_STRAIN:
         raise EstimationError(
             f"the limbs' reach and the way the cameras move disagree on the scale by "
-            f"{100 * strain * _REACH_SIGMA:.0f} %",
+            f"{100 * strain * reach_sigma:.0f} %",
             hint="a longer walk with turns tells more",
         )
     out = []
@@ -237,10 +242,19 @@ class Placing:
         calibration: At a provisional place of all maps.
         groups: The cameras of each further map.
         scale: Metres per unit of the main map, provisional.
+        reach_sigma: Of its logarithm.
     """
 
-    def __init__(self, calibration: Calibration, groups: Sequence[tuple[str, ...]], scale: float) -> None:
+    def __init__(
+        self,
+        calibration: Calibration,
+        groups: Sequence[tuple[str, ...]],
+        scale: float,
+        *,
+        reach_sigma: float = _REACH_SIGMA,
+    ) -> None:
         self._calibration, self._scale, self._reached = calibration, scale, scale
+        self._reach_sigma = reach_sigma
         cameras = calibration.samples.cameras
         self._members = [[cameras.index(name) for name in group] for group in groups]
         self.moved = [Similarity(1.0, np.eye(3), np.zeros(3)) for _ in groups]
@@ -293,7 +307,7 @@ class Placing:
         solved = mounts.eliminated(shifts)
         count = shifts.shape[1]
         reach = np.zeros(solved.influence.shape[1])
-        reach[-count] = 1.0 / _REACH_SIGMA
+        reach[-count] = 1.0 / self._reach_sigma
         influence = np.vstack([solved.influence, reach])
         right = np.append(mounts.linear.right, -self.from_reach())
         normal = influence.T @ influence
@@ -312,7 +326,7 @@ class Placing:
 
     def from_reach(self) -> float:
         """How far the scale has left the one that the limbs' reach gave, in sigmas."""
-        return float(np.log(self._scale / self._reached)) / _REACH_SIGMA
+        return float(np.log(self._scale / self._reached)) / self._reach_sigma
 
     def _directions(self) -> FloatArray:
         """(C,K,P,6) movement of each camera's pose in metres, turn and shift in the main map's axes."""
