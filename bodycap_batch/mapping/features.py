@@ -51,9 +51,18 @@ def features_of(
     """Yield (frame, features) in frame order, at most `count` features a frame, none where a mask says so."""
     import cv2
 
+    detectors = [
+        cv2.SIFT.create(count, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
+        for _ in range(context.threads)
+    ]
+    if context.threads == 1:
+        for index, rgb in camera.read(frames, colour=True):
+            context.check_cancelled()
+            yield index, _detect(detectors[0], camera, rgb)
+        return
     free: SimpleQueue[Any] = SimpleQueue()
-    for _ in range(context.threads):
-        free.put(cv2.SIFT.create(count, contrastThreshold=_CONTRAST, enable_precise_upscale=True))
+    for detector in detectors:
+        free.put(detector)
 
     def work(rgb: npt.NDArray[np.uint8]) -> Features:
         detector = free.get()
