@@ -13,11 +13,12 @@ from bodycap_batch.merging.graph import MountPoints
 from bodycap_batch.merging.posture import Posture, find_posture
 from bodycap_batch.merging.tracks import MIN_SIGMA_M, MIN_SIGMA_RAD, SAMPLE_REACH_NS, Track, evenly
 
-MAP_ERROR_M = 0.01
-MAP_ERROR_RAD = float(np.radians(0.5))
+MAP_ERROR_M = 0.005
+MAP_ERROR_RAD = float(np.radians(0.25))
 MAP_ERROR_S = 1.0
 """Maps bend: camera paths are off by about this much for about this long, all poses of a stretch together.
-What repeats must not count as often as it was sampled, or the mounts follow the map (one by 10 cm)."""
+What repeats must not count as often as it was sampled, or the mounts follow the map (one by 10 cm). Maps that
+have settled lie 3 to 6 mm off; at twice these values joints' sigmas were larger, no palm was better."""
 T_POSE_TICKS = 8
 FEWEST_SAMPLES = 10
 """Samples each camera gets where it was measured so often, however seldom all were measured together."""
