@@ -9,7 +9,9 @@ class Film {
     this.parts = [];
     this.part = null;
     this.wanted = null;
-    for (const event of ["seeked", "loadeddata"]) video.addEventListener(event, () => this.settle());
+    this.unseen = false;
+    // A browser that fetches sparingly may decode nothing before it is asked for a frame.
+    for (const event of ["loadedmetadata", "loadeddata", "seeked"]) video.addEventListener(event, () => this.settle());
     video.addEventListener("error", () => {
       if (!this.part) return;
       this.load([]);
@@ -36,7 +38,8 @@ class Film {
     const { video } = this;
     const look = (seconds) => {
       if (this.part && video.readyState >= 2) {
-        this.onFrame(this.part.first + nearest(this.part.container, seconds));
+        this.unseen = false;
+        this.show(seconds);
       }
       this.watch();
     };
@@ -45,12 +48,17 @@ class Film {
     } else requestAnimationFrame(() => look(video.currentTime));
   }
 
+  show(seconds) {
+    this.onFrame(this.part.first + nearest(this.part.container, seconds));
+  }
+
   go(time, playing, speed) {
     const part = this.parts.findLast((each) => each.common[0] <= time) || this.parts[0];
     if (!part) return;
     if (part !== this.part) {
       this.part = part;
       this.video.src = part.url;
+      this.unseen = true;
     }
     const there = between(part.common, part.container, time);
     const inside = time >= part.common[0] && time <= part.common.at(-1) + 2 * part.half;
@@ -67,13 +75,18 @@ class Film {
 
   seek(seconds) {
     if (this.video.seeking || this.video.readyState < 1) this.wanted = seconds;
-    else if (Math.abs(this.video.currentTime - seconds) > 1e-4) this.video.currentTime = seconds;
+    else if (Math.abs(this.video.currentTime - seconds) > 1e-4) {
+      this.unseen = true;
+      this.video.currentTime = seconds;
+    }
   }
 
+  // A frame can be on the screen before the video says that it has it: what came to rest unseen is looked at.
   settle() {
-    const { wanted } = this;
+    const { video, part, wanted } = this;
     this.wanted = null;
     if (wanted !== null) this.seek(wanted);
+    if (part && this.unseen && !video.seeking && video.readyState >= 2) this.show(video.currentTime);
   }
 
   // The common time the video is at; null while it does not play, so that the page goes by its own clock.
