@@ -15,8 +15,9 @@ _GAP_SIGMAS = 4.0
 _GAP_TIMES_USUAL = 5.0
 """The same for the ends of lost stretches. On 14 results with truth six of some 150 such ends bend the path
 so much: five beside poses that are off by 6 to 16 cm, one beside a pose off by 3 cm."""
-_SURELY_FIRST, _SURELY_SECOND = 0.25, 0.45
-"""Answers of the third pose's bend to the second's between which either may be wrong."""
+_SURELY_FIRST, _SURELY_SECOND, _SURELY_THIRD = 0.25, 0.45, 1.0
+"""Answers of the third pose's bend to the second's: between 0.25 and 0.45 either of the first two may be
+wrong, beyond 1 neither is."""
 _AROUND = 12
 _LONE_RUN = 2
 _LONE_GAP = 3
@@ -70,6 +71,7 @@ def _jumps_after_gaps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
 
     The first one bends the second by half of its height and the third not at all; the second one bends itself
     by all of it and the third by half, the other way. Where that does not tell them apart both are refused.
+    The third one bends itself twice as much as the second: it has both neighbours to be judged by.
     """
     offset, noise = _bends(centres, sigma)
     bend = np.linalg.norm(offset, axis=1)
@@ -83,7 +85,7 @@ def _jumps_after_gaps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
         if bend[second] > max(_GAP_SIGMAS * noise[second], _GAP_TIMES_USUAL * np.nanmedian(near)):
             answer = -offset[third] @ offset[second] / bend[second] ** 2
             out[first] |= answer < _SURELY_SECOND
-            out[second] |= answer > _SURELY_FIRST
+            out[second] |= _SURELY_FIRST < answer <= _SURELY_THIRD
     return out
 
 

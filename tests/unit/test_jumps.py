@@ -58,7 +58,7 @@ def test_wide_covariance_and_gaps_are_no_evidence() -> None:
 
 
 @pytest.mark.parametrize("backwards", [False, True])
-@pytest.mark.parametrize("wrong", [30, 31])
+@pytest.mark.parametrize("wrong", [30, 31, 32])
 def test_a_wrong_pose_beside_a_lost_stretch_is_told_from_its_neighbour(
     *, wrong: int, backwards: bool
 ) -> None:
