@@ -10,10 +10,11 @@ import numpy as np
 from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import Similarity, invert, make_transform
-from bodycap_batch.merging.bones import Bone
-from bodycap_batch.merging.initial import anchor_and_reach, provisional_scale, related
+from bodycap_batch.merging.bones import LIMB_LINKS, Bone
+from bodycap_batch.merging.initial import linked, provisional_scale, related
 from bodycap_batch.merging.tracks import SAMPLE_REACH_NS, Track, moved
 from bodycap_batch.skeleton import Mount
+from bodycap_batch.skeleton_presets import split_side
 
 _SMOOTHING_S = 0.75
 """Half the time over which paths are averaged: a stride swings the arms once in about a second."""
@@ -25,6 +26,10 @@ _COMMON_S = 4.0
 _INSTANTS = 3
 _TOGETHER = 10
 """Points of the walk, and frames of both cameras, without which there is nothing to compare."""
+_ROUGH = 0.25
+"""Sigma of the log of the scale, from how far off mounts may be, beyond which cameras that sit close
+together do not tell it: a forearm's and its palm's have 0.4, a shin's and its foot's 0.3 (taken at their
+word, they lay 12 to 49 cm off at 4 cm stated), an upper arm's beside the trunk's 0.15."""
 _ROUNDS = 3
 """Of finding the start and the metric scale in turn; the first knows no lengths."""
 
@@ -36,7 +41,7 @@ class Starts:
     Attributes:
         places: By gauge, main_from_gauge.
         metric: Metres per unit of the main map.
-        told: Whether anything but the limbs' reach from one map to another tells `metric`.
+        told: Whether more than what was put where it is at ease tells `metric`, and not just roughly.
     """
 
     places: dict[str, Similarity]
@@ -53,31 +58,54 @@ def starts_of(
     """Where the maps start, and metres per unit of the main map: each helps to find the other.
 
     How far a hand reaches from a shoulder in another map does not tell the scale: the hand was put there by
-    the length of an arm at ease, and the less there is of the scale, the less its swinging adds to that.
+    the length of an arm at ease, and the less there is of the scale, the less its swinging adds to that. Nor
+    does the distance of a trunk and a head in maps of their own: it is the one at ease, whatever the scale.
+
+    Raises:
+        EstimationError: Nothing tells the scale, or the cameras' distances fit no person.
     """
-    guessed, told = _guessed(bones, [main, *(group for _, group in others)])
+    guessed, sigma_log = _guessed(bones, [main, *(group for _, group in others)], mounts)
     metric, starts = np.inf, {}
     for _ in range(_ROUNDS):
         starts = {gauge: start_of(bones, main[0], group, (mounts, metric)) for gauge, group in others}
         placed = [moved(track, starts[gauge]) for gauge, group in others for track in group]
-        telling = [track for track in (*main, *placed) if not told or track.camera not in guessed]
-        metric = provisional_scale(bones, telling, mounts)
-    return Starts(starts, metric, told)
+        metric = provisional_scale(bones, [*main, *placed], mounts, guessed if np.isfinite(sigma_log) else ())
+    return Starts(starts, metric, bool(sigma_log <= _ROUGH))
 
 
-def _guessed(bones: Sequence[Bone], groups: Sequence[Sequence[Track]]) -> tuple[set[str], bool]:
-    """Cameras known by their reach from another map only, and whether others tell the scale."""
+def _guessed(
+    bones: Sequence[Bone], groups: Sequence[Sequence[Track]], mounts: Mapping[str, Mount]
+) -> tuple[set[str], float]:
+    """Cameras whose distance from a relative in another map is a guess, and how well others tell the scale.
+
+    Across maps only a limb that swings about a joint of its relative's bone tells something. What each tells
+    depends on how far apart its camera and the relative's are, and how well their mounts are known.
+
+    Raises:
+        EstimationError: None does, and a camera that hardly swings has a map of its own.
+    """
     where = {track.camera: index for index, group in enumerate(groups) for track in group}
-    guessed, told = set(), False
+    guessed, still, information = set(), [], 0.0
     for track, other in related(bones, [track for group in groups for track in group]):
-        geometry = anchor_and_reach(bones, track.bone, other.bone)
-        if geometry is None:
+        link = linked(bones, track, other, mounts)
+        if link is None:
             continue
-        if geometry[1] > 0.0 and where[track.camera] != where[other.camera]:
-            guessed.add(track.camera)
+        _, fixed, reach = link
+        swings = reach == 0.0 and split_side(bones[track.bone].role)[1] in LIMB_LINKS
+        if where[track.camera] == where[other.camera] or swings:
+            apart = reach + float(np.linalg.norm(fixed, axis=1).mean())
+            information += apart**2 / (mounts[track.camera].sigma_m ** 2 + mounts[other.camera].sigma_m ** 2)
         else:
-            told = True
-    return guessed, told
+            guessed.add(track.camera)
+            still += [(track.camera, other.camera)] if reach == 0.0 else []
+    if still and not information:
+        raise EstimationError(
+            "the distance of {!r} from {!r} in another map tells no scale, nor does anything else".format(
+                *still[0]
+            ),
+            hint="an upper arm's camera, or two cameras of the body in one map, tell it",
+        )
+    return guessed, 1.0 / np.sqrt(information) if information else np.inf
 
 
 def start_of(

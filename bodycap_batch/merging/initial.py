@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -19,16 +19,32 @@ _STRETCHED = 0.96
 """A limb's extension over its length when nearly straight: walking elbows keep 15 to 30° of flexion."""
 
 
-def provisional_scale(bones: Sequence[Bone], tracks: Sequence[Track], mounts: Mapping[str, Mount]) -> float:
+def provisional_scale(
+    bones: Sequence[Bone],
+    tracks: Sequence[Track],
+    mounts: Mapping[str, Mount],
+    guessed: Collection[str] = (),
+) -> float:
     """Estimate metres per map unit from how far apart the cameras of linked bones come.
 
     Every pair of cameras gives, for a scale, the distance between two points of the body that the bones'
     lengths bound; the scale that makes the largest distances equal the stretched limb wins.
 
+    Args:
+        bones: The graph's bones.
+        tracks: All cameras, in one map's gauge.
+        mounts: Where cameras sit, by camera.
+        guessed: Cameras whose distance from their relative up the tree does not count.
+
     Raises:
         EstimationError: No two cameras were localised at the same time, or they never moved apart.
     """
-    pairs = [pair for pair in _pairs(bones, tracks, mounts) if pair is not None]
+    links = [
+        linked(bones, track, other, mounts)
+        for track, other in related(bones, tracks)
+        if track.camera not in guessed
+    ]
+    pairs = [link for link in links if link is not None]
     if not pairs:
         raise EstimationError(
             "no two cameras whose distance the body knows were localised at the same time",
@@ -57,13 +73,6 @@ def _reach_cost(scale: float, apart: FloatArray, fixed: FloatArray, reach: float
     return float(np.median(distance))
 
 
-def _pairs(
-    bones: Sequence[Bone], tracks: Sequence[Track], mounts: Mapping[str, Mount]
-) -> list[tuple[FloatArray, FloatArray, float] | None]:
-    """Per camera and its nearest measured relative up the tree: centre differences, mount parts, reach."""
-    return [_pair(bones, track, other, mounts) for track, other in related(bones, tracks)]
-
-
 def related(bones: Sequence[Bone], tracks: Sequence[Track]) -> list[tuple[Track, Track]]:
     """Each camera with its nearest measured relative up the tree, else with the one nearest to the root."""
     out = []
@@ -79,9 +88,13 @@ def related(bones: Sequence[Bone], tracks: Sequence[Track]) -> list[tuple[Track,
     return out
 
 
-def _pair(
+def linked(
     bones: Sequence[Bone], track: Track, other: Track, mounts: Mapping[str, Mount]
 ) -> tuple[FloatArray, FloatArray, float] | None:
+    """Centre differences (N,3) in map units, mount parts (N,3) in metres, and reach of two cameras.
+
+    None where the body does not know their distance, or they were hardly localised at the same time.
+    """
     geometry = anchor_and_reach(bones, track.bone, other.bone)
     if geometry is None:
         return None

@@ -36,7 +36,7 @@ _REACH_SIGMA = 0.05
 """Of the log of the scale that the limbs' reach gives: walking elbows keep 15 to 30 degrees of flexion. With
 maps of their own, mounts and scale can make up for each other."""
 _UNTOLD_SIGMA = 0.4
-"""The same where no two cameras of a limb are in one map, nor an upper arm's is there: palms alone gave 0.69
+"""The same where nothing tells it but that, or two cameras that sit close together: palms alone gave 0.69
 and 0.72 of the true scale, and lay 20 to 30 cm too low at 5 cm stated."""
 _MAX_STRAIN = 2.0
 """Sigmas between that scale and the solved one above which the body does not tell where the maps lie."""

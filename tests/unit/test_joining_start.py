@@ -5,19 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bodycap_batch.errors import EstimationError
 from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.choosing import choices
 from bodycap_batch.merging.common_walk import starts_of
+from bodycap_batch.merging.initial import provisional_scale
 from bodycap_batch.merging.tracks import make_track
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.joining import SPLITS
 from tests.bench.posed import posed
 
 
-def _starts(split, seed):
-    """The starts, and the scale they found over the true one."""
-    options = SynthOptions(seconds=20.0, cameras=tuple(SPLITS[split]), seed=seed, poses_only=True)
-    capture = posed(options, SPLITS[split])
+def _groups(maps, seed):
+    """Bones, mounts, tracks by map (the trunk's first), and units of its map a metre."""
+    capture = posed(SynthOptions(seconds=20.0, cameras=tuple(maps), seed=seed, poses_only=True), maps)
     inputs, (main, further) = capture.inputs, choices(capture.inputs)[0]
     bones = graph_bones(inputs.skeleton, {mount.role for mount in inputs.mounts})
     index = {bone.role: place for place, bone in enumerate(bones)}
@@ -25,15 +26,26 @@ def _starts(split, seed):
     for each in (*main, *further):
         track = make_track(inputs, each, index[inputs.mount_of(each.camera).role])
         groups.setdefault(each.gauge, []).append(track)
-    (gauge, first), *others = groups.items()
-    found = starts_of(bones, first, others, {mount.camera: mount for mount in inputs.mounts})
-    return found, found.metric * capture.gauges[gauge].scale
+    return (
+        bones,
+        {mount.camera: mount for mount in inputs.mounts},
+        groups,
+        capture.gauges[main[0].gauge].scale,
+    )
+
+
+def _starts(maps, seed):
+    """The starts, and the scale they found over the true one."""
+    bones, mounts, groups, units = _groups(maps, seed)
+    (_, first), *others = groups.items()
+    found = starts_of(bones, first, others, mounts)
+    return found, found.metric * units
 
 
 @pytest.mark.parametrize("split", ["an arm each", "upper arms, palms"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_upper_arms_tell_the_scale_that_palms_in_another_map_do_not(split, seed):
-    found, off = _starts(split, seed)
+    found, off = _starts(SPLITS[split], seed)
     assert found.told
     assert set(found.places) == set(SPLITS[split].values()) - {"a"}
     # Two mounts 5 cm off, 25 cm apart, on two sides: one sigma is 20 %. Palms drew it to 0.63 (log -0.46).
@@ -41,6 +53,39 @@ def test_upper_arms_tell_the_scale_that_palms_in_another_map_do_not(split, seed)
 
 
 def test_palms_in_maps_of_their_own_tell_no_scale():
-    found, _ = _starts("a palm each", 0)
+    found, _ = _starts(SPLITS["a palm each"], 0)
     assert not found.told
     assert np.isfinite(found.metric)
+
+
+@pytest.mark.parametrize("limb", [("left_forearm", "left_palm"), ("left_shin", "left_foot")])
+def test_a_limbs_own_cameras_tell_the_scale_not_their_reach_from_another_map(limb):
+    bones, mounts, groups, _ = _groups({"torso": "a", **dict.fromkeys(limb, "b")}, 0)
+    found = starts_of(bones, groups["a"], [("b", groups["b"])], mounts)
+    # The two sit 14 to 20 cm apart, each 4 cm off.
+    assert not found.told
+    # What a map's own pair gives does not depend on where the map lies.
+    alone = provisional_scale(bones, groups["b"], mounts)
+    assert found.metric * found.places["b"].scale == pytest.approx(alone, rel=1e-6)
+
+
+def test_a_head_in_a_map_of_its_own_tells_no_scale():
+    arms = SPLITS["upper arms, palms"]
+    bones, mounts, groups, _ = _groups({**arms, "head": "h"}, 0)
+    head = ("h", groups.pop("h"))
+    (_, first), *others = groups.items()
+    beside, without = (starts_of(bones, first, each, mounts) for each in ([*others, head], others))
+    assert beside.told
+    assert beside.metric == without.metric
+    with pytest.raises(EstimationError, match="'head' from 'torso' in another map tells no scale"):
+        _starts({"torso": "a", "head": "b", "left_palm": "c", "right_palm": "d"}, 0)
+
+
+def test_a_camera_that_was_hardly_localised_tells_no_scale():
+    maps = {"torso": "a", "head": "a", "left_palm": "b", "right_palm": "c"}
+    bones, mounts, groups, _ = _groups(maps, 0)
+    (_, (trunk, head)), *others = groups.items()
+    assert starts_of(bones, [trunk, head], others, mounts).told
+    seldom = starts_of(bones, [trunk, head.keep(np.arange(len(head.frames)) < 9)], others, mounts)
+    assert not seldom.told
+    assert seldom.metric == starts_of(bones, [trunk], others, mounts).metric
