@@ -65,13 +65,15 @@ def _checked(
 ) -> CheckReport:
     errors: list[BodycapError] = []
     findings: list[CameraFinding] = []
-    with ThreadPoolExecutor(max_workers=threads) as pool:
-        looks = [pool.submit(_look_at, job.capture, config) for config in job.capture.cameras]
-    for look in looks:
-        try:
-            findings.append(look.result())
-        except CaptureError as error:
-            errors.append(error)
+    pool = ThreadPoolExecutor(max_workers=threads)
+    try:
+        for look in [pool.submit(_look_at, job.capture, config) for config in job.capture.cameras]:
+            try:
+                findings.append(look.result())
+            except CaptureError as error:
+                errors.append(error)
+    finally:  # who stops it does not wait for the cameras that are left
+        pool.shutdown(cancel_futures=True)
     notes = _body_notes(job)
     for check in checks:
         try:

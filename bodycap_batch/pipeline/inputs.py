@@ -11,7 +11,7 @@ from bodycap_batch.config.models import CameraConfig, CaptureConfig, Job
 from bodycap_batch.digests import FileDigests, json_digest
 from bodycap_batch.errors import CaptureError, JobError
 from bodycap_batch.identity import algorithm_version, library_versions
-from bodycap_batch.store import ArtefactKey
+from bodycap_batch.store import DISK_ERRORS, ArtefactKey, store_error
 from bodycap_batch.tasks import STAGES
 
 _FILES = ("video", "timestamps", "mask")
@@ -41,16 +41,11 @@ def camera_digest(
 
     Raises:
         CaptureError: A file cannot be read.
+        StoreError: The disk fails; `DiskAway` where it does not answer.
     """
     settings = camera.model_dump(mode="json", exclude=set(_FILES + _BODY))
     shared = capture.model_dump(mode="json", include={"start_s", "end_s", "work_px"})
-    files = camera.input_files()
-    try:
-        content = [digests.sha256(path, on_bytes) for path in files]
-    except FileNotFoundError as error:
-        raise CaptureError("there is no such file", path=error.filename, hint="check the path") from error
-    except OSError as error:
-        raise CaptureError(f"cannot be read: {error.strerror}", path=error.filename, hint=MAY_READ) from error
+    content = [_footage_digest(path, digests, on_bytes) for path in camera.input_files()]
     return json_digest(
         {
             **settings,
@@ -60,6 +55,17 @@ def camera_digest(
             "mask": camera.mask is not None,
         }
     )
+
+
+def _footage_digest(path: Path, digests: FileDigests, on_bytes: Callable[[int], None] | None) -> str:
+    try:
+        return digests.sha256(path, on_bytes)
+    except FileNotFoundError as error:
+        raise CaptureError("there is no such file", path=path, hint="check the path") from error
+    except OSError as error:
+        if error.errno in DISK_ERRORS:
+            raise store_error(error, path) from error
+        raise CaptureError(f"cannot be read: {error.strerror}", path=path, hint=MAY_READ) from error
 
 
 def one_camera(capture: CaptureConfig, camera: CameraConfig) -> dict[str, Any]:
@@ -91,11 +97,18 @@ def body_arguments(job: Job) -> dict[str, Any]:
 
 
 def body_digest(job: Job, digests: FileDigests) -> dict[str, Any]:
-    """The same with the skeleton file's content in the place of its path."""
+    """The same with the skeleton file's content in the place of its path.
+
+    Raises:
+        JobError: The file cannot be read.
+        StoreError: The disk fails.
+    """
     path = skeleton_file(job)
     try:
         content = digests.sha256(path) if path else None
     except OSError as error:
+        if path is not None and error.errno in DISK_ERRORS:
+            raise store_error(error, path) from error
         raise JobError(
             f"cannot be read: {error.strerror}", path=path, field="skeleton", hint=MAY_READ
         ) from error

@@ -37,7 +37,7 @@ class Settings:
         executor: Makes the tasks of several jobs, here or elsewhere; default: this job's own children.
         compute: False: only what is stored is used, `NotStored` raised where something is not.
         redo: Stages that are computed anew although they are stored.
-        until: Last stage to run; then there are no results. "" runs all.
+        until: Last stage to run; no results are written before the last. "" runs all.
         priority: Higher goes first where several jobs wait.
         results_ready: Called with the folder of the results where they are there before their video.
         limits: How large the videos may be; None where they are the user's own.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib
 import json
 import os
@@ -19,7 +20,15 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from bodycap_batch.context import THREADS_VARIABLE, StageContext
-from bodycap_batch.errors import EXIT_BUG, BodycapError, Cancelled, StoreError
+from bodycap_batch.errors import (
+    EXIT_BUG,
+    BodycapError,
+    Cancelled,
+    CaptureError,
+    DiskAway,
+    JobError,
+    StoreError,
+)
 from bodycap_batch.runner.task import Task, TaskFunction, task_from_json
 from bodycap_batch.store import DISK_ERRORS, Store, store_error
 
@@ -137,7 +146,7 @@ def _function(stage: str, table: Mapping[str, TaskFunction] | None) -> TaskFunct
 
 
 class _DiskWatch:
-    """Turns what a stage raises when the disk fails into `StoreError`, before the draft is removed."""
+    """Turns what a stage raises when a disk fails into `StoreError`, before the draft is removed."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -148,10 +157,40 @@ class _DiskWatch:
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         if isinstance(error, OSError) and error.errno in DISK_ERRORS:
             raise store_error(error, self._store.root) from error
+        if isinstance(error, CaptureError | JobError) and (away := _away(error)) is not None:
+            raise away from error
         # A writer that met the full disk knows its own file, but not that the folder is the store's.
         other = isinstance(error, Exception) and not isinstance(error, BodycapError)
         if (other or isinstance(error, StoreError)) and self._store.free_bytes() < FULL_DISK_BYTES:
             raise disk_full(self._store.root) from error
+
+
+def _away(error: BodycapError) -> DiskAway | None:
+    """What is wrong where the file that an error names is not to blame: its disk does not answer.
+
+    FFmpeg says EIO of broken files, too, and takes a file whose disk goes away for one that ends early: then
+    the file is asked.
+    """
+    if error.path is None:
+        return None
+    path, failed = Path(error.path), error.__cause__
+    if not isinstance(failed, OSError) or failed.errno in (None, errno.EIO):
+        failed = _failure_to_read(path)
+    found = store_error(failed, path) if isinstance(failed, OSError) else None
+    return found if isinstance(found, DiskAway) else None
+
+
+def _failure_to_read(path: Path) -> OSError | None:
+    """What the first or the last byte of a file cannot be read for; None where it is no plain file."""
+    try:
+        if path.is_file():
+            with path.open("rb") as stream:
+                stream.read(1)
+                stream.seek(max(0, path.stat().st_size - 1))
+                stream.read(1)
+    except OSError as error:
+        return error
+    return None
 
 
 def disk_full(root: Path) -> StoreError:

@@ -220,13 +220,13 @@ def test_a_job_waits_while_the_store_is_cleaned(bench: SpoolBench) -> None:
     bench.drop("walk")
     watcher = bench.watcher(once=False)
     thread = threading.Thread(target=watcher.run)
-    with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
-        fcntl.flock(cleaning, fcntl.LOCK_EX)
-        thread.start()
-        wait_for(lambda: any("goes on later" in line for line in bench.told))
-        cause = f"goes on later: {bench.spool.root / '.store'}: the store is being cleaned"
-        wait_for(lambda: claimed_row(bench.job("walk")).cause == cause)
     try:
+        with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
+            fcntl.flock(cleaning, fcntl.LOCK_EX)
+            thread.start()
+            wait_for(lambda: any("goes on later" in line for line in bench.told))
+            cause = f"goes on later: {bench.spool.root / '.store'}: the store is being cleaned"
+            wait_for(lambda: claimed_row(bench.job("walk")).cause == cause)
         wait_for((bench.spool.done / "walk").is_dir)
     finally:
         watcher.stop()

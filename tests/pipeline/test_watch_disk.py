@@ -246,6 +246,9 @@ def test_a_job_whose_footage_is_away_waits_as_long_as_that_takes(
         claim = claiming.Claim(claim.job, claim.generation, claim._token)
     assert main(["status"]) == 0
     assert f"goes on later: {footage / 'torso.mp4'}: Stale file handle" in capfd.readouterr().out
+    claim.job.cancel.touch()
+    assert worker.work(claim).place == bench.spool.failed / "walk"
+    assert bench.status("walk")["state"] == "cancelled"
 
 
 def test_what_holds_a_job_up_again_and_again_is_told_once(

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bodycap_batch.capture import open_capture
-from bodycap_batch.check import check_job, check_path
+from bodycap_batch.check import check_job, check_path, preflight, require_ready
 from bodycap_batch.check.pictures import sample_indices
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.errors import JobError
+from bodycap_batch.errors import Cancelled, JobError
 from bodycap_batch.formats import needs
 from bodycap_batch.formats.bvh import write_bvh
 from tests.bodies import reaching
@@ -183,3 +184,23 @@ def test_the_sample_job_before_it_is_rendered(tmp_path: Path) -> None:
     report = check_path(path)
     assert report.ready
     assert "renders its videos" in report.notes[0]
+
+
+def test_who_stops_a_check_does_not_wait_for_the_cameras_that_are_left(
+    walk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = load_job(walk)
+    looked: list[object] = []
+
+    def look(_: object, config: object) -> None:
+        if config is job.capture.cameras[0]:
+            raise Cancelled("stopped on request")
+        looked.append(config)
+        time.sleep(0.5 if len(looked) == 1 else 0.0)
+
+    monkeypatch.setattr(preflight, "_look_at", look)
+    cameras = (job.capture.cameras[0], *job.capture.cameras[1:] * 50)
+    many = job.model_copy(update={"capture": job.capture.model_copy(update={"cameras": cameras})})
+    with pytest.raises(Cancelled):
+        require_ready(many, threads=1)
+    assert len(looked) < 50

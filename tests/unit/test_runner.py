@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -16,9 +17,17 @@ from typing import Any
 
 import pytest
 
-from bodycap_batch.errors import BodycapError, Cancelled, EstimationError, StoreError
+from bodycap_batch.errors import (
+    BodycapError,
+    Cancelled,
+    CaptureError,
+    DiskAway,
+    EstimationError,
+    StoreError,
+)
 from bodycap_batch.progress import Event
 from bodycap_batch.runner import Children, NotStored, Rules, Runner, Task
+from bodycap_batch.runner.child import _DiskWatch
 from bodycap_batch.store import ArtefactKey, Store
 
 ROOT = Path(__file__).parents[2]
@@ -357,3 +366,39 @@ def test_a_store_error_is_what_a_removed_store_gives(bench: Bench) -> None:
     (bench.store.root / "tmp").write_text("in the way")
     with pytest.raises(StoreError):
         bench.runner.run(a_task("work"))
+
+
+@pytest.mark.parametrize(
+    ("said", "asked", "away"),
+    [
+        (errno.ESTALE, 0, True),
+        (errno.EIO, 0, False),  # FFmpeg says so of broken files, too
+        (errno.EIO, errno.EIO, True),
+        (0, errno.ENOTCONN, True),  # the video seemed to end early
+        (0, errno.EACCES, False),
+        (0, 0, False),
+    ],
+)
+def test_a_video_is_not_to_blame_where_its_disk_does_not_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: int, asked: int, away: bool
+) -> None:
+    video, store = tmp_path / "torso.mp4", Store(tmp_path / "store")
+    video.write_text("frames")
+
+    def fail(path: Path, *_: Any) -> None:
+        raise OSError(asked, os.strerror(asked), str(path))
+
+    if asked:
+        monkeypatch.setattr(Path, "open", fail)
+    with pytest.raises(BodycapError) as caught, _DiskWatch(store):
+        raise CaptureError("decoding fails", path=video) from (OSError(said, "x") if said else None)
+    assert isinstance(caught.value, DiskAway if away else CaptureError)
+    assert caught.value.path == str(video)
+
+
+def test_what_is_no_plain_file_is_not_asked(tmp_path: Path) -> None:
+    pipe = tmp_path / "torso.mp4"
+    os.mkfifo(pipe)  # opening it would wait for somebody to write
+    for path in (pipe, tmp_path, tmp_path / "none"):
+        with pytest.raises(CaptureError, match="no such video"), _DiskWatch(Store(tmp_path / "store")):
+            raise CaptureError("no such video", path=path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ import pytest
 from bodycap_batch.camera import Camera
 from bodycap_batch.config.models import Job
 from bodycap_batch.digests import FileDigests
-from bodycap_batch.errors import CaptureError, JobError
+from bodycap_batch.errors import CaptureError, DiskAway, JobError
 from bodycap_batch.pipeline.inputs import body_arguments, camera_digest
 from bodycap_batch.scene import FrameStatus, Registration, Trajectory
 from bodycap_batch.skeleton import Mount
@@ -135,3 +137,17 @@ def test_a_sidecars_content_counts_and_a_missing_one_is_named(tmp_path: Path) ->
     with pytest.raises(CaptureError, match="no such file") as caught:
         camera_digest(job.capture, job.capture.cameras[0], digests)
     assert caught.value.path == str(sidecar)
+
+
+@pytest.mark.parametrize("number", [errno.ESTALE, errno.EIO])
+def test_footage_whose_disk_goes_away_while_it_is_read_is_not_to_blame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def fail(*_: Any) -> str:
+        raise OSError(number, os.strerror(number))  # from `read`: it names no file
+
+    monkeypatch.setattr("bodycap_batch.digests.file_sha256", fail)
+    job = a_job(tmp_path)
+    with pytest.raises(DiskAway, match=os.strerror(number)) as caught:
+        camera_digest(job.capture, job.capture.cameras[0], FileDigests(tmp_path / "digests"))
+    assert caught.value.path == str(job.capture.cameras[0].video[0])
