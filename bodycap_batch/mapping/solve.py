@@ -153,7 +153,11 @@ def _from_start(
     context: StageContext,
     total: int,
 ) -> list[Any]:
-    """The model from a chosen pair, and those of the keyframes it does not hold."""
+    """The model from a chosen pair, and those of the keyframes it does not hold.
+
+    The largest of these takes what it can of the first one's keyframes, as COLMAP's own further models do: a
+    part of the room can be reached from one side alone.
+    """
     import pycolmap
 
     settings.init_image_id1, settings.init_image_id2 = start.ids
@@ -162,14 +166,40 @@ def _from_start(
     models = _run(workspace, settings, context, total)
     if not models or models[0].num_reg_images() < _MIN_STANDING * total:
         return models
-    held = {models[0].image(number).name for number in models[0].reg_image_ids()}
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
-        left = sorted({image.name for image in database.read_all_images()} - held)
+        left = sorted({image.name for image in database.read_all_images()} - _keyframes(models[0]))
     if len(left) >= _MIN_MODEL_KEYFRAMES:
         settings.image_names = left
-        models += _search(workspace, settings, context, total)
+        further = _search(workspace, settings, context, total)
         settings.image_names = []
+        if further:
+            further[0] = _grown(further[0], workspace, settings, context, total)
+            models = [model for model in models if not _keyframes(model) <= _keyframes(further[0])]
+        models += further
     return sorted(models, key=_size)
+
+
+def _keyframes(model: Any) -> set[str]:
+    """Names of a model's keyframes."""
+    return {model.image(number).name for number in model.reg_image_ids()}
+
+
+def _grown(
+    model: Any,
+    workspace: Path,
+    settings: pycolmap.IncrementalPipelineOptions,
+    context: StageContext,
+    total: int,
+) -> Any:
+    """A model with all keyframes that find a place in it."""
+    source = workspace / "grown"
+    shutil.rmtree(source, ignore_errors=True)
+    source.mkdir()
+    model.write(str(source))
+    settings.multiple_models = False
+    found = _run(workspace, settings, context, total, source)
+    shutil.rmtree(source, ignore_errors=True)
+    return min([*found, model], key=_size)
 
 
 def extend(

@@ -22,7 +22,7 @@ from bodycap_batch.mapping.confirmed import drop_unconfirmed
 from bodycap_batch.mapping.consistency import Link, doubtful, links_of
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, image_ids, write_image
 from bodycap_batch.mapping.initial import named_start, rank_starts
-from bodycap_batch.mapping.matching import match_pairs
+from bodycap_batch.mapping.matching import match_pairs, mutual_matches
 from bodycap_batch.mapping.repair import Workshop, cut_doubtful, place_again, repair
 from bodycap_batch.mapping.solve import mapper_options, reconstruct, refine, settle
 
@@ -242,6 +242,35 @@ def test_keyframes_that_a_chosen_start_does_not_reach_make_a_model_of_their_own(
     held = [{model.image(number).name for number in model.reg_image_ids()} for model in models]
     assert sorted(map(sorted, held)) == [[ref.name for ref in half] for half in halves]
     assert max(_rms(model, poses) for model in models) < 0.01
+
+
+def _link_one_way(folder: Path) -> None:
+    """Two halves of the walk; two keyframes of the first half see points that only the second half places."""
+    with pycolmap.Database.open(str(folder / DATABASE_NAME)) as database:
+        ids = {ref.frame: number for ref, number in image_ids(database).items()}
+        seen = {frame: np.asarray(database.read_descriptors(number).data) for frame, number in ids.items()}
+        pairs = [(a, b) for a in range(_KEYFRAMES) for b in range(a + 1, min(a + 6, _KEYFRAMES))]
+        for a, b in [
+            pair for pair in pairs if pair[0] >= 8 or pair[1] < 8 or (pair[0] >= 6 and pair[1] <= 10)
+        ]:
+            matches = mutual_matches(seen[a].astype(np.float32), seen[b].astype(np.float32))
+            odd = seen[a][matches[:, 0]].astype(int).sum(axis=1) % 2 == 1
+            geometry: Any = pycolmap.TwoViewGeometry()
+            geometry.config = 2
+            geometry.inlier_matches = matches[odd == (b >= 8) if a < 8 else slice(None)].astype(np.uint32)
+            database.write_two_view_geometry(ids[a], ids[b], geometry)
+
+
+def test_a_start_on_the_side_that_leads_nowhere_loses_no_keyframes(tmp_path: Path) -> None:
+    poses = _workspace(tmp_path)
+    _link_one_way(tmp_path)
+    context = StageContext(work_dir=tmp_path, threads=1)
+    start = named_start(tmp_path, ("cam:1", "cam:5"), _LENSES)
+    assert start is not None
+    settings = mapper_options(MapOptions(), [1], 1.0)
+    models, _ = reconstruct(tmp_path, settings, context, _KEYFRAMES, [start])
+    assert [model.num_reg_images() for model in models] == [_KEYFRAMES]
+    assert _rms(models[0], poses) < 0.01
 
 
 @pytest.mark.slow
