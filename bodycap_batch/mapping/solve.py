@@ -31,24 +31,21 @@ _SEARCH_TRIALS = 200
 """Pairs that COLMAP's own search looks at: its default."""
 _MIN_STANDING = 0.25
 """Share of the keyframes that a map from a chosen pair must reach; else the next pair is tried."""
-_MAPPER_TOLERANCE = 1e-4
 _ADJUSTMENT_TOLERANCE = 1e-5
-"""Relative change of the cost that ends a bundle adjustment within the mapper, and one of a whole map that
-stands. COLMAP's 0 runs every one to its last iteration, which on 299 violent keyframes took 3.7 times as long
-(206 to 55 CPU seconds) for the same map."""
+"""Relative change of the cost that ends a bundle adjustment: COLMAP's 0 runs every one to its last
+iteration, which on 299 violent keyframes took 3.7 times as long (206 to 55 CPU seconds) for the same map."""
 
 _SETTLED_TOLERANCE = 1e-4
 """The same for the last adjustment, whose loss converges slowly. Half the time of 1e-5, keyframes as exact
 (walk12 0.30 and 0.30 cm, room12 0.71 and 0.73, violent arms 1.30 and 1.30); 1e-3 costs them up to 5 %."""
 
 _GLOBAL_GROWTH = 1.4
-_GLOBAL_REFINEMENTS = 1
+_GLOBAL_REFINEMENTS = 2
 _LOCAL_REFINEMENTS = 1
 """The whole map is adjusted when it has grown by this factor (COLMAP: 1.1), with fewer rounds (COLMAP:
 5 and 2). Keyframes are as exact as with COLMAP's numbers (walk12 0.51 and 0.49 cm, room12 0.71 and 0.70,
-tum_fr1_xyz 0.87 and 0.87, walk131 0.66 and 0.80), in 55 to 85 % of the time. One round in place of two,
-without points that others make redundant, and with the tolerance above, then settled: walk12 0.30 and 0.30,
-room12 0.71 and 0.72, tum_fr1_xyz 0.74 and 0.74, walk131 0.31 and 0.30 cm, in 55 to 100 % of that time."""
+tum_fr1_xyz 0.87 and 0.87, walk131 0.66 and 0.80), in 55 to 85 % of the time. One round, a tolerance of 1e-4
+and no redundant points save another 1 to 3 seconds, but left a palm's block of room131 36 cm off."""
 
 _MIN_POINTS = 20
 """Points of the map that place a keyframe. With COLMAP's 30, 20 and 15 on room131: 152, 167, 182 of 271
@@ -79,12 +76,11 @@ def mapper_options(
     settings.random_seed = options.seed
     settings.num_threads = 1
     settings.ba_min_num_residuals_for_cpu_multi_threading = 2**31 - 1
-    settings.ba_local_function_tolerance = settings.ba_global_function_tolerance = _MAPPER_TOLERANCE
+    settings.ba_local_function_tolerance = _ADJUSTMENT_TOLERANCE
+    settings.ba_global_function_tolerance = _ADJUSTMENT_TOLERANCE
     settings.ba_global_frames_ratio = settings.ba_global_points_ratio = _GLOBAL_GROWTH
     settings.ba_global_max_refinements = _GLOBAL_REFINEMENTS
     settings.ba_local_max_refinements = _LOCAL_REFINEMENTS
-    # Points that add little to what each keyframe sees wait for `settle`, which adjusts all.
-    settings.mapper.ba_global_ignore_redundant_points3D = True
     settings.extract_colors = False
     settings.min_model_size = _MIN_MODEL_KEYFRAMES
     settings.constant_cameras = set(constant_cameras)
@@ -349,7 +345,6 @@ def adjust(
     import pycolmap
 
     adjustment = settings.get_global_bundle_adjustment()
-    adjustment.ceres.solver_options.function_tolerance = _ADJUSTMENT_TOLERANCE
     if iterations is not None:
         adjustment.ceres.solver_options.max_num_iterations = iterations
     if loss_px is not None:
