@@ -281,10 +281,12 @@ class Store:
     def _set_aside(self, path: Path, look: Callable[[], _Found]) -> _Found:
         """Move a damaged artefact away, unless a last look finds a sound one: another process was quicker.
 
-        Nobody else moves it between that look and the move, so what was made anew is never taken away.
+        Nobody else moves it between that look and the move, so what was made anew is never taken away. Where
+        nothing lies before the look, something made anew may lie there after it.
         """
         with self._setting_aside():
-            if not (found := look()):
+            there = os.path.lexists(path)
+            if not (found := look()) and there:
                 target = self._corrupt / f"{path.parent.name}-{path.name}-{time.time_ns()}"
                 with contextlib.suppress(FileNotFoundError):
                     os.replace(path, target)

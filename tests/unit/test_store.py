@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -174,8 +175,7 @@ def test_what_another_process_has_made_anew_is_not_set_aside(
 
 def test_one_process_at_a_time_takes_artefacts_from_their_places(tmp_path: Path) -> None:
     stores = [Store(tmp_path) for _ in range(4)]
-    barrier = threading.Barrier(len(stores))
-    lost: list[str] = []
+    barrier = threading.Barrier(len(stores), timeout=60)
 
     def mend(store: Store) -> None:
         """Damage, find and make anew, over and over; what a commit returned must be there and sound."""
@@ -184,17 +184,37 @@ def test_one_process_at_a_time_takes_artefacts_from_their_places(tmp_path: Path)
             if (found := store.find(key())) is None:
                 found = make(store, key(), {"a.txt": b"good"})
             barrier.wait()
-            if (found.path / "a.txt").read_bytes() != b"good":
-                lost.append(str(found.path))
+            assert (found.path / "a.txt").read_bytes() == b"good"
             if barrier.wait() == 0:
                 (found.path / "a.txt").write_bytes(b"evil")
 
-    threads = [threading.Thread(target=mend, args=(store,)) for store in stores]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert lost == []
+    with ThreadPoolExecutor(len(stores)) as pool:
+        for work in [pool.submit(mend, store) for store in stores]:
+            work.result()
+
+
+def test_what_is_made_anew_where_nothing_lay_is_not_set_aside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow, quick = Store(tmp_path), Store(tmp_path)
+    damaged = make(quick, key(), {"a.txt": b"good"}).path
+    (damaged / "a.txt").write_bytes(b"evil")
+    look, looks = slow._verified, []
+
+    def late(path: Path, wanted: ArtefactKey) -> Any:
+        """After the first look another process takes the damage away, after the last it has mended it."""
+        found = look(path, wanted)
+        looks.append(found)
+        if len(looks) == 1:
+            assert quick.find(key()) is None
+        else:
+            make(quick, key(), {"a.txt": b"good"})
+        return found
+
+    monkeypatch.setattr(slow, "_verified", late)
+    assert slow.find(key()) is None
+    assert looks == [None, None]
+    assert (damaged / "a.txt").read_bytes() == b"good"
 
 
 _COMMIT = """
