@@ -7,7 +7,7 @@ import itertools
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -87,12 +87,12 @@ class LocalPool:
 
     def make(self, task: Task, making: Making) -> None:
         """Make and commit the task's artefact when there is room for it. Raises `BodycapError`."""
-        with self._turns.taken(task, making) as made, ExitStack() as held:
+        with self._turns.taken(task, making) as made:
             if made:
                 return
-            held.enter_context(self.slots.taken(task, making.cancelled))
-            self._logs.add(making.logs)
-            self._children.make(task, replace(making, meanwhile=()))
+            with self.slots.taken(task, making.cancelled):
+                self._logs.add(making.logs)
+                self._children.make(task, replace(making, meanwhile=()))
 
     def close(self, logs: Path) -> None:
         """A job has ended; its children wait for those of other jobs."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import weakref
+from collections.abc import Generator
 from fractions import Fraction
 from pathlib import Path
 
@@ -112,23 +113,24 @@ def test_wrong_indices_are_refused(tmp_path: Path) -> None:
             camera.read(wrong)
 
 
+def counting(made: list[int], closed: list[str]) -> Generator[int, None, None]:
+    """Numbers; tells what was made, and the thread that it ended in."""
+    try:
+        for number in range(1000):
+            made.append(number)
+            yield number
+    finally:
+        closed.append(threading.current_thread().name)
+
+
 def test_decoding_ahead_is_bounded_and_ends_with_its_consumer() -> None:
     made: list[int] = []
-    closed = threading.Event()
-
-    def source():  # type: ignore[no-untyped-def]
-        try:
-            for k in range(1000):
-                made.append(k)
-                yield k
-        finally:
-            closed.set()
-
+    closed: list[str] = []
     threads = threading.active_count()
-    stream = prefetched(source(), ahead=3)
+    stream = prefetched(counting(made, closed), ahead=3)
     assert [next(stream) for _ in range(5)] == list(range(5))
     stream.close()
-    assert closed.is_set()
+    assert len(closed) == 1
     assert len(made) <= 5 + 3 + 1
     assert threading.active_count() == threads
 
@@ -148,17 +150,8 @@ def test_an_error_ahead_arrives_in_its_place() -> None:
 def test_one_thread_decodes_what_is_asked_for_and_nothing_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[int] = []
     closed: list[str] = []
-
-    def source():  # type: ignore[no-untyped-def]
-        try:
-            for k in range(1000):
-                made.append(k)
-                yield k
-        finally:
-            closed.append(threading.current_thread().name)
-
     monkeypatch.setenv(THREADS_VARIABLE, "1")
-    stream = prefetched(source())
+    stream = prefetched(counting(made, closed))
     assert [next(stream) for _ in range(5)] == made == list(range(5))
     stream.close()
     assert closed == [threading.current_thread().name]
