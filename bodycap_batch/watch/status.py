@@ -54,6 +54,7 @@ class StatusFile:
         self._may_write = may_write
         self._lock = threading.Lock()
         self._written = 0.0
+        self._failed = False
         now, before = time_text(), before or {}
         self.document: dict[str, Any] = {
             "name": job.name,
@@ -82,6 +83,9 @@ class StatusFile:
         """Take one event of the job in."""
         with self._lock:
             _take(self.document, event)
+            if event.kind != "note" and not self._failed:  # a report made afterwards is no end
+                self.document.update(stage=event.stage, camera=event.camera)
+                self._failed = event.kind == "failed"
             if event.kind != "progress":
                 self._log(event)
             if event.kind != "progress" or time.monotonic() - self._written >= _PERIOD_S:
@@ -183,7 +187,6 @@ def _take(document: dict[str, Any], event: Event) -> None:
     if event.kind == "note":
         _add_note(document, event.what)
         return
-    document["stage"], document["camera"] = event.stage, event.camera
     if event.kind != "progress":
         document["active"].pop(_UNENDED, None)
     share = event.done / event.total if event.total else None

@@ -68,6 +68,7 @@ def test_a_broken_job_is_filed_under_failed_with_its_reason(worked_off: SpoolBen
     assert case.message in error["message"]
     assert Path(error["path"]).name == case.file
     assert error["hint"]
+    assert status["stage"] in ("", "check")
     assert worked_off.job(folder_of(case)).path.parent == worked_off.spool.root / "failed"
 
 
