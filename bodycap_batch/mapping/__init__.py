@@ -21,7 +21,7 @@ from bodycap_batch.mapping.consistency import require_consistent
 from bodycap_batch.mapping.convert import to_map
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, add_keyframes, image_ids
 from bodycap_batch.mapping.initial import Start, named_start, rank_starts
-from bodycap_batch.mapping.lens import better_lenses, misfitting_lenses
+from bodycap_batch.mapping.lens import change_lenses, misfitting_lenses
 from bodycap_batch.mapping.pairs import PairChooser, link_keyframes
 from bodycap_batch.mapping.reach import Reach, check_reach
 from bodycap_batch.mapping.repair import Workshop, cut_doubtful, place_again, repair
@@ -84,30 +84,20 @@ def build_map(
     ]
     add_keyframes(workspace, wanted, options, context)
     refs = [ImageRef(item.camera, int(frame)) for item in selections for frame in item.frames]
-    scale = _scale(capture)
     chooser = PairChooser(workspace, refs, _common_ns(capture), options)
     tried, linked = link_keyframes(chooser, workspace, _lenses(capture), context)
     constant = _constant(capture, cameras)
-    settings = mapper_options(options, constant, scale)
-    starts, named = _starts(workspace, options, _lenses(capture))
-    models, ladder = reconstruct(workspace, settings, context, len(refs), starts)
-    log: dict[str, Any] = {"keyframes": len(refs), **linked, **named, "initial_pair_ladder": ladder}
-    if len(ladder) > 1:
-        best = rank_starts(workspace, _lenses(capture))[:_CANDIDATES_TOLD]
-        log["initial_candidates"] = [{**start.to_log(), "doubt": start.doubt} for start in best]
+    shop = _shop(workspace, capture, options, constant, context)
     guessed = {number: name for name, number in cameras.items() if number not in set(constant)}
-    if models and guessed:
-        settings = mapper_options(options, constant, scale)
-        models, log["better_lenses"] = _with_better_lenses(models, workspace, guessed, settings, context)
+    models, begun = _begun(shop, options, guessed, len(refs))
+    log: dict[str, Any] = {"keyframes": len(refs), **linked, **begun}
     if models:
-        shop = _shop(workspace, capture, options, constant, context)
         models[0], log["repair"] = repair(models[0], tried, shop)
         log["unconfirmed_points"] = _settled(models, shop, capture)
-    _require_coverage(models, len(refs), log.get("initial_candidates", ladder), options)
+    _require_coverage(models, len(refs), log.get("initial_candidates", log["initial_pair_ladder"]), options)
     write_models(workspace, models)
     given = {number: name for name, number in cameras.items() if capture.camera(name).calibrated}
-    settings = mapper_options(options, constant, scale)
-    log["misfitting_lenses"] = misfitting_lenses(models[0], settings, given)
+    log["misfitting_lenses"] = misfitting_lenses(models[0], shop.settings(), given)
     result = _result(models, workspace, log)
     verdict = check_reach(result.maps[0], _common_ns(capture), reach).to_log() if reach else None
     require_consistent(log["repair"]["contradicted_share"], verdict)
@@ -150,24 +140,32 @@ def _starts(
     return ranked if start is None else [start, *ranked], {"named_initial_pair": told}
 
 
-def _with_better_lenses(
-    models: list[Any],
-    workspace: Path,
-    guessed: Mapping[int, str],
-    settings: pycolmap.IncrementalPipelineOptions,
-    context: StageContext,
-) -> tuple[list[Any], dict[str, str]]:
-    """Models built anew where guessed lenses (names by id) need another kind of camera; which one."""
-    import pycolmap
+def _begun(
+    shop: Workshop, options: MapOptions, guessed: Mapping[int, str], total: int
+) -> tuple[list[Any], dict[str, Any]]:
+    """The first models and how they came about.
 
-    lenses = better_lenses(models[0], settings, guessed)
-    if lenses:
-        with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
-            for lens in lenses.values():
-                database.update_camera(lens)
-            total = len(database.read_all_images())
-        models, _ = reconstruct(workspace, settings, context, total)
-    return models, {guessed[number]: lens.model_name for number, lens in sorted(lenses.items())}
+    They are built anew, from the pairs that then are best, where guessed lenses (names by id) need another
+    kind of camera.
+    """
+    models, log = _started(shop, options, total)
+    if models and guessed:
+        found = change_lenses(shop.workspace, models[0], shop.settings(), guessed)
+        if found:
+            models, log = _started(replace(shop, lenses={**shop.lenses, **found}), options, total)
+        log["better_lenses"] = {name: lens.model for name, (lens, _) in sorted(found.items())}
+    return models, log
+
+
+def _started(shop: Workshop, options: MapOptions, total: int) -> tuple[list[Any], dict[str, Any]]:
+    """Models from the pair the user named or the best ranked, and what each of the pairs gave."""
+    starts, named = _starts(shop.workspace, options, shop.lenses)
+    models, ladder = reconstruct(shop.workspace, shop.settings(), shop.context, total, starts)
+    log: dict[str, Any] = {**named, "initial_pair_ladder": ladder}
+    if len(ladder) > 1:
+        best = rank_starts(shop.workspace, shop.lenses)[:_CANDIDATES_TOLD]
+        log["initial_candidates"] = [{**start.to_log(), "doubt": start.doubt} for start in best]
+    return models, log
 
 
 def extend_map(

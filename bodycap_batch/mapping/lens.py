@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bodycap_batch.camera import Camera
+from bodycap_batch.mapping.convert import lens_of
+from bodycap_batch.mapping.database import DATABASE_NAME
 from bodycap_batch.mapping.solve import part_of
 
 if TYPE_CHECKING:
@@ -98,6 +102,33 @@ def better_lenses(
         # COLMAP looks for no initial pair among fisheye cameras whose focal length is a mere guess.
         camera.has_prior_focal_length = True
     return out
+
+
+def change_lenses(
+    workspace: Path,
+    model: Any,
+    settings: pycolmap.IncrementalPipelineOptions,
+    guessed: Mapping[int, str],
+) -> dict[str, tuple[Camera, bool]]:
+    """Write the better lenses of guessed cameras into the database.
+
+    Args:
+        workspace: Folder of the database.
+        model: The reconstruction; stays as it is.
+        settings: The mapper's settings.
+        guessed: Names of the cameras whose lens was not given, by id.
+
+    Returns:
+        By camera name the lens that was written, and that it is none that was given (`better_lenses`).
+    """
+    import pycolmap
+
+    lenses = better_lenses(model, settings, guessed)
+    if lenses:
+        with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+            for lens in lenses.values():
+                database.update_camera(lens)
+    return {guessed[number]: (lens_of(lens), False) for number, lens in sorted(lenses.items())}
 
 
 def _change_model(camera: Any, name: str) -> None:

@@ -18,6 +18,7 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import JobError
 from bodycap_batch.geometry import align_points, invert, make_transform, so3_exp
+from bodycap_batch.mapping import _begun, lens
 from bodycap_batch.mapping.confirmed import drop_unconfirmed
 from bodycap_batch.mapping.consistency import Link, doubtful, links_of
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, image_ids, write_image
@@ -288,3 +289,28 @@ def test_a_named_start_is_used(built: tuple[Any, FloatArray, Workshop, set[Any]]
         named_start(shop.workspace, ("cam:3", "cam:3"), _LENSES)
     with pytest.raises(JobError, match="camera 'hat'"):
         named_start(shop.workspace, ("hat:3", "cam:3"), _LENSES)
+
+
+def test_a_named_start_is_used_again_where_a_guessed_lens_changes_its_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _workspace(tmp_path)
+    _link_one_way(tmp_path)
+    context = StageContext(work_dir=tmp_path, threads=1)
+    shop = Workshop(
+        workspace=tmp_path,
+        lenses=_LENSES,
+        settings=lambda: mapper_options(MapOptions(), [], 1.0),
+        constant=[],
+        context=context,
+    )
+    other = Camera(model="RADIAL", width_px=640, height_px=480, params=np.array([421.0, 320, 240, 0, 0]))
+    changed = other.to_pycolmap()
+    changed.camera_id = 1
+    monkeypatch.setattr(lens, "better_lenses", lambda *_: {1: changed})
+    options = MapOptions(init_frames=("cam:1", "cam:5"))
+    models, log = _begun(shop, options, {1: "cam"}, _KEYFRAMES)
+    assert log["better_lenses"] == {"cam": "RADIAL"}
+    assert models[0].camera(1).model_name == "RADIAL"
+    assert log["initial_pair_ladder"][0]["pair"] == ["cam/0000001", "cam/0000005"]
+    assert log["named_initial_pair"]["pair"] == ["cam/0000001", "cam/0000005"]
