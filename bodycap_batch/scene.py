@@ -17,10 +17,14 @@ _FEATURE_STRIDE = 1 << 24
 
 
 class FrameStatus(StrEnum):
-    """Whether a frame was localised, and if not, why."""
+    """Whether a frame was localised, and if not, why.
+
+    RIG: through the cameras that a hardware-synchronised rig holds beside it; it saw too little itself.
+    """
 
     KEYFRAME = "KEYFRAME"
     REGISTERED = "REGISTERED"
+    RIG = "RIG"
     BLUR = "BLUR"
     FEW_TRACKS = "FEW_TRACKS"
     FEW_INLIERS = "FEW_INLIERS"
@@ -32,7 +36,7 @@ class FrameStatus(StrEnum):
     @property
     def localised(self) -> bool:
         """True where the frame has a measured pose."""
-        return self in (FrameStatus.KEYFRAME, FrameStatus.REGISTERED)
+        return self in (FrameStatus.KEYFRAME, FrameStatus.REGISTERED, FrameStatus.RIG)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,7 +18,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "bodycap_batch"
 GROUND = {"errors", "arrays", "context", "geometry", "shares"}
 TYPES = GROUND | {"camera", "scene", "skeleton", "body"}
 MATERIAL = TYPES | {
-    "capture", "config", "formats", "skeleton_presets", "tracking", "rolling_shutter", "overlay",
+    "capture", "config", "formats", "skeleton_presets", "tracking", "rolling_shutter", "overlay", "rig",
 }  # fmt: skip
 STAGES = {
     "keyframes", "mapping", "registration", "merging", "export", "report", "evaluate", "synthetic", "check",
@@ -38,6 +38,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "skeleton_presets": GROUND | {"skeleton"},
     "tracking": GROUND | {"camera"},
     "rolling_shutter": GROUND | {"camera", "scene"},
+    "rig": GROUND | {"camera", "scene"},
     "overlay": TYPES | {"skeleton_presets"},
     "formats": TYPES,
     "config": TYPES | {"formats", "skeleton_presets"},

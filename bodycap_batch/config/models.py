@@ -126,6 +126,10 @@ class CaptureConfig(_Block):
     calibration: AnyCalibration | None = Field(
         None, description="calibration of every camera that has none of its own"
     )
+    rig: Literal["free", "synced"] = Field(
+        "free",
+        description="synced: cameras on one segment are held rigidly and exposed by one hardware trigger",
+    )
     start_s: Seconds | None = Field(None, description="first moment used, common clock")
     end_s: Seconds | None = Field(None, description="last moment used, common clock")
     work_px: int = Field(
@@ -134,6 +138,14 @@ class CaptureConfig(_Block):
     synthetic: dict[str, Any] | None = Field(
         None, description="options of `bodycap synth`: the videos are rendered on first use"
     )
+
+    def segments(self) -> list[list[CameraConfig]]:
+        """Cameras that share a segment of the body, two and more."""
+        by_role: dict[str, list[CameraConfig]] = {}
+        for camera in self.cameras:
+            if camera.role is not None:
+                by_role.setdefault(camera.role, []).append(camera)
+        return [cameras for cameras in by_role.values() if len(cameras) > 1]
 
 
 class Job(_Block):

@@ -26,7 +26,7 @@ def problems_in(job: Job) -> list[Problem]:
     for index, camera in enumerate(job.capture.cameras):
         for found in (*_camera_names(job, index), *_mount(job, camera), *_pose(camera), *_paths(camera)):
             problems.append(found._replace(location=("capture", "cameras", index, *found.location)))
-    return [*problems, *_job_names(job), *_skeleton(job), *_times(job), *_first_frames(job)]
+    return [*problems, *_job_names(job), *_skeleton(job), *_times(job), *_first_frames(job), *_rig(job)]
 
 
 def skeleton_of(job: Job) -> str:
@@ -139,6 +139,13 @@ def _times(job: Job) -> Iterator[Problem]:
     start, end = job.capture.start_s, job.capture.end_s
     if start is not None and end is not None and end <= start:
         yield Problem(("capture", "end_s"), f"end_s {end:g} is not after start_s {start:g}", "swap them?")
+
+
+def _rig(job: Job) -> Iterator[Problem]:
+    """A rig is made of cameras on one segment."""
+    if job.capture.rig == "synced" and not job.capture.segments():
+        message = "`synced` speaks of cameras on one segment, and no two share one"
+        yield Problem(("capture", "rig"), message, "give them one `mount` or `segment`, or leave it out")
 
 
 def _first_frames(job: Job) -> Iterator[Problem]:

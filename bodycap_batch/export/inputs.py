@@ -9,6 +9,7 @@ from typing import Any
 
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.body import CameraClock, MergeResult
+from bodycap_batch.rig import RelativePose
 from bodycap_batch.scene import KeyframeSelection, Map, Trajectory
 
 
@@ -26,6 +27,7 @@ class ExportInputs:
         partial_reason: Why there is no body although one was asked for.
         row_fraction: By camera, (N,) mean row of the observations behind each pose over the image height, for
             rolling shutters; a camera that is missing is taken at the middle row.
+        relative_poses: Of cameras on one segment, in the unit of the gauge both were solved in.
         log: Plain JSON values about the map's making (no clocks, no paths), kept in ``metrics.json``.
     """
 
@@ -37,6 +39,7 @@ class ExportInputs:
     merge: MergeResult | None = None
     partial_reason: str | None = None
     row_fraction: Mapping[str, FloatArray] = field(default_factory=dict)
+    relative_poses: tuple[RelativePose, ...] = ()
     log: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

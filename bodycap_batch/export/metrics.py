@@ -12,7 +12,8 @@ import numpy as np
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.export.inputs import ExportInputs
 from bodycap_batch.export.placed import WORLD, main_frame, place_maps, place_trajectories
-from bodycap_batch.geometry import invert, transform_points
+from bodycap_batch.geometry import invert, rotation_angle_rad, transform_points
+from bodycap_batch.rig import RelativePose
 from bodycap_batch.rolling_shutter import at_mid_row, image_velocity
 from bodycap_batch.scene import Map, Trajectory
 from bodycap_batch.skeleton import Motion
@@ -47,6 +48,8 @@ def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[st
         ],
         "mapping": dict(inputs.log),
     }
+    if inputs.relative_poses:
+        out["relative_poses"] = [_relative(inputs, item) for item in inputs.relative_poses]
     if inputs.merge is not None:
         out["merge"] = {
             **inputs.merge.report,
@@ -136,6 +139,25 @@ def _registration(trajectory: Trajectory) -> dict[str, Any]:
         "measurements": total,
         "median_inliers": float(np.median(weights)) if len(weights) else None,
         "mean_reprojection_error_px": error,
+    }
+
+
+def _relative(inputs: ExportInputs, item: RelativePose) -> dict[str, Any]:
+    """Where one camera of a segment sits beside another: metres in the world, else the map's unit."""
+    gauge = {path.camera: path.gauge for path in inputs.trajectories}.get(item.cameras[0])
+    placed = next((each for each in place_maps(inputs) if each.scene.gauge == gauge), None)
+    target_from_map = None if placed is None else placed.target_from_map
+    scale = 1.0 if target_from_map is None else target_from_map.scale
+    pose = item.first_from_second
+    return {
+        "cameras": list(item.cameras),
+        "instants": item.instants,
+        "rigid": item.rigid,
+        "turn_deg": float(np.degrees(rotation_angle_rad(pose[:3, :3]))) if item.instants else None,
+        "translation": scale * pose[:3, 3],
+        "spread_deg": float(np.degrees(item.spread_rad)),
+        "explained_deg": float(np.degrees(item.explained_rad)),
+        "spread": scale * item.spread,
     }
 
 

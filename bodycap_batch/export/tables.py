@@ -21,7 +21,8 @@ LOST = "LOST"
 def write_frames(path: Path, inputs: ExportInputs) -> Path:
     """Write the table (times in seconds, error in pixels at the work size) and return its path.
 
-    `status` is KEYFRAME, REGISTERED or LOST; `reason` says why a frame is lost.
+    `status` is KEYFRAME, REGISTERED, RIG (carried by the other cameras of a rig) or LOST; `reason` says why
+    a frame is lost.
 
     Raises:
         StoreError: The file cannot be written.

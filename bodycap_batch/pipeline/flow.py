@@ -19,11 +19,14 @@ from bodycap_batch.pipeline.inputs import (
     body_arguments,
     body_digest,
     camera_digest,
+    content_of,
     has_body,
     key_of,
+    localised_in,
     one_camera,
 )
 from bodycap_batch.pipeline.made import Made, report_task
+from bodycap_batch.pipeline.rigs import rig_tasks, segments_of
 from bodycap_batch.pipeline.settings import Settings, StageRecord
 from bodycap_batch.progress import Event
 from bodycap_batch.references import References, in_use
@@ -82,16 +85,14 @@ class Flow:
             # What is installed can change between two runs: looked at each time, not kept with the check.
             require_libraries(self._job.export.formats)
             body = body_digest(self._job, self._settings.store.digests)
-        limits = self._settings.limits
-        bounds = {} if limits is None else {"limits": asdict(limits)}
+        bounds = {} if self._settings.limits is None else {"limits": asdict(self._settings.limits)}
         files = self._job.export.model_dump(mode="json", include={"formats", "names"})
         key = key_of("check", {}, {"cameras": self._digests, "body": body, "files": files, **bounds})
         arguments = {"job": self._job.model_dump(mode="json"), **bounds}
         task = Task(key=key, arguments=arguments, threads=self._settings.threads)
         artefact = self._one(task, [STAGES["keyframes"].modules] * (self._side_by_side - 1))
         self._frames = int(read_summary(artefact.path)["frames"])
-        for note in read_summary(artefact.path)["notes"]:
-            self._note(note, "check")
+        self._tell_notes(artefact, "check")
 
     def keyframes(self) -> ByCamera:
         """Keyframes of every camera."""
@@ -111,7 +112,7 @@ class Flow:
         """The map of all keyframes."""
         # The distances, not the body: a mount stated a little better makes no other map.
         reach = reach_rows(body_arguments(self._job)) if has_body(self._job) else []
-        inputs = {"cameras": self._digests, "keyframes": _content(keyframes), "reach": reach}
+        inputs = {"cameras": self._digests, "keyframes": content_of(keyframes), "reach": reach}
         key = key_of("map", self._map_options(), inputs)
         arguments = {
             "capture": all_cameras(self._job.capture),
@@ -123,8 +124,7 @@ class Flow:
         meanwhile = [[module for name in later for module in STAGES[name].modules]]
         task = Task(key=key, arguments=arguments, threads=self._settings.threads)
         artefact = self._one(task, meanwhile if self._settings.threads > 1 else [])
-        for note in read_summary(artefact.path).get("notes", []):
-            self._note(note, "map")
+        self._tell_notes(artefact, "map")
         return artefact
 
     def registrations(
@@ -151,7 +151,7 @@ class Flow:
                 break
             grown = self._extend(scene, wanted, map_round)
             again = self.registrations(grown, keyframes, registrations, map_round)
-            gained = _localised(again) - _localised(registrations)
+            gained = localised_in(again) - localised_in(registrations)
             if gained < 0:
                 break
             # Keyframes that the video contradicted were placed anew, even where no frame was gained.
@@ -166,11 +166,8 @@ class Flow:
         """Where a camera's shutter rolls: the map without its bending, and every pose solved again."""
         if not any(read_summary(item.path)["rolling"] for item in registrations.values()):
             return scene, registrations
-        inputs = {
-            "cameras": self._digests,
-            "map": scene.digest,
-            "registrations": _content(registrations),
-        }
+        known = content_of(registrations)
+        inputs = {"cameras": self._digests, "map": scene.digest, "registrations": known}
         arguments = {
             "capture": all_cameras(self._job.capture),
             "previous": str(scene.path),
@@ -181,12 +178,19 @@ class Flow:
         after = 1 + max(record.round for record in self.records)
         return refined, self.registrations(refined, keyframes, registrations, after)
 
+    def solve_rigs(self, scene: Artefact, registrations: ByCamera, keyframes: ByCamera) -> ByCamera:
+        """Cameras that one trigger exposes: their frames again, from what all of them see."""
+        found = self._all(rig_tasks(self._job, self._digests, scene, keyframes, registrations))
+        for artefact in found.values():
+            self._tell_notes(artefact, "registration")
+        return {**registrations, **found}
+
     def merge(self, scene: Artefact, registrations: ByCamera) -> Artefact:
         """The skeleton's motion, in the world."""
         options = self._job.merge.model_dump(mode="json")
         inputs = {
             "map": scene.digest,
-            "registrations": _content(registrations),
+            "registrations": content_of(registrations),
             "body": body_digest(self._job, self._settings.store.digests),
         }
         arguments = {
@@ -211,14 +215,16 @@ class Flow:
         reason = None if failure is None else failure.message
         inputs = {
             "map": scene.digest,
-            "registrations": _content(registrations),
-            "keyframes": _content(keyframes),
+            "registrations": content_of(registrations),
+            "keyframes": content_of(keyframes),
             "merge": None if merged is None else merged.digest,
             "failure": reason,
+            "segments": segments_of(self._job.capture),
         }
         arguments = {
             "map": str(scene.path),
             "registrations": [str(artefact.path) for artefact in registrations.values()],
+            "segments": segments_of(self._job.capture),
             "keyframes": [str(artefact.path) for artefact in keyframes.values()],
             "merge": None if merged is None else str(merged.path),
             "failure": reason,
@@ -235,7 +241,7 @@ class Flow:
         inputs = {
             "cameras": self._digests,
             "map": scene.digest,
-            "registrations": _content(registrations),
+            "registrations": content_of(registrations),
             "merge": None if merged is None else merged.digest,
             "failure": reason,
         }
@@ -274,9 +280,8 @@ class Flow:
     def _side_by_side(self) -> int:
         """How many tasks of this job are asked for at once."""
         cameras = len(self._job.capture.cameras)
-        return (
-            cameras if self._settings.executor is not None else max(1, min(self._settings.threads, cameras))
-        )
+        at_once = cameras if self._settings.executor is not None else self._settings.threads
+        return max(1, min(at_once, cameras))
 
     def _require_room(self, task: Task) -> None:
         """Refuse to begin what will not fit on the disk; the space may have gone since the check was made."""
@@ -345,6 +350,10 @@ class Flow:
         )
         return artefact
 
+    def _tell_notes(self, artefact: Artefact, stage: str) -> None:
+        for note in read_summary(artefact.path).get("notes", []):
+            self._note(note, stage)
+
     def _note(self, text: str, stage: str = "") -> None:
         """Tell something worth knowing, once."""
         if text not in self._told:
@@ -389,11 +398,3 @@ class Flow:
             )
 
         return {camera.name: camera_digest(capture, camera, digests, on_bytes) for camera in capture.cameras}
-
-
-def _content(artefacts: ByCamera) -> dict[str, str]:
-    return {name: artefact.digest for name, artefact in artefacts.items()}
-
-
-def _localised(registrations: ByCamera) -> int:
-    return sum(int(read_summary(item.path)["localised"]) for item in registrations.values())

@@ -11,8 +11,8 @@ from bodycap_batch.config.models import CameraConfig, CaptureConfig, Job
 from bodycap_batch.digests import FileDigests, json_digest
 from bodycap_batch.errors import CaptureError, JobError
 from bodycap_batch.identity import algorithm_version, library_versions
-from bodycap_batch.store import DISK_ERRORS, ArtefactKey, store_error
-from bodycap_batch.tasks import STAGES
+from bodycap_batch.store import DISK_ERRORS, Artefact, ArtefactKey, store_error
+from bodycap_batch.tasks import STAGES, read_summary
 
 _FILES = ("video", "timestamps", "mask")
 _BODY = ("mount", "segment", "joint_from_cam", "sigma_deg", "sigma_m")
@@ -142,3 +142,13 @@ def _mount_block(camera: CameraConfig) -> dict[str, Any]:
         "sigma_deg": camera.sigma_deg,
         "sigma_m": camera.sigma_m,
     }
+
+
+def content_of(artefacts: Mapping[str, Artefact]) -> dict[str, str]:
+    """Digests of artefacts by camera."""
+    return {name: artefact.digest for name, artefact in artefacts.items()}
+
+
+def localised_in(registrations: Mapping[str, Artefact]) -> int:
+    """Localised frames of all cameras."""
+    return sum(int(read_summary(item.path)["localised"]) for item in registrations.values())

@@ -100,7 +100,8 @@ def run_stages(job: Job, flow: Flow, made: Made) -> Iterator[str]:
     made.stage = "registration"
     made.registrations = found = flow.registrations(scene, made.keyframes)
     scene, found = flow.grow(scene, found, made.keyframes)
-    made.scene, made.registrations = flow.refine(scene, found, made.keyframes)
+    made.scene, found = flow.refine(scene, found, made.keyframes)
+    made.registrations = flow.solve_rigs(made.scene, found, made.keyframes)
     yield "registration"
     made.stage = "merge"
     made.merged, made.failure = _merge(job, flow, made.scene, made.registrations)

@@ -130,6 +130,8 @@ def _status_line(
     text = f"{len(points.px)} points, {error:.1f} px"
     if status is FrameStatus.KEYFRAME:
         text = f"keyframe · {text}"
+    elif status is FrameStatus.RIG:
+        text = f"carried by the rig · {text}"
     return text, GREEN if len(points.px) else AMBER
 
 

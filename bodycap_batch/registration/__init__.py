@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,13 +13,15 @@ from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.registration.growth import wanted_keyframes
 from bodycap_batch.registration.pose import FramePose, PoseLimits
+from bodycap_batch.registration.rigs import RigCamera, first_poses, members_of, relative_poses
 from bodycap_batch.registration.seams import misplaced, without_keyframes
-from bodycap_batch.registration.solving import matrices, solve_frames
+from bodycap_batch.registration.solving import matrices, solve_frames, solve_rig
 from bodycap_batch.registration.stretches import Known, all_tracks
 from bodycap_batch.registration.tracks import Tracks, anchors_of, track_scale
+from bodycap_batch.rig import RelativePose
 from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 
-__all__ = ["register_frames"]
+__all__ = ["RigCamera", "register_frames", "register_in_rig"]
 
 _MAP_NOISE_PX = 0.6
 _THRESHOLD_SIGMAS = 3.5
@@ -71,6 +74,44 @@ def register_frames(
         wanted_keyframes=np.union1d(lost, np.setdiff1d(doubtful, asked)),
         tried_keyframes=tried,
     )
+
+
+def register_in_rig(
+    own: RigCamera,
+    others: Sequence[RigCamera],
+    maps: Sequence[Map],
+    selection: KeyframeSelection,
+    options: RegistrationOptions,
+) -> tuple[Registration, list[RelativePose]]:
+    """Solve every frame of one camera again, with what the others of its rig see at the same instant.
+
+    Where they sit beside it is the robust mean over all frames in which both were localised alone. Others of
+    which that says too little, or whose place scatters, are left out.
+
+    Args:
+        own: The camera with its registration.
+        others: The others on its segment, exposed at the same instants.
+        maps: The models it was registered against.
+        selection: Its keyframes.
+        options: Limits.
+
+    Returns:
+        The registration with poses that all cameras support, and where each other one sits.
+
+    Source: generalised cameras, Pless, "Using many cameras as one", CVPR 2003.
+    """
+    relative = relative_poses(own, others)
+    members = members_of(own, others, relative)
+    scene_map = next((each for each in maps if each.gauge == own.found.trajectory.gauge), None)
+    if scene_map is None or len(members) == 1:
+        return own.found, relative
+    limits = _limits(own.camera, selection, options)
+    for member in members:
+        wrong = misplaced(member.camera.name, scene_map, member.tracks, limits)
+        scene_map = without_keyframes(scene_map, wrong)
+    poses = solve_rig(members, scene_map, first_poses(own, others, members), limits)
+    trajectory = _trajectory(own.camera, scene_map.gauge, poses, selection.sharpness)
+    return replace(own.found, trajectory=trajectory), relative
 
 
 def _without_misplaced(

@@ -42,6 +42,8 @@ class Views:
         rays: (M,2) where they are seen, undistorted, at depth 1.
         px_from_ray: (M,2,2) derivative of the pixel by the ray there.
         weight: (M,) how much each counts: 1 over its variance, in units of the best.
+        member: (M,) which camera of a rig saw each; None where poses are those of the one camera there is.
+        cam_from_rig: (C,4,4) where a rig's cameras sit; poses are then the rig's.
     """
 
     bounds: IntArray
@@ -49,6 +51,8 @@ class Views:
     rays: FloatArray
     px_from_ray: FloatArray
     weight: FloatArray
+    member: IntArray | None = None
+    cam_from_rig: FloatArray | None = None
 
     def rows(self, frame: int) -> slice:
         """Rows of one frame."""
@@ -63,7 +67,15 @@ class Views:
             rays=self.rays[rows],
             px_from_ray=self.px_from_ray[rows],
             weight=self.weight[rows],
+            member=None if self.member is None else self.member[rows],
+            cam_from_rig=self.cam_from_rig,
         )
+
+    def in_cameras(self, rows: IntArray, poses: FloatArray) -> FloatArray:
+        """Poses (N,4,4) of the cameras that rows (N,) were seen by, from those of their frames (N,4,4)."""
+        if self.member is None or self.cam_from_rig is None:
+            return poses
+        return np.asarray(self.cam_from_rig[self.member[rows]] @ poses)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -237,14 +249,31 @@ def linearise(
         derivative[3] = by_a * inverse
         derivative[4] = by_b * inverse
         derivative[5] = -along * inverse
+    if views.member is not None and views.cam_from_rig is not None:
+        _turn_to_rig(jacobian, views.member[rows], views.cam_from_rig)
     return residual, jacobian, z
+
+
+def _turn_to_rig(jacobian: FloatArray, member: IntArray, cam_from_rig: FloatArray) -> None:
+    """Make derivatives (2,6,N) by a camera's perturbation ones by its rig's, in place.
+
+    Source: the adjoint map of SE(3), as in Sola, Deray, Atchuthan, "A micro Lie theory for state estimation
+        in robotics", 2018; rotation first.
+    """
+    for number, pose in enumerate(cam_from_rig):
+        mine = np.flatnonzero(member == number)
+        turn, (x, y, z) = pose[:3, :3], pose[:3, 3].tolist()
+        adjoint = np.zeros((6, 6))
+        adjoint[:3, :3] = adjoint[3:, 3:] = turn
+        adjoint[3:, :3] = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ turn
+        jacobian[:, :, mine] = np.einsum("dim,ik->dkm", jacobian[:, :, mine], adjoint)
 
 
 def _residuals(
     views: Views, rows: IntArray, cam_from_gauge: FloatArray
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]:
     """Residuals (2,N) as `linearise` has them; x/z, y/z, 1/z, z; the lens (2,2,N), 0 where unusable."""
-    x, y, z = transform_points(cam_from_gauge, views.points[rows]).T
+    x, y, z = transform_points(views.in_cameras(rows, cam_from_gauge), views.points[rows]).T
     front = z > 1e-9
     inverse = 1.0 / np.where(front, z, 1.0)
     a, b = x * inverse, y * inverse

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.camera import Camera
 from bodycap_batch.geometry import invert, make_transform
 from bodycap_batch.registration.batch import COUNTING_WEIGHT, Fits, Views, assess_poses, refine_poses
@@ -67,12 +68,12 @@ class FramePose:
 
 
 def solve_poses(
-    camera: Camera, views: Views, px: FloatArray, start: FloatArray, limits: PoseLimits
+    lenses: Sequence[Camera], views: Views, px: FloatArray, start: FloatArray, limits: PoseLimits
 ) -> list[FramePose]:
-    """Poses of all frames of a camera from the map points seen in them.
+    """Poses of all frames of a camera, or of a rig, from the map points seen in them.
 
     Args:
-        camera: Lens.
+        lenses: The camera's lens, or those of the rig's cameras.
         views: Points and where they are seen (M rows), by frame.
         px: (M,2) the same as pixels.
         start: (F,4,4) cam_from_gauge to start from; NaN where there is none.
@@ -91,13 +92,55 @@ def solve_poses(
         some = alone.weight >= COUNTING_WEIGHT
         if some.sum() < limits.min_inliers:
             some[:] = True
-        sampled = sample_pose(camera, alone.points[some], px[views.rows(frame)][some], limits)
+        sampled = _sampled(lenses, alone, some, px[views.rows(frame)], limits)
         if sampled is not None:
             refined = refine_poses(alone, sampled[None], limits.max_error_px)
             found[frame] = max(
                 found[frame], *judge_poses(alone, refined, limits), key=lambda pose: pose.evidence
             )
     return found
+
+
+def _sampled(
+    lenses: Sequence[Camera], views: Views, some: BoolArray, px: FloatArray, limits: PoseLimits
+) -> FloatArray | None:
+    """Pose (4,4) of one frame from some of its views; of its rig where several cameras see them."""
+    seen, px = views.points[some], px[some]
+    if views.member is None or views.cam_from_rig is None:
+        return sample_pose(lenses[0], seen, px, limits)
+    member = views.member[some]
+    if len(np.unique(member)) > 1:
+        return _sample_rig_pose(lenses, views.cam_from_rig, member, seen, px, limits)
+    pose = sample_pose(lenses[member[0]], seen, px, limits)
+    return None if pose is None else np.asarray(invert(views.cam_from_rig[member[0]]) @ pose)
+
+
+def _sample_rig_pose(
+    lenses: Sequence[Camera],
+    cam_from_rig: FloatArray,
+    member: IntArray,
+    points: FloatArray,
+    px: FloatArray,
+    limits: PoseLimits,
+) -> FloatArray | None:
+    """Pose rig_from_gauge (4,4) from map points (N,3) that its cameras `member` (N,) see at pixels (N,2).
+
+    Source: Hee Lee et al., "Minimal solutions for pose estimation of a multi-camera system", ISRR 2013, as
+        in COLMAP.
+    """
+    import pycolmap
+
+    options = pycolmap.RANSACOptions()
+    options.max_error = limits.max_error_px
+    options.random_seed = limits.seed
+    options.max_num_trials = _MAX_TRIALS
+    places = [pycolmap.Rigid3d(pose[:3]) for pose in cam_from_rig]
+    cameras = [lens.to_pycolmap() for lens in lenses]
+    found = pycolmap.estimate_generalized_absolute_pose(px, points, member.tolist(), places, cameras, options)
+    if found is None:
+        return None
+    matrix = np.asarray(found["rig_from_world"].matrix())
+    return make_transform(matrix[:, :3], matrix[:, 3])
 
 
 def sample_pose(camera: Camera, points: FloatArray, px: FloatArray, limits: PoseLimits) -> FloatArray | None:

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.camera import Camera
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.geometry import interpolate_pose, invert
-from bodycap_batch.registration.batch import inliers_of, make_views
+from bodycap_batch.registration.batch import Views, inliers_of, lens_jacobian, make_views
 from bodycap_batch.registration.confirmed import confirmed_points
 from bodycap_batch.registration.jumps import lone_poses, pose_jumps
 from bodycap_batch.registration.pose import MAP_VARIANCE_RATIO, FramePose, PoseLimits, solve_poses
@@ -35,79 +36,211 @@ _AGAIN_ROLLING = 2
 """The velocity that moves pixels comes from the poses that the moved pixels give."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Member:
+    """One of the cameras that see a frame together.
+
+    Attributes:
+        camera: Its video.
+        tracks: Observations in its frames.
+        cam_from_rig: (4,4) where it sits; frames' poses are those of the rig.
+        rig_frame: (N,) frame of the rig at the instant of each of its own; -1 where there is none.
+    """
+
+    camera: CaptureCamera
+    tracks: Tracks
+    cam_from_rig: FloatArray
+    rig_frame: IntArray
+
+
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """Map points seen by a camera, by frame: tracked into it, and in a keyframe the map's own observations.
+    """Map points seen by a camera or a rig, by frame: tracked into it, and a keyframe's own observations.
 
     Attributes:
         frame: (M,) frame index, increasing.
         point: (M,) point index.
         px: (M,2) where.
+        member: (M,) which camera saw it.
     """
 
     frame: IntArray
     point: IntArray
     px: FloatArray
+    member: IntArray
 
     @staticmethod
-    def by(camera: str, scene_map: Map, tracks: Tracks) -> _Seen:
-        point = scene_map.points_of(camera, tracks.keyframe, tracks.feature)
-        tracked = point >= 0
-        mine = np.isin(scene_map.obs_keyframe, scene_map.keyframes_of(camera))
-        own_frame = scene_map.keyframe_frame[scene_map.obs_keyframe[mine]]
-        frame = np.concatenate([own_frame, tracks.frame[tracked]])
+    def by(members: Sequence[Member], scene_map: Map) -> _Seen:
+        parts = [_seen_by(member, scene_map) for member in members]
+        frame, point, px = (np.concatenate(each) for each in zip(*parts, strict=True))
+        member = np.repeat(np.arange(len(members)), [len(part[0]) for part in parts])
         order = np.argsort(frame, kind="stable")
-        return _Seen(
-            frame[order],
-            np.concatenate([scene_map.obs_point[mine], point[tracked]])[order],
-            np.concatenate([scene_map.obs_px[mine], tracks.px[tracked].astype(np.float64)])[order],
+        order = order[frame[order] >= 0]
+        return _Seen(frame[order], point[order], px[order], member[order])
+
+
+def _seen_by(member: Member, scene_map: Map) -> tuple[IntArray, IntArray, FloatArray]:
+    """Frames of the rig, points and pixels of what one camera sees."""
+    tracks, name = member.tracks, member.camera.name
+    point = scene_map.points_of(name, tracks.keyframe, tracks.feature)
+    tracked = point >= 0
+    mine = np.isin(scene_map.obs_keyframe, scene_map.keyframes_of(name))
+    own_frame = scene_map.keyframe_frame[scene_map.obs_keyframe[mine]]
+    return (
+        member.rig_frame[np.concatenate([own_frame, tracks.frame[tracked]])],
+        np.concatenate([scene_map.obs_point[mine], point[tracked]]),
+        np.concatenate([scene_map.obs_px[mine], tracks.px[tracked].astype(np.float64)]),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Rig:
+    """Cameras with all that they see of the map.
+
+    Attributes:
+        members: The cameras; the first one's frames are the rig's.
+        scene_map: The map.
+        seen: What they see.
+        points: (M,3) the points of it.
+        bounds: (F+1,) its rows by frame.
+    """
+
+    members: Sequence[Member]
+    scene_map: Map
+    seen: _Seen
+    points: FloatArray
+    bounds: IntArray
+
+    @staticmethod
+    def of(members: Sequence[Member], scene_map: Map) -> _Rig:
+        seen = _Seen.by(members, scene_map)
+        bounds = np.searchsorted(seen.frame, np.arange(len(members[0].camera.times_ns) + 1))
+        return _Rig(members, scene_map, seen, scene_map.points[seen.point], bounds)
+
+    @property
+    def lenses(self) -> list[Camera]:
+        return [self.scene_map.cameras[member.camera.name] for member in self.members]
+
+    def views(self, px: FloatArray, weight: FloatArray) -> Views:
+        """What is seen, at pixels (M,2), with weights (M,)."""
+        lenses = self.lenses
+        if len(lenses) == 1:
+            return make_views(lenses[0], self.bounds, self.points, px, weight)
+        rays, px_from_ray = np.empty((len(px), 2)), np.empty((len(px), 2, 2))
+        for number, lens in enumerate(lenses):
+            mine = self.seen.member == number
+            rays[mine] = lens.unproject(px[mine])
+            px_from_ray[mine] = lens_jacobian(lens, rays[mine])
+        return Views(
+            bounds=self.bounds,
+            points=self.points,
+            rays=rays,
+            px_from_ray=px_from_ray,
+            weight=weight,
+            member=self.seen.member,
+            cam_from_rig=np.array([member.cam_from_rig for member in self.members]),
         )
+
+    @property
+    def rolling(self) -> bool:
+        """Whether pixels have to be moved to the middle row's instant."""
+        return any(self.scene_map.readout_s.get(member.camera.name, 0.0) for member in self.members)
+
+    def at_mid_row(self, path: FloatArray) -> FloatArray:
+        """Pixels (M,2) at the instant of the middle row, for the rig's poses (F,4,4)."""
+        out = self.seen.px.copy()
+        times_ns = self.members[0].camera.times_ns
+        for number, (member, lens) in enumerate(zip(self.members, self.lenses, strict=True)):
+            readout_s = self.scene_map.readout_s.get(member.camera.name, 0.0)
+            if readout_s:
+                mine = self.seen.member == number
+                own = path @ invert(member.cam_from_rig)
+                velocity = image_velocity(lens, own, times_ns, self.seen.frame[mine], self.points[mine])
+                out[mine] = at_mid_row(lens, out[mine], velocity, readout_s)
+        return out
+
+    def confirmed(self) -> BoolArray:
+        """(M,) whether something confirms the point that is seen."""
+        by_member = np.array([confirmed_points(member.camera, self.scene_map) for member in self.members])
+        return np.asarray(by_member[self.seen.member, self.seen.point])
 
 
 def solve_frames(
     camera: CaptureCamera, scene_map: Map, tracks: Tracks, limits: PoseLimits
 ) -> list[FramePose]:
-    """Solve every frame from the map points seen in it.
+    """Solve every frame of a camera from the map points seen in it; see `solve_rig`."""
+    count = len(camera.times_ns)
+    alone = Member(camera=camera, tracks=tracks, cam_from_rig=np.eye(4), rig_frame=np.arange(count))
+    rows = scene_map.keyframes_of(camera.name)
+    start = _between(scene_map.keyframe_frame[rows], scene_map.map_from_cam[rows], count)
+    return solve_rig([alone], scene_map, start, limits)
+
+
+def solve_rig(
+    members: Sequence[Member], scene_map: Map, start: FloatArray, limits: PoseLimits
+) -> list[FramePose]:
+    """Solve every frame of a rig from the map points that its cameras see at that instant.
 
     Points that move with the wearer, or were matched wrongly, lie off in most frames whatever the pose:
     once the poses stand, a point counts by the share of frames that agree with it, and all is solved
     again. Pixels of a rolling shutter are moved to the middle row's instant on the way.
+
+    Args:
+        members: Its cameras. The first one sits in the rig's origin and has its frames.
+        scene_map: The map.
+        start: (F,4,4) rig_from_map to start from; NaN where there is none.
+        limits: What makes a pose acceptable.
+
+    Returns:
+        Poses of the first camera; `FrameStatus.RIG` where it saw too little for one of its own.
     """
-    seen = _Seen.by(camera.name, scene_map, tracks)
-    lens = scene_map.cameras[camera.name]
-    rows = scene_map.keyframes_of(camera.name)
-    keyframes, count = scene_map.keyframe_frame[rows], len(camera.times_ns)
-    bounds = np.searchsorted(seen.frame, np.arange(count + 1))
-    confirmed = confirmed_points(camera, scene_map)
-    points, known = scene_map.points[seen.point], _point_weights(scene_map, confirmed)[seen.point]
-    start = _between(keyframes, scene_map.map_from_cam[rows], count)
-    views = make_views(lens, bounds, points, seen.px, known)
-    poses = solve_poses(lens, views, seen.px, start, limits)
-    readout_s = scene_map.readout_s.get(camera.name, 0.0)
-    for _ in range(_AGAIN_ROLLING if readout_s else _AGAIN):
+    rig = _Rig.of(members, scene_map)
+    seen, lenses, confirmed = rig.seen, rig.lenses, rig.confirmed()
+    known = _point_weights(scene_map, seen.point, confirmed)
+    views = rig.views(seen.px, known)
+    poses = solve_poses(lenses, views, seen.px, start, limits)
+    for _ in range(_AGAIN_ROLLING if rig.rolling else _AGAIN):
         path = matrices(poses)
         posed = np.asarray(np.isfinite(path).all(axis=(1, 2)))[seen.frame]
-        share = agreement(inliers_of(views, invert(path), limits.max_error_px), posed, seen.point)
+        judged = seen.point * len(members) + seen.member
+        share = agreement(inliers_of(views, invert(path), limits.max_error_px), posed, judged)
         start = np.where(np.isfinite(path), invert(path), start)
         px, weight = seen.px, known * share**2
-        if readout_s:
-            velocity = image_velocity(lens, path, camera.times_ns, seen.frame, points)
-            px = at_mid_row(lens, px, velocity, readout_s)
-            views = make_views(lens, bounds, points, px, weight)
+        if rig.rolling:
+            px = rig.at_mid_row(path)
+            views = rig.views(px, weight)
         else:
             views = replace(views, weight=weight)
-        poses = solve_poses(lens, views, px, start, limits)
-    agrees = inliers_of(views, invert(matrices(poses)), limits.max_error_px) & confirmed[seen.point]
-    poses = _with_evidence(poses, np.bincount(seen.frame[agrees], minlength=count))
-    for index in keyframes.tolist():
-        if poses[index].status is FrameStatus.REGISTERED:
-            poses[index] = replace(poses[index], status=FrameStatus.KEYFRAME)
-    return _without_doubtful(poses, limits)
+        poses = solve_poses(lenses, views, px, start, limits)
+    agrees = inliers_of(views, invert(matrices(poses)), limits.max_error_px)
+    poses = _with_evidence(poses, _counts(rig, agrees & confirmed))
+    own = _counts(rig, agrees & (seen.member == 0))
+    return _without_doubtful(_named(poses, rig, own, limits), limits)
 
 
-def _point_weights(scene_map: Map, confirmed: BoolArray) -> FloatArray:
-    """(P,) weights of the map's points: where one stands is known the better the more keyframes see it."""
-    seen = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))
+def _counts(rig: _Rig, which: BoolArray) -> IntArray:
+    """(F,) how many of the rows under a mask each frame has."""
+    return np.bincount(rig.seen.frame[which], minlength=len(rig.bounds) - 1)
+
+
+def _named(poses: list[FramePose], rig: _Rig, own: IntArray, limits: PoseLimits) -> list[FramePose]:
+    """Tell keyframes, and frames that the rig's other cameras carry; `own` counts the first one's inliers."""
+    status = {}
+    if len(rig.members) > 1:
+        status = dict.fromkeys(np.flatnonzero(own < limits.min_inliers).tolist(), FrameStatus.RIG)
+    rows = rig.scene_map.keyframes_of(rig.members[0].camera.name)
+    status |= dict.fromkeys(rig.scene_map.keyframe_frame[rows].tolist(), FrameStatus.KEYFRAME)
+    return [
+        replace(pose, status=status.get(frame, pose.status))
+        if pose.status is FrameStatus.REGISTERED
+        else pose
+        for frame, pose in enumerate(poses)
+    ]
+
+
+def _point_weights(scene_map: Map, point: IntArray, confirmed: BoolArray) -> FloatArray:
+    """(M,) weights of views of points: where one stands is known the better the more keyframes see it."""
+    seen = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))[point]
     return np.asarray(seen / (seen + _POINT_VARIANCE) * np.where(confirmed, 1.0, _UNCONFIRMED_WEIGHT))
 
 

@@ -13,6 +13,7 @@ from bodycap_batch.tasks.merge import MERGE
 from bodycap_batch.tasks.preview import PREVIEW
 from bodycap_batch.tasks.registration import REGISTRATION
 from bodycap_batch.tasks.report import REPORT
+from bodycap_batch.tasks.rig import RIG
 from bodycap_batch.tasks.stage import CAPTURE, RESULTS, SUMMARY, Stage, read_summary
 from bodycap_batch.tasks.synth import SYNTH
 
@@ -37,6 +38,7 @@ STAGES = {
     "extend": EXTEND,
     "refine": REFINE,
     "registration": REGISTRATION,
+    "rig": RIG,
     "merge": MERGE,
     "export": EXPORT,
     "report": REPORT,
@@ -45,8 +47,9 @@ STAGES = {
 
 StageName = Literal["check", "keyframes", "map", "registration", "merge", "export", "report", "preview"]
 ORDER: tuple[StageName, ...] = get_args(StageName)
-"""A job's stages one after another. While frames are registered the map may be extended and refined."""
-_DURING_REGISTRATION = {"extend", "refine"}
+"""A job's stages one after another. While frames are registered the map may be extended and refined, and the
+cameras of a rig be solved together."""
+_DURING_REGISTRATION = {"extend", "refine", "rig"}
 
 
 def stages_from(stage: StageName) -> frozenset[str]:

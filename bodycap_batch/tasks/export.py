@@ -28,6 +28,7 @@ def _export(options: Json, arguments: Json, context: StageContext, files: Path) 
         merge=None if merged is None else read_bundle(MergeResult, Path(merged), "merge"),
         partial_reason=arguments["failure"],
         row_fraction=found.row_fraction,
+        relative_poses=found.relative_poses(arguments["registrations"], arguments["segments"]),
         log=scene.log,
     )
     export_results(inputs, ExportOptions.model_validate(options), context)

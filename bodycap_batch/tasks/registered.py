@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,11 @@ if TYPE_CHECKING:
     from bodycap_batch.arrays import FloatArray
     from bodycap_batch.body import CameraClock
     from bodycap_batch.camera import Camera
+    from bodycap_batch.rig import RelativePose
     from bodycap_batch.scene import Map, Registration, Trajectory
+
+RIG_POSES = "rig"
+"""Name of the bundle that says where a rig's cameras sit beside each other."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,6 +58,32 @@ class Registered:
                 and item.trajectory.camera not in corrected
             },
         )
+
+    def relative_poses(
+        self, paths: Sequence[str], segments: Sequence[Sequence[str]]
+    ) -> tuple[RelativePose, ...]:
+        """Where cameras on one segment sit beside each other, every pair once.
+
+        Args:
+            paths: The artefacts; those of a rig kept how its cameras' own poses lay.
+            segments: Names of the cameras on each segment that carries several.
+        """
+        from bodycap_batch.formats.bundle import read_bundle
+        from bodycap_batch.rig import RigPoses, relative_pose
+
+        path_of = {each.camera: each for each in self.trajectories}
+        kept = {
+            each.cameras: each
+            for path in map(Path, paths)
+            if (path / f"{RIG_POSES}.json").exists()
+            for each in read_bundle(RigPoses, path, RIG_POSES).relative
+        }
+        out = []
+        for pair in (pair for names in segments for pair in combinations(sorted(names), 2)):
+            offset_s = self.clocks[pair[1]].offset_s - self.clocks[pair[0]].offset_s
+            first, second = (path_of[name] for name in pair)
+            out.append(kept.get(pair) or relative_pose(first, second, round(1e9 * offset_s)))
+        return tuple(out)
 
 
 def row_fraction(found: Registration, camera: Camera) -> FloatArray:

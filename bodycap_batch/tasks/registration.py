@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bodycap_batch.context import StageContext
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.stage import SEEING, VISION, Json, Stage, write_summary
 
+if TYPE_CHECKING:
+    from bodycap_batch.capture import CaptureCamera
+    from bodycap_batch.scene import Registration
+
 
 def _registration(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
-    from bodycap_batch.body import CameraClock
     from bodycap_batch.config import RegistrationOptions
-    from bodycap_batch.formats.bundle import write_bundle
     from bodycap_batch.registration import register_frames
     from bodycap_batch.rolling_shutter import looks_rolling
 
@@ -23,6 +27,22 @@ def _registration(options: Json, arguments: Json, context: StageContext, files: 
     maps = load_map(arguments["map"]).maps
     found = register_frames(camera, maps, selection, options_, context, previous)
     known = camera.rolling_shutter_known
+    rolling = bool(camera.rolling_shutter_s) if known else looks_rolling(found, maps)
+    save_registration(found, camera, files, rolling=rolling)
+
+
+def save_registration(
+    found: Registration,
+    camera: CaptureCamera,
+    files: Path,
+    *,
+    rolling: bool,
+    notes: Sequence[str] = (),
+) -> None:
+    """Keep a camera's poses with what the stages after it need to know of the camera."""
+    from bodycap_batch.body import CameraClock
+    from bodycap_batch.formats.bundle import write_bundle
+
     write_bundle(found, files, "registration")
     clock = CameraClock(
         nominal_fps=camera.nominal_fps,
@@ -36,7 +56,8 @@ def _registration(options: Json, arguments: Json, context: StageContext, files: 
         frames=len(found.trajectory.status),
         localised=int(found.trajectory.localised.sum()),
         wanted=[int(frame) for frame in found.wanted_keyframes],
-        rolling=bool(camera.rolling_shutter_s) if known else looks_rolling(found, maps),
+        rolling=rolling,
+        notes=list(notes),
     )
 
 

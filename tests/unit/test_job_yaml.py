@@ -301,3 +301,13 @@ def test_any_values_are_a_job_or_a_typed_error(
             load_job(path)
         except (JobError, CaptureError):
             continue
+
+
+def test_a_synchronised_rig_is_made_of_cameras_on_one_segment(tmp_path: Path) -> None:
+    two = MINIMAL + "    - name: torso_back\n      video: back.mp4\n  rig: synced\n"
+    assert [[each.name for each in some] for some in load(tmp_path, two).capture.segments()] == [
+        ["torso", "torso_back"]
+    ]
+    error = refused(tmp_path, MINIMAL + "  rig: synced\n")
+    assert error.field == "capture.rig"
+    assert "no two share one" in error.message

@@ -40,7 +40,7 @@ def _solve(points: np.ndarray, px: np.ndarray, start: np.ndarray | None = None) 
     """One frame alone, from a starting cam_from_gauge or from none."""
     views = make_views(CAMERA, np.array([0, len(px)]), points, px)
     first = np.full((4, 4), np.nan) if start is None else start
-    return solve_poses(CAMERA, views, px, first[None], LIMITS)[0]
+    return solve_poses([CAMERA], views, px, first[None], LIMITS)[0]
 
 
 def test_pose_survives_a_third_of_wrong_points() -> None:
@@ -77,7 +77,7 @@ def test_frames_solved_together_do_not_influence_each_other() -> None:
     start = np.stack([invert(scene[2]) for scene in scenes])
     bounds = np.concatenate([[0], np.cumsum([len(part) for part in px])])
     points, pixels = np.concatenate([scene[0] for scene in scenes]), np.concatenate(px)
-    together = solve_poses(CAMERA, make_views(CAMERA, bounds, points, pixels), pixels, start, LIMITS)
+    together = solve_poses([CAMERA], make_views(CAMERA, bounds, points, pixels), pixels, start, LIMITS)
     assert [pose.status for pose in together] == [
         FrameStatus.REGISTERED if len(part) > 50 else FrameStatus.FEW_TRACKS for part in px
     ]
@@ -98,7 +98,7 @@ def test_points_that_are_known_badly_count_less() -> None:
 
     def solve(weight: float) -> np.ndarray:
         views = make_views(CAMERA, np.array([0, 100]), points, seen, np.where(displaced, weight, 1.0))
-        pose = solve_poses(CAMERA, views, seen, start, LIMITS)[0].gauge_from_cam
+        pose = solve_poses([CAMERA], views, seen, start, LIMITS)[0].gauge_from_cam
         assert pose is not None
         return pose
 
