@@ -102,8 +102,9 @@ class MergeResult:
         solved: (J,) True where the joint was a variable of the graph.
         observed: (T,J) True where cameras measured the joint at that tick.
         world_from_map: By gauge; a gauge that could not be placed is missing.
-        trajectories: The used cameras' trajectories, gauge "world", covariance in metres; poses that proved
-            to be gross errors are gone, with the status POSE_JUMP.
+        trajectories: The used cameras' trajectories, gauge "world", the measurements' covariance in metres,
+            centres as solved with the body (`MergeOptions.camera_paths`); poses that proved to be gross
+            errors are gone, with the status POSE_JUMP.
         mounts: The solved mounts with their sigmas.
         unused_cameras: Cameras whose map could not be linked to the body, with the reason.
         report: Plain JSON values: sources and values of scale, up and floor, residuals, outliers …

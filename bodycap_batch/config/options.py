@@ -69,6 +69,9 @@ class MergeOptions(Options):
     t_pose_s: float | None = Field(
         None, ge=0, description="how long a T-pose stands at the start; default: looked for; 0: none"
     )
+    camera_paths: Literal["joint", "measured"] = Field(
+        "joint", description="every frame's camera as solved together with the body, or as measured alone"
+    )
     known_distance: tuple[FrameName, FrameName, Annotated[float, Field(gt=0)]] | None = Field(
         None, description="two frames, each camera:frame, and the metres between their lenses; sets the scale"
     )

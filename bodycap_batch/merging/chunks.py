@@ -105,7 +105,8 @@ def _joined(parts: Sequence[Part], tick_times_ns: IntArray) -> Solution:
         for solution, _, (first, last), low in parts
         if solution.joint_covariance is not None
     ]
-    collected: dict[str, dict[str, list[FloatArray]]] = {"residual_m": {}, "residual_rad": {}, "weights": {}}
+    kinds = ("residual_m", "residual_rad", "weights", "world_from_cam")
+    collected: dict[str, dict[str, list[FloatArray]]] = {kind: {} for kind in kinds}
     errors: dict[str, float] = {}
     for solution, tracks, (first, last), _ in parts:
         low, high = _window(tick_times_ns, first, last)
@@ -124,6 +125,7 @@ def _joined(parts: Sequence[Part], tick_times_ns: IntArray) -> Solution:
         residual_m=joined["residual_m"],
         residual_rad=joined["residual_rad"],
         weights=joined["weights"],
+        world_from_cam=joined["world_from_cam"],
         iterations=max(solution.iterations for solution, *_ in parts),
         errors=errors,
         joint_covariance=np.concatenate(spreads) if spreads else None,

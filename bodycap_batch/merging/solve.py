@@ -50,6 +50,7 @@ class Solution:
         residual_m: By camera, (N,) distance of the measured centre from the solved one.
         residual_rad: By camera, (N,) angle between them.
         weights: By camera, (N,) robust weight of each measurement, 1 = kept whole.
+        world_from_cam: By camera, (N,4,4) where its bone and mount have it at each measurement.
         iterations: Steps the optimiser took.
         errors: Half the sum of squares by kind of factor.
         joint_covariance: (T,B,3,3) of each bone's joint centre minus the first bone's, m²; None if not asked.
@@ -59,6 +60,7 @@ class Solution:
     residual_m: Mapping[str, FloatArray]
     residual_rad: Mapping[str, FloatArray]
     weights: Mapping[str, FloatArray]
+    world_from_cam: Mapping[str, FloatArray]
     iterations: int
     errors: Mapping[str, float]
     joint_covariance: FloatArray | None = None
@@ -227,11 +229,12 @@ class MotionGraph:
         return values
 
     def _read(self, values: Any, poses: FloatArray, count: int) -> Solution:
-        residual_m, residual_rad, weights = {}, {}, {}
+        residual_m, residual_rad, weights, world_from_cam = {}, {}, {}, {}
         for track in self._tracks:
             mount = self._mounts[track.camera]
             keys = self._measured_keys[track.camera]
             solved = np.array([values.atPose3(key).matrix() for key in keys]).reshape(-1, 4, 4) @ mount
+            world_from_cam[track.camera] = solved
             off = invert(track.map_from_cam) @ solved
             residual_m[track.camera] = np.linalg.norm(off[:, :3, 3], axis=1)
             residual_rad[track.camera] = np.linalg.norm(so3_log(off[:, :3, :3]), axis=1)
@@ -246,6 +249,7 @@ class MotionGraph:
             residual_m=residual_m,
             residual_rad=residual_rad,
             weights=weights,
+            world_from_cam=world_from_cam,
             iterations=count,
             errors=errors,
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,11 +20,12 @@ from bodycap_batch.merging.complete import complete_body, observed_joints
 from bodycap_batch.merging.constants import Calibrated, Cleaned, calibrate_body, points_around
 from bodycap_batch.merging.initial import provisional_scale
 from bodycap_batch.merging.marginals import joints_in_axes, sigma_summary
+from bodycap_batch.merging.paths import in_world, solved_with_body
 from bodycap_batch.merging.report import build_report
 from bodycap_batch.merging.rules import soft_rules
 from bodycap_batch.merging.solve import MotionGraph, Solution, hinge_errors, joint_gaps
-from bodycap_batch.merging.tracks import Track, adapt_psd, clean, in_gauge, loosened, make_track
-from bodycap_batch.scene import FrameStatus, Trajectory
+from bodycap_batch.merging.tracks import Track, adapt_psd, clean, loosened, make_track
+from bodycap_batch.scene import Trajectory
 
 
 class _Progress:
@@ -72,6 +72,9 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
     )
     world_from_solved, joints, solved, floor = _place(inputs, bones, solution, calibrated, fps)
     place = Similarity(calibrated.scale, world_from_solved.rotation, world_from_solved.translation)
+    paths = tuple(in_world(each, place, dropped[each.camera]) for each in used)
+    if options.camera_paths == "joint":
+        paths = _with_body(paths, metric, calibrated, solution, world_from_solved)
     observed = observed_joints(inputs.skeleton, bones, tracks, tick_times, options.max_gap_s)
     covariance = joints_in_axes(world_from_solved.rotation, bones, solution.joint_covariance, len(solved))
     step.finish()
@@ -83,7 +86,7 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         solved=solved,
         observed=observed,
         world_from_map={gauge: place.after(here) for gauge, here in together.places.items()},
-        trajectories=tuple(_in_world(each, place, dropped[each.camera]) for each in used),
+        trajectories=paths,
         mounts=calibrated.mounts,
         unused_cameras=together.unused,
         report=build_report(
@@ -160,12 +163,17 @@ def _place(
     return placed, to_world.apply_to_poses(joints), solved, floor
 
 
-def _in_world(trajectory: Trajectory, world_from_map: Similarity, dropped: IntArray) -> Trajectory:
-    """The trajectory in the world, without the poses that proved to be gross errors."""
-    placed = in_gauge(trajectory, world_from_map, "world")
-    poses, covariance = np.array(placed.gauge_from_cam), np.array(placed.covariance)
-    status = list(trajectory.status)
-    poses[dropped], covariance[dropped] = np.nan, np.nan
-    for frame in dropped.tolist():
-        status[frame] = FrameStatus.POSE_JUMP
-    return replace(placed, gauge_from_cam=poses, covariance=covariance, status=tuple(status))
+def _with_body(
+    paths: Sequence[Trajectory],
+    tracks: Sequence[Track],
+    calibrated: Calibrated,
+    solution: Solution,
+    world_from_solved: Similarity,
+) -> tuple[Trajectory, ...]:
+    """All paths as solved together with the body."""
+    mounts = {mount.camera: mount for mount in calibrated.mounts}
+    own = {track.camera: track for track in tracks}
+    return tuple(
+        solved_with_body(path, own[path.camera], mounts[path.camera], solution, world_from_solved)
+        for path in paths
+    )

@@ -218,13 +218,18 @@ def adapt_psd(bones: Sequence[Bone], tracks: Sequence[Track]) -> tuple[Bone, ...
     )
 
 
+def untold(mount: Mount) -> bool:
+    """Whether a solved mount is known no better than its name promises."""
+    return mount.sigma_rad >= _UNTOLD_RAD
+
+
 def loosened(track: Track, mount: Mount) -> Track:
     """The track (metres) at the uncertainty of its mount, where the motion told next to nothing of it.
 
     A camera never seen together with others keeps the mount its name promises: 15° and 4 cm. At its poses'
     own millimetres it would bend the body to that guess.
     """
-    if mount.sigma_rad < _UNTOLD_RAD:
+    if not untold(mount):
         return track
     return replace(
         track,
