@@ -12,13 +12,13 @@ from typing import Any
 
 from bodycap_batch.config.models import CameraConfig, Job
 from bodycap_batch.disk_room import require_room
-from bodycap_batch.errors import BodycapError, Cancelled, EstimationError
+from bodycap_batch.errors import BodycapError, Cancelled, CaptureError, EstimationError, JobError
 from bodycap_batch.formats.needs import require_libraries
 from bodycap_batch.pipeline.inputs import (
     all_cameras,
     body_arguments,
     body_digest,
-    camera_digest,
+    camera_digests,
     content_of,
     has_body,
     key_of,
@@ -79,7 +79,20 @@ class Flow:
         Raises:
             BodycapError: The job, a video or a calibration cannot be used.
         """
-        self._digests = self._camera_digests()
+        try:
+            task = self._check_task()
+        except (CaptureError, JobError):
+            self._settings.listener(Event(kind="failed", stage="check"))
+            raise
+        artefact = self._one(task, [STAGES["keyframes"].modules] * (self._side_by_side - 1))
+        self._frames = int(read_summary(artefact.path)["frames"])
+        self._tell_notes(artefact, "check")
+
+    def _check_task(self) -> Task:
+        digests = self._settings.store.digests
+        self._digests = camera_digests(
+            self._job.capture, digests, self._settings.listener, self._settings.cancelled
+        )
         body = None
         if has_body(self._job):
             # What is installed can change between two runs: looked at each time, not kept with the check.
@@ -89,10 +102,7 @@ class Flow:
         files = self._job.export.model_dump(mode="json", include={"formats", "names"})
         key = key_of("check", {}, {"cameras": self._digests, "body": body, "files": files, **bounds})
         arguments = {"job": self._job.model_dump(mode="json"), **bounds}
-        task = Task(key=key, arguments=arguments, threads=self._settings.threads)
-        artefact = self._one(task, [STAGES["keyframes"].modules] * (self._side_by_side - 1))
-        self._frames = int(read_summary(artefact.path)["frames"])
-        self._tell_notes(artefact, "check")
+        return Task(key=key, arguments=arguments, threads=self._settings.threads)
 
     def keyframes(self) -> ByCamera:
         """Keyframes of every camera."""
@@ -380,21 +390,3 @@ class Flow:
             future.cancel()
         wait(futures)
         self._abort.clear()
-
-    def _camera_digests(self) -> dict[str, str]:
-        capture, digests = self._job.capture, self._settings.store.digests
-        total = sum(
-            path.stat().st_size for camera in capture.cameras for path in camera.video if path.exists()
-        )
-        read = 0
-
-        def on_bytes(count: int) -> None:
-            nonlocal read
-            read += count
-            if self._settings.cancelled():
-                raise Cancelled("stopped on request", hint="run it again to go on")
-            self._settings.listener(
-                Event(kind="progress", stage="reading videos", done=read >> 20, total=total >> 20, what="MB")
-            )
-
-        return {camera.name: camera_digest(capture, camera, digests, on_bytes) for camera in capture.cameras}

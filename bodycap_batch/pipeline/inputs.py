@@ -9,8 +9,9 @@ from typing import Any
 from bodycap_batch.capture.video import MAY_READ
 from bodycap_batch.config.models import CameraConfig, CaptureConfig, Job
 from bodycap_batch.digests import FileDigests, json_digest
-from bodycap_batch.errors import CaptureError, JobError
+from bodycap_batch.errors import Cancelled, CaptureError, JobError
 from bodycap_batch.identity import algorithm_version, library_versions
+from bodycap_batch.progress import Event, Listener
 from bodycap_batch.store import DISK_ERRORS, Artefact, ArtefactKey, store_error
 from bodycap_batch.tasks import STAGES, read_summary
 
@@ -55,6 +56,31 @@ def camera_digest(
             "mask": camera.mask is not None,
         }
     )
+
+
+def camera_digests(
+    capture: CaptureConfig, digests: FileDigests, listener: Listener, cancelled: Callable[[], bool]
+) -> dict[str, str]:
+    """By camera, `camera_digest`; tells how far reading the videos is.
+
+    Raises:
+        Cancelled: Asked to stop meanwhile.
+        CaptureError, StoreError: See `camera_digest`.
+    """
+    videos = [path for camera in capture.cameras for path in camera.video]
+    total = sum(path.stat().st_size for path in videos if path.exists())
+    read = 0
+
+    def on_bytes(count: int) -> None:
+        nonlocal read
+        read += count
+        if cancelled():
+            raise Cancelled("stopped on request", hint="run it again to go on")
+        listener(
+            Event(kind="progress", stage="reading videos", done=read >> 20, total=total >> 20, what="MB")
+        )
+
+    return {camera.name: camera_digest(capture, camera, digests, on_bytes) for camera in capture.cameras}
 
 
 def _footage_digest(path: Path, digests: FileDigests, on_bytes: Callable[[int], None] | None) -> str:

@@ -418,7 +418,9 @@ def test_a_missing_video_is_named_before_anything_is_computed(bench: Bench) -> N
         bench.run()
     assert caught.value.exit_code == 3
     assert str(caught.value.path).endswith("torso.mp4")
-    assert {event.stage for event in bench.events if event.kind != "progress"} <= {"report"}
+    told = [(event.stage, event.kind) for event in bench.events if event.kind != "progress"]
+    assert told[0] == ("check", "failed")
+    assert {stage for stage, _ in told[1:]} <= {"report"}
 
 
 def test_events_tell_every_stage(bench: Bench) -> None:
