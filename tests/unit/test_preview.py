@@ -7,6 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from bodycap_batch.formats.mp4 import planes_of
 from bodycap_batch.preview import room
 from bodycap_batch.preview.layout import HEIGHT, ROOM_WIDTH, WIDTH, Box, place_videos
 from bodycap_batch.preview.room import Cloud
@@ -163,3 +164,18 @@ def test_lines_behind_the_viewer_are_not_drawn() -> None:
     assert (image == room.BACKGROUND).all()
     room.draw_lines(image, looking_down_z(), np.array([[[-1, 0, 0.0], [1, 0, 0.0]]]), (255, 255, 255))
     assert image[40, 40:60].min() > 100
+
+
+def test_pictures_get_the_colours_that_ffmpeg_would_give_them() -> None:
+    import av
+
+    rng = np.random.default_rng(0)
+    colours = rng.integers(0, 256, (6, 8, 3), dtype=np.uint8)
+    image = np.ascontiguousarray(colours.repeat(16, axis=0).repeat(16, axis=1))
+    planes = planes_of(image)
+    frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format="yuv420p")
+    off = np.abs(planes.astype(int) - frame.to_ndarray())
+    assert off[:96].max() <= 1  # rounding
+    # Chroma is rounded twice, and at the borders of a block it is mixed by another filter.
+    blocks = off[96:].reshape(2, 6, 8, 8, 8)[:, :, 2:6, :, 2:6]
+    assert blocks.max() <= 2
