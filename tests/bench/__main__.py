@@ -15,29 +15,43 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.bench import batch, joining, ours, peers, scaling, simulation, solving, spool, uncertainty, viewer
+from tests.bench import (
+    batch,
+    joining,
+    ours,
+    peers,
+    scaling,
+    seeds,
+    simulation,
+    solving,
+    spool,
+    uncertainty,
+    viewer,
+)
 from tests.bench.rows import DATA, LAB, Row, row_of, rows_in
 
-_ON_POSES = {
+_OF_ONE_STAGE = {
     "simulation": simulation.main,
     "uncertainty": uncertainty.main,
     "joining": joining.main,
     "solving": solving.main,
+    "seeds": seeds.main,
 }
-"""Benchmarks of the skeleton stage alone; they take options of their own."""
+"""Benchmarks of one stage alone; they take options of their own."""
 
 
 def main() -> int:
     """Run the chosen benchmarks; the exit code says whether every job of ours ran."""
-    if sys.argv[1:2] and sys.argv[1] in _ON_POSES:
-        return _ON_POSES[sys.argv[1]](sys.argv[2:])
+    if sys.argv[1:2] and sys.argv[1] in _OF_ONE_STAGE:
+        return _OF_ONE_STAGE[sys.argv[1]](sys.argv[2:])
     parser = argparse.ArgumentParser(prog="make bench ARGS=...", description=__doc__)
     parser.add_argument(
         "only",
         nargs="*",
-        help="rows to run, or folders of captures with truth (default: all), `scaling`, `batch`, `spool`, "
-        "`viewer`; `simulation`, `uncertainty`, `joining` or `solving` first run the skeleton stage on "
-        "simulated poses, with options of their own",
+        help="rows to run, or folders of captures with truth (default: all), `scaling` (or `length`, "
+        "`cameras`, `size` of it), `batch`, `spool`, `viewer`; with options of their own: `simulation`, "
+        "`uncertainty`, `joining` or `solving`, the skeleton stage on simulated poses, and `seeds`, the map "
+        "with several seeds",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)
@@ -76,11 +90,11 @@ def main() -> int:
 def _run_by_name(options: argparse.Namespace, work: Path, results: list[dict[str, Any]]) -> None:
     """What is no capture."""
     only = options.only
-    if "scaling" in only:
-        for case in scaling.cases(work / "scaling"):
-            own = ours.run(case.row, work / case.row.name)
+    for series in scaling.SERIES if "scaling" in only else [name for name in scaling.SERIES if name in only]:
+        for case in scaling.cases(series, work / series):
+            own = ours.run(case.row, work / series / f"{case.row.name}_job")
             _tell(results, {**own, **case.size()}, scaling.lines_of(own, case))
-        _tell(results, {}, scaling.summary(results))
+        _tell(results, {}, scaling.summary(series, results))
     if "batch" in only:
         done = batch.run(work / "batch", options.jobs or batch.JOBS, options.repeat)
         _tell(results, done, list(batch.lines_of(done)))
@@ -104,7 +118,7 @@ def _chosen(options: argparse.Namespace, work: Path) -> list[Row]:
     if not options.only:
         return known
     rows = [row for row in known if row.name in options.only]
-    names = {row.name for row in rows} | {"scaling", "batch", "spool", "viewer"}
+    names = {row.name for row in rows} | {"scaling", *scaling.SERIES, "batch", "spool", "viewer"}
     rows += [
         row_of(Path(name).resolve()) for name in options.only if name not in names and Path(name).is_dir()
     ]

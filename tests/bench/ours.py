@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import resource
 import subprocess
 import time
 from collections import defaultdict
@@ -22,7 +23,7 @@ def run(row: Row, work: Path) -> dict[str, Any]:
     out = work / "out"
     work.mkdir(parents=True, exist_ok=True)
     command = [*BODYCAP, "run", str(row.capture), "--out", str(out), "--store", str(work / "store")]
-    started = time.monotonic()
+    started, before = time.monotonic(), _children_cpu_s()
     with (work / "stderr.txt").open("w+", encoding="utf-8") as errors:
         job = subprocess.Popen(
             [*command, *row.arguments, "--json-progress"],
@@ -33,7 +34,7 @@ def run(row: Row, work: Path) -> dict[str, Any]:
         )
         with job:
             wall = _wall_seconds(job.stdout or ())
-        wall_s = time.monotonic() - started
+        wall_s, cpu_s = time.monotonic() - started, _children_cpu_s() - before
         errors.seek(0)
         complaint = errors.read().strip().splitlines()[-3:]
     if not (out / "run.json").exists():
@@ -47,6 +48,7 @@ def run(row: Row, work: Path) -> dict[str, Any]:
         "name": row.name,
         "exit": job.returncode,
         "wall_s": wall_s,
+        "cpu_s": cpu_s,
         "wall_seconds": wall,
         "stage_seconds": dict(stages),
         "camera_seconds": camera_seconds(out / "frames.csv"),
@@ -54,6 +56,12 @@ def run(row: Row, work: Path) -> dict[str, Any]:
         "report": score(out, row),
         "metrics": metrics,
     }
+
+
+def _children_cpu_s() -> float:
+    """Processor seconds of all child processes that have ended, theirs included."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def score(results: Path, row: Row) -> dict[str, Any]:
@@ -118,7 +126,8 @@ def lines_of(result: dict[str, Any]) -> list[str]:
     text.append(f"    registration {each_ms:.1f} ms a frame (all rounds, one core each)")
     wall_s = result["wall_s"]
     text.append(
-        f"    whole job {wall_s:.1f} s, {wall_s / result['camera_seconds']:.2f} s per camera-second, "
+        f"    whole job {wall_s:.1f} s ({result['cpu_s']:.1f} of a core), "
+        f"{wall_s / result['camera_seconds']:.2f} s per camera-second, "
         f"peak memory {result['peak_memory_mb']:.0f} MB"
     )
     return text

@@ -1,9 +1,10 @@
-"""How cost grows: the same walk for 1, 2 and 4 times as long, and with 1, 2, 3 and 5 cameras."""
+"""How cost grows: the same walk for 1, 2 and 4 times as long, with 1, 2, 3 and 5 cameras, in three sizes."""
 
 from __future__ import annotations
 
 import shutil
 import subprocess
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,41 +18,73 @@ LENGTHS = (1, 2, 4)
 CAMERAS = ("torso", "left_palm", "right_palm", "left_upper_arm", "right_upper_arm")
 COUNTS = (1, 2, 3, 5)
 _USUAL = 3
+SIZES = ("640x480", "1440x1080", "2880x2160")
+"""The last two have the height of 1080p and 4K video, and all the same view."""
+SIZED_S = 3
 
 
 @dataclass(frozen=True)
 class Case:
-    """One capture of the series.
+    """One capture of a series.
 
     Attributes:
         row: What is run.
         seconds: Length of each video.
         cameras: How many cameras.
+        pixels: Image size.
+        decoding_s: Seconds of one thread to read every frame of all cameras once, at the work size.
     """
 
     row: Row
     seconds: int
     cameras: int
+    pixels: str = SIZES[0]
+    decoding_s: float = 0.0
 
-    def size(self) -> dict[str, int]:
+    def size(self) -> dict[str, Any]:
         """What varies, for the table."""
-        return {"scaling_seconds": self.seconds, "scaling_cameras": self.cameras}
+        return {
+            "scaling_seconds": self.seconds,
+            "scaling_cameras": self.cameras,
+            "scaling_pixels": self.pixels,
+            "decoding_s": self.decoding_s,
+        }
 
 
-def cases(work: Path) -> Iterator[Case]:
-    """Render the captures one by one: a longer one is the same walk, continued."""
-    sizes = [(BASE_S * times, _USUAL) for times in LENGTHS]
-    sizes += [(BASE_S, count) for count in COUNTS if count != _USUAL]
-    for seconds, count in sizes:
-        folder = work / f"{seconds}s_{count}cameras"
+SERIES: dict[str, tuple[tuple[int, int, str], ...]] = {
+    "length": tuple((BASE_S * times, _USUAL, SIZES[0]) for times in LENGTHS),
+    "cameras": tuple((BASE_S, count, SIZES[0]) for count in COUNTS),
+    "size": tuple((SIZED_S, 1, pixels) for pixels in SIZES),
+}
+"""Seconds, cameras and image size of each case; each series is told relative to its first."""
+
+
+def cases(series: str, work: Path) -> Iterator[Case]:
+    """Render the captures of a series one by one: a longer one is the same walk, continued."""
+    for seconds, count, pixels in SERIES[series]:
+        folder = work / f"{seconds}s_{count}cameras_{pixels}"
         command = [*BODYCAP, "synth", str(folder), "--seconds", str(seconds), "--seed", "1"]
-        command += ["--cameras", ",".join(CAMERAS[:count])]
+        command += ["--cameras", ",".join(CAMERAS[:count]), "--size", pixels]
         subprocess.run(
             command, cwd=REPOSITORY, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         arguments = ("--skeleton", "none") if count == 1 else row_of(folder).arguments
-        yield Case(Row(folder.name, folder, folder / "gt", arguments), seconds, count)
+        row = Row(folder.name, folder, folder / "gt", arguments)
+        yield Case(row, seconds, count, pixels, decoding_seconds(folder))
         shutil.rmtree(folder)
+
+
+def decoding_seconds(capture: Path) -> float:
+    """Processor seconds to read every frame of a capture once, as the stages see it."""
+    from bodycap_batch.capture import open_capture
+    from bodycap_batch.config.job import load_job
+
+    opened = open_capture(load_job(capture).capture)
+    started = time.process_time()
+    for camera in opened.cameras:
+        for _ in camera.grey_frames():
+            pass
+    return time.process_time() - started
 
 
 def lines_of(result: dict[str, Any], case: Case) -> list[str]:
@@ -60,30 +93,54 @@ def lines_of(result: dict[str, Any], case: Case) -> list[str]:
     if len(lines) < 2:
         return lines
     keep = [line for line in lines[1:] if "seconds:" in line or "whole job" in line]
-    return [f"scaling, {case.seconds} s, {case.cameras} cameras: {lines[0].partition(': ')[2]}", *keep]
+    what = f"{case.seconds} s, {case.cameras} cameras, {case.pixels}"
+    return [
+        f"scaling, {what}: {lines[0].partition(': ')[2]}",
+        *keep,
+        f"    to decode all of it once: {case.decoding_s:.1f} s",
+    ]
 
 
-def summary(results: list[dict[str, Any]]) -> list[str]:
-    """Time, pairs and memory of each case over those of the shortest one with three cameras."""
-    found = [result for result in results if "scaling_seconds" in result and "wall_seconds" in result]
-    base = next((each for each in found if _is_base(each)), None)
-    if base is None:
-        return ["scaling: the base case did not run"]
-    lines = [f"scaling, times the base of {BASE_S} s and {_USUAL} cameras:"]
-    for result in found:
+def summary(series: str, results: list[dict[str, Any]]) -> list[str]:
+    """Time, pairs, memory and error of each case of a series over those of its first."""
+    found = {_case_of(each): each for each in results if "scaling_seconds" in each and "wall_seconds" in each}
+    wanted = SERIES[series]
+    if wanted[0] not in found:
+        return [f"scaling, {series}: the first case did not run"]
+    base = found[wanted[0]]
+    lines = [f"scaling, {series}, times {_words(wanted[0])}:"]
+    for case in (case for case in wanted if case in found):
+        result = found[case]
         ratios = [
             f"whole job {result['wall_s'] / base['wall_s']:.2f}",
+            f"its processor seconds {result['cpu_s'] / base['cpu_s']:.2f}",
             f"map and registration {ours.mapping_seconds(result) / ours.mapping_seconds(base):.2f}",
+            f"vision without decoding {_seeing_s(result) / _seeing_s(base):.2f}",
             f"pairs {_pairs(result) / max(_pairs(base), 1):.2f}",
             f"peak memory {result['peak_memory_mb'] / base['peak_memory_mb']:.2f}",
         ]
-        size = f"{result['scaling_seconds']} s, {result['scaling_cameras']} cameras"
-        lines.append(f"    {size:16} " + ", ".join(ratios))
+        lines.append(f"    {_words(case):28} " + ", ".join(ratios))
     return lines
 
 
-def _is_base(result: dict[str, Any]) -> bool:
-    return bool(result["scaling_seconds"] == BASE_S and result["scaling_cameras"] == _USUAL)
+def _case_of(result: dict[str, Any]) -> tuple[int, int, str]:
+    return result["scaling_seconds"], result["scaling_cameras"], result["scaling_pixels"]
+
+
+def _words(case: tuple[int, int, str]) -> str:
+    return f"{case[0]} s, {case[1]} cameras, {case[2]}"
+
+
+_PASSES = 3
+"""Keyframes and registration read every frame once; features read the keyframes and what these are coded
+from, which is nearly every frame too."""
+
+
+def _seeing_s(result: dict[str, Any]) -> float:
+    """Seconds of the stages that look at frames, one core each, less what decoding takes of them."""
+    stages = ("keyframes", "map", "registration")
+    total = sum(result["stage_seconds"].get(stage, 0.0) for stage in stages)
+    return float(max(total - _PASSES * result["decoding_s"], 1e-3))
 
 
 def _pairs(result: dict[str, Any]) -> int:

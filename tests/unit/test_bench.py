@@ -2,9 +2,11 @@
 
 import numpy as np
 
-from tests.bench import ours, peers, scaling, solving
+from bodycap_batch.geometry import so3_exp
+from tests.bench import ours, peers, scaling, seeds, solving
 from tests.bench.peer_pairs import AWAY_NS, FROM_OTHER, OWN_AGAIN, STEPS, pairs_of
 from tests.bench.rows import Row, row_of
+from tests.scenes import small_map
 
 
 def _frames(count, cameras=("a", "b")):
@@ -81,16 +83,20 @@ def test_the_ratio_is_that_of_map_and_registration():
     assert "3.0 times as long" in text
 
 
-def test_scaling_is_told_relative_to_its_base():
+def test_scaling_is_told_relative_to_its_first_case():
     def case(seconds, cameras, wall_s):
         return {
-            "scaling_seconds": seconds, "scaling_cameras": cameras, "wall_s": wall_s, "peak_memory_mb": 100.0,
+            "scaling_seconds": seconds, "scaling_cameras": cameras, "wall_s": wall_s, "cpu_s": 2 * wall_s,
+            "peak_memory_mb": 100.0,
             "wall_seconds": {"map": wall_s / 2}, "metrics": {"mapping": {"pairs": 10 * seconds}},
+            "scaling_pixels": "640x480", "decoding_s": 1.0,
+            "stage_seconds": {"map": wall_s - 3.0, "registration": 3.0, "report": 5.0},
         }  # fmt: skip
 
-    lines = scaling.summary([case(6, 3, 10.0), case(24, 3, 42.0), {}])
-    assert "whole job 4.20, map and registration 4.20, pairs 4.00" in lines[-1]
-    assert "did not run" in scaling.summary([])[0]
+    lines = scaling.summary("length", [case(6, 3, 10.0), case(24, 3, 42.0), {}])
+    whole = "whole job 4.20, its processor seconds 4.20, map and registration 4.20"
+    assert f"{whole}, vision without decoding 5.57, pairs 4.00" in lines[-1]
+    assert "did not run" in scaling.summary("size", [case(6, 3, 10.0)])[0]
 
 
 def test_a_folder_is_a_row(tmp_path):
@@ -117,3 +123,22 @@ def test_solving_compares_a_longer_capture_with_the_first():
     assert solving.lines_of(first, first).endswith("peak 700 MB (200 before)")
     assert "10.5 times the seconds of the first, for 10.0 times its frames" in solving.lines_of(longer, first)
     assert "times" not in solving.lines_of({**longer, "bones": 15}, first)
+
+
+def test_seeds_are_told_with_their_spread():
+    assert seeds.summary("walk", [0.01, 0.012, 0.008]) == (
+        "walk: 1.00 cm on the average of 3 seeds, standard deviation 20%, from least to largest 40% of it"
+    )
+
+
+def test_keyframes_are_scored_under_one_similarity():
+    scene_map = small_map()
+    turn = so3_exp([0.1, 0.2, 0.3])
+    truth = {name: np.tile(np.eye(4), (10, 1, 1)) for name in scene_map.cameras}
+    for camera, frame, pose in zip(
+        scene_map.keyframe_camera, scene_map.keyframe_frame, scene_map.map_from_cam, strict=True
+    ):
+        truth[camera][frame, :3, 3] = 2.0 * turn @ pose[:3, 3] + 1.0
+    assert seeds.keyframe_errors_m(scene_map, truth).max() < 1e-9
+    truth["torso"][0, 0, 3] += 1.0
+    assert seeds.keyframe_errors_m(scene_map, truth).max() > 0.05
