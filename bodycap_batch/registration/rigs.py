@@ -10,7 +10,7 @@ import numpy as np
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.geometry import invert
-from bodycap_batch.registration.solving import Member
+from bodycap_batch.registration.seeing import Member
 from bodycap_batch.registration.tracks import Tracks
 from bodycap_batch.rig import RelativePose, relative_pose, same_instants
 from bodycap_batch.scene import Registration

@@ -84,7 +84,12 @@ class Tracks:
         order = np.lexsort((feature, keyframe, frame))
         return Tracks(frame[order], keyframe[order], feature[order], px[order])
 
-    def select(self, mask: npt.NDArray[Any]) -> Tracks:
+    def within(self, first: int, stop: int) -> Tracks:
+        """Those in frames from `first` on and before `stop`, of tracks that are ordered by frame."""
+        low, high = np.searchsorted(self.frame, [first, stop]).tolist()
+        return self.select(slice(low, high))
+
+    def select(self, mask: npt.NDArray[Any] | slice) -> Tracks:
         """Keep the observations under a mask."""
         return Tracks(self.frame[mask], self.keyframe[mask], self.feature[mask], self.px[mask])
 

@@ -6,13 +6,15 @@ from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
+import pytest
 
 from bodycap_batch.camera import Camera
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.geometry import invert, make_transform, so3_exp
-from bodycap_batch.registration import solving
+from bodycap_batch.registration import seeing, solving
 from bodycap_batch.registration.pose import FramePose, PoseLimits
-from bodycap_batch.registration.solving import agreement, solve_frames
+from bodycap_batch.registration.seeing import Votes
+from bodycap_batch.registration.solving import solve_frames
 from bodycap_batch.registration.tracks import Tracks
 from bodycap_batch.scene import FrameStatus, Map
 
@@ -104,8 +106,16 @@ def test_a_point_counts_by_the_frames_that_agree_with_it() -> None:
     agrees = np.ones(18, dtype=bool)
     agrees[[1, 4, 7]] = False
     agrees[[2, 5, 8, 11, 14]] = False
-    share = agreement(agrees, posed, point)
-    np.testing.assert_allclose(share[:3], [1.0, 0.4, 0.0])
-    np.testing.assert_allclose(share[3:], np.tile(share[:3], 5))
+    votes = Votes.none(3)
+    votes.add(point[:9], posed[:9], agrees[:9])
     # Three views of a point are too few to condemn it.
-    np.testing.assert_array_equal(agreement(agrees[:9], posed[:9], point[:9]), np.ones(9))
+    np.testing.assert_array_equal(votes.share(point), np.ones(18))
+    votes.add(point[9:], posed[9:], agrees[9:])
+    np.testing.assert_allclose(votes.share(point[:3]), [1.0, 0.4, 0.0])
+
+
+def test_a_long_video_is_solved_in_stretches_as_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene_map, tracks = _capture(30, np.random.default_rng(1))
+    whole = solving.matrices(_solve(scene_map, tracks))
+    monkeypatch.setattr(seeing, "STRETCH", 7)
+    np.testing.assert_allclose(solving.matrices(_solve(scene_map, tracks)), whole, atol=1e-12)
