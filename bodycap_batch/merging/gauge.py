@@ -22,6 +22,9 @@ MOVING_M_PER_S = 0.4
 WALKING_HEIGHT = 0.97
 """Mean height of the trunk in walking over its standing height: 0.95 to 1.00 on four captures."""
 
+_USUAL_RAD = float(np.radians(15.0))
+"""A trunk sways by less than this about its usual direction in walking and standing."""
+_DIRECTIONS = 300
 SLAB_M = 0.03
 _MIN_POINTS = 100
 _MIN_FLOOR_POINTS = 30
@@ -56,29 +59,39 @@ class Floor:
 
 
 def body_up(skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray) -> FloatArray:
-    """Mean up direction (3,) of an upright body: its trunk's axis, else against its hanging limbs."""
+    """Up direction (3,) of a body: its trunk's axis as it usually is, else against its hanging limbs."""
     trunk = [i for i, bone in enumerate(bones) if not split_side(bone.role)[0]]
     limbs = [
         i for i, bone in enumerate(bones) if split_side(bone.role)[1] in ("Arm", "UpLeg", "Leg", "ForeArm")
     ]
     if trunk:
-        direction = world_from_bone[:, trunk, :3, 2].mean(axis=(0, 1))
-    else:
-        chosen = limbs or list(range(len(bones)))
-        along = [world_from_bone[:, i, :3, :3] @ proper_axes(skeleton, bones[i].role)[:, 0] for i in chosen]
-        direction = -np.mean(along, axis=(0, 1))
+        return usual_direction(world_from_bone[:, trunk, :3, 2].mean(axis=1))
+    chosen = limbs or list(range(len(bones)))
+    along = [world_from_bone[:, i, :3, :3] @ proper_axes(skeleton, bones[i].role)[:, 0] for i in chosen]
+    direction = -np.mean(along, axis=(0, 1))
     return np.asarray(direction / np.linalg.norm(direction))
 
 
 def body_up_from_prior(bones: Sequence[Bone], trunk: Track, mount: Mount) -> FloatArray:
-    """Mean up (3,) in the map that a camera's path and its mount's prior promise."""
+    """Usual up (3,) in the map that a camera's path and its mount's prior promise."""
     rest = np.eye(3)
     index = trunk.bone
     while bones[index].parent >= 0:
         rest = bones[index].mean_rotation.T @ rest
         index = bones[index].parent
     joint = trunk.map_from_cam[:, :3, :3] @ mount.joint_from_cam[:3, :3].T
-    direction = (joint @ rest)[:, :, 2].mean(axis=0)
+    return usual_direction((joint @ rest)[:, :, 2])
+
+
+def usual_direction(directions: FloatArray) -> FloatArray:
+    """The direction (3,) near which most of (N,3) lie: who bends down is upright in between.
+
+    The mean of a lifter's trunk leans by half of its bends.
+    """
+    some = directions[np.unique(np.linspace(0, len(directions) - 1, _DIRECTIONS).astype(np.int64))]
+    some = some / np.linalg.norm(some, axis=1, keepdims=True)
+    near = some @ some.T > np.cos(_USUAL_RAD)
+    direction = some[near[int(np.argmax(near.sum(axis=1)))]].mean(axis=0)
     return np.asarray(direction / np.linalg.norm(direction))
 
 

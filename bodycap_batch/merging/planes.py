@@ -19,8 +19,9 @@ _HYPOTHESES = 600
 _NEAR_M = 1.5
 _MOST_POINTS = 20_000
 """Points that tell as much as all: a long capture's map has hundreds of thousands."""
-TILT_LIMIT_DEG = 20.0
-"""How far the vertical may lie from the body's own: a chest's lean and its mount's error, three sigma."""
+TILT_LIMITS_DEG = (20.0, 35.0)
+"""How far the vertical may lie from the body's own: a chest's lean and its mount's error, three sigma;
+and where there is none so near, of someone who mostly bends. At 45 a wall could pass for the floor."""
 _AGREE_DEG = 1.0
 _DETERMINED = 0.12
 """Smallest share of the planes' points that must fix each of the two tilts."""
@@ -112,16 +113,22 @@ def vertical(planes: Sequence[Plane], body_up: FloatArray) -> tuple[FloatArray, 
         Up (3,) and the share of the planes' points that agree within `_AGREE_DEG`, or None where the planes
         do not fix both tilts.
     """
-    if not planes:
-        return None
+    found = (_vertical(planes, body_up, limit) for limit in TILT_LIMITS_DEG) if planes else ()
+    return next((each for each in found if each is not None), None)
+
+
+def _vertical(
+    planes: Sequence[Plane], body_up: FloatArray, limit_deg: float
+) -> tuple[FloatArray, float] | None:
+    """The same within so many degrees of the body's up."""
     normals = np.array([plane.normal for plane in planes])
     counts = np.array([plane.count for plane in planes], dtype=np.float64)
     first, second = np.linalg.svd(body_up[None])[2][1:]
-    centre, tilt = np.zeros(2), TILT_LIMIT_DEG
+    centre, tilt = np.zeros(2), limit_deg
     for _ in range(4):
         grid = np.linspace(-tilt, tilt, 41)
         offsets = centre + np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
-        offsets = offsets[np.hypot(*offsets.T) <= TILT_LIMIT_DEG]
+        offsets = offsets[np.hypot(*offsets.T) <= limit_deg]
         ups = so3_exp(np.radians(offsets[:, :1] * first + offsets[:, 1:] * second)) @ body_up
         scores = np.exp(-0.5 * (_off_deg(ups @ normals.T) / _AGREE_DEG) ** 2) @ counts
         centre = offsets[int(np.argmax(scores))]

@@ -28,6 +28,16 @@ UPRIGHT_RAD = float(np.radians(5.0))
 AHEAD_RAD = float(np.radians(8.0))
 """How far a walker's mean chest is off the vertical and off the way it goes: the lean and turn of a habit,
 and a rig's or preset's own idea of the chest's axes."""
+STANDING_RAD = float(np.radians(7.0))
+"""The same for a chest that is at its highest in a capture without walking: who bends and lifts stands up in
+between. A walker's 5 degrees, and about as many for the bend that the height leaves open."""
+_MOSTLY_BELOW = 95.0
+_HIGHEST_M = 0.02
+"""How far below its highest a chest still counts as up: half a metre over hips, it bends by 16 degrees."""
+_FEW_STEPS = 0.125
+"""Share of the ticks below which walking is a step aside between other things, mostly bowed."""
+_BOWED_M = 0.12
+"""A chest this far below where it mostly is in walking is bowed, or knees are bent: walkers' move by 5 cm."""
 _SIDEWAYS_RAD = float(np.radians(35.0))
 _BOUNCE_M = 0.03
 """Half of the rise and fall of a walking trunk, 4 to 5 cm from lowest to highest."""
@@ -50,18 +60,20 @@ class Posture:
         walking: (K,) where the body walks ahead.
         ahead: (K,3) horizontal direction it walks, NaN elsewhere.
         t_pose: (K,) where it stands in a T-pose.
+        standing: (K,) where a body that walks nowhere is as upright as it gets.
     """
 
     up: FloatArray | None
     walking: BoolArray
     ahead: FloatArray
     t_pose: BoolArray
+    standing: BoolArray
 
     @staticmethod
     def unknown(count: int) -> Posture:
         """No knowledge of `count` ticks."""
         none = np.zeros(count, dtype=bool)
-        return Posture(up=None, walking=none, ahead=np.full((count, 3), np.nan), t_pose=none)
+        return Posture(up=None, walking=none, ahead=np.full((count, 3), np.nan), t_pose=none, standing=none)
 
 
 def find_posture(
@@ -87,11 +99,28 @@ def find_posture(
     moving = before[1] & after[1] & (speed > WALKING_M_PER_S)
     ahead = np.where(moving[:, None], velocity / np.maximum(speed, 1e-9)[:, None], np.nan)
     poses, _ = track.at(times_ns, reach_ns=_STRIDE_NS)
+    height_m = poses[:, :3, 3] @ up
+    moving &= height_m > np.percentile(height_m[moving], 75.0) - _BOWED_M if moving.any() else False
     walking = moving & _facing_ahead(poses[:, :3, :3], ahead, up)
     if walking.sum() < max(5, 0.5 * moving.sum()):
         # Half of the steps go sideways or backwards: which way this body faces is not told by where it goes.
         walking, ahead = moving, np.full_like(ahead, np.nan)
-    return replace(posture, up=up, walking=walking, ahead=np.where(walking[:, None], ahead, np.nan))
+    if walking.mean() < _FEW_STEPS:
+        walking = np.zeros_like(walking)
+    standing = np.zeros_like(walking) if walking.any() else _standing(track, height_m, up)
+    return replace(
+        posture,
+        up=up,
+        walking=walking,
+        ahead=np.where(walking[:, None], ahead, np.nan),
+        standing=standing & ~posture.t_pose,
+    )
+
+
+def _standing(track: Track, height_m: FloatArray, up: FloatArray) -> BoolArray:
+    """Where heights (K,) are about the greatest of the trunk's path."""
+    highest = float(np.percentile(track.map_from_cam[:, :3, 3] @ up, _MOSTLY_BELOW))
+    return np.asarray(height_m > highest - _HIGHEST_M)
 
 
 def _facing_ahead(rotation: FloatArray, ahead: FloatArray, up: FloatArray) -> BoolArray:
@@ -124,16 +153,19 @@ class PostureFactors:
         self._trunk = [position for position, bone in enumerate(bones) if bone.role in _TRUNK]
         upright = posture.walking | posture.t_pose
         self._upright = _once(UPRIGHT_RAD, int(upright.sum()))
+        self._standing = _once(STANDING_RAD, int(posture.standing.sum()))
         self._facing = _once(AHEAD_RAD, int(np.isfinite(posture.ahead[:, 0]).sum()))
 
     def add(self, graph: Any, tick: int) -> None:
         """Add the factors of one tick: the trunk's up, and its left across the way it goes."""
         posture = self._posture
-        if posture.up is None or not (posture.walking[tick] or posture.t_pose[tick]):
+        straight = posture.walking[tick] or posture.t_pose[tick]
+        if posture.up is None or not (straight or posture.standing[tick]):
             return
+        noise = self._upright if straight else self._standing
         for bone in self._trunk:
             key = bone_key(tick, bone)
-            graph.add(gtsam.AttitudeFactorPose3(key, gtsam.Unit3(posture.up), self._upright, _OWN_UP))
+            graph.add(gtsam.AttitudeFactorPose3(key, gtsam.Unit3(posture.up), noise, _OWN_UP))
             if np.isfinite(posture.ahead[tick, 0]):
                 left = gtsam.Unit3(np.cross(posture.up, posture.ahead[tick]))
                 graph.add(gtsam.AttitudeFactorPose3(key, left, self._facing, _OWN_LEFT))
@@ -178,6 +210,11 @@ def _gestures(times_ns: IntArray) -> float:
     apart_ns = round(1e9 * GESTURE_S)
     since_ns = times_ns - times_ns[0]
     return max(1.0, min(float(since_ns[-1]) / apart_ns, float(len(np.unique(since_ns // apart_ns)))))
+
+
+def per_gesture(times_ns: IntArray) -> float:
+    """How many of the ticks (K,) fall into one gesture, 1 or more."""
+    return max(1.0, len(times_ns) / _gestures(times_ns))
 
 
 def walking_plane(path_m: FloatArray, body: FloatArray) -> FloatArray | None:

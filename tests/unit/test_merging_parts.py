@@ -264,6 +264,9 @@ def test_walls_and_floor_give_the_vertical_and_the_floor():
     assert found is not None
     # Planes 3 m wide with 5 mm of noise tilt by a fraction of a degree.
     assert np.degrees(np.arccos(found[0] @ turn @ UP)) < 0.5
+    bent = vertical(planes, so3_exp([0.5, 0.2, 0.0]) @ turn @ UP)  # 31 degrees: who mostly bends
+    assert bent is not None
+    assert np.degrees(np.arccos(bent[0] @ turn @ UP)) < 0.5
     floor_found = find_floor(room @ UP, Direction(UP, "map", 0.0, 1.0), 0.08, 1.2)
     assert floor_found.source == "map"
     assert floor_found.height_m == pytest.approx(0.0, abs=0.01)

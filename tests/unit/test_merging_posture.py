@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 
 from bodycap_batch.geometry import make_transform, so3_exp
 from bodycap_batch.merging.bones import graph_bones, proper_axes
+from bodycap_batch.merging.gauge import usual_direction
 from bodycap_batch.merging.posture import GESTURE_S, find_posture, walking_plane, widened
 from bodycap_batch.merging.spread import BETWEEN_SHARE
 from bodycap_batch.merging.t_pose import arm_span, find_t_pose, t_posed
@@ -86,6 +87,49 @@ def test_the_way_ahead_follows_the_path_and_leaves_side_steps_out():
     tangent = np.column_stack([-np.sin(angle), np.cos(angle), 0.0 * angle]) @ TILT.T
     # The chord over half a second leaves the tangent's direction alone; the bounce is projected out.
     assert_allclose(posture.ahead[inner], tangent, atol=1e-3)
+
+
+def _bending(seconds=20.0):
+    """A chest half a metre over hips that bend by up to 70 degrees every five seconds, in a tilted map."""
+    t = np.arange(0.0, seconds, 1.0 / FPS)
+    bend = np.radians(70.0) * (0.5 - 0.5 * np.cos(2 * np.pi * t / 5.0)) ** 2
+    turn = so3_exp(np.outer(bend, [1.0, 0.0, 0.0]))
+    centre = turn[:, :, 2] * 0.5 + [0.0, 0.0, 0.9]
+    return make_transform(TILT, np.zeros(3)) @ make_transform(turn, centre), bend
+
+
+def test_who_bends_and_lifts_stands_upright_in_between():
+    poses, bend = _bending()
+    track = _track(poses)
+    posture = find_posture(track, track.times_ns, TILT[:, 2], None)
+    assert not posture.walking.any()
+    assert 0.1 < posture.standing.mean() < 0.5
+    # 2 cm below the highest of a chest half a metre over the hips is arccos(1 - 0.04), 16 degrees.
+    assert np.degrees(bend[posture.standing].max()) < 17.0
+    assert not find_posture(track, track.times_ns, None, None).standing.any()
+    # The mean of all bends leans by 26 degrees; what is usual does not.
+    assert np.degrees(np.arccos(usual_direction(poses[:, :3, 2]) @ TILT[:, 2])) < 10.0
+
+
+def test_a_bowed_walk_does_not_count_as_upright():
+    poses = _circle()
+    bowed = np.arange(len(poses)) % 150 > 110
+    poses[bowed, :3, 3] -= 0.3 * TILT[:, 2]
+    track = _track(poses)
+    posture = find_posture(track, track.times_ns[::5], TILT[:, 2], None)
+    assert posture.walking.sum() > 50
+    assert not posture.walking[bowed[::5]].any()
+    assert not posture.standing.any()
+
+
+def test_a_few_steps_aside_are_no_walk():
+    poses, _ = _bending()
+    steps = np.clip(np.arange(len(poses)) - 300, 0, 20)
+    poses[:, :3, 3] += np.outer(steps, 0.04 * TILT[:, 0])
+    track = _track(poses)
+    posture = find_posture(track, track.times_ns, TILT[:, 2], None)
+    assert not posture.walking.any()
+    assert posture.standing.any()
 
 
 def test_someone_who_faces_nowhere_in_particular_gets_no_heading():
