@@ -25,8 +25,8 @@ MEAN_HEIGHT_M = 1.70
 NCD Risk Factor Collaboration, "A century of trends in adult human height", eLife 2016)."""
 
 NOMINAL_SIGMA_RAD = float(np.radians(15.0))
-NOMINAL_SIGMA_M = 0.04
-"""Per axis, of a mount known by its name only: straps turn, and bodies differ."""
+NOMINAL_SIGMA_M = 0.029
+"""Per axis, of a mount known by its name only: straps turn, and bodies differ; 5 cm in all."""
 
 STATED_SIGMA_RAD = float(np.radians(5.0))
 STATED_SIGMA_M = 0.015

@@ -72,7 +72,7 @@ def test_every_mount_has_a_movement_that_tells_more():
     for role in filter(None, skeleton.roles):
         mount = nominal_mount("cam", role, skeleton)
         sentence = mount_sentence(mount, t_pose=False)
-        assert "15.0° and 4.0 cm" in sentence
+        assert "15.0° and 2.9 cm" in sentence
         assert "to know it better" in sentence
         assert "T-pose" in sentence
         side = "left" if role.startswith("Left") else "right"
