@@ -44,6 +44,22 @@ def mount_sentence(mount: Mount, *, t_pose: bool) -> str:
     return f"{text}; to know it better, {movement}{stand}"
 
 
+def hinge_sentence(role: str, off_m: float) -> str:
+    """What it means that a hinged bone leaves its hinge.
+
+    Args:
+        role: Of the bone below the hinge.
+        off_m: Sigma by which its far end does.
+    """
+    side, part = split_side(role)
+    joint = f"{side.lower()} {'elbow' if part == 'ForeArm' else 'knee'}"
+    return (
+        f"the {joint} bends {100.0 * off_m:.1f} cm (1 sigma) out of its plane and is not held to it; "
+        f"to know it better, strap the cameras above and below the {joint} so that none slides, and check "
+        f"which way its axis lies in the skeleton"
+    )
+
+
 def scale_sentence(calibrated: Calibrated) -> str:
     """How well the metric scale is known."""
     text = f"the metric scale is known to {100.0 * calibrated.sigma_log:.1f} % (1 sigma)"

@@ -69,6 +69,7 @@ class Hinge:
         following: Index of the bone that starts at the lower bone's far end.
         anchors_m: (2,3) the two points in the upper bone's frame.
         range_m: Their distance to the following bone's joint.
+        sigma_m: How far that distance may be off beyond a joint's slack: the lower bone's `off_hinge_m`.
     """
 
     upper: int
@@ -76,6 +77,7 @@ class Hinge:
     following: int
     anchors_m: FloatArray
     range_m: float
+    sigma_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,6 +92,7 @@ class Bone:
         mean_rotation: (3,3) parent_from_bone at ease.
         rotation_covariance: (3,3) rad², in the bone's own axes.
         psd: (6,) power spectral density of its acceleration, rotation first.
+        off_hinge_m: Sigma by which its far end leaves the plane of its hinge, beyond a joint's slack.
     """
 
     joint: int
@@ -99,6 +102,7 @@ class Bone:
     mean_rotation: FloatArray
     rotation_covariance: FloatArray
     psd: FloatArray
+    off_hinge_m: float = 0.0
 
 
 def graph_bones(skeleton: SkeletonModel, mounted_roles: Iterable[str]) -> tuple[Bone, ...]:
@@ -184,6 +188,7 @@ def hinges(skeleton: SkeletonModel, bones: tuple[Bone, ...]) -> tuple[Hinge, ...
                 following=following,
                 anchors_m=bone.offset_m + HINGE_ARM_M * np.array([axis, -axis]),
                 range_m=float(np.hypot(HINGE_ARM_M, length)),
+                sigma_m=bone.off_hinge_m,
             )
         )
     return tuple(out)

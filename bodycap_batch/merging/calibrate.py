@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -23,10 +24,11 @@ from bodycap_batch.merging.graph import (
     pose_values,
     read_mount,
 )
+from bodycap_batch.merging.hinge_give import FREE_M, loosened, off_hinges, told
 from bodycap_batch.merging.initial import fill_gaps, pose_bones
 from bodycap_batch.merging.linear import Linear, linearise
 from bodycap_batch.merging.mount_spread import JOINED, MEASURED, Eliminated, SolvedMounts, kinds_of
-from bodycap_batch.merging.posture import PostureFactors, widened
+from bodycap_batch.merging.posture import PostureFactors, per_gesture, widened
 from bodycap_batch.merging.samples import Samples
 from bodycap_batch.merging.spread import (
     BETWEEN_SHARE,
@@ -116,6 +118,40 @@ class Calibration:
         if usual.any():
             poses, times_ns = self.poses()[usual], self._samples.times_ns[usual]
             self._at_ease = widened(self._skeleton, self._bones, poses, times_ns)
+
+    def test_hinges(self) -> bool:
+        """Let go of the hinges that cameras can contradict, and keep those loose that give.
+
+        What a joint does beside its hinge it does for as long as a gesture lasts: all samples of one count as
+        one, or the hinge would bend the mounts with the weight of them all.
+
+        Returns:
+            Whether any of them gives.
+        """
+        tested = told(self._hinges, self._samples.bones)
+        if not tested:
+            return False
+        kept = self._at_ease, self._hinges, self._values, dict(self.mounts)
+        self._use(loosened(self._at_ease, {hinge.lower: FREE_M for hinge in tested}), once=1.0)
+        self.solve(self._scale)
+        self._use(
+            loosened(self._at_ease, off_hinges(self.solved())), once=per_gesture(self._samples.times_ns)
+        )
+        if not self.off_hinge_m():
+            self._at_ease, self._hinges, self._values, self.mounts = kept
+            return False
+        return True
+
+    def _use(self, bones: tuple[Bone, ...], once: float) -> None:
+        self._at_ease = bones
+        self._hinges = tuple(
+            replace(hinge, sigma_m=float(np.sqrt(once)) * hinge.sigma_m)
+            for hinge in hinges(self._skeleton, bones)
+        )
+
+    def off_hinge_m(self) -> dict[str, float]:
+        """By role, sigma by which a hinge's distances are off beyond a joint's slack; of those that give."""
+        return {bone.role: bone.off_hinge_m for bone in self._at_ease if bone.off_hinge_m > 0.0}
 
     def spread(
         self,

@@ -68,6 +68,7 @@ class Calibrated:
         height_over_floor_m: Of the trunk's joint, where a walked floor was seen.
         t_pose_ns: From when to when a T-pose stands, None without one.
         rolls: Which way up each limb's camera was tried.
+        off_hinge_m: By role, sigma by which a bone's far end leaves its hinge's plane; those that do.
     """
 
     scale: float
@@ -81,6 +82,7 @@ class Calibrated:
     height_over_floor_m: float | None
     t_pose_ns: tuple[int, int] | None
     rolls: tuple[RollSearch, ...]
+    off_hinge_m: Mapping[str, float] = field(default_factory=dict)
 
 
 def calibrate_body(
@@ -101,6 +103,8 @@ def calibrate_body(
     calibration.solve(provisional)
     calibration.widen_postures()
     estimate = find_scale(calibration, provisional)
+    if calibration.test_hinges():
+        estimate = find_scale(calibration, estimate.scale)
     poses = calibration.poses()
     path_m = estimate.scale * tracks[0].map_from_cam[:, :3, 3]
     body_up = gauge.body_up(inputs.skeleton, bones, poses)
@@ -129,6 +133,7 @@ def calibrate_body(
         height_over_floor_m=height,
         t_pose_ns=t_pose_ns,
         rolls=rolls,
+        off_hinge_m=calibration.off_hinge_m(),
     )
 
 

@@ -21,6 +21,8 @@ GEMAN_MCCLURE_C = 6.0
 measurements of violent motion (palm 6.4 cm off instead of 0.6); gross errors have been dropped before."""
 _LEAST_DAMPING = 1e-5
 """Damping is raised tenfold from here until the error falls; each try is a solve, at the end all in vain."""
+HINGE_SLACK = 2.0
+"""Sigma of a hinge's distances over that of a joint's gap."""
 _AXIS_WEIGHT = 0.1
 """Information of a mount's axis points over its centre's: small, so that turning and moving decouple."""
 
@@ -97,7 +99,10 @@ class JointFactors:
             for index, bone in self._children
         }
         self._noise = {index: _joint_noise(bone, prior_scale, slack_m) for index, bone in self._children}
-        self._hinge_noise = gtsam.noiseModel.Isotropic.Sigma(1, 2.0 * slack_m)
+        self._hinge_noises = [
+            gtsam.noiseModel.Isotropic.Sigma(1, float(np.hypot(HINGE_SLACK * slack_m, hinge.sigma_m)))
+            for hinge in joints
+        ]
         self._anchors = [
             [gtsam.Pose3(gtsam.Rot3(), anchor) for anchor in hinge.anchors_m] for hinge in joints
         ]
@@ -107,14 +112,10 @@ class JointFactors:
         for index, bone in self._children:
             parent, child = bone_key(tick, bone.parent), bone_key(tick, index)
             graph.add(gtsam.BetweenFactorPose3(parent, child, self._rest[index], self._noise[index]))
-        for hinge, anchors in zip(self._hinges, self._anchors, strict=True):
+        for hinge, anchors, noise in zip(self._hinges, self._anchors, self._hinge_noises, strict=True):
             upper, following = bone_key(tick, hinge.upper), bone_key(tick, hinge.following)
             for anchor in anchors:
-                graph.add(
-                    gtsam.RangeFactorWithTransformPose3(
-                        upper, following, hinge.range_m, self._hinge_noise, anchor
-                    )
-                )
+                graph.add(gtsam.RangeFactorWithTransformPose3(upper, following, hinge.range_m, noise, anchor))
 
 
 def _joint_noise(bone: Bone, prior_scale: float, slack_m: float) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.body import MergeInputs
 from bodycap_batch.geometry import rotation_angle_rad
-from bodycap_batch.merging.advice import mount_sentence, scale_sentence
+from bodycap_batch.merging.advice import hinge_sentence, mount_sentence, scale_sentence
 from bodycap_batch.merging.constants import Calibrated
 from bodycap_batch.merging.scale import ScaleSource, disagreement
 from bodycap_batch.merging.solve import Solution
@@ -65,6 +65,10 @@ def build_report(
         "joint_gap_m": {role: _percentiles(gap) for role, gap in notes["joint_gap_m"].items()},
         "joint_sigma_m": notes["uncertainty"],
         "hinge_off_plane_m": {role: _percentiles(off) for role, off in notes["hinge_m"].items()},
+        "loose_hinges": {
+            role: {"sigma_m": round(off_m, 5), "known_to": hinge_sentence(role, off_m)}
+            for role, off_m in calibrated.off_hinge_m.items()
+        },
         "activity": {
             "name": inputs.activity,
             "rules_active": {name: float((off > 0.0).mean()) for name, off in notes["rules"].items()},

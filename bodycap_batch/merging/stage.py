@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -60,7 +61,8 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
     step.what = "solving"
     metric = [track.scaled(calibrated.scale) for track in tracks]
     rules = soft_rules(inputs.skeleton, bones, inputs.activity)
-    psd_bones = adapt_psd(bones, metric)
+    loose = tuple(replace(bone, off_hinge_m=calibrated.off_hinge_m.get(bone.role, 0.0)) for bone in bones)
+    psd_bones = adapt_psd(loose, metric)
     mounts = {mount.camera: mount.joint_from_cam for mount in calibrated.mounts}
     solution = solve_motion(
         lambda ticks, seen: MotionGraph(inputs.skeleton, psd_bones, ticks, seen, mounts, rules),

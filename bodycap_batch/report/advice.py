@@ -223,6 +223,9 @@ def _of_body(inputs: ReportInputs) -> Iterator[Advice]:
                 f"{100 * _ARM_M * sigma:.1f} cm on the length of an arm",
                 weight=1.1 + sigma,
             )
+    for hinge in report.get("loose_hinges", {}).values():
+        known, _, way = str(hinge["known_to"]).partition(_BETTER)
+        yield Advice(do=_sentence(way), because=known, weight=1.1 + hinge["sigma_m"])
     for name, mount in report.get("mounts", {}).items():
         known, _, way = str(mount.get("known_to", "")).partition(_BETTER)
         if way or mount["sigma_deg"] > _MOUNT_WELL_KNOWN_DEG:

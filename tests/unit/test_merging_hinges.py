@@ -1,0 +1,93 @@
+"""Elbows that bend about more than one axis: seen where cameras on both sides tell, and then let go."""
+
+import numpy as np
+import pytest
+
+from bodycap_batch.geometry import so3_exp
+from bodycap_batch.merging.advice import hinge_sentence
+from bodycap_batch.merging.bones import graph_bones, hinges
+from bodycap_batch.merging.calibrate import Calibration
+from bodycap_batch.merging.hinge_give import FREE_M, told
+from bodycap_batch.merging.samples import take_samples
+from bodycap_batch.merging.tracks import Track
+from bodycap_batch.skeleton import forward_kinematics
+from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount
+from tests.bodies import reaching
+
+ROLES = {
+    "torso": "Spine1",
+    "left_upper_arm": "LeftArm",
+    "left_palm": "LeftHand",
+    "right_palm": "RightHand",
+}
+
+
+def _calibrated(sideways_rad: float) -> Calibration:
+    """A body whose left elbow swings sideways by so much, seen by cameras that sit where they should."""
+    motion = reaching(240)
+    skeleton = motion.skeleton
+    local = np.array(motion.local_rotation)
+    elbow = skeleton.index_of_role("LeftForeArm")
+    sway = sideways_rad * np.sqrt(2.0) * np.sin(np.arange(240) / 7.0)
+    local[:, elbow] = so3_exp(np.outer(sway, [0.0, 1.0, 0.0])) @ local[:, elbow]
+    poses = forward_kinematics(skeleton, motion.root_in_world_m, local)
+    bones = graph_bones(skeleton, ROLES.values())
+    index = {bone.role: place for place, bone in enumerate(bones)}
+    mounts = {camera: nominal_mount(camera, role, skeleton) for camera, role in ROLES.items()}
+    tracks = [
+        Track(
+            camera=camera,
+            bone=index[role],
+            frames=np.arange(240),
+            times_ns=np.round(np.arange(240) * (1e9 / 30.0)).astype(np.int64),
+            map_from_cam=poses[:, skeleton.index_of_role(role)] @ mounts[camera].joint_from_cam,
+            sigma_rad=np.full(240, 0.005),
+            sigma_map=np.full(240, 0.004),
+        )
+        for camera, role in ROLES.items()
+    ]
+    calibration = Calibration(skeleton, bones, take_samples(tracks, 1.0, 30), mounts, 1.0, lambda: None)
+    calibration.solve(1.0)
+    return calibration
+
+
+def test_an_elbow_that_swings_sideways_is_let_go():
+    calibration = _calibrated(np.radians(15.0))
+    assert calibration.test_hinges()
+    (role,) = calibration.off_hinge_m()  # the right one has no camera above it that could tell
+    assert role == "LeftForeArm"
+    # 15 degrees are 6.5 cm at the wrist of a straight forearm of 25 cm, 5 cm in the distances; the elbow is
+    # bent, and the mounts take part of it.
+    assert 0.015 < calibration.off_hinge_m()[role] < 0.06
+
+
+def test_an_elbow_that_keeps_to_its_hinge_is_held_as_before():
+    calibration = _calibrated(0.0)
+    before, mounts = calibration.poses(), dict(calibration.mounts)
+    assert not calibration.test_hinges()
+    assert calibration.off_hinge_m() == {}
+    assert (calibration.poses() == before).all()
+    assert all((calibration.mounts[camera] == mount).all() for camera, mount in mounts.items())
+
+
+@pytest.mark.parametrize(
+    ("cameras", "tested"),
+    [
+        (("Spine1", "LeftHand"), 0),
+        (("Spine1", "LeftArm"), 0),
+        (("Spine1", "LeftArm", "LeftHand"), 1),
+        (("Spine1", "LeftArm", "LeftForeArm", "LeftHand", "RightHand"), 1),
+    ],
+)
+def test_only_cameras_on_both_sides_contradict_a_hinge(cameras, tested):
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = graph_bones(skeleton, cameras)
+    measured = {place for place, bone in enumerate(bones) if bone.role in cameras}
+    assert len(told(hinges(skeleton, bones), measured)) == tested
+
+
+def test_a_loose_hinge_is_told_with_what_to_do():
+    sentence = hinge_sentence("LeftForeArm", FREE_M)
+    assert "left elbow bends 10.0 cm" in sentence
+    assert "; to know it better, strap" in sentence
+    assert "right knee" in hinge_sentence("RightLeg", 0.02)
