@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -124,13 +123,7 @@ def place_again(model: pycolmap.Reconstruction, suspects: Collection[int], shop:
         shop: Workspace, lenses, settings.
         total: Keyframes there are.
     """
-    source = shop.workspace / "repair"
-    shutil.rmtree(source, ignore_errors=True)
-    source.mkdir()
     rest = part_of(model, set(model.reg_image_ids()) - set(suspects))
-    rest.write(str(source))
-    found = extend(shop.workspace, source, shop.settings(), shop.context, total)
-    shutil.rmtree(source, ignore_errors=True)
-    grown = found if found is not None else rest
+    grown = extend(shop.workspace, rest, shop.settings(), shop.context, total)
     refine(grown, shop.settings(), shop.constant)
     return grown

@@ -12,6 +12,7 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.mapping.database import DATABASE_NAME
+from bodycap_batch.mapping.incremental import grow
 from bodycap_batch.mapping.initial import Start
 from bodycap_batch.mapping.residuals import typical_residual_px
 
@@ -157,10 +158,11 @@ def _from_start(
     import pycolmap
 
     settings.init_image_id1, settings.init_image_id2 = start.ids
-    # COLMAP would try the same pair again and again, and start every further model from it, too.
-    settings.init_num_trials, settings.multiple_models = 1, False
-    models = _run(workspace, settings, context, total)
-    if not models or models[0].num_reg_images() < _MIN_STANDING * total:
+    first = pycolmap.Reconstruction()
+    if not grow(workspace, settings, first, _ticker(context, total, context.check_cancelled)):
+        return []
+    models = [first]
+    if first.num_reg_images() < _MIN_STANDING * total:
         return models
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         left = sorted({image.name for image in database.read_all_images()} - _keyframes(models[0]))
@@ -188,28 +190,23 @@ def _grown(
     total: int,
 ) -> Any:
     """A model with all keyframes that find a place in it."""
-    source = workspace / "grown"
-    shutil.rmtree(source, ignore_errors=True)
-    source.mkdir()
-    model.write(str(source))
-    settings.multiple_models = False
-    found = _run(workspace, settings, context, total, source)
-    shutil.rmtree(source, ignore_errors=True)
-    return min([*found, model], key=_size)
+    grown = copy.deepcopy(model)
+    grow(workspace, settings, grown, _ticker(context, total, context.check_cancelled))
+    return min([grown, model], key=_size)
 
 
 def extend(
     workspace: Path,
-    model: Path,
+    model: Any,
     settings: pycolmap.IncrementalPipelineOptions,
     context: StageContext,
     total: int,
 ) -> Any:
-    """Register the database's new images in an existing model, whose poses stay where they are."""
+    """A model with the database's new images registered in it; its own poses stay where they are."""
     settings.fix_existing_frames = True
-    settings.multiple_models = False
-    found = _run(workspace, settings, context, total, model)
-    return found[0] if found else None
+    grown = copy.deepcopy(model)
+    grow(workspace, settings, grown, _ticker(context, total, context.check_cancelled))
+    return grown
 
 
 def _run(
@@ -217,7 +214,6 @@ def _run(
     settings: pycolmap.IncrementalPipelineOptions,
     context: StageContext,
     total: int,
-    model: Path | None = None,
 ) -> list[Any]:
     import pycolmap
 
@@ -232,8 +228,7 @@ def _run(
         str(images),
         str(target),
         settings,
-        str(model) if model else "",
-        next_image_callback=_ticker(context, token, total),
+        next_image_callback=_ticker(context, total, token.cancel),
         cancellation_token=token,
     )
     shutil.rmtree(target, ignore_errors=True)
@@ -246,7 +241,7 @@ def _size(model: Any) -> tuple[int, int]:
     return -model.num_reg_images(), -model.num_points3D()
 
 
-def _ticker(context: StageContext, token: pycolmap.CancellationToken, total: int) -> Callable[[], None]:
+def _ticker(context: StageContext, total: int, stop: Callable[[], None]) -> Callable[[], None]:
     done = 0
 
     def tick() -> None:
@@ -254,7 +249,7 @@ def _ticker(context: StageContext, token: pycolmap.CancellationToken, total: int
         done += 1
         context.progress(min(done, total), total, "keyframes in the map")
         if context.cancelled():
-            token.cancel()
+            stop()
 
     return tick
 

@@ -22,6 +22,7 @@ from bodycap_batch.mapping import _begun, lens
 from bodycap_batch.mapping.confirmed import drop_unconfirmed
 from bodycap_batch.mapping.consistency import Link, doubtful, links_of
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, image_ids, write_image
+from bodycap_batch.mapping.incremental import grow
 from bodycap_batch.mapping.initial import named_start, rank_starts
 from bodycap_batch.mapping.matching import match_pairs, mutual_matches
 from bodycap_batch.mapping.repair import Workshop, cut_doubtful, place_again, repair
@@ -109,6 +110,29 @@ def _rms(model: Any, poses: FloatArray) -> float:
     found = np.array([model.image(refs[frame]).projection_center() for frame in sorted(refs)])
     true = invert(poses)[sorted(refs), :3, 3]
     return float(np.sqrt(((align_points(found, true).apply(found) - true) ** 2).sum(axis=1).mean()))
+
+
+def test_a_map_that_stands_is_adjusted_once_more(
+    built: tuple[Any, FloatArray, Workshop, set[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, poses, shop, _ = built
+    sizes: list[int] = []
+    adjust_all = pycolmap.IncrementalMapper.iterative_global_refinement
+
+    def counted(mapper: Any, *arguments: Any, **options: Any) -> None:
+        sizes.append(mapper.reconstruction.num_reg_frames())
+        adjust_all(mapper, *arguments, **options)
+
+    monkeypatch.setattr(pycolmap.IncrementalMapper, "iterative_global_refinement", counted)
+    settings, model = shop.settings(), pycolmap.Reconstruction()
+    settings.init_image_id1, settings.init_image_id2 = rank_starts(shop.workspace, shop.lenses)[0].ids
+    settings.mapper.init_min_tri_angle = 2.0
+    assert grow(shop.workspace, settings, model, lambda: None)
+    assert model.num_reg_images() == _KEYFRAMES
+    assert _rms(model, poses) < 0.01
+    assert sizes[-1] == _KEYFRAMES
+    # No size twice: nothing is adjusted again where nothing was added.
+    assert len(set(sizes)) == len(sizes)
 
 
 def test_a_right_map_is_left_alone(built: tuple[Any, FloatArray, Workshop, set[Any]]) -> None:
