@@ -84,7 +84,7 @@ def build_map(
     ]
     add_keyframes(workspace, wanted, options, context)
     refs = [ImageRef(item.camera, int(frame)) for item in selections for frame in item.frames]
-    chooser = PairChooser(workspace, refs, _common_ns(capture), options)
+    chooser = PairChooser(workspace, refs, _common_ns(capture), options, context.threads)
     tried, linked = link_keyframes(chooser, workspace, _lenses(capture), context)
     constant = _constant(capture, cameras)
     shop = _shop(workspace, capture, options, constant, context)
@@ -202,7 +202,7 @@ def extend_map(
         for name in sorted({ref.camera for ref in new})
     ]
     add_keyframes(workspace, wanted, options, context)
-    chooser = PairChooser(workspace, new, _common_ns(capture), options)
+    chooser = PairChooser(workspace, new, _common_ns(capture), options, context.threads)
     _, linked = link_keyframes(chooser, workspace, _lenses(capture), context)
     constant = _constant(capture, cameras)
     doubted = {known[ref] for ref in _refs(extra_frames) if ref in known}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import numpy.typing as npt
@@ -48,7 +49,7 @@ def largest(descriptors: Descriptors, keypoints: npt.NDArray[np.float32]) -> npt
 
 
 def likeness(
-    images: Sequence[npt.NDArray[np.float32]], rows: Sequence[int], cameras: Sequence[str]
+    images: Sequence[npt.NDArray[np.float32]], rows: Sequence[int], cameras: Sequence[str], threads: int = 1
 ) -> IntArray:
     """Clear mutual matches among the largest features of some images and those that could be alike.
 
@@ -56,6 +57,7 @@ def likeness(
         images: N images' `largest`.
         rows: R of them.
         cameras: N images' cameras.
+        threads: How many images are looked at side by side; what is found is the same.
 
     Returns:
         (R,N); 0 with itself and with those whose pooled features already say that others are more alike.
@@ -66,20 +68,38 @@ def likeness(
     short = _shortlists(_pooled(every), rows, np.array(cameras))
     out = np.zeros((len(rows), len(every)), dtype=np.int64)
     place = {row: number for number, row in enumerate(rows)}
-    for number, row in enumerate(rows):
-        # A pair of two of these images is looked at once.
-        listed = np.flatnonzero(short[number]).tolist()
-        done = (other for other in listed if place.get(other, number) < number)
-        short[number, [row, *(other for other in done if short[place[other], row])]] = False
-        todo = np.flatnonzero(short[number])
-        for start in range(0, len(todo), _BLOCK):
-            some = todo[start : start + _BLOCK]
-            alike = every[row] @ every[some].reshape(-1, 128).T
-            out[number, some] = _clear(alike.reshape(_LARGEST, len(some), _LARGEST))
-        for other in todo.tolist():
-            if other in place:
-                out[place[other], row] = out[number, other]
+    todo = _looked_at(short, rows, place)
+
+    def work(number: int) -> IntArray:
+        return _alike(every, rows[number], todo[number])
+
+    with ThreadPoolExecutor(threads) as pool:
+        for number, found in enumerate(pool.map(work, range(len(rows)))):
+            out[number, todo[number]] = found
+            for other, count in zip(todo[number].tolist(), found.tolist(), strict=True):
+                if other in place:
+                    out[place[other], rows[number]] = count
     return out
+
+
+def _looked_at(short: BoolArray, rows: Sequence[int], place: Mapping[int, int]) -> list[IntArray]:
+    """For each of the rows the images it is held against: a pair of two of them is looked at once."""
+    left = short.copy()
+    for number, row in enumerate(rows):
+        listed = np.flatnonzero(left[number]).tolist()
+        done = (other for other in listed if place.get(other, number) < number)
+        left[number, [row, *(other for other in done if left[place[other], row])]] = False
+    return [np.flatnonzero(each) for each in left]
+
+
+def _alike(every: npt.NDArray[np.float32], row: int, others: IntArray) -> IntArray:
+    """(K,) clear matches of an image with some others."""
+    parts = [np.zeros(0, dtype=np.int64)]
+    for start in range(0, len(others), _BLOCK):
+        some = others[start : start + _BLOCK]
+        alike = every[row] @ every[some].reshape(-1, 128).T
+        parts.append(_clear(alike.reshape(_LARGEST, len(some), _LARGEST)))
+    return np.concatenate(parts)
 
 
 def _shortlists(

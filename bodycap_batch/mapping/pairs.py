@@ -44,6 +44,7 @@ class PairChooser:
         new: Keyframes not matched yet.
         common_ns: Common time of every frame, by camera.
         options: ``pairs``: "retrieval" or "exhaustive"; few keyframes are always matched exhaustively.
+        threads: How many keyframes are looked at side by side.
     """
 
     def __init__(
@@ -52,6 +53,7 @@ class PairChooser:
         new: Collection[ImageRef],
         common_ns: Mapping[str, IntArray],
         options: MapOptions,
+        threads: int = 1,
     ) -> None:
         import pycolmap
 
@@ -69,7 +71,7 @@ class PairChooser:
                     )
                     for ref in self._images
                 ]
-                alike = likeness(images, self._new, [ref.camera for ref in self._images])
+                alike = likeness(images, self._new, [ref.camera for ref in self._images], threads)
                 self._alike = dict(zip(self._new, alike, strict=True))
         self._times = np.array([common_ns[ref.camera][ref.frame] for ref in self._images], dtype=np.int64)
         self._cameras = np.array([ref.camera for ref in self._images])

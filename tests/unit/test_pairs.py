@@ -34,6 +34,7 @@ def test_two_views_of_a_place_are_alike_and_others_not() -> None:
         images += [largest(descriptors, keypoints), largest(noisy, keypoints)]
     rows = list(range(0, 80, 7))
     alike = likeness(images, rows, ["a"] * 80)
+    assert (likeness(images, rows, ["a"] * 80, threads=3) == alike).all()
     partner = np.array(rows) ^ 1
     assert (alike[np.arange(len(rows)), partner] >= 50).all()
     alike[np.arange(len(rows)), partner] = 0
