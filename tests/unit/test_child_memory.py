@@ -1,0 +1,38 @@
+"""A child that does one task after another starts each with the memory it needs, not with what was freed."""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+
+import pytest
+
+from bodycap_batch.runner.child import _give_memory_back
+
+_BLOCK, _COUNT = 64 * 1024, 1600
+
+
+def _resident_mb() -> float:
+    with open("/proc/self/status", encoding="ascii") as status:
+        return next(int(line.split()[1]) / 1024 for line in status if line.startswith("VmRSS:"))
+
+
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="the C library gives memory back by itself, or not at all"
+)
+def test_what_earlier_tasks_freed_goes_back() -> None:
+    libc = ctypes.CDLL(None)
+    if not hasattr(libc, "malloc_trim"):
+        pytest.skip("not glibc")
+    libc.malloc.restype, libc.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
+    libc.free.argtypes = [ctypes.c_void_p]
+    blocks = [libc.malloc(_BLOCK) for _ in range(_COUNT)]
+    for block in blocks:
+        ctypes.memset(block, 1, _BLOCK)
+    # One block at the heap's end keeps the freed 100 MB below it from going back by themselves.
+    for block in blocks[:-1]:
+        libc.free(block)
+    held = _resident_mb()
+    _give_memory_back()
+    assert held - _resident_mb() > 80
+    libc.free(blocks[-1])
