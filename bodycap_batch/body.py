@@ -49,6 +49,25 @@ class CameraClock:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class BoardView:
+    """A marker board in one keyframe.
+
+    Attributes:
+        camera: Camera name.
+        frame: Index of the frame in the camera's trajectory.
+        board_m: (N,3) corners on the board, metres, z = 0.
+        rays: (N,2) where they were seen, undistorted, at depth 1.
+        cam_from_board: (4,4) the board's pose from this view alone.
+    """
+
+    camera: str
+    frame: int
+    board_m: FloatArray
+    rays: FloatArray
+    cam_from_board: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MergeInputs:
     """Everything the skeleton stage works on.
 
@@ -63,6 +82,7 @@ class MergeInputs:
         map_points: (P,3) points by gauge; the floor is looked for in them.
         row_fraction: By camera, (N,) mean row of the observations behind each pose over the image height
             (NaN where not localised); a camera that is missing is taken at the middle row.
+        board: Where keyframes see the marker board the job names.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -74,6 +94,7 @@ class MergeInputs:
     activity: Activity = "generic"
     map_points: Mapping[str, FloatArray] = field(default_factory=dict)
     row_fraction: Mapping[str, FloatArray] = field(default_factory=dict)
+    board: tuple[BoardView, ...] = ()
 
     def __post_init__(self) -> None:
         cameras = [trajectory.camera for trajectory in self.trajectories]

@@ -61,6 +61,18 @@ class RegistrationOptions(Options):
     )
 
 
+class MarkerBoard(Options):
+    """A flat board of known squares that lies or hangs in the room."""
+
+    square_m: float = Field(gt=0, le=2, description="side of one square, metres, as measured on the print")
+    columns: int = Field(ge=3, description="chessboard: inner corners in a row; ChArUco: squares in a row")
+    rows: int = Field(ge=3, description="the same down a column")
+    kind: Literal["charuco", "chessboard"] = Field("charuco", description="kind of board")
+    dictionary: str = Field("4X4_50", description="ChArUco: family of its markers, as OpenCV names it")
+    marker: float = Field(0.75, gt=0.1, lt=1, description="ChArUco: side of a marker over that of a square")
+    legacy: bool = Field(False, description="ChArUco: drawn by an OpenCV older than 4.6")
+
+
 class MergeOptions(Options):
     """Stage 4, the skeleton."""
 
@@ -74,6 +86,9 @@ class MergeOptions(Options):
     )
     known_distance: tuple[FrameName, FrameName, Annotated[float, Field(gt=0)]] | None = Field(
         None, description="two frames, each camera:frame, and the metres between their lenses; sets the scale"
+    )
+    marker_board: MarkerBoard | None = Field(
+        None, description="a board of known squares that keyframes see in the room; sets the scale"
     )
 
 

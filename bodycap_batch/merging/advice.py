@@ -64,9 +64,9 @@ def scale_sentence(calibrated: Calibrated) -> str:
     """How well the metric scale is known."""
     text = f"the metric scale is known to {100.0 * calibrated.sigma_log:.1f} % (1 sigma)"
     used = {source.name for source in calibrated.sources if source.used}
-    if calibrated.sigma_log <= 0.02 or "known distance" in used:
+    if calibrated.sigma_log <= 0.02 or used & {"known distance", "marker board"}:
         return text
-    ways = ["name a known distance (merge.known_distance)"]
+    ways = ["name a known distance (merge.known_distance) or a board in the room (merge.marker_board)"]
     if len({mount.role for mount in calibrated.mounts}) == 1:
         return (
             f"{text}: all cameras sit on one bone, so that only their distance on it tells; to know it "

@@ -12,6 +12,7 @@ from bodycap_batch.body import MergeInputs
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging import gauge
+from bodycap_batch.merging.board import board_scale
 from bodycap_batch.merging.bones import Bone
 from bodycap_batch.merging.calibrate import Calibration
 from bodycap_batch.merging.distance import known_distance
@@ -113,7 +114,8 @@ def calibrate_body(
     # Who bends down or sits is not as tall as who walks.
     erect = poses[walking] if walking.sum() >= _ENOUGH_WALKING else poses
     height = _height_over_floor(inputs, bones, erect, up, (estimate.scale * points, path_m))
-    known = known_distance(inputs, options, cleaned.places)
+    stated = (ask(inputs, options, cleaned.places) for ask in (known_distance, board_scale))
+    known = tuple(source for source in stated if source is not None)
     sources = _sources(inputs, bones, estimate, height, known)
     scale, sigma = combine(sources)
     if not inputs.skeleton_is_measured and inputs.height_m is None and sources[0].used:
@@ -211,9 +213,9 @@ def _sources(
     bones: Sequence[Bone],
     estimate: ScaleEstimate,
     height_m: float | None,
-    known: ScaleSource | None,
+    known: Sequence[ScaleSource],
 ) -> tuple[ScaleSource, ...]:
-    """The bones, the floor and a measured distance; the last overrules the others."""
+    """The bones, the floor, and what was measured (a distance, a board), which overrules the others."""
     name, spread = "skeleton", 0.0
     if not inputs.skeleton_is_measured:
         name, spread = "height" if inputs.height_m is not None else "mean stature", PROPORTION_SIGMA
@@ -221,7 +223,7 @@ def _sources(
         name=name,
         scale=estimate.scale,
         sigma_log=float(np.hypot(estimate.sigma_log, spread)),
-        used=known is None,
+        used=not known,
     )
     out = [body]
     if height_m is not None:
@@ -229,7 +231,7 @@ def _sources(
         floor = floor_source(body, height_m, standing)
         out.append(
             floor
-            if known is None
+            if not known
             else ScaleSource(name="floor", scale=floor.scale, sigma_log=floor.sigma_log, used=False)
         )
-    return (*out, known) if known is not None else tuple(out)
+    return (*out, *known)

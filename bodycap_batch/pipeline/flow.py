@@ -23,6 +23,7 @@ from bodycap_batch.pipeline.inputs import (
     has_body,
     key_of,
     localised_in,
+    merge_arguments,
     one_camera,
 )
 from bodycap_batch.pipeline.made import Made, report_task
@@ -206,7 +207,7 @@ class Flow:
         arguments = {
             "map": str(scene.path),
             "registrations": [str(artefact.path) for artefact in registrations.values()],
-            **body_arguments(self._job),
+            **merge_arguments(self._job),
         }
         task = Task(key=key_of("merge", options, inputs), arguments=arguments, threads=self._settings.threads)
         filming = self._job.export.preview and self._settings.threads > 1
@@ -341,8 +342,7 @@ class Flow:
         return self._one(Task(key=key, arguments=arguments, round=map_round, threads=self._settings.threads))
 
     def _one(self, task: Task, meanwhile: Sequence[Sequence[str]] = ()) -> Artefact:
-        stage = STAGES[task.key.stage]
-        priority = self._settings.priority
+        stage, priority = STAGES[task.key.stage], self._settings.priority
         task = replace(task, modules=stage.modules, memory_mb=stage.memory_mb, priority=priority)
         artefact, made = self._runner.run(task, meanwhile)
         self._references.add(artefact.path)

@@ -122,6 +122,16 @@ def body_arguments(job: Job) -> dict[str, Any]:
     }
 
 
+def merge_arguments(job: Job) -> dict[str, Any]:
+    """The body, and the videos where the merge looks for a board in them.
+
+    Raises:
+        JobError: A camera's place on the body is not known.
+    """
+    shown = {} if job.merge.marker_board is None else {"capture": all_cameras(job.capture)}
+    return {**body_arguments(job), **shown}
+
+
 def body_digest(job: Job, digests: FileDigests) -> dict[str, Any]:
     """The same with the skeleton file's content in the place of its path.
 

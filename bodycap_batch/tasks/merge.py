@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 
 from bodycap_batch.context import StageContext
 from bodycap_batch.tasks.body import load_body
-from bodycap_batch.tasks.loading import load_map
+from bodycap_batch.tasks.loading import load_capture, load_map
 from bodycap_batch.tasks.registered import Registered
-from bodycap_batch.tasks.stage import Json, Stage, write_summary
+from bodycap_batch.tasks.stage import VISION, Json, Stage, write_summary
 
 if TYPE_CHECKING:
     from bodycap_batch.body import MergeInputs
+    from bodycap_batch.config.options import MarkerBoard
 
 
 def _merge(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
@@ -20,8 +21,10 @@ def _merge(options: Json, arguments: Json, context: StageContext, files: Path) -
     from bodycap_batch.formats.bundle import write_bundle
     from bodycap_batch.merging import merge_trajectories
 
-    inputs = _merge_inputs(arguments)
-    result = merge_trajectories(inputs, MergeOptions.model_validate(options), context)
+    inputs, options_ = _merge_inputs(arguments), MergeOptions.model_validate(options)
+    if options_.marker_board is not None:
+        inputs = _with_board(inputs, arguments, options_.marker_board, context)
+    result = merge_trajectories(inputs, options_, context)
     write_bundle(result, files, "merge")
     write_summary(files, unused_cameras=dict(result.unused_cameras))
 
@@ -45,8 +48,30 @@ def _merge_inputs(arguments: Json) -> MergeInputs:
     )
 
 
+def _with_board(
+    inputs: MergeInputs, arguments: Json, wanted: MarkerBoard, context: StageContext
+) -> MergeInputs:
+    """The inputs with every keyframe's view of the board."""
+    import dataclasses
+
+    import numpy as np
+
+    from bodycap_batch.calibration.in_room import find_board_views
+    from bodycap_batch.scene import FrameStatus
+
+    frames, lenses = {}, {}
+    maps = {item.gauge: item for item in load_map(arguments["map"]).maps}
+    for path in inputs.trajectories:
+        keyframes = np.array([status is FrameStatus.KEYFRAME for status in path.status], dtype=bool)
+        if keyframes.any():
+            frames[path.camera] = np.flatnonzero(keyframes)
+            lenses[path.camera] = maps[path.gauge].cameras[path.camera]
+    views = find_board_views(load_capture(arguments), frames, lenses, wanted, context)
+    return dataclasses.replace(inputs, board=views)
+
+
 MERGE = Stage(
     function=_merge,
-    libraries=("numpy", "scipy", "gtsam"),
+    libraries=("scipy", "gtsam", *VISION),
     modules=("bodycap_batch.merging", "gtsam", "scipy.optimize", "scipy.spatial.transform"),
 )
