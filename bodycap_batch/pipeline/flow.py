@@ -324,6 +324,7 @@ class Flow:
             "capture": one_camera(self._job.capture, camera),
             "map": str(scene.path),
             "selection": str(keyframes[name].path),
+            "cameras": all_cameras(self._job.capture),
             "previous": None if before is None else str(before.path),
         }
         # How often the map may grow decides which rounds are run, not what one of them gives.

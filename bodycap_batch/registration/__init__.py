@@ -13,6 +13,7 @@ from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.registration.growth import wanted_keyframes
 from bodycap_batch.registration.pose import FramePose, PoseLimits
+from bodycap_batch.registration.recovery import LEAST_LOST, recover_lost
 from bodycap_batch.registration.rigs import RigCamera, first_poses, members_of, relative_poses
 from bodycap_batch.registration.seams import misplaced, without_keyframes
 from bodycap_batch.registration.solving import matrices, solve_frames, solve_rig
@@ -21,7 +22,7 @@ from bodycap_batch.registration.tracks import Tracks, anchors_of, track_scale
 from bodycap_batch.rig import RelativePose
 from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 
-__all__ = ["RigCamera", "register_frames", "register_in_rig"]
+__all__ = ["LEAST_LOST", "RigCamera", "recover_lost", "register_frames", "register_in_rig"]
 
 _MAP_NOISE_PX = 0.6
 _THRESHOLD_SIGMAS = 3.5

@@ -37,12 +37,14 @@ class PoseLimits:
         max_error_px: RANSAC's inlier threshold.
         min_inliers: Fewest inliers.
         max_sigma_depth: Largest centre sigma as a share of the median depth.
+        min_noise_px: Least noise of a view that residuals are believed to tell.
         seed: RANSAC's seed.
     """
 
     max_error_px: float
     min_inliers: int
     max_sigma_depth: float
+    min_noise_px: float = _MIN_NOISE_PX
     seed: int = 0
 
 
@@ -164,7 +166,7 @@ def sample_pose(camera: Camera, points: FloatArray, px: FloatArray, limits: Pose
 def judge_poses(views: Views, cam_from_gauge: FloatArray, limits: PoseLimits) -> list[FramePose]:
     """Count the inliers of poses (F,4,4), estimate their covariance, and accept or refuse them."""
     fits = assess_poses(views, cam_from_gauge, limits.max_error_px)
-    covariance = _covariance(fits)
+    covariance = _covariance(fits, limits.min_noise_px)
     sigma = np.sqrt(np.linalg.eigvalsh(covariance[:, 3:, 3:])[:, -1])
     constrained = sigma < limits.max_sigma_depth * fits.depth
     gauge_from_cam = invert(cam_from_gauge)
@@ -191,7 +193,7 @@ def judge_poses(views: Views, cam_from_gauge: FloatArray, limits: PoseLimits) ->
     return out
 
 
-def _covariance(fits: Fits) -> FloatArray:
+def _covariance(fits: Fits, min_noise_px: float) -> FloatArray:
     """Covariance (F,6,6) from the inliers' information and their own spread; huge where there is no inverse.
 
     Views that disagree with a pose are evidence against it: the sigmas grow as the inliers' share falls.
@@ -200,7 +202,7 @@ def _covariance(fits: Fits) -> FloatArray:
     A left perturbation of cam_from_gauge is a right one of gauge_from_cam with the sign turned: the
     covariance is the same.
     """
-    noise_px = np.maximum(1.4826 * np.nan_to_num(fits.noise_px), _MIN_NOISE_PX)
+    noise_px = np.maximum(1.4826 * np.nan_to_num(fits.noise_px), min_noise_px)
     solvable = np.linalg.matrix_rank(fits.information) == 6
     safe = np.where(solvable[:, None, None], fits.information, np.eye(6) / _HUGE)
     sigma_px = noise_px / np.maximum(fits.evidence, _LEAST_EVIDENCE)

@@ -105,7 +105,7 @@ def anchors_of(scene_map: Map, camera: str) -> dict[int, Anchor]:
         mine = order[bounds[keyframe] : bounds[keyframe + 1]]
         px = scene_map.obs_px[mine]
         cell = np.clip((px / (lens.width_px, lens.height_px) * _CELLS).astype(int), 0, _CELLS - 1)
-        picked = _spread(cell[:, 1] * _CELLS + cell[:, 0], seen[scene_map.obs_point[mine]])
+        picked = well_spread(cell[:, 1] * _CELLS + cell[:, 0], seen[scene_map.obs_point[mine]], _MAX_TRACKS)
         rows = np.sort(mine[picked])
         frame = int(scene_map.keyframe_frame[keyframe])
         out[frame] = Anchor(
@@ -116,14 +116,14 @@ def anchors_of(scene_map: Map, camera: str) -> dict[int, Anchor]:
     return out
 
 
-def _spread(cell: IntArray, value: IntArray) -> IntArray:
-    """Rows of up to `_MAX_TRACKS` items, taken from the cells in turn, the most valuable first."""
+def well_spread(cell: IntArray, value: IntArray, count: int) -> IntArray:
+    """Rows of up to `count` items, taken from the cells in turn, the most valuable first."""
     order = np.lexsort((-value, cell))
     sorted_cells = cell[order]
     first = np.searchsorted(sorted_cells, sorted_cells)
     rank = np.arange(len(order)) - first
     turn = np.lexsort((-value[order], rank))
-    return np.asarray(order[turn[:_MAX_TRACKS]])
+    return np.asarray(order[turn[:count]])
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def _registration(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
     from bodycap_batch.config import RegistrationOptions
-    from bodycap_batch.registration import register_frames
+    from bodycap_batch.registration import LEAST_LOST, recover_lost, register_frames
     from bodycap_batch.rolling_shutter import looks_rolling
 
     camera = load_capture(arguments).cameras[0]
@@ -26,9 +26,15 @@ def _registration(options: Json, arguments: Json, context: StageContext, files: 
     options_ = RegistrationOptions.model_validate(options)
     maps = load_map(arguments["map"]).maps
     found = register_frames(camera, maps, selection, options_, context, previous)
+    tracked = int(found.trajectory.localised.sum())
+    scene = next((each for each in maps if each.gauge == found.trajectory.gauge), None)
+    growing = previous is None and len(found.wanted_keyframes) > 0
+    if scene is not None and not growing and tracked <= len(found.trajectory.status) - LEAST_LOST:
+        capture = load_capture({"capture": arguments["cameras"]})
+        found = recover_lost(found, scene, capture, options_, context)
     known = camera.rolling_shutter_known
     rolling = bool(camera.rolling_shutter_s) if known else looks_rolling(found, maps)
-    save_registration(found, camera, files, rolling=rolling)
+    save_registration(found, camera, files, rolling=rolling, tracked=tracked)
 
 
 def save_registration(
@@ -37,6 +43,7 @@ def save_registration(
     files: Path,
     *,
     rolling: bool,
+    tracked: int | None = None,
     notes: Sequence[str] = (),
 ) -> None:
     """Keep a camera's poses with what the stages after it need to know of the camera."""
@@ -54,7 +61,8 @@ def save_registration(
     write_summary(
         files,
         frames=len(found.trajectory.status),
-        localised=int(found.trajectory.localised.sum()),
+        # Those that tracking found: they tell whether the map grew where it should.
+        localised=int(found.trajectory.localised.sum()) if tracked is None else tracked,
         wanted=[int(frame) for frame in found.wanted_keyframes],
         rolling=rolling,
         notes=list(notes),

@@ -1,0 +1,229 @@
+"""Poses of lost frames, from what the map's points look like and from how the camera moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.camera import Camera
+from bodycap_batch.capture import Capture, CaptureCamera
+from bodycap_batch.config import RegistrationOptions
+from bodycap_batch.context import StageContext
+from bodycap_batch.geometry import invert
+from bodycap_batch.registration.confirmed import confirmed_points
+from bodycap_batch.registration.growth import lost_runs
+from bodycap_batch.registration.jumps import lone_poses
+from bodycap_batch.registration.marching import Finder, Fix, March, Stretch
+from bodycap_batch.registration.pose import PoseLimits
+from bodycap_batch.registration.smoothing import Steadiness, smooth_centres
+from bodycap_batch.registration.templates import Gallery, Pyramid, Search, View, choose_rows, find_points
+from bodycap_batch.scene import FrameStatus, Map, Registration, Trajectory
+from bodycap_batch.tracking import sharpness
+
+LEAST_LOST = 3
+"""Fewer lost frames are not worth decoding the keyframes of all cameras again."""
+_MIN_POSED = 20
+"""Frames with poses below which nobody knows how the camera moves."""
+_MAX_PICTURES = 600
+"""Keyframes held in memory, half a megabyte each."""
+_AROUND = 8
+_REACH = 90
+"""Frames of a lost stretch from its ends or a seed that are looked at; bounds memory."""
+_EXPOSURES = (0.0, 0.3, 0.6)
+_EXPOSURE_FRAMES = 4
+_EXPOSURE_SEARCH = Search(level=1, side=21, radius=4, score=-1.0, limit_px=6.0)
+_MIN_EVIDENCE = 0.5
+_MAX_DISAGREEMENT = 11.3
+"""Squared Mahalanobis distance between where a frame was found and its smoothed place: 99 % of three axes."""
+_LONE_EVIDENCE = 4
+
+
+def recover_lost(
+    found: Registration,
+    scene_map: Map,
+    capture: Capture,
+    options: RegistrationOptions,
+    context: StageContext,
+) -> Registration:
+    """Give lost frames the poses that can be vouched for.
+
+    From both ends of a lost stretch, and from keyframes within it whose poses were not believed, the frames
+    are walked through one after another: the map's points are looked for where the motion so far leads, as
+    they look in keyframes of any camera. What is found is smoothed together with the poses around the
+    stretch: a body-worn camera's centre has little change of acceleration from frame to frame. A frame gets
+    a pose where enough points agree, its own place is near the smoothed one, and that is known well enough.
+
+    Args:
+        found: One camera's frames as tracking left them.
+        scene_map: The map they were solved in.
+        capture: All cameras.
+        options: Limits.
+        context: Progress, cancellation.
+
+    Returns:
+        The same with more poses; their observations are not kept.
+    """
+    path = found.trajectory
+    camera = capture.camera(path.camera)
+    lost = ~path.localised
+    times = np.asarray(path.times_ns - path.times_ns[0], dtype=np.float64) if len(lost) else np.zeros(0)
+    if not lost.any() or (~lost).sum() < _MIN_POSED:
+        return found
+    times = times / np.median(np.diff(times))
+    steadiness = Steadiness.of(times, path.gauge_from_cam[:, :3, 3])
+    if steadiness is None:
+        return found
+    gallery = _gallery(scene_map, capture, camera, context)
+    lens = scene_map.cameras[camera.name]
+    limits = PoseLimits(
+        max_error_px=1.0, min_inliers=options.min_inliers, max_sigma_depth=options.max_sigma_depth
+    )
+    exposure = _exposure(camera, lens, path, gallery)
+    finder = Finder(lens=lens, gallery=gallery, limits=limits, exposure=exposure)
+    seeds = _seeds(scene_map, camera.name, lost)
+    known = _known(path)
+    poses: dict[int, Fix] = {}
+    for start, stop in lost_runs(~lost):
+        context.check_cancelled()
+        context.progress(start, len(lost), "lost frames looked at")
+        inside = {frame: pose for frame, pose in seeds.items() if start <= frame < stop}
+        stretch = Stretch(
+            start=start,
+            stop=stop,
+            times=times,
+            pyramids=_pictures(camera, start, stop, sorted(inside)),
+            known=known,
+            seeds=inside,
+            steadiness=steadiness,
+        )
+        poses |= _vouched(March(finder, stretch).run(), stretch, limits)
+    return replace(found, trajectory=_with_poses(path, poses, limits))
+
+
+def _vouched(fixes: Mapping[int, Fix], stretch: Stretch, limits: PoseLimits) -> dict[int, Fix]:
+    """Smoothed poses of the frames of a stretch that enough speaks for."""
+    if not fixes:
+        return {}
+    first = max(0, stretch.start - _AROUND)
+    frames = np.arange(first, min(len(stretch.times), stretch.stop + _AROUND))
+    around = {frame: stretch.known[frame].place for frame in frames.tolist() if frame in stretch.known}
+    found = around | {frame: fix.place for frame, fix in fixes.items()}
+    smoothed = smooth_centres(frames, stretch.times[frames], found, around.keys(), stretch.steadiness)
+    out = {}
+    for frame, fix in fixes.items():
+        pose, covariance = fix.with_place(smoothed.places[frame])
+        sigma = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
+        if (
+            fix.inliers >= limits.min_inliers
+            and fix.evidence >= _MIN_EVIDENCE
+            and smoothed.disagreement[frame] < _MAX_DISAGREEMENT
+            and sigma < limits.max_sigma_depth * fix.depth
+        ):
+            out[frame] = replace(fix, cam_from_map=pose, covariance=covariance)
+    return out
+
+
+def _with_poses(path: Trajectory, poses: Mapping[int, Fix], limits: PoseLimits) -> Trajectory:
+    """A trajectory with more poses, without those that stand alone amid lost frames."""
+    posed: BoolArray = path.localised.copy()
+    inliers = path.inliers.copy()
+    for frame, fix in poses.items():
+        posed[frame], inliers[frame] = True, fix.inliers
+    lone = lone_poses(posed, inliers, _LONE_EVIDENCE * limits.min_inliers) | _unaccompanied(posed)
+    matrices, covariance = path.gauge_from_cam.copy(), path.covariance.copy()
+    status, error_px = list(path.status), path.error_px.copy()
+    for frame, fix in poses.items():
+        if lone[frame]:
+            continue
+        matrices[frame], covariance[frame] = invert(fix.cam_from_map), fix.covariance
+        status[frame], error_px[frame] = FrameStatus.REGISTERED, fix.error_px
+    inliers = np.where([each.localised for each in status], inliers, path.inliers)
+    return replace(
+        path,
+        gauge_from_cam=matrices,
+        covariance=covariance,
+        status=tuple(status),
+        inliers=inliers,
+        error_px=error_px,
+    )
+
+
+def _unaccompanied(posed: BoolArray) -> BoolArray:
+    """(N,) frames with a pose that neither neighbour has."""
+    padded = np.concatenate([[False], posed, [False]])
+    return np.asarray(posed & ~padded[:-2] & ~padded[2:])
+
+
+def _known(path: Trajectory) -> dict[int, Fix]:
+    """Poses that tracking found, by frame."""
+    return {
+        frame: Fix(
+            cam_from_map=invert(path.gauge_from_cam[frame]),
+            covariance=path.covariance[frame],
+            inliers=int(path.inliers[frame]),
+            evidence=1.0,
+            error_px=float(path.error_px[frame]),
+            depth=np.inf,
+        )
+        for frame in np.flatnonzero(path.localised).tolist()
+    }
+
+
+def _seeds(scene_map: Map, camera: str, lost: BoolArray) -> dict[int, FloatArray]:
+    """Poses cam_from_map of the map's keyframes among the lost frames."""
+    rows = scene_map.keyframes_of(camera)
+    frames = scene_map.keyframe_frame[rows]
+    return {
+        int(frame): invert(scene_map.map_from_cam[row])
+        for row, frame in zip(rows, frames, strict=True)
+        if lost[frame]
+    }
+
+
+def _gallery(scene_map: Map, capture: Capture, camera: CaptureCamera, context: StageContext) -> Gallery:
+    """The map's keyframes' pictures, of all cameras; evenly thinned out where they are very many."""
+    count = len(scene_map.keyframe_camera)
+    held = np.unique(np.linspace(0, count - 1, min(count, _MAX_PICTURES)).round().astype(int))
+    pictures: dict[int, Pyramid] = {}
+    sharp = np.zeros(count)
+    for name in sorted(set(scene_map.keyframe_camera)):
+        rows = np.intersect1d(scene_map.keyframes_of(name), held)
+        row_of = dict(zip(scene_map.keyframe_frame[rows].tolist(), rows.tolist(), strict=True))
+        for frame, grey in capture.camera(name).read(sorted(row_of)):
+            context.check_cancelled()
+            row = row_of[frame]
+            pictures[row] = Pyramid.of(grey)
+            sharp[row] = sharpness(pictures[row].levels[0])
+        sharp[rows] /= max(float(np.median(sharp[rows])), 1e-9) if len(rows) else 1.0
+    seen: IntArray = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))
+    usable = confirmed_points(camera, scene_map)
+    return Gallery(scene_map=scene_map, pictures=pictures, sharpness=sharp, usable=usable, seen=seen)
+
+
+def _pictures(camera: CaptureCamera, start: int, stop: int, seeds: list[int]) -> dict[int, Pyramid]:
+    """Frames of a lost stretch near its ends or a seed, and those on either side of it."""
+    frames = np.arange(max(0, start - 1), min(len(camera.times_ns), stop + 1))
+    near = np.array([start, stop - 1, *seeds])
+    frames = frames[np.abs(frames[:, None] - near).min(axis=1) <= _REACH]
+    return {frame: Pyramid.of(grey) for frame, grey in camera.read(frames)}
+
+
+def _exposure(camera: CaptureCamera, lens: Camera, path: Trajectory, gallery: Gallery) -> float:
+    """Share of the time between two frames that the shutter is open, as blurred frames with poses show it."""
+    posed = path.localised
+    pairs = np.flatnonzero(posed[1:] & posed[:-1]) + 1
+    turned = path.gauge_from_cam[:, :3, :3]
+    cosine = np.einsum("nij,nij->n", turned[pairs - 1], turned[pairs])
+    fastest = np.sort(pairs[np.argsort(cosine, kind="stable")[:_EXPOSURE_FRAMES]])
+    totals = np.zeros(len(_EXPOSURES))
+    for frame, grey in camera.read(fastest):
+        pose, before = (invert(path.gauge_from_cam[each]) for each in (frame, frame - 1))
+        view = View(lens=lens, pyramid=Pyramid.of(grey), cam_from_map=pose, before=before, exposure=0.0)
+        rows = choose_rows(gallery, view)
+        for number, share in enumerate(_EXPOSURES):
+            found = find_points(gallery, replace(view, exposure=share), rows, _EXPOSURE_SEARCH)
+            totals[number] += found.score.sum()
+    return _EXPOSURES[int(np.argmax(totals))]
