@@ -187,6 +187,8 @@ def find_points(gallery: Gallery, view: View, rows: IntArray, search: Search) ->
     px = lens.project(transform_points(view.cam_from_map, points))
     shown = np.isfinite(px).all(axis=1)
     rows, points, px = rows[shown], points[shown], px[shown]
+    if len(rows) == 0:
+        return Found(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
     warp = _warps(scene, lens, view.cam_from_map, rows, px)
     step = view.pyramid.step_px[search.level]
     patches, whole = _patches(gallery, rows, warp, _blur(lens, view, points, px), search, step)
