@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -133,6 +134,31 @@ def test_a_map_that_stands_is_adjusted_once_more(
     assert sizes[-1] == _KEYFRAMES
     # No size twice: nothing is adjusted again where nothing was added.
     assert len(set(sizes)) == len(sizes)
+
+
+def test_long_tracks_are_settled_by_conjugate_gradients_to_the_same_map(
+    built: tuple[Any, FloatArray, Workshop, set[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, poses, shop, _ = built
+    centres, solvers = [], []
+    create = pycolmap.create_default_bundle_adjuster
+
+    def noted(options: Any, *arguments: Any) -> Any:
+        solvers.append(options.ceres.max_num_images_direct_sparse_cpu_solver)
+        return create(options, *arguments)
+
+    monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", noted)
+    for limit in (0.0, np.inf):
+        monkeypatch.setattr("bodycap_batch.mapping.solve._LONG_TRACKS", limit)
+        settled = copy.deepcopy(model)
+        settle(settled, shop.settings(), shop.constant)
+        assert _rms(settled, poses) < 0.01
+        found = sorted(settled.reg_image_ids())
+        centres.append(np.array([settled.image(image).projection_center() for image in found]))
+    assert solvers[0] < _KEYFRAMES < solvers[1]
+    # Half a pixel makes 5 mm a point: a hundredth of what the noise leaves open.
+    off = align_points(centres[0], centres[1]).apply(centres[0]) - centres[1]
+    assert np.linalg.norm(off, axis=1).max() < 1e-4
 
 
 def test_a_right_map_is_left_alone(built: tuple[Any, FloatArray, Workshop, set[Any]]) -> None:
