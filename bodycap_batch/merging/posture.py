@@ -182,7 +182,9 @@ def widened(
     """Bones whose everyday range is wider by what a capture happens to show.
 
     A joint's mean over a capture differs from its ease by the person's habit, a share of its everyday range,
-    and by the gestures that fall into the capture: their spread over the root of how many there were.
+    and by the gestures that fall into the capture: their spread over the root of how many there were. Where
+    it comes out further off than that although the prior drew it in (arms that lift all the time), its range
+    is that wide: one draw of a normal distribution is likeliest where sigma is the draw.
 
     Args:
         skeleton: The body.
@@ -198,9 +200,10 @@ def widened(
             continue
         turn = np.swapaxes(world_from_bone[:, bone.parent, :3, :3], 1, 2) @ world_from_bone[:, index, :3, :3]
         axes = proper_axes(skeleton, bone.role)
-        gestures = (so3_log(bone.mean_rotation.T @ turn) @ axes).std(axis=0) ** 2
+        off = so3_log(bone.mean_rotation.T @ turn) @ axes
         usual = np.diagonal(axes.T @ bone.rotation_covariance @ axes)
-        spread = np.diag(usual + gestures * few / BETWEEN_SHARE**2)
+        drawn = usual + off.var(axis=0) * few / BETWEEN_SHARE**2
+        spread = np.diag(np.maximum(drawn, (off.mean(axis=0) / BETWEEN_SHARE) ** 2))
         out.append(replace(bone, rotation_covariance=axes @ spread @ axes.T))
     return tuple(out)
 

@@ -258,3 +258,20 @@ def test_what_a_capture_happens_to_show_widens_a_joints_range(times_s, few):
     for index, (bone, other) in enumerate(zip(bones, wider, strict=True)):
         assert index == elbow or np.allclose(bone.rotation_covariance, other.rotation_covariance)
         assert (bone.mean_rotation == other.mean_rotation).all()
+
+
+@pytest.mark.parametrize(("off_deg", "sigma_deg"), [(15.0, 40.0), (50.0, 100.0)])
+def test_a_joint_held_far_off_its_ease_all_the_time_has_that_range(off_deg, sigma_deg):
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = graph_bones(skeleton, ROLES)
+    elbow = [bone.role for bone in bones].index("LeftForeArm")
+    axes = proper_axes(skeleton, "LeftForeArm")
+    poses = np.tile(np.eye(4), (20, len(bones), 1, 1))
+    for index, bone in enumerate(bones):
+        if bone.parent >= 0:
+            turn = so3_exp(np.radians(off_deg if index == elbow else 0.0) * axes[:, 2])
+            poses[:, index, :3, :3] = poses[:, bone.parent, :3, :3] @ bone.mean_rotation @ turn
+    wider = widened(skeleton, bones, poses, np.arange(20) * 1_000_000_000)
+    sigma = np.degrees(np.sqrt(np.diagonal(axes.T @ wider[elbow].rotation_covariance @ axes)))
+    # A habit is half of a range: 50 degrees of habit need one of 100, 15 lie within the usual 40.
+    assert_allclose(sigma, [40.0, 40.0, sigma_deg], atol=1e-6)
