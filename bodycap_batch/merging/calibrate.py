@@ -14,6 +14,7 @@ from bodycap_batch.geometry import invert
 from bodycap_batch.merging.bones import JOINT_SLACK_M, Bone, hinges
 from bodycap_batch.merging.graph import (
     JointFactors,
+    MountPoints,
     add_mount_measurements,
     add_mount_prior,
     bone_key,
@@ -224,6 +225,40 @@ class Calibration:
                 rows = linear.first_row[factors][:, None] + np.arange(3)
                 out[rows] = derivative @ in_bone
             first += 4 * len(ticks)
+        return out
+
+    def reweigh(self, mounts: SolvedMounts, solved: Eliminated) -> None:
+        """Weigh measurements and gaps by what the last solution left of them, never by less than believed.
+
+        Residuals that are smaller than a map's usual error say that this map is better. What is left of a gap
+        may repeat itself as the map's error does.
+        """
+        samples = self._samples
+        factors = self.row_variance(mounts, solved)
+        measured = min(float(factors[MEASURED]), 1.0)
+        self._samples = replace(
+            samples,
+            sigma_rad=np.sqrt(measured) * samples.sigma_rad,
+            sigma_map=np.sqrt(measured) * samples.sigma_map,
+            white_share=samples.white_share / measured,
+        )
+        self._slack_map *= float(np.sqrt(min(samples.repeats * float(factors[JOINED]), 1.0)))
+
+    def unit_shifts(self, mounts: SolvedMounts) -> FloatArray:
+        """How the residuals (R,) change per unit of log scale because their sigmas do.
+
+        Centres and gaps are uncertain in map units: their residuals shrink as the map grows. Without this
+        share the smallest scale would look best. How far a camera is turned does not depend on the scale.
+        """
+        linear, samples, first = mounts.linear, self._samples, 0
+        out = np.where(mounts.kinds == JOINED, -linear.right, 0.0)
+        for camera in range(len(samples.cameras)):
+            first += 4  # the prior of the mount's four points
+            factors = first + 4 * np.arange(int(samples.valid[camera].sum()))
+            centre = linear.first_row[factors][:, None] + np.arange(3)
+            for point, share in enumerate((1.0, *[MountPoints.AXIS_SHARE] * 3)):
+                out[centre + 3 * point] = -share * linear.right[centre]
+            first += 4 * len(factors)
         return out
 
     def solved(self) -> SolvedMounts:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import gtsam
 import numpy as np
@@ -52,6 +52,9 @@ class MountPoints:
 
     sigma_rad: float
     sigma_m: float
+
+    AXIS_SHARE: ClassVar[float] = float(np.sqrt(_AXIS_WEIGHT))
+    """A shift of all four points in sigmas of an axis point over the same in sigmas of the centre point."""
 
     @property
     def axis_sigma_m(self) -> float:

@@ -21,17 +21,19 @@ from bodycap_batch.merging.bones import Bone, graph_bones
 from bodycap_batch.merging.calibrate import Calibration
 from bodycap_batch.merging.common_walk import require_common_time, starts_of
 from bodycap_batch.merging.constants import early_up, points_around
-from bodycap_batch.merging.mount_spread import PRIOR
+from bodycap_batch.merging.mount_spread import PRIOR, SolvedMounts
 from bodycap_batch.merging.samples import take_samples
 from bodycap_batch.merging.tracks import Track, clean, in_gauge, make_track, moved
 from bodycap_batch.scene import Trajectory
 
 MAX_SIGMA_M = 0.06
 """A map whose cameras are known less well than this, per axis, is not placed."""
-_SAMPLES = 120
+_SAMPLES = 240
 _LOOSENED = (16.0, 4.0, 1.0)
 """Slack of the joints in turn: a start that is a decimetre off must pull, not be taken for gross errors."""
 _STEPS = 8
+_CLOSE = 1e-3
+"""Share of the cost by which a step changes it that is the last."""
 _REACH_SIGMA = 0.05
 """Of the log of the scale that the limbs' reach gives: walking elbows keep 15 to 30 degrees of flexion. With
 maps of their own, mounts and scale can make up for each other."""
@@ -219,8 +221,8 @@ def join_maps(
         why = None
         if not sigma_m <= MAX_SIGMA_M:
             why = (
-                f"the body tells it only to {100 * sigma_m:.0f} cm; turns in the walk, an upper arm's camera "
-                "or a common view settle it"
+                f"the body tells it only to {100 * sigma_m:.0f} cm; bending forward and aside, turns in the "
+                "walk, an upper arm's camera or a common view settle it"
             )
         out.append(
             Joined(
@@ -264,24 +266,30 @@ class Placing:
         """Move the maps until the body's cost no longer falls, its joints stiffer step by step."""
         for slack in _LOOSENED:
             self._calibration.slack_factor = slack
-            cost = self._cost()
-            damping = 1e-4
-            for _ in range(_STEPS):
-                change, _ = self._step(damping)
-                before = self._calibration.samples, self._scale, list(self.moved)
-                self._apply(change)
-                trial = self._cost()
-                close = abs(trial - cost) < 1e-3 * max(cost, 1.0)
-                if trial > cost:
-                    self._calibration.move(before[0])
-                    _, self._scale, self.moved = before
-                    self._calibration.solve(self._scale)
-                    damping = max(100.0 * damping, 1e-2)
-                else:
-                    cost, damping = trial, 0.1 * damping
-                if close:
-                    break
+            self._descend()
+        mounts, shifts = self._linearised()
+        self._calibration.reweigh(mounts, mounts.eliminated(shifts))
+        self._descend()
         self._covariance = self._step(0.0)[1]
+
+    def _descend(self) -> None:
+        cost = self._cost()
+        damping = 1e-4
+        for _ in range(_STEPS):
+            change, _ = self._step(damping)
+            before = self._calibration.samples, self._scale, list(self.moved)
+            self._apply(change)
+            trial = self._cost()
+            close = abs(trial - cost) < _CLOSE * max(cost, 1.0)
+            if trial > cost:
+                self._calibration.move(before[0])
+                _, self._scale, self.moved = before
+                self._calibration.solve(self._scale)
+                damping = max(100.0 * damping, 1e-2)
+            else:
+                cost, damping = trial, 0.1 * damping
+            if close:
+                break
 
     def sigmas(self, index: int) -> tuple[float, float]:
         """Sigma per axis of a map's rotation (rad) and its cameras' positions (m), over the samples."""
@@ -302,8 +310,7 @@ class Placing:
 
     def _step(self, damping: float) -> tuple[FloatArray, FloatArray]:
         """Change (1 + 7 G) of log scale and maps that lowers the cost, and its covariance."""
-        mounts = self._calibration.solved()
-        shifts = -self._calibration.measurement_shifts(mounts.linear, self._directions())
+        mounts, shifts = self._linearised()
         solved = mounts.eliminated(shifts)
         count = shifts.shape[1]
         reach = np.zeros(solved.influence.shape[1])
@@ -320,6 +327,13 @@ class Placing:
         normal[free, free] *= 1.0 + damping
         change = _solved(normal, influence.T @ right)[-count:]
         return np.asarray(change, dtype=np.float64), np.asarray(covariance[-count:, -count:])
+
+    def _linearised(self) -> tuple[SolvedMounts, FloatArray]:
+        """The graph's derivatives by bones and mounts, and (R,1 + 7 G) those by log scale and maps."""
+        mounts = self._calibration.solved()
+        shifts = -self._calibration.measurement_shifts(mounts.linear, self._directions())
+        shifts[:, 0] -= self._calibration.unit_shifts(mounts)
+        return mounts, shifts
 
     def _cost(self) -> float:
         return self._calibration.solve(self._scale) + 0.5 * self.from_reach() ** 2
@@ -371,5 +385,5 @@ def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
     except np.linalg.LinAlgError as error:
         raise EstimationError(
             "the body's movement does not determine where the map lies",
-            hint="turns in the walk, an upper arm's camera or a common view settle it",
+            hint="bending, turns in the walk, an upper arm's camera or a common view settle it",
         ) from error

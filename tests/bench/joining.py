@@ -2,7 +2,8 @@
 
 ``python -m tests.bench joining``: the walker of ``bodycap synth --poses`` whose cameras' poses come in three
 maps, each with a scale and axes of its own; mounts and noise as in ``simulation``. A camera counts as placed
-when the median distance of its path from the true one, in the main map, is below 5 cm.
+when the median distance of its path from the true one, in the main map, is below 5 cm. In pieces:
+``--seeds 0-5 --json FILE``, then ``--seeds 6-11`` with the same file, whose summary covers both.
 """
 
 from __future__ import annotations
@@ -96,31 +97,48 @@ def main(arguments: Sequence[str]) -> int:
     """Run and print; one line per seed and one per split."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench joining", description=__doc__)
     parser.add_argument("--splits", nargs="*", default=list(SPLITS), choices=list(SPLITS))
-    parser.add_argument("--seeds", type=int, default=24)
-    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument(
+        "--seeds", type=_seeds, default=range(24), help="the first so many, or FIRST-LAST, both included"
+    )
     parser.add_argument("--seconds", type=float, default=1000 / 30)
-    parser.add_argument("--json", type=Path, help="also write all figures here")
+    parser.add_argument(
+        "--json", type=Path, help="also write all outcomes here; those of earlier runs stay and count too"
+    )
     options = parser.parse_args(arguments)
-    figures: dict[str, Any] = {}
+    path: Path | None = options.json
+    known = json.loads(path.read_text(encoding="utf-8")) if path is not None and path.exists() else {}
     for split in options.splits:
-        outcomes = []
-        for seed in range(options.first_seed, options.first_seed + options.seeds):
-            outcomes.append(run_case(split, seed, options.seconds))
-            errors = " ".join(f"{name} {100 * off:.1f}" for name, off in outcomes[-1]["off_m"].items())
-            sigma = max(outcomes[-1]["sigma_m"].values(), default=float("nan"))
-            refused = "; ".join(sorted(set(outcomes[-1]["refused"].values())))
-            _tell(f"    {split}, seed {seed}: cm off: {errors} (sigma {100 * sigma:.1f}) {refused}")
-        found = figures[split] = summary(outcomes)
-        _tell(
-            f"{split}: {100 * found['placed']:.0f} % of {found['cameras']:.0f} cameras placed within 5 cm, "
-            f"{found['misplaced']:.0f} beyond, {found['refused']:.0f} refused; median "
-            f"{100 * found['median_m']:.1f} cm, worst {100 * found['worst_m']:.1f}; stated sigma "
-            f"{100 * found['stated_sigma_m']:.1f} cm per axis, error over it "
-            f"{found['error_over_sigma']:.2f}; {found['seconds']:.1f} s"
-        )
-    if options.json:
-        options.json.write_text(json.dumps(figures, indent=1), encoding="utf-8")
+        outcomes = known.setdefault(split, {})
+        for seed in options.seeds:
+            outcomes[str(seed)] = run_case(split, seed, options.seconds)
+            _tell(f"    {split}, seed {seed}: {_one_line(outcomes[str(seed)])}")
+            if path is not None:
+                path.write_text(json.dumps(known, indent=1), encoding="utf-8")
+        _tell(f"{split}: {_all_lines(list(outcomes.values()))}")
     return 0
+
+
+def _seeds(text: str) -> range:
+    first, dash, last = text.partition("-")
+    return range(int(first), int(last) + 1) if dash else range(int(first))
+
+
+def _one_line(outcome: Mapping[str, Any]) -> str:
+    errors = " ".join(f"{name} {100 * off:.1f}" for name, off in outcome["off_m"].items())
+    sigma = max(outcome["sigma_m"].values(), default=float("nan"))
+    refused = "; ".join(sorted(set(outcome["refused"].values())))
+    return f"cm off: {errors} (sigma {100 * sigma:.1f}) {refused}"
+
+
+def _all_lines(outcomes: Sequence[Mapping[str, Any]]) -> str:
+    found = summary(outcomes)
+    return (
+        f"{100 * found['placed']:.0f} % of {found['cameras']:.0f} cameras of {len(outcomes)} walks placed "
+        f"within 5 cm, {found['misplaced']:.0f} beyond, {found['refused']:.0f} refused; median "
+        f"{100 * found['median_m']:.1f} cm, worst {100 * found['worst_m']:.1f}; stated sigma "
+        f"{100 * found['stated_sigma_m']:.1f} cm per axis, error over it "
+        f"{found['error_over_sigma']:.2f}; {found['seconds']:.1f} s"
+    )
 
 
 def _tell(line: str) -> None:

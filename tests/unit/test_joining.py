@@ -13,8 +13,13 @@ from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.calibrate import Calibration
 from bodycap_batch.merging.common_walk import start_of
 from bodycap_batch.merging.joining import use_together
+from bodycap_batch.merging.mount_spread import MEASURED
 from bodycap_batch.merging.samples import take_samples
 from bodycap_batch.merging.tracks import make_track
+from bodycap_batch.synthetic import SynthOptions
+from tests.bench.joining import run_case
+from tests.bench.posed import GAUGE, posed
+from tests.bench.simulation import ARMS
 from tests.stages.walker import ROLES, make_inputs, make_walk, record
 
 FURTHER = Similarity(1.7, so3_exp([0.4, 1.1, -0.3]), np.array([0.5, -3.0, 1.0]))
@@ -42,6 +47,20 @@ def _tracks(walk, recorded):
     bones = graph_bones(walk.skeleton, set(ROLES.values()))
     index = {bone.role: place for place, bone in enumerate(bones)}
     return inputs, bones, [make_track(inputs, each, index[ROLES[each.camera]]) for each in recorded]
+
+
+@pytest.fixture(scope="module")
+def arms():
+    """Five cameras in one map: samples of five a second, their calibration, metres per map unit."""
+    capture = posed(SynthOptions(seconds=12.0, cameras=ARMS, outliers=0.0, poses_only=True))
+    inputs, roles = capture.inputs, {mount.camera: mount.role for mount in capture.mounts}
+    bones = graph_bones(inputs.skeleton, set(roles.values()))
+    index = {bone.role: place for place, bone in enumerate(bones)}
+    tracks = [make_track(inputs, each, index[roles[each.camera]]) for each in inputs.trajectories]
+    metric = 1.0 / capture.gauges[GAUGE].scale
+    samples = take_samples(tracks, metric, 60)
+    mounts = {mount.camera: mount for mount in inputs.mounts}
+    return samples, Calibration(inputs.skeleton, bones, samples, mounts, metric, lambda: None), metric
 
 
 def _off_m(place: Similarity, track) -> float:
@@ -85,6 +104,44 @@ def test_residuals_follow_moved_cameras_as_predicted(walk, recorded):
     # The right-hand side grows by what the movement asks for; robust weights change in second order.
     assert np.abs(predicted).max() > 1e-4
     assert_allclose(after.right - before.right, predicted, atol=0.15 * np.abs(predicted).max())
+
+
+def test_the_cost_follows_the_scale_as_predicted(arms):
+    samples, calibration, metric = arms
+    before, after = (calibration.solve(metric * float(np.exp(step))) for step in (-0.005, 0.005))
+    calibration.solve(metric)
+    mounts = calibration.solved()
+    directions = np.zeros((*samples.valid.shape, 1, 6))
+    directions[..., 0, 3:] = metric * samples.map_from_cam[..., :3, 3]
+    follow = calibration.measurement_shifts(mounts.linear, directions)[:, 0]
+    right, shrink = mounts.linear.right, calibration.unit_shifts(mounts)
+    # The cost is half the sum of squares, and all else is at its minimum: solves end within 1e-5 of theirs.
+    end = 1e-5 * before / 0.01
+    assert right @ (follow + shrink) == pytest.approx((after - before) / 0.01, abs=2.0 * end)
+    assert abs(right @ shrink) > 20.0 * end
+
+
+def test_what_fits_better_than_believed_counts_more(arms):
+    samples, calibration, metric = arms
+    calibration.solve(metric)
+    mounts = calibration.solved()
+    left = calibration.row_variance(mounts, mounts.eliminated())[MEASURED]
+    calibration.reweigh(mounts, mounts.eliminated())
+    found = calibration.samples
+    calibration.move(samples)
+    assert left < 0.9
+    assert_allclose(found.sigma_map, np.sqrt(left) * samples.sigma_map)
+    assert_allclose(found.sigma_rad, np.sqrt(left) * samples.sigma_rad)
+    # What is not the map's error stays as large as it was, whatever share it now has.
+    assert_allclose(found.white_share * found.sigma_map**2, samples.white_share * samples.sigma_map**2)
+
+
+@pytest.mark.slow
+def test_a_walks_arms_are_placed():
+    outcome = run_case("an arm each", 3, seconds=1000 / 30)
+    assert not outcome["refused"]
+    # All but a centimetre is the height of the trunk's camera over the shoulders: 1.5 cm, twice.
+    assert max(outcome["off_m"].values()) < 0.03
 
 
 @pytest.mark.slow
