@@ -84,6 +84,9 @@ class MergeOptions(Options):
     camera_paths: Literal["joint", "measured"] = Field(
         "joint", description="every frame's camera as solved together with the body, or as measured alone"
     )
+    foot_contact: bool = Field(
+        True, description="standing feet do not slide, where cameras on shins or feet show that they stand"
+    )
     known_distance: tuple[FrameName, FrameName, Annotated[float, Field(gt=0)]] | None = Field(
         None, description="two frames, each camera:frame, and the metres between their lenses; sets the scale"
     )

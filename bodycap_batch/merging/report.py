@@ -33,6 +33,7 @@ def build_report(
         tracks: The tracks that were used.
         notes: ``dropped`` frames by camera, the ``floor``, the ``unused`` and the ``joined`` cameras,
             ``joint_gap_m`` and ``hinge_m`` and ``uncertainty`` by role, how far the ``rules`` were pressed,
+            the feet's ``contacts``,
             and ``start_ns`` and ``end_ns``, the first
             and the last tick.
     """
@@ -78,6 +79,7 @@ def build_report(
                 if (off > 0.0).any()
             },
         },
+        "foot_contact": notes["contacts"],
         "solver": {
             "ticks": len(solution.world_from_bone),
             "bones": solution.world_from_bone.shape[1],

@@ -13,6 +13,7 @@ import numpy as np
 from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.geometry import interpolate_pose, invert, so3_log
 from bodycap_batch.merging.bones import Bone, hinges
+from bodycap_batch.merging.contact import Contact
 from bodycap_batch.merging.graph import (
     GEMAN_MCCLURE_C,
     MAX_BONES,
@@ -78,7 +79,7 @@ class MotionGraph:
         tick_times_ns: (T,) the timeline.
         tracks: Cleaned tracks, poses in metres.
         mounts: joint_from_cam (4,4) by camera.
-        rules: Soft rules of the activity.
+        rules: Soft rules of the activity, and feet that stand.
     """
 
     def __init__(
@@ -88,7 +89,7 @@ class MotionGraph:
         tick_times_ns: IntArray,
         tracks: Sequence[Track],
         mounts: Mapping[str, FloatArray],
-        rules: Sequence[Rule] = (),
+        rules: Sequence[Rule | Contact] = (),
     ) -> None:
         self._skeleton, self._bones, self._times = skeleton, bones, tick_times_ns
         self._tracks, self._mounts, self._rules = tracks, mounts, rules

@@ -19,6 +19,7 @@ from bodycap_batch.merging.choosing import bring_together
 from bodycap_batch.merging.chunks import MAX_ITERATIONS, longest_stretch, solve_motion
 from bodycap_batch.merging.complete import complete_body, observed_joints
 from bodycap_batch.merging.constants import Calibrated, Cleaned, calibrate_body, points_around
+from bodycap_batch.merging.contact import accounts, during, find_contacts
 from bodycap_batch.merging.initial import provisional_scale
 from bodycap_batch.merging.marginals import joints_in_axes, sigma_summary
 from bodycap_batch.merging.paths import in_world, solved_with_body
@@ -64,8 +65,12 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
     loose = tuple(replace(bone, off_hinge_m=calibrated.off_hinge_m.get(bone.role, 0.0)) for bone in bones)
     psd_bones = adapt_psd(loose, metric)
     mounts = {mount.camera: mount.joint_from_cam for mount in calibrated.mounts}
+    asked = metric if options.foot_contact else ()
+    contacts = find_contacts(inputs.skeleton, bones, asked, mounts, calibrated.up.up, tick_times)
     solution = solve_motion(
-        lambda ticks, seen: MotionGraph(inputs.skeleton, psd_bones, ticks, seen, mounts, rules),
+        lambda ticks, seen: MotionGraph(
+            inputs.skeleton, psd_bones, ticks, seen, mounts, (*rules, *during(contacts, tick_times, ticks))
+        ),
         tick_times,
         [loosened(track, mount) for track, mount in zip(metric, calibrated.mounts, strict=True)],
         step,
@@ -106,6 +111,7 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
                 "uncertainty": sigma_summary(inputs.skeleton.roles, covariance, observed),
                 "joint_gap_m": joint_gaps(bones, solution.world_from_bone),
                 "hinge_m": hinge_errors(inputs.skeleton, bones, solution.world_from_bone),
+                "contacts": accounts(contacts, solution.world_from_bone, fps),
                 "rules": {rule.name: rule.violation_m(solution.world_from_bone) for rule in rules},
             },
         ),

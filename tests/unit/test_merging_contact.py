@@ -1,0 +1,95 @@
+"""Feet that stand: when they are found to, and what holding them does."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from bodycap_batch.config.options import MergeOptions
+from bodycap_batch.context import StageContext
+from bodycap_batch.geometry import make_transform, so3_exp
+from bodycap_batch.merging import merge_trajectories
+from bodycap_batch.merging.bones import graph_bones
+from bodycap_batch.merging.contact import Contact, during, find_contacts
+from bodycap_batch.merging.graph import bone_key
+from bodycap_batch.merging.tracks import Track
+from bodycap_batch.skeleton_presets import load_skeleton
+from bodycap_batch.synthetic import SynthOptions
+from tests.bench.posed import posed
+
+FPS, COUNT, STAND = 30.0, 60, 25
+TICKS = np.round(np.arange(COUNT) * 1e9 / FPS).astype(np.int64)
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def shin():
+    """The skeleton, its bones, and a shin that rolls over its foot for 25 ticks, then swings ahead."""
+    skeleton = load_skeleton("full_body", 1.75)
+    bones = graph_bones(skeleton, {"Hips", "LeftLeg"})
+    index = [bone.role for bone in bones].index("LeftLeg")
+    ankle_m = np.array([0.0, 0.0, -0.43])
+    time = np.arange(COUNT) / FPS
+    swing = np.clip((np.arange(COUNT) - STAND) / (COUNT - STAND), 0.0, 1.0)
+    ankle = np.stack([0.0 * time, -1.5 * swing, 0.08 + 0.15 * np.sin(np.pi * swing)], axis=1)
+    turn = so3_exp(np.outer(0.8 * np.sin(2.0 * time), [1.0, 0.0, 0.0]))
+    poses = make_transform(turn, ankle - turn @ ankle_m)
+    return skeleton, bones, index, poses
+
+
+def _track(index, poses, seed=0):
+    rng = np.random.default_rng(seed)
+    noisy = poses.copy()
+    noisy[:, :3, 3] += rng.normal(scale=0.005, size=(COUNT, 3))
+    return Track(
+        camera="left_shin",
+        bone=index,
+        frames=np.arange(COUNT),
+        times_ns=TICKS,
+        map_from_cam=noisy,
+        sigma_rad=np.full(COUNT, 0.005),
+        sigma_map=np.full(COUNT, 0.005),
+    )
+
+
+def test_a_foot_stands_where_its_ankle_is_slow_and_low(shin):
+    skeleton, bones, index, poses = shin
+    found = find_contacts(skeleton, bones, [_track(index, poses)], {"left_shin": np.eye(4)}, UP, TICKS)
+    assert [each.name for each in found] == ["Left foot"]
+    standing = found[0].standing
+    # The speed is taken over five ticks, and a tick at either end is left out.
+    assert standing[3 : STAND - 4].all()
+    assert not standing[STAND + 2 : COUNT - 3].any()
+    assert find_contacts(skeleton, bones, [], {}, UP, TICKS) == ()
+    part = during(found, TICKS, TICKS[10:30])
+    assert np.array_equal(part[0].standing, standing[10:30])
+
+
+def test_an_ankle_that_rests_costs_nothing_however_the_shin_turns(shin):
+    _, _, _, poses = shin
+    contact = Contact("Left foot", 0, np.array([0.0, 0.0, -0.43]), np.ones(COUNT, dtype=bool), 0.0017)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for tick in range(COUNT):
+        values.insert(bone_key(tick, 0), gtsam.Pose3(poses[tick]))
+        contact.add(graph, tick)
+    assert graph.size() == COUNT - 1
+    assert max(graph.at(tick).error(values) for tick in range(STAND - 1)) < 1e-3
+    # Swinging, the ankle goes several centimetres a tick: tens of sigmas, which Huber's loss counts once.
+    assert graph.at(STAND + 10).error(values) > 10.0
+
+
+def test_standing_feet_are_held_in_the_solved_motion(tmp_path):
+    cameras = ("hips", "left_thigh", "left_shin")
+    capture = posed(SynthOptions(seconds=2.4, cameras=cameras, seed=1, poses_only=True, t_pose_s=2.0))
+    slides = []
+    for held in (True, False):
+        options, context = MergeOptions(foot_contact=held), StageContext(work_dir=tmp_path)
+        result = merge_trajectories(capture.inputs, options, context)
+        told = result.report["foot_contact"]
+        assert list(told) == (["Left foot"] if held else [])
+        roles = result.skeleton.roles
+        still = result.world_from_joint[10:50, roles.index("LeftFoot"), :3, 3]
+        slides.append(float(np.linalg.norm(np.diff(still, axis=0), axis=1).mean()) * FPS)
+    # In the T-pose, two of 2.4 seconds, the foot stands; poses have 5 mm of noise.
+    assert slides[0] < 0.7 * slides[1]
