@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
 from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.camera import Camera
+from bodycap_batch.context import THREADS_VARIABLE
 from bodycap_batch.geometry import make_transform, transform_points
 
 _RAY_STEP = 1e-4
@@ -135,13 +138,15 @@ def refine_poses(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> F
     Source: Holland, Welsch, "Robust regression using iteratively reweighted least-squares", 1977.
     """
     poses = cam_from_gauge.copy()
-    for some in _chunks(views):
-        active = some
+
+    def work(active: IntArray) -> None:
         for _ in range(_ROUNDS):
             poses[active], done = _step(views, active, poses[active], limit_px)
             active = active[~done]
             if len(active) == 0:
                 break
+
+    _side_by_side(views, work)
     return poses
 
 
@@ -156,7 +161,8 @@ def assess_poses(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> F
         depth=np.full(frames, np.nan),
         information=np.zeros((frames, 6, 6)),
     )
-    for some in _chunks(views):
+
+    def work(some: IntArray) -> None:
         rows, starts, owner = _gather(views, some)
         residual, jacobian, depth = linearise(views, rows, cam_from_gauge[some][owner])
         size = np.hypot(residual[0], residual[1])
@@ -173,17 +179,34 @@ def assess_poses(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> F
         fits.noise_px[some] = _medians(spread, np.repeat(owner, 2), 2 * starts, 2 * many)
         fits.depth[some] = _medians(np.where(inlier, depth, np.inf), owner, starts, count)
         fits.information[some] = _normal_equations(residual, jacobian, inlier * views.weight[rows], starts)[0]
+
+    _side_by_side(views, work)
     return fits
 
 
 def inliers_of(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> BoolArray:
     """Which views (M,) lie within a limit of what poses (F,4,4) predict; none where a pose is NaN."""
     out = np.zeros(len(views.rays), dtype=bool)
-    for some in _chunks(views):
+
+    def work(some: IntArray) -> None:
         rows, _, owner = _gather(views, some)
         residual, _, _ = _residuals(views, rows, cam_from_gauge[some][owner])
         out[rows] = np.hypot(residual[0], residual[1]) < limit_px
+
+    _side_by_side(views, work)
     return out
+
+
+def _side_by_side(views: Views, work: Callable[[IntArray], None]) -> None:
+    """Do chunks of frames, on all threads of the task: frames do not influence each other."""
+    chunks, threads = list(_chunks(views)), int(os.environ.get(THREADS_VARIABLE, "1"))
+    if threads == 1 or len(chunks) < 2:
+        for some in chunks:
+            work(some)
+        return
+    with ThreadPoolExecutor(threads, thread_name_prefix="poses") as pool:
+        for _ in pool.map(work, chunks):
+            pass
 
 
 def _chunks(views: Views) -> Iterator[IntArray]:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import threading
+from typing import Any
+
 import numpy as np
 import pytest
 
 from bodycap_batch.camera import Camera
+from bodycap_batch.context import THREADS_VARIABLE
 from bodycap_batch.geometry import invert, make_transform, so3_exp, so3_log
+from bodycap_batch.registration import batch
 from bodycap_batch.registration.batch import make_views
 from bodycap_batch.registration.growth import lost_runs, wanted_keyframes
 from bodycap_batch.registration.pose import MAP_VARIANCE_RATIO, FramePose, PoseLimits, solve_poses
@@ -68,6 +73,31 @@ def test_a_start_that_is_off_leads_to_the_same_pose(degrees: float, metres: floa
     assert started.gauge_from_cam is not None
     # Both end where the step is below 1e-2 px: 3.5 m · 1e-2/420 · 6, and one inlier more or less.
     assert np.linalg.norm(started.gauge_from_cam[:3, 3] - sampled.gauge_from_cam[:3, 3]) < 1e-3
+
+
+def test_threads_of_a_task_solve_the_same_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(6)
+    scenes = [_scene(rng, 90) for _ in range(12)]
+    px = np.concatenate([scene[1] + rng.normal(0, 0.5, scene[1].shape) for scene in scenes])
+    start = np.stack([make_transform(np.eye(3), [0.05, 0.0, 0.0]) @ invert(scene[2]) for scene in scenes])
+    points, bounds = np.concatenate([scene[0] for scene in scenes]), np.arange(13) * 90
+    views = make_views(CAMERA, bounds, points, px)
+    monkeypatch.setattr(batch, "_CHUNK", 2)
+    workers: set[str] = set()
+    step = batch._step
+
+    def noted(*arguments: Any) -> Any:
+        workers.add(threading.current_thread().name.partition("_")[0])
+        return step(*arguments)
+
+    monkeypatch.setattr(batch, "_step", noted)
+    found = {}
+    for threads, name in (("1", "MainThread"), ("2", "poses")):
+        monkeypatch.setenv(THREADS_VARIABLE, threads)
+        workers.clear()
+        found[threads] = batch.refine_poses(views, start, LIMITS.max_error_px)
+        assert workers == {name}
+    assert (found["1"] == found["2"]).all()
 
 
 def test_frames_solved_together_do_not_influence_each_other() -> None:
