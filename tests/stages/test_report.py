@@ -370,6 +370,19 @@ def test_nobody_is_asked_for_a_skeleton_that_was_given(inputs: ReportInputs, sou
     assert [each.do for each in advise(told, {}) if "metric scale" in each.because] == [says]
 
 
+def test_an_elbow_that_is_no_hinge_is_advised_about(inputs: ReportInputs) -> None:
+    assert inputs.merge is not None
+    loose = {
+        "LeftForeArm": {
+            "sigma_m": 0.021,
+            "known_to": "the left elbow bends 2.1 cm out of its plane; to know it better, strap it",
+        }
+    }
+    told = replace(inputs, merge=replace(inputs.merge, report={"loose_hinges": loose}))
+    (advice,) = (each for each in advise(told, {}) if "left elbow" in each.because)
+    assert (advice.do, advice.because) == ("Strap it.", "the left elbow bends 2.1 cm out of its plane")
+
+
 def test_shared_points_count_what_both_cameras_see(inputs: ReportInputs) -> None:
     counts = shared_points(inputs.maps, inputs.cameras)
     scene = inputs.maps[0]
