@@ -42,22 +42,19 @@ class Registered:
         from bodycap_batch.camera import Camera
         from bodycap_batch.formats.bundle import read_bundle
 
-        found = {path: load_registration(path) for path in paths}
         corrected = {name for each in maps for name in each.readout_s}
-        clocks = {
-            item.trajectory.camera: read_bundle(CameraClock, Path(path), "clock")
-            for path, item in found.items()
-        }
-        return Registered(
-            trajectories=tuple(item.trajectory for item in found.values()),
-            clocks=clocks,
-            row_fraction={
-                item.trajectory.camera: row_fraction(item, read_bundle(Camera, Path(path), "camera"))
-                for path, item in found.items()
-                if clocks[item.trajectory.camera].rolling_shutter_s
-                and item.trajectory.camera not in corrected
-            },
-        )
+        trajectories: list[Trajectory] = []
+        clocks: dict[str, CameraClock] = {}
+        rows: dict[str, FloatArray] = {}
+        for path in paths:
+            # One at a time: what was tracked in a long video takes most of an artefact's memory.
+            found = load_registration(path)
+            name = found.trajectory.camera
+            trajectories.append(found.trajectory)
+            clocks[name] = read_bundle(CameraClock, Path(path), "clock")
+            if clocks[name].rolling_shutter_s and name not in corrected:
+                rows[name] = row_fraction(found, read_bundle(Camera, Path(path), "camera"))
+        return Registered(trajectories=tuple(trajectories), clocks=clocks, row_fraction=rows)
 
     def relative_poses(
         self, paths: Sequence[str], segments: Sequence[Sequence[str]]
