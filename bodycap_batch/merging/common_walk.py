@@ -42,11 +42,13 @@ class Starts:
         places: By gauge, main_from_gauge.
         metric: Metres per unit of the main map.
         told: Whether more than what was put where it is at ease tells `metric`, and not just roughly.
+        spanned: Whether one map holds the trunk and the end of a limb, which tells it with no map placed.
     """
 
     places: dict[str, Similarity]
     metric: float
     told: bool
+    spanned: bool
 
 
 def starts_of(
@@ -70,7 +72,19 @@ def starts_of(
         starts = {gauge: start_of(bones, main[0], group, (mounts, metric)) for gauge, group in others}
         placed = [moved(track, starts[gauge]) for gauge, group in others for track in group]
         metric = provisional_scale(bones, [*main, *placed], mounts, guessed if np.isfinite(sigma_log) else ())
-    return Starts(starts, metric, bool(sigma_log <= _ROUGH))
+    return Starts(
+        starts, metric, bool(sigma_log <= _ROUGH), _spanned(bones, [main, *(group for _, group in others)])
+    )
+
+
+def _spanned(bones: Sequence[Bone], groups: Sequence[Sequence[Track]]) -> bool:
+    """Whether a trunk's camera and a hand's or foot's, or a forearm's or shin's, are in one map."""
+    roles = [[split_side(bones[track.bone].role) for track in group] for group in groups]
+    near = ("Shoulder", "Arm", "UpLeg")
+    return any(
+        any(not side for side, _ in group) and any(side and part not in near for side, part in group)
+        for group in roles
+    )
 
 
 def _guessed(

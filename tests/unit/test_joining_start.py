@@ -72,6 +72,12 @@ def test_a_limbs_own_cameras_tell_the_scale_not_their_reach_from_another_map(lim
     assert found.metric * found.places["b"].scale == pytest.approx(alone, rel=1e-6)
 
 
+def test_a_palm_beside_the_trunk_tells_the_scale_with_no_map_placed():
+    maps = {"torso": "a", "left_upper_arm": "a", "left_palm": "b", "right_palm": "b"}
+    assert not _starts(maps, 0)[0].spanned
+    assert _starts({**maps, "right_palm": "a"}, 0)[0].spanned
+
+
 def test_a_head_in_a_map_of_its_own_tells_no_scale():
     arms = SPLITS["upper arms, palms"]
     bones, mounts, groups, _ = _groups({**arms, "head": "h"}, 0)
