@@ -10,7 +10,7 @@ import numpy as np
 
 from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.camera import Camera
-from bodycap_batch.geometry import invert, make_transform, so3_exp
+from bodycap_batch.geometry import interpolate_pose, invert, make_transform, so3_exp
 from bodycap_batch.registration.batch import Views, make_views, refine_poses
 from bodycap_batch.registration.pose import PoseLimits, judge_poses, sample_pose
 from bodycap_batch.registration.smoothing import CentreFilter, Place, Steadiness
@@ -156,6 +156,11 @@ class Finder:
             best = self._search(view, search)
         return best
 
+    def look_again(self, pyramid: Pyramid, pose: FloatArray, before: FloatArray) -> Fix | None:
+        """The pose of a frame that is nearly known; `pose` and `before` as for `locate`."""
+        view = View(lens=self.lens, pyramid=pyramid, cam_from_map=pose, before=before, exposure=self.exposure)
+        return self._search(view, _SEARCHES[-1])
+
     def _search(self, view: View, search: Search) -> Fix | None:
         rows = choose_rows(self.gallery, view)
         if len(rows) < _MIN_FOUND:
@@ -275,6 +280,35 @@ class March:
             if other is None or fix.inliers * fix.evidence > other.inliers * other.evidence:
                 best[frame] = fix
         return best
+
+    def again(self, fixes: Mapping[int, Fix], places: Mapping[int, Place]) -> dict[int, Fix]:
+        """Look once more from smoothed places, and between two frames of which one was missed.
+
+        Args:
+            fixes: What `run` found.
+            places: Smoothed places of these frames and those around them.
+        """
+        out = {}
+        poses = {frame: fix.with_place(places[frame])[0] for frame, fix in fixes.items()}
+        poses |= {frame: fix.cam_from_map for frame, fix in self.stretch.known.items()}
+        for frame in range(self.stretch.start, self.stretch.stop):
+            before, after = poses.get(frame - 1), poses.get(frame + 1)
+            pyramid = self.stretch.pyramids.get(frame)
+            fix: Fix | None = None
+            if pyramid is None:
+                continue
+            if frame in fixes:
+                other = after if before is None else before
+                fix = self.finder.look_again(pyramid, poses[frame], poses[frame] if other is None else other)
+                fix = max(fixes[frame], fix or fixes[frame], key=lambda each: each.inliers * each.evidence)
+            elif before is not None and after is not None:
+                halfway = invert(interpolate_pose(invert(before), invert(after), 0.5))
+                turn = halfway[:3, :3]
+                prior = make_transform(turn, -turn @ places[frame].centre)
+                fix = self.finder.locate(pyramid, [prior], before, places[frame])
+            if fix is not None and fix.inliers >= _MIN_INLIERS and fix.evidence >= _MIN_EVIDENCE:
+                out[frame] = fix
+        return out
 
     def _warmed_up(self, end: int, direction: int) -> _Walk:
         """A walk that has come through the frames with poses up to an end of the stretch."""

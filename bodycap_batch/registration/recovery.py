@@ -18,7 +18,7 @@ from bodycap_batch.registration.growth import lost_runs
 from bodycap_batch.registration.jumps import lone_poses
 from bodycap_batch.registration.marching import Finder, Fix, March, Stretch
 from bodycap_batch.registration.pose import PoseLimits
-from bodycap_batch.registration.smoothing import Steadiness, smooth_centres
+from bodycap_batch.registration.smoothing import Smoothed, Steadiness, smooth_centres
 from bodycap_batch.registration.templates import Gallery, Pyramid, Search, View, choose_rows, find_points
 from bodycap_batch.scene import FrameStatus, Map, Registration, Trajectory
 from bodycap_batch.tracking import sharpness
@@ -99,19 +99,26 @@ def recover_lost(
             seeds=inside,
             steadiness=steadiness,
         )
-        poses |= _vouched(March(finder, stretch).run(), stretch, limits)
+        poses |= _vouched(March(finder, stretch), limits)
     return replace(found, trajectory=_with_poses(path, poses, limits))
 
 
-def _vouched(fixes: Mapping[int, Fix], stretch: Stretch, limits: PoseLimits) -> dict[int, Fix]:
-    """Smoothed poses of the frames of a stretch that enough speaks for."""
-    if not fixes:
-        return {}
+def _smoothed(fixes: Mapping[int, Fix], stretch: Stretch) -> Smoothed:
+    """Places of a stretch's frames and of those around it."""
     first = max(0, stretch.start - _AROUND)
     frames = np.arange(first, min(len(stretch.times), stretch.stop + _AROUND))
     around = {frame: stretch.known[frame].place for frame in frames.tolist() if frame in stretch.known}
     found = around | {frame: fix.place for frame, fix in fixes.items()}
-    smoothed = smooth_centres(frames, stretch.times[frames], found, around.keys(), stretch.steadiness)
+    return smooth_centres(frames, stretch.times[frames], found, around.keys(), stretch.steadiness)
+
+
+def _vouched(march: March, limits: PoseLimits) -> dict[int, Fix]:
+    """Smoothed poses of the frames of a stretch that enough speaks for."""
+    fixes = march.run()
+    if not fixes:
+        return {}
+    fixes = march.again(fixes, _smoothed(fixes, march.stretch).places)
+    smoothed = _smoothed(fixes, march.stretch)
     out = {}
     for frame, fix in fixes.items():
         pose, covariance = fix.with_place(smoothed.places[frame])

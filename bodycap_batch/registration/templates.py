@@ -15,7 +15,7 @@ from bodycap_batch.registration.tracks import well_spread
 from bodycap_batch.scene import Map
 from bodycap_batch.tracking import GreyImage, pixel_scale
 
-_MAX_POINTS = 200
+_MAX_POINTS = 300
 _CELLS = 8
 _MARGIN_PX = 4.0
 _MIN_COSINE = 0.6
@@ -28,6 +28,8 @@ _BLUR_SAMPLES = 5
 _BLUR_STEP = 3.0
 """Pixels of the level from sample to sample; a longer blur is sampled less densely."""
 _STEP_PX = 4.0
+_MIN_DEPTH = 0.25
+"""Of the median depth: what seems to hang before the lens was triangulated wrongly and would tie the pose."""
 _MIN_CONTRAST = 3.0
 _LEVELS = 3
 
@@ -143,6 +145,7 @@ def choose_rows(gallery: Gallery, view: View) -> IntArray:
     size = np.array([lens.width_px, lens.height_px])
     with np.errstate(invalid="ignore"):
         inside = ((px > _MARGIN_PX) & (px < size - _MARGIN_PX)).all(axis=1) & gallery.usable
+    inside &= x_in_cam[:, 2] > _MIN_DEPTH * np.median(x_in_cam[inside, 2]) if inside.any() else False
     held = np.zeros(len(scene.keyframe_camera), dtype=bool)
     held[list(gallery.pictures)] = True
     rows = np.flatnonzero(inside[scene.obs_point] & held[scene.obs_keyframe])
