@@ -29,7 +29,8 @@ class Projection:
 
     Attributes:
         motion: The rigid motion.
-        gap: JSON values: graph joints against its joints, measured cameras against its cameras.
+        gap: JSON values: graph joints against its joints, the merge's camera paths (measured, or solved with
+            the body: `MergeOptions.camera_paths`) against its cameras.
     """
 
     motion: Motion
