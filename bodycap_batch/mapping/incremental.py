@@ -31,7 +31,7 @@ def grow(
         tick: Called after each keyframe; what it raises ends the run.
 
     Returns:
-        False where the model was empty and the initial pair does not hold.
+        False where the model was empty and there is no initial pair, or it does not hold.
 
     Source: Schönberger, Frahm, "Structure-from-motion revisited", CVPR 2016, as COLMAP has it.
     """
@@ -69,8 +69,10 @@ class _Run:
         self._global = settings.get_global_bundle_adjustment()
 
     def start(self) -> bool:
-        """Begin with the settings' initial pair; False where it does not hold."""
+        """Begin with the settings' initial pair; False where there is none, or it does not hold."""
         pair = (self._settings.init_image_id1, self._settings.init_image_id2)
+        if min(pair) < 0:  # none was chosen
+            return False
         geometry = self._mapper.estimate_initial_two_view_geometry(self._options, *pair)
         if geometry is None:
             return False

@@ -95,7 +95,7 @@ def draw_tile(image: Picture, tile: Tile, shown: Picture | None, frame: int, bod
     if shown is None:
         text, colour = "no picture at this time", GREY
     else:
-        text, colour = _status_line(tile.view, status, points)
+        text, colour = status_line(status, points)
     _frame(image, box, colour)
     base = (tile.bar.x + 2, tile.bar.y + 16)
     image[base[1] - 9 : base[1], base[0] : base[0] + 9] = tile.colour
@@ -121,18 +121,15 @@ def _painted(
     return draw_overlay(shown, view.lens.width_px, points, lines, () if body is None else body.side)
 
 
-def _status_line(
-    view: CameraView | None, status: FrameStatus, points: SeenPoints | None
-) -> tuple[str, Colour]:
-    if not status.localised or points is None or view is None:
+def status_line(status: FrameStatus, points: SeenPoints | None) -> tuple[str, Colour]:
+    """What the line below a frame says of its pose."""
+    if not status.localised or points is None:
         return f"lost: {_REASONS.get(status, status.value)}", RED
-    error = float(points.error_px.mean()) if len(points.error_px) else float("nan")
-    text = f"{len(points.px)} points, {error:.1f} px"
-    if status is FrameStatus.KEYFRAME:
-        text = f"keyframe · {text}"
-    elif status is FrameStatus.RIG:
-        text = f"carried by the rig · {text}"
-    return text, GREEN if len(points.px) else AMBER
+    name = {FrameStatus.KEYFRAME: "keyframe", FrameStatus.RIG: "carried by the rig"}.get(status, "")
+    if not len(points.px):  # what a second look found is not kept point by point
+        return name or "found again", AMBER
+    text = f"{len(points.px)} points, {float(points.error_px.mean()):.1f} px"
+    return f"{name} · {text}" if name else text, GREEN
 
 
 def _frame(image: Picture, box: Box, colour: Colour) -> None:

@@ -116,11 +116,10 @@ def _solve(
 
 def _named(poses: list[FramePose], rig: Rig, own: IntArray, limits: PoseLimits) -> list[FramePose]:
     """Tell keyframes, and frames that the rig's other cameras carry; `own` counts the first one's inliers."""
-    status = {}
-    if len(rig.members) > 1:
-        status = dict.fromkeys(np.flatnonzero(own < limits.min_inliers).tolist(), FrameStatus.RIG)
     rows = rig.scene_map.keyframes_of(rig.members[0].camera.name)
-    status |= dict.fromkeys(rig.scene_map.keyframe_frame[rows].tolist(), FrameStatus.KEYFRAME)
+    status = dict.fromkeys(rig.scene_map.keyframe_frame[rows].tolist(), FrameStatus.KEYFRAME)
+    if len(rig.members) > 1:
+        status |= dict.fromkeys(np.flatnonzero(own < limits.min_inliers).tolist(), FrameStatus.RIG)
     return [
         replace(pose, status=status.get(frame, pose.status))
         if pose.status is FrameStatus.REGISTERED

@@ -148,6 +148,20 @@ def test_a_camera_that_sees_nothing_is_carried_and_says_so() -> None:
     assert np.sqrt((error_m**2).mean()) < 0.004
 
 
+def test_a_keyframe_that_sees_too_little_is_no_less_carried() -> None:
+    scene_map, (first, second) = _rig()
+    kept = (scene_map.obs_keyframe != 1) | (np.cumsum(scene_map.obs_keyframe == 1) <= 5)
+    poor = replace(
+        scene_map,
+        **{
+            name: getattr(scene_map, name)[kept]
+            for name in ("obs_keyframe", "obs_point", "obs_feature", "obs_px")
+        },
+    )
+    found = _solved(poor, first, second).trajectory
+    assert found.status[KEYFRAMES[1]] is FrameStatus.RIG
+
+
 def test_both_cameras_of_a_rig_get_poses_that_fit_together() -> None:
     scene_map, (first, second) = _rig()
     one = _solved(scene_map, first, second).trajectory.gauge_from_cam

@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 
 from bodycap_batch.formats.mp4 import planes_of
+from bodycap_batch.overlay import SeenPoints
 from bodycap_batch.preview import room
 from bodycap_batch.preview.layout import HEIGHT, ROOM_WIDTH, WIDTH, Box, place_videos
 from bodycap_batch.preview.room import Cloud
+from bodycap_batch.preview.tiles import status_line
 from bodycap_batch.preview.timeline import MAX_FRAMES, make_timeline
 from bodycap_batch.preview.viewpoint import Viewpoint, follow
+from bodycap_batch.scene import FrameStatus
 
 SECOND = 1_000_000_000
 
@@ -179,3 +182,21 @@ def test_pictures_get_the_colours_that_ffmpeg_would_give_them() -> None:
     # Chroma is rounded twice, and at the borders of a block it is mixed by another filter.
     blocks = off[96:].reshape(2, 6, 8, 8, 8)[:, :, 2:6, :, 2:6]
     assert blocks.max() <= 2
+
+
+@pytest.mark.parametrize(
+    ("status", "points", "says"),
+    [
+        (FrameStatus.REGISTERED, 3, "3 points, 0.5 px"),
+        (FrameStatus.KEYFRAME, 3, "keyframe · 3 points, 0.5 px"),
+        (FrameStatus.RIG, 3, "carried by the rig · 3 points, 0.5 px"),
+        (FrameStatus.RIG, 0, "carried by the rig"),
+        (FrameStatus.REGISTERED, 0, "found again"),
+    ],
+)
+def test_a_frame_says_what_its_pose_rests_on(status: FrameStatus, points: int, says: str) -> None:
+    px = np.zeros((points, 2))
+    seen = SeenPoints(
+        point=np.arange(points), px=px, observed_px=px, depth=np.ones(points), error_px=np.full(points, 0.5)
+    )
+    assert status_line(status, seen)[0] == says

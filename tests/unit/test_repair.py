@@ -136,6 +136,13 @@ def test_a_map_that_stands_is_adjusted_once_more(
     assert len(set(sizes)) == len(sizes)
 
 
+def test_an_empty_map_without_a_pair_to_begin_with_is_no_bug(tmp_path: Path) -> None:
+    with pycolmap.Database.open(str(tmp_path / DATABASE_NAME)):
+        pass
+    settings = mapper_options(MapOptions(), [], 1.0)
+    assert not grow(tmp_path, settings, pycolmap.Reconstruction(), lambda: None)
+
+
 def test_long_tracks_are_settled_by_conjugate_gradients_to_the_same_map(
     built: tuple[Any, FloatArray, Workshop, set[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
