@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,9 @@ from bodycap_batch.mapping.database import DATABASE_NAME
 
 if TYPE_CHECKING:
     import pycolmap
+
+_INIT_RELAXATIONS = 2
+"""How often COLMAP eases its demands on the initial pair before it gives up."""
 
 
 def grow(
@@ -54,6 +58,17 @@ def grow(
     return True
 
 
+def _eased(options: Any) -> Iterator[Any]:
+    """Demands on the initial pair, eased as COLMAP does: half the inliers, then half the angle, twice."""
+    eased = copy.deepcopy(options)
+    yield eased
+    for _ in range(_INIT_RELAXATIONS):
+        eased.init_min_num_inliers //= 2
+        yield eased
+        eased.init_min_tri_angle /= 2
+        yield eased
+
+
 class _Run:
     """One model's growth."""
 
@@ -73,12 +88,15 @@ class _Run:
         pair = (self._settings.init_image_id1, self._settings.init_image_id2)
         if min(pair) < 0:  # none was chosen
             return False
-        geometry = self._mapper.estimate_initial_two_view_geometry(self._options, *pair)
-        if geometry is None:
+        for options in _eased(self._options):
+            geometry = self._mapper.estimate_initial_two_view_geometry(options, *pair)
+            if geometry is not None:
+                break
+        else:
             return False
-        self._mapper.register_initial_image_pair(self._options, *pair, geometry)
+        self._mapper.register_initial_image_pair(options, *pair, geometry)
         first = self._settings.get_triangulation()
-        first.min_angle = self._options.init_min_tri_angle
+        first.min_angle = options.init_min_tri_angle
         for image_id in pair:
             self._triangulate(first, image_id)
         self._mapper.adjust_global_bundle(self._options, self._global)
