@@ -30,8 +30,9 @@ _MIN_POSED = 20
 _MAX_PICTURES = 600
 """Keyframes held in memory, half a megabyte each."""
 _AROUND = 8
-_REACH = 90
-"""Frames of a lost stretch from its ends or a seed that are looked at; bounds memory."""
+_REACH, _MAX_HELD = 90, 400
+"""Frames of a lost stretch from its ends or a seed that are looked at, and how many of them all in all: the
+nearest; bounds memory."""
 _EXPOSURES = (0.0, 0.3, 0.6)
 _EXPOSURE_FRAMES = 4
 _EXPOSURE_SEARCH = Search(level=1, side=21, radius=4, score=-1.0, limit_px=6.0)
@@ -214,7 +215,9 @@ def _pictures(camera: CaptureCamera, start: int, stop: int, seeds: list[int]) ->
     """Frames of a lost stretch near its ends or a seed, and those on either side of it."""
     frames = np.arange(max(0, start - 1), min(len(camera.times_ns), stop + 1))
     near = np.array([start, stop - 1, *seeds])
-    frames = frames[np.abs(frames[:, None] - near).min(axis=1) <= _REACH]
+    away = np.abs(frames[:, None] - near).min(axis=1)
+    nearest = np.argsort(away, kind="stable")[:_MAX_HELD]
+    frames = frames[np.sort(nearest[away[nearest] <= _REACH])]
     return {frame: Pyramid.of(grey) for frame, grey in camera.read(frames)}
 
 

@@ -128,43 +128,97 @@ def smooth_centres(
     """
     at = {frame: index for index, frame in enumerate(frames.tolist())}
     bends, sigma = _bends(times, steadiness.bend)
-    count = len(frames)
+    windows = np.arange(len(bends))[:, None] + np.arange(_NEIGHBOURS + 1)
     worth, bend_worth = dict.fromkeys(found, 1.0), np.ones(len(bends))
-    centres, covariance = np.zeros((count, 3)), np.zeros((3 * count, 3 * count))
+    centres, covariance = np.zeros((len(frames), 3)), np.zeros((len(frames), 3, 3))
     disagreement: dict[int, float] = {}
     for _ in range(_ROUNDS):
-        information = np.kron((bends * (bend_worth / sigma**2)[:, None]).T @ bends, np.eye(3))
-        pull = np.zeros(3 * count)
+        known, pull = np.zeros((len(frames), 3, 3)), np.zeros((len(frames), 3))
         for frame, place in found.items():
-            rows = slice(3 * at[frame], 3 * at[frame] + 3)
             share = worth[frame] * np.linalg.inv(place.covariance)
-            information[rows, rows] += share
-            pull[rows] += share @ place.centre
-        information += np.eye(3 * count) * (_PRIOR * np.trace(information) / (3 * count))
-        covariance = np.linalg.inv(information)
-        centres = (covariance @ pull).reshape(count, 3)
+            known[at[frame]] += share
+            pull[at[frame]] += share @ place.centre
+        centres, covariance = _solved(bends, bend_worth / sigma**2, known, pull)
         for frame, place in found.items():
             off = place.centre - centres[at[frame]]
             disagreement[frame] = float(off @ np.linalg.solve(place.covariance, off))
             if frame not in trusted:
                 worth[frame] = 1.0 / (1.0 + disagreement[frame] / _LOSS_WIDTH)
-        bend_worth = 1.0 / (1.0 + ((bends @ centres) ** 2).mean(axis=1) / sigma**2 / _LOSS_WIDTH)
-    blocks = {frame: covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for frame, i in at.items()}
-    places = {frame: Place(centres[i], blocks[frame]) for frame, i in at.items()}
+        bent = np.einsum("nj,njc->nc", bends, centres[windows])
+        bend_worth = 1.0 / (1.0 + (bent**2).mean(axis=1) / sigma**2 / _LOSS_WIDTH)
+    places = {frame: Place(centres[i], covariance[i]) for frame, i in at.items()}
     return Smoothed(places, disagreement)
 
 
+def _solved(
+    bends: FloatArray, weight: FloatArray, known: FloatArray, pull: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Centres (N,3) and their covariances (N,3,3) of the least squares that bends and places make.
+
+    A bend ties five frames together, so that groups of four are tied to the next group only: the time and
+    memory grow with the number of frames, not with its powers.
+
+    Args:
+        bends: (N−4,5) as `_bends` gives them.
+        weight: (N−4,) their information.
+        known: (N,3,3) information of the places.
+        pull: (N,3) the same times the places.
+
+    Source: block elimination, and its way back for the blocks of the inverse, as in Rauch, Tung, Striebel,
+        "Maximum likelihood estimates of linear dynamic systems", AIAA Journal 1965.
+    """
+    count, size = len(known), 3 * _NEIGHBOURS
+    groups = -(-count // _NEIGHBOURS)
+    own, ahead = _blocks(bends, weight, groups)
+    own = np.kron(own, np.eye(3))
+    ahead = np.kron(ahead, np.eye(3))
+    for index in range(count):
+        group, rows = index // _NEIGHBOURS, index % _NEIGHBOURS * 3
+        own[group, rows : rows + 3, rows : rows + 3] += known[index]
+    own += np.eye(size) * (_PRIOR * np.trace(own, axis1=1, axis2=2).sum() / (3 * count))
+    towards = np.zeros((groups, size))
+    towards.reshape(-1, 3)[:count] = pull
+    for group in range(1, groups):
+        back = np.linalg.solve(own[group - 1], ahead[group - 1]).T
+        own[group] -= back @ ahead[group - 1]
+        towards[group] -= back @ towards[group - 1]
+    covariance = np.linalg.inv(own)
+    centres = np.einsum("gij,gj->gi", covariance, towards)
+    for group in range(groups - 2, -1, -1):
+        follows = covariance[group] @ ahead[group]
+        centres[group] -= follows @ centres[group + 1]
+        covariance[group] += follows @ covariance[group + 1] @ follows.T
+    blocks = covariance.reshape(groups, _NEIGHBOURS, 3, _NEIGHBOURS, 3)
+    diagonal = np.einsum("gaiaj->gaij", blocks).reshape(-1, 3, 3)
+    return centres.reshape(-1, 3)[:count], diagonal[:count]
+
+
+def _blocks(bends: FloatArray, weight: FloatArray, groups: int) -> tuple[FloatArray, FloatArray]:
+    """(G,4,4) information that bends are about groups of four frames, and (G,4,4) with the group after."""
+    both = np.zeros((groups + 1, 2 * _NEIGHBOURS, 2 * _NEIGHBOURS))
+    for number, row in enumerate(bends):
+        group, first = divmod(number, _NEIGHBOURS)
+        rows = slice(first, first + _NEIGHBOURS + 1)
+        both[group, rows, rows] += weight[number] * np.outer(row, row)
+    own = both[:-1, :_NEIGHBOURS, :_NEIGHBOURS].copy()
+    own[1:] += both[: groups - 1, _NEIGHBOURS:, _NEIGHBOURS:]
+    return own, both[:-1, :_NEIGHBOURS, _NEIGHBOURS:]
+
+
 def _bends(times: FloatArray, bend: float) -> tuple[FloatArray, FloatArray]:
-    """Rows (N−4,N) that give each centre's distance from the cubic through its neighbours, and its sigma."""
+    """Rows (N−4,5) that give a centre's distance from the cubic through its neighbours, and its sigma.
+
+    Row n is about frames n to n+4.
+    """
     count = max(0, len(times) - _NEIGHBOURS)
-    rows, sigma = np.zeros((count, len(times))), np.full(count, bend)
+    rows, sigma = np.zeros((count, _NEIGHBOURS + 1)), np.full(count, bend)
+    others = (0, 1, 3, 4)
     for number in range(count):
-        window = np.arange(number, number + _NEIGHBOURS + 1)
-        middle, others = window[2], np.delete(window, 2)
-        rows[number, middle] = 1.0
-        for index in others.tolist():
-            rest = others[others != index]
-            rows[number, index] = -np.prod((times[middle] - times[rest]) / (times[index] - times[rest]))
+        window = times[number : number + _NEIGHBOURS + 1]
+        rows[number, 2] = 1.0
+        for index in others:
+            rest = window[[each for each in others if each != index]]
+            rows[number, index] = -np.prod((window[2] - rest) / (window[index] - rest))
         # What a cubic misses grows with the third power of the time it spans.
-        sigma[number] *= ((times[window[-1]] - times[window[0]]) / _NEIGHBOURS) ** 3
+        sigma[number] *= ((window[-1] - window[0]) / _NEIGHBOURS) ** 3
     return rows, sigma

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from bodycap_batch.camera import Camera
-from bodycap_batch.capture import Capture
+from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.geometry import invert, make_transform, so3_exp, transform_points
-from bodycap_batch.registration import recover_lost
+from bodycap_batch.registration import recover_lost, recovery
 from bodycap_batch.scene import FrameStatus, Map, Registration, Trajectory
 from bodycap_batch.tracking import detect_corners
 from tests.rooms import HALF_M, LENS, Room
@@ -180,6 +180,13 @@ def test_frames_that_show_no_part_of_the_map_stay_lost(
     path = _recovered(_map(pictures), shown, context)
     assert not path.localised[list(LOST)].any()
     assert all(path.status[frame] is FrameStatus.FEW_TRACKS for frame in LOST)
+
+
+def test_of_a_long_stretch_only_so_many_pictures_are_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recovery, "_MAX_HELD", 12)
+    video = cast(CaptureCamera, _Video([np.zeros((240, 320), np.uint8)] * COUNT))
+    held = sorted(recovery._pictures(video, 4, 40, [20]))
+    assert held == [3, 4, 5, 6, 18, 19, 20, 21, 22, 38, 39, 40]
 
 
 def test_points_on_one_small_thing_are_no_pose(pictures: list[np.ndarray], context: StageContext) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 
 from bodycap_batch.registration.smoothing import CentreFilter, Place, Steadiness, smooth_centres
@@ -44,6 +46,19 @@ def test_what_lies_far_from_all_places_is_hardly_known() -> None:
     sigma = [float(np.sqrt(np.trace(smoothed.places[frame].covariance))) for frame in (9, 11, 15, 25)]
     assert sigma == sorted(sigma)
     assert sigma[2] > 5.0 * sigma[0]
+
+
+def test_a_long_stretch_costs_memory_in_proportion_to_its_length() -> None:
+    frames = np.arange(1500)
+    ends = [*range(8), *range(1492, 1500)]
+    found = {frame: Place(np.array([0.01 * frame, 0.0, 0.0]), np.eye(3) * 1e-4) for frame in ends}
+    tracemalloc.start()
+    smoothed = smooth_centres(frames, frames.astype(np.float64), found, found.keys(), STEADY)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # Some 144 numbers for every four frames, a few times over; a square of all of them would take 160 MB.
+    assert peak < 12e6
+    np.testing.assert_allclose(smoothed.places[4].centre, found[4].centre, atol=1e-3)
 
 
 def test_uneven_times_bend_no_even_path() -> None:
