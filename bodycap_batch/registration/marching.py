@@ -109,6 +109,19 @@ def together(first: Place, second: Place) -> tuple[Place, float]:
     return Place(centre, first.covariance @ total @ second.covariance), float(off @ total @ off)
 
 
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """A frame as it is searched.
+
+    Attributes:
+        pyramid: Its picture.
+        row: Its own among the map's keyframes, -1 where it is none.
+    """
+
+    pyramid: Pyramid
+    row: int
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finder:
     """Finds poses of a camera's frames near where they are expected.
@@ -125,23 +138,18 @@ class Finder:
     limits: PoseLimits
     exposure: float
 
-    def locate(
-        self, pyramid: Pyramid, priors: list[FloatArray], before: FloatArray, place: Place
-    ) -> Fix | None:
+    def locate(self, seen: Seen, priors: list[FloatArray], before: FloatArray, place: Place) -> Fix | None:
         """The pose of a frame.
 
         Args:
-            pyramid: Its picture.
+            seen: The frame.
             priors: Poses cam_from_map (4,4) it may have, the likeliest first.
             before: (4,4) pose a frame earlier.
             place: Where its motion leads to.
         """
         best: Fix | None = None
         for prior in priors:
-            view = View(
-                lens=self.lens, pyramid=pyramid, cam_from_map=prior, before=before, exposure=self.exposure
-            )
-            fix = self._search(view, _SEARCHES[0])
+            fix = self._search(self._view(seen, prior, before), _SEARCHES[0])
             if fix is not None and (best is None or fix.inliers > best.inliers):
                 best = fix
             if best is not None and best.inliers >= _SURE_INLIERS and best.evidence >= _SURE_EVIDENCE:
@@ -150,16 +158,22 @@ class Finder:
             if best is None:
                 return None
             pose, _ = best.with_place(together(best.place, place)[0])
-            view = View(
-                lens=self.lens, pyramid=pyramid, cam_from_map=pose, before=before, exposure=self.exposure
-            )
-            best = self._search(view, search)
+            best = self._search(self._view(seen, pose, before), search)
         return best
 
-    def look_again(self, pyramid: Pyramid, pose: FloatArray, before: FloatArray) -> Fix | None:
+    def look_again(self, seen: Seen, pose: FloatArray, before: FloatArray) -> Fix | None:
         """The pose of a frame that is nearly known; `pose` and `before` as for `locate`."""
-        view = View(lens=self.lens, pyramid=pyramid, cam_from_map=pose, before=before, exposure=self.exposure)
-        return self._search(view, _SEARCHES[-1])
+        return self._search(self._view(seen, pose, before), _SEARCHES[-1])
+
+    def _view(self, seen: Seen, pose: FloatArray, before: FloatArray) -> View:
+        return View(
+            lens=self.lens,
+            pyramid=seen.pyramid,
+            cam_from_map=pose,
+            before=before,
+            exposure=self.exposure,
+            row=seen.row,
+        )
 
     def _search(self, view: View, search: Search) -> Fix | None:
         rows = choose_rows(self.gallery, view)
@@ -220,6 +234,7 @@ class Stretch:
         pyramids: Pictures by frame, of the frames on either side too.
         known: Poses around it, by frame.
         seeds: Poses cam_from_map (4,4) within it that are not believed.
+        rows: Their rows in the map, by frame.
         steadiness: How evenly the camera moves.
     """
 
@@ -229,7 +244,12 @@ class Stretch:
     pyramids: Mapping[int, Pyramid]
     known: Mapping[int, Fix]
     seeds: Mapping[int, FloatArray]
+    rows: Mapping[int, int]
     steadiness: Steadiness
+
+    def seen(self, frame: int) -> Seen:
+        """A frame of which the picture is held."""
+        return Seen(self.pyramids[frame], self.rows.get(frame, -1))
 
 
 @dataclass(slots=True)
@@ -267,7 +287,7 @@ class March:
                 continue
             spread = np.eye(3) * (_SEED_SPREAD * stretch.steadiness.jerk) ** 2
             expected = Place(invert(prior)[:3, 3], spread)
-            fix = self.finder.locate(stretch.pyramids[frame], [prior], prior, expected)
+            fix = self.finder.locate(stretch.seen(frame), [prior], prior, expected)
             if fix is None or fix.inliers < _SEED_INLIERS or fix.evidence < _SEED_EVIDENCE:
                 continue
             for direction in (1, -1):
@@ -293,19 +313,19 @@ class March:
         poses |= {frame: fix.cam_from_map for frame, fix in self.stretch.known.items()}
         for frame in range(self.stretch.start, self.stretch.stop):
             before, after = poses.get(frame - 1), poses.get(frame + 1)
-            pyramid = self.stretch.pyramids.get(frame)
             fix: Fix | None = None
-            if pyramid is None:
+            if frame not in self.stretch.pyramids:
                 continue
+            seen = self.stretch.seen(frame)
             if frame in fixes:
                 other = after if before is None else before
-                fix = self.finder.look_again(pyramid, poses[frame], poses[frame] if other is None else other)
+                fix = self.finder.look_again(seen, poses[frame], poses[frame] if other is None else other)
                 fix = max(fixes[frame], fix or fixes[frame], key=lambda each: each.inliers * each.evidence)
             elif before is not None and after is not None:
                 halfway = invert(interpolate_pose(invert(before), invert(after), 0.5))
                 turn = halfway[:3, :3]
                 prior = make_transform(turn, -turn @ places[frame].centre)
-                fix = self.finder.locate(pyramid, [prior], before, places[frame])
+                fix = self.finder.locate(seen, [prior], before, places[frame])
             if fix is not None and fix.inliers >= _MIN_INLIERS and fix.evidence >= _MIN_EVIDENCE:
                 out[frame] = fix
         return out
@@ -333,7 +353,7 @@ class March:
                 return
             place = walk.path.predict(abs(stretch.times[frame] - stretch.times[walk.frame]))
             priors = [make_transform(turn, -turn @ place.centre) for turn in self._turns(walk, frame)]
-            fix = self.finder.locate(stretch.pyramids[frame], priors, walk.pose, place)
+            fix = self.finder.locate(stretch.seen(frame), priors, walk.pose, place)
             walk.frame = frame
             good = fix is not None and fix.inliers >= _MIN_INLIERS and fix.evidence >= _MIN_EVIDENCE
             both, distance = (place, np.inf) if fix is None else together(fix.place, place)

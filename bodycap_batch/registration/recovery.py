@@ -90,14 +90,15 @@ def recover_lost(
     for start, stop in lost_runs(~lost):
         context.check_cancelled()
         context.progress(start, len(lost), "lost frames looked at")
-        inside = {frame: pose for frame, pose in seeds.items() if start <= frame < stop}
+        inside = {frame: row for frame, row in seeds.items() if start <= frame < stop}
         stretch = Stretch(
             start=start,
             stop=stop,
             times=times,
             pyramids=_pictures(camera, start, stop, sorted(inside)),
             known=known,
-            seeds=inside,
+            seeds={frame: invert(scene_map.map_from_cam[row]) for frame, row in inside.items()},
+            rows=inside,
             steadiness=steadiness,
         )
         poses |= _vouched(March(finder, stretch), limits)
@@ -180,15 +181,11 @@ def _known(path: Trajectory) -> dict[int, Fix]:
     }
 
 
-def _seeds(scene_map: Map, camera: str, lost: BoolArray) -> dict[int, FloatArray]:
-    """Poses cam_from_map of the map's keyframes among the lost frames."""
+def _seeds(scene_map: Map, camera: str, lost: BoolArray) -> dict[int, int]:
+    """Rows of the map's keyframes among a camera's lost frames, by frame."""
     rows = scene_map.keyframes_of(camera)
     frames = scene_map.keyframe_frame[rows]
-    return {
-        int(frame): invert(scene_map.map_from_cam[row])
-        for row, frame in zip(rows, frames, strict=True)
-        if lost[frame]
-    }
+    return {int(frame): int(row) for row, frame in zip(rows, frames, strict=True) if lost[frame]}
 
 
 def _gallery(scene_map: Map, capture: Capture, camera: CaptureCamera, context: StageContext) -> Gallery:

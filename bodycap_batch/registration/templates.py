@@ -94,6 +94,8 @@ class View:
         cam_from_map: (4,4) its pose.
         before: (4,4) the same a frame earlier; the other way about blurs alike.
         exposure: Share of the time between two frames that the shutter is open.
+        row: Of the frame itself among the map's keyframes, -1 where it is none: its own look is found in it
+            wherever the map puts it.
     """
 
     lens: Camera
@@ -101,6 +103,7 @@ class View:
     cam_from_map: FloatArray
     before: FloatArray
     exposure: float
+    row: int = -1
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +150,7 @@ def choose_rows(gallery: Gallery, view: View) -> IntArray:
         inside = ((px > _MARGIN_PX) & (px < size - _MARGIN_PX)).all(axis=1) & gallery.usable
     inside &= x_in_cam[:, 2] > _MIN_DEPTH * np.median(x_in_cam[inside, 2]) if inside.any() else False
     held = np.zeros(len(scene.keyframe_camera), dtype=bool)
-    held[list(gallery.pictures)] = True
+    held[[row for row in gallery.pictures if row != view.row]] = True
     rows = np.flatnonzero(inside[scene.obs_point] & held[scene.obs_keyframe])
     point, keyframe = scene.obs_point[rows], scene.obs_keyframe[rows]
     here = scene.points[point] - invert(view.cam_from_map)[:3, 3]

@@ -189,6 +189,45 @@ def test_of_a_long_stretch_only_so_many_pictures_are_held(monkeypatch: pytest.Mo
     assert held == [3, 4, 5, 6, 18, 19, 20, 21, 22, 38, 39, 40]
 
 
+def test_a_keyframe_in_the_wrong_place_does_not_confirm_itself(
+    monkeypatch: pytest.MonkeyPatch, context: StageContext
+) -> None:
+    """Far from both ends, amid black frames, one keyframe and the points of its own stand 60 cm off."""
+    frames, middle, wrong = np.arange(90), 45, np.array([0.6, 0.0, 0.0])
+    swaying = 0.02 * np.sin(np.column_stack([frames / 2.4, frames / 2.1 + 1.0, frames / 1.9 + 1.5]))
+    centres = np.column_stack([0.01 * frames, 0.2 * np.sin(frames / 14.0), 0.005 * frames]) + swaying
+    path = make_transform(so3_exp(np.radians(2.0) * np.outer(frames, [0.1, 1.0, 0.0])), centres)
+    for name, value in {"COUNT": 90, "LOST": range(20, 70), "PATH": path}.items():
+        monkeypatch.setitem(globals(), name, value)
+    pictures = [
+        np.zeros((240, 320), np.uint8)
+        if frame in LOST and abs(frame - middle) > 4
+        else ROOM.view(CAMERA, pose)
+        for frame, pose in enumerate(path)
+    ]
+    scene = _map(pictures)
+    corners = detect_corners(pictures[middle], 120, 8.0).astype(float)
+    rows = np.arange(len(corners)) + len(scene.points)
+    scene = replace(
+        scene,
+        keyframe_camera=(*scene.keyframe_camera, "torso"),
+        keyframe_frame=np.append(scene.keyframe_frame, middle),
+        map_from_cam=np.concatenate(
+            [scene.map_from_cam, (make_transform(np.eye(3), wrong) @ path[middle])[None]]
+        ),
+        points=np.vstack([scene.points, _hits(corners, path[middle]) + wrong]),
+        colors=np.zeros((len(scene.points) + len(rows), 3), np.uint8),
+        point_error_px=np.zeros(len(scene.points) + len(rows)),
+        obs_keyframe=np.append(scene.obs_keyframe, np.full(len(rows), len(scene.keyframe_camera))),
+        obs_point=np.append(scene.obs_point, rows),
+        obs_feature=np.append(scene.obs_feature, rows),
+        obs_px=np.vstack([scene.obs_px, corners]),
+    )
+    found = _recovered(scene, pictures, context)
+    off_m = np.linalg.norm(found.gauge_from_cam[:, :3, 3] - path[:, :3, 3], axis=1)[list(LOST)]
+    assert not (off_m[np.isfinite(off_m)] > 0.1).any()
+
+
 def test_points_on_one_small_thing_are_no_pose(pictures: list[np.ndarray], context: StageContext) -> None:
     scene = _map(pictures)
     middle = _hits(np.array([[160.0, 120.0]]), PATH[21])[0]
