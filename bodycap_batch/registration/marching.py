@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray, IntArray
+from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.camera import Camera
 from bodycap_batch.geometry import interpolate_pose, invert, make_transform, so3_exp
 from bodycap_batch.registration.batch import Views, make_views, refine_poses
@@ -131,12 +131,14 @@ class Finder:
         gallery: The map and what its points look like.
         limits: What makes a pose acceptable.
         exposure: Share of the time between two frames that the shutter is open.
+        sees_room: Which pixels (N,2) of the camera show the room, as its mask says.
     """
 
     lens: Camera
     gallery: Gallery
     limits: PoseLimits
     exposure: float
+    sees_room: Callable[[FloatArray], BoolArray]
 
     def locate(self, seen: Seen, priors: list[FloatArray], before: FloatArray, place: Place) -> Fix | None:
         """The pose of a frame.
@@ -180,6 +182,7 @@ class Finder:
         if len(rows) < _MIN_FOUND:
             return None
         found = find_points(self.gallery, view, rows, search)
+        found = found.chosen(self.sees_room(found.px))
         return self._solve(view, found, search) if len(found.point) >= _MIN_FOUND else None
 
     def _solve(self, view: View, found: Found, search: Search) -> Fix | None:

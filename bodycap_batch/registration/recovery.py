@@ -83,7 +83,9 @@ def recover_lost(
         max_error_px=1.0, min_inliers=options.min_inliers, max_sigma_depth=options.max_sigma_depth
     )
     exposure = _exposure(camera, lens, path, gallery)
-    finder = Finder(lens=lens, gallery=gallery, limits=limits, exposure=exposure)
+    finder = Finder(
+        lens=lens, gallery=gallery, limits=limits, exposure=exposure, sees_room=camera.sees_room
+    )
     seeds = _seeds(scene_map, camera.name, lost)
     known = _known(path)
     poses: dict[int, Fix] = {}

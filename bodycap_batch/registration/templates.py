@@ -139,6 +139,10 @@ class Found:
     px: FloatArray
     score: FloatArray
 
+    def chosen(self, which: BoolArray) -> Found:
+        """Some of them."""
+        return Found(self.point[which], self.px[which], self.score[which])
+
 
 def choose_rows(gallery: Gallery, view: View) -> IntArray:
     """Rows of the map's observations to take points' looks from: one for each of some well spread points."""

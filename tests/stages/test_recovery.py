@@ -48,11 +48,15 @@ class _Video:
 
     pictures: list[np.ndarray]
     name: str = "torso"
-    mask: None = None
+    mask: np.ndarray | None = None
 
     @property
     def times_ns(self) -> np.ndarray:
         return np.arange(COUNT, dtype=np.int64) * 33_333_333
+
+    def sees_room(self, px: np.ndarray) -> np.ndarray:
+        column, row = np.clip(px.astype(int), 0, (319, 239)).T
+        return np.ones(len(px), dtype=bool) if self.mask is None else self.mask[row, column]
 
     def read(self, indices: object) -> Iterator[tuple[int, np.ndarray]]:
         for index in np.asarray(indices).tolist():
@@ -136,8 +140,10 @@ def _tracked() -> Registration:
     )
 
 
-def _recovered(scene: Map, pictures: list[np.ndarray], context: StageContext) -> Trajectory:
-    capture = cast(Capture, _Capture(_Video(pictures)))
+def _recovered(
+    scene: Map, pictures: list[np.ndarray], context: StageContext, mask: np.ndarray | None = None
+) -> Trajectory:
+    capture = cast(Capture, _Capture(_Video(pictures, mask=mask)))
     return recover_lost(_tracked(), scene, capture, RegistrationOptions(), context).trajectory
 
 
@@ -180,6 +186,13 @@ def test_frames_that_show_no_part_of_the_map_stay_lost(
     path = _recovered(_map(pictures), shown, context)
     assert not path.localised[list(LOST)].any()
     assert all(path.status[frame] is FrameStatus.FEW_TRACKS for frame in LOST)
+
+
+def test_what_the_mask_hides_is_no_room(pictures: list[np.ndarray], context: StageContext) -> None:
+    mask = np.ones((240, 320), dtype=bool)
+    mask[10:, :] = False
+    path = _recovered(_map(pictures), pictures, context, mask)
+    assert not path.localised[list(LOST)].any()
 
 
 def test_of_a_long_stretch_only_so_many_pictures_are_held(monkeypatch: pytest.MonkeyPatch) -> None:
