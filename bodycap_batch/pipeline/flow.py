@@ -27,6 +27,7 @@ from bodycap_batch.pipeline.inputs import (
     one_camera,
 )
 from bodycap_batch.pipeline.made import Made, report_task
+from bodycap_batch.pipeline.recovery import recovery_tasks
 from bodycap_batch.pipeline.rigs import rig_tasks, segments_of
 from bodycap_batch.pipeline.settings import Settings, StageRecord
 from bodycap_batch.progress import Event
@@ -196,6 +197,11 @@ class Flow:
             self._tell_notes(artefact, "registration")
         return {**registrations, **found}
 
+    def recover(self, scene: Artefact, registrations: ByCamera, keyframes: ByCamera) -> ByCamera:
+        """Cameras that lost frames: these once more, by what the map's points look like."""
+        tasks = recovery_tasks(self._job, self._digests, scene, keyframes, registrations)
+        return {**registrations, **self._all(tasks)}
+
     def merge(self, scene: Artefact, registrations: ByCamera) -> Artefact:
         """The skeleton's motion, in the world."""
         options = self._job.merge.model_dump(mode="json")
@@ -324,7 +330,6 @@ class Flow:
             "capture": one_camera(self._job.capture, camera),
             "map": str(scene.path),
             "selection": str(keyframes[name].path),
-            "cameras": all_cameras(self._job.capture),
             "previous": None if before is None else str(before.path),
         }
         # How often the map may grow decides which rounds are run, not what one of them gives.

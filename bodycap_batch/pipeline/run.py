@@ -101,7 +101,8 @@ def run_stages(job: Job, flow: Flow, made: Made) -> Iterator[str]:
     made.registrations = found = flow.registrations(scene, made.keyframes)
     scene, found = flow.grow(scene, found, made.keyframes)
     made.scene, found = flow.refine(scene, found, made.keyframes)
-    made.registrations = flow.solve_rigs(made.scene, found, made.keyframes)
+    found = flow.solve_rigs(made.scene, found, made.keyframes)
+    made.registrations = flow.recover(made.scene, found, made.keyframes)
     yield "registration"
     made.stage = "merge"
     made.merged, made.failure = _merge(job, flow, made.scene, made.registrations)

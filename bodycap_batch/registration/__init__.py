@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.registration.growth import wanted_keyframes
 from bodycap_batch.registration.pose import FramePose, PoseLimits
-from bodycap_batch.registration.recovery import LEAST_LOST, recover_lost
+from bodycap_batch.registration.recovery import recover_lost
 from bodycap_batch.registration.rigs import RigCamera, first_poses, members_of, relative_poses
 from bodycap_batch.registration.seams import misplaced, without_keyframes
 from bodycap_batch.registration.solving import matrices, solve_frames, solve_rig
@@ -22,7 +22,7 @@ from bodycap_batch.registration.tracks import Tracks, anchors_of, track_scale
 from bodycap_batch.rig import RelativePose
 from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 
-__all__ = ["LEAST_LOST", "RigCamera", "recover_lost", "register_frames", "register_in_rig"]
+__all__ = ["RigCamera", "recover_lost", "register_frames", "register_in_rig", "without_contradicted"]
 
 _MAP_NOISE_PX = 0.6
 _THRESHOLD_SIGMAS = 3.5
@@ -113,6 +113,25 @@ def register_in_rig(
     poses = solve_rig(members, scene_map, first_poses(own, others, members), limits)
     trajectory = _trajectory(own.camera, scene_map.gauge, poses, selection.sharpness)
     return replace(own.found, trajectory=trajectory), relative
+
+
+def without_contradicted(
+    scene_map: Map, cameras: Iterable[RigCamera], selection: KeyframeSelection, options: RegistrationOptions
+) -> Map:
+    """The map without keyframes that the video of one of its cameras contradicts.
+
+    Args:
+        scene_map: The map.
+        cameras: With their registrations; those against another map are passed over.
+        selection: Keyframes of one of them; the noise of tracks is read from it.
+        options: Limits.
+    """
+    wrong: list[IntArray] = []
+    for each in cameras:
+        if each.found.trajectory.gauge == scene_map.gauge:
+            limits = _limits(each.camera, selection, options)
+            wrong.append(misplaced(each.camera.name, scene_map, each.tracks, limits))
+    return without_keyframes(scene_map, np.concatenate([np.zeros(0, np.int64), *wrong]))
 
 
 def _without_misplaced(

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.arrays import BoolArray, IntArray
 from bodycap_batch.camera import Camera
 from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.config import RegistrationOptions
@@ -23,8 +23,6 @@ from bodycap_batch.registration.templates import Gallery, Pyramid, Search, View,
 from bodycap_batch.scene import FrameStatus, Map, Registration, Trajectory
 from bodycap_batch.tracking import sharpness
 
-LEAST_LOST = 3
-"""Fewer lost frames are not worth decoding the keyframes of all cameras again."""
 _MIN_POSED = 20
 """Frames with poses below which nobody knows how the camera moves."""
 _MAX_PICTURES = 600
@@ -83,9 +81,7 @@ def recover_lost(
         max_error_px=1.0, min_inliers=options.min_inliers, max_sigma_depth=options.max_sigma_depth
     )
     exposure = _exposure(camera, lens, path, gallery)
-    finder = Finder(
-        lens=lens, gallery=gallery, limits=limits, exposure=exposure, sees_room=camera.sees_room
-    )
+    finder = Finder(lens=lens, gallery=gallery, limits=limits, exposure=exposure, sees_room=camera.sees_room)
     seeds = _seeds(scene_map, camera.name, lost)
     known = _known(path)
     poses: dict[int, Fix] = {}

@@ -170,8 +170,7 @@ def _solved(
     count, size = len(known), 3 * _NEIGHBOURS
     groups = -(-count // _NEIGHBOURS)
     own, ahead = _blocks(bends, weight, groups)
-    own = np.kron(own, np.eye(3))
-    ahead = np.kron(ahead, np.eye(3))
+    own, ahead = (np.asarray(np.kron(each, np.eye(3)), np.float64) for each in (own, ahead))
     for index in range(count):
         group, rows = index // _NEIGHBOURS, index % _NEIGHBOURS * 3
         own[group, rows : rows + 3, rows : rows + 3] += known[index]

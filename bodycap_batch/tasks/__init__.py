@@ -11,6 +11,7 @@ from bodycap_batch.tasks.keyframes import KEYFRAMES
 from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE
 from bodycap_batch.tasks.merge import MERGE
 from bodycap_batch.tasks.preview import PREVIEW
+from bodycap_batch.tasks.recover import RECOVER
 from bodycap_batch.tasks.registration import REGISTRATION
 from bodycap_batch.tasks.report import REPORT
 from bodycap_batch.tasks.rig import RIG
@@ -39,6 +40,7 @@ STAGES = {
     "refine": REFINE,
     "registration": REGISTRATION,
     "rig": RIG,
+    "recover": RECOVER,
     "merge": MERGE,
     "export": EXPORT,
     "report": REPORT,
@@ -48,8 +50,8 @@ STAGES = {
 StageName = Literal["check", "keyframes", "map", "registration", "merge", "export", "report", "preview"]
 ORDER: tuple[StageName, ...] = get_args(StageName)
 """A job's stages one after another. While frames are registered the map may be extended and refined, and the
-cameras of a rig be solved together."""
-_DURING_REGISTRATION = {"extend", "refine", "rig"}
+cameras of a rig be solved together, and lost frames be looked for once more."""
+_DURING_REGISTRATION = {"extend", "refine", "rig", "recover"}
 
 
 def stages_from(stage: StageName) -> frozenset[str]:

@@ -17,24 +17,19 @@ if TYPE_CHECKING:
 
 def _registration(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
     from bodycap_batch.config import RegistrationOptions
-    from bodycap_batch.registration import LEAST_LOST, recover_lost, register_frames
+    from bodycap_batch.registration import register_frames
     from bodycap_batch.rolling_shutter import looks_rolling
 
     camera = load_capture(arguments).cameras[0]
     selection = load_keyframes(arguments["selection"])
     previous = load_registration(arguments["previous"]) if arguments.get("previous") else None
-    options_ = RegistrationOptions.model_validate(options)
     maps = load_map(arguments["map"]).maps
-    found = register_frames(camera, maps, selection, options_, context, previous)
-    tracked = int(found.trajectory.localised.sum())
-    scene = next((each for each in maps if each.gauge == found.trajectory.gauge), None)
-    growing = previous is None and len(found.wanted_keyframes) > 0
-    if scene is not None and not growing and tracked <= len(found.trajectory.status) - LEAST_LOST:
-        capture = load_capture({"capture": arguments["cameras"]})
-        found = recover_lost(found, scene, capture, options_, context)
+    found = register_frames(
+        camera, maps, selection, RegistrationOptions.model_validate(options), context, previous
+    )
     known = camera.rolling_shutter_known
     rolling = bool(camera.rolling_shutter_s) if known else looks_rolling(found, maps)
-    save_registration(found, camera, files, rolling=rolling, tracked=tracked)
+    save_registration(found, camera, files, rolling=rolling)
 
 
 def save_registration(
@@ -43,7 +38,6 @@ def save_registration(
     files: Path,
     *,
     rolling: bool,
-    tracked: int | None = None,
     notes: Sequence[str] = (),
 ) -> None:
     """Keep a camera's poses with what the stages after it need to know of the camera."""
@@ -61,8 +55,7 @@ def save_registration(
     write_summary(
         files,
         frames=len(found.trajectory.status),
-        # Those that tracking found: they tell whether the map grew where it should.
-        localised=int(found.trajectory.localised.sum()) if tracked is None else tracked,
+        localised=int(found.trajectory.localised.sum()),
         wanted=[int(frame) for frame in found.wanted_keyframes],
         rolling=rolling,
         notes=list(notes),

@@ -14,7 +14,7 @@ from typing import Any
 
 from tests.bench.rows import BODYCAP, REPOSITORY, Row
 
-MAPPING = ("map", "registration")
+MAPPING = ("map", "registration", "recover")
 """Stages that do what the peers do: pose every frame."""
 
 

@@ -19,7 +19,8 @@ from bodycap_batch.tasks import STAGES
 Json = Mapping[str, Any]
 ORDERS = "BODYCAP_FAKE_ORDERS"
 """Path of a JSON file: {"fail" | "crash" | "hang" | "fill": stage, "on": text in its videos,
-"wanted" | "localised": [a value per round], "rolling": true, "real": [stages that are no stand-ins]}.
+"wanted" | "localised": [a value per round], "lost": {camera: frames},
+"rolling": true, "real": [stages that are no stand-ins]}.
 "fail" may be a list of stages."""
 
 
@@ -87,7 +88,14 @@ def registered(options: Json, arguments: Json, files: Path) -> None:
     wanted = [*orders().get("wanted", []), *[[]] * 9][again]
     localised = [*orders().get("localised", []), *[10] * 9][again]
     rolling = bool(orders().get("rolling"))
-    values = {"round": again, "wanted": wanted, "localised": localised, "rolling": rolling}
+    frames = localised + orders().get("lost", {}).get(arguments["capture"]["cameras"][0]["name"], 0)
+    values = {
+        "round": again,
+        "wanted": wanted,
+        "localised": localised,
+        "frames": frames,
+        "rolling": rolling,
+    }
     (files / "summary.json").write_text(json.dumps(values))
 
 
@@ -136,6 +144,7 @@ NAMES = (
     "extend",
     "refine",
     "registration",
+    "recover",
     "merge",
     "export",
     "preview",

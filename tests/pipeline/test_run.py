@@ -328,6 +328,30 @@ def test_rounds_limit_the_growth(bench: Bench) -> None:
     assert bench.executed(registration={"rounds": 1}).count("extend") == 1
 
 
+@pytest.mark.parametrize(
+    "order", [{}, {"wanted": [[5], [7]], "localised": [38, 37]}, {"rolling": True}], ids=str
+)
+@pytest.mark.parametrize("rounds", [0, 1])
+def test_lost_frames_are_looked_for_once_in_what_was_kept(
+    bench: Bench, order: dict[str, Any], rounds: int
+) -> None:
+    bench.order(lost={"torso": 3, "left_palm": 2}, **{"localised": [40, 40], **order})
+    executed = bench.executed(registration={"rounds": rounds})
+    assert [name for name in executed if name.startswith("recover")] == ["recover torso"]
+    used = json.loads((bench.out / "result.ply").read_text())["registrations"]
+    names = [json.loads(each)[0] for each in used]
+    assert sorted(names) == ["recover", "registration"]
+    kept = json.loads(used[names.index("recover")])[2]
+    # The other camera's as the results have it.
+    assert used[names.index("registration")] in kept["registrations"]
+    assert bench.executed(registration={"rounds": rounds}) == []
+
+
+def test_where_hardly_a_frame_has_a_pose_nothing_is_looked_for(bench: Bench) -> None:
+    bench.order(lost={"torso": 9}, localised=[19])
+    assert bench.executed() == ALL
+
+
 def test_a_rolling_shutter_is_taken_out_of_the_map_and_every_frame_solved_again(bench: Bench) -> None:
     bench.order(rolling=True)
     executed = bench.executed()

@@ -67,6 +67,7 @@ def test_everything_a_stage_imports_counts(copied: Path, stage: str) -> None:
         "map": "mapping",
         "extend": "mapping",
         "refine": "mapping",
+        "recover": "registration",
         "merge": "merging",
         "synth": "synthetic",
     }

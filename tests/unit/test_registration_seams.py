@@ -7,11 +7,14 @@ import pytest
 
 from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.camera import Camera
+from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.geometry import invert, make_transform, transform_points
+from bodycap_batch.registration import RigCamera, without_contradicted
 from bodycap_batch.registration.pose import PoseLimits
 from bodycap_batch.registration.seams import misplaced, without_keyframes
 from bodycap_batch.registration.tracks import Tracks
-from bodycap_batch.scene import Map
+from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 
 _LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([400.0, 400.0, 320.0, 240.0]))
 _KEYFRAMES = 12
@@ -114,3 +117,54 @@ def test_the_rest_keeps_its_observations() -> None:
     assert len(rest.obs_px) == (_KEYFRAMES - 1) * _POINTS
     kept = rest.points_of("cam", np.array([6 * _STEP, 5 * _STEP]), np.array([7, 7]))
     assert kept.tolist() == [7, -1]
+
+
+def _registered(tracks: Tracks, gauge: str) -> RigCamera:
+    """A camera and what registration left of it."""
+    count = _KEYFRAMES * _STEP
+    times_ns, none = np.arange(count) * 33_333_333, np.zeros(0, np.int64)
+    camera = CaptureCamera(
+        name="cam",
+        chapters=(),
+        camera=_LENS,
+        calibrated=True,
+        frame_numbers=np.arange(count),
+        times_ns=times_ns,
+        nominal_fps=30.0,
+        offset_s=0.0,
+        rolling_shutter_s=0.0,
+    )
+    path = Trajectory(
+        camera="cam",
+        gauge=gauge,
+        frame_numbers=np.arange(count),
+        times_ns=times_ns,
+        gauge_from_cam=np.full((count, 4, 4), np.nan),
+        covariance=np.full((count, 6, 6), np.nan),
+        status=(FrameStatus.FEW_TRACKS,) * count,
+        inliers=np.zeros(count, np.int64),
+        error_px=np.zeros(count),
+    )
+    found = Registration(
+        trajectory=path,
+        obs_frame=tracks.frame,
+        obs_keyframe=tracks.keyframe,
+        obs_feature=tracks.feature,
+        obs_px=tracks.px,
+        wanted_keyframes=none,
+        tried_keyframes=none,
+    )
+    return RigCamera(camera=camera, found=found)
+
+
+@pytest.mark.parametrize(("gauge", "left_out"), [("g", [5]), ("another", [])])
+def test_what_registration_left_out_is_left_out_of_the_map(gauge: str, left_out: list[int]) -> None:
+    scene_map, tracks = _map(np.array([5]), 0.2)
+    # Nothing is tracked from a keyframe that was left out, but the others' tracks run through its frame.
+    through = tracks.keyframe != 5 * _STEP
+    tracks = Tracks(*(each[through] for each in (tracks.frame, tracks.keyframe, tracks.feature, tracks.px)))
+    selection = KeyframeSelection(
+        camera="cam", frames=np.zeros(0, np.int64), frame_count=0, sharpness=np.zeros(0), noise_px=0.2
+    )
+    rest = without_contradicted(scene_map, [_registered(tracks, gauge)], selection, RegistrationOptions())
+    assert rest.keyframe_frame.tolist() == [k * _STEP for k in range(_KEYFRAMES) if k not in left_out]

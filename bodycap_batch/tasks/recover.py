@@ -1,0 +1,47 @@
+"""The task that looks for a camera's lost frames once more, when its poses are final."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bodycap_batch.context import StageContext
+from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
+from bodycap_batch.tasks.registered import RIG_POSES
+from bodycap_batch.tasks.registration import save_registration
+from bodycap_batch.tasks.stage import SEEING, VISION, Json, Stage, read_summary
+
+_MEMORY_MB = 900
+"""With as many keyframes and frames held as recovery allows, at half a megabyte each."""
+
+
+def _recover(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    from bodycap_batch.config import RegistrationOptions
+    from bodycap_batch.formats.bundle import read_bundle, write_bundle
+    from bodycap_batch.registration import RigCamera, recover_lost, without_contradicted
+    from bodycap_batch.rig import RigPoses
+
+    context.check_cancelled()
+    capture, paths = load_capture(arguments), [Path(path) for path in arguments["registrations"]]
+    options_ = RegistrationOptions.model_validate(options)
+    selection = load_keyframes(arguments["selection"])
+    found = load_registration(str(paths[0]))
+    maps = load_map(arguments["map"]).maps
+    scene = next(each for each in maps if each.gauge == found.trajectory.gauge)
+    # One at a time: what was tracked in a long video takes most of an artefact's memory.
+    everyone = (
+        RigCamera(camera=camera, found=load_registration(str(path)))
+        for camera, path in zip(capture.cameras, paths, strict=True)
+    )
+    scene = without_contradicted(scene, everyone, selection, options_)
+    found = recover_lost(found, scene, capture, options_, context)
+    save_registration(found, capture.cameras[0], files, rolling=read_summary(paths[0])["rolling"])
+    if (paths[0] / f"{RIG_POSES}.json").exists():
+        write_bundle(read_bundle(RigPoses, paths[0], RIG_POSES), files, RIG_POSES)
+
+
+RECOVER = Stage(
+    function=_recover,
+    libraries=(*VISION, "pycolmap"),
+    modules=(*SEEING, "pycolmap"),
+    memory_mb=_MEMORY_MB,
+)
