@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from bodycap_batch.arrays import BoolArray, FloatArray
 from bodycap_batch.geometry import Similarity, so3_exp
 from bodycap_batch.merging.bones import Bone, proper_axes
-from bodycap_batch.merging.planes import find_planes, vertical
+from bodycap_batch.merging.planes import BENT_LIMIT_DEG, TILT_LIMIT_DEG, find_planes, vertical
 from bodycap_batch.merging.posture import walking_plane
 from bodycap_batch.merging.tracks import Track
 from bodycap_batch.skeleton import Mount, SkeletonModel
@@ -100,23 +100,29 @@ def find_up(
 ) -> Direction:
     """Turn the body's up onto the vertical of the map's walls, floor and ceiling, else of the walk.
 
+    Planes further from the body's up than an upright body's come after the walk: a wall and a sloping roof
+    agree on a vertical too, and who walked level knows better.
+
     Args:
         points_m: (P,3) map points in the solved frame.
         body: (3,) the body's up.
         rng: Draws the planes' hypotheses.
         path_m: (N,3) path of the trunk's camera.
     """
-    found = vertical(find_planes(points_m, rng), body)
-    source, share = "map", 0.0
-    if found is not None:
-        up, share = found
-    else:
-        walked = walking_plane(path_m, body)
-        if walked is None:
-            return Direction(body, "body", None, 0.0)
-        up, source = walked, "walk"
-    angle = float(np.degrees(np.arccos(np.clip(up @ body, -1.0, 1.0))))
-    return Direction(up, source, angle, share)
+    planes = find_planes(points_m, rng)
+    near = vertical(planes, body, TILT_LIMIT_DEG)
+    if near is not None:
+        return _direction("map", near, body)
+    walked = walking_plane(path_m, body)
+    if walked is not None:
+        return _direction("walk", (walked, 0.0), body)
+    far = vertical(planes, body, BENT_LIMIT_DEG)
+    return Direction(body, "body", None, 0.0) if far is None else _direction("map", far, body)
+
+
+def _direction(source: str, found: tuple[FloatArray, float], body: FloatArray) -> Direction:
+    angle = float(np.degrees(np.arccos(np.clip(found[0] @ body, -1.0, 1.0))))
+    return Direction(found[0], source, angle, found[1])
 
 
 def find_floor(heights_m: FloatArray, up: Direction, expected_m: float, standing_m: float) -> Floor:

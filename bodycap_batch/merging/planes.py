@@ -19,9 +19,10 @@ _HYPOTHESES = 600
 _NEAR_M = 1.5
 _MOST_POINTS = 20_000
 """Points that tell as much as all: a long capture's map has hundreds of thousands."""
-TILT_LIMITS_DEG = (20.0, 35.0)
-"""How far the vertical may lie from the body's own: a chest's lean and its mount's error, three sigma;
-and where there is none so near, of someone who mostly bends. At 45 a wall could pass for the floor."""
+TILT_LIMIT_DEG = 20.0
+"""How far the vertical may lie from the body's own: a chest's lean and its mount's error, three sigma."""
+BENT_LIMIT_DEG = 35.0
+"""The same of someone who mostly bends. At 45 a wall could pass for the floor."""
 _AGREE_DEG = 1.0
 _DETERMINED = 0.12
 """Smallest share of the planes' points that must fix each of the two tilts."""
@@ -102,25 +103,22 @@ def _fullest(points: FloatArray, rng: np.random.Generator) -> Plane | None:
     return Plane(normal, offset, int((np.abs(points @ normal - offset) < THICKNESS_M).sum()))
 
 
-def vertical(planes: Sequence[Plane], body_up: FloatArray) -> tuple[FloatArray, float] | None:
+def vertical(
+    planes: Sequence[Plane], body_up: FloatArray, limit_deg: float
+) -> tuple[FloatArray, float] | None:
     """The direction near the body's up that most planes are parallel or perpendicular to.
 
     Args:
         planes: From `find_planes`.
         body_up: (3,) where to look.
+        limit_deg: How far from it.
 
     Returns:
         Up (3,) and the share of the planes' points that agree within `_AGREE_DEG`, or None where the planes
         do not fix both tilts.
     """
-    found = (_vertical(planes, body_up, limit) for limit in TILT_LIMITS_DEG) if planes else ()
-    return next((each for each in found if each is not None), None)
-
-
-def _vertical(
-    planes: Sequence[Plane], body_up: FloatArray, limit_deg: float
-) -> tuple[FloatArray, float] | None:
-    """The same within so many degrees of the body's up."""
+    if not planes:
+        return None
     normals = np.array([plane.normal for plane in planes])
     counts = np.array([plane.count for plane in planes], dtype=np.float64)
     first, second = np.linalg.svd(body_up[None])[2][1:]

@@ -18,6 +18,7 @@ from bodycap_batch.merging.gauge import (
     Direction,
     feet_floor,
     find_floor,
+    find_up,
     heading,
     place,
     standing_height,
@@ -33,7 +34,7 @@ from bodycap_batch.merging.graph import (
     read_mount,
 )
 from bodycap_batch.merging.initial import anchor_and_reach, fill_gaps, pose_bones, provisional_scale
-from bodycap_batch.merging.planes import find_planes, vertical
+from bodycap_batch.merging.planes import BENT_LIMIT_DEG, TILT_LIMIT_DEG, find_planes, vertical
 from bodycap_batch.merging.rules import activity_rules, limit_rules, reach_rules
 from bodycap_batch.merging.scale import ScaleSource, combine, disagreement, floor_source
 from bodycap_batch.merging.tracks import Track, adapt_psd, clean
@@ -260,11 +261,13 @@ def test_walls_and_floor_give_the_vertical_and_the_floor():
     room = np.concatenate([wall, side, floor, clutter]) + rng.normal(scale=0.005, size=(500, 3))
     turn = so3_exp([0.4, -0.9, 0.3])
     planes = find_planes(room @ turn.T, np.random.default_rng(0))
-    found = vertical(planes, so3_exp([0.15, 0.1, 0.0]) @ turn @ UP)
+    found = vertical(planes, so3_exp([0.15, 0.1, 0.0]) @ turn @ UP, TILT_LIMIT_DEG)
     assert found is not None
     # Planes 3 m wide with 5 mm of noise tilt by a fraction of a degree.
     assert np.degrees(np.arccos(found[0] @ turn @ UP)) < 0.5
-    bent = vertical(planes, so3_exp([0.5, 0.2, 0.0]) @ turn @ UP)  # 31 degrees: who mostly bends
+    body = turn @ so3_exp([0.5, 0.2, 0.0]) @ UP  # 31 degrees: who mostly bends
+    assert vertical(planes, body, TILT_LIMIT_DEG) is None
+    bent = vertical(planes, body, BENT_LIMIT_DEG)
     assert bent is not None
     assert np.degrees(np.arccos(bent[0] @ turn @ UP)) < 0.5
     floor_found = find_floor(room @ UP, Direction(UP, "map", 0.0, 1.0), 0.08, 1.2)
@@ -305,11 +308,27 @@ def test_clutter_beside_the_walk_is_no_floor(floor, clutter, source):
     assert walked_floor(points[:0], path, Direction(UP, source, 0.0, 1.0), 0.0, 1.2) is None
 
 
+def test_a_wall_and_a_sloping_roof_do_not_tilt_a_level_walk():
+    rng = np.random.default_rng(1)
+    wall = rng.uniform([3.0, -2.0, 0.0], [3.0, 2.0, 2.5], (300, 3))
+    roof = rng.uniform([-3.0, -2.0, 2.5], [3.0, 2.0, 2.5], (300, 3))
+    roof[:, 2] -= np.tan(np.radians(30.0)) * roof[:, 1]
+    clutter = rng.uniform([-3.0, -2.0, 0.0], [3.0, 2.0, 2.5], (150, 3))
+    attic = np.concatenate([wall, roof, clutter]) + rng.normal(scale=0.005, size=(750, 3))
+    angle = np.linspace(0.0, 10.0, 300)
+    walk = np.column_stack([1.5 * np.sin(angle), 1.2 * np.cos(angle), 1.3 + 0.02 * np.sin(22.0 * angle)])
+    up = find_up(attic, UP, np.random.default_rng(0), walk)
+    assert up.source == "walk"
+    assert np.degrees(np.arccos(up.up @ UP)) < 0.5
+    # Who stands still has nothing better than what the planes agree on.
+    assert find_up(attic, UP, np.random.default_rng(0), walk[:20]).source == "map"
+
+
 def test_one_wall_does_not_fix_the_vertical():
     rng = np.random.default_rng(4)
     wall = rng.uniform([0, 0, 0], [4, 0.005, 2.5], (300, 3))
-    assert vertical(find_planes(wall, np.random.default_rng(0)), UP) is None
-    assert vertical([], UP) is None
+    assert vertical(find_planes(wall, np.random.default_rng(0)), UP, BENT_LIMIT_DEG) is None
+    assert vertical([], UP, BENT_LIMIT_DEG) is None
     assert find_planes(wall[:50], np.random.default_rng(0)) == []
 
 
