@@ -31,7 +31,7 @@ and a rig's or preset's own idea of the chest's axes."""
 STANDING_RAD = float(np.radians(7.0))
 """The same for a chest that is at its highest in a capture without walking: who bends and lifts stands up in
 between. A walker's 5 degrees, and about as many for the bend that the height leaves open."""
-_MOSTLY_BELOW = 95.0
+_MOSTLY_BELOW, _OFTEN_BELOW = 95.0, 25.0
 _HIGHEST_M = 0.02
 """How far below its highest a chest still counts as up: half a metre over hips, it bends by 16 degrees."""
 _FEW_STEPS = 0.125
@@ -118,9 +118,12 @@ def find_posture(
 
 
 def _standing(track: Track, height_m: FloatArray, up: FloatArray) -> BoolArray:
-    """Where heights (K,) are about the greatest of the trunk's path."""
-    highest = float(np.percentile(track.map_from_cam[:, :3, 3] @ up, _MOSTLY_BELOW))
-    return np.asarray(height_m > highest - _HIGHEST_M)
+    """Where heights (K,) are about the greatest of the trunk's path, nowhere if it hardly rises and falls.
+
+    Who sits, or leans on a desk or a cart, is never upright, however high.
+    """
+    often, highest = np.percentile(track.map_from_cam[:, :3, 3] @ up, [_OFTEN_BELOW, _MOSTLY_BELOW])
+    return np.asarray((height_m > highest - _HIGHEST_M) & (highest - often > _BOWED_M))
 
 
 def _facing_ahead(rotation: FloatArray, ahead: FloatArray, up: FloatArray) -> BoolArray:

@@ -111,6 +111,14 @@ def test_who_bends_and_lifts_stands_upright_in_between():
     assert np.degrees(np.arccos(usual_direction(poses[:, :3, 2]) @ TILT[:, 2])) < 10.0
 
 
+def test_who_leans_all_the_time_is_nowhere_upright():
+    time = np.arange(0.0, 20.0, 1.0 / FPS)
+    lean = np.radians(30.0 + 8.0 * np.sin(time))
+    turn = so3_exp(np.outer(lean, [1.0, 0.0, 0.0]))
+    track = _track(make_transform(TILT, np.zeros(3)) @ make_transform(turn, 0.5 * turn[:, :, 2]))
+    assert not find_posture(track, track.times_ns, TILT[:, 2], None).standing.any()
+
+
 def test_a_bowed_walk_does_not_count_as_upright():
     poses = _circle()
     bowed = np.arange(len(poses)) % 150 > 110
