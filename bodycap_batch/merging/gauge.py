@@ -25,6 +25,9 @@ WALKING_HEIGHT = 0.97
 _USUAL_RAD = float(np.radians(15.0))
 """A trunk sways by less than this about its usual direction in walking and standing."""
 _DIRECTIONS = 300
+_FROM_MEAN = float(np.cos(np.radians(45.0)))
+"""Of two directions at right angles one is nearer to the mean than this: further off, a wall passes for the
+floor."""
 SLAB_M = 0.03
 _MIN_POINTS = 100
 _MIN_FLOOR_POINTS = 30
@@ -37,6 +40,19 @@ _WALKED_OVER = 5
 _LEGLESS_HIP_M = 0.9
 _ANKLE_OVER_LEG = 0.039 / 0.491
 """Ankle height over leg length (Drillis and Contini), for rigs whose feet end at the ankle."""
+
+
+@dataclass(frozen=True, slots=True)
+class BodyUp:
+    """Where a body's trunk points.
+
+    Attributes:
+        usual: (3,) near which it is most of the time: who bends now and then is upright in between.
+        mean: (3,) of all the time: who is bent most of the time leans less in the mean.
+    """
+
+    usual: FloatArray
+    mean: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,29 +74,37 @@ class Floor:
     support: int
 
 
-def body_up(skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray) -> FloatArray:
-    """Up direction (3,) of a body: its trunk's axis as it usually is, else against its hanging limbs."""
+def body_up(skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray) -> BodyUp:
+    """Up direction of a body: its trunk's axis as it usually is, else against its hanging limbs."""
     trunk = [i for i, bone in enumerate(bones) if not split_side(bone.role)[0]]
     limbs = [
         i for i, bone in enumerate(bones) if split_side(bone.role)[1] in ("Arm", "UpLeg", "Leg", "ForeArm")
     ]
     if trunk:
-        return usual_direction(world_from_bone[:, trunk, :3, 2].mean(axis=1))
+        return _over_time(world_from_bone[:, trunk, :3, 2].mean(axis=1))
     chosen = limbs or list(range(len(bones)))
     along = [world_from_bone[:, i, :3, :3] @ proper_axes(skeleton, bones[i].role)[:, 0] for i in chosen]
-    direction = -np.mean(along, axis=(0, 1))
-    return np.asarray(direction / np.linalg.norm(direction))
+    hanging = _unit(-np.mean(along, axis=(0, 1)))
+    return BodyUp(hanging, hanging)
 
 
-def body_up_from_prior(bones: Sequence[Bone], trunk: Track, mount: Mount) -> FloatArray:
-    """Usual up (3,) in the map that a camera's path and its mount's prior promise."""
+def body_up_from_prior(bones: Sequence[Bone], trunk: Track, mount: Mount) -> BodyUp:
+    """Up in the map that a camera's path and its mount's prior promise."""
     rest = np.eye(3)
     index = trunk.bone
     while bones[index].parent >= 0:
         rest = bones[index].mean_rotation.T @ rest
         index = bones[index].parent
     joint = trunk.map_from_cam[:, :3, :3] @ mount.joint_from_cam[:3, :3].T
-    return usual_direction((joint @ rest)[:, :, 2])
+    return _over_time((joint @ rest)[:, :, 2])
+
+
+def _over_time(directions: FloatArray) -> BodyUp:
+    return BodyUp(usual_direction(directions), _unit(directions.mean(axis=0)))
+
+
+def _unit(direction: FloatArray) -> FloatArray:
+    return np.asarray(direction / np.linalg.norm(direction))
 
 
 def usual_direction(directions: FloatArray) -> FloatArray:
@@ -91,38 +115,47 @@ def usual_direction(directions: FloatArray) -> FloatArray:
     some = directions[np.unique(np.linspace(0, len(directions) - 1, _DIRECTIONS).astype(np.int64))]
     some = some / np.linalg.norm(some, axis=1, keepdims=True)
     near = some @ some.T > np.cos(_USUAL_RAD)
-    direction = some[near[int(np.argmax(near.sum(axis=1)))]].mean(axis=0)
-    return np.asarray(direction / np.linalg.norm(direction))
+    return _unit(some[near[int(np.argmax(near.sum(axis=1)))]].mean(axis=0))
 
 
-def find_up(
-    points_m: FloatArray, body: FloatArray, rng: np.random.Generator, path_m: FloatArray
-) -> Direction:
+def find_up(points_m: FloatArray, body: BodyUp, rng: np.random.Generator, path_m: FloatArray) -> Direction:
     """Turn the body's up onto the vertical of the map's walls, floor and ceiling, else of the walk.
 
-    Planes further from the body's up than an upright body's come after the walk: a wall and a sloping roof
-    agree on a vertical too, and who walked level knows better.
+    Looked for about both of the body's directions; found about both, the one nearer to the mean is it. Planes
+    further off than an upright body's come after the walk: a wall and a sloping roof agree on a vertical
+    too, and who walked level knows better.
 
     Args:
         points_m: (P,3) map points in the solved frame.
-        body: (3,) the body's up.
+        body: The body's up.
         rng: Draws the planes' hypotheses.
         path_m: (N,3) path of the trunk's camera.
     """
     planes = find_planes(points_m, rng)
-    near = vertical(planes, body, TILT_LIMIT_DEG)
-    if near is not None:
-        return _direction("map", near, body)
-    walked = walking_plane(path_m, body)
-    if walked is not None:
-        return _direction("walk", (walked, 0.0), body)
-    far = vertical(planes, body, BENT_LIMIT_DEG)
-    return Direction(body, "body", None, 0.0) if far is None else _direction("map", far, body)
+
+    def by_planes(limit_deg: float) -> Direction | None:
+        return _nearest(body, "map", [vertical(planes, hint, limit_deg) for hint in (body.usual, body.mean)])
+
+    def by_walk() -> Direction | None:
+        walked = [walking_plane(path_m, hint) for hint in (body.usual, body.mean)]
+        return _nearest(body, "walk", [None if up is None else (up, 0.0) for up in walked])
+
+    return (
+        by_planes(TILT_LIMIT_DEG)
+        or by_walk()
+        or by_planes(BENT_LIMIT_DEG)
+        or Direction(body.usual, "body", None, 0.0)
+    )
 
 
-def _direction(source: str, found: tuple[FloatArray, float], body: FloatArray) -> Direction:
-    angle = float(np.degrees(np.arccos(np.clip(found[0] @ body, -1.0, 1.0))))
-    return Direction(found[0], source, angle, found[1])
+def _nearest(body: BodyUp, source: str, found: Sequence[tuple[FloatArray, float] | None]) -> Direction | None:
+    """Of verticals and their planes' shares the one nearest to the body's mean, if near enough."""
+    near = [each for each in found if each is not None and float(each[0] @ body.mean) > _FROM_MEAN]
+    if not near:
+        return None
+    up, share = max(near, key=lambda each: float(each[0] @ body.mean))
+    angle = float(np.degrees(np.arccos(np.clip(up @ body.usual, -1.0, 1.0))))
+    return Direction(up, source, angle, share)
 
 
 def find_floor(heights_m: FloatArray, up: Direction, expected_m: float, standing_m: float) -> Floor:
