@@ -13,7 +13,7 @@ from bodycap_batch.body import BoardView, MergeInputs
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import Similarity, invert, so3_exp, so3_log
-from bodycap_batch.merging.samples import MAP_ERROR_S
+from bodycap_batch.merging.samples import MAP_ERROR_M, MAP_ERROR_S
 from bodycap_batch.merging.scale import ScaleSource
 
 NAME = "marker board"
@@ -56,7 +56,8 @@ def board_scale(
 
     The board's place, orientation and size in the map are fitted to its corners in all keyframes at once, by
     reprojection, with the keyframes' poses held; how well that is known is the jackknife's spread over
-    stretches of a second of a camera, whose poses are off together.
+    stretches of a second of a camera, whose poses are off together; of few stretches, which hide how far they
+    are off, at least what maps are known to bend over the way.
 
     Args:
         inputs: ``board``, and the trajectories the keyframes belong to.
@@ -73,7 +74,7 @@ def board_scale(
     gauge, seen = _gather(inputs, places)
     start = _start(seen)
     found, weight = _fit(seen, start)
-    sigma = float(np.hypot(_spread(seen, found, weight), _LEAST_SIGMA))
+    sigma = float(np.hypot(max(_spread(seen, found, weight), _bend(seen, found)), _LEAST_SIGMA))
     if not sigma < _MOST_SIGMA:
         raise EstimationError(
             f"the marker board tells the scale to {sigma:.0%} only: its {len(seen.map_from_cam)} views are "
@@ -193,3 +194,11 @@ def _spread(seen: _Seen, value: FloatArray, weight: FloatArray) -> float:
     # Few groups know their own spread badly: without (n + 1) / (n - 1) four of them state 0.87 of the error.
     variance = (count + 1) / count * np.sum((np.array(moved) - np.mean(moved)) ** 2)
     return float(np.sqrt(variance))
+
+
+def _bend(seen: _Seen, value: FloatArray) -> float:
+    """Sigma of the log of the size where the two ends of the way are off, each by as much as maps are."""
+    centre = seen.map_from_cam[:, :3, 3]
+    along = np.linalg.svd(centre - centre.mean(axis=0), full_matrices=False)[2][0]
+    way_m = float(np.ptp(centre @ along)) / float(np.exp(value[6]))
+    return float(np.sqrt(2.0)) * MAP_ERROR_M / max(way_m, 1e-9)

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 from bodycap_batch.body import BoardView, CameraClock, MergeInputs
 from bodycap_batch.calibration.boards import Board
@@ -33,10 +34,10 @@ WORLD_FROM_BOARD = make_transform(look(0.1) @ so3_exp([0.2, 0.1, 0.3]), [1.6, 0.
 CAMERA = Camera(model="PINHOLE", width_px=320, height_px=240, params=np.array(LENS["params"]))
 
 
-def _path(count: int, centre_noise_m: float = 0.0) -> np.ndarray:
+def _path(count: int, centre_noise_m: float = 0.0, half_way_m: float = 0.7) -> np.ndarray:
     """world_from_cam (N,4,4) of somebody who walks past the board, looking at it."""
     rng = np.random.default_rng(3)
-    across = np.linspace(-0.7, 0.7, count)
+    across = np.linspace(-half_way_m, half_way_m, count)
     centres = np.stack([0.3 + 0.2 * across, across, 0.1 * np.sin(5.0 * across)], axis=1)
     yaw = np.arctan2(0.3 - centres[:, 1], 1.6 - centres[:, 0])
     centres += rng.normal(scale=centre_noise_m, size=centres.shape) if centre_noise_m else 0.0
@@ -94,6 +95,23 @@ def test_the_board_gives_the_scale_and_how_well():
         # Four millimetres on a way of 1.4 m, twelve times: half a per cent, five times that for five draws.
         assert abs(np.log(source.scale * GAUGE.scale)) < min(3.0 * source.sigma_log, 0.025)
         assert 0.003 <= source.sigma_log < 0.02
+
+
+@pytest.mark.parametrize("half_way_m", [0.25, 0.5])
+def test_a_glimpse_of_the_board_shares_its_maps_error(half_way_m):
+    off = []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        exact = _path(15, half_way_m=half_way_m)
+        bent = exact.copy()
+        # Errors of 5 mm that last for half a second, five keyframes.
+        bent[:, :3, 3] += 0.005 * gaussian_filter1d(rng.normal(scale=4.2, size=(75, 3)), 5, axis=0)[30:-30]
+        inputs = _inputs(bent, _views(exact, rng))
+        path = replace(inputs.trajectories[0], times_ns=np.arange(15) * 100_000_000)
+        source = board_scale(replace(inputs, trajectories=(path,)), MergeOptions(marker_board=FLAT))
+        off.append(np.log(source.scale * GAUGE.scale) / source.sigma_log)
+    # The root mean square of sixteen is known to 18 %.
+    assert 0.6 < float(np.sqrt(np.mean(np.square(off)))) < 1.5
 
 
 def test_views_that_begin_at_the_other_end_and_a_wrong_one_do_no_harm():
