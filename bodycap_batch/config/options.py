@@ -61,6 +61,18 @@ class RegistrationOptions(Options):
     )
 
 
+MARKER_COUNTS = {
+    **{f"{n}X{n}_{count}": count for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
+    "ARUCO_ORIGINAL": 1024,
+    "ARUCO_MIP_36H12": 250,
+    "APRILTAG_16H5": 30,
+    "APRILTAG_25H9": 35,
+    "APRILTAG_36H10": 2320,
+    "APRILTAG_36H11": 587,
+}
+"""Markers in each of OpenCV's families."""
+
+
 class MarkerBoard(Options):
     """A flat board of known squares that lies or hangs in the room."""
 

@@ -12,6 +12,7 @@ import numpy as np
 from bodycap_batch.config.explain import Problem
 from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, Job, MountPose
 from bodycap_batch.config.mounts import MOUNT_NAMES, ROLES
+from bodycap_batch.config.options import MARKER_COUNTS
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._\-]*")
 _UNFILLED = re.compile(r"<[^<>]*>")
@@ -26,7 +27,8 @@ def problems_in(job: Job) -> list[Problem]:
     for index, camera in enumerate(job.capture.cameras):
         for found in (*_camera_names(job, index), *_mount(job, camera), *_pose(camera), *_paths(camera)):
             problems.append(found._replace(location=("capture", "cameras", index, *found.location)))
-    return [*problems, *_job_names(job), *_skeleton(job), *_times(job), *_first_frames(job), *_rig(job)]
+    rules = (_job_names, _skeleton, _times, _first_frames, _rig, _board)
+    return [*problems, *(found for rule in rules for found in rule(job))]
 
 
 def skeleton_of(job: Job) -> str:
@@ -156,6 +158,29 @@ def _first_frames(job: Job) -> Iterator[Problem]:
         if camera not in names:
             where = ("map", "init_frames", index)
             yield Problem(where, f"there is no camera {camera[:40]!r}", _nearest(camera, names))
+
+
+def _board(job: Job) -> Iterator[Problem]:
+    """The marker board is one that can be found, and cannot be taken for itself turned by a right angle."""
+    board, where = job.merge.marker_board, ("merge", "marker_board")
+    if board is None:
+        return
+    size = f"{board.columns}x{board.rows}"
+    if board.kind == "chessboard":
+        if board.columns == board.rows:
+            same = f"a chessboard of {size} looks the same from all four sides"
+            yield Problem(where, same, "one with a row more than columns, or a ChArUco board")
+        return
+    if min(board.columns, board.rows) < 4:
+        small = f"a ChArUco board of {size} squares has too few corners"
+        yield Problem(where, small, "four squares and more each way, for example 7 columns and 5 rows")
+    held = MARKER_COUNTS.get(board.dictionary.upper().removeprefix("DICT_"))
+    if held is None:
+        nearest = _nearest(board.dictionary, tuple(MARKER_COUNTS))
+        yield Problem((*where, "dictionary"), f"unknown markers {board.dictionary[:40]!r}", nearest)
+    elif board.columns * board.rows // 2 > held:
+        many = f"a ChArUco board of {size} squares takes more markers than {board.dictionary} has"
+        yield Problem((*where, "dictionary"), many, "name the family that was printed, a larger one")
 
 
 def _nearest(value: str, known: tuple[str, ...]) -> str:

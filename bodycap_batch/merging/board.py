@@ -62,7 +62,7 @@ def board_scale(
     Args:
         inputs: ``board``, and the trajectories the keyframes belong to.
         options: ``marker_board``.
-        places: By gauge, where each used map lies in the main one; None where all are in one map.
+        places: By gauge, the main one first, where each used map lies in it; None where all are in one map.
 
     Raises:
         EstimationError: It was not found, or in too few keyframes, or only from one place.
@@ -71,7 +71,7 @@ def board_scale(
     """
     if options.marker_board is None:
         return None
-    gauge, seen = _gather(inputs, places)
+    gauge, seen = _gather(inputs, places, turns=options.marker_board.kind == "chessboard")
     start = _start(seen)
     found, weight = _fit(seen, start)
     sigma = float(np.hypot(max(_spread(seen, found, weight), _bend(seen, found)), _LEAST_SIGMA))
@@ -85,8 +85,10 @@ def board_scale(
     return ScaleSource(name=NAME, scale=float(np.exp(-found[6])) / unit, sigma_log=sigma)
 
 
-def _gather(inputs: MergeInputs, places: Mapping[str, Similarity] | None) -> tuple[str, _Seen]:
-    """The views of the map that has most of them."""
+def _gather(
+    inputs: MergeInputs, places: Mapping[str, Similarity] | None, *, turns: bool
+) -> tuple[str, _Seen]:
+    """The views of the main map; of the map that has most where the main one has too few."""
     paths = {each.camera: each for each in inputs.trajectories}
     by_gauge: dict[str, list[BoardView]] = {}
     for view in inputs.board:
@@ -94,6 +96,9 @@ def _gather(inputs: MergeInputs, places: Mapping[str, Similarity] | None) -> tup
         if path.localised[view.frame] and (places is None or path.gauge in places):
             by_gauge.setdefault(path.gauge, []).append(view)
     gauge, views = max(by_gauge.items(), key=lambda item: len(item[1]), default=("", []))
+    main = next(iter(places or {}), gauge)
+    if len(by_gauge.get(main, [])) >= _FEWEST_VIEWS:
+        gauge, views = main, by_gauge[main]  # a joined map's own scale is known less well
     if len(views) < _FEWEST_VIEWS:
         raise EstimationError(
             f"the marker board was found in {len(views)} keyframes of one map, {_FEWEST_VIEWS} are needed",
@@ -103,13 +108,15 @@ def _gather(inputs: MergeInputs, places: Mapping[str, Similarity] | None) -> tup
     stretch = round(1e9 * MAP_ERROR_S)
     shared = [f"{v.camera} {int(paths[v.camera].times_ns[v.frame]) // stretch}" for v in views]
     _, group = np.unique(shared, return_inverse=True)
-    return gauge, _upright(views, np.array([paths[v.camera].gauge_from_cam[v.frame] for v in views]), group)
+    map_from_cam = np.array([paths[v.camera].gauge_from_cam[v.frame] for v in views])
+    return gauge, _upright(views, map_from_cam, group, turns=turns)
 
 
-def _upright(views: Sequence[BoardView], map_from_cam: FloatArray, group: IntArray) -> _Seen:
+def _upright(views: Sequence[BoardView], map_from_cam: FloatArray, group: IntArray, *, turns: bool) -> _Seen:
     """Views with corners about the board's middle, all the same way round.
 
-    Half a turn maps many a chessboard onto itself: its detector may begin at either end.
+    Half a turn maps many a chessboard onto itself (`turns`): its detector may begin at either end. A ChArUco
+    board's markers have numbers: a view half a turn off is wrong.
     """
     corners = np.concatenate([view.board_m for view in views])
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
@@ -119,7 +126,7 @@ def _upright(views: Sequence[BoardView], map_from_cam: FloatArray, group: IntArr
         own = view.cam_from_board.copy()
         own[:3, 3] += own[:3, :3] @ middle
         flip = np.eye(3)
-        if float(np.trace(first[:3, :3].T @ (pose @ own)[:3, :3])) < 1.0:  # more than a right angle
+        if turns and float(np.trace(first[:3, :3].T @ (pose @ own)[:3, :3])) < 1.0:  # more than a right angle
             flip = _FLIP
         own[:3, :3] = own[:3, :3] @ flip
         placed.append(own)

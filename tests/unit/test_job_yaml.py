@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import Job
+from bodycap_batch.config.options import MARKER_COUNTS
 from bodycap_batch.errors import CaptureError, JobError
 
 MINIMAL = """\
@@ -311,3 +313,43 @@ def test_a_synchronised_rig_is_made_of_cameras_on_one_segment(tmp_path: Path) ->
     error = refused(tmp_path, MINIMAL + "  rig: synced\n")
     assert error.field == "capture.rig"
     assert "no two share one" in error.message
+
+
+@pytest.mark.parametrize(
+    ("board", "field", "words"),
+    [
+        ("dictionary: 4x4_5", ".dictionary", ("unknown markers '4x4_5'", "did you mean '4X4_50'?")),
+        ("dictionary: nonsense", ".dictionary", ("unknown markers 'nonsense'", "ARUCO_ORIGINAL")),
+        ("columns: 11, rows: 10", ".dictionary", ("takes more markers than 4X4_50 has", "a larger one")),
+        ("columns: 3, rows: 3", "", ("3x3 squares has too few corners", "four squares and more")),
+        ("kind: chessboard, columns: 6, rows: 6", "", ("6x6 looks the same", "a row more")),
+    ],
+)
+def test_a_board_that_cannot_be_found_is_refused_before_anything_runs(
+    tmp_path: Path, board: str, field: str, words: tuple[str, str]
+) -> None:
+    size = "" if "columns" in board else ", columns: 7, rows: 5"
+    error = refused(tmp_path, MINIMAL + f"merge: {{marker_board: {{square_m: 0.1{size}, {board}}}}}\n")
+    assert error.field == f"merge.marker_board{field}"
+    assert words[0] in error.message
+    assert words[1] in (error.hint or "")
+
+
+@pytest.mark.parametrize(
+    "board", ["columns: 10, rows: 10", "columns: 7, rows: 5, dictionary: DICT_apriltag_36h11"]
+)
+def test_a_board_that_can_be_found_is_taken(tmp_path: Path, board: str) -> None:
+    assert load(
+        tmp_path, MINIMAL + f"merge: {{marker_board: {{square_m: 0.1, {board}}}}}\n"
+    ).merge.marker_board
+
+
+def test_the_marker_families_are_those_of_opencv() -> None:
+    names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
+    held = {
+        name.removeprefix("DICT_").upper(): len(
+            cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList
+        )
+        for name in names
+    }
+    assert held.items() <= MARKER_COUNTS.items()

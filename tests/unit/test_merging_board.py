@@ -139,6 +139,42 @@ def test_a_board_in_a_further_map_is_in_that_maps_units():
         board_scale(inputs, asked, {"map-1": half})
 
 
+def test_corners_with_numbers_are_not_turned_to_fit_a_view_whose_pose_is_wrong():
+    views = list(_views(_path(12), np.random.default_rng(0), noise_px=0.1))
+    inputs, asked = _inputs(_path(12), tuple(views)), MergeOptions(marker_board=FLAT)
+    right = board_scale(inputs, asked)
+    about = make_transform(np.diag([-1.0, -1.0, 1.0]), [0.36, 0.24, 0.0])
+    for one in (1, 4, 5):
+        views[one] = replace(views[one], cam_from_board=views[one].cam_from_board @ about)
+    source = board_scale(replace(inputs, board=tuple(views)), asked)
+    # Turned, their corners would be outliers, and the fit rest on the other nine.
+    assert source.scale == pytest.approx(right.scale, rel=1e-6)
+
+
+def test_the_main_map_is_asked_before_one_that_was_joined():
+    rng = np.random.default_rng(0)
+    views = _views(_path(12), rng)
+    inputs = _inputs(_path(12))
+    palm = replace(inputs.trajectories[0], camera="left_palm", gauge="map-1")
+    few = tuple(view for view in views if view.frame % 3 == 0)
+    # The joined map's place is a fifth too large; its views are three times as many.
+    places = {
+        "map-0": Similarity(1.0, np.eye(3), np.zeros(3)),
+        "map-1": Similarity(1.2, np.eye(3), np.zeros(3)),
+    }
+    both = replace(
+        inputs,
+        clocks=inputs.clocks | {"left_palm": inputs.clocks["torso"]},
+        mounts=(*inputs.mounts, replace(inputs.mounts[0], camera="left_palm")),
+        trajectories=(*inputs.trajectories, palm),
+        board=(*few, *(replace(view, camera="left_palm") for view in views)),
+    )
+    asked = MergeOptions(marker_board=FLAT)
+    assert board_scale(both, asked, places).scale * GAUGE.scale == pytest.approx(1.0, abs=0.02)
+    fewer = replace(both, board=both.board[2:])
+    assert board_scale(fewer, asked, places).scale * GAUGE.scale == pytest.approx(1.0 / 1.2, abs=0.02)
+
+
 def test_a_board_that_tells_nothing_is_refused():
     rng = np.random.default_rng(0)
     asked = MergeOptions(marker_board=FLAT)
