@@ -80,8 +80,10 @@ def find_contacts(
         tick_times_ns: (T,) the timeline.
 
     Returns:
-        One for each foot whose shin or foot carries a camera.
+        One for each foot whose shin or foot carries a camera; none on a timeline of one tick.
     """
+    if len(tick_times_ns) < 2:
+        return ()
     rest, out = rest_positions(skeleton), []
     for side in ("Left", "Right"):
         ankle = skeleton.index_of_role(side + "Foot")

@@ -62,6 +62,9 @@ def test_a_foot_stands_where_its_ankle_is_slow_and_low(shin):
     assert standing[3 : STAND - 4].all()
     assert not standing[STAND + 2 : COUNT - 3].any()
     assert find_contacts(skeleton, bones, [], {}, UP, TICKS) == ()
+    assert (
+        find_contacts(skeleton, bones, [_track(index, poses)], {"left_shin": np.eye(4)}, UP, TICKS[:1]) == ()
+    )
     part = during(found, TICKS, TICKS[10:30])
     assert np.array_equal(part[0].standing, standing[10:30])
 
