@@ -56,7 +56,7 @@ def hinge_sentence(role: str, off_m: float) -> str:
     return (
         f"the {joint} bends {100.0 * off_m:.1f} cm (1 sigma) out of its plane and is not held to it; "
         f"to know it better, strap the cameras above and below the {joint} so that none slides, and check "
-        f"which way its axis lies in the skeleton"
+        f"their clocks (offset_s) and which way its axis lies in the skeleton"
     )
 
 

@@ -90,4 +90,6 @@ def test_a_loose_hinge_is_told_with_what_to_do():
     sentence = hinge_sentence("LeftForeArm", FREE_M)
     assert "left elbow bends 10.0 cm" in sentence
     assert "; to know it better, strap" in sentence
+    # A palm's clock 60 ms off looks like a loose hinge, too.
+    assert "check their clocks (offset_s)" in sentence
     assert "right knee" in hinge_sentence("RightLeg", 0.02)
