@@ -226,8 +226,8 @@ def untold(mount: Mount) -> bool:
 def loosened(track: Track, mount: Mount) -> Track:
     """The track (metres) at the uncertainty of its mount, where the motion told next to nothing of it.
 
-    A camera never seen together with others keeps the mount its name promises: 15° and 4 cm. At its poses'
-    own millimetres it would bend the body to that guess.
+    A camera never seen together with others keeps the mount its name promises: 15° and 2.9 cm an axis.
+    At its poses' own millimetres it would bend the body to that guess.
     """
     if not untold(mount):
         return track
