@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,11 +12,16 @@ import pytest
 from bodycap_batch.camera import Camera
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import RegistrationOptions
+from bodycap_batch.context import StageContext
+from bodycap_batch.formats.bundle import read_bundle, write_bundle
 from bodycap_batch.geometry import invert, make_transform, rotation_angle_rad, so3_exp
 from bodycap_batch.registration import RigCamera, register_in_rig
 from bodycap_batch.registration.batch import Views, linearise, make_views
-from bodycap_batch.rig import mean_rotation, relative_pose, same_instants
+from bodycap_batch.rig import RigPoses, mean_rotation, relative_pose, same_instants
 from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
+from bodycap_batch.tasks import read_summary, recover
+from bodycap_batch.tasks.registered import RIG_POSES
+from bodycap_batch.tasks.registration import save_registration
 
 LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
 COUNT = 61
@@ -160,6 +167,33 @@ def test_a_keyframe_that_sees_too_little_is_no_less_carried() -> None:
     )
     found = _solved(poor, first, second).trajectory
     assert found.status[KEYFRAMES[1]] is FrameStatus.RIG
+
+
+def test_what_the_rig_left_outlasts_the_search_for_lost_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene_map, cameras = _rig()
+    folders = [tmp_path / each.camera.name for each in cameras]
+    for folder, each in zip(folders, cameras, strict=True):
+        folder.mkdir()
+        save_registration(each.found, each.camera, folder, rolling=True)
+    selection = KeyframeSelection(
+        camera="torso", frames=KEYFRAMES, frame_count=COUNT, sharpness=np.ones(COUNT), noise_px=0.2
+    )
+    relative = relative_pose(*(each.found.trajectory for each in cameras), 0)
+    write_bundle(RigPoses(relative=(relative,)), folders[0], RIG_POSES)
+    capture = SimpleNamespace(cameras=tuple(each.camera for each in cameras))
+    monkeypatch.setattr(recover, "load_capture", lambda _: capture)
+    monkeypatch.setattr(recover, "load_map", lambda _: SimpleNamespace(maps=(scene_map,)))
+    monkeypatch.setattr(recover, "load_keyframes", lambda _: selection)
+    monkeypatch.setattr("bodycap_batch.registration.recover_lost", lambda found, *_: found)
+    out = tmp_path / "out"
+    out.mkdir()
+    arguments = {"registrations": [str(folder) for folder in folders], "map": "", "selection": ""}
+    recover.RECOVER.function({}, arguments, StageContext(work_dir=tmp_path, threads=1), out)
+    (kept,) = read_bundle(RigPoses, out, RIG_POSES).relative
+    assert kept.cameras == relative.cameras
+    assert read_summary(out) == read_summary(folders[0])
 
 
 def test_both_cameras_of_a_rig_get_poses_that_fit_together() -> None:
