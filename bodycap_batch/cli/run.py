@@ -28,7 +28,7 @@ from bodycap_batch.cli.options import (
 from bodycap_batch.cli.stop import stoppable
 from bodycap_batch.errors import BodycapError, JobError
 from bodycap_batch.progress import Event
-from bodycap_batch.tasks import StageName, stages_from
+from bodycap_batch.tasks import ORDER, StageName, stages_from
 
 if TYPE_CHECKING:
     from bodycap_batch.config.models import Job
@@ -125,9 +125,9 @@ def _report(summary: RunSummary, job: Job, display: Display, *, verbose: bool) -
             cost = f"{stage.seconds:8.1f} s {stage.peak_memory_mb:7.0f} MB"
             typer.echo(f"{cost}  {stage.stage} {stage.camera}{' (kept)' if stage.reused else ''}".rstrip())
     if not summary.files:
-        typer.echo(
-            f"{job.name}: stopped after {summary.stages[-1].stage}, as asked; run it again for the rest"
-        )
+        # What is done while frames are registered is no stage that can be asked for.
+        last = next(each.stage for each in reversed(summary.stages) if each.stage in ORDER)
+        typer.echo(f"{job.name}: stopped after {last}, as asked; run it again for the rest")
         return
     if summary.executed == 0:
         typer.echo(f"{job.name}: nothing to do, all {len(summary.stages)} stages were done before")

@@ -108,6 +108,12 @@ def test_the_store_can_be_named_by_option_or_variable(bench: Bench) -> None:
     assert "nothing to do" in bench.run("run", "my walk", "--out", "elsewhere")[1]
 
 
+def test_a_stage_asked_for_is_told_by_its_own_name(bench: Bench) -> None:
+    bench.order(localised=[40], lost={"torso": 3})
+    code, out, _ = bench.run("run", "my walk", "--until", "registration")
+    assert (code, out) == (0, "my_walk: stopped after registration, as asked; run it again for the rest\n")
+
+
 @pytest.mark.slow
 def test_stages_are_done_again_left_out_explained_and_cleaned_away(bench: Bench) -> None:
     code, out, _ = bench.run("run", "my walk", "--until", "keyframes")
