@@ -126,8 +126,8 @@ def _report(summary: RunSummary, job: Job, display: Display, *, verbose: bool) -
             typer.echo(f"{cost}  {stage.stage} {stage.camera}{' (kept)' if stage.reused else ''}".rstrip())
     if not summary.files:
         # What is done while frames are registered is no stage that can be asked for.
-        last = next(each.stage for each in reversed(summary.stages) if each.stage in ORDER)
-        typer.echo(f"{job.name}: stopped after {last}, as asked; run it again for the rest")
+        reached = next(each.stage for each in reversed(summary.stages) if each.stage in ORDER)
+        typer.echo(f"{job.name}: stopped after {reached}, as asked; run it again for the rest")
         return
     if summary.executed == 0:
         typer.echo(f"{job.name}: nothing to do, all {len(summary.stages)} stages were done before")
