@@ -10,6 +10,7 @@ import numpy as np
 
 from bodycap_batch.arrays import IntArray
 from bodycap_batch.capture.video import COPY_AGAIN, VideoFile, open_container, reason_of, video_stream
+from bodycap_batch.context import THREADS_VARIABLE
 from bodycap_batch.errors import CaptureError
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def first_frame(video: VideoFile) -> tuple[VideoFrame, bool]:
     import av
 
     with open_container(video.path) as container:
-        stream = _decoder(container, video)
+        stream = decoder(container, video)
         try:
             for frame in container.decode(stream):
                 return frame, bool(stream.codec_context.has_b_frames)
@@ -68,11 +69,14 @@ def first_frame(video: VideoFile) -> tuple[VideoFrame, bool]:
     raise CaptureError("no frame of it can be decoded", path=video.path, hint=COPY_AGAIN)
 
 
-def _decoder(container: InputContainer, video: VideoFile) -> VideoStream:
+def decoder(container: InputContainer, video: VideoFile) -> VideoStream:
+    """The video's stream, decoded on as many threads as there are for it."""
     stream = video_stream(container, video.path)
     stream.thread_type = "AUTO"
-    # The process's thread budget, where one is set; all processors otherwise.
-    stream.codec_context.thread_count = int(os.environ.get("OMP_NUM_THREADS", "0") or 0)
+    # The task's threads, else the process's, else all processors. (In a task's process the libraries' own
+    # pools are pinned to one.)
+    told = os.environ.get(THREADS_VARIABLE) or os.environ.get("OMP_NUM_THREADS") or "0"
+    stream.codec_context.thread_count = int(told)
     return stream
 
 
@@ -85,7 +89,7 @@ class _Cursor:
         self._video = video
         self._may_seek = seek and not video.counted
         self._container = open_container(video.path)
-        self._stream = _decoder(self._container, video)
+        self._stream = decoder(self._container, video)
         self._frames: Iterator[VideoFrame] = self._container.decode(self._stream)
         self._key_index = np.searchsorted(video.pts, video.key_pts)
 

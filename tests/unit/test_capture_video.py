@@ -16,6 +16,7 @@ from bodycap_batch.capture import CaptureCamera, decoding, open_camera
 from bodycap_batch.capture.images import turn_upright
 from bodycap_batch.capture.indexing import index_video
 from bodycap_batch.capture.prefetch import prefetched
+from bodycap_batch.capture.video import open_container
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.context import THREADS_VARIABLE
 from bodycap_batch.errors import CaptureError
@@ -282,3 +283,14 @@ def test_sound_beside_the_pictures_is_left_alone(tmp_path: Path) -> None:
                     both.mux(packet)
     camera = opened(tmp_path / "both.mp4")
     assert [shown_index(image) for _, image in camera.grey_frames()] == list(range(10))
+
+
+@pytest.mark.parametrize(("task", "process", "expected"), [("2", "1", 2), ("1", "4", 1), ("", "3", 3)])
+def test_a_task_decodes_on_the_threads_it_was_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, task: str, process: str, expected: int
+) -> None:
+    video = index_video(write_video(tmp_path / "a.mp4", FRAMES[:3]))
+    monkeypatch.setenv(THREADS_VARIABLE, task)
+    monkeypatch.setenv("OMP_NUM_THREADS", process)
+    with open_container(video.path) as container:
+        assert decoding.decoder(container, video).codec_context.thread_count == expected
