@@ -148,7 +148,12 @@ class Cluster:
             if self._client.status in _LEFT:
                 raise _lost(task)
         if future.status == "finished":
-            return dict(future.result())
+            try:
+                return dict(future.result())
+            except (
+                OSError
+            ) as error:  # the task's own errors come as answers: this is the way to the scheduler
+                raise _lost(task) from error
         if future.status == "error":
             raise _explained(future.exception(), task, making)
         raise _lost(task)

@@ -93,6 +93,22 @@ def test_a_scheduler_that_is_lost_while_it_is_asked_is_told(
         make(client, tmp_path, [])
 
 
+def test_a_scheduler_that_is_lost_with_the_answer_in_hand_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A future can be finished, and the way to what it gave be closed a moment later."""
+
+    def lost() -> None:
+        raise OSError("Stream is closed")
+
+    future = SimpleNamespace(status="finished", result=lost, add_done_callback=lambda call: call(None))
+    client = Client()
+    monkeypatch.setattr(client, "submit", lambda *_, **__: future)
+    monkeypatch.setattr(cluster, "_connect", lambda _: client)
+    with pytest.raises(BodycapError, match="the scheduler was lost"):
+        make(client, tmp_path, [])
+
+
 @pytest.mark.parametrize(("threads", "tasks_at_once", "want"), [(6, 4, 2), (1, 4, 1), (6, 16, 1), (6, 1, 6)])
 def test_the_tasks_of_a_worker_share_its_cores(
     monkeypatch: pytest.MonkeyPatch, threads: int, tasks_at_once: int, want: int
