@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -188,3 +188,37 @@ def content_of(artefacts: Mapping[str, Artefact]) -> dict[str, str]:
 def localised_in(registrations: Mapping[str, Artefact]) -> int:
     """Localised frames of all cameras."""
     return sum(int(read_summary(item.path)["localised"]) for item in registrations.values())
+
+
+def beside_others(
+    capture: CaptureConfig,
+    cameras: Sequence[CameraConfig],
+    digests: Mapping[str, str],
+    scene: Artefact,
+    keyframes: Artefact,
+    registrations: Mapping[str, Artefact],
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Inputs of the key and arguments of a task that solves a camera's frames with those of others.
+
+    Args:
+        capture: All cameras.
+        cameras: The task's own camera, then the others.
+        digests: By camera, of what its frames are.
+        scene: The map.
+        keyframes: Of the own camera.
+        registrations: By camera.
+    """
+    found = {camera.name: registrations[camera.name] for camera in cameras}
+    inputs = {
+        "cameras": [digests[name] for name in found],
+        "map": scene.digest,
+        "keyframes": keyframes.digest,
+        "registrations": list(content_of(found).values()),
+    }
+    arguments = {
+        "capture": all_cameras(capture.model_copy(update={"cameras": tuple(cameras)})),
+        "map": str(scene.path),
+        "selection": str(keyframes.path),
+        "registrations": [str(artefact.path) for artefact in found.values()],
+    }
+    return inputs, arguments

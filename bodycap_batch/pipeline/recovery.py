@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from bodycap_batch.config.models import Job
-from bodycap_batch.pipeline.inputs import all_cameras, content_of, key_of
+from bodycap_batch.pipeline.inputs import beside_others, key_of
 from bodycap_batch.runner import Task
 from bodycap_batch.store import Artefact
 from bodycap_batch.tasks import read_summary
@@ -37,17 +37,7 @@ def recovery_tasks(
         if not _LEAST_POSED <= summary["localised"] <= summary["frames"] - _LEAST_LOST:
             continue
         ordered = (own, *(camera for camera in job.capture.cameras if camera.name != own.name))
-        found = {camera.name: registrations[camera.name] for camera in ordered}
-        inputs = {
-            "cameras": [digests[camera.name] for camera in ordered],
-            "map": scene.digest,
-            "keyframes": keyframes[own.name].digest,
-            "registrations": list(content_of(found).values()),
-        }
-        arguments = {
-            "capture": all_cameras(job.capture.model_copy(update={"cameras": ordered})),
-            "map": str(scene.path),
-            "selection": str(keyframes[own.name].path),
-            "registrations": [str(artefact.path) for artefact in found.values()],
-        }
+        inputs, arguments = beside_others(
+            job.capture, ordered, digests, scene, keyframes[own.name], registrations
+        )
         yield Task(key=key_of("recover", options, inputs), arguments=arguments, camera=own.name)

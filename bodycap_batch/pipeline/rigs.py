@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from bodycap_batch.config.models import CaptureConfig, Job
-from bodycap_batch.pipeline.inputs import all_cameras, key_of
+from bodycap_batch.pipeline.inputs import beside_others, key_of
 from bodycap_batch.runner import Task
 from bodycap_batch.store import Artefact
 
@@ -35,16 +35,7 @@ def rig_tasks(
     segments = job.capture.segments() if job.capture.rig == "synced" else []
     for own, cameras in ((own, segment) for segment in segments for own in segment):
         ordered = (own, *(camera for camera in cameras if camera.name != own.name))
-        inputs = {
-            "cameras": [digests[camera.name] for camera in ordered],
-            "map": scene.digest,
-            "keyframes": keyframes[own.name].digest,
-            "registrations": [registrations[camera.name].digest for camera in ordered],
-        }
-        arguments = {
-            "capture": all_cameras(job.capture.model_copy(update={"cameras": ordered})),
-            "map": str(scene.path),
-            "selection": str(keyframes[own.name].path),
-            "registrations": [str(registrations[camera.name].path) for camera in ordered],
-        }
+        inputs, arguments = beside_others(
+            job.capture, ordered, digests, scene, keyframes[own.name], registrations
+        )
         yield Task(key=key_of("rig", options, inputs), arguments=arguments, camera=own.name)
