@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from tests.bench import poses
 from tests.bench.rows import BODYCAP, REPOSITORY, Row
 
 MAPPING = ("map", "registration", "recover")
@@ -54,6 +55,7 @@ def run(row: Row, work: Path) -> dict[str, Any]:
         "camera_seconds": camera_seconds(out / "frames.csv"),
         "peak_memory_mb": record["peak_memory_mb"],
         "report": score(out, row),
+        "covariance": poses.consistency(out, work / "store", row.truth),
         "metrics": metrics,
     }
 
@@ -120,6 +122,8 @@ def lines_of(result: dict[str, Any]) -> list[str]:
         if "vector_m" in relative:
             vector = relative["vector_m"]
             text.append(f"    {name}: mean {100 * vector['mean']:.2f} cm, p95 {100 * vector['p95']:.2f} cm")
+    if result.get("covariance"):
+        text.append("    " + poses.line_of(result["covariance"]))
     text.append("    seconds: " + stage_text(result["wall_seconds"]))
     frames = trajectories["total"]["frames"]
     each_ms = 1000 * result["stage_seconds"].get("registration", 0.0) / max(frames, 1)

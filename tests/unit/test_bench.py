@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from bodycap_batch.geometry import so3_exp
-from tests.bench import ours, peers, scaling, seeds, solving
+from bodycap_batch.geometry import Similarity, make_transform, so3_exp
+from tests.bench import ours, peers, poses, scaling, seeds, solving
 from tests.bench.peer_pairs import AWAY_NS, FROM_OTHER, OWN_AGAIN, STEPS, pairs_of
 from tests.bench.rows import Row, row_of
 from tests.scenes import small_map
@@ -142,3 +142,25 @@ def test_keyframes_are_scored_under_one_similarity():
     assert seeds.keyframe_errors_m(scene_map, truth).max() < 1e-9
     truth["torso"][0, 0, 3] += 1.0
     assert seeds.keyframe_errors_m(scene_map, truth).max() > 0.05
+
+
+def _poses_with_noise(rng, count, sigma):
+    """Random true poses, what was measured of them in another gauge, and the covariances it states."""
+    true = make_transform(so3_exp(rng.normal(0.0, 0.5, (count, 3))), rng.normal(0.0, 1.0, (count, 3)))
+    gauge = Similarity(3.0, so3_exp(np.array([0.4, -0.2, 1.0])), np.array([1.0, 2.0, 3.0]))
+    noise = rng.normal(0.0, sigma, (count, 6))
+    step = make_transform(so3_exp(noise[:, :3]), noise[:, 3:])
+    return gauge.apply_to_poses(true) @ step, true, np.tile(np.eye(6) * sigma**2, (count, 1, 1))
+
+
+def test_stated_covariances_of_poses_score_one_in_any_gauge():
+    mine, true, stated = _poses_with_noise(np.random.default_rng(4), 400, 0.01)
+    mine[:8, :3, 3] += 0.5  # gross errors count as such and pull at nothing
+    found = poses.figures(poses.least_errors(mine, true, stated), stated)
+    for part in ("rotation", "centre", "pose"):
+        # A median of 400 draws of chi-squared (3) is good to 6 %, three sigmas of that and some for 8 gross.
+        assert 0.8 < found[part] < 1.25
+        assert found[f"{part}_inside"] > 0.9
+    wide = poses.figures(poses.least_errors(mine, true, 4.0 * stated), 4.0 * stated)
+    assert np.isclose(wide["centre"], found["centre"] / 4.0, rtol=0.02)
+    assert wide["centre_inside"] > 0.97
