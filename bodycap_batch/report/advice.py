@@ -77,12 +77,26 @@ def advise(inputs: ReportInputs, lost: Mapping[str, Counter[Cause]]) -> list[Adv
     """
     found = [
         *_of_losses(inputs, lost),
+        *_of_lenses(inputs),
         *_of_overlap(inputs),
         *_of_motion(inputs),
         *_of_ends(inputs),
         *_of_body(inputs),
     ]
     return sorted(found, key=lambda each: -each.weight)
+
+
+def _of_lenses(inputs: ReportInputs) -> Iterator[Advice]:
+    """Calibrations that the map contradicts: nothing else can be right before they are."""
+    misfits = (inputs.metrics or {}).get("mapping", {}).get("misfitting_lenses", {})
+    if misfits:
+        fits = ", ".join(f"{name} {factor:.2f}" for name, factor in sorted(misfits.items()))
+        yield Advice(
+            do="Run again with `calibration: auto`, or calibrate in the mode that was filmed in, with "
+            "stabilisation and digital zoom off.",
+            because=f"the pictures contradict the given focal lengths; what fits, as a share of them: {fits}",
+            weight=3.0,
+        )
 
 
 def _sentence(text: str) -> str:

@@ -200,6 +200,24 @@ def _of_map(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
             metric="mapping.reach.within_reach",
             value=share,
         )
+    yield from _of_lenses(metrics.get("mapping", {}).get("misfitting_lenses", {}))
+
+
+def _of_lenses(misfits: Mapping[str, float]) -> Iterator[Criterion]:
+    """Given focal lengths that the map contradicts: by camera, what fits over what was given."""
+    name, worst = max(misfits.items(), key=lambda item: abs(item[1] - 1.0), default=("", None))
+    if worst is not None:
+        yield Criterion(
+            about="cameras",
+            name="Lenses fit the pictures",
+            grade=graded(abs(worst - 1.0), 0.0, 0.1),
+            says=f"{name}: the pictures fit a focal length {100 * abs(worst - 1.0):.0f} % "
+            f"{'longer' if worst > 1.0 else 'shorter'} than the calibration says",
+            why="A wrong focal length bends the whole map although its error in pixels is small: on a walk "
+            "of 2 m, 25 % put every camera 9 cm off.",
+            metric="" if "." in name else f"mapping.misfitting_lenses.{name}",
+            value=float(worst),
+        )
 
 
 def _of_body(merge: Mapping[str, Any]) -> Iterator[Criterion]:

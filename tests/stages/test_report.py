@@ -143,6 +143,23 @@ def test_a_share_below_one_never_reads_as_all(inputs: ReportInputs, tmp_path: Pa
     assert not any("100.0" in each for each in coverage)
 
 
+@pytest.mark.parametrize(
+    ("factor", "grade", "says"), [(0.81, Grade.POOR, "19 % shorter"), (1.08, Grade.FAIR, "8 % longer")]
+)
+def test_a_lens_that_the_map_contradicts_is_no_good_result(
+    inputs: ReportInputs, tmp_path: Path, factor: float, grade: Grade, says: str
+) -> None:
+    metrics = json.loads(json.dumps(inputs.metrics))
+    assert not any("Lenses" in each.name for each in judge(metrics, None).criteria)
+    metrics["mapping"]["misfitting_lenses"] = {"left_palm": factor, "torso": 1.0 + 0.9 * (factor - 1.0)}
+    (lenses,) = (each for each in judge(metrics, None).criteria if "Lenses" in each.name)
+    assert (lenses.grade, lenses.value) == (grade, factor)
+    assert f"left_palm: the pictures fit a focal length {says}" in lenses.says
+    told = replace(inputs, metrics=metrics)
+    assert "calibration: auto" in advise(told, {})[0].do
+    assert says in written(told, tmp_path)
+
+
 def test_cameras_that_come_late_or_leave_early_are_told_where_to_cut(inputs: ReportInputs) -> None:
     assert inputs.merge is not None
     assert not any("start_s" in each.do for each in advise(inputs, {}))
