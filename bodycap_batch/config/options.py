@@ -83,6 +83,11 @@ class MarkerBoard(Options):
     dictionary: str = Field("4X4_50", description="ChArUco: family of its markers, as OpenCV names it")
     marker: float = Field(0.75, gt=0.1, lt=1, description="ChArUco: side of a marker over that of a square")
     legacy: bool = Field(False, description="ChArUco: drawn by an OpenCV older than 4.6")
+    placed: Literal["lying", "hanging"] | None = Field(
+        None,
+        description="lying on a level floor or table, or hanging on a wall with its edges level and upright: "
+        "then it tells the vertical as well",
+    )
 
 
 class MergeOptions(Options):

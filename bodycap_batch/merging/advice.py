@@ -77,3 +77,20 @@ def scale_sentence(calibrated: Calibrated) -> str:
     if calibrated.t_pose_ns is None:
         ways.append("stand in a T-pose for two seconds first")
     return f"{text}; to know it better, {' or '.join(ways)}"
+
+
+def up_sentence(calibrated: Calibrated) -> str:
+    """How well the vertical is known."""
+    up = calibrated.up
+    text = f"up is known to {up.sigma_deg:.1f}° (1 sigma), from the {up.source}"
+    if not up.determined():
+        text = (
+            f"{text}, and not for certain: another direction, at a right angle or so to it, explains the "
+            f"leaning nearly as well"
+        )
+    elif up.source != "body":
+        return text
+    return (
+        f"{text}; to know it better, walk a few steps upright, film the floor and two walls, or lay a "
+        f"marker board on the floor (merge.marker_board.placed)"
+    )

@@ -1,10 +1,11 @@
-"""Metric scale from a board of known squares that keyframes saw in the room."""
+"""Metric scale, and up, from a board of known squares that keyframes saw in the room."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import Similarity, invert, so3_exp, so3_log
 from bodycap_batch.merging.samples import MAP_ERROR_M, MAP_ERROR_S
 from bodycap_batch.merging.scale import ScaleSource
+from bodycap_batch.merging.upright import Say
 
 NAME = "marker board"
 _FEWEST_VIEWS = 3
@@ -26,6 +28,29 @@ _MOST_SIGMA = 0.05
 _FITS = 3
 """Times the loss's width is taken from the residuals anew: the third changes it by less than a tenth."""
 _FLIP = np.diag([-1.0, -1.0, 1.0])
+_PLACED_SIGMA_DEG = 1.5
+"""A board hung by eye; a level floor or table is off by less."""
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """The marker board in the room.
+
+    Attributes:
+        scale: What it says of the scale.
+        axes: (3,3) its two edges and its normal, towards the cameras, as columns in the tracks' gauge.
+    """
+
+    scale: ScaleSource
+    axes: FloatArray
+
+    def ups(self, placed: Literal["lying", "hanging"] | None) -> tuple[Say, ...]:
+        """What it says of up: its normal where it lies, any of its edges where it hangs."""
+        if placed is None:
+            return ()
+        edges = [sign * self.axes[:, axis] for axis in (0, 1) for sign in (1.0, -1.0)]
+        ups = [self.axes[:, 2]] if placed == "lying" else edges
+        return tuple(Say(source=NAME, up=up, sigma_deg=_PLACED_SIGMA_DEG) for up in ups)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +74,10 @@ class _Seen:
     group: IntArray
 
 
-def board_scale(
+def find_board(
     inputs: MergeInputs, options: MergeOptions, places: Mapping[str, Similarity] | None = None
-) -> ScaleSource | None:
-    """The scale from the job's marker board, None where it names none.
+) -> Board | None:
+    """The scale and the way up from the job's marker board, None where it names none.
 
     The board's place, orientation and size in the map are fitted to its corners in all keyframes at once, by
     reprojection, with the keyframes' poses held; how well that is known is the jackknife's spread over
@@ -81,8 +106,12 @@ def board_scale(
             "from nearly the same place, or their poses contradict each other",
             hint="walk past it, so that it is seen from several sides; or leave merge.marker_board out",
         )
-    unit = 1.0 if places is None else places[gauge].scale
-    return ScaleSource(name=NAME, scale=float(np.exp(-found[6])) / unit, sigma_log=sigma)
+    unit, turn = (1.0, np.eye(3)) if places is None else (places[gauge].scale, places[gauge].rotation)
+    axes = so3_exp(found[None, :3])[0]
+    # Whichever way the detector's normal points, a board is seen from its front.
+    axes[:, 2] *= np.sign((seen.map_from_cam[:, :3, 3] - found[3:6]).mean(axis=0) @ axes[:, 2])
+    scale = ScaleSource(name=NAME, scale=float(np.exp(-found[6])) / unit, sigma_log=sigma)
+    return Board(scale, turn @ axes)
 
 
 def _gather(

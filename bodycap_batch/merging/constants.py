@@ -12,10 +12,11 @@ from bodycap_batch.body import MergeInputs
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging import gauge
-from bodycap_batch.merging.board import board_scale
+from bodycap_batch.merging.board import Board, find_board
 from bodycap_batch.merging.bones import Bone
 from bodycap_batch.merging.calibrate import Calibration
 from bodycap_batch.merging.distance import known_distance
+from bodycap_batch.merging.lean import body_up, body_up_from_prior
 from bodycap_batch.merging.limbs import limb_scales
 from bodycap_batch.merging.rolls import RollSearch, rolled, search_rolls, trunk_roll
 from bodycap_batch.merging.samples import take_samples
@@ -23,7 +24,8 @@ from bodycap_batch.merging.scale import ScaleEstimate, ScaleSource, combine, fin
 from bodycap_batch.merging.spread import Spread, joined
 from bodycap_batch.merging.t_pose import arm_span, find_t_pose
 from bodycap_batch.merging.tracks import Track
-from bodycap_batch.skeleton import Mount
+from bodycap_batch.merging.upright import Around, Direction, Say, find_up
+from bodycap_batch.skeleton import Mount, SkeletonModel
 from bodycap_batch.skeleton_presets import split_side
 
 _CALIBRATION_TICKS = 80
@@ -79,7 +81,7 @@ class Calibrated:
     limbs: tuple[ScaleSource, ...]
     mounts: tuple[Mount, ...]
     spread: Spread
-    up: gauge.Direction
+    up: Direction
     height_over_floor_m: float | None
     t_pose_ns: tuple[int, int] | None
     rolls: tuple[RollSearch, ...]
@@ -97,7 +99,9 @@ def calibrate_body(
     tracks, provisional = cleaned.tracks, cleaned.provisional
     points = points_around(inputs, tracks[0].camera)
     t_pose_ns = _t_pose(inputs, options, bones, cleaned)
-    inputs, known_up, rolls = _right_way_up(inputs, bones, cleaned, t_pose_ns, step)
+    board = find_board(inputs, options, cleaned.places)
+    stated_up = _stated_up(options, board)
+    inputs, known_up, rolls = _right_way_up(inputs, bones, cleaned, (t_pose_ns, stated_up), step)
     priors = {mount.camera: mount for mount in inputs.mounts}
     samples = take_samples(tracks, provisional, _CALIBRATION_TICKS, known_up, t_pose_ns)
     calibration = Calibration(inputs.skeleton, bones, samples, priors, provisional, step)
@@ -108,13 +112,17 @@ def calibrate_body(
         estimate = find_scale(calibration, estimate.scale)
     poses = calibration.poses()
     path_m = estimate.scale * tracks[0].map_from_cam[:, :3, 3]
-    body_up = gauge.body_up(inputs.skeleton, bones, poses)
-    up = gauge.find_up(estimate.scale * points, body_up, np.random.default_rng(0), path_m)
+    around = Around(
+        points_m=estimate.scale * points,
+        path_m=path_m,
+        standing_m=gauge.standing_height(inputs.skeleton, bones[0].joint),
+    )
+    up = find_up(body_up(inputs.skeleton, bones, poses), around, np.random.default_rng(0), stated_up)
     walking = samples.posture.walking
     # Who bends down or sits is not as tall as who walks.
     erect = poses[walking] if walking.sum() >= _ENOUGH_WALKING else poses
     height = _height_over_floor(inputs, bones, erect, up, (estimate.scale * points, path_m))
-    stated = (ask(inputs, options, cleaned.places) for ask in (known_distance, board_scale))
+    stated = (known_distance(inputs, options, cleaned.places), board.scale if board else None)
     known = tuple(source for source in stated if source is not None)
     sources = _sources(inputs, bones, estimate, height, known)
     scale, sigma = combine(sources)
@@ -143,19 +151,29 @@ def _right_way_up(
     inputs: MergeInputs,
     bones: Sequence[Bone],
     cleaned: Cleaned,
-    t_pose_ns: tuple[int, int] | None,
+    known: tuple[tuple[int, int] | None, Sequence[Say]],
     step: Callable[[], None],
 ) -> tuple[MergeInputs, FloatArray | None, tuple[RollSearch, ...]]:
     """The priors with each camera the way up it sits, the vertical where it is known, and what was tried."""
+    t_pose_ns, stated = known
     trunk = cleaned.tracks[0].scaled(cleaned.provisional)
     points_m = cleaned.provisional * points_around(inputs, trunk.camera)
     prior = inputs.mount_of(trunk.camera)
     roll, up = trunk_roll(
-        inputs, cleaned.tracks, lambda degrees: early_up(bones, trunk, rolled(prior, degrees), points_m)
+        inputs,
+        cleaned.tracks,
+        lambda degrees: early_up(inputs.skeleton, bones, (trunk, rolled(prior, degrees)), points_m, stated),
     )
     inputs = _rolled(inputs, {trunk.camera: roll})
     rolls = search_rolls(inputs, cleaned.tracks, cleaned.provisional, (up, t_pose_ns), step)
     return _rolled(inputs, {each.camera: each.chosen_deg for each in rolls}), up, rolls
+
+
+def _stated_up(options: MergeOptions, board: Board | None) -> tuple[Say, ...]:
+    """What the job itself says of up."""
+    if board is None or options.marker_board is None:
+        return ()
+    return board.ups(options.marker_board.placed)
 
 
 def _rolled(inputs: MergeInputs, degrees: Mapping[str, float]) -> MergeInputs:
@@ -179,23 +197,34 @@ def _t_pose(
     return find_t_pose(bones, cleaned.tracks, arm_span(bones, inputs.skeleton) / cleaned.provisional)
 
 
-def early_up(bones: Sequence[Bone], trunk: Track, prior: Mount, points_m: FloatArray) -> FloatArray | None:
-    """The vertical (3,) where planes or the walk show it, before anything is solved.
+def early_up(
+    skeleton: SkeletonModel,
+    bones: Sequence[Bone],
+    worn: tuple[Track, Mount],
+    points_m: FloatArray,
+    stated: Sequence[Say] = (),
+) -> FloatArray | None:
+    """The vertical (3,) where the job, planes or the walk tell it, before anything is solved.
 
     None from a limb's camera: a swinging arm tells neither the vertical nor the way the body faces.
     """
+    trunk, prior = worn
     if split_side(bones[trunk.bone].role)[0]:
         return None
-    hint = gauge.body_up_from_prior(bones, trunk, prior)
-    found = gauge.find_up(points_m, hint, np.random.default_rng(0), trunk.map_from_cam[:, :3, 3])
-    return None if found.source == "body" else found.up
+    around = Around(
+        points_m=points_m,
+        path_m=trunk.map_from_cam[:, :3, 3],
+        standing_m=gauge.standing_height(skeleton, bones[trunk.bone].joint),
+    )
+    found = find_up(body_up_from_prior(bones, trunk, prior), around, np.random.default_rng(0), stated)
+    return None if found.source == "body" or not found.determined() else found.up
 
 
 def _height_over_floor(
     inputs: MergeInputs,
     bones: Sequence[Bone],
     poses: FloatArray,
-    up: gauge.Direction,
+    up: Direction,
     around: tuple[FloatArray, FloatArray],
 ) -> float | None:
     """Median height of the trunk's first solved joint over the walked floor, None if none was seen."""

@@ -1,8 +1,7 @@
-"""From the solved frame (metres, arbitrary axes) to the world: which way is up, where the floor is."""
+"""From the solved frame (metres, arbitrary axes) to the world: where the floor is, which way ahead."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,23 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from bodycap_batch.arrays import BoolArray, FloatArray
 from bodycap_batch.geometry import Similarity, so3_exp
-from bodycap_batch.merging.bones import Bone, proper_axes
-from bodycap_batch.merging.planes import BENT_LIMIT_DEG, TILT_LIMIT_DEG, find_planes, vertical
-from bodycap_batch.merging.posture import walking_plane
-from bodycap_batch.merging.tracks import Track
-from bodycap_batch.skeleton import Mount, SkeletonModel
-from bodycap_batch.skeleton_presets import rest_positions, split_side
+from bodycap_batch.merging.upright import Direction
+from bodycap_batch.skeleton import SkeletonModel
+from bodycap_batch.skeleton_presets import rest_positions
 
 MOVING_M_PER_S = 0.4
 WALKING_HEIGHT = 0.97
 """Mean height of the trunk in walking over its standing height: 0.95 to 1.00 on four captures."""
 
-_USUAL_RAD = float(np.radians(15.0))
-"""A trunk sways by less than this about its usual direction in walking and standing."""
-_DIRECTIONS = 300
-_FROM_MEAN = float(np.cos(np.radians(45.0)))
-"""Of two directions at right angles one is nearer to the mean than this: further off, a wall passes for the
-floor."""
 SLAB_M = 0.03
 _MIN_POINTS = 100
 _MIN_FLOOR_POINTS = 30
@@ -43,119 +33,12 @@ _ANKLE_OVER_LEG = 0.039 / 0.491
 
 
 @dataclass(frozen=True, slots=True)
-class BodyUp:
-    """Where a body's trunk points.
-
-    Attributes:
-        usual: (3,) near which it is most of the time: who bends now and then is upright in between.
-        mean: (3,) of all the time: who is bent most of the time leans less in the mean.
-    """
-
-    usual: FloatArray
-    mean: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
-class Direction:
-    """Up in the solved frame, and what it rests on."""
-
-    up: FloatArray
-    source: str
-    body_off_deg: float | None
-    plane_share: float
-
-
-@dataclass(frozen=True, slots=True)
 class Floor:
     """Height of the floor along up, and what it rests on."""
 
     height_m: float
     source: str
     support: int
-
-
-def body_up(skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray) -> BodyUp:
-    """Up direction of a body: its trunk's axis as it usually is, else against its hanging limbs."""
-    trunk = [i for i, bone in enumerate(bones) if not split_side(bone.role)[0]]
-    limbs = [
-        i for i, bone in enumerate(bones) if split_side(bone.role)[1] in ("Arm", "UpLeg", "Leg", "ForeArm")
-    ]
-    if trunk:
-        return _over_time(world_from_bone[:, trunk, :3, 2].mean(axis=1))
-    chosen = limbs or list(range(len(bones)))
-    along = [world_from_bone[:, i, :3, :3] @ proper_axes(skeleton, bones[i].role)[:, 0] for i in chosen]
-    hanging = _unit(-np.mean(along, axis=(0, 1)))
-    return BodyUp(hanging, hanging)
-
-
-def body_up_from_prior(bones: Sequence[Bone], trunk: Track, mount: Mount) -> BodyUp:
-    """Up in the map that a camera's path and its mount's prior promise."""
-    rest = np.eye(3)
-    index = trunk.bone
-    while bones[index].parent >= 0:
-        rest = bones[index].mean_rotation.T @ rest
-        index = bones[index].parent
-    joint = trunk.map_from_cam[:, :3, :3] @ mount.joint_from_cam[:3, :3].T
-    return _over_time((joint @ rest)[:, :, 2])
-
-
-def _over_time(directions: FloatArray) -> BodyUp:
-    return BodyUp(usual_direction(directions), _unit(directions.mean(axis=0)))
-
-
-def _unit(direction: FloatArray) -> FloatArray:
-    return np.asarray(direction / np.linalg.norm(direction))
-
-
-def usual_direction(directions: FloatArray) -> FloatArray:
-    """The direction (3,) near which most of (N,3) lie: who bends down is upright in between.
-
-    The mean of a lifter's trunk leans by half of its bends.
-    """
-    some = directions[np.unique(np.linspace(0, len(directions) - 1, _DIRECTIONS).astype(np.int64))]
-    some = some / np.linalg.norm(some, axis=1, keepdims=True)
-    near = some @ some.T > np.cos(_USUAL_RAD)
-    return _unit(some[near[int(np.argmax(near.sum(axis=1)))]].mean(axis=0))
-
-
-def find_up(points_m: FloatArray, body: BodyUp, rng: np.random.Generator, path_m: FloatArray) -> Direction:
-    """Turn the body's up onto the vertical of the map's walls, floor and ceiling, else of the walk.
-
-    Looked for about both of the body's directions; found about both, the one nearer to the mean is it. Planes
-    further off than an upright body's come after the walk: a wall and a sloping roof agree on a vertical
-    too, and who walked level knows better.
-
-    Args:
-        points_m: (P,3) map points in the solved frame.
-        body: The body's up.
-        rng: Draws the planes' hypotheses.
-        path_m: (N,3) path of the trunk's camera.
-    """
-    planes = find_planes(points_m, rng)
-
-    def by_planes(limit_deg: float) -> Direction | None:
-        return _nearest(body, "map", [vertical(planes, hint, limit_deg) for hint in (body.usual, body.mean)])
-
-    def by_walk() -> Direction | None:
-        walked = [walking_plane(path_m, hint) for hint in (body.usual, body.mean)]
-        return _nearest(body, "walk", [None if up is None else (up, 0.0) for up in walked])
-
-    return (
-        by_planes(TILT_LIMIT_DEG)
-        or by_walk()
-        or by_planes(BENT_LIMIT_DEG)
-        or Direction(body.usual, "body", None, 0.0)
-    )
-
-
-def _nearest(body: BodyUp, source: str, found: Sequence[tuple[FloatArray, float] | None]) -> Direction | None:
-    """Of verticals and their planes' shares the one nearest to the body's mean, if near enough."""
-    near = [each for each in found if each is not None and float(each[0] @ body.mean) > _FROM_MEAN]
-    if not near:
-        return None
-    up, share = max(near, key=lambda each: float(each[0] @ body.mean))
-    angle = float(np.degrees(np.arccos(np.clip(up @ body.usual, -1.0, 1.0))))
-    return Direction(up, source, angle, share)
 
 
 def find_floor(heights_m: FloatArray, up: Direction, expected_m: float, standing_m: float) -> Floor:

@@ -204,7 +204,7 @@ def join_maps(
     together = [clean(each, provisional, inputs.clocks[each.camera].nominal_fps)[0] for each in together]
     trunk = together[0].scaled(provisional)
     points_m = provisional * points_around(inputs, trunk.camera)
-    known_up = early_up(bones, trunk, mounts[trunk.camera], points_m)
+    known_up = early_up(inputs.skeleton, bones, (trunk, mounts[trunk.camera]), points_m)
     samples = take_samples(together, provisional, _SAMPLES, known_up)
     calibration = Calibration(inputs.skeleton, bones, samples, mounts, provisional, step)
     names = {gauge: tuple(track.camera for track in group) for gauge, group in others}

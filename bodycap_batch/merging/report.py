@@ -10,11 +10,12 @@ import numpy as np
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.body import MergeInputs
 from bodycap_batch.geometry import rotation_angle_rad
-from bodycap_batch.merging.advice import hinge_sentence, mount_sentence, scale_sentence
+from bodycap_batch.merging.advice import hinge_sentence, mount_sentence, scale_sentence, up_sentence
 from bodycap_batch.merging.constants import Calibrated
 from bodycap_batch.merging.scale import ScaleSource, disagreement
 from bodycap_batch.merging.solve import Solution
 from bodycap_batch.merging.tracks import Track
+from bodycap_batch.merging.upright import apart_deg
 
 
 def build_report(
@@ -41,13 +42,7 @@ def build_report(
     return {
         "scale": _scale(calibrated),
         "t_pose": _t_pose(calibrated, notes["start_ns"]),
-        "up": {
-            "source": calibrated.up.source,
-            "body_off_deg": None
-            if calibrated.up.body_off_deg is None
-            else round(calibrated.up.body_off_deg, 3),
-            "plane_points_share": round(calibrated.up.plane_share, 3),
-        },
+        "up": _up(calibrated),
         "floor": {"source": floor.source, "points": floor.support},
         "mounts": {mount.camera: _mount(inputs, mount.camera, calibrated) for mount in calibrated.mounts},
         "cameras": {
@@ -115,6 +110,27 @@ def _scale(calibrated: Calibrated) -> dict[str, Any]:
             "degrees_of_freedom": freedom,
         }
     return out
+
+
+def _up(calibrated: Calibrated) -> dict[str, Any]:
+    """What up was taken from, and how far off everything else is."""
+    up = calibrated.up
+    return {
+        "source": up.source,
+        "sigma_deg": round(up.sigma_deg, 2),
+        "body_off_deg": None if up.body_off_deg is None else round(up.body_off_deg, 3),
+        "plane_points_share": round(up.plane_share, 3),
+        "others": [
+            {
+                "name": say.source,
+                "off_deg": round(apart_deg(say.up, up.up), 2),
+                "sigma_deg": round(say.sigma_deg, 2),
+                "less_likely_nats": round(say.nats - up.nats, 2),
+            }
+            for say in up.others
+        ],
+        "known_to": up_sentence(calibrated),
+    }
 
 
 def _source(source: ScaleSource, scale: float) -> dict[str, Any]:

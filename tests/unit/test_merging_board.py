@@ -20,7 +20,8 @@ from bodycap_batch.config.options import MarkerBoard, MergeOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import Similarity, invert, make_transform, so3_exp, transform_points
-from bodycap_batch.merging.board import board_scale
+from bodycap_batch.merging.board import find_board
+from bodycap_batch.merging.scale import ScaleSource
 from bodycap_batch.scene import FrameStatus, Trajectory
 from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount
 from tests.rooms import LENS, look
@@ -32,6 +33,10 @@ CHESSBOARD = MarkerBoard(kind="chessboard", square_m=0.06, columns=7, rows=5)
 GAUGE = Similarity(0.4, so3_exp([0.7, -1.1, 0.4]), np.array([1.0, 2.0, -0.5]))
 WORLD_FROM_BOARD = make_transform(look(0.1) @ so3_exp([0.2, 0.1, 0.3]), [1.6, 0.3, 0.2])
 CAMERA = Camera(model="PINHOLE", width_px=320, height_px=240, params=np.array(LENS["params"]))
+
+
+def _scale(*asked: object) -> ScaleSource:
+    return find_board(*asked).scale
 
 
 def _path(count: int, centre_noise_m: float = 0.0, half_way_m: float = 0.7) -> np.ndarray:
@@ -91,7 +96,7 @@ def test_the_board_gives_the_scale_and_how_well():
         exact = _path(12)
         bent = exact.copy()
         bent[:, :3, 3] += rng.normal(scale=0.004, size=(12, 3))
-        source = board_scale(_inputs(bent, _views(exact, rng)), MergeOptions(marker_board=FLAT))
+        source = _scale(_inputs(bent, _views(exact, rng)), MergeOptions(marker_board=FLAT))
         # Four millimetres on a way of 1.4 m, twelve times: half a per cent, five times that for five draws.
         assert abs(np.log(source.scale * GAUGE.scale)) < min(3.0 * source.sigma_log, 0.025)
         assert 0.003 <= source.sigma_log < 0.02
@@ -108,7 +113,7 @@ def test_a_glimpse_of_the_board_shares_its_maps_error(half_way_m):
         bent[:, :3, 3] += 0.005 * gaussian_filter1d(rng.normal(scale=4.2, size=(75, 3)), 5, axis=0)[30:-30]
         inputs = _inputs(bent, _views(exact, rng))
         path = replace(inputs.trajectories[0], times_ns=np.arange(15) * 100_000_000)
-        source = board_scale(replace(inputs, trajectories=(path,)), MergeOptions(marker_board=FLAT))
+        source = _scale(replace(inputs, trajectories=(path,)), MergeOptions(marker_board=FLAT))
         off.append(np.log(source.scale * GAUGE.scale) / source.sigma_log)
     # The root mean square of sixteen is known to 18 %.
     assert 0.6 < float(np.sqrt(np.mean(np.square(off)))) < 1.5
@@ -125,7 +130,7 @@ def test_views_that_begin_at_the_other_end_and_a_wrong_one_do_no_harm():
             views[one], rays=views[one].rays[::-1].copy(), cam_from_board=views[one].cam_from_board @ about
         )
     views[7] = replace(views[7], rays=views[7].rays + 0.15)
-    source = board_scale(_inputs(exact, tuple(views)), MergeOptions(marker_board=CHESSBOARD))
+    source = _scale(_inputs(exact, tuple(views)), MergeOptions(marker_board=CHESSBOARD))
     assert source.scale * GAUGE.scale == pytest.approx(1.0, abs=0.01)
 
 
@@ -133,20 +138,20 @@ def test_a_board_in_a_further_map_is_in_that_maps_units():
     views = _views(_path(12), np.random.default_rng(0))
     inputs, asked = _inputs(_path(12), views), MergeOptions(marker_board=FLAT)
     half = Similarity(0.5, np.eye(3), np.zeros(3))
-    alone, placed = board_scale(inputs, asked), board_scale(inputs, asked, {"map-0": half})
+    alone, placed = _scale(inputs, asked), _scale(inputs, asked, {"map-0": half})
     assert placed.scale == pytest.approx(2.0 * alone.scale)
     with pytest.raises(EstimationError, match="0 keyframes"):
-        board_scale(inputs, asked, {"map-1": half})
+        _scale(inputs, asked, {"map-1": half})
 
 
 def test_corners_with_numbers_are_not_turned_to_fit_a_view_whose_pose_is_wrong():
     views = list(_views(_path(12), np.random.default_rng(0), noise_px=0.1))
     inputs, asked = _inputs(_path(12), tuple(views)), MergeOptions(marker_board=FLAT)
-    right = board_scale(inputs, asked)
+    right = _scale(inputs, asked)
     about = make_transform(np.diag([-1.0, -1.0, 1.0]), [0.36, 0.24, 0.0])
     for one in (1, 4, 5):
         views[one] = replace(views[one], cam_from_board=views[one].cam_from_board @ about)
-    source = board_scale(replace(inputs, board=tuple(views)), asked)
+    source = _scale(replace(inputs, board=tuple(views)), asked)
     # Turned, their corners would be outliers, and the fit rest on the other nine.
     assert source.scale == pytest.approx(right.scale, rel=1e-6)
 
@@ -170,21 +175,21 @@ def test_the_main_map_is_asked_before_one_that_was_joined():
         board=(*few, *(replace(view, camera="left_palm") for view in views)),
     )
     asked = MergeOptions(marker_board=FLAT)
-    assert board_scale(both, asked, places).scale * GAUGE.scale == pytest.approx(1.0, abs=0.02)
+    assert _scale(both, asked, places).scale * GAUGE.scale == pytest.approx(1.0, abs=0.02)
     fewer = replace(both, board=both.board[2:])
-    assert board_scale(fewer, asked, places).scale * GAUGE.scale == pytest.approx(1.0 / 1.2, abs=0.02)
+    assert _scale(fewer, asked, places).scale * GAUGE.scale == pytest.approx(1.0 / 1.2, abs=0.02)
 
 
 def test_a_board_that_tells_nothing_is_refused():
     rng = np.random.default_rng(0)
     asked = MergeOptions(marker_board=FLAT)
-    assert board_scale(_inputs(_path(4)), MergeOptions()) is None
+    assert find_board(_inputs(_path(4)), MergeOptions()) is None
     with pytest.raises(EstimationError, match="found in 2 keyframes"):
-        board_scale(_inputs(_path(2), _views(_path(2), rng)), asked)
+        _scale(_inputs(_path(2), _views(_path(2), rng)), asked)
     still = np.repeat(_path(1), 6, axis=0)
     still[:, :3, 3] += rng.normal(scale=1e-3, size=(6, 3))
     with pytest.raises(EstimationError, match="from nearly the same place"):
-        board_scale(_inputs(still, _views(still, rng)), asked)
+        _scale(_inputs(still, _views(still, rng)), asked)
 
 
 @pytest.fixture(scope="module")
@@ -228,8 +233,30 @@ def test_a_filmed_board_is_found_and_measured(filmed, tmp_path):
     context = StageContext(work_dir=tmp_path)
     views = find_board_views(capture, every, {"torso": CAMERA}, LARGE, context)
     assert len(views) >= 6
-    source = board_scale(_inputs(poses, views), MergeOptions(marker_board=LARGE))
+    source = _scale(_inputs(poses, views), MergeOptions(marker_board=LARGE))
     # A tenth of a pixel on a board of 130 px, eight times.
     assert source.scale * GAUGE.scale == pytest.approx(1.0, abs=0.01)
     other = LARGE.model_copy(update={"dictionary": "6X6_50"})
     assert find_board_views(capture, every, {"torso": CAMERA}, other, context) == ()
+
+
+def test_a_board_that_lies_or_hangs_tells_up():
+    views = _views(_path(12), np.random.default_rng(0))
+    board = find_board(_inputs(_path(12), views), MergeOptions(marker_board=FLAT))
+    assert board.ups(None) == ()
+    edges = GAUGE.rotation @ WORLD_FROM_BOARD[:3, :3]
+    (lying,) = board.ups("lying")
+    # It is seen from where its normal points, whichever way the detector has that.
+    towards = GAUGE.rotation @ (_path(12)[:, :3, 3].mean(axis=0) - WORLD_FROM_BOARD[:3, 3])
+    assert lying.up @ towards > 0.0
+    # 0.1 px of noise in a dozen views of 24 corners: a small part of a degree.
+    assert abs(lying.up @ edges[:, 2]) > np.cos(np.radians(0.5))
+    hanging = [say.up for say in board.ups("hanging")]
+    assert len(hanging) == 4
+    for edge in (edges[:, 0], -edges[:, 0], edges[:, 1], -edges[:, 1]):
+        assert max(up @ edge for up in hanging) > np.cos(np.radians(0.5))
+    turned = Similarity(0.5, so3_exp([0.0, 0.0, 1.0]), np.zeros(3))
+    (placed,) = find_board(_inputs(_path(12), views), MergeOptions(marker_board=FLAT), {"map-0": turned}).ups(
+        "lying"
+    )
+    assert np.allclose(placed.up, turned.rotation @ lying.up)

@@ -112,7 +112,10 @@ def test_a_limbs_camera_tells_no_vertical(capture):
     arm = next(mount for mount in inputs.mounts if mount.camera == "left_upper_arm")
     place = [bone.role for bone in bones].index(arm.role)
     trajectory = next(each for each in inputs.trajectories if each.camera == arm.camera)
-    assert early_up(bones, make_track(inputs, trajectory, place), arm, np.zeros((0, 3))) is None
+    assert (
+        early_up(inputs.skeleton, bones, (make_track(inputs, trajectory, place), arm), np.zeros((0, 3)))
+        is None
+    )
 
 
 def test_the_timeline_is_that_of_the_cameras_in_use(capture):

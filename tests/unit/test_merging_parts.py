@@ -15,16 +15,12 @@ from bodycap_batch.geometry import invert, make_transform, so3_exp, so3_log
 from bodycap_batch.merging.bones import graph_bones, hinges, proper_axes
 from bodycap_batch.merging.complete import complete_body, observed_joints
 from bodycap_batch.merging.gauge import (
-    BodyUp,
-    Direction,
     feet_floor,
     find_floor,
-    find_up,
     heading,
     place,
     standing_height,
     upright,
-    usual_direction,
     walked_floor,
 )
 from bodycap_batch.merging.graph import (
@@ -40,6 +36,7 @@ from bodycap_batch.merging.planes import BENT_LIMIT_DEG, TILT_LIMIT_DEG, find_pl
 from bodycap_batch.merging.rules import activity_rules, limit_rules, reach_rules
 from bodycap_batch.merging.scale import ScaleSource, combine, disagreement, floor_source
 from bodycap_batch.merging.tracks import Track, adapt_psd, clean
+from bodycap_batch.merging.upright import Direction
 from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount, rest_positions
 
 SECOND = 1_000_000_000
@@ -308,50 +305,6 @@ def test_clutter_beside_the_walk_is_no_floor(floor, clutter, source):
     path, points = _beside_a_walk(np.random.default_rng(1), floor, clutter)
     assert walked_floor(points, path, Direction(UP, source, 0.0, 1.0), 0.0, 1.2) is None
     assert walked_floor(points[:0], path, Direction(UP, source, 0.0, 1.0), 0.0, 1.2) is None
-
-
-def _box_room(rng):
-    """Points (P,3) of the floor, the ceiling and four walls."""
-    low, high = np.array([-3.0, -2.5, 0.0]), np.array([3.0, 2.5, 2.6])
-    faces = np.tile(rng.uniform(low, high, (200, 3)), (6, 1, 1))
-    for face in range(6):
-        faces[face, :, face % 3] = (low, high)[face // 3][face % 3]
-    return faces.reshape(-1, 3) + rng.normal(scale=0.005, size=(1200, 3))
-
-
-@pytest.mark.parametrize(("bent_deg", "share"), [(40, 0.6), (50, 0.6), (65, 0.5), (50, 0.3), (80, 0.3)])
-def test_who_is_bent_most_of_the_time_does_not_tilt_the_room(bent_deg, share):
-    rng = np.random.default_rng(1)
-    lean = np.where(np.arange(200) < share * 200, bent_deg, 3.0) + rng.normal(scale=4.0, size=200)
-    turn = so3_exp(np.outer(np.radians(lean), [0.0, 1.0, 0.0]))
-    mean = turn[:, :, 2].mean(axis=0)
-    body = BodyUp(usual_direction(turn[:, :, 2]), mean / np.linalg.norm(mean))
-    up = find_up(_box_room(rng), body, np.random.default_rng(0), 0.45 * turn[:, :, 2])
-    assert up.source == "map"
-    assert np.degrees(np.arccos(up.up @ UP)) < 0.5
-
-
-def test_a_wall_is_no_floor_to_who_is_bent_too_far():
-    rng = np.random.default_rng(1)
-    usual, mean = (so3_exp(np.radians(angle) * np.eye(3)[1]) @ UP for angle in (65.0, 42.0))
-    up = find_up(_box_room(rng), BodyUp(usual, mean), np.random.default_rng(0), np.zeros((20, 3)))
-    assert up.source == "body"
-
-
-def test_a_wall_and_a_sloping_roof_do_not_tilt_a_level_walk():
-    rng = np.random.default_rng(1)
-    wall = rng.uniform([3.0, -2.0, 0.0], [3.0, 2.0, 2.5], (300, 3))
-    roof = rng.uniform([-3.0, -2.0, 2.5], [3.0, 2.0, 2.5], (300, 3))
-    roof[:, 2] -= np.tan(np.radians(30.0)) * roof[:, 1]
-    clutter = rng.uniform([-3.0, -2.0, 0.0], [3.0, 2.0, 2.5], (150, 3))
-    attic = np.concatenate([wall, roof, clutter]) + rng.normal(scale=0.005, size=(750, 3))
-    angle = np.linspace(0.0, 10.0, 300)
-    walk = np.column_stack([1.5 * np.sin(angle), 1.2 * np.cos(angle), 1.3 + 0.02 * np.sin(22.0 * angle)])
-    up = find_up(attic, BodyUp(UP, UP), np.random.default_rng(0), walk)
-    assert up.source == "walk"
-    assert np.degrees(np.arccos(up.up @ UP)) < 0.5
-    # Who stands still has nothing better than what the planes agree on.
-    assert find_up(attic, BodyUp(UP, UP), np.random.default_rng(0), walk[:20]).source == "map"
 
 
 def test_one_wall_does_not_fix_the_vertical():

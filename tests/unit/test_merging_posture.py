@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 
 from bodycap_batch.geometry import make_transform, so3_exp
 from bodycap_batch.merging.bones import graph_bones, proper_axes
-from bodycap_batch.merging.gauge import usual_direction
+from bodycap_batch.merging.lean import usual_direction
 from bodycap_batch.merging.posture import GESTURE_S, find_posture, walking_plane, widened
 from bodycap_batch.merging.spread import BETWEEN_SHARE
 from bodycap_batch.merging.t_pose import arm_span, find_t_pose, t_posed

@@ -1,0 +1,158 @@
+"""Which way is up: planes, the walk, the leaning of the body and what the job states, against each other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodycap_batch.geometry import make_transform, so3_exp
+from bodycap_batch.merging.bones import graph_bones
+from bodycap_batch.merging.lean import BodyUp, body_up
+from bodycap_batch.merging.upright import Around, Direction, Say, find_up
+from bodycap_batch.skeleton_presets import load_skeleton
+
+UP = np.array([0.0, 0.0, 1.0])
+TURN = so3_exp([0.4, -0.9, 0.3])
+STANDING_M = 1.25
+
+
+def _box_room(rng):
+    """Points (P,3) of the floor, the ceiling and four walls."""
+    low, high = np.array([-3.0, -2.5, 0.0]), np.array([3.0, 2.5, 2.6])
+    faces = np.tile(rng.uniform(low, high, (200, 3)), (6, 1, 1))
+    for face in range(6):
+        faces[face, :, face % 3] = (low, high)[face // 3][face % 3]
+    return faces.reshape(-1, 3) + rng.normal(scale=0.005, size=(1200, 3))
+
+
+def _leaning(rng, forward_deg, share, side_deg=0.0):
+    """Axes (N,3,3) of a trunk that leans for a share of the time, and where its chest is then (N,3)."""
+    leans = np.arange(200) < share * 200
+    pitch, side = (
+        np.where(leans, most, 0.0) + rng.normal(scale=4.0, size=200) for most in (forward_deg, side_deg)
+    )
+    # Left is +X and back +Y: a turn about +X tips up towards the front.
+    axes = so3_exp(np.outer(np.radians(pitch), [1.0, 0.0, 0.0])) @ so3_exp(
+        np.outer(np.radians(side), [0.0, 1.0, 0.0])
+    )
+    return axes, 0.45 * axes[:, :, 2] + [0.0, 0.0, STANDING_M - 0.45]
+
+
+def _found(axes, path, points, sided=True, stated=()) -> Direction:
+    """What is found in a frame that is turned, and turned back."""
+    around = Around(points_m=points @ TURN.T, path_m=path @ TURN.T, standing_m=STANDING_M)
+    return find_up(BodyUp(TURN @ axes, sided), around, np.random.default_rng(0), stated)
+
+
+def _off_deg(found: Direction) -> float:
+    return float(np.degrees(np.arccos(np.clip(found.up @ TURN @ UP, -1.0, 1.0))))
+
+
+@pytest.mark.parametrize(
+    ("forward_deg", "share"),
+    [
+        (0, 1.0),
+        (40, 0.6),
+        (80, 0.3),
+        (58, 0.6),
+        (75, 0.6),
+        (90, 0.6),
+        (58, 0.8),
+        (90, 0.8),
+        (58, 1.0),
+        (-30, 1.0),
+    ],
+)
+def test_a_room_is_not_laid_on_its_side_by_who_bends_in_it(forward_deg, share):
+    rng = np.random.default_rng(1)
+    found = _found(*_leaning(rng, forward_deg, share), _box_room(rng))
+    assert found.source == "map"
+    assert _off_deg(found) < 0.5
+    assert found.determined()
+
+
+def test_a_room_seen_from_one_side_is_not_laid_on_its_side_either():
+    rng = np.random.default_rng(1)
+    room = _box_room(rng)
+    # He faces -Y: what lies behind him, and the ceiling, no camera sees.
+    ahead = room[(room[:, 1] < 0.2) & (room[:, 2] < 2.0)]
+    found = _found(*_leaning(rng, 80.0, 0.7), ahead)
+    assert found.source == "map"
+    assert _off_deg(found) < 0.5
+
+
+def test_the_body_alone_is_upright_where_it_bends_from():
+    rng = np.random.default_rng(1)
+    axes, path = _leaning(rng, 60.0, 0.6)
+    found = _found(axes, path, np.zeros((0, 3)))
+    assert found.source == "body"
+    assert found.body_off_deg is None
+    # The mean leans by 36 degrees, and the usual direction by 60.
+    assert _off_deg(found) < 5.0
+    # Half of the 46 degrees that the trunk moves in the mean square, and a mount's 15.
+    assert 20.0 < found.sigma_deg < 35.0
+
+
+def test_a_wall_and_a_sloping_roof_do_not_tilt_a_level_walk():
+    rng = np.random.default_rng(1)
+    wall = rng.uniform([3.0, -2.0, 0.0], [3.0, 2.0, 2.5], (300, 3))
+    roof = rng.uniform([-3.0, -2.0, 2.5], [3.0, 2.0, 2.5], (300, 3))
+    roof[:, 2] -= np.tan(np.radians(30.0)) * roof[:, 1]
+    clutter = rng.uniform([-3.0, -2.0, 0.0], [3.0, 2.0, 2.5], (150, 3))
+    attic = np.concatenate([wall, roof, clutter]) + rng.normal(scale=0.005, size=(750, 3))
+    angle = np.linspace(0.0, 10.0, 300)
+    walk = np.column_stack([1.5 * np.sin(angle), 1.2 * np.cos(angle), 1.3 + 0.02 * np.sin(22.0 * angle)])
+    axes, _ = _leaning(rng, 0.0, 1.0)
+    found = _found(axes, walk, attic, sided=False)
+    assert found.source == "walk"
+    assert _off_deg(found) < 0.5
+    # Who stands still has nothing better than what the planes agree on.
+    assert _found(axes, walk[:20], attic, sided=False).source == "map"
+
+
+@pytest.mark.parametrize(("hung_deg", "taken"), [(3.0, "map"), (10.0, "marker board")])
+def test_what_the_job_states_is_taken_and_the_others_are_told_against_it(hung_deg, taken):
+    rng = np.random.default_rng(1)
+    room, (axes, path) = _box_room(rng), _leaning(rng, 0.0, 1.0)
+    hung = TURN @ so3_exp([np.radians(hung_deg), 0.0, 0.0])
+    edges = [
+        Say(source="marker board", up=sign * hung[:, axis], sigma_deg=1.5)
+        for axis in (0, 2)
+        for sign in (1, -1)
+    ]
+    found = _found(axes, path, room, stated=edges)
+    assert found.source == taken
+    assert _off_deg(found) == pytest.approx(0.0 if taken == "map" else hung_deg, abs=0.5)
+    told = {say.source: np.degrees(np.arccos(say.up @ found.up)) for say in reversed(found.others)}
+    assert told["map" if taken == "marker board" else "marker board"] == pytest.approx(hung_deg, abs=0.5)
+    assert "body" in told
+
+
+def test_a_board_on_the_floor_tells_who_is_upside_down():
+    rng = np.random.default_rng(1)
+    axes, path = _leaning(rng, 0.0, 1.0)
+    lying = [Say(source="marker board", up=TURN @ UP, sigma_deg=1.5)]
+    found = _found(so3_exp([np.pi, 0.0, 0.0]) @ axes, path, _box_room(rng), stated=lying)
+    assert _off_deg(found) < 0.5
+
+
+def test_two_directions_that_explain_as_much_are_told():
+    """Planes alone, seen by a camera that shows no front: leaning by 45 degrees either may be up."""
+    rng = np.random.default_rng(1)
+    axes, _ = _leaning(rng, 45.0, 1.0)
+    cabin = _box_room(rng) * [1.0, 0.52, 1.0] - [0.0, 0.0, 1.3]  # as wide as high, about the chest
+    found = _found(axes, np.zeros((20, 3)), cabin, sided=False)
+    assert not found.determined()
+    rival = max(found.others, key=lambda say: float(np.arccos(np.clip(say.up @ found.up, -1.0, 1.0))))
+    assert rival.nats - found.nats == pytest.approx(found.margin_nats)
+
+
+def test_hanging_limbs_tell_up_but_no_front():
+    skeleton = load_skeleton("upper_body", 1.75)
+    bones = [bone for bone in graph_bones(skeleton, {"LeftArm"}) if bone.role == "LeftArm"]
+    down = so3_exp([0.0, np.pi / 2.0, 0.0])  # the left arm of the zero pose points along +X
+    poses = np.tile(make_transform(TURN @ down, np.zeros(3)), (3, 1, 1, 1))
+    body = body_up(skeleton, bones, poses)
+    assert not body.sided
+    assert np.allclose(body.usual(), TURN @ UP)
+    assert np.allclose(np.linalg.det(body.axes), 1.0)
