@@ -15,6 +15,9 @@ from bodycap_batch.skeleton import Mount, SkeletonModel
 
 Activity = Literal["walk", "generic"]
 
+STANDING_M_PER_S = 0.05
+"""Speed of a standing foot's ankle, one sigma: the shin rolls over the foot."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraClock:
@@ -131,6 +134,7 @@ class MergeResult:
         report: Plain JSON values: sources and values of scale, up and floor, residuals, outliers …
         joint_covariance_m2: (T,J,3,3) of each joint's centre minus the first solved joint's, world axes:
             measurement noise, mounts and scale together; not the world's own axes. NaN where not solved.
+        standing: (T,J) True where a foot stands on its ankle, this joint; None where that was not looked for.
     """
 
     skeleton: SkeletonModel
@@ -145,6 +149,7 @@ class MergeResult:
     unused_cameras: Mapping[str, str]
     report: Mapping[str, Any]
     joint_covariance_m2: FloatArray | None = None
+    standing: BoolArray | None = None
 
     def __post_init__(self) -> None:
         ticks, joints = len(self.world_from_joint), len(self.skeleton.joints)
@@ -153,6 +158,8 @@ class MergeResult:
         set_array(self, "observed", (ticks, joints), np.bool_)
         if self.joint_covariance_m2 is not None:
             set_array(self, "joint_covariance_m2", (ticks, joints, 3, 3), finite=False)
+        if self.standing is not None:
+            set_array(self, "standing", (ticks, joints), np.bool_)
 
     def joint_sigma_m(self) -> FloatArray:
         """(T,J) sigma per axis of each joint's centre relative to the first solved one's; NaN: not solved."""

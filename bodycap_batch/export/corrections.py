@@ -27,6 +27,9 @@ _GRAPH_SIGMA = np.repeat([np.deg2rad(3.0), 0.01], 3)
 _CHANGE_SIGMA = np.repeat([0.002, np.deg2rad(0.3)], 3)
 """Change of the correction a tick, root shift and rotations: below what a viewer sees as jitter."""
 
+_SLIPS = 2.0
+"""Sigmas beyond which a standing foot slips after all (Huber), as in the graph."""
+
 _OUTLIER_SCALE = 100.0
 """Geman-McClure's c² on the squared error in sigmas: 3 to 4 sigmas on each of six numbers."""
 
@@ -49,13 +52,23 @@ class Tracked:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Planted:
+    """A joint that should stay where it is from one tick to the next, to `sigma_m`, where `held` (T-1,)."""
+
+    joint: int
+    held: BoolArray
+    sigma_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Problem:
-    """What the corrected motion should meet: graph poses (T,J,4,4) of the solved joints, and cameras."""
+    """What the corrected motion should meet: graph poses (T,J,4,4) of the solved joints, cameras, ground."""
 
     skeleton: SkeletonModel
     solved: IntArray
     world_from_joint: FloatArray
     cameras: tuple[Tracked, ...]
+    planted: tuple[Planted, ...] = ()
 
     def reach(self) -> FloatArray:
         """(J,S) one where a solved joint turns a joint: itself and its ancestors."""
@@ -143,13 +156,22 @@ def _cost(problem: Problem, now: Correction) -> float:
     for tracked in problem.cameras:
         squared = (_camera_error(tracked, world, everything)[0] ** 2).sum(axis=1)
         cost += float((_OUTLIER_SCALE * squared / (_OUTLIER_SCALE + squared)).sum())
+    for planted in problem.planted:
+        size = np.linalg.norm(_slip(planted, world), axis=1)
+        cost += float(np.where(size < _SLIPS, size**2, _SLIPS * (2.0 * size - _SLIPS)).sum())
     return cost
+
+
+def _slip(planted: Planted, world: FloatArray) -> FloatArray:
+    """How far (T-1,3) a joint moves from tick to tick while it should not, in sigmas."""
+    moved = np.diff(world[:, planted.joint, :3, 3], axis=0)
+    return np.asarray(np.where(planted.held[:, None], moved / planted.sigma_m, 0.0))
 
 
 def _normal_equations(
     problem: Problem, now: Correction, reach: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Diagonal blocks (T,n,n), the one block (n,n) that ties neighbours, and the gradient (T,n)."""
+    """Diagonal blocks (T,n,n), the blocks (T-1,n,n) that tie neighbours, and the gradient (T,n)."""
     world = forward_kinematics(problem.skeleton, now.root, now.local)
     ticks, size = len(world), 3 + 3 * len(problem.solved)
     blocks, gradient = np.zeros((ticks, size, size)), np.zeros((ticks, size))
@@ -172,7 +194,34 @@ def _normal_equations(
     pull[:-1] -= np.diff(change, axis=0)
     pull[1:] += np.diff(change, axis=0)
     gradient += pull @ turns
-    return blocks, -coupling, gradient
+    ties = np.broadcast_to(-coupling, (ticks - 1, size, size))
+    if problem.planted:
+        ties = ties.copy()
+        _plant(problem, world, reach, (blocks, ties, gradient))
+    return blocks, ties, gradient
+
+
+def _plant(
+    problem: Problem, world: FloatArray, reach: FloatArray, system: tuple[FloatArray, FloatArray, FloatArray]
+) -> None:
+    """Add the standing feet to the normal equations."""
+    blocks, ties, gradient = system
+    for planted in problem.planted:
+        (held,) = np.nonzero(planted.held)
+        slip = _slip(planted, world)[held]
+        root_weight = np.sqrt(_SLIPS / np.maximum(np.linalg.norm(slip, axis=1), _SLIPS))
+        rows = []
+        for ticks in (held, held + 1):
+            centres = world[ticks][:, problem.solved][..., :3, 3]
+            jacobian = _jacobian(centres, world[ticks, planted.joint, :3, 3], reach[planted.joint])[:, 3:]
+            rows.append(jacobian * (root_weight / planted.sigma_m)[:, None, None])
+        before, after = rows
+        error = (slip * root_weight[:, None])[..., None]
+        blocks[held] += np.swapaxes(before, 1, 2) @ before
+        blocks[held + 1] += np.swapaxes(after, 1, 2) @ after
+        ties[held] -= np.swapaxes(before, 1, 2) @ after
+        gradient[held] -= (np.swapaxes(before, 1, 2) @ error)[..., 0]
+        gradient[held + 1] += (np.swapaxes(after, 1, 2) @ error)[..., 0]
 
 
 def _rows(
@@ -215,20 +264,28 @@ def _jacobian(centres: FloatArray, point: FloatArray, reach: FloatArray) -> Floa
 def _solve_tridiagonal(
     blocks: FloatArray, coupling: FloatArray, right: FloatArray, damping: float
 ) -> FloatArray:
-    """Solve the block tridiagonal system by elimination forwards, substitution backwards."""
+    """Solve the block tridiagonal system by elimination forwards, substitution backwards.
+
+    Args:
+        blocks: (T,n,n) on the diagonal.
+        coupling: (T-1,n,n) of each tick with the next one.
+        right: (T,n).
+        damping: Share that is added to the diagonal.
+    """
     ticks, size = right.shape
     diagonal = blocks.copy()
     index = np.arange(size)
     diagonal[:, index, index] *= 1.0 + damping
-    carried = np.empty_like(blocks)
+    carried = np.zeros_like(blocks)
     out = np.empty_like(right)
     for tick in range(ticks):
         block, value = diagonal[tick], right[tick]
         if tick:
-            block = block - coupling.T @ carried[tick - 1]
-            value = value - coupling.T @ out[tick - 1]
-        both = np.linalg.solve(block, np.column_stack([coupling, value]))
-        carried[tick], out[tick] = both[:, :-1], both[:, -1]
+            block = block - coupling[tick - 1].T @ carried[tick - 1]
+            value = value - coupling[tick - 1].T @ out[tick - 1]
+        following = coupling[tick] if tick + 1 < ticks else np.zeros((size, 0))
+        both = np.linalg.solve(block, np.column_stack([following, value]))
+        carried[tick, :, : following.shape[1]], out[tick] = both[:, :-1], both[:, -1]
     for tick in range(ticks - 2, -1, -1):
         out[tick] -= carried[tick] @ out[tick + 1]
     return out

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.arrays import BoolArray, FloatArray
-from bodycap_batch.body import CameraClock, MergeResult
-from bodycap_batch.export.corrections import Correction, Problem, Tracked, solve_correction
+from bodycap_batch.body import STANDING_M_PER_S, CameraClock, MergeResult
+from bodycap_batch.export.corrections import Correction, Planted, Problem, Tracked, solve_correction
 from bodycap_batch.geometry import invert, poses_at, rotation_angle_rad
 from bodycap_batch.skeleton import Motion, SkeletonModel, forward_kinematics
 
@@ -30,7 +30,7 @@ class Projection:
     Attributes:
         motion: The rigid motion.
         gap: JSON values: graph joints against its joints, the merge's camera paths (measured, or solved with
-            the body: `MergeOptions.camera_paths`) against its cameras.
+            the body: `MergeOptions.camera_paths`) against its cameras, how fast standing feet slide.
     """
 
     motion: Motion
@@ -56,7 +56,11 @@ def project_motion(
     solved = np.flatnonzero(merge.solved)
     start = _start(merge.skeleton, merge.world_from_joint, merge.solved)
     problem = Problem(
-        skeleton=merge.skeleton, solved=solved, world_from_joint=merge.world_from_joint, cameras=cameras
+        skeleton=merge.skeleton,
+        solved=solved,
+        world_from_joint=merge.world_from_joint,
+        cameras=cameras,
+        planted=_planted(merge),
     )
     result = solve_correction(problem, start)
     motion = Motion(
@@ -68,6 +72,18 @@ def project_motion(
         observed=merge.observed,
     )
     return Projection(motion=motion, gap=_gap(merge, motion, cameras))
+
+
+def _planted(merge: MergeResult) -> tuple[Planted, ...]:
+    """The ankles whose feet stand now and then."""
+    if merge.standing is None:
+        return ()
+    held = merge.standing[1:] & merge.standing[:-1]
+    sigma_m = STANDING_M_PER_S / merge.fps
+    return tuple(
+        Planted(joint=int(joint), held=held[:, joint], sigma_m=sigma_m)
+        for joint in np.flatnonzero(held.any(axis=0))
+    )
 
 
 def _start(skeleton: SkeletonModel, world_from_joint: FloatArray, solved: BoolArray) -> Correction:
@@ -134,7 +150,20 @@ def _gap(merge: MergeResult, motion: Motion, cameras: tuple[Tracked, ...]) -> di
         for tracked in cameras
         if tracked.found.any()
     }
+    if merge.standing is not None:
+        out["feet"] = {
+            merge.skeleton.joints[planted.joint]: _slide(
+                exported[:, planted.joint, :3, 3], planted, merge.fps
+            )
+            for planted in _planted(merge)
+        }
     return out
+
+
+def _slide(centre: FloatArray, planted: Planted, fps: float) -> dict[str, float]:
+    """How fast an ankle (T,3) slides while its foot stands."""
+    speed = fps * np.linalg.norm(np.diff(centre, axis=0), axis=1)[planted.held]
+    return {f"slide_p{q}_m_per_s": float(np.percentile(speed, q)) for q in (50, 95)}
 
 
 def _difference(first: FloatArray, second: FloatArray) -> dict[str, float]:

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 
 from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.body import STANDING_M_PER_S
 from bodycap_batch.geometry import invert, make_transform
 from bodycap_batch.merging.bones import Bone
 from bodycap_batch.merging.graph import bone_key
@@ -24,8 +25,6 @@ _REST_M_PER_S = 0.25
 _LOW_M = 0.04
 """The heel rises by more than this before the foot leaves the floor."""
 _SHORTEST_S = 0.1
-_SIGMA_M_PER_S = 0.05
-"""Speed of a standing ankle: the shin rolls over the foot."""
 _FREE_RAD = 10.0
 
 
@@ -35,13 +34,15 @@ class Contact:
 
     Attributes:
         name: For the report.
-        bone: Index of the bone that carries the ankle.
+        joint: The ankle in the skeleton.
+        bone: Index of the bone that carries it.
         ankle_m: (3,) the ankle in that bone's frame.
         standing: (T,) at ticks.
         sigma_m: How far the ankle moves from one standing tick to the next.
     """
 
     name: str
+    joint: int
     bone: int
     ankle_m: FloatArray
     standing: BoolArray
@@ -97,7 +98,9 @@ def find_contacts(
             centre = (poses @ invert(mounts[track.camera]) @ np.append(ankle_m, 1.0))[:, :3]
             tick_s = 1e-9 * float(np.median(np.diff(tick_times_ns)))
             standing = _standing(centre, seen, centre @ up, tick_s)
-            out.append(Contact(f"{side} foot", track.bone, ankle_m, standing, _SIGMA_M_PER_S * tick_s))
+            out.append(
+                Contact(f"{side} foot", ankle, track.bone, ankle_m, standing, STANDING_M_PER_S * tick_s)
+            )
             break
     return tuple(out)
 
@@ -145,4 +148,14 @@ def accounts(
             speed = fps * np.linalg.norm(np.diff(ankle, axis=0), axis=1)[held]
             figures = {f"slide_p{q}_m_per_s": round(float(np.percentile(speed, q)), 4) for q in (50, 95)}
             out[each.name] |= figures
+    return out
+
+
+def standing_joints(contacts: Sequence[Contact], ticks: int, joints: int) -> BoolArray | None:
+    """(T,J) where an ankle's foot stands; None where no foot can be seen to."""
+    if not contacts:
+        return None
+    out = np.zeros((ticks, joints), dtype=bool)
+    for each in contacts:
+        out[:, each.joint] = each.standing
     return out

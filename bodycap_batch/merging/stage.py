@@ -19,7 +19,7 @@ from bodycap_batch.merging.choosing import bring_together
 from bodycap_batch.merging.chunks import MAX_ITERATIONS, longest_stretch, solve_motion
 from bodycap_batch.merging.complete import complete_body, observed_joints
 from bodycap_batch.merging.constants import Calibrated, Cleaned, calibrate_body, points_around
-from bodycap_batch.merging.contact import accounts, during, find_contacts
+from bodycap_batch.merging.contact import accounts, during, find_contacts, standing_joints
 from bodycap_batch.merging.initial import provisional_scale
 from bodycap_batch.merging.marginals import joints_in_axes, sigma_summary
 from bodycap_batch.merging.paths import in_world, solved_with_body
@@ -116,6 +116,7 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
             },
         ),
         joint_covariance_m2=covariance,
+        standing=standing_joints(contacts, len(tick_times), len(solved)),
     )
 
 

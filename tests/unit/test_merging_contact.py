@@ -71,7 +71,7 @@ def test_a_foot_stands_where_its_ankle_is_slow_and_low(shin):
 
 def test_an_ankle_that_rests_costs_nothing_however_the_shin_turns(shin):
     _, _, _, poses = shin
-    contact = Contact("Left foot", 0, np.array([0.0, 0.0, -0.43]), np.ones(COUNT, dtype=bool), 0.0017)
+    contact = Contact("Left foot", 3, 0, np.array([0.0, 0.0, -0.43]), np.ones(COUNT, dtype=bool), 0.0017)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for tick in range(COUNT):
         values.insert(bone_key(tick, 0), gtsam.Pose3(poses[tick]))
