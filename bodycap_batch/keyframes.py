@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from bodycap_batch.arrays import BoolArray, FloatArray
 from bodycap_batch.camera import Camera
-from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.capture import CaptureCamera, FrameKeeper, Shot
 from bodycap_batch.config import KeyframeOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import CaptureError
@@ -43,6 +43,7 @@ class _Candidate:
     image: GreyImage
     sharpness: float
     survival: float
+    shot: Shot
 
 
 @dataclass(slots=True)
@@ -112,7 +113,10 @@ class _Tracker:
 
 
 def select_keyframes(
-    camera: CaptureCamera, options: KeyframeOptions, context: StageContext
+    camera: CaptureCamera,
+    options: KeyframeOptions,
+    context: StageContext,
+    keeper: FrameKeeper | None = None,
 ) -> KeyframeSelection:
     """Choose the frames of one camera that the map is built from.
 
@@ -123,6 +127,7 @@ def select_keyframes(
         camera: The camera's video, calibrated.
         options: Thresholds; pixels are for a 640 px long side.
         context: Progress and cancellation.
+        keeper: Where given, it is shown every frame and those that are chosen.
 
     Raises:
         CaptureError: The camera has no frames.
@@ -137,30 +142,32 @@ def select_keyframes(
     novelty = [0.0]
     tracker = _Tracker(camera.camera, _coarse_mask(camera))
     recent: deque[_Candidate] = deque(maxlen=options.window)
-    for index, grey in camera.grey_frames():
+    see, keep = (_no_keeping, _no_keeping) if keeper is None else (keeper.see, keeper.choose)
+    for shot in camera.shots():
         context.check_cancelled()
-        sharp[index] = sharpness(grey)
-        image = coarse_image(grey)
+        index = shot.index
+        sharp[index] = sharpness(shot.grey)
+        image = coarse_image(shot.grey)
+        see(shot)
         if not chosen:
             chosen.append(index)
+            keep(shot)
             tracker.restart(image)
         else:
             tracker.step(image)
-            recent.append(_Candidate(index, image, sharp[index], tracker.survival()))
+            recent.append(_Candidate(index, image, sharp[index], tracker.survival(), shot))
             gap_s = times_s[index] - times_s[chosen[-1]]
-            due = (
-                gap_s >= options.max_gap_s
-                or tracker.survival() < options.min_survival
-                or (gap_s >= options.min_gap_s and tracker.parallax_px() > limit_px)
-            )
-            if due:
+            if _is_due(tracker, gap_s, limit_px, options):
                 seen = max(1.0 - tracker.survival(), tracker.parallax_px() / limit_px)
                 novelty.append(seen + _PASSING * gap_s / options.max_gap_s)
-                chosen.append(_take_sharpest(recent, tracker))
+                best = _take_sharpest(recent, tracker)
+                chosen.append(best.index)
+                keep(best.shot)
         if index % 30 == 0:
             context.progress(index, count, "frames")
     if chosen[-1] != count - 1:
         chosen.append(count - 1)
+        keep(shot)
         novelty.append(0.0)
     context.progress(count, count, "frames")
     if options.max_per_min is not None:
@@ -172,6 +179,15 @@ def select_keyframes(
         frame_count=count,
         sharpness=sharp,
         noise_px=tracker.noise_px(),
+    )
+
+
+def _is_due(tracker: _Tracker, gap_s: float, limit_px: float, options: KeyframeOptions) -> bool:
+    """Whether a keyframe is due after so much time since the last one."""
+    return (
+        gap_s >= options.max_gap_s
+        or tracker.survival() < options.min_survival
+        or (gap_s >= options.min_gap_s and tracker.parallax_px() > limit_px)
     )
 
 
@@ -198,7 +214,11 @@ def _coarse_mask(camera: CaptureCamera) -> BoolArray | None:
     return np.asarray(coarse_image(np.where(camera.mask, 255, 0).astype(np.uint8)) > 127)
 
 
-def _take_sharpest(recent: deque[_Candidate], tracker: _Tracker) -> int:
+def _no_keeping(_: Shot) -> None:
+    """Keep nothing."""
+
+
+def _take_sharpest(recent: deque[_Candidate], tracker: _Tracker) -> _Candidate:
     """Pick the sharpest recent frame that still sees what the keyframe saw; restart the tracks there."""
     usable = [frame for frame in recent if frame.survival >= 0.5 * recent[0].survival]
     best = max(usable, key=lambda frame: frame.sharpness)
@@ -207,5 +227,5 @@ def _take_sharpest(recent: deque[_Candidate], tracker: _Tracker) -> int:
         recent.popleft()
     for position, frame in enumerate(recent):
         tracker.step(frame.image)
-        recent[position] = _Candidate(frame.index, frame.image, frame.sharpness, tracker.survival())
-    return best.index
+        recent[position] = replace(frame, survival=tracker.survival())
+    return best

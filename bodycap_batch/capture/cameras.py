@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,9 +14,17 @@ import numpy.typing as npt
 from bodycap_batch.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.camera import Camera
 from bodycap_batch.capture.decoding import decode_frames
-from bodycap_batch.capture.images import Image, work_image
+from bodycap_batch.capture.images import Colours, Image, Planes, grey_of, work_image, work_planes
+from bodycap_batch.capture.kept import KeptFrames, Shot, keeps_all
 from bodycap_batch.capture.prefetch import prefetched
 from bodycap_batch.capture.video import VideoFile
+
+if TYPE_CHECKING:
+    from av.video.frame import VideoFrame
+
+_MOSTLY = 0.75
+"""Share of the frames asked for that must be kept: with many others between them the video is decoded from
+end to end anyway."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,6 +45,7 @@ class CaptureCamera:
         notes: What opening found worth telling: gaps and overlaps of chapters, dropped frames.
         videos: Frame index of each chapter.
         mask: (H,W) at the work size, True where the room is seen; None where that is everywhere.
+        kept: Frames that are read from a copy at the work size instead.
     """
 
     name: str
@@ -51,6 +61,7 @@ class CaptureCamera:
     notes: tuple[str, ...] = ()
     videos: tuple[VideoFile, ...] = field(default=(), repr=False)
     mask: BoolArray | None = field(default=None, repr=False)
+    kept: KeptFrames | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         count = len(self.frame_numbers)
@@ -122,15 +133,57 @@ class CaptureCamera:
             raise ValueError("indices must increase and lie inside the video")
         return prefetched(self._decode(wanted, colour=colour))
 
+    def shots(self) -> Generator[Shot, None, None]:
+        """Stream all frames as they may be kept, decoded ahead in a thread.
+
+        Raises:
+            CaptureError: A frame cannot be decoded.
+        """
+        return prefetched(self._shots())
+
+    @property
+    def keeps_all(self) -> bool:
+        """True where the videos are so large that all of their frames are worth keeping at the work size."""
+        size = (self.camera.width_px, self.camera.height_px)
+        return any(keeps_all(video.stored_size, size) for video in self.videos)
+
+    def _shots(self) -> Generator[Shot, None, None]:
+        size = (self.camera.width_px, self.camera.height_px)
+        everything = self.keeps_all
+        indices = np.arange(len(self.frame_numbers), dtype=np.int64)
+        for index, frame, video in self._frames(indices):
+            if everything:
+                # A large frame is let go of at once.
+                planes = work_planes(frame, video.orientation, size)
+                yield Shot(index, grey_of(planes, size), partial(_same, planes))
+            else:
+                grey = work_image(frame, video.orientation, size, colour=False)
+                yield Shot(index, grey, partial(work_planes, frame, video.orientation, size))
+
     def _decode(self, indices: IntArray, *, colour: bool) -> Generator[tuple[int, Image], None, None]:
         size = (self.camera.width_px, self.camera.height_px)
+        held = np.zeros(len(indices), dtype=bool) if self.kept is None else self.kept.holds(indices)
+        copies: Iterator[Image] = iter(())
+        if self.kept is not None and held.sum() >= _MOSTLY * len(held):
+            copies = self.kept.read(indices[held], size, colour=colour)
+        else:
+            held[:] = False
+        others = self._frames(indices[~held])
+        for index, is_held in zip(indices.tolist(), held.tolist(), strict=True):
+            if is_held:
+                yield index, next(copies)
+            else:
+                _, frame, video = next(others)
+                yield index, work_image(frame, video.orientation, size, colour=colour)
+
+    def _frames(self, indices: IntArray) -> Generator[tuple[int, VideoFrame, VideoFile], None, None]:
         first = 0
         for video in self.videos:
             numbers = self.frame_numbers[indices] - first
             inside = (numbers >= 0) & (numbers < len(video.pts))
             mine = indices[inside]
             for index, (_, frame) in zip(mine, decode_frames(video, numbers[inside]), strict=True):
-                yield int(index), work_image(frame, video.orientation, size, colour=colour)
+                yield int(index), frame, video
             first += len(video.pts)
 
 
@@ -146,6 +199,10 @@ class Capture:
             if camera.name == name:
                 return camera
         raise KeyError(name)
+
+
+def _same(planes: tuple[Planes, Colours]) -> tuple[Planes, Colours]:
+    return planes
 
 
 def rolling_shutter_delay_s(rows_px: npt.ArrayLike, height_px: int, rolling_shutter_s: float) -> FloatArray:

@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
 Image = npt.NDArray[np.uint8]
+Planes = npt.NDArray[np.uint8]
+"""Luma and halved chroma (1.5·H,W), sides even."""
+Colours = tuple[int, int]
+"""Range and matrix of luma and chroma, as FFmpeg numbers them."""
 
 # Formats whose first plane is 8-bit luma and can be taken as it is.
 _LUMA_FORMATS = frozenset(
@@ -23,25 +27,69 @@ _FULL_RANGE = 2
 _EXPAND = np.clip(np.round((np.arange(256) - 16.0) * (255.0 / 219.0)), 0, 255).astype(np.uint8)
 
 
-def work_image(frame: VideoFrame, orientation: Orientation, size: tuple[int, int], *, colour: bool) -> Image:
-    """Grey (H,W) or RGB (H,W,3), upright, at (width, height), full range; an own, contiguous array."""
-    if colour:
-        return _resized(np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8), orientation, size)
-    if frame.format.name not in _LUMA_FORMATS:
-        return _resized(np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8), orientation, size)
-    image = _resized(_luma(frame), orientation, size)
-    if frame.format.name.startswith(("yuvj", "gray")) or frame.color_range == _FULL_RANGE:
-        return image
+def work_image(
+    frame: VideoFrame,
+    orientation: Orientation,
+    size: tuple[int, int],
+    *,
+    colour: bool,
+    shown: tuple[int, int] | None = None,
+) -> Image:
+    """Grey (H,W) or RGB (H,W,3), upright, at (width, height), full range; an own, contiguous array.
+
+    Args:
+        frame: As it was decoded.
+        orientation: How it is turned.
+        size: Width and height wanted.
+        colour: RGB instead of grey.
+        shown: Width and height of what counts of it, where it was filled up to even sides.
+    """
+    width, height = shown or (frame.width, frame.height)
+    if colour or frame.format.name not in _LUMA_FORMATS:
+        picture = np.asarray(frame.to_ndarray(format="rgb24" if colour else "gray"), dtype=np.uint8)
+        return _resized(picture[:height, :width], orientation, size)
+    image = _resized(_plane(frame, 0)[:height, :width], orientation, size)
+    return image if _is_full_range(frame) else _expanded(image)
+
+
+def grey_of(planes: tuple[Planes, Colours], size: tuple[int, int]) -> Image:
+    """Grey (H,W), full range, of what `work_planes` made."""
+    luma = np.ascontiguousarray(planes[0][: size[1], : size[0]])
+    return luma if planes[1][0] == _FULL_RANGE else _expanded(luma)
+
+
+def _expanded(luma: Image) -> Image:
+    """Luma of studio range in full range."""
     import cv2
 
-    return np.asarray(cv2.LUT(image, _EXPAND), dtype=np.uint8)
+    return np.asarray(cv2.LUT(luma, _EXPAND), dtype=np.uint8)
 
 
-def _luma(frame: VideoFrame) -> Image:
-    """A view of the first plane, without the padding of its rows."""
-    plane = frame.planes[0]
+def work_planes(frame: VideoFrame, orientation: Orientation, size: tuple[int, int]) -> tuple[Planes, Colours]:
+    """Luma and halved chroma, upright, at (width, height) filled up to even sides, in the frame's own range.
+
+    Where the size is the frame's own and its chroma is halved already, they are its planes, unchanged.
+    """
+    colours = (_FULL_RANGE if _is_full_range(frame) else int(frame.color_range), int(frame.colorspace))
+    if frame.format.name not in ("yuv420p", "yuvj420p"):
+        frame = frame.reformat(format="yuv420p")
+    half = ((size[0] + 1) // 2, (size[1] + 1) // 2)
+    luma = _resized(_plane(frame, 0), orientation, size)
+    luma = np.pad(luma, ((0, size[1] % 2), (0, size[0] % 2)), mode="edge")
+    chroma = [_resized(_plane(frame, number), orientation, half).reshape(-1) for number in (1, 2)]
+    flat = np.concatenate([luma.reshape(-1), *chroma])
+    return flat.reshape(-1, luma.shape[1]), colours
+
+
+def _is_full_range(frame: VideoFrame) -> bool:
+    return frame.format.name.startswith(("yuvj", "gray")) or frame.color_range == _FULL_RANGE
+
+
+def _plane(frame: VideoFrame, number: int) -> Image:
+    """A view of a plane, without the padding of its rows."""
+    plane = frame.planes[number]
     rows = np.asarray(memoryview(plane), dtype=np.uint8).reshape(-1, plane.line_size)
-    return rows[: frame.height, : frame.width]
+    return rows[: plane.height, : plane.width]
 
 
 def _resized(image: Image, orientation: Orientation, size: tuple[int, int]) -> Image:

@@ -252,7 +252,8 @@ def _check_files(job: Job, _findings: list[CameraFinding]) -> list[str]:
 
 def _check_disk(job: Job, findings: list[CameraFinding]) -> list[str]:
     """Room for the job's results and intermediate files, and the right to write them."""
-    return require_room(job.out or Path("out").resolve(), sum(camera.used_frames for camera in findings))
+    frames, large = sum(each.used_frames for each in findings), sum(each.large_frames for each in findings)
+    return require_room(job.out or Path("out").resolve(), frames, large)
 
 
 _ALWAYS = (_check_files, _check_clocks, _check_skeleton, _check_formats)

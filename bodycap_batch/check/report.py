@@ -7,6 +7,7 @@ import textwrap
 from dataclasses import dataclass
 from typing import Any
 
+from bodycap_batch.capture.kept import keeps_all
 from bodycap_batch.config.models import Job
 from bodycap_batch.errors import BodycapError
 
@@ -49,6 +50,11 @@ class CameraFinding:
     lens: str
     notes: tuple[str, ...] = ()
     guessed_lens: bool = False
+
+    @property
+    def large_frames(self) -> int:
+        """Frames of which copies at the work size are kept: all of a video that is much larger, else none."""
+        return self.used_frames if keeps_all(self.size_px, self.work_size_px) else 0
 
     def lines(self) -> list[str]:
         """The finding as a person reads it."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -13,16 +13,22 @@ import numpy.typing as npt
 from bodycap_batch.errors import StoreError
 from bodycap_batch.formats.files import store_error
 
-_TIME_BASE = 15360
+if TYPE_CHECKING:
+    from av.video.frame import VideoFrame
+
+TIME_BASE = 15360
 _OPTIONS = {
     "high": {"crf": "16", "preset": "superfast"},
     "lossless": {"crf": "0", "preset": "ultrafast"},
     # Without looking ahead a picture takes 16 ms instead of 22, and a file a tenth more.
+    # Every frame decodes alone.
+    "exact": {"qp": "0", "preset": "ultrafast", "g": "1"},
+    "near": {"crf": "12", "preset": "ultrafast", "g": "12"},
     "small": {"crf": "27", "preset": "superfast", "x264-params": "bframes=0:rc-lookahead=0"},
 }
 _FILE_OPTIONS = {"small": {"movflags": "+faststart"}}
 """The index first, so that a page plays the file while it is still loading."""
-Quality = Literal["high", "lossless", "small"]
+Quality = Literal["high", "lossless", "exact", "near", "small"]
 _STUDIO = np.round((np.arange(256) - 128.0) * (224.0 / 255.0) + 128.0).astype(np.uint8)
 """Chroma of full range in studio range (ITU-R BT.601)."""
 
@@ -34,13 +40,22 @@ class VideoWriter:
         path: The file.
         fps: Frames per second.
         size: Width and height.
-        quality: "high", "lossless" (but for the chroma, which has half the resolution), or "small".
+        quality: "high", "lossless" (but for the chroma, which has half the resolution), "exact" (the same,
+            every frame by itself), "near" (hardly a difference to be seen), or "small".
+        colours: Range and matrix of what `add_planes` is given, as FFmpeg numbers them; told in the file.
 
     Raises:
         StoreError: The file cannot be written.
     """
 
-    def __init__(self, path: Path, fps: float, size: tuple[int, int], quality: Quality) -> None:
+    def __init__(
+        self,
+        path: Path,
+        fps: float,
+        size: tuple[int, int],
+        quality: Quality,
+        colours: tuple[int, int] | None = None,
+    ) -> None:
         import av
 
         self._av = av
@@ -56,17 +71,25 @@ class VideoWriter:
         self._stream.pix_fmt = "yuv420p"
         self._stream.options = _OPTIONS[quality]
         self._stream.codec_context.thread_count = 1
+        if colours is not None:
+            self._stream.codec_context.color_range, self._stream.codec_context.colorspace = colours
         self._frame_duration = Fraction(1) / rate
         self._count = 0
 
     def add(self, image: npt.NDArray[np.uint8]) -> None:
         """Append an RGB image (H,W,3)."""
         if self._quality == "small":
-            frame = self._av.VideoFrame.from_ndarray(planes_of(image), format="yuv420p")
+            self.add_planes(planes_of(image))
         else:
-            frame = self._av.VideoFrame.from_ndarray(image, format="rgb24")
-        frame.pts = round(self._count * self._frame_duration * _TIME_BASE)
-        frame.time_base = Fraction(1, _TIME_BASE)
+            self._add(self._av.VideoFrame.from_ndarray(image, format="rgb24"))
+
+    def add_planes(self, planes: npt.NDArray[np.uint8]) -> None:
+        """Append luma and halved chroma (1.5·H,W), in the range that the file tells."""
+        self._add(self._av.VideoFrame.from_ndarray(planes, format="yuv420p"))
+
+    def _add(self, frame: VideoFrame) -> None:
+        frame.pts = round(self._count * self._frame_duration * TIME_BASE)
+        frame.time_base = Fraction(1, TIME_BASE)
         self._count += 1
         self._send(frame)
 

@@ -21,12 +21,13 @@ from bodycap_batch.pipeline.inputs import (
     camera_digests,
     content_of,
     has_body,
+    kept_in,
     key_of,
     localised_in,
     merge_arguments,
     one_camera,
 )
-from bodycap_batch.pipeline.made import Made, report_task
+from bodycap_batch.pipeline.made import Made, preview_task, report_task
 from bodycap_batch.pipeline.recovery import recovery_tasks
 from bodycap_batch.pipeline.rigs import rig_tasks, segments_of
 from bodycap_batch.pipeline.settings import Settings, StageRecord
@@ -60,7 +61,7 @@ class Flow:
         self._digests: dict[str, str] = {}
         self._open = ExitStack()
         self._references = References(settings.store, logs.parent)
-        self._frames = 0
+        self._frames = (0, 0)
         self._told: set[str] = set()
 
     def __enter__(self) -> Flow:
@@ -87,7 +88,8 @@ class Flow:
             self._settings.listener(Event(kind="failed", stage="check"))
             raise
         artefact = self._one(task, [STAGES["keyframes"].modules] * (self._side_by_side - 1))
-        self._frames = int(read_summary(artefact.path)["frames"])
+        found = read_summary(artefact.path)
+        self._frames = (int(found["frames"]), int(found.get("large_frames", 0)))
         self._tell_notes(artefact, "check")
 
     def _check_task(self) -> Task:
@@ -129,6 +131,7 @@ class Flow:
         arguments = {
             "capture": all_cameras(self._job.capture),
             "selections": [str(artefact.path) for artefact in keyframes.values()],
+            "kept": kept_in(keyframes),
             "reach": reach,
         }
         later = [*(["merge"] if has_body(self._job) else []), "export", "report"]
@@ -161,7 +164,7 @@ class Flow:
             wanted = {name: frames for name, frames in wanted.items() if frames}
             if not wanted:
                 break
-            grown = self._extend(scene, wanted, map_round)
+            grown = self._extend(scene, wanted, keyframes, map_round)
             again = self.registrations(grown, keyframes, registrations, map_round)
             gained = localised_in(again) - localised_in(registrations)
             if gained < 0:
@@ -253,26 +256,8 @@ class Flow:
         """Begin the video of the results, beside what follows the merge; None where it is not wanted."""
         if self._settings.until not in ("", "preview") or made.scene is None:
             return None
-        scene, merged, registrations = made.scene, made.merged, made.registrations
-        reason = None if made.failure is None else made.failure.message
-        inputs = {
-            "cameras": self._digests,
-            "map": scene.digest,
-            "registrations": content_of(registrations),
-            "merge": None if merged is None else merged.digest,
-            "failure": reason,
-        }
-        arguments = {
-            "capture": all_cameras(self._job.capture),
-            "map": str(scene.path),
-            "registrations": [str(artefact.path) for artefact in registrations.values()],
-            "merge": None if merged is None else str(merged.path),
-            "failure": reason,
-        }
-        key = key_of("preview", {}, inputs)
-        return self._pool.submit(
-            self._one, Task(key=key, arguments=arguments, threads=self._settings.threads)
-        )
+        task = preview_task(self._job, made, self._digests)
+        return self._pool.submit(self._one, replace(task, threads=self._settings.threads))
 
     def report(self, made: Made, stopped_by: BodycapError | None = None) -> Artefact:
         """The page a person reads, of all that was made."""
@@ -304,7 +289,7 @@ class Flow:
         """Refuse to begin what will not fit on the disk; the space may have gone since the check was made."""
         if task.key.stage != "check":
             for folder in self._folders:
-                for note in require_room(folder, self._frames):
+                for note in require_room(folder, *self._frames):
                     self._note(note)
 
     def _map_options(self) -> dict[str, Any]:
@@ -330,6 +315,7 @@ class Flow:
             "capture": one_camera(self._job.capture, camera),
             "map": str(scene.path),
             "selection": str(keyframes[name].path),
+            "kept": kept_in({name: keyframes[name]}),
             "previous": None if before is None else str(before.path),
         }
         # How often the map may grow decides which rounds are run, not what one of them gives.
@@ -337,10 +323,14 @@ class Flow:
         key = key_of("registration", options, inputs)
         return Task(key=key, arguments=arguments, camera=name, round=map_round)
 
-    def _extend(self, scene: Artefact, wanted: Mapping[str, list[int]], map_round: int) -> Artefact:
-        inputs = {"cameras": self._digests, "map": scene.digest, "extra": wanted}
+    def _extend(
+        self, scene: Artefact, wanted: Mapping[str, list[int]], keyframes: ByCamera, map_round: int
+    ) -> Artefact:
+        known = content_of(keyframes)
+        inputs = {"cameras": self._digests, "map": scene.digest, "keyframes": known, "extra": wanted}
         arguments = {
             "capture": all_cameras(self._job.capture),
+            "kept": kept_in(keyframes),
             "previous": str(scene.path),
             "extra": wanted,
         }

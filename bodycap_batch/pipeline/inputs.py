@@ -185,6 +185,11 @@ def content_of(artefacts: Mapping[str, Artefact]) -> dict[str, str]:
     return {name: artefact.digest for name, artefact in artefacts.items()}
 
 
+def kept_in(keyframes: Mapping[str, Artefact]) -> dict[str, str]:
+    """By camera, the artefact that keeps frames of its video."""
+    return {name: str(artefact.path) for name, artefact in keyframes.items()}
+
+
 def localised_in(registrations: Mapping[str, Artefact]) -> int:
     """Localised frames of all cameras."""
     return sum(int(read_summary(item.path)["localised"]) for item in registrations.values())
@@ -195,7 +200,7 @@ def beside_others(
     cameras: Sequence[CameraConfig],
     digests: Mapping[str, str],
     scene: Artefact,
-    keyframes: Artefact,
+    keyframes: Mapping[str, Artefact],
     registrations: Mapping[str, Artefact],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Inputs of the key and arguments of a task that solves a camera's frames with those of others.
@@ -205,20 +210,21 @@ def beside_others(
         cameras: The task's own camera, then the others.
         digests: By camera, of what its frames are.
         scene: The map.
-        keyframes: Of the own camera.
+        keyframes: By camera.
         registrations: By camera.
     """
     found = {camera.name: registrations[camera.name] for camera in cameras}
     inputs = {
         "cameras": [digests[name] for name in found],
         "map": scene.digest,
-        "keyframes": keyframes.digest,
+        "keyframes": [keyframes[name].digest for name in found],
         "registrations": list(content_of(found).values()),
     }
     arguments = {
         "capture": all_cameras(capture.model_copy(update={"cameras": tuple(cameras)})),
         "map": str(scene.path),
-        "selection": str(keyframes.path),
+        "selection": str(keyframes[cameras[0].name].path),
+        "kept": kept_in({name: keyframes[name] for name in found}),
         "registrations": [str(artefact.path) for artefact in found.values()],
     }
     return inputs, arguments

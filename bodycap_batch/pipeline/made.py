@@ -9,7 +9,7 @@ from typing import Any
 
 from bodycap_batch.config.models import Job
 from bodycap_batch.errors import BodycapError, EstimationError
-from bodycap_batch.pipeline.inputs import all_cameras, body_arguments, has_body, key_of
+from bodycap_batch.pipeline.inputs import all_cameras, body_arguments, content_of, has_body, kept_in, key_of
 from bodycap_batch.runner import Task
 from bodycap_batch.store import Artefact
 
@@ -70,8 +70,36 @@ def report_task(job: Job, made: Made, digests: Mapping[str, str], failure: Mappi
     arguments = {
         **stated,
         "capture": all_cameras(job.capture),
+        "kept": kept_in(made.keyframes),
         "body": body,
         **{name: None if item is None else str(item.path) for name, item in single.items()},
         **{name: [str(item.path) for item in items.values()] for name, items in many.items()},
     }
     return Task(key=key_of("report", {}, inputs), arguments=arguments)
+
+
+def preview_task(job: Job, made: Made, digests: Mapping[str, str]) -> Task:
+    """The task that films what was made.
+
+    Args:
+        job: The job.
+        made: With a map and what came after it, as far as that came.
+        digests: Of the cameras, by name.
+    """
+    reason = None if made.failure is None else made.failure.message
+    single = {"map": made.scene, "merge": made.merged}
+    inputs = {
+        "cameras": dict(digests),
+        "keyframes": content_of(made.keyframes),
+        "registrations": content_of(made.registrations),
+        **{name: None if item is None else item.digest for name, item in single.items()},
+        "failure": reason,
+    }
+    arguments = {
+        "capture": all_cameras(job.capture),
+        "kept": kept_in(made.keyframes),
+        "registrations": [str(artefact.path) for artefact in made.registrations.values()],
+        **{name: None if item is None else str(item.path) for name, item in single.items()},
+        "failure": reason,
+    }
+    return Task(key=key_of("preview", {}, inputs), arguments=arguments)

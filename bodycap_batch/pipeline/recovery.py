@@ -37,7 +37,5 @@ def recovery_tasks(
         if not _LEAST_POSED <= summary["localised"] <= summary["frames"] - _LEAST_LOST:
             continue
         ordered = (own, *(camera for camera in job.capture.cameras if camera.name != own.name))
-        inputs, arguments = beside_others(
-            job.capture, ordered, digests, scene, keyframes[own.name], registrations
-        )
+        inputs, arguments = beside_others(job.capture, ordered, digests, scene, keyframes, registrations)
         yield Task(key=key_of("recover", options, inputs), arguments=arguments, camera=own.name)

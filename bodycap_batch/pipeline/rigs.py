@@ -35,7 +35,5 @@ def rig_tasks(
     segments = job.capture.segments() if job.capture.rig == "synced" else []
     for own, cameras in ((own, segment) for segment in segments for own in segment):
         ordered = (own, *(camera for camera in cameras if camera.name != own.name))
-        inputs, arguments = beside_others(
-            job.capture, ordered, digests, scene, keyframes[own.name], registrations
-        )
+        inputs, arguments = beside_others(job.capture, ordered, digests, scene, keyframes, registrations)
         yield Task(key=key_of("rig", options, inputs), arguments=arguments, camera=own.name)

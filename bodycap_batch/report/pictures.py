@@ -87,7 +87,7 @@ def series(
     length_s = float(times_s[-1] - times_s[0])
     most = 1 + int(_PER_SECOND * length_s)
     if most * (_LARGEST + _MARKS_EACH) > budget:
-        probes = _read(camera, thinned(count, _PROBES), _SERIES_PX, context)
+        probes = _read(camera, _cheap(camera, thinned(count, _PROBES)), _SERIES_PX, context)
         if not probes:
             return ()
         each = float(np.mean([len(picture.jpeg) for picture in probes])) + _MARKS_EACH
@@ -123,11 +123,14 @@ def _contrasted(grey: Any, corners: FloatArray) -> FloatArray:
 
 
 def _cheap(camera: CaptureCamera, indices: IntArray) -> IntArray:
-    """The same spread on frames that decode without their neighbours, where such are near."""
-    keys = camera.key_indices()
+    """The same spread on the nearest frames that are kept: between keyframes little new comes into view.
+
+    Where none are, on frames that decode without their neighbours, as far as such are near.
+    """
+    keys = camera.key_indices() if camera.kept is None else camera.kept.frames
     if len(indices) < 3 or len(keys) == 0:
         return indices
-    half = 0.5 * float(np.median(np.diff(indices)))
+    half = 0.5 * float(np.median(np.diff(indices))) if camera.kept is None else np.inf
     right = np.clip(np.searchsorted(keys, indices), 0, len(keys) - 1)
     left = np.maximum(right - 1, 0)
     nearest = np.where(np.abs(keys[left] - indices) <= np.abs(keys[right] - indices), keys[left], keys[right])

@@ -121,7 +121,7 @@ def _run(task: Task, store: Store, function: TaskFunction, link: _Link) -> None:
     _pin_threads(task.threads)
     _give_memory_back()
     _forget_peak_memory()
-    for artefact in store.artefacts_in(task.arguments):
+    for artefact in dict.fromkeys(store.artefacts_in(task.arguments)):
         store.verify(artefact)
     with store.draft(task.key) as draft, _DiskWatch(store):
         context = StageContext(

@@ -20,7 +20,8 @@ def _check(_: Json, arguments: Json, context: StageContext, files: Path) -> None
     report = require_ready(job, context.threads)
     notes = [f"{camera.name}: {note}" for camera in report.cameras for note in camera.notes]
     frames = sum(camera.used_frames for camera in report.cameras)
-    write_summary(files, notes=[*notes, *report.notes], frames=frames)
+    large = sum(camera.large_frames for camera in report.cameras)
+    write_summary(files, notes=[*notes, *report.notes], frames=frames, large_frames=large)
 
 
 CHECK = Stage(function=_check, libraries=VISION, modules=SEEING)

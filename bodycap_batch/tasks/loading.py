@@ -2,22 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bodycap_batch.tasks.stage import Json
 
 if TYPE_CHECKING:
-    from bodycap_batch.capture import Capture
+    from bodycap_batch.capture import Capture, KeptFrames
     from bodycap_batch.scene import KeyframeSelection, MapResult, Registration
 
 
 def load_capture(arguments: Json) -> Capture:
-    """Open the capture block of a task's arguments."""
+    """Open the capture block of a task's arguments, with the frames that its keyframes' artefacts keep."""
     from bodycap_batch.capture import open_capture
     from bodycap_batch.config.models import CaptureConfig
 
-    return open_capture(CaptureConfig.model_validate(arguments["capture"]))
+    capture = open_capture(CaptureConfig.model_validate(arguments["capture"]))
+    folders = arguments.get("kept", {})
+    cameras = (replace(each, kept=_kept(folders.get(each.name))) for each in capture.cameras)
+    return replace(capture, cameras=tuple(cameras))
+
+
+def _kept(folder: str | None) -> KeptFrames | None:
+    from bodycap_batch.capture.kept import NAME, KeptFrames
+    from bodycap_batch.formats.bundle import read_bundle
+
+    if folder is None or not (Path(folder) / f"{NAME}.json").exists():
+        return None
+    return read_bundle(KeptFrames, Path(folder), NAME)
 
 
 def load_keyframes(path: str) -> KeyframeSelection:

@@ -131,16 +131,16 @@ def _words(case: tuple[int, int, str]) -> str:
     return f"{case[0]} s, {case[1]} cameras, {case[2]}"
 
 
-_PASSES = 3
-"""Keyframes and registration read every frame once; features read the keyframes and what these are coded
-from, which is nearly every frame too."""
+_PASSES = 2
+"""Keyframes and registration read every frame once; of large videos registration reads copies."""
 
 
 def _seeing_s(result: dict[str, Any]) -> float:
     """Seconds of the stages that look at frames, one core each, less what decoding takes of them."""
     stages = ("keyframes", "map", "registration")
     total = sum(result["stage_seconds"].get(stage, 0.0) for stage in stages)
-    return float(max(total - _PASSES * result["decoding_s"], 1e-3))
+    passes = _PASSES if result["scaling_pixels"] == SIZES[0] else 1
+    return float(max(total - passes * result["decoding_s"], 1e-3))
 
 
 def _pairs(result: dict[str, Any]) -> int:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from bodycap_batch.capture import KeptFrames
 from bodycap_batch.context import StageContext
 from bodycap_batch.report.pictures import _LARGEST, series
 
@@ -15,8 +16,9 @@ from bodycap_batch.report.pictures import _LARGEST, series
 class Film:
     """Three seconds of noise at 30 frames a second; counts how often it is read."""
 
-    def __init__(self, levels: int = 64) -> None:
+    def __init__(self, levels: int = 64, kept: KeptFrames | None = None) -> None:
         self.levels = levels
+        self.kept = kept
         self.frame_numbers = np.arange(90)
         self.passes = 0
 
@@ -49,3 +51,10 @@ def test_nothing_is_larger_than_noise_of_all_levels(tmp_path: Path) -> None:
     context = StageContext(work_dir=tmp_path)
     noisy = series(film, np.arange(90) / 30.0, 15 * 60_000, context)
     assert 45_000 < max(len(picture.jpeg) for picture in noisy) < _LARGEST
+
+
+def test_where_frames_are_kept_the_video_is_left_alone(tmp_path: Path) -> None:
+    kept = KeptFrames(path=tmp_path, frames=np.arange(3, 90, 12), width_px=320, height_px=240, group=1)
+    film: Any = Film(kept=kept)
+    found = series(film, np.arange(90) / 30.0, 15 * 60_000, StageContext(work_dir=tmp_path))
+    assert [picture.index for picture in found] == kept.frames.tolist()
