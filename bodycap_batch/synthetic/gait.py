@@ -34,6 +34,8 @@ _LAP = np.array(
         [11.8, -1.75, -0.40, 345.0],
     ]
 )
+_TURN_S, _TURN_DEG, _SWAY_M = 5.0, 75.0, 0.02
+"""On the spot: there and back again in so long, so far to either side, swaying by so much."""
 _LATTICE_HZ = 50.0
 _MARGIN_S = 4.0
 
@@ -102,11 +104,13 @@ class Habits:
         t_pose_s: The walker first stands with arms stretched out until then, at most.
         arms_ahead: 1 holds both forearms up before the chest, 0 lets them hang.
         presses: Hands laid against the chest.
+        on_the_spot: Turns to both sides where it stands instead of walking.
     """
 
     t_pose_s: float = 0.0
     arms_ahead: float = 0.0
     presses: tuple[Press, ...] = ()
+    on_the_spot: bool = False
 
 
 class Walk:
@@ -128,7 +132,7 @@ class Walk:
         self._presses = habits.presses
         # Streams of their own: a longer capture is the same walk, continued.
         for_path, for_reaches, rng = rng.spawn(3)
-        self._way = _draw_path(length_s, for_path)
+        self._way = (_draw_turns if habits.on_the_spot else _draw_path)(length_s, for_path)
         self._stride_gain = float(rng.uniform(0.92, 1.08))
         self._wobbles = {
             name: _wobble(degrees, rng)
@@ -278,6 +282,15 @@ def _draw_path(length_s: float, rng: np.random.Generator) -> CubicSpline:
         rows.append(places)
     knots = np.concatenate(rows)
     return CubicSpline(knots[:, 0], knots[:, 1:])
+
+
+def _draw_turns(length_s: float, rng: np.random.Generator) -> CubicSpline:
+    """x, y (m) and heading (degrees) over time of somebody who stands and turns to both sides."""
+    times = np.arange(-2.0 * _MARGIN_S, length_s + 2.0 * _MARGIN_S, 0.1)
+    phase = rng.uniform(0, 2 * np.pi, 3)
+    x, y = (_SWAY_M * np.sin(rate * times + phase[axis]) for axis, rate in enumerate((1.1, 0.9)))
+    heading = 90.0 + _TURN_DEG * np.sin(2 * np.pi * times / _TURN_S + phase[2])
+    return CubicSpline(times, np.column_stack([x, y, heading]))
 
 
 def _draw_reaches(length_s: float, t_pose_s: float, rng: np.random.Generator) -> tuple[_Reach, ...]:

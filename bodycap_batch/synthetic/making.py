@@ -86,6 +86,7 @@ def draw_subject(options: SynthOptions) -> Subject:
         habits = Habits(
             t_pose_s=options.t_pose_s,
             arms_ahead=options.arms_ahead,
+            on_the_spot=options.on_the_spot,
             presses=tuple(
                 press_of(mount, body, *options.pressed_s[mount.camera])
                 for mount in mounts

@@ -58,6 +58,9 @@ class SynthOptions(Options):
         le=1,
         description="how far both forearms are held up ahead; 1 brings them into the torso's view",
     )
+    on_the_spot: bool = Field(
+        False, description="the built-in walker stands and turns to both sides: hardly any parallax"
+    )
     furnished: bool = Field(True, description="False: a bare room, with nothing but what hangs on its walls")
     repeated_posters: bool = Field(False, description="hang one and the same poster in several places")
     pressed_s: Mapping[str, tuple[float, float]] = Field(
@@ -91,8 +94,9 @@ class SynthOptions(Options):
             raise ValueError(f"offsets_s: no earlier than -{_EARLIEST_S:g} s")
         if self.exposure_s > 1.0 / self.fps or self.rolling_shutter_s > 1.0 / self.fps:
             raise ValueError("exposure_s and rolling_shutter_s cannot exceed the frame interval")
-        if self.motion is not None and self.t_pose_s > 0:
-            raise ValueError("t_pose_s: a BVH motion is followed as it is")
+        for key in ("t_pose_s", "on_the_spot"):
+            if self.motion is not None and getattr(self, key):
+                raise ValueError(f"{key}: a BVH motion is followed as it is")
         self._check_pressed()
         return self
 

@@ -17,6 +17,7 @@ from typing import Any
 
 from tests.bench import (
     batch,
+    field,
     joining,
     ours,
     peers,
@@ -49,7 +50,8 @@ def main() -> int:
         "only",
         nargs="*",
         help="rows to run, or folders of captures with truth (default: all), `scaling` (or `length`, "
-        "`cameras`, `size` of it), `batch`, `spool`, `viewer`; with options of their own: `simulation`, "
+        "`cameras`, `size` of it), `field` (rendered captures with what phones do to them), `batch`, "
+        "`spool`, `viewer`; with options of their own: `simulation`, "
         "`uncertainty`, `joining` or `solving`, the skeleton stage on simulated poses, and `seeds`, the map "
         "with several seeds",
     )
@@ -95,6 +97,10 @@ def _run_by_name(options: argparse.Namespace, work: Path, results: list[dict[str
             own = ours.run(case.row, work / series / f"{case.row.name}_job")
             _tell(results, {**own, **case.size()}, scaling.lines_of(own, case))
         _tell(results, {}, scaling.summary(series, results))
+    if "field" in only:
+        for row in field.cases(work / "field"):
+            own = ours.run(row, work / "field" / f"{row.name}_job")
+            _tell(results, own, ours.lines_of(own))
     if "batch" in only:
         done = batch.run(work / "batch", options.jobs or batch.JOBS, options.repeat)
         _tell(results, done, list(batch.lines_of(done)))
@@ -118,7 +124,7 @@ def _chosen(options: argparse.Namespace, work: Path) -> list[Row]:
     if not options.only:
         return known
     rows = [row for row in known if row.name in options.only]
-    names = {row.name for row in rows} | {"scaling", *scaling.SERIES, "batch", "spool", "viewer"}
+    names = {row.name for row in rows} | {"scaling", *scaling.SERIES, "field", "batch", "spool", "viewer"}
     rows += [
         row_of(Path(name).resolve()) for name in options.only if name not in names and Path(name).is_dir()
     ]

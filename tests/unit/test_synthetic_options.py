@@ -31,6 +31,7 @@ def test_every_lens_has_a_default(model):
         ({"exposure_s": 0.05}, "frame interval"),
         ({"rolling_shutter_s": 0.05}, "frame interval"),
         ({"motion": "walk.bvh", "t_pose_s": 2.0}, "followed as it is"),
+        ({"motion": "walk.bvh", "on_the_spot": True}, "on_the_spot: a BVH motion is followed as it is"),
         ({"colour": True}, "Extra inputs"),
         ({"width": 641}, "multiple of 2"),
     ],

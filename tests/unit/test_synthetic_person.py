@@ -127,6 +127,18 @@ def test_a_longer_capture_continues_the_same_walk():
     assert np.abs(short[1] - long[1]).max() < 1e-3
 
 
+def test_somebody_who_turns_on_the_spot_hardly_travels():
+    body = draw_body(1.75, 0.05, np.random.default_rng(3))
+    walk = Walk(body, 8.0, Habits(on_the_spot=True), np.random.default_rng(4))
+    t_s = np.linspace(0, 8, 161)
+    root = _poses(walk, t_s)[:, 0]
+    assert np.ptp(root[:, :2, 3], axis=0).max() < 0.05
+    heading = np.degrees(np.unwrap(np.arctan2(root[:, 1, 0], root[:, 0, 0])))
+    # 75 degrees to either side within 5 s, give or take a gait that stands still.
+    assert 145 < np.ptp(heading) < 155
+    assert np.abs(np.diff(heading)).max() / 0.05 < 100
+
+
 def test_a_t_pose_first():
     body = draw_body(1.75, 0.05, np.random.default_rng(3))
     walk = Walk(body, 8.0, Habits(t_pose_s=2.0), np.random.default_rng(4))
