@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from bodycap_batch.merging.constants import Calibrated
@@ -25,6 +27,15 @@ _MOVEMENTS = {
     "Foot": "lift the {side} foot and circle the ankle",
     "ToeBase": "roll over the toes of the {side} foot",
 }
+
+
+def clock_sentence(camera: str, doubt: Mapping[str, float], offset_s: float) -> str:
+    """What a doubted clock looks like, and the offset that would suit it."""
+    way = "behind" if doubt["shift_s"] > 0.0 else "ahead"
+    return (
+        f"{camera} moves about the body as if its clock were {abs(doubt['shift_s']):.1f} s {way}; with "
+        f"offset_s: {offset_s:.2f} its place would scatter {1.0 - doubt['scatter_left']:.0%} less"
+    )
 
 
 def mount_sentence(mount: Mount, *, t_pose: bool) -> str:

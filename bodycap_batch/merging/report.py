@@ -10,7 +10,14 @@ import numpy as np
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.body import MergeInputs
 from bodycap_batch.geometry import rotation_angle_rad
-from bodycap_batch.merging.advice import hinge_sentence, mount_sentence, scale_sentence, up_sentence
+from bodycap_batch.merging.advice import (
+    clock_sentence,
+    hinge_sentence,
+    mount_sentence,
+    scale_sentence,
+    up_sentence,
+)
+from bodycap_batch.merging.clocks import doubted_clocks
 from bodycap_batch.merging.constants import Calibrated
 from bodycap_batch.merging.scale import ScaleSource, disagreement
 from bodycap_batch.merging.solve import Solution
@@ -56,6 +63,7 @@ def build_report(
             }
             for track in tracks
         },
+        "doubted_clocks": _clocks(inputs, [each for each in tracks if each.camera not in notes["joined"]]),
         "unused_cameras": dict(notes["unused"]),
         "joined_cameras": notes["joined"],
         "joint_gap_m": {role: _percentiles(gap) for role, gap in notes["joint_gap_m"].items()},
@@ -82,6 +90,15 @@ def build_report(
             "half_squared_error": {kind: round(error, 4) for kind, error in solution.errors.items()},
         },
     }
+
+
+def _clocks(inputs: MergeInputs, tracks: Sequence[Track]) -> dict[str, Any]:
+    """Cameras whose clock is doubted, and the ``offset_s`` that would suit them; none of joined maps."""
+    out: dict[str, Any] = {}
+    for camera, doubt in doubted_clocks(tracks).items():
+        offset_s = round(inputs.clocks[camera].offset_s + doubt["shift_s"], 2)
+        out[camera] = {**doubt, "offset_s": offset_s, "says": clock_sentence(camera, doubt, offset_s)}
+    return out
 
 
 def _scale(calibrated: Calibrated) -> dict[str, Any]:

@@ -223,6 +223,15 @@ def _of_body(inputs: ReportInputs) -> Iterator[Advice]:
     if inputs.merge is None:
         return
     report: Mapping[str, Any] = inputs.merge.report
+    clocks = report.get("doubted_clocks", {})
+    if clocks:
+        offsets = ", ".join(f"{doubt['offset_s']:.2f} for {name}" for name, doubt in sorted(clocks.items()))
+        yield Advice(
+            do="Clap once in view of all cameras and state each one's `offset_s` (the time of the clap in "
+            f"the first video less that in this one), or try {offsets}.",
+            because="; ".join(str(doubt["says"]) for _, doubt in sorted(clocks.items())),
+            weight=2.5,
+        )
     scale = report.get("scale", {})
     sigma = scale.get("relative_sigma")
     if sigma is not None and sigma > _SCALE_WELL_KNOWN:

@@ -254,6 +254,7 @@ def _of_body(merge: Mapping[str, Any]) -> Iterator[Criterion]:
             says=f"{1000 * max(gaps):.1f} mm at the 95th percentile of the worst joint",
             why="Bones that do not meet at their joint tell of a wrong bone length, mount or scale.",
         )
+    yield from _of_clocks(merge.get("doubted_clocks", {}))
     yield from _of_mounts(merge.get("mounts", {}))
     yield from _of_unused(merge.get("unused_cameras", {}))
 
@@ -274,6 +275,18 @@ def _of_gaps(cameras: Mapping[str, Any]) -> Iterator[Criterion]:
         metric=f"merge.cameras.{name}.longest_gap_s",
         value=gap,
     )
+
+
+def _of_clocks(doubted: Mapping[str, Any]) -> Iterator[Criterion]:
+    if doubted:
+        yield Criterion(
+            about="body",
+            name="One clock",
+            grade=Grade.POOR,
+            says="; ".join(str(doubt["says"]) for _, doubt in sorted(doubted.items())),
+            why="Half a second is half a step: with a clock that far off, limbs are where they were before, "
+            "and the metric scale follows them (28 % off on a walk with two clocks 0.5 and 0.2 s off).",
+        )
 
 
 def _of_mounts(mounts: Mapping[str, Any]) -> Iterator[Criterion]:

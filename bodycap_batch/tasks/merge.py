@@ -26,7 +26,9 @@ def _merge(options: Json, arguments: Json, context: StageContext, files: Path) -
         inputs = _with_board(inputs, arguments, options_.marker_board, context)
     result = merge_trajectories(inputs, options_, context)
     write_bundle(result, files, "merge")
-    write_summary(files, unused_cameras=dict(result.unused_cameras))
+    clocks = result.report.get("doubted_clocks", {})
+    notes = [str(doubt["says"]) for doubt in clocks.values()]
+    write_summary(files, unused_cameras=dict(result.unused_cameras), notes=notes)
 
 
 def _merge_inputs(arguments: Json) -> MergeInputs:

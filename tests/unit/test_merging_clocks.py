@@ -1,0 +1,64 @@
+"""Cameras whose clock does not suit the body they move with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bodycap_batch.geometry import make_transform, so3_exp
+from bodycap_batch.merging.advice import clock_sentence
+from bodycap_batch.merging.clocks import best_shift, doubted_clocks
+from bodycap_batch.merging.tracks import Track
+
+
+def _track(camera: str, poses, times_s) -> Track:
+    count = len(times_s)
+    return Track(
+        camera=camera,
+        bone=0,
+        frames=np.arange(count),
+        times_ns=np.round(1e9 * times_s).astype(np.int64),
+        map_from_cam=poses,
+        sigma_rad=np.full(count, 0.01),
+        sigma_map=np.full(count, 0.01),
+    )
+
+
+def _walk(turns: float, seconds: float = 8.0) -> tuple[Track, Track]:
+    """A trunk that walks and turns by so much there and back, and a palm that swings beside it."""
+    times_s = np.arange(0.0, seconds, 1.0 / 30.0)
+    heading = turns * np.sin(2.0 * np.pi * times_s / 3.7) * np.array([[0.0], [0.0], [1.0]])
+    place = np.column_stack([0.9 * times_s, 0.0 * times_s, 0.0 * times_s])
+    trunk = make_transform(so3_exp(heading.T), place)
+    swing = 0.15 * np.sin(2.0 * np.pi * times_s / 1.1)
+    in_trunk = np.column_stack([0.2 + swing, np.full(len(times_s), 0.3), np.full(len(times_s), -0.5)])
+    palm = trunk @ make_transform(np.tile(np.eye(3), (len(times_s), 1, 1)), in_trunk)
+    return _track("torso", trunk, times_s), _track("palm", palm, times_s)
+
+
+def _late(track: Track, seconds: float) -> Track:
+    return replace(track, times_ns=track.times_ns + round(1e9 * seconds))
+
+
+@pytest.mark.parametrize("late_s", [-1.2, -0.5, 0.4, 1.5])
+def test_a_clock_that_is_off_is_told_with_what_would_suit_it(late_s: float) -> None:
+    trunk, palm = _walk(turns=1.0)
+    (doubt,) = doubted_clocks([trunk, _late(palm, late_s)]).values()
+    # A step of the search, and another for the arm's swing, which follows the turns now and then.
+    assert doubt["shift_s"] == pytest.approx(-late_s, abs=0.1)
+    assert doubt["scatter_left"] < 0.7
+    way = "behind" if late_s < 0.0 else "ahead"
+    assert f"s {way}; with offset_s: 2.00" in clock_sentence("palm", doubt, 2.0)
+
+
+def test_right_clocks_straight_walks_and_short_clips_are_not_doubted() -> None:
+    trunk, palm = _walk(turns=1.0)
+    assert doubted_clocks([trunk, palm]) == {}
+    assert doubted_clocks([trunk, _late(palm, 0.1)]) == {}
+    straight, swinging = _walk(turns=0.0)
+    # The body is moved along its way, which looks like another mount.
+    assert doubted_clocks([straight, _late(swinging, 0.5)]) == {}
+    assert best_shift(trunk, palm.keep(palm.times_ns < 1_000_000_000)) is None
+    assert best_shift(trunk, _late(palm, 9.0)) is None
