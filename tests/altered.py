@@ -75,6 +75,18 @@ def covered(*spans_s: tuple[float, float]) -> Recording:
     return Recording(look=look)
 
 
+def zoomed(share: float) -> Recording:
+    """The middle of the picture, enlarged: digital zoom, which no calibration of the lens knows of."""
+
+    def look(image: Image, time_s: float) -> Image:
+        height, width = image.shape[:2]
+        top, left = (round(side * (1.0 - share) / 2.0) for side in (height, width))
+        middle = image[top : height - top, left : width - left]
+        return cv2.resize(middle, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.uint8)
+
+    return Recording(look=look)
+
+
 def slower(every: int, size: tuple[int, int]) -> Recording:
     """One frame in so many, in another size."""
     return Recording(

@@ -20,6 +20,7 @@ from bodycap_batch.mapping.confirmed import drop_unconfirmed
 from bodycap_batch.mapping.consistency import require_consistent
 from bodycap_batch.mapping.convert import to_map
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, add_keyframes, image_ids
+from bodycap_batch.mapping.freeing import as_mapped, freed_where_contradicted
 from bodycap_batch.mapping.initial import Start, named_start, rank_starts
 from bodycap_batch.mapping.lens import change_lenses, misfitting_lenses
 from bodycap_batch.mapping.pairs import PairChooser, link_keyframes
@@ -73,6 +74,21 @@ def build_map(
 
     Source: Schönberger, Frahm, "Structure-from-motion revisited", CVPR 2016 (COLMAP).
     """
+    result = _build(capture, selections, options, context, reach)
+    apart = replace(context, work_dir=context.work_dir / "freed")
+    return freed_where_contradicted(
+        result, capture, lambda other: _build(other, selections, options, apart, reach)
+    )
+
+
+def _build(
+    capture: Capture,
+    selections: Sequence[KeyframeSelection],
+    options: MapOptions,
+    context: StageContext,
+    reach: Reach | None,
+) -> MapResult:
+    """`build_map` with the lenses as the capture has them: held where calibrated, else refined."""
     import pycolmap
 
     workspace = context.work_dir / "workspace"
@@ -88,7 +104,7 @@ def build_map(
     tried, linked = link_keyframes(chooser, workspace, _lenses(capture), context)
     constant = _constant(capture, cameras)
     shop = _shop(workspace, capture, options, constant, context)
-    guessed = {number: name for name, number in cameras.items() if number not in set(constant)}
+    guessed = {number: name for name, number in cameras.items() if capture.camera(name).camera.refine}
     models, begun = _begun(shop, options, guessed, len(refs))
     log: dict[str, Any] = {"keyframes": len(refs), **linked, **begun}
     if models:
@@ -191,6 +207,7 @@ def extend_map(
     """
     import pycolmap
 
+    capture = as_mapped(capture, previous)
     workspace = context.work_dir / "workspace"
     shutil.copytree(previous.workspace, workspace)
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
@@ -258,6 +275,7 @@ def refine_map(
     """
     import pycolmap
 
+    capture = as_mapped(capture, previous)
     workspace = context.work_dir / "workspace"
     shutil.copytree(previous.workspace, workspace)
     settings, constant = _settings(capture, workspace, options)

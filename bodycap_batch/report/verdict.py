@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -200,19 +200,26 @@ def _of_map(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
             metric="mapping.reach.within_reach",
             value=share,
         )
-    yield from _of_lenses(metrics.get("mapping", {}).get("misfitting_lenses", {}))
+    mapping = metrics.get("mapping", {})
+    yield from _of_lenses(mapping.get("misfitting_lenses", {}), mapping.get("freed_lenses", ()))
 
 
-def _of_lenses(misfits: Mapping[str, float]) -> Iterator[Criterion]:
-    """Given focal lengths that the map contradicts: by camera, what fits over what was given."""
+def _of_lenses(misfits: Mapping[str, float], freed: Collection[str]) -> Iterator[Criterion]:
+    """Given focal lengths that the map contradicts: by camera, what fits over what was given.
+
+    Freed ones were found along with the map.
+    """
+    held = {name: factor for name, factor in misfits.items() if name not in freed}
+    misfits = held or misfits
     name, worst = max(misfits.items(), key=lambda item: abs(item[1] - 1.0), default=("", None))
     if worst is not None:
         yield Criterion(
             about="cameras",
             name="Lenses fit the pictures",
-            grade=graded(abs(worst - 1.0), 0.0, 0.1),
+            grade=graded(abs(worst - 1.0), 0.0, 0.1) if held else Grade.FAIR,
             says=f"{name}: the pictures fit a focal length {100 * abs(worst - 1.0):.0f} % "
-            f"{'longer' if worst > 1.0 else 'shorter'} than the calibration says",
+            f"{'longer' if worst > 1.0 else 'shorter'} than the calibration says"
+            f"{'' if held else '; what fits was used instead'}",
             why="A wrong focal length bends the whole map although its error in pixels is small: on a walk "
             "of 2 m, 25 % put every camera 9 cm off.",
             metric="" if "." in name else f"mapping.misfitting_lenses.{name}",

@@ -52,6 +52,7 @@ def _refine(options: Json, arguments: Json, context: StageContext, files: Path) 
 def _save_map(result: MapResult, files: Path) -> None:
     """Keep a map together with the workspace that is needed to extend it."""
     from bodycap_batch.formats.bundle import write_bundle
+    from bodycap_batch.mapping.freeing import FREED
     from bodycap_batch.mapping.lens import misfit_note
 
     workspace = files / "workspace"
@@ -63,7 +64,10 @@ def _save_map(result: MapResult, files: Path) -> None:
         files,
         keyframes=len(largest.keyframe_camera),
         points=len(largest.points),
-        notes=[misfit_note(camera, factor) for camera, factor in sorted(wrong.items())],
+        notes=[
+            misfit_note(camera, factor, freed=camera in result.log.get(FREED, ()))
+            for camera, factor in sorted(wrong.items())
+        ],
     )
 
 

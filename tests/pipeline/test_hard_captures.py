@@ -15,7 +15,7 @@ from bodycap_batch.context import StageContext
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.evaluate import TrajectoryReport, evaluate_trajectories
 from bodycap_batch.synthetic import SynthOptions, synthesise
-from tests.altered import AS_A_PHONE, alter, covered, slower
+from tests.altered import AS_A_PHONE, alter, covered, slower, zoomed
 
 pytestmark = pytest.mark.slow
 
@@ -83,6 +83,7 @@ RECORDED = {
     "phones": dict.fromkeys(COVERED_S, AS_A_PHONE),
     "covered": {name: covered(span) for name, span in COVERED_S.items()},
     "rates": {"left_palm": slower(2, (240, 180))},
+    "zoomed": {"left_palm": zoomed(0.75)},
 }
 
 

@@ -156,6 +156,10 @@ def test_a_lens_that_the_map_contradicts_is_no_good_result(
     assert (lenses.grade, lenses.value) == (grade, factor)
     assert f"left_palm: the pictures fit a focal length {says}" in lenses.says
     told = replace(inputs, metrics=metrics)
+    metrics["mapping"]["freed_lenses"] = ["left_palm", "torso"]
+    (freed,) = (each for each in judge(metrics, None).criteria if "Lenses" in each.name)
+    assert freed.grade is Grade.FAIR
+    assert "what fits was used instead" in freed.says
     assert "calibration: auto" in advise(told, {})[0].do
     assert says in written(told, tmp_path)
 
