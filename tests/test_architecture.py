@@ -15,7 +15,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "bodycap_batch"
 
 # A room is a module or package directly below bodycap_batch. Each may import the rooms named and no other.
-GROUND = {"errors", "arrays", "context", "geometry", "shares"}
+GROUND = {"errors", "arrays", "context", "geometry", "memory", "shares"}
 TYPES = GROUND | {"camera", "scene", "skeleton", "body"}
 MATERIAL = TYPES | {
     "capture", "config", "formats", "skeleton_presets", "tracking", "rolling_shutter", "overlay", "rig",
@@ -28,6 +28,7 @@ KEEPING = {"errors", "digests", "identity", "progress", "disk_room"}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "arrays": set(),
+    "memory": set(),
     "shares": set(),
     "context": {"errors"},
     "geometry": {"errors", "arrays"},
@@ -53,7 +54,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "store": KEEPING,
     "references": KEEPING | {"store"},
     "tasks": MATERIAL | STAGES | KEEPING | {"store"},
-    "runner": KEEPING | {"context", "store", "tasks"},
+    "runner": KEEPING | {"context", "memory", "store", "tasks"},
     "cluster": KEEPING | {"context", "store", "runner"},
     "pipeline": MATERIAL | STAGES | KEEPING | {"store", "references", "tasks", "runner"},
     "watch": MATERIAL | KEEPING | {"store", "references", "runner", "cluster", "pipeline"},

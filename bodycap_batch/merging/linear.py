@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,9 @@ from scipy import sparse
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from bodycap_batch.arrays import FloatArray, IntArray
+
+_HELD_BYTES = 3e7
+"""Of a chain's factors: those of 160 ticks with nine bones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,41 +89,49 @@ def _solve(lower: FloatArray, right: FloatArray, *, transposed: bool = False) ->
 class Chain:
     """Normal equations whose unknowns are linked within a block and with the next block only.
 
+    Of a long chain factors are held for a stretch of blocks at a time, and made again when they are needed:
+    they are dense, and the equations are not.
+
     Args:
         information: (C,C) sparse, symmetric.
         order: (C,) its columns block by block.
         bounds: (K+1,) where each block begins in `order`.
+        held: Bytes of factors that may be held.
 
     Source: block-tridiagonal Cholesky factorisation; its way back is the Rauch-Tung-Striebel smoother.
     """
 
-    def __init__(self, information: Any, order: IntArray, bounds: IntArray) -> None:
+    def __init__(
+        self, information: Any, order: IntArray, bounds: IntArray, held: float = _HELD_BYTES
+    ) -> None:
         self._order, self._bounds = order, bounds.tolist()
-        ordered = information.tocsr()[order].tocsc()[:, order].tocsr()
-        self._lower: list[FloatArray] = []
-        self._links: list[FloatArray] = []
-        carried: FloatArray | None = None
-        for block, (start, end) in enumerate(zip(self._bounds[:-1], self._bounds[1:], strict=True)):
-            after = self._bounds[min(block + 2, len(self._bounds) - 1)]
-            dense = ordered[start:end, start:after].toarray()
-            own = dense[:, : end - start] if carried is None else dense[:, : end - start] - carried
-            lower = _factor(own)
-            link = _solve(lower, dense[:, end - start :])
-            carried = link.T @ link
-            self._lower.append(lower)
-            self._links.append(link)
+        self._ordered = information.tocsr()[order].tocsc()[:, order].tocsr()
+        count = len(self._bounds) - 1
+        # A block's factor and its link to the next one.
+        size = max(16.0 * float(np.square(np.diff(bounds)).max(initial=1)), 1.0)
+        step = max(1, int(held / size))
+        self._stretches = [range(first, min(first + step, count)) for first in range(0, count, step)]
+        self._carried: list[FloatArray | None] = [None]
+        self._at = -1
+        self._factors: list[tuple[FloatArray, FloatArray]] = []
+        for number in range(len(self._stretches)):
+            self._carried.append(self._factorise(number))
 
     def solve(self, right: FloatArray) -> list[FloatArray]:
         """Solve for right-hand sides (C,M); the answer (n,M) of each block."""
         right = right[self._order]
         below: list[FloatArray] = []
-        for block, lower in enumerate(self._lower):
-            own = right[self._bounds[block] : self._bounds[block + 1]]
-            if below:
-                own = own - self._links[block - 1].T @ below[-1]
-            below.append(_solve(lower, own))
+        link: FloatArray | None = None
+        for number, blocks in enumerate(self._stretches):
+            for block, (lower, following) in zip(blocks, self._stretch(number), strict=True):
+                own = right[self._bounds[block] : self._bounds[block + 1]]
+                if link is not None:
+                    own = own - link.T @ below[-1]
+                below.append(_solve(lower, own))
+                link = following
         out: list[FloatArray] = []
-        for lower, link, own in zip(self._lower[::-1], self._links[::-1], below[::-1], strict=True):
+        for lower, link in self._backwards():
+            own = below.pop()
             known = own - link @ out[-1] if out else own
             out.append(_solve(lower, known, transposed=True))
         return out[::-1]
@@ -128,10 +139,37 @@ class Chain:
     def covariances(self, read: Callable[[int, FloatArray], None]) -> None:
         """Hand out each block's marginal covariance (n,n), the last block's first."""
         later: FloatArray | None = None
-        for block in range(len(self._lower) - 1, -1, -1):
-            lower, link = self._lower[block], self._links[block]
+        block = len(self._bounds) - 1
+        for lower, link in self._backwards():
+            block -= 1
             spread = np.eye(len(lower)) if later is None else np.eye(len(lower)) + link @ later @ link.T
             half = _solve(lower, spread, transposed=True)
             covariance = _solve(lower, half.T, transposed=True)
             later = 0.5 * (covariance + covariance.T)
             read(block, later)
+
+    def _backwards(self) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Every block's factor and link, the last block's first."""
+        for number in range(len(self._stretches) - 1, -1, -1):
+            yield from self._stretch(number)[::-1]
+
+    def _stretch(self, number: int) -> list[tuple[FloatArray, FloatArray]]:
+        """Factor and link of each block of a stretch."""
+        if number != self._at:
+            self._factorise(number)
+        return self._factors
+
+    def _factorise(self, number: int) -> FloatArray | None:
+        """Make the factors of a stretch; what it carries into the next one."""
+        self._at, self._factors = number, []
+        carried = self._carried[number]
+        for block in self._stretches[number]:
+            start, end = self._bounds[block : block + 2]
+            after = self._bounds[min(block + 2, len(self._bounds) - 1)]
+            dense = self._ordered[start:end, start:after].toarray()
+            own = dense[:, : end - start] if carried is None else dense[:, : end - start] - carried
+            lower = _factor(own)
+            link = _solve(lower, dense[:, end - start :])
+            carried = link.T @ link
+            self._factors.append((lower, link))
+        return carried

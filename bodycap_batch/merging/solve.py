@@ -12,6 +12,7 @@ import numpy as np
 
 from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.geometry import interpolate_pose, invert, so3_log
+from bodycap_batch.memory import give_back
 from bodycap_batch.merging.bones import Bone, hinges
 from bodycap_batch.merging.contact import Contact
 from bodycap_batch.merging.graph import (
@@ -122,6 +123,8 @@ class MotionGraph:
         solution = self._read(values, poses, count)
         if spread is None:
             return solution
+        # The optimiser's factors, 0.2 MB a tick, are of a size that nothing of what follows would take again.
+        give_back()
         return replace(solution, joint_covariance=joint_covariance(self._solved(values), poses, spread))
 
     def _solved(self, values: Any) -> SolvedGraph:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import errno
-import gc
 import importlib
 import json
 import os
@@ -31,6 +29,7 @@ from bodycap_batch.errors import (
     JobError,
     StoreError,
 )
+from bodycap_batch.memory import give_back
 from bodycap_batch.runner.task import Task, TaskFunction, task_from_json
 from bodycap_batch.store import DISK_ERRORS, Store, store_error
 
@@ -119,7 +118,7 @@ def _send_prints_to(log: Path) -> None:
 def _run(task: Task, store: Store, function: TaskFunction, link: _Link) -> None:
     started = time.monotonic()
     _pin_threads(task.threads)
-    _give_memory_back()
+    give_back()
     _forget_peak_memory()
     for artefact in dict.fromkeys(store.artefacts_in(task.arguments)):
         store.verify(artefact)
@@ -220,16 +219,6 @@ def _pin_threads(threads: int) -> None:
     os.environ["OPENCV_FOR_THREADS_NUM"] = str(threads)
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(threads)
-
-
-def _give_memory_back() -> None:
-    """Let go of what earlier tasks of this process freed: the C library keeps it, and so did peaks grow.
-
-    A map of 54 keyframes leaves 80 MB behind. Elsewhere than with glibc nothing happens.
-    """
-    gc.collect()
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _forget_peak_memory() -> None:

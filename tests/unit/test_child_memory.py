@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from bodycap_batch.runner.child import _give_memory_back
+from bodycap_batch.memory import give_back
 
 _BLOCK, _COUNT = 64 * 1024, 1600
 
@@ -33,6 +33,6 @@ def test_what_earlier_tasks_freed_goes_back() -> None:
     for block in blocks[:-1]:
         libc.free(block)
     held = _resident_mb()
-    _give_memory_back()
+    give_back()
     assert held - _resident_mb() > 80
     libc.free(blocks[-1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from itertools import pairwise
 
@@ -22,7 +23,8 @@ from bodycap_batch.merging.tracks import make_track
 from tests.stages.walker import FPS, ROLES, make_inputs, make_walk, record
 
 
-def test_a_chain_of_blocks_is_the_dense_solution():
+@pytest.mark.parametrize("held", [1.0, 600.0, 1e6])  # bytes of one block, of two, of all
+def test_a_chain_of_blocks_is_the_dense_solution(held):
     rng = np.random.default_rng(0)
     bounds = np.array([0, 3, 7, 8, 12])
     rows = np.zeros((0, 12))
@@ -36,7 +38,7 @@ def test_a_chain_of_blocks_is_the_dense_solution():
     shuffled = np.zeros_like(rows)
     shuffled[:, order] = rows
     information = shuffled.T @ shuffled
-    chain = Chain(sparse.csr_matrix(information), order, bounds)
+    chain = Chain(sparse.csr_matrix(information), order, bounds, held)
     right = rng.normal(size=(12, 2))
     assert_allclose(np.vstack(chain.solve(right)), np.linalg.solve(information, right)[order], atol=1e-9)
     inverse = np.linalg.inv(information)[np.ix_(order, order)]
@@ -44,6 +46,32 @@ def test_a_chain_of_blocks_is_the_dense_solution():
     chain.covariances(found.setdefault)
     for block, (start, end) in enumerate(pairwise(bounds.tolist())):
         assert_allclose(found[block], inverse[start:end, start:end], atol=1e-9)
+
+
+def test_a_long_chain_is_not_held_and_its_solution_is_the_same():
+    size, count = 12, 300
+    rng = np.random.default_rng(0)
+    eye, side = 4.0 * np.eye(size), 0.1 * rng.normal(size=(size, size))
+    rows = [[None] * count for _ in range(count)]
+    for block in range(count):
+        rows[block][block] = eye
+        if block:
+            rows[block - 1][block], rows[block][block - 1] = side, side.T
+    information = sparse.bmat(rows, format="csr")
+    order, bounds = np.arange(size * count), size * np.arange(count + 1)
+    right = rng.normal(size=(size * count, 2))
+    found, kept = [], []
+    for held in (1e9, 20_000.0):
+        tracemalloc.start()
+        chain = Chain(information, order, bounds, held)
+        kept.append(tracemalloc.get_traced_memory()[0])
+        tracemalloc.stop()
+        covariances = {}
+        chain.covariances(lambda block, each, known=covariances: known.setdefault(block, each[0, 0]))
+        found.append((np.vstack(chain.solve(right)), covariances))
+    assert np.array_equal(found[0][0], found[1][0])
+    assert found[0][1] == found[1][1]
+    assert kept[0] - kept[1] > 0.9 * (2 * 8 * size**2 * count - 20_000)
 
 
 def test_a_graph_that_holds_nothing_states_no_covariance(walk):
