@@ -38,6 +38,14 @@ def clock_sentence(camera: str, doubt: Mapping[str, float], offset_s: float) -> 
     )
 
 
+def sides_sentence(exchanged: Mapping[str, float]) -> str:
+    """What limbs on the wrong side of the body mean."""
+    return (
+        f"{' and '.join(sorted(exchanged))} stay on the other side of the body: left and right are "
+        "exchanged in the cameras' names, or the trunk's camera looks backward"
+    )
+
+
 def mount_sentence(mount: Mount, *, t_pose: bool) -> str:
     """How well a camera's place on its bone is known.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,13 @@ from bodycap_batch.merging.advice import (
     hinge_sentence,
     mount_sentence,
     scale_sentence,
+    sides_sentence,
     up_sentence,
 )
 from bodycap_batch.merging.clocks import doubted_clocks
 from bodycap_batch.merging.constants import Calibrated
 from bodycap_batch.merging.scale import ScaleSource, disagreement
+from bodycap_batch.merging.sides import exchanged_sides
 from bodycap_batch.merging.solve import Solution
 from bodycap_batch.merging.tracks import Track
 from bodycap_batch.merging.upright import apart_deg
@@ -64,6 +66,7 @@ def build_report(
             for track in tracks
         },
         "doubted_clocks": _clocks(inputs, [each for each in tracks if each.camera not in notes["joined"]]),
+        "exchanged_sides": _sides(inputs, calibrated, tracks, notes["joined"]),
         "unused_cameras": dict(notes["unused"]),
         "joined_cameras": notes["joined"],
         "joint_gap_m": {role: _percentiles(gap) for role, gap in notes["joint_gap_m"].items()},
@@ -99,6 +102,16 @@ def _clocks(inputs: MergeInputs, tracks: Sequence[Track]) -> dict[str, Any]:
         offset_s = round(inputs.clocks[camera].offset_s + doubt["shift_s"], 2)
         out[camera] = {**doubt, "offset_s": offset_s, "says": clock_sentence(camera, doubt, offset_s)}
     return out
+
+
+def _sides(
+    inputs: MergeInputs, calibrated: Calibrated, tracks: Sequence[Track], joined: Collection[str]
+) -> dict[str, Any]:
+    """Limbs' cameras on the other side of the body, where all are; nothing of joined maps."""
+    own = [each for each in tracks if each.camera not in joined]
+    roles = {mount.camera: mount.role for mount in inputs.mounts}
+    wrong = exchanged_sides(own, roles, calibrated.up.up)
+    return {"cameras": wrong, "says": sides_sentence(wrong)} if wrong else {}
 
 
 def _scale(calibrated: Calibrated) -> dict[str, Any]:

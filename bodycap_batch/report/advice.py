@@ -223,6 +223,13 @@ def _of_body(inputs: ReportInputs) -> Iterator[Advice]:
     if inputs.merge is None:
         return
     report: Mapping[str, Any] = inputs.merge.report
+    sides = report.get("exchanged_sides", {})
+    if sides:
+        yield Advice(
+            do="Exchange the names (or mounts) of the left and the right cameras, and run again.",
+            because=str(sides["says"]),
+            weight=2.8,
+        )
     clocks = report.get("doubted_clocks", {})
     if clocks:
         offsets = ", ".join(f"{doubt['offset_s']:.2f} for {name}" for name, doubt in sorted(clocks.items()))

@@ -262,6 +262,14 @@ def _of_body(merge: Mapping[str, Any]) -> Iterator[Criterion]:
             why="Bones that do not meet at their joint tell of a wrong bone length, mount or scale.",
         )
     yield from _of_clocks(merge.get("doubted_clocks", {}))
+    if merge.get("exchanged_sides"):
+        yield Criterion(
+            about="body",
+            name="Left and right",
+            grade=Grade.POOR,
+            says=str(merge["exchanged_sides"]["says"]),
+            why="No body fits arms that have changed sides: the metric scale was 62 % off on such a walk.",
+        )
     yield from _of_mounts(merge.get("mounts", {}))
     yield from _of_unused(merge.get("unused_cameras", {}))
 

@@ -26,8 +26,8 @@ def _merge(options: Json, arguments: Json, context: StageContext, files: Path) -
         inputs = _with_board(inputs, arguments, options_.marker_board, context)
     result = merge_trajectories(inputs, options_, context)
     write_bundle(result, files, "merge")
-    clocks = result.report.get("doubted_clocks", {})
-    notes = [str(doubt["says"]) for doubt in clocks.values()]
+    doubts = [*result.report.get("doubted_clocks", {}).values(), result.report.get("exchanged_sides", {})]
+    notes = [str(doubt["says"]) for doubt in doubts if doubt]
     write_summary(files, unused_cameras=dict(result.unused_cameras), notes=notes)
 
 

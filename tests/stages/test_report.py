@@ -164,6 +164,36 @@ def test_a_lens_that_the_map_contradicts_is_no_good_result(
     assert says in written(told, tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("doubt", "name", "do"),
+    [
+        (
+            {"doubted_clocks": {"left_palm": {"offset_s": 0.47, "says": "0.5 s behind"}}},
+            "One clock",
+            "0.47 for",
+        ),
+        (
+            {"exchanged_sides": {"cameras": {"left_palm": 1.0}, "says": "0.5 s behind"}},
+            "Left and right",
+            "Exchange",
+        ),
+    ],
+)
+def test_what_cannot_be_a_body_is_told_first(
+    inputs: ReportInputs, tmp_path: Path, doubt: dict[str, Any], name: str, do: str
+) -> None:
+    assert inputs.merge is not None
+    metrics = json.loads(json.dumps(inputs.metrics))
+    assert not any(each.name == name for each in judge(metrics, None).criteria)
+    metrics["merge"] |= doubt
+    (found,) = (each for each in judge(metrics, None).criteria if each.name == name)
+    assert (found.grade, found.says) == (Grade.POOR, "0.5 s behind")
+    merge = replace(inputs.merge, report={**inputs.merge.report, **doubt})
+    told = replace(inputs, metrics=metrics, merge=merge)
+    assert do in advise(told, {})[0].do
+    assert "0.5 s behind" in written(told, tmp_path)
+
+
 def test_cameras_that_come_late_or_leave_early_are_told_where_to_cut(inputs: ReportInputs) -> None:
     assert inputs.merge is not None
     assert not any("start_s" in each.do for each in advise(inputs, {}))

@@ -1,0 +1,68 @@
+"""Left and right cameras whose names were exchanged."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodycap_batch.geometry import make_transform, so3_exp
+from bodycap_batch.merging.advice import sides_sentence
+from bodycap_batch.merging.sides import exchanged_sides
+from bodycap_batch.merging.tracks import Track
+
+ROLES = {"torso": "Spine1", "left_palm": "LeftHand", "right_palm": "RightHand", "head": "Head"}
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def _track(camera: str, poses) -> Track:
+    count = len(poses)
+    return Track(
+        camera=camera,
+        bone=0,
+        frames=np.arange(count),
+        times_ns=np.arange(count) * 33_000_000,
+        map_from_cam=poses,
+        sigma_rad=np.full(count, 0.01),
+        sigma_map=np.full(count, 0.01),
+    )
+
+
+def _tracks(*sides: tuple[str, float], down_rad: float = 0.0, count: int = 90) -> list[Track]:
+    """A trunk's camera that turns round, looking down by so much, and cameras so far to its right."""
+    headings = np.linspace(0.0, 6.0, count)
+    level = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    turned = so3_exp(headings[:, None] * UP) @ level @ so3_exp(np.array([-down_rad, 0.0, 0.0]))
+    trunk = make_transform(turned, np.zeros((count, 3)))
+    out = [_track("torso", trunk)]
+    for camera, right_m in sides:
+        swing = 0.1 * np.sin(np.arange(count) / 5.0)
+        away = np.column_stack([right_m + swing, np.full(count, 0.4), np.full(count, 0.2)])
+        out.append(_track(camera, trunk @ make_transform(np.tile(np.eye(3), (count, 1, 1)), away)))
+    return out
+
+
+def test_exchanged_names_are_told() -> None:
+    wrong = exchanged_sides(_tracks(("left_palm", 0.3), ("right_palm", -0.3), ("head", 0.0)), ROLES, UP)
+    assert wrong == {"left_palm": 1.0, "right_palm": 1.0}
+    assert sides_sentence(wrong).startswith("left_palm and right_palm stay on the other side")
+
+
+@pytest.mark.parametrize(
+    "tracks",
+    [
+        _tracks(("left_palm", -0.3), ("right_palm", 0.3)),
+        # One arm held across the chest is a posture.
+        _tracks(("left_palm", 0.3), ("right_palm", 0.3)),
+        _tracks(("left_palm", 0.0)),
+        _tracks(("head", 0.0)),
+        # Looking at the feet tells nothing of where the body faces.
+        _tracks(("left_palm", 0.3), ("right_palm", -0.3), down_rad=1.3),
+    ],
+    ids=["right", "one arm across", "in the middle", "no limb", "looking down"],
+)
+def test_sides_that_do_not_tell_are_left_alone(tracks: list[Track]) -> None:
+    assert exchanged_sides(tracks, ROLES, UP) == {}
+
+
+def test_a_camera_on_its_head_does_not_tell() -> None:
+    assert exchanged_sides(_tracks(("left_palm", 0.3), ("right_palm", -0.3)), ROLES, -UP) == {}
