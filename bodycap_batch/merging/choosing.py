@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from bodycap_batch.body import MergeInputs
+from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.initial import anchor_and_reach
@@ -20,12 +21,15 @@ _SHORT = 0.25
 """Share of the longest camera's time below which a camera does not lead, nor its map become the main one."""
 
 
-def bring_together(inputs: MergeInputs, step: Callable[[], None]) -> Together:
+def bring_together(
+    inputs: MergeInputs, step: Callable[[], None], options: MergeOptions | None = None
+) -> Together:
     """Gather the cameras that can be used together, from the first main map that makes a body.
 
     Args:
         inputs: Trajectories, skeleton, mounts and clocks.
         step: Called after each iteration; may raise to stop.
+        options: What the job states of the scale.
 
     Raises:
         EstimationError: No map holds two cameras whose distance the body knows.
@@ -33,7 +37,7 @@ def bring_together(inputs: MergeInputs, step: Callable[[], None]) -> Together:
     useless = seldom_localised(inputs)
     left_out: dict[str, str] = {}
     for main, further in choices(inputs):
-        together = use_together(inputs, main, further, step)
+        together = use_together(inputs, main, further, step, options)
         if _make_a_body(inputs, together.trajectories):
             return replace(together, unused={**useless, **together.unused})
         left_out = left_out or dict(together.unused)

@@ -51,7 +51,7 @@ class _Progress:
 def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> MergeResult:
     """See `bodycap_batch.merging.merge_trajectories`."""
     step = _Progress(context)
-    together = bring_together(inputs, step)
+    together = bring_together(inputs, step, options)
     used = together.trajectories
     bones = graph_bones(inputs.skeleton, {inputs.mount_of(each.camera).role for each in used})
     fps = options.fps or inputs.clocks[used[0].camera].nominal_fps

@@ -9,7 +9,7 @@ import pytest
 
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import Similarity
-from bodycap_batch.merging import choosing, joining
+from bodycap_batch.merging import choosing, joining, placing
 from bodycap_batch.merging.choosing import bring_together, choices, seldom_localised
 from bodycap_batch.merging.constants import early_up
 from bodycap_batch.merging.joining import Joined, use_together
@@ -131,7 +131,7 @@ def test_one_bad_map_does_not_take_the_others_with_it(capture, monkeypatch):
     inputs = _in_maps(capture.inputs, {"left_palm": "good", "right_palm": "bad"})
     asked = []
 
-    def place(_inputs, _bones, tracks, _step):
+    def place(_inputs, _options, _bones, tracks, _step):
         asked.append(tuple(tracks))
         if "bad" in tracks:
             raise EstimationError("fits no person")
@@ -158,4 +158,4 @@ def test_one_bad_map_does_not_take_the_others_with_it(capture, monkeypatch):
 
 def test_equations_without_an_answer_are_an_estimation_error():
     with pytest.raises(EstimationError, match="does not determine"):
-        joining._solved(np.zeros((2, 2)), np.ones(2))
+        placing._solved(np.zeros((2, 2)), np.ones(2))
