@@ -34,7 +34,7 @@ def clock_sentence(camera: str, doubt: Mapping[str, float], offset_s: float) -> 
     way = "behind" if doubt["shift_s"] > 0.0 else "ahead"
     return (
         f"{camera} moves about the body as if its clock were {abs(doubt['shift_s']):.1f} s {way}; with "
-        f"offset_s: {offset_s:.2f} its place would scatter {1.0 - doubt['scatter_left']:.0%} less"
+        f"an offset_s of about {offset_s:.1f} its place would scatter {1.0 - doubt['scatter_left']:.0%} less"
     )
 
 

@@ -232,7 +232,9 @@ def _of_body(inputs: ReportInputs) -> Iterator[Advice]:
         )
     clocks = report.get("doubted_clocks", {})
     if clocks:
-        offsets = ", ".join(f"{doubt['offset_s']:.2f} for {name}" for name, doubt in sorted(clocks.items()))
+        offsets = ", ".join(
+            f"about {doubt['offset_s']:.1f} for {name}" for name, doubt in sorted(clocks.items())
+        )
         yield Advice(
             do="Clap once in view of all cameras and state each one's `offset_s` (the time of the clap in "
             f"the first video less that in this one), or try {offsets}.",
