@@ -15,7 +15,8 @@ _BLACK_LEVEL = 20.0
 # A wall out of focus, fog on the lens: fewer grey levels than this between dark and bright.
 _FLAT_CONTRAST = 12.0
 # Decoding this many frames for one sample takes a second or two.
-_STRETCH = 250
+_STRETCH, _STRETCH_PIXELS = 250, 640 * 480
+"""So many frames of that size are decoded to see the last one: a second of work. Of 4K no more than nine."""
 # Sound captures have a median grey of 100 and more.
 _DARK_LEVEL = 45.0
 # FAST corners that stand out by this much: 229 and more in every picture looked at of four captures that
@@ -112,5 +113,6 @@ def sample_indices(camera: CaptureCamera, count: int) -> IntArray:
         return even[:1]
     picked = keys[np.abs(keys[None] - even[:, None]).argmin(axis=1)]
     # The end is where a broken recording shows; without a key frame near it, it costs too much.
-    end = min(last, int(keys[-1]) + _STRETCH)
+    width, height = camera.videos[-1].stored_size
+    end = min(last, int(keys[-1]) + round(_STRETCH * min(1.0, _STRETCH_PIXELS / (width * height))))
     return np.unique(np.append(picked, [0, end]))

@@ -11,6 +11,7 @@ import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.context import StageContext
+from bodycap_batch.memory import give_back
 from bodycap_batch.registration.tracks import Anchor, Tracks, track_stretch
 from bodycap_batch.scene import FrameStatus, Registration
 
@@ -57,7 +58,9 @@ def all_tracks(
         done = set(zip([None, *known.keyframes], [*known.keyframes, None], strict=True))
         parts.append(_inside(known.tracks, [stretch for stretch in stretches if stretch in done], count))
     todo = _joined([stretch for stretch in stretches if stretch not in done], count)
-    return Tracks.join(parts + _track(camera, anchors, _shared_out(todo, frames, context.threads), context))
+    tracks = Tracks.join(parts + _track(camera, anchors, _shared_out(todo, frames, context.threads), context))
+    give_back()  # the many small pieces: 330 MB after ten minutes of video
+    return tracks
 
 
 def _track(

@@ -73,16 +73,26 @@ class Tracks:
 
     @staticmethod
     def join(parts: list[Tracks]) -> Tracks:
-        """Concatenate, ordered by frame, keyframe and feature."""
+        """Concatenate, ordered by frame, keyframe and feature; the list is emptied.
+
+        One field after the other lets go of its parts: ten minutes of video have 260 MB of observations.
+        """
         if not parts:
             none = np.zeros(0, np.int64)
             return Tracks(none, none, none, np.zeros((0, 2), np.float32))
-        frame = np.concatenate([part.frame for part in parts])
-        keyframe = np.concatenate([part.keyframe for part in parts])
-        feature = np.concatenate([part.feature for part in parts])
-        px = np.concatenate([part.px for part in parts])
+        names = ("frame", "keyframe", "feature", "px")
+        columns = [[getattr(part, name) for part in parts] for name in names]
+        parts.clear()
+        fields = []
+        while columns:
+            fields.append(np.concatenate(columns.pop(0)))
+        frame, keyframe, feature, px = fields
+        fields.clear()
         order = np.lexsort((feature, keyframe, frame))
-        return Tracks(frame[order], keyframe[order], feature[order], px[order])
+        frame = frame[order]
+        keyframe = keyframe[order]
+        feature = feature[order]
+        return Tracks(frame, keyframe, feature, px[order])
 
     def within(self, first: int, stop: int) -> Tracks:
         """Those in frames from `first` on and before `stop`, of tracks that are ordered by frame."""

@@ -179,6 +179,13 @@ def test_samples_are_key_frames_and_the_end(tmp_path: Path) -> None:
     assert sample_indices(capture.camera("head"), 8).tolist() == [0, 74]
 
 
+def test_the_end_of_large_pictures_is_not_waited_for(tmp_path: Path) -> None:
+    large = [np.full((960, 1280), 100 + index, np.uint8) for index in range(75)]
+    write_video(tmp_path / "torso.mp4", large, gop=1000, bframes=False)
+    # Four times the pixels of 640×480: a quarter of 250 frames.
+    assert sample_indices(open_capture(load_job(tmp_path).capture).camera("torso"), 8).tolist() == [0, 62]
+
+
 def test_the_sample_job_before_it_is_rendered(tmp_path: Path) -> None:
     path = tmp_path / "lab.yaml"
     path.write_text(
