@@ -16,6 +16,7 @@ from bodycap_batch.check.files import check_files
 from bodycap_batch.check.pictures import look_at_frames
 from bodycap_batch.check.report import CameraFinding, CheckReport
 from bodycap_batch.check.settings import setting_notes
+from bodycap_batch.config.folder import job_file_in
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, CaptureConfig, Job
 from bodycap_batch.disk_room import require_room
@@ -39,7 +40,9 @@ def check_path(path: Path, overrides: Overrides | None = None) -> CheckReport:
             note = f"a sample capture: `bodycap run {path.name}` renders its videos first"
             return CheckReport(notes=(note,))
         return CheckReport(errors=(error,))
-    return check_job(job)
+    report = check_job(job)
+    decides = job_file_in(path) if path.is_dir() else None
+    return report if decides is None else replace(report, notes=(f"as {decides} says", *report.notes))
 
 
 def require_ready(job: Job, threads: int = 1) -> CheckReport:

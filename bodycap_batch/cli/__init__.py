@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import traceback
 from collections.abc import Sequence
+from pathlib import Path
 
 from bodycap_batch.cli import (
     batch,
@@ -74,11 +75,24 @@ def _run(arguments: Sequence[str]) -> int:
         for note in getattr(error, "__notes__", []):
             _say(note)
         return error.exit_code
-    except Exception:  # noqa: BLE001 - the one place where bugs are caught
+    except Exception as error:  # noqa: BLE001 - the one place where bugs are caught
+        if (away := _disk_away(error)) is not None:
+            _say(f"error: {away}")
+            return away.exit_code
         _say(traceback.format_exc())
         _say("This is a bug in bodycap. Please report the lines above, the command and the job file.")
         return EXIT_BUG
     return 0
+
+
+def _disk_away(error: Exception) -> BodycapError | None:
+    """A disk that does not answer, which no look at a path expects; None for anything else."""
+    if not isinstance(error, OSError):
+        return None
+    from bodycap_batch.store import DiskAway, store_error  # takes longer than all else about `--help`
+
+    found = store_error(error, Path.cwd())
+    return found if isinstance(found, DiskAway) else None
 
 
 def _say(text: str) -> None:

@@ -181,7 +181,7 @@ class _Teller:
             if self._as_json:
                 self._line({"job": str(job), **event.to_dict()})
             elif event.kind != "progress":
-                self._say(f"{job.stem}: {sentence(event)}")
+                self._say(f"{_called(job)}: {sentence(event)}")
 
         return listen
 
@@ -190,7 +190,7 @@ class _Teller:
         if self._as_json:
             self._line({"kind": "job", **outcome.to_dict()})
         elif outcome.error is not None:
-            self._say(f"{outcome.job.path.stem}: {outcome.error}")
+            self._say(f"{_called(outcome.job.path)}: {outcome.error}")
             for note in getattr(outcome.error, "__notes__", []):
                 self._say(note)
         return outcome
@@ -200,9 +200,9 @@ class _Teller:
         if self._as_json:
             return
         found = {outcome.job: outcome for outcome in outcomes}
-        width = max(len(job.path.name) for job in jobs)
+        width = max(len(_called(job.path)) for job in jobs)
         for job in jobs:
-            typer.echo(f"{job.path.name:{width}}  {_end_of(found[job])}")
+            typer.echo(f"{_called(job.path):{width}}  {_end_of(found[job])}")
         failed = sum(outcome.exit_code != 0 for outcome in outcomes)
         typer.echo(f"{len(jobs) - failed} of {len(jobs)} jobs done")
 
@@ -215,6 +215,13 @@ class _Teller:
         with self._lock:
             sys.stdout.write(json.dumps(values) + "\n")
             sys.stdout.flush()
+
+
+def _called(job: Path) -> str:
+    """What a job is called where many are told of: each folder may hold a ``job.yaml``."""
+    from bodycap_batch.config.folder import JOB_FILES
+
+    return f"{job.resolve().parent.name}/{job.name}" if job.name in JOB_FILES else job.name
 
 
 def _end_of(outcome: Outcome) -> str:

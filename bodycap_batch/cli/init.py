@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -34,4 +35,4 @@ def init(
         typer.echo(
             f"fill in where {missing} camera{'s were' if missing > 1 else ' was'} worn (`mount:`), then"
         )
-    typer.echo(f"next: bodycap check {path}")
+    typer.echo(f"next: bodycap check {shlex.quote(str(path))}")

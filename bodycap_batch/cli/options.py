@@ -32,7 +32,7 @@ JobArgument = Annotated[
     Path,
     typer.Argument(
         metavar="JOB_OR_FOLDER",
-        help="A job file (YAML), or a folder of videos.",
+        help="A job file (YAML), or a folder of videos (its job.yaml decides, if it has one).",
         readable=False,  # the loader says it better, with the remedy
     ),
 ]

@@ -70,6 +70,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap run jobs/cpl_lab.yaml
       bodycap run my_walk/ --from merge
     """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.config.folder import job_file_in
     from bodycap_batch.config.job import Overrides, load_job
     from bodycap_batch.pipeline import Settings, prepare_capture, run_job
     from bodycap_batch.store import Store
@@ -98,6 +99,8 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
         def prepare(options: Mapping[str, Any], folder: Path) -> None:
             prepare_capture(options, folder, settings(default_store(out or default_out())))
 
+        if job.is_dir() and (decides := job_file_in(job)) is not None:
+            display(Event(kind="note", stage="", what=f"as {decides} says"))
         resolved = load_job(job, overrides, prepare=prepare)
         out_dir = results_folder(resolved)
         summary = run_job(resolved, out_dir=out_dir, settings=settings(default_store(out_dir)))

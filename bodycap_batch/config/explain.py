@@ -15,6 +15,8 @@ from bodycap_batch.config.yaml_source import Location, YamlSource, dotted
 from bodycap_batch.errors import JobError
 
 _ALSO = 5
+_MISSING = "this is missing"
+_MEANT = "did you mean "
 _WANTED = {
     "string_type": "text",
     "int_type": "a whole number",
@@ -61,8 +63,18 @@ def problems_of(error: ValidationError, model: type[BaseModel], data: object) ->
     errors = error.errors(include_url=False)
     # A list whose items are all wrong is also called too short: the items' errors say it better.
     told = [e for e in errors if e["type"] != "too_short" or not _has_deeper(e, errors)]
-    problems = [_problem(details, model, data) for details in told]
+    problems = _without_misspelt([_problem(details, model, data) for details in told])
     return [p if p.hint else p._replace(hint=_meaning(p.location, model)) for p in problems]
+
+
+def _without_misspelt(problems: list[Problem]) -> list[Problem]:
+    """A key that is missing because it was misspelt is told once, as the misspelling."""
+    meant = {
+        (*problem.location[:-1], problem.hint.removeprefix(_MEANT).strip("'?"))
+        for problem in problems
+        if problem.hint is not None and problem.hint.startswith(_MEANT)
+    }
+    return [p for p in problems if p.message != _MISSING or p.location not in meant]
 
 
 def _has_deeper(error: Any, errors: Sequence[Any]) -> bool:
@@ -76,7 +88,7 @@ def _problem(details: Any, model: type[BaseModel], data: object) -> Problem:
     if kind == "extra_forbidden":
         return _unknown_key(location, model)
     if kind == "missing":
-        return Problem(location, "this is missing", f"add `{location[-1]}:`")
+        return Problem(location, _MISSING, f"add `{location[-1]}:`")
     if kind in _WANTED:
         return Problem(location, f"{_short(details['input'])} should be {_WANTED[kind]}", None)
     if kind == "literal_error":
@@ -118,7 +130,7 @@ def _meaning(location: Location, model: type[BaseModel]) -> str:
 def _unknown_key(location: Location, model: type[BaseModel]) -> Problem:
     known = known_keys(model, location[:-1])
     near = difflib.get_close_matches(str(location[-1]), known, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(known)}"
+    hint = f"{_MEANT}{near[0]!r}?" if near else f"known here: {', '.join(known)}"
     return Problem(location, f"unknown key {str(location[-1])[:60]!r}", hint)
 
 

@@ -26,6 +26,10 @@ VIDEO_SUFFIXES = frozenset(
         ".wmv",
     }
 )
+JOB_FILES = ("job.yaml", "job.yml")
+"""What a folder's job file is called."""
+RUN_FILE = "run.json"
+"""Beside it, a ``job.yaml`` belongs to results."""
 _GOPRO = re.compile(r"^(G[HXPSLOT])(PR|[0-9]{2})([0-9]{4})$", re.IGNORECASE)
 
 
@@ -67,18 +71,14 @@ def chapters_in(folder: Path) -> tuple[Path, ...]:
 
 
 def videos_in(folder: Path) -> list[Path]:
-    """Videos and folders of chapters in a folder, by name.
+    """Videos and folders of chapters in a folder, by name. A folder of results is none, preview and all.
 
     Raises:
         CaptureError: There are none, or the folder cannot be read.
     """
     try:
         entries = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
-        videos = [
-            path
-            for path in entries
-            if is_video(path) or (path.is_dir() and any(map(is_video, path.iterdir())))
-        ]
+        videos = [path for path in entries if is_video(path) or (path.is_dir() and _holds_chapters(path))]
     except OSError as error:
         raise CaptureError(f"cannot read the folder ({error})", path=folder, hint="check the path") from error
     if not videos:
@@ -88,6 +88,10 @@ def videos_in(folder: Path) -> list[Path]:
             hint="name them after their place on the body, e.g. torso.mp4, left_palm.mp4, right_palm.mp4",
         )
     return videos
+
+
+def _holds_chapters(folder: Path) -> bool:
+    return any(map(is_video, folder.iterdir())) and not (folder / RUN_FILE).is_file()
 
 
 def recordings_in(folder: Path) -> list[tuple[str, tuple[Path, ...]]]:
@@ -104,6 +108,13 @@ def recordings_in(folder: Path) -> list[tuple[str, tuple[Path, ...]]]:
     return [(name, tuple(sorted(paths, key=natural_key))) for name, paths in found.items()]
 
 
+def job_file_in(folder: Path) -> Path | None:
+    """The job file that decides for a folder of videos, None where there is none; results' own is none."""
+    if (folder / RUN_FILE).is_file():
+        return None
+    return next((folder / name for name in JOB_FILES if (folder / name).is_file()), None)
+
+
 def folder_capture(folder: Path) -> dict[str, object]:
     """Describe a folder as the raw ``capture`` block of a job.
 
@@ -112,6 +123,7 @@ def folder_capture(folder: Path) -> dict[str, object]:
         JobError: Several cameras, and one whose name says no place on the body; two of one name.
     """
     videos = videos_in(folder)
+    _refuse_missing(folder)
     named = [(path.name if path.is_dir() else path.stem, path) for path in videos]
     _refuse_doubles(named)
     if len(named) > 1:
@@ -135,6 +147,17 @@ def _camera_block(folder: Path, name: str, path: Path) -> dict[str, object]:
     if path.is_dir() and own.is_file():
         block["calibration"] = str(own)
     return block
+
+
+def _refuse_missing(folder: Path) -> None:
+    """A camera whose videos are not there yet is missed now, not when the body has come out without it."""
+    for path in sorted(folder.iterdir()):
+        if path.is_symlink() and not path.exists() and path.suffix.lower() in VIDEO_SUFFIXES:
+            raise CaptureError(
+                "a link that leads nowhere", path=path, hint="link it again, or copy the video itself"
+            )
+        if path.is_dir() and mount_of(path.name) is not None and not (path / RUN_FILE).is_file():
+            chapters_in(path)
 
 
 def _refuse_doubles(named: list[tuple[str, Path]]) -> None:

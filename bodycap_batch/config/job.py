@@ -13,7 +13,14 @@ from pydantic import ValidationError
 
 from bodycap_batch.config.calibration import CalibrationEntry, read_calibration
 from bodycap_batch.config.explain import Problem, job_error, problems_of
-from bodycap_batch.config.folder import chapters_in, folder_capture
+from bodycap_batch.config.folder import (
+    JOB_FILES,
+    RUN_FILE,
+    VIDEO_SUFFIXES,
+    chapters_in,
+    folder_capture,
+    job_file_in,
+)
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.models import SKELETON_PRESETS, CameraConfig, CaptureConfig, Job
 from bodycap_batch.config.rules import problems_in, skeleton_of
@@ -50,7 +57,8 @@ def load_job(
     """Load a job and resolve it: absolute paths, chapters and sidecars listed, calibrations read.
 
     Args:
-        path: A YAML file (paths in it are relative to it), or a folder of videos.
+        path: A YAML file (paths in it are relative to it), or a folder of videos: its ``job.yaml`` decides,
+            where there is one.
         overrides: Values of the command line.
         prepare: Makes the videos of a job with `capture.synthetic` before they are looked for.
         policy: Which files the job may name; any, where it is the user's own.
@@ -65,6 +73,7 @@ def load_job(
     """
     full = path.resolve()
     try:
+        full = _deciding(full, policy)
         return _loaded(full, _source(full, limits or Limits()), overrides or Overrides(), prepare, policy)
     except PermissionError as error:
         kind = JobError if error.filename == str(full) else CaptureError
@@ -75,10 +84,22 @@ def load_job(
         ) from error
 
 
+def _deciding(full: Path, policy: PathPolicy | None) -> Path:
+    """The job file: of a folder that one that decides for it, or the folder itself."""
+    found = job_file_in(full) if full.is_dir() else None
+    if found is None:
+        return full
+    if policy is not None:
+        policy.require(found)
+    return found.resolve()
+
+
 def _source(full: Path, limits: Limits) -> YamlSource | None:
     """The job's YAML, None for a folder of videos."""
     if full.is_dir():
         return None
+    if full.suffix.lower() in VIDEO_SUFFIXES:
+        raise JobError("a video is no job", path=full, hint=f"give the folder that it lies in: {full.parent}")
     return read_yaml(full, max_bytes=int(1024 * limits.yaml_kb), max_depth=int(limits.yaml_depth))
 
 
@@ -92,7 +113,9 @@ def _loaded(
     if source is None:
         data, base, name = {"capture": folder_capture(full)}, full, full.name
     else:
-        data, base, name = _mapping(source), full.parent, full.stem
+        base = full.parent
+        data = _with_videos_beside(_mapping(source), base)
+        name = base.name if full.name in JOB_FILES else full.stem
     job = _with_overrides(_validated(data, full, source), overrides)
     problems = problems_in(job)
     if problems:
@@ -102,7 +125,9 @@ def _loaded(
     if job.capture.synthetic is not None:
         _prepare_synthetic(job, base, full, prepare)
     resolved = _resolved(job, base, safe_name(name), full, source)
-    if policy is not None:
+    if policy is None:
+        _require_apart(resolved, full)
+    else:  # whose results go where the operator says
         policy.require_resolved(resolved)
     return resolved
 
@@ -127,6 +152,22 @@ def _mapping(source: YamlSource) -> dict[str, Any]:
             "the job is no block of `key: value` lines", path=source.path, hint="start with `capture:`"
         )
     return source.data
+
+
+def _with_videos_beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Where a job names no cameras they are the videos beside it, as for a folder without a job file.
+
+    A key that nobody knows goes first: it may be the one that is missed.
+    """
+    capture = data.get("capture", {})
+    if not isinstance(capture, dict) or "cameras" in capture:
+        return data
+    if not (data.keys() <= Job.model_fields.keys() and capture.keys() <= CaptureConfig.model_fields.keys()):
+        return data
+    try:
+        return {**data, "capture": {**folder_capture(folder), **capture}}
+    except CaptureError:
+        return data
 
 
 def _validated(data: dict[str, Any], path: Path, source: YamlSource | None) -> Job:
@@ -201,6 +242,19 @@ def _resolved(job: Job, base: Path, name: str, path: Path, source: YamlSource | 
     name = job.name or name
     out = (base / job.out if job.out is not None else Path("out") / name).resolve()
     return job.model_copy(update={"capture": capture, "name": name, "skeleton": skeleton, "out": out})
+
+
+def _require_apart(job: Job, full: Path) -> None:
+    """Results have a folder of their own: no job file is lost, and no preview is taken for a video."""
+    videos = {video.parent for camera in job.capture.cameras for video in camera.video}
+    kept = full.name == JOB_FILES[0] and full.parent == job.out and not (full.parent / RUN_FILE).is_file()
+    if job.out in videos or kept:
+        raise JobError(
+            f"the results would lie among what they are made from, in {job.out}",
+            path=full,
+            field="out",
+            hint=f"a folder of their own, for example {Path(str(job.out)) / 'results'}",
+        )
 
 
 def _resolved_camera(camera: CameraConfig, index: int, capture: CaptureConfig, base: Path) -> CameraConfig:

@@ -122,7 +122,9 @@ class CameraConfig(_Block):
 class CaptureConfig(_Block):
     """The videos of one recording."""
 
-    cameras: tuple[CameraConfig, ...] = Field(min_length=1, max_length=64)
+    cameras: tuple[CameraConfig, ...] = Field(
+        min_length=1, max_length=64, description="a list of blocks: - {name: torso, video: torso.mp4}"
+    )
     calibration: AnyCalibration | None = Field(
         None, description="calibration of every camera that has none of its own"
     )
@@ -149,7 +151,7 @@ class CaptureConfig(_Block):
 
 
 class Job(_Block):
-    """Everything a run needs; only `capture` has no default."""
+    """Everything a run needs. A job file without cameras means the videos beside it."""
 
     capture: CaptureConfig
     name: str = Field("", max_length=100, description="names the results; default: the file's or folder's")

@@ -115,7 +115,9 @@ class MergeOptions(Options):
 class ExportOptions(Options):
     """Stage 5, the files."""
 
-    formats: tuple[FileFormat, ...] = ("ply", "bvh", "glb", "tum", "csv", "colmap")
+    formats: tuple[FileFormat, ...] = Field(
+        ("ply", "bvh", "glb", "tum", "csv", "colmap"), description="files to write, as a list: [ply, bvh]"
+    )
     units: Literal["cm", "m"] = Field("cm", description="unit of the BVH")
     names: NamePreset = Field("hik", description="joint names and spine count of the files for animation")
     root: RootMode = Field(

@@ -13,7 +13,10 @@ from bodycap_batch.config.explain import Problem
 from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, Job, MountPose
 from bodycap_batch.config.mounts import MOUNT_NAMES, ROLES
 from bodycap_batch.config.options import MARKER_COUNTS
+from bodycap_batch.skeleton_presets import split_side
 
+_FREE_LIMB = {"Arm": "arm", "ForeArm": "arm", "Hand": "arm", "Leg": "leg", "Foot": "leg"}
+"""Bones whose joint is not held to the trunk, and the limb that they belong to."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._\-]*")
 _UNFILLED = re.compile(r"<[^<>]*>")
 _MAX_NAME_BYTES = 255
@@ -27,7 +30,7 @@ def problems_in(job: Job) -> list[Problem]:
     for index, camera in enumerate(job.capture.cameras):
         for found in (*_camera_names(job, index), *_mount(job, camera), *_pose(camera), *_paths(camera)):
             problems.append(found._replace(location=("capture", "cameras", index, *found.location)))
-    rules = (_job_names, _skeleton, _times, _first_frames, _rig, _board)
+    rules = (_job_names, _skeleton, _size, _times, _first_frames, _rig, _board)
     return [*problems, *(found for rule in rules for found in rule(job))]
 
 
@@ -134,6 +137,20 @@ def _skeleton(job: Job) -> Iterator[Problem]:
             ("skeleton",),
             f"every camera rides on {roles.pop()}; a body's motion takes cameras on two bones or more",
             "`skeleton: none` gives the cameras' path and the map",
+        )
+
+
+def _size(job: Job) -> Iterator[Problem]:
+    """Two cameras on limbs that hang free of each other are any distance apart, whatever the body's size."""
+    parts = [split_side(camera.role) for camera in job.capture.cameras if camera.role is not None]
+    limbs = [(side, _FREE_LIMB.get(part)) for side, part in parts]
+    lone = len(limbs) == len(set(limbs)) == len(job.capture.cameras) > 1
+    if skeleton_of(job) != NO_SKELETON and lone and all(limb is not None for _, limb in limbs):
+        yield Problem(
+            ("skeleton",),
+            "no two of these cameras tell how large the body is: each rides on a limb of its own",
+            "add one on the trunk or the head (torso), or a second one on the same limb; "
+            "`skeleton: none` gives the cameras' paths and the map",
         )
 
 

@@ -17,6 +17,7 @@ from bodycap_batch.errors import EXIT_BUG, BodycapError, Cancelled, JobError
 from bodycap_batch.pipeline.run import RunSummary, run_job
 from bodycap_batch.pipeline.sample import prepare_capture
 from bodycap_batch.pipeline.settings import Settings
+from bodycap_batch.store import DiskAway, store_error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,6 +136,9 @@ def _outcome(job: BatchJob, future: Future[RunSummary], seconds: float) -> Outco
         return Outcome(job=job, seconds=seconds, summary=future.result())
     if isinstance(failure, BodycapError):
         return Outcome(job=job, seconds=seconds, error=failure)
+    away = store_error(failure, job.path) if isinstance(failure, OSError) else None
+    if isinstance(away, DiskAway):
+        return Outcome(job=job, seconds=seconds, error=away)
     bug = BodycapError(f"{type(failure).__name__}: {failure}", path=job.path, hint="this is a bug")
     bug.exit_code = EXIT_BUG
     bug.add_note("".join(traceback.format_exception(failure)))

@@ -9,10 +9,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from bodycap_batch.config.folder import RUN_FILE
 from bodycap_batch.digests import remove_abandoned, temporary_beside, write_atomically
 from bodycap_batch.store import disk_errors, sync_folder
 
-RUN_FILE = "run.json"
 PARTIAL = "partial"
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import yaml
 
 import bodycap_batch
+from bodycap_batch.config.folder import RUN_FILE
 from bodycap_batch.config.models import Job
 from bodycap_batch.errors import BodycapError, Cancelled, CaptureError, EstimationError, JobError
 from bodycap_batch.pipeline.flow import Flow
@@ -18,7 +19,6 @@ from bodycap_batch.pipeline.inputs import has_body
 from bodycap_batch.pipeline.made import Made
 from bodycap_batch.pipeline.results import (
     PARTIAL,
-    RUN_FILE,
     clear_partial,
     publish,
     remove_outdated,

@@ -14,7 +14,6 @@ from bodycap_batch.watch.spool import visible
 
 READY = "READY"
 NO_JOB = "no job: neither a folder nor a YAML file"
-JOB_FILES = ("job.yaml", "job.yml")
 YAML_SUFFIXES = (".yaml", ".yml")
 _PART = ".part"
 _HARMLESS = (".DS_Store", ".localized", ".directory", ".Spotlight-V100", ".Trashes", ".fseventsd", ".nomedia")

@@ -8,17 +8,15 @@ from pathlib import Path
 
 import yaml
 
+from bodycap_batch.config.folder import job_file_in
 from bodycap_batch.config.job import load_job, safe_name
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.models import SKELETON_PRESETS, CameraConfig, Job
 from bodycap_batch.config.trust import PathPolicy
 from bodycap_batch.errors import CaptureError, JobError
 from bodycap_batch.pipeline.results import write_results_file
-from bodycap_batch.watch.drops import JOB_FILES, YAML_SUFFIXES, Drop, Look
+from bodycap_batch.watch.drops import YAML_SUFFIXES, Drop, Look
 from bodycap_batch.watch.spool import JobDir, visible
-
-_UNNAMED = ("job", "input")
-"""What a job is called by its file or folder alone."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +66,8 @@ def read_drop(drop: Drop, look: Look, terms: Terms) -> Job:
     if source != drop.path:
         policy.require(source)
     job = load_job(source, policy=policy, limits=terms.limits)
-    if source != drop.path and job.name in _UNNAMED:
+    if source != drop.path and job.name == safe_name(source.resolve().parent.name):
+        # Its file gives no name of its own: the drop's, which may be a link to a folder of another.
         job = job.model_copy(update={"name": safe_name(drop.name)})
     _require_sizes(job, terms.limits)
     return job.model_copy(update={"capture": job.capture.model_copy(update={"synthetic": None})})
@@ -78,11 +77,6 @@ def policy_for(path: Path, roots: tuple[Path, ...], *, is_file: bool) -> PathPol
     """Which paths a drop may name: those in its folder, unless that is a link or there is none."""
     own = None if is_file or path.is_symlink() else path
     return PathPolicy(folder=own, roots=roots)
-
-
-def job_file_in(folder: Path) -> Path | None:
-    """The job file of a dropped folder, None where there is none."""
-    return next((folder / name for name in JOB_FILES if (folder / name).is_file()), None)
 
 
 def other_job_files(folder: Path) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import pty
@@ -328,6 +329,20 @@ def test_an_unwritable_place_for_results_is_named(bench: Bench) -> None:
     assert code == 5
     assert str(bench.folder / "out") in err
     assert "hint:" in err
+
+
+def test_a_disk_that_does_not_answer_is_no_bug(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def stale(path: Path) -> Path:
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(path))
+
+    monkeypatch.setattr(Path, "resolve", stale)
+    assert main(["check", "walk"]) == 5
+    told = capfd.readouterr().err
+    assert "error: walk: Stale file handle" in told
+    assert "mounted" in told
+    assert "bug" not in told
 
 
 def test_the_version_is_told(capfd: pytest.CaptureFixture[str]) -> None:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+from itertools import combinations, permutations
 from pathlib import Path
 
 import pytest
 
 from bodycap_batch.config.job import Overrides, load_job
-from bodycap_batch.config.models import SKELETON_PRESETS
+from bodycap_batch.config.models import SKELETON_PRESETS, Job
 from bodycap_batch.config.mounts import MOUNT_NAMES, ROLES, mount_of, role_of_segment
+from bodycap_batch.config.rules import problems_in
 from bodycap_batch.errors import CaptureError, JobError
+from bodycap_batch.merging.bones import graph_bones
+from bodycap_batch.merging.initial import anchor_and_reach
 from bodycap_batch.skeleton_presets import load_skeleton
 
 LENS = {"model": "PINHOLE", "params": [420, 420, 320, 240], "width": 640, "height": 480}
@@ -84,6 +88,94 @@ def test_a_folder_is_a_job(tmp_path: Path) -> None:
     assert (by_name["torso"].offset_s, by_name["left_palm"].offset_s) == (0.12, 0.0)
     assert by_name["left_palm"].rolling_shutter_s == 0.02
     assert by_name["torso"].input_files() == (root / "torso.mp4", root / "torso.timestamps.txt")
+
+
+def test_the_job_file_of_a_folder_decides(tmp_path: Path) -> None:
+    root = folder(tmp_path / "kitchen walk", "torso.mp4", "left_palm.mp4", "right_palm.mp4")
+    (root / "job.yaml").write_text("height_m: 1.8\ncapture: {cameras: [{name: head, video: torso.mp4}]}\n")
+    job = load_job(root)
+    assert (job.name, job.height_m) == ("kitchen_walk", 1.8)
+    assert [camera.name for camera in job.capture.cameras] == ["head"]
+    assert load_job(root / "job.yaml") == job
+    assert load_job(root, Overrides(height_m=1.7)).height_m == 1.7
+    (root / "run.json").write_text("{}")
+    assert len(load_job(root).capture.cameras) == 3, "that of results does not speak for videos"
+
+
+def test_a_job_that_names_no_cameras_means_the_videos_beside_it(tmp_path: Path) -> None:
+    root = folder(tmp_path, "torso.mp4", "left_palm.mp4")
+    (root / "calib.json").write_text(json.dumps(LENS))
+    (root / "job.yaml").write_text("height_m: 1.8\n")
+    job = load_job(root)
+    assert job.height_m == 1.8
+    assert job.capture == load_job(folder(root, "run.json")).capture, "as without a job file"
+    (root / "walk.yaml").write_text("capture: {calibration: auto, start_s: 2.0}\n")
+    job = load_job(root / "walk.yaml")
+    assert (job.name, job.capture.start_s, len(job.capture.cameras)) == ("walk", 2.0, 2)
+    assert {camera.calibration for camera in job.capture.cameras} == {"auto"}
+    (root / "walk.yaml").write_text("captur: {start_s: 2.0}\n")
+    with pytest.raises(JobError, match="unknown key 'captur'") as caught:
+        load_job(root / "walk.yaml")
+    assert caught.value.hint == "did you mean 'capture'?"
+    assert "missing" not in caught.value.message
+    for word in ("", "capture: {}"):
+        (tmp_path / "jobs").mkdir(exist_ok=True)
+        (tmp_path / "jobs" / "none.yaml").write_text(f"height_m: 1.8\n{word}\n")
+        with pytest.raises(JobError, match="missing"):
+            load_job(tmp_path / "jobs" / "none.yaml")
+
+
+def test_results_beside_the_videos_are_no_camera(tmp_path: Path) -> None:
+    root = folder(tmp_path, "torso.mp4", "left_palm.mp4", "results/preview.mp4", "results/run.json")
+    assert [camera.name for camera in load_job(root).capture.cameras] == ["left_palm", "torso"]
+
+
+def test_results_do_not_lie_among_what_they_are_made_from(tmp_path: Path) -> None:
+    root = folder(tmp_path / "walk", "torso.mp4", "left_palm.mp4")
+    with pytest.raises(JobError, match="among what they are made from") as caught:
+        load_job(root, Overrides(out=root))
+    assert str(root / "results") in str(caught.value.hint)
+    own = folder(tmp_path, "jobs/job.yaml") / "jobs" / "job.yaml"
+    own.write_text("out: .\ncapture: {cameras: [{name: torso, video: ../walk/torso.mp4}]}\n")
+    with pytest.raises(JobError, match="among what they are made from"):
+        load_job(own)
+    folder(tmp_path, "jobs/run.json")
+    assert load_job(own).out == own.parent, "the resolved job of results runs again as it is"
+
+
+def test_a_camera_whose_videos_did_not_come_along(tmp_path: Path) -> None:
+    root = folder(tmp_path, "torso.mp4", "left_palm.mp4", "gt/a.tum", "right_palm/notes.txt")
+    with pytest.raises(CaptureError, match="no video in this camera's folder"):
+        load_job(root)
+    folder(root, "right_palm/GX010001.MP4")
+    (root / "head.mp4").symlink_to(tmp_path / "unplugged" / "head.mp4")
+    with pytest.raises(CaptureError, match="leads nowhere") as caught:
+        load_job(root)
+    assert caught.value.path == str(root / "head.mp4")
+
+
+def test_a_video_is_no_job(tmp_path: Path) -> None:
+    with pytest.raises(JobError, match="a video is no job") as caught:
+        load_job(folder(tmp_path, "torso.mp4") / "torso.mp4")
+    assert str(tmp_path) in str(caught.value.hint)
+
+
+def test_cameras_that_cannot_tell_the_size_are_refused_beforehand() -> None:
+    """The rule is the skeleton stage's, which would say so after the map."""
+    skeleton, wrong = load_skeleton("full_body"), []
+    for roles in combinations(ROLES, 2):
+        bones = graph_bones(skeleton, set(roles))
+        place = {bone.role: index for index, bone in enumerate(bones)}
+        known = any(
+            anchor_and_reach(bones, place[one], place[other]) is not None
+            for one, other in permutations(roles, 2)
+        )
+        cameras = [{"name": f"c{n}", "video": [f"{n}.mp4"], "segment": role} for n, role in enumerate(roles)]
+        problems = problems_in(Job.model_validate({"capture": {"cameras": cameras}}))
+        told = any("how large the body is" in problem.message for problem in problems)
+        if told == known:
+            wrong.append(roles)
+    assert not wrong
 
 
 def test_a_single_camera_may_have_any_name(tmp_path: Path) -> None:

@@ -28,8 +28,10 @@ def folder(tmp_path: Path) -> Path:
 
 def test_the_job_written_means_what_the_folder_means(folder: Path) -> None:
     (folder / "calib.json").write_text(json.dumps(LENS))
+    without = load_job(folder)
     path = write_starting_job(folder)
-    assert load_job(path) == load_job(folder)
+    assert load_job(path) == without
+    assert load_job(folder) == without
 
 
 @pytest.mark.parametrize("named", ["20261121", "1e5", "true", "null"])
