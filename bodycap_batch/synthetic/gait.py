@@ -6,7 +6,8 @@ periodic functions of a gait phase plus a few slow sinusoids, the path is a spli
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -36,6 +37,7 @@ _LAP = np.array(
 )
 _TURN_S, _TURN_DEG, _SWAY_M = 5.0, 75.0, 0.02
 """On the spot: there and back again in so long, so far to either side, swaying by so much."""
+_ARM_PARTS = ("Lift", "Ahead", "Arm", "Out", "Spin", "Elbow", "Twist")
 _LATTICE_HZ = 50.0
 _MARGIN_S = 4.0
 
@@ -105,12 +107,17 @@ class Habits:
         arms_ahead: 1 holds both forearms up before the chest, 0 lets them hang.
         presses: Hands laid against the chest.
         on_the_spot: Turns to both sides where it stands instead of walking.
+        bearing: Degrees by which joints are held other than everyone's, where not 0: ``Bend`` and ``Turn``
+            of the trunk, and with ``Left`` or ``Right`` before it ``Lift`` and ``Ahead`` of the shoulder,
+            ``Arm`` (flexion), ``Out`` (abduction), ``Spin`` of the upper arm, ``Elbow`` and ``Twist``
+            (pronation). Arms in a T-pose are stretched out all the same.
     """
 
     t_pose_s: float = 0.0
     arms_ahead: float = 0.0
     presses: tuple[Press, ...] = ()
     on_the_spot: bool = False
+    bearing: Mapping[str, float] = field(default_factory=dict)
 
 
 class Walk:
@@ -130,6 +137,7 @@ class Walk:
         self._t_pose_s = habits.t_pose_s
         self._arms_ahead = habits.arms_ahead
         self._presses = habits.presses
+        self._bearing = habits.bearing
         # Streams of their own: a longer capture is the same walk, continued.
         for_path, for_reaches, rng = rng.spawn(3)
         self._way = (_draw_turns if habits.on_the_spot else _draw_path)(length_s, for_path)
@@ -198,10 +206,11 @@ class Walk:
                * _about("XY", np.column_stack([alive * 1.5 * np.cos(2 * phase) * np.abs(stride),
                                                alive * 2.0 * np.sin(phase) * np.abs(stride)]))}  # fmt: skip
         twist = alive * (wave["Turn"](t_s) - 3.0 * stride * np.cos(phase))
+        bend, turn = (self._bearing.get(part, 0.0) for part in ("Bend", "Turn"))
         for share, name in ((0.45, "Spine"), (0.55, "Spine1")):
             angles = [
-                share * twist,
-                share * alive * (2.0 + wave["Bend"](t_s)),
+                share * twist + share * turn,
+                share * alive * (2.0 + wave["Bend"](t_s)) + share * bend,
                 share * alive * wave["Lean"](t_s),
             ]
             out[name] = _about("ZXY", np.column_stack(angles))
@@ -244,10 +253,11 @@ class Walk:
         """Clavicle, shoulder, elbow and wrist: swing against the leg, slow habits, reaching."""
         forth, alive = swing
         wave, outward = self._wobbles, 1.0 if side == "Left" else -1.0
-        flexion = 4.0 + 11.0 * forth + wave[f"{side}Arm"](t_s)
-        abduction = 10.0 + wave[f"{side}Out"](t_s)
-        elbow = 24.0 + 7.0 * forth + wave[f"{side}Elbow"](t_s)
-        pronation = 8.0 + wave[f"{side}Twist"](t_s)
+        held = {part: self._bearing.get(side + part, 0.0) for part in _ARM_PARTS}
+        flexion = 4.0 + held["Arm"] + 11.0 * forth + wave[f"{side}Arm"](t_s)
+        abduction = 10.0 + held["Out"] + wave[f"{side}Out"](t_s)
+        elbow = 24.0 + held["Elbow"] + 7.0 * forth + wave[f"{side}Elbow"](t_s)
+        pronation = 8.0 + held["Twist"] + wave[f"{side}Twist"](t_s)
         flexion, elbow = flexion + 25.0 * self._arms_ahead, elbow + 60.0 * self._arms_ahead
         lift = np.zeros_like(t_s)
         for reach in self._reaches:
@@ -261,14 +271,17 @@ class Walk:
             abduction=abduction,
             elbow=elbow,
             pronation=pronation,
-            spin=np.zeros_like(t_s),
+            spin=np.full_like(t_s, held["Spin"]),
             wrist=wave[f"{side}Wrist"](t_s),
             radial=wave[f"{side}Radial"](t_s),
         )
         for press in self._presses:
             if press.side == side:
                 angles, lift = press.blended(angles, t_s), lift * (1.0 - press.weight(t_s))
-        out[f"{side}Shoulder"] = _about("Y", -outward * alive * lift)
+        shoulder = _about("Y", -outward * (alive * lift + held["Lift"]))
+        if held["Ahead"]:
+            shoulder = _about("Z", np.full_like(t_s, -outward * held["Ahead"])) * shoulder
+        out[f"{side}Shoulder"] = shoulder
         out.update(angles.rotations(side, alive))
 
 

@@ -27,7 +27,7 @@ from bodycap_batch.synthetic.gait import Habits, Walk
 from bodycap_batch.synthetic.lens import focal_and_centre, ray_grid
 from bodycap_batch.synthetic.measured import measure
 from bodycap_batch.synthetic.options import SynthOptions
-from bodycap_batch.synthetic.person import draw_body, draw_mounts
+from bodycap_batch.synthetic.person import draw_bearing, draw_body, draw_mounts
 from bodycap_batch.synthetic.pressing import press_of
 from bodycap_batch.synthetic.render import View, triangles_of
 from bodycap_batch.synthetic.room import build_room
@@ -68,7 +68,7 @@ def draw_subject(options: SynthOptions) -> Subject:
     Raises:
         JobError: The BVH file cannot be used.
     """
-    names = ("body", "walk", "mounts", "room", "clothes", "images", "poses", "drops")
+    names = ("body", "walk", "mounts", "room", "clothes", "images", "poses", "drops", "bearing")
     children = np.random.SeedSequence(options.seed).spawn(len(names))
     seeds = dict(zip(names, children, strict=True))
     length_s = options.seconds + max(0.0, *options.offsets_s.values(), 0.0)
@@ -92,6 +92,7 @@ def draw_subject(options: SynthOptions) -> Subject:
                 for mount in mounts
                 if mount.camera in options.pressed_s
             ),
+            bearing=draw_bearing(options.posture_spread, np.random.default_rng(seeds["bearing"])),
         )
         motion = Walk(body, length_s, habits, np.random.default_rng(seeds["walk"]))
     return Subject(motion=motion, mounts=mounts, seeds=seeds)

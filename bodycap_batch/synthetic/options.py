@@ -40,6 +40,12 @@ class SynthOptions(Options):
     proportion_range: float = Field(
         0.05, ge=0, lt=0.5, description="bones of the built-in walker differ by up to this share"
     )
+    posture_spread: float = Field(
+        0.0,
+        ge=0,
+        le=3,
+        description="how far the built-in walker's usual posture is off everyone's mean; 1: as people differ",
+    )
     mount_sigma_deg: float = Field(15.0, ge=0, description="how far mounts are turned off nominal, in all")
     mount_sigma_m: float = Field(0.05, ge=0, description="how far mounts sit off nominal, in all")
     noise: float = Field(2.0, ge=0, le=50, description="image noise at mid grey, grey levels of 255")

@@ -59,6 +59,7 @@ class Case:
     shifted: bool = False
     seconds: float = SECONDS
     mount_sigmas: tuple[float, float] = (15.0, 0.05)
+    posture_spread: float = 0.0
 
     def options(self) -> SynthOptions:
         names = CAMERAS[self.cameras]
@@ -71,6 +72,7 @@ class Case:
             t_pose_s=2.0 if self.t_pose else 0.0,
             mount_sigma_deg=self.mount_sigmas[0],
             mount_sigma_m=self.mount_sigmas[1],
+            posture_spread=self.posture_spread,
             offsets_s=offsets,
             rates_fps={names[-1]: 24.0} if self.shifted else {},
         )
