@@ -9,7 +9,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.geometry import invert
 from bodycap_batch.merging.bones import JOINT_SLACK_M, Bone, hinges
 from bodycap_batch.merging.graph import (
@@ -28,6 +28,7 @@ from bodycap_batch.merging.graph import (
 from bodycap_batch.merging.hinge_give import FREE_M, loosened, off_hinges, told
 from bodycap_batch.merging.initial import fill_gaps, pose_bones
 from bodycap_batch.merging.linear import Linear, linearise
+from bodycap_batch.merging.liveliness import passing_shares
 from bodycap_batch.merging.mount_spread import JOINED, MEASURED, Eliminated, SolvedMounts, kinds_of
 from bodycap_batch.merging.posture import PostureFactors, per_gesture, widened
 from bodycap_batch.merging.samples import Samples
@@ -43,6 +44,7 @@ from bodycap_batch.merging.spread import (
 )
 from bodycap_batch.merging.t_pose import t_posed
 from bodycap_batch.skeleton import Mount, SkeletonModel
+from bodycap_batch.skeleton_presets import NAMED_SIGMA_RAD, NOMINAL_SIGMA_RAD
 
 PRIOR_SCALE = 4.0
 """The pose prior counts once per tick here; its sigmas are widened, or it would outvote the cameras."""
@@ -185,20 +187,32 @@ class Calibration:
             ]
         )
         passing = [
-            habits(self._bones, cameras, _FLEETING),
+            habits(self._bones, cameras, self._passing(mounts, solved)),
             map_bends(self._bones, dict(zip(cameras, bends, strict=True))),
         ]
         return constant, joined(passing)
 
+    def _passing(self, mounts: SolvedMounts, solved: Eliminated) -> FloatArray:
+        """Share (B,) of each joint's everyday range that comes and goes."""
+        usual = np.flatnonzero(~self._samples.posture.t_pose)
+        times_ns = self._samples.times_ns[usual]
+        return np.sqrt(passing_shares(mounts, solved, (usual, times_ns), PRIOR_SCALE))
+
     def _bent(self, mounts: SolvedMounts, solved: Eliminated) -> float:
         """Variance of the measurements beyond their own noise, as a share of what was believed."""
-        return max(mounts.variance(solved, MEASURED) - self._samples.white_share, 0.0)
+        white, repeats = self._samples.white_share, self._samples.repeats
+        # The map's error was widened by what samples share of it: one sample alone shows the plain one.
+        return max(mounts.variance(solved, MEASURED, white + (1.0 - white) / repeats) - white, 0.0)
 
     def row_variance(self, mounts: SolvedMounts, solved: Eliminated) -> FloatArray:
-        """Variance factor (4,) of each kind of the graph's rows, from the residuals."""
-        measured = self._samples.white_share + self._samples.repeats * self._bent(mounts, solved)
+        """Variance factor (5,) of each kind of the graph's rows, from the residuals."""
+        repeats = self._samples.repeats
+        measured = self._samples.white_share + repeats * self._bent(mounts, solved)
+        # What is left of a gap may repeat itself as the map's error does.
+        joined = repeats * mounts.variance(solved, JOINED, 1.0 / repeats)
         # Rotations are weighed at the pose prior's widened sigmas; what comes and goes differs by sample.
-        return np.array([1.0, measured, mounts.variance(solved, JOINED), (_FLEETING / PRIOR_SCALE) ** 2])
+        posed = (_FLEETING / PRIOR_SCALE) ** 2
+        return np.array([1.0, measured, joined, posed, (NAMED_SIGMA_RAD / NOMINAL_SIGMA_RAD) ** 2])
 
     def measurement_shifts(self, linear: Linear, directions: FloatArray) -> FloatArray:
         """How the residuals change as the measured cameras move: rows (R,P).
@@ -230,8 +244,7 @@ class Calibration:
     def reweigh(self, mounts: SolvedMounts, solved: Eliminated) -> None:
         """Weigh measurements and gaps by what the last solution left of them, never by less than believed.
 
-        Residuals that are smaller than a map's usual error say that this map is better. What is left of a gap
-        may repeat itself as the map's error does.
+        Residuals that are smaller than a map's usual error say that this map is better.
         """
         samples = self._samples
         factors = self.row_variance(mounts, solved)
@@ -242,7 +255,7 @@ class Calibration:
             sigma_map=np.sqrt(measured) * samples.sigma_map,
             white_share=samples.white_share / measured,
         )
-        self._slack_map *= float(np.sqrt(min(samples.repeats * float(factors[JOINED]), 1.0)))
+        self._slack_map *= float(np.sqrt(min(float(factors[JOINED]), 1.0)))
 
     def unit_shifts(self, mounts: SolvedMounts) -> FloatArray:
         """How the residuals (R,) change per unit of log scale because their sigmas do.
@@ -285,7 +298,9 @@ class Calibration:
                 name: mount_change(self.mounts[name], all_points[camera])
                 for camera, name in enumerate(cameras)
             },
-            kinds=kinds_of(linear, (self._first_joint, self._first_joint + each * last), stated),
+            kinds=kinds_of(
+                linear, (self._first_joint, self._first_joint + each * last), stated, self._named()
+            ),
             first_joint=self._first_joint,
         )
 
@@ -304,6 +319,15 @@ class Calibration:
                 )
             )
         return tuple(out)
+
+    def _named(self) -> IntArray:
+        """Factors of how cameras are turned that rest on the camera's name."""
+        out, first = [], 0
+        for camera, name in enumerate(self._samples.cameras):
+            if self._priors[name].sigma_rad >= NOMINAL_SIGMA_RAD:
+                out += [first + 1, first + 2, first + 3]  # the first is the centre's
+            first += 4 + 4 * int(self._samples.valid[camera].sum())
+        return np.array(out, dtype=np.int64)
 
     def _graph(self, world_from_cam: FloatArray, scale: float) -> Any:
         samples, graph = self._samples, gtsam.NonlinearFactorGraph()

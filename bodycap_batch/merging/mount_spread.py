@@ -24,8 +24,9 @@ from bodycap_batch.merging.graph import bone_key, mount_keys
 from bodycap_batch.merging.linear import Linear
 from bodycap_batch.merging.spread import BETWEEN_SHARE, Body, Spread, habits, joined, joint_shifts
 
-PRIOR, MEASURED, JOINED, POSED = range(4)
-"""Kinds of rows: what is believed beforehand, camera points, gaps of joints and hinges, joint rotations."""
+PRIOR, MEASURED, JOINED, POSED, NAMED = range(5)
+"""Kinds of rows: what is believed beforehand, camera points, gaps of joints and hinges, joint rotations, and
+how a camera is turned whose name alone says it."""
 _BELIEF = 30.0
 """Redundant residuals that the variance believed beforehand counts as much as."""
 
@@ -90,13 +91,20 @@ class SolvedMounts:
         taken = own + np.einsum("ri,ij,rj->r", influence, covariance, influence)
         return Eliminated(influence=influence, covariance=covariance, redundancy=1.0 - taken)
 
-    def variance(self, solved: Eliminated, kind: int) -> float:
-        """Variance factor of a kind of rows: 1 where they are as large as was believed."""
+    def variance(self, solved: Eliminated, kind: int, believed: float = 1.0) -> float:
+        """Variance factor of a kind of rows, of what they were weighed with.
+
+        Args:
+            solved: The mounts' share of the graph.
+            kind: Of the rows.
+            believed: The factor believed beforehand, where little redundancy contradicts it: less than 1 for
+                rows that were weighed down because they share their errors.
+        """
         mine = self.kinds == kind
         # Four points hold twelve coordinates of a pose that has six: the others never disagree.
         idle = 0.5 * mine.sum() if kind == MEASURED else 0.0
         redundancy = max(float(solved.redundancy[mine].sum()) - idle, 0.0)
-        return (_BELIEF + float((self.linear.right[mine] ** 2).sum())) / (_BELIEF + redundancy)
+        return (_BELIEF * believed + float((self.linear.right[mine] ** 2).sum())) / (_BELIEF + redundancy)
 
     def habit_shifts(self) -> Any:
         """How the residuals change with the wearer's habits: rows (R,M), sparse, one sigma each."""
@@ -108,7 +116,7 @@ class SolvedMounts:
 
         Args:
             solved: The mounts' share of the graph.
-            factors: (4,) variance of each kind of rows, as a factor on what the graph believes.
+            factors: (5,) variance of each kind of rows, as a factor on what the graph believes.
             bias: Directions in which the body differs from what the calibration believed.
 
         Returns:
@@ -148,13 +156,14 @@ class Eliminated:
     redundancy: FloatArray
 
 
-def kinds_of(linear: Linear, joints: tuple[int, int], stated: IntArray) -> IntArray:
+def kinds_of(linear: Linear, joints: tuple[int, int], stated: IntArray, named: IntArray) -> IntArray:
     """Kind of each row (R,) from what it touches.
 
     Args:
         linear: A calibration graph; its mounts' columns follow all bones'.
         joints: First joint factor and the one after the last.
         stated: Joint factors of postures that are believed as they stand (a T-pose), not widened habits.
+        named: Factors of how cameras are turned of which nothing but the name is known.
     """
     height = np.diff(linear.first_row)
     factor = np.repeat(np.arange(len(height)), height)
@@ -168,5 +177,6 @@ def kinds_of(linear: Linear, joints: tuple[int, int], stated: IntArray) -> IntAr
     kinds[of_mounts & ~of_bones] = PRIOR
     inside = (factor >= joints[0]) & (factor < joints[1])
     kinds[(factor >= joints[1]) | np.isin(factor, stated)] = PRIOR
+    kinds[np.isin(factor, named)] = NAMED
     kinds[inside & ((height[factor] == 1) | (place >= 3))] = JOINED
     return kinds

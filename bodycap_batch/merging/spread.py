@@ -122,13 +122,20 @@ BETWEEN_SHARE = 0.5
 seconds. Both shares count at any one tick, only the habit bends the mounts."""
 
 
-def habits(bones: Sequence[Bone], cameras: Sequence[str], share: float) -> Spread:
-    """The ways in which joints may be held other than at ease, as a share of their everyday range."""
+def habits(bones: Sequence[Bone], cameras: Sequence[str], share: float | FloatArray) -> Spread:
+    """The ways in which joints may be held other than at ease, as a share of their everyday range.
+
+    Args:
+        bones: The graph's bones.
+        cameras: Names of the cameras, whose mounts stay.
+        share: Of the range, one for all or (B,) by bone.
+    """
+    shares = np.broadcast_to(share, len(bones))
     jointed = [index for index, bone in enumerate(bones) if bone.parent >= 0]
     rest = np.zeros((len(bones), 3, 3 * len(jointed)))
     for place, index in enumerate(jointed):
         half = np.linalg.cholesky(bones[index].rotation_covariance)
-        rest[index, :, 3 * place : 3 * place + 3] = share * half
+        rest[index, :, 3 * place : 3 * place + 3] = shares[index] * half
     return Spread(
         mounts={camera: np.zeros((6, rest.shape[-1])) for camera in cameras},
         log_scale=np.zeros(rest.shape[-1]),

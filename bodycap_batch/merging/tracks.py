@@ -13,7 +13,7 @@ from bodycap_batch.geometry import Similarity, interpolate_pose, so3_log
 from bodycap_batch.merging.bones import Bone
 from bodycap_batch.scene import Trajectory
 from bodycap_batch.skeleton import Mount
-from bodycap_batch.skeleton_presets import NOMINAL_SIGMA_RAD
+from bodycap_batch.skeleton_presets import NAMED_SIGMA_RAD, NOMINAL_SIGMA_M
 
 CLEAN_HALF_WINDOW = 6
 CLEAN_LIMIT_M = 0.12
@@ -23,8 +23,9 @@ MIN_SIGMA_M = 0.004
 MIN_SIGMA_RAD = float(np.radians(0.4))
 """Floors of a pose's sigma: PnP's covariance knows image noise, not the map's error or a strap's give."""
 
-_UNTOLD_RAD = 0.95 * NOMINAL_SIGMA_RAD
-"""A mount known less well than this was not calibrated: its name alone promises as much."""
+_UNTOLD_RAD, _UNTOLD_M = 0.98 * NAMED_SIGMA_RAD, 0.98 * NOMINAL_SIGMA_M
+"""A mount known less well than both was not calibrated: its name alone promises as much. (The wearer's habits
+alone turn a calibrated palm's by up to that.)"""
 
 _WILDEST = 100.0
 """Largest factor on a motion model's density: accelerations ten times the table's."""
@@ -220,13 +221,13 @@ def adapt_psd(bones: Sequence[Bone], tracks: Sequence[Track]) -> tuple[Bone, ...
 
 def untold(mount: Mount) -> bool:
     """Whether a solved mount is known no better than its name promises."""
-    return mount.sigma_rad >= _UNTOLD_RAD
+    return mount.sigma_rad >= _UNTOLD_RAD and mount.sigma_m >= _UNTOLD_M
 
 
 def loosened(track: Track, mount: Mount) -> Track:
     """The track (metres) at the uncertainty of its mount, where the motion told next to nothing of it.
 
-    A camera never seen together with others keeps the mount its name promises: 15° and 2.9 cm an axis.
+    A camera never seen together with others keeps the mount its name promises: 9° and 2.9 cm an axis.
     At its poses' own millimetres it would bend the body to that guess.
     """
     if not untold(mount):

@@ -13,7 +13,7 @@ from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.calibrate import Calibration
 from bodycap_batch.merging.common_walk import start_of
 from bodycap_batch.merging.joining import use_together
-from bodycap_batch.merging.mount_spread import MEASURED
+from bodycap_batch.merging.mount_spread import JOINED, MEASURED, NAMED
 from bodycap_batch.merging.samples import take_samples
 from bodycap_batch.merging.tracks import make_track
 from bodycap_batch.synthetic import SynthOptions
@@ -134,6 +134,31 @@ def test_what_fits_better_than_believed_counts_more(arms):
     assert_allclose(found.sigma_rad, np.sqrt(left) * samples.sigma_rad)
     # What is not the map's error stays as large as it was, whatever share it now has.
     assert_allclose(found.white_share * found.sigma_map**2, samples.white_share * samples.sigma_map**2)
+
+
+def test_what_no_residual_can_contradict_is_as_believed(arms):
+    samples, calibration, metric = arms
+    calibration.solve(metric)
+    mounts = calibration.solved()
+    silent = replace(mounts, linear=replace(mounts.linear, right=np.zeros_like(mounts.linear.right)))
+    free = replace(mounts.eliminated(), redundancy=np.zeros(len(mounts.kinds)))
+    # Samples that share the map's error were weighed down for it; that does not make the map bend more.
+    assert samples.repeats > 1.5
+    assert_allclose(calibration.row_variance(silent, free)[[MEASURED, JOINED]], 1.0)
+
+
+def test_a_mounts_name_is_believed_better_than_it_is_weighed(arms):
+    samples, calibration, metric = arms
+    inputs = posed(SynthOptions(seconds=1.0, cameras=ARMS, poses_only=True)).inputs
+    calibration.solve(metric)
+    mounts = calibration.solved()
+    # 15 degrees an axis against 15 in all; three differences of three rows for each of five cameras.
+    assert calibration.row_variance(mounts, mounts.eliminated())[NAMED] == pytest.approx(1.0 / 3.0)
+    assert (mounts.kinds == NAMED).sum() == 5 * 9
+    told = {mount.camera: replace(mount, sigma_rad=0.1) for mount in inputs.mounts}
+    stated = Calibration(inputs.skeleton, mounts.body.bones, samples, told, metric, lambda: None)
+    stated.solve(metric, iterations=1)
+    assert not (stated.solved().kinds == NAMED).any()
 
 
 @pytest.mark.slow

@@ -72,9 +72,12 @@ def test_a_camera_never_seen_with_others_keeps_its_usual_mount_and_weighs_as_lit
     constant, _ = calibration.spread(0.05, {name: np.zeros((4, 4)) for name in ROLES}, {})
     solved = {mount.camera: mount for mount in calibration.solved_mounts(constant)}
     loose = loosened(tracks[2], solved["right_palm"])
-    assert (loose.sigma_rad > np.radians(14.0)).all()
+    # 15 degrees in all, 8.7 per axis.
+    assert (loose.sigma_rad > np.radians(8.6)).all()
     assert (loose.sigma_map > 0.039).all()
     assert loosened(tracks[1], solved["left_palm"]) is tracks[1]
+    turned = replace(solved["left_palm"], sigma_rad=np.radians(12.0), sigma_m=0.02)
+    assert loosened(tracks[1], turned) is tracks[1]
 
 
 def test_a_camera_never_seen_with_the_trunk_is_sampled_beside_another(body):

@@ -1,0 +1,74 @@
+"""How lively joints are: what residuals show, what nothing shows, and what a T-pose has no say in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bodycap_batch.merging.bones import graph_bones
+from bodycap_batch.merging.calibrate import PRIOR_SCALE, Calibration
+from bodycap_batch.merging.liveliness import passing_shares
+from bodycap_batch.merging.samples import take_samples
+from bodycap_batch.merging.tracks import make_track
+from bodycap_batch.synthetic import SynthOptions
+from tests.bench.posed import GAUGE, posed
+
+EVERYDAY = 0.75
+"""Of the everyday range's variance, what is no habit."""
+
+
+@pytest.fixture(scope="module")
+def solved():
+    """Three cameras on a walk of 20 s, calibrated at the true scale."""
+    capture = posed(SynthOptions(seconds=20.0, outliers=0.0, poses_only=True))
+    inputs, roles = capture.inputs, {mount.camera: mount.role for mount in capture.mounts}
+    bones = graph_bones(inputs.skeleton, set(roles.values()))
+    index = {bone.role: place for place, bone in enumerate(bones)}
+    tracks = [make_track(inputs, each, index[roles[each.camera]]) for each in inputs.trajectories]
+    metric = 1.0 / capture.gauges[GAUGE].scale
+    samples = take_samples(tracks, metric, 60)
+    mounts = {mount.camera: mount for mount in inputs.mounts}
+    calibration = Calibration(inputs.skeleton, bones, samples, mounts, metric, lambda: None)
+    calibration.solve(metric)
+    return calibration.solved(), samples.times_ns
+
+
+def _shares(mounts, times_ns, redundancy=None):
+    found = mounts.eliminated()
+    if redundancy is not None:
+        found = replace(found, redundancy=np.full_like(found.redundancy, redundancy))
+    return passing_shares(mounts, found, (np.arange(len(times_ns)), times_ns), PRIOR_SCALE)
+
+
+def test_a_calm_walker_uses_a_part_of_the_everyday_range(solved):
+    mounts, times_ns = solved
+    shares = dict(zip((bone.role for bone in mounts.body.bones), _shares(mounts, times_ns), strict=True))
+    # Five gestures, about half of what counts; arms swing by 11 degrees and reach by 40: 40 are one sigma.
+    assert 0.2 < shares["LeftArm"] < 0.8 * EVERYDAY
+    # One part in eight of the shoulder girdle's turns shows, two of fifteen, against six that are believed.
+    assert shares["LeftShoulder"] > 0.75 * EVERYDAY
+
+
+def test_what_nothing_shows_is_as_lively_as_ever(solved):
+    mounts, times_ns = solved
+    silent = replace(mounts, linear=replace(mounts.linear, right=np.zeros_like(mounts.linear.right)))
+    assert _shares(silent, times_ns, redundancy=0.0) == pytest.approx(EVERYDAY)
+    # A joint that rests although each of five gestures could have shown it: 6 believed against 15 seen.
+    assert _shares(silent, times_ns, redundancy=1.0)[1:] == pytest.approx(EVERYDAY * 6.0 / 21.0, rel=0.05)
+
+
+def test_who_moves_more_than_everyday_is_livelier(solved):
+    mounts, times_ns = solved
+    wild = replace(mounts, linear=replace(mounts.linear, right=10.0 * mounts.linear.right))
+    assert (_shares(wild, times_ns)[1:] > _shares(mounts, times_ns)[1:]).all()
+    assert _shares(wild, times_ns).max() > 1.0
+
+
+def test_a_t_pose_alone_says_nothing(solved):
+    mounts, times_ns = solved
+    none = np.zeros(0, dtype=np.int64)
+    assert passing_shares(mounts, mounts.eliminated(), (none, times_ns[:0]), PRIOR_SCALE) == pytest.approx(
+        EVERYDAY
+    )
