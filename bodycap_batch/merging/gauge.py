@@ -21,7 +21,8 @@ WALKING_HEIGHT = 0.97
 SLAB_M = 0.03
 _MIN_POINTS = 100
 _MIN_FLOOR_POINTS = 30
-_MOST_BELOW = 0.02
+_MOST_BELOW = 0.2
+"""Points below a floor over those in it: below what stands on a floor, the floor's own are more."""
 _FLOOR_REACH = 0.25
 """How far off the body's own idea of it the floor is looked for, as a share of the trunk's height."""
 _BESIDE_M = 0.8
@@ -58,8 +59,8 @@ def find_floor(heights_m: FloatArray, up: Direction, expected_m: float, standing
         reach = _FLOOR_REACH * standing_m
         edges = np.arange(expected_m - reach, expected_m + reach, 0.25 * SLAB_M)
         inside = (heights_m >= edges[:, None]) & (heights_m < edges[:, None] + SLAB_M)
-        below = (heights_m < edges[:, None] - 2.0 * SLAB_M).mean(axis=1)
-        counts = np.where(below < _MOST_BELOW, inside.sum(axis=1), 0)
+        below = (heights_m < edges[:, None] - 2.0 * SLAB_M).sum(axis=1)
+        counts = np.where(below < _MOST_BELOW * inside.sum(axis=1), inside.sum(axis=1), 0)
         best = int(np.argmax(counts))
         # Clutter spreads evenly over heights; a floor stands out from it.
         if counts[best] >= max(_MIN_FLOOR_POINTS, 3.0 * float(np.median(inside.sum(axis=1)))):

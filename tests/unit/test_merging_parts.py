@@ -275,6 +275,24 @@ def test_walls_and_floor_give_the_vertical_and_the_floor():
     assert find_floor(room @ UP, Direction(UP, "body", None, 0.0), 0.08, 1.2).height_m == 0.08
 
 
+@pytest.mark.parametrize(("floor", "source"), [(0, "map"), (3, "map"), (13, "standing hip height")])
+def test_what_stands_on_the_floor_is_no_floor(floor, source):
+    """Things 8 cm high that 35 points show, in a room of thousands whose floor a dozen points show."""
+    rng = np.random.default_rng(2)
+    heights = np.concatenate(
+        [
+            rng.normal(scale=0.01, size=floor),
+            rng.normal(0.08, 0.01, size=35),
+            rng.uniform(0.12, 0.5, size=60),
+            rng.uniform(0.5, 2.5, size=3000),
+        ]
+    )
+    found = find_floor(heights, Direction(UP, "map", 0.0, 1.0), 0.01, 1.2)
+    assert found.source == source
+    if source != "map":
+        assert found.height_m == 0.01
+
+
 def _beside_a_walk(rng, floor, clutter):
     """A path of four metres, points of the floor and of clutter beside it, and a room further away."""
     path = np.column_stack([np.linspace(0.0, 4.0, 60), np.zeros(60), np.full(60, 1.2)])
