@@ -9,6 +9,9 @@ from typing import Any
 
 from bodycap_batch.shares import percent
 
+_SHARP_PX = 1.0
+"""Mean reprojection error that sharp corners and a lens that fits stay below."""
+
 
 class Grade(IntEnum):
     """How far a result can be relied on; the worst of its criteria counts."""
@@ -162,7 +165,7 @@ def _of_map(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
         yield Criterion(
             about="cameras",
             name="Map error",
-            grade=graded(float(error), 1.0, 2.0),
+            grade=graded(float(error), _SHARP_PX, 2.0),
             says=f"{error:.2f} px mean reprojection error",
             why="Sharp corners are found to about half a pixel; above one the lens, the shutter or blur is "
             "at work, above two the map is strained. A low value alone does not prove a right map.",
@@ -201,13 +204,15 @@ def _of_map(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
             value=share,
         )
     mapping = metrics.get("mapping", {})
-    yield from _of_lenses(mapping.get("misfitting_lenses", {}), mapping.get("freed_lenses", ()))
+    misfits, freed = mapping.get("misfitting_lenses", {}), mapping.get("freed_lenses", ())
+    # A lens of the wrong kind, a wide one given as a pinhole, leaves more than sharp corners do.
+    yield from _of_lenses(misfits, freed if error is not None and float(error) <= _SHARP_PX else ())
 
 
 def _of_lenses(misfits: Mapping[str, float], freed: Collection[str]) -> Iterator[Criterion]:
     """Given focal lengths that the map contradicts: by camera, what fits over what was given.
 
-    Freed ones were found along with the map.
+    Freed ones were found along with the map, and fit.
     """
     held = {name: factor for name, factor in misfits.items() if name not in freed}
     misfits = held or misfits

@@ -160,6 +160,11 @@ def test_a_lens_that_the_map_contradicts_is_no_good_result(
     (freed,) = (each for each in judge(metrics, None).criteria if "Lenses" in each.name)
     assert freed.grade is Grade.FAIR
     assert "what fits was used instead" in freed.says
+    # Found, but it does not fit either: a wide lens given as a pinhole was 53 cm off with 1.1 px.
+    strained = json.loads(json.dumps(metrics))
+    strained["total"]["mean_reprojection_error_px"] = 1.1
+    (misfit,) = (each for each in judge(strained, None).criteria if "Lenses" in each.name)
+    assert misfit.grade is grade
     assert "calibration: auto" in advise(told, {})[0].do
     assert says in written(told, tmp_path)
 
