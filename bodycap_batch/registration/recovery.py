@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray, IntArray
-from bodycap_batch.camera import Camera
+from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.geometry import invert
 from bodycap_batch.registration.confirmed import confirmed_points
+from bodycap_batch.registration.finding import Finder, Fix
 from bodycap_batch.registration.growth import lost_runs
 from bodycap_batch.registration.jumps import lone_poses
-from bodycap_batch.registration.marching import Finder, Fix, March, Stretch
+from bodycap_batch.registration.marching import March, Stretch
 from bodycap_batch.registration.pose import PoseLimits
 from bodycap_batch.registration.smoothing import Smoothed, Steadiness, smooth_centres
 from bodycap_batch.registration.templates import Gallery, Pyramid, Search, View, choose_rows, find_points
@@ -38,6 +38,9 @@ _MIN_EVIDENCE = 0.5
 _MAX_DISAGREEMENT = 11.3
 """Squared Mahalanobis distance between where a frame was found and its smoothed place: 99 % of three axes."""
 _LONE_EVIDENCE = 4
+_ROUNDS = 2
+"""A walk goes as far as motion leads it; from poses smoothed and vouched for it goes further. With 1 and 2
+rounds room131's right palm has 94 and 104 of 150 frames, off by 2.4 and 2.7 cm, the worst by 7.6 and 7.5."""
 
 
 def recover_lost(
@@ -54,6 +57,7 @@ def recover_lost(
     they look in keyframes of any camera. What is found is smoothed together with the poses around the
     stretch: a body-worn camera's centre has little change of acceleration from frame to frame. A frame gets
     a pose where enough points agree, its own place is near the smoothed one, and that is known well enough.
+    What is still lost beside them is walked through once more, from the poses that were found.
 
     Args:
         found: One camera's frames as tracking left them.
@@ -75,32 +79,96 @@ def recover_lost(
     steadiness = Steadiness.of(times, path.gauge_from_cam[:, :3, 3])
     if steadiness is None:
         return found
-    gallery = _gallery(scene_map, capture, camera, context)
-    lens = scene_map.cameras[camera.name]
+    finder = _finder(scene_map, capture, path, options, context)
+    search = _LostFrames(
+        camera=camera,
+        scene_map=scene_map,
+        finder=finder,
+        times=times,
+        steadiness=steadiness,
+        seeds=_seeds(scene_map, camera.name, lost),
+        tracked=frozenset(np.flatnonzero(~lost).tolist()),
+    )
+    stretches = lost_runs(~lost)
+    for _ in range(_ROUNDS):
+        poses: dict[int, Fix] = {}
+        known = _known(path)
+        for start, stop in stretches:
+            context.check_cancelled()
+            context.progress(start, len(lost), "lost frames looked at")
+            poses |= search.within(start, stop, known)
+        before, path = path.localised, _with_poses(path, poses, finder.limits)
+        stretches = _beside(path.localised, before)
+    return replace(found, trajectory=path)
+
+
+def _finder(
+    scene_map: Map,
+    capture: Capture,
+    path: Trajectory,
+    options: RegistrationOptions,
+    context: StageContext,
+) -> Finder:
+    """What finds poses of a camera's frames."""
+    camera = capture.camera(path.camera)
     limits = PoseLimits(
         max_error_px=1.0, min_inliers=options.min_inliers, max_sigma_depth=options.max_sigma_depth
     )
-    exposure = _exposure(camera, lens, path, gallery)
-    finder = Finder(lens=lens, gallery=gallery, limits=limits, exposure=exposure, sees_room=camera.sees_room)
-    seeds = _seeds(scene_map, camera.name, lost)
-    known = _known(path)
-    poses: dict[int, Fix] = {}
-    for start, stop in lost_runs(~lost):
-        context.check_cancelled()
-        context.progress(start, len(lost), "lost frames looked at")
-        inside = {frame: row for frame, row in seeds.items() if start <= frame < stop}
+    interval_s = float(np.median(np.diff(path.times_ns))) * 1e-9
+    finder = Finder(
+        lens=scene_map.cameras[camera.name],
+        gallery=_gallery(scene_map, capture, camera, context),
+        limits=limits,
+        exposure=0.0,
+        readout=scene_map.readout_s.get(camera.name, 0.0) / interval_s,
+        sees_room=camera.sees_room,
+    )
+    return replace(finder, exposure=_exposure(camera, finder, path))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _LostFrames:
+    """What looking for a camera's lost frames takes.
+
+    Attributes:
+        camera: The camera.
+        scene_map: The map.
+        finder: Finds poses.
+        times: (N,) of its frames, in frame intervals.
+        steadiness: How evenly it moves.
+        seeds: Rows of the map's keyframes among its lost frames, by frame.
+        tracked: Frames whose poses tracking found.
+    """
+
+    camera: CaptureCamera
+    scene_map: Map
+    finder: Finder
+    times: FloatArray
+    steadiness: Steadiness
+    seeds: Mapping[int, int]
+    tracked: Collection[int]
+
+    def within(self, start: int, stop: int, known: Mapping[int, Fix]) -> dict[int, Fix]:
+        """Poses vouched for of the lost frames [start, stop) amid `known` ones."""
+        inside = {frame: row for frame, row in self.seeds.items() if start <= frame < stop}
         stretch = Stretch(
             start=start,
             stop=stop,
-            times=times,
-            pyramids=_pictures(camera, start, stop, sorted(inside)),
+            times=self.times,
+            pyramids=_pictures(self.camera, start, stop, sorted(inside)),
             known=known,
-            seeds={frame: invert(scene_map.map_from_cam[row]) for frame, row in inside.items()},
+            tracked=self.tracked,
+            seeds={frame: invert(self.scene_map.map_from_cam[row]) for frame, row in inside.items()},
             rows=inside,
-            steadiness=steadiness,
+            steadiness=self.steadiness,
         )
-        poses |= _vouched(March(finder, stretch), limits)
-    return replace(found, trajectory=_with_poses(path, poses, limits))
+        return _vouched(March(self.finder, stretch), self.finder.limits)
+
+
+def _beside(posed: BoolArray, before: BoolArray) -> list[tuple[int, int]]:
+    """Stretches still lost at an end of which a pose was found."""
+    fresh = np.concatenate([[False], posed & ~before, [False]])
+    return [(start, stop) for start, stop in lost_runs(posed) if fresh[start] or fresh[stop + 1]]
 
 
 def _smoothed(fixes: Mapping[int, Fix], stretch: Stretch) -> Smoothed:
@@ -109,7 +177,8 @@ def _smoothed(fixes: Mapping[int, Fix], stretch: Stretch) -> Smoothed:
     frames = np.arange(first, min(len(stretch.times), stretch.stop + _AROUND))
     around = {frame: stretch.known[frame].place for frame in frames.tolist() if frame in stretch.known}
     found = around | {frame: fix.place for frame, fix in fixes.items()}
-    return smooth_centres(frames, stretch.times[frames], found, around.keys(), stretch.steadiness)
+    trusted = around.keys() & stretch.tracked
+    return smooth_centres(frames, stretch.times[frames], found, trusted, stretch.steadiness)
 
 
 def _vouched(march: March, limits: PoseLimits) -> dict[int, Fix]:
@@ -166,17 +235,7 @@ def _unaccompanied(posed: BoolArray) -> BoolArray:
 
 def _known(path: Trajectory) -> dict[int, Fix]:
     """Poses that tracking found, by frame."""
-    return {
-        frame: Fix(
-            cam_from_map=invert(path.gauge_from_cam[frame]),
-            covariance=path.covariance[frame],
-            inliers=int(path.inliers[frame]),
-            evidence=1.0,
-            error_px=float(path.error_px[frame]),
-            depth=np.inf,
-        )
-        for frame in np.flatnonzero(path.localised).tolist()
-    }
+    return {frame: Fix.of(path, frame) for frame in np.flatnonzero(path.localised).tolist()}
 
 
 def _seeds(scene_map: Map, camera: str, lost: BoolArray) -> dict[int, int]:
@@ -199,6 +258,7 @@ def _gallery(scene_map: Map, capture: Capture, camera: CaptureCamera, context: S
             context.check_cancelled()
             row = row_of[frame]
             pictures[row] = Pyramid.of(grey)
+            context.progress(len(pictures), len(held), "keyframes of all cameras decoded")
             sharp[row] = sharpness(pictures[row].levels[0])
         sharp[rows] /= max(float(np.median(sharp[rows])), 1e-9) if len(rows) else 1.0
     seen: IntArray = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))
@@ -216,7 +276,7 @@ def _pictures(camera: CaptureCamera, start: int, stop: int, seeds: list[int]) ->
     return {frame: Pyramid.of(grey) for frame, grey in camera.read(frames)}
 
 
-def _exposure(camera: CaptureCamera, lens: Camera, path: Trajectory, gallery: Gallery) -> float:
+def _exposure(camera: CaptureCamera, finder: Finder, path: Trajectory) -> float:
     """Share of the time between two frames that the shutter is open, as blurred frames with poses show it."""
     posed = path.localised
     pairs = np.flatnonzero(posed[1:] & posed[:-1]) + 1
@@ -226,9 +286,16 @@ def _exposure(camera: CaptureCamera, lens: Camera, path: Trajectory, gallery: Ga
     totals = np.zeros(len(_EXPOSURES))
     for frame, grey in camera.read(fastest):
         pose, before = (invert(path.gauge_from_cam[each]) for each in (frame, frame - 1))
-        view = View(lens=lens, pyramid=Pyramid.of(grey), cam_from_map=pose, before=before, exposure=0.0)
-        rows = choose_rows(gallery, view)
+        view = View(
+            lens=finder.lens,
+            pyramid=Pyramid.of(grey),
+            cam_from_map=pose,
+            before=before,
+            exposure=0.0,
+            readout=finder.readout,
+        )
+        rows = choose_rows(finder.gallery, view)
         for number, share in enumerate(_EXPOSURES):
-            found = find_points(gallery, replace(view, exposure=share), rows, _EXPOSURE_SEARCH)
-            totals[number] += found.score.sum()
+            found = find_points(finder.gallery, replace(view, exposure=share), rows, _EXPOSURE_SEARCH)
+            totals[number] += found.score[finder.sees_room(found.px)].sum()
     return _EXPOSURES[int(np.argmax(totals))]

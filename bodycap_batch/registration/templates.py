@@ -12,6 +12,7 @@ from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.camera import Camera
 from bodycap_batch.geometry import invert, transform_points
 from bodycap_batch.registration.tracks import well_spread
+from bodycap_batch.rolling_shutter import at_mid_row
 from bodycap_batch.scene import Map
 from bodycap_batch.tracking import GreyImage, pixel_scale
 
@@ -92,8 +93,9 @@ class View:
         lens: Its camera.
         pyramid: Its picture.
         cam_from_map: (4,4) its pose.
-        before: (4,4) the same a frame earlier; the other way about blurs alike.
+        before: (4,4) the same a frame earlier; a frame later where `readout` is negative.
         exposure: Share of the time between two frames that the shutter is open.
+        readout: Share of it from the first row's exposure to the last's that the map was refined for.
         row: Of the frame itself among the map's keyframes, -1 where it is none: its own look is found in it
             wherever the map puts it.
     """
@@ -103,6 +105,7 @@ class View:
     cam_from_map: FloatArray
     before: FloatArray
     exposure: float
+    readout: float = 0.0
     row: int = -1
 
 
@@ -132,16 +135,18 @@ class Found:
     Attributes:
         point: (N,) which.
         px: (N,2) where.
+        mid_row_px: (N,2) where they were at the instant of the middle row, to which the map's poses belong.
         score: (N,) normalised correlation.
     """
 
     point: IntArray
     px: FloatArray
+    mid_row_px: FloatArray
     score: FloatArray
 
     def chosen(self, which: BoolArray) -> Found:
         """Some of them."""
-        return Found(self.point[which], self.px[which], self.score[which])
+        return Found(self.point[which], self.px[which], self.mid_row_px[which], self.score[which])
 
 
 def choose_rows(gallery: Gallery, view: View) -> IntArray:
@@ -198,19 +203,23 @@ def find_points(gallery: Gallery, view: View, rows: IntArray, search: Search) ->
     shown = np.isfinite(px).all(axis=1)
     rows, points, px = rows[shown], points[shown], px[shown]
     if len(rows) == 0:
-        return Found(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
+        return Found(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
     warp = _warps(scene, lens, view.cam_from_map, rows, px)
     step = view.pyramid.step_px[search.level]
-    patches, whole = _patches(gallery, rows, warp, _blur(lens, view, points, px), search, step)
+    crossing = _crossing(view, points, px)
+    patches, whole = _patches(gallery, rows, warp, _blur(view, crossing), search, step)
+    # Within the readout a point crosses a small part of the image: its row hardly depends on it.
+    seen_px = at_mid_row(lens, px, crossing, -view.readout)
     found_px, score = np.full((len(rows), 2), np.nan), np.zeros(len(rows))
     target = view.pyramid.levels[search.level].astype(np.float32)
     for number in np.flatnonzero(whole).tolist():
-        place = _place(target, patches[number], px[number] / step - 0.5, search.radius)
+        place = _place(target, patches[number], seen_px[number] / step - 0.5, search.radius)
         if place is not None:
             found_px[number] = (np.array(place[:2]) + 0.5) * step
             score[number] = place[2]
     good = (score > search.score) & np.isfinite(found_px).all(axis=1)
-    return Found(scene.obs_point[rows[good]], found_px[good], score[good])
+    mid_row_px = at_mid_row(lens, found_px, crossing, view.readout)
+    return Found(scene.obs_point[rows[good]], found_px[good], mid_row_px[good], score[good])
 
 
 def _warps(scene: Map, lens: Camera, cam_from_map: FloatArray, rows: IntArray, px: FloatArray) -> FloatArray:
@@ -231,9 +240,14 @@ def _warps(scene: Map, lens: Camera, cam_from_map: FloatArray, rows: IntArray, p
     return np.stack([places[1] - places[0], places[2] - places[0]], axis=2) / _STEP_PX
 
 
-def _blur(lens: Camera, view: View, points: FloatArray, px: FloatArray) -> FloatArray:
+def _crossing(view: View, points: FloatArray, px: FloatArray) -> FloatArray:
+    """(N,2) how far points seen at `px` (N,2) moved since the frame before."""
+    return np.asarray(np.nan_to_num(px - view.lens.project(transform_points(view.before, points))))
+
+
+def _blur(view: View, crossing_px: FloatArray) -> FloatArray:
     """(N,2) how far points cross the image while the shutter is open; held to what is sane."""
-    moved = np.nan_to_num(px - lens.project(transform_points(view.before, points))) * view.exposure
+    moved = crossing_px * view.exposure
     longest = _MAX_BLUR_PX * max(1.0, view.pyramid.step_px[0])
     return np.asarray(
         moved * np.minimum(1.0, longest / np.maximum(np.linalg.norm(moved, axis=1), 1e-9))[:, None]

@@ -14,8 +14,19 @@ from bodycap_batch.camera import Camera
 from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.context import StageContext
-from bodycap_batch.geometry import invert, make_transform, so3_exp, transform_points
+from bodycap_batch.geometry import (
+    interpolate_pose,
+    invert,
+    make_transform,
+    so3_exp,
+    so3_log,
+    transform_points,
+)
 from bodycap_batch.registration import recover_lost, recovery
+from bodycap_batch.registration.finding import Finder, Fix
+from bodycap_batch.registration.marching import March
+from bodycap_batch.registration.pose import PoseLimits
+from bodycap_batch.registration.templates import Found, Gallery, View
 from bodycap_batch.scene import FrameStatus, Map, Registration, Trajectory
 from bodycap_batch.tracking import detect_corners
 from tests.rooms import HALF_M, LENS, Room
@@ -256,3 +267,108 @@ def test_points_on_one_small_thing_are_no_pose(pictures: list[np.ndarray], conte
     path = _recovered(small, pictures, context)
     off_m = np.linalg.norm(path.gauge_from_cam[:, :3, 3] - PATH[:, :3, 3], axis=1)[list(LOST)]
     assert not (off_m[np.isfinite(off_m)] > 0.1).any()
+
+
+def _rolled(pictures: list[np.ndarray], readout_s: float) -> list[np.ndarray]:
+    """The lost frames again, fifteen rows at a time, each band from where the camera was at its instant."""
+    bands, out = 16, list(pictures)
+    rows = CAMERA.height_px // bands
+    for frame in LOST:
+        shown = []
+        for band in range(bands):
+            late = ((band + 0.5) / bands - 0.5) * readout_s / 0.033333333
+            first = frame if late >= 0.0 else frame - 1
+            pose = interpolate_pose(PATH[first], PATH[first + 1], late if late >= 0.0 else 1.0 + late)
+            params = CAMERA.params - (0.0, 0.0, 0.0, band * rows)
+            shown.append(
+                ROOM.view(
+                    Camera(model=CAMERA.model, width_px=CAMERA.width_px, height_px=rows, params=params), pose
+                )
+            )
+        out[frame] = np.vstack(shown)
+    return out
+
+
+def test_a_rolling_shutter_is_undone(
+    monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray], context: StageContext
+) -> None:
+    monkeypatch.setitem(globals(), "LOST", range(20, 25))
+    rolled, lost = _rolled(pictures, 0.02), list(LOST)
+    off = []
+    for readout_s in (0.0, 0.02):
+        scene = replace(_map(pictures), readout_s={"torso": readout_s})
+        path = _recovered(scene, rolled, context)
+        assert path.localised.all()
+        turned = path.gauge_from_cam[lost, :3, :3].swapaxes(1, 2) @ PATH[lost, :3, :3]
+        centre = np.linalg.norm(path.gauge_from_cam[lost, :3, 3] - PATH[lost, :3, 3], axis=1)
+        off.append(np.median(np.linalg.norm(so3_log(turned), axis=1)) + np.median(centre))
+    # Nine pixels from the first row to the last; what is left are bands of half a pixel.
+    assert off[1] < 0.5 * off[0]
+
+
+def test_what_the_mask_hides_tells_nothing_of_the_exposure(
+    monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray]
+) -> None:
+    """The wearer's sleeve, which is still before the camera, looks like a short exposure."""
+
+    def found(_: object, view: View, *__: object) -> Found:
+        px = np.array([[20.0, 100.0], [200.0, 100.0]])
+        score = np.array([0.9 - view.exposure, 0.5 + 0.1 * view.exposure])
+        return Found(np.arange(2), px, px, score)
+
+    monkeypatch.setattr(recovery, "find_points", found)
+    mask = np.ones((240, 320), dtype=bool)
+    mask[:, :160] = False
+    shares = []
+    for hidden in (None, mask):
+        camera = cast(CaptureCamera, _Video(pictures, mask=hidden))
+        gallery = Gallery(
+            scene_map=_map(pictures),
+            pictures={},
+            sharpness=np.zeros(0),
+            usable=np.zeros(0, bool),
+            seen=np.zeros(0, np.int64),
+        )
+        monkeypatch.setattr(recovery, "choose_rows", lambda *_: np.arange(2))
+        limits = PoseLimits(max_error_px=1.0, min_inliers=12, max_sigma_depth=0.1)
+        finder = Finder(lens=CAMERA, gallery=gallery, limits=limits, exposure=0.0, sees_room=camera.sees_room)
+        shares.append(recovery._exposure(camera, finder, _tracked().trajectory))
+    assert shares == [0.0, 0.6]
+
+
+def test_decoding_the_keyframes_is_told(pictures: list[np.ndarray], tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+
+    def progress(done: int, total: int, what: str = "") -> None:
+        if "decoded" in what:
+            told.append((done, total))
+
+    scene = _map(pictures)
+    context = StageContext(work_dir=tmp_path, progress=progress)
+    capture = cast(Capture, _Capture(_Video(pictures)))
+    recovery._gallery(scene, capture, capture.camera("torso"), context)
+    count = len(scene.keyframe_camera)
+    assert told == [(number + 1, count) for number in range(count)]
+
+
+def test_what_is_left_beside_found_frames_is_looked_through_again(
+    monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray], context: StageContext
+) -> None:
+    """From the frames found, which count as found and not as tracked; once nothing is found, no more."""
+    asked = []
+
+    def vouched(march: March, limits: PoseLimits) -> dict[int, Fix]:
+        stretch = march.stretch
+        asked.append((stretch.start, stretch.stop))
+        if len(asked) > 1:
+            assert {18, 19} <= set(stretch.known)
+            assert not {18, 19} & set(stretch.tracked)
+            return {}
+        fix = replace(stretch.known[17], depth=1.0)
+        return {18: fix, 19: fix}
+
+    monkeypatch.setattr(recovery, "_vouched", vouched)
+    path = _recovered(_map(pictures), pictures, context)
+    assert asked == [(18, 26), (20, 26)]
+    assert path.localised[[18, 19]].all()
+    assert not path.localised[20:26].any()
