@@ -17,6 +17,7 @@ from bodycap_batch.registration.recovery import recover_lost
 from bodycap_batch.registration.rigs import RigCamera, first_poses, members_of, relative_poses
 from bodycap_batch.registration.seams import misplaced, without_keyframes
 from bodycap_batch.registration.solving import matrices, solve_frames, solve_rig
+from bodycap_batch.registration.steadying import steadied
 from bodycap_batch.registration.stretches import Known, all_tracks
 from bodycap_batch.registration.tracks import Tracks, anchors_of, track_scale
 from bodycap_batch.rig import RelativePose
@@ -63,7 +64,7 @@ def register_frames(
     tracks = all_tracks(camera, anchors_of(scene_map, camera.name), Known.of(previous), context)
     scene_map, tracks, doubtful = _without_misplaced(camera, scene_map, tracks, limits, context)
     poses = solve_frames(camera, scene_map, tracks, limits)
-    trajectory = _trajectory(camera, scene_map.gauge, poses, selection.sharpness)
+    trajectory = steadied(_trajectory(camera, scene_map.gauge, poses, selection.sharpness))
     asked = np.zeros(0, np.int64) if previous is None else previous.wanted_keyframes
     lost = wanted_keyframes(trajectory.localised, selection.sharpness, tried)
     return Registration(
@@ -111,7 +112,7 @@ def register_in_rig(
         wrong = misplaced(member.camera.name, scene_map, member.tracks, limits)
         scene_map = without_keyframes(scene_map, wrong)
     poses = solve_rig(members, scene_map, first_poses(own, others, members), limits)
-    trajectory = _trajectory(own.camera, scene_map.gauge, poses, selection.sharpness)
+    trajectory = steadied(_trajectory(own.camera, scene_map.gauge, poses, selection.sharpness))
     return replace(own.found, trajectory=trajectory), relative
 
 
