@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from bodycap_batch.config.models import Job
+from bodycap_batch.config.options import LEAST_LOST, LEAST_POSED
 from bodycap_batch.pipeline.inputs import beside_others, key_of
 from bodycap_batch.runner import Task
 from bodycap_batch.store import Artefact
 from bodycap_batch.tasks import read_summary
-
-_LEAST_LOST, _LEAST_POSED = 3, 20
-"""Fewer lost frames are not worth decoding the keyframes of all cameras again; from fewer frames with poses
-nobody knows how the camera moves."""
 
 
 def recovery_tasks(
@@ -34,7 +31,7 @@ def recovery_tasks(
     options = job.registration.model_dump(mode="json", exclude={"rounds"})
     for own in job.capture.cameras:
         summary = read_summary(registrations[own.name].path)
-        if not _LEAST_POSED <= summary["localised"] <= summary["frames"] - _LEAST_LOST:
+        if not LEAST_POSED <= summary["localised"] <= summary["frames"] - LEAST_LOST:
             continue
         ordered = (own, *(camera for camera in job.capture.cameras if camera.name != own.name))
         inputs, arguments = beside_others(job.capture, ordered, digests, scene, keyframes, registrations)

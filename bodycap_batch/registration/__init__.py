@@ -10,6 +10,7 @@ import numpy as np
 from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import RegistrationOptions
+from bodycap_batch.config.options import LEAST_LOST
 from bodycap_batch.context import StageContext
 from bodycap_batch.registration.growth import wanted_keyframes
 from bodycap_batch.registration.pose import FramePose, PoseLimits
@@ -64,7 +65,7 @@ def register_frames(
     tracks = all_tracks(camera, anchors_of(scene_map, camera.name), Known.of(previous), context)
     scene_map, tracks, doubtful = _without_misplaced(camera, scene_map, tracks, limits, context)
     poses = solve_frames(camera, scene_map, tracks, limits)
-    trajectory = steadied(_trajectory(camera, scene_map.gauge, poses, selection.sharpness))
+    trajectory = _finished(_trajectory(camera, scene_map.gauge, poses, selection.sharpness))
     asked = np.zeros(0, np.int64) if previous is None else previous.wanted_keyframes
     lost = wanted_keyframes(trajectory.localised, selection.sharpness, tried)
     return Registration(
@@ -112,7 +113,7 @@ def register_in_rig(
         wrong = misplaced(member.camera.name, scene_map, member.tracks, limits)
         scene_map = without_keyframes(scene_map, wrong)
     poses = solve_rig(members, scene_map, first_poses(own, others, members), limits)
-    trajectory = steadied(_trajectory(own.camera, scene_map.gauge, poses, selection.sharpness))
+    trajectory = _finished(_trajectory(own.camera, scene_map.gauge, poses, selection.sharpness))
     return replace(own.found, trajectory=trajectory), relative
 
 
@@ -204,6 +205,11 @@ def _trajectory(
         inliers=np.array([pose.inliers for pose in poses], dtype=np.int64),
         error_px=np.array([pose.error_px for pose in poses]),
     )
+
+
+def _finished(path: Trajectory) -> Trajectory:
+    """Steadied, unless its lost frames are looked for first: that goes from poses as they were measured."""
+    return steadied(path) if (~path.localised).sum() < LEAST_LOST else path
 
 
 def _blamed(poses: Sequence[FramePose], sharpness: FloatArray) -> list[FrameStatus]:

@@ -10,6 +10,7 @@ import numpy as np
 from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.config import RegistrationOptions
+from bodycap_batch.config.options import LEAST_POSED
 from bodycap_batch.context import StageContext
 from bodycap_batch.geometry import invert
 from bodycap_batch.registration.confirmed import confirmed_points
@@ -19,12 +20,11 @@ from bodycap_batch.registration.jumps import lone_poses
 from bodycap_batch.registration.marching import March, Stretch
 from bodycap_batch.registration.pose import PoseLimits
 from bodycap_batch.registration.smoothing import Smoothed, Steadiness, smooth_centres
+from bodycap_batch.registration.steadying import steadied
 from bodycap_batch.registration.templates import Gallery, Pyramid, Search, View, choose_rows, find_points
 from bodycap_batch.scene import FrameStatus, Map, Registration, Trajectory
 from bodycap_batch.tracking import sharpness
 
-_MIN_POSED = 20
-"""Frames with poses below which nobody knows how the camera moves."""
 _MAX_PICTURES = 600
 """Keyframes held in memory, half a megabyte each."""
 _AROUND = 8
@@ -67,13 +67,13 @@ def recover_lost(
         context: Progress, cancellation.
 
     Returns:
-        The same with more poses; their observations are not kept.
+        The same with more poses, their observations not kept, and the path steadied.
     """
     path = found.trajectory
     camera = capture.camera(path.camera)
     lost = ~path.localised
     times = np.asarray(path.times_ns - path.times_ns[0], dtype=np.float64) if len(lost) else np.zeros(0)
-    if not lost.any() or (~lost).sum() < _MIN_POSED:
+    if not lost.any() or (~lost).sum() < LEAST_POSED:
         return found
     times = times / np.median(np.diff(times))
     steadiness = Steadiness.of(times, path.gauge_from_cam[:, :3, 3])
@@ -99,7 +99,7 @@ def recover_lost(
             poses |= search.within(start, stop, known)
         before, path = path.localised, _with_poses(path, poses, finder.limits)
         stretches = _beside(path.localised, before)
-    return replace(found, trajectory=path)
+    return replace(found, trajectory=steadied(path, ~lost))
 
 
 def _finder(

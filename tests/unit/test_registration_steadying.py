@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bodycap_batch.config.options import LEAST_LOST
 from bodycap_batch.geometry import make_transform, so3_exp
+from bodycap_batch.registration import _finished
 from bodycap_batch.registration.steadying import steadied
 from bodycap_batch.scene import FrameStatus, Trajectory
 
@@ -108,6 +110,28 @@ def test_the_unit_of_the_map_does_not_matter(scale: float) -> None:
     np.testing.assert_allclose(
         after[:, :3, 3] / scale, steadied(before).gauge_from_cam[:, :3, 3], rtol=1e-5, atol=1e-6
     )
+
+
+def test_only_movable_centres_move() -> None:
+    before, movable = _measured(), np.ones(COUNT, dtype=bool)
+    movable[WEAK[:5]] = False
+    after = steadied(before, movable)
+    moved = (after.gauge_from_cam != before.gauge_from_cam).any(axis=(1, 2))
+    assert not moved[WEAK[:5]].any()
+    assert moved[WEAK[5:]].any()
+
+
+@pytest.mark.parametrize(("lost", "moves"), [(LEAST_LOST - 1, True), (LEAST_LOST, False)])
+def test_where_lost_frames_are_looked_for_next_the_path_is_left_to_that(lost: int, moves: bool) -> None:
+    path = _measured()
+    gone = np.arange(COUNT) < lost
+    none = np.where(gone[:, None, None], np.nan, 1.0)
+    status = tuple(FrameStatus.BLUR if away else FrameStatus.REGISTERED for away in gone.tolist())
+    path = replace(
+        path, gauge_from_cam=path.gauge_from_cam * none, covariance=path.covariance * none, status=status
+    )
+    after = _finished(path)
+    assert (after.gauge_from_cam[WEAK] != path.gauge_from_cam[WEAK]).any() == moves
 
 
 def _with(path: Trajectory, poses: np.ndarray, covariance: np.ndarray | None = None) -> Trajectory:
