@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,8 @@ def frozen_array(
 ) -> npt.NDArray[Any]:
     """Copy `value` into a read-only array of the given dtype and shape.
 
+    One that is such already is taken as it is.
+
     Args:
         value: Anything numpy accepts.
         name: The field's name, for the message.
@@ -32,7 +34,7 @@ def frozen_array(
     Raises:
         ValueError: The shape differs or a value is not finite.
     """
-    array = np.array(value, dtype=dtype, copy=True)
+    array = value if _is_frozen(value, dtype) else np.array(value, dtype=dtype, copy=True)
     matches = array.ndim == len(shape) and all(
         want is None or want == got for want, got in zip(shape, array.shape, strict=True)
     )
@@ -42,6 +44,13 @@ def frozen_array(
         raise ValueError(f"{name}: holds NaN or infinity")
     array.flags.writeable = False
     return array
+
+
+def _is_frozen(value: npt.ArrayLike, dtype: npt.DTypeLike) -> TypeGuard[npt.NDArray[Any]]:
+    """True for an array that nobody writes to: copies of long recordings take hundreds of megabytes."""
+    if not isinstance(value, np.ndarray) or value.dtype != dtype:
+        return False
+    return bool(value.flags.owndata and not value.flags.writeable and value.flags.c_contiguous)
 
 
 def set_array(

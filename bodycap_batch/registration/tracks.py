@@ -92,7 +92,10 @@ class Tracks:
         frame = frame[order]
         keyframe = keyframe[order]
         feature = feature[order]
-        return Tracks(frame, keyframe, feature, px[order])
+        px = px[order]
+        for field in (frame, keyframe, feature, px):
+            field.flags.writeable = False  # so that a registration takes them as they are
+        return Tracks(frame, keyframe, feature, px)
 
     def within(self, first: int, stop: int) -> Tracks:
         """Those in frames from `first` on and before `stop`, of tracks that are ordered by frame."""
