@@ -114,7 +114,9 @@ def _loaded(
         data, base, name = {"capture": folder_capture(full)}, full, full.name
     else:
         base = full.parent
-        data = _with_videos_beside(_mapping(source), base)
+        data = _mapping(source)
+        if policy is None or policy.folder is not None:  # beside one that came alone lies what others dropped
+            data = _with_videos_beside(data, base)
         name = base.name if full.name in JOB_FILES else full.stem
     job = _with_overrides(_validated(data, full, source), overrides)
     problems = problems_in(job)

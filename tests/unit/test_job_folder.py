@@ -12,6 +12,7 @@ from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import SKELETON_PRESETS, Job
 from bodycap_batch.config.mounts import MOUNT_NAMES, ROLES, mount_of, role_of_segment
 from bodycap_batch.config.rules import problems_in
+from bodycap_batch.config.trust import PathPolicy
 from bodycap_batch.errors import CaptureError, JobError
 from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.initial import anchor_and_reach
@@ -123,6 +124,14 @@ def test_a_job_that_names_no_cameras_means_the_videos_beside_it(tmp_path: Path) 
         (tmp_path / "jobs" / "none.yaml").write_text(f"height_m: 1.8\n{word}\n")
         with pytest.raises(JobError, match="missing"):
             load_job(tmp_path / "jobs" / "none.yaml")
+
+
+def test_a_job_that_was_dropped_alone_has_no_videos_beside_it(tmp_path: Path) -> None:
+    folder(tmp_path, "torso.mp4", "left_palm.mp4")
+    (tmp_path / "lone.yaml").write_text("height_m: 1.8\n")
+    assert load_job(tmp_path / "lone.yaml", policy=PathPolicy(folder=tmp_path)).height_m == 1.8
+    with pytest.raises(JobError, match="missing"):
+        load_job(tmp_path / "lone.yaml", policy=PathPolicy(folder=None))
 
 
 def test_results_beside_the_videos_are_no_camera(tmp_path: Path) -> None:
