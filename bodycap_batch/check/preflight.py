@@ -19,6 +19,7 @@ from bodycap_batch.check.settings import setting_notes
 from bodycap_batch.config.folder import job_file_in
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, CaptureConfig, Job
+from bodycap_batch.config.rules import named_frames
 from bodycap_batch.disk_room import require_room
 from bodycap_batch.errors import BodycapError, CaptureError, JobError
 from bodycap_batch.formats.bvh import RigOptions, read_rig
@@ -247,6 +248,19 @@ def _check_formats(job: Job, _findings: list[CameraFinding]) -> list[str]:
     return []
 
 
+def _check_named_frames(job: Job, findings: list[CameraFinding]) -> list[str]:
+    """Frames that the job names must be there: a map or a body would have been made before they are missed."""
+    counts = {camera.name: camera.frames for camera in findings}
+    for (block, field, _), camera, number in named_frames(job):
+        if number >= counts.get(camera, number + 1):
+            raise JobError(
+                f"camera {camera} has no frame {number}",
+                field=f"{block}.{field}",
+                hint=f"its frames are counted from 0 to {counts[camera] - 1}",
+            )
+    return []
+
+
 def _check_files(job: Job, _findings: list[CameraFinding]) -> list[str]:
     """No video twice, no chapter missing."""
     check_files(job)
@@ -259,4 +273,4 @@ def _check_disk(job: Job, findings: list[CameraFinding]) -> list[str]:
     return require_room(job.out or Path("out").resolve(), frames, large)
 
 
-_ALWAYS = (_check_files, _check_clocks, _check_skeleton, _check_formats)
+_ALWAYS = (_check_files, _check_clocks, _check_named_frames, _check_skeleton, _check_formats)

@@ -30,7 +30,7 @@ def problems_in(job: Job) -> list[Problem]:
     for index, camera in enumerate(job.capture.cameras):
         for found in (*_camera_names(job, index), *_mount(job, camera), *_pose(camera), *_paths(camera)):
             problems.append(found._replace(location=("capture", "cameras", index, *found.location)))
-    rules = (_job_names, _skeleton, _size, _times, _first_frames, _rig, _board)
+    rules = (_job_names, _skeleton, _size, _times, _named_frames, _rig, _board)
     return [*problems, *(found for rule in rules for found in rule(job))]
 
 
@@ -167,13 +167,23 @@ def _rig(job: Job) -> Iterator[Problem]:
         yield Problem(("capture", "rig"), message, "give them one `mount` or `segment`, or leave it out")
 
 
-def _first_frames(job: Job) -> Iterator[Problem]:
-    """The two frames a map starts from are named after cameras of the job."""
+def named_frames(job: Job) -> Iterator[tuple[tuple[str, str, int], str, int]]:
+    """Where a job names single frames: the field, the camera's name and the frame's number."""
+    distance = job.merge.known_distance
+    for block, field, frames in (
+        ("map", "init_frames", job.map.init_frames or ()),
+        ("merge", "known_distance", distance[:2] if distance else ()),
+    ):
+        for index, frame in enumerate(frames):
+            camera, _, number = frame.rpartition(":")
+            yield (block, field, index), camera, int(number)
+
+
+def _named_frames(job: Job) -> Iterator[Problem]:
+    """Frames are named after cameras of the job."""
     names = tuple(camera.name for camera in job.capture.cameras)
-    for index, frame in enumerate(job.map.init_frames or ()):
-        camera = frame.rpartition(":")[0]
+    for where, camera, _ in named_frames(job):
         if camera not in names:
-            where = ("map", "init_frames", index)
             yield Problem(where, f"there is no camera {camera[:40]!r}", _nearest(camera, names))
 
 

@@ -92,6 +92,22 @@ def test_cameras_that_never_ran_together(walk: Path) -> None:
     assert "Unix" in str(with_offset(1.7e9).errors[0].hint)
 
 
+@pytest.mark.parametrize(
+    ("named", "told"),
+    [
+        ("merge: {known_distance: ['torso:0', 'torso:75', 2.5]}", "camera torso has no frame 75"),
+        ("merge: {known_distance: ['torso:0', 'trso:9', 2.5]}", "there is no camera 'trso'"),
+        ("map: {init_frames: ['left_palm:400', 'torso:9']}", "camera left_palm has no frame 400"),
+        ("map: {init_frames: ['left_palm:74', 'torso:9']}", ""),
+    ],
+)
+def test_frames_that_are_not_there_are_missed_beforehand(walk: Path, named: str, told: str) -> None:
+    (walk / "job.yaml").write_text(f"{named}\n")
+    report = check_path(walk)
+    assert report.exit_code == (2 if told else 0)
+    assert [error.message for error in report.errors] == ([told] if told else [])
+
+
 def test_every_problem_is_collected(walk: Path) -> None:
     (walk / "torso.mp4").write_bytes(b"")
     (walk / "left_palm.mp4").write_bytes(b"no video at all")
