@@ -249,7 +249,7 @@ def _check_formats(job: Job, _findings: list[CameraFinding]) -> list[str]:
 
 
 def _check_named_frames(job: Job, findings: list[CameraFinding]) -> list[str]:
-    """Frames that the job names must be there: a map or a body would have been made before they are missed."""
+    """Frames that the job names must be there; else a map would be made before they are missed."""
     counts = {camera.name: camera.frames for camera in findings}
     for (block, field, _), camera, number in named_frames(job):
         if number >= counts.get(camera, number + 1):

@@ -20,6 +20,7 @@ from bodycap_batch.config.folder import (
     chapters_in,
     folder_capture,
     job_file_in,
+    videos_in,
 )
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.models import SKELETON_PRESETS, CameraConfig, CaptureConfig, Job
@@ -167,9 +168,10 @@ def _with_videos_beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:
     if not (data.keys() <= Job.model_fields.keys() and capture.keys() <= CaptureConfig.model_fields.keys()):
         return data
     try:
-        return {**data, "capture": {**folder_capture(folder), **capture}}
-    except CaptureError:
+        videos_in(folder)
+    except CaptureError:  # none are there: what is missing is told
         return data
+    return {**data, "capture": {**folder_capture(folder), **capture}}
 
 
 def _validated(data: dict[str, Any], path: Path, source: YamlSource | None) -> Job:

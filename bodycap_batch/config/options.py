@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-FrameName = Annotated[str, StringConstraints(pattern=r"^.+:\d+$")]
+FrameName = Annotated[str, StringConstraints(pattern=r"^.+:\d{1,9}$")]
 """One frame of one camera, ``camera:frame``."""
 
 FileFormat = Literal["ply", "bvh", "glb", "fbx", "usd", "c3d", "trc", "tum", "csv", "npz", "colmap"]

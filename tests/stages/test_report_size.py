@@ -32,6 +32,7 @@ def test_a_page_that_would_be_too_large_is_thinned_until_it_fits_and_says_so(
     assert 5_000_000 < len(text.encode()) <= stage.MAX_BYTES
     found = re.search(r"it shows .*?([\d,]+) of 1,200 video frames as pictures", text)
     assert found is not None
+    assert re.search(r"\. +<code>bodycap view", text), "a space between two sentences"
     assert 0 < int(found[1]) == text.count('"jpeg":"A') < 375
 
 

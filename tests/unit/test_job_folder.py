@@ -161,6 +161,9 @@ def test_a_camera_whose_videos_did_not_come_along(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="leads nowhere") as caught:
         load_job(root)
     assert caught.value.path == str(root / "head.mp4")
+    (root / "job.yaml").write_text("height_m: 1.8\n")
+    with pytest.raises(CaptureError, match="leads nowhere"):
+        load_job(root)
 
 
 def test_a_video_is_no_job(tmp_path: Path) -> None:
