@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ _END_S = 0.6
 """From here on the verdict calls a gap poor."""
 _NARROW_DEG = 3.0
 _SCALE_WELL_KNOWN, _MOUNT_WELL_KNOWN_DEG, _ARM_M = 0.02, 4.0, 0.6
+_T_POSE = re.compile(r",? or stand in a T-pose for two seconds first")
 _BETTER = "; to know it better, "
 """Where merging's sentence about a constant turns to what would help."""
 
@@ -83,7 +85,23 @@ def advise(inputs: ReportInputs, lost: Mapping[str, Counter[Cause]]) -> list[Adv
         *_of_ends(inputs),
         *_of_body(inputs),
     ]
-    return sorted(found, key=lambda each: -each.weight)
+    return sorted(_t_pose_once(found), key=lambda each: -each.weight)
+
+
+def _t_pose_once(found: Sequence[Advice]) -> list[Advice]:
+    """A T-pose helps several constants at once: said once, before what else each of them would take."""
+    helped = [each for each in found if _T_POSE.search(each.do)]
+    if len(helped) < 2:
+        return list(found)
+    others = [replace(each, do=_T_POSE.sub("", each.do)) if each in helped else each for each in found]
+    once = Advice(
+        do="Stand still for two seconds before you start, arms stretched out to the sides (a T-pose): it "
+        "tells more of every constant below that is not well known.",
+        because=f"{len(helped)} of the body's constants are known less well than they could be, and none "
+        "was seen",
+        weight=max(each.weight for each in helped) + 1e-3,
+    )
+    return [*others, once]
 
 
 def _of_lenses(inputs: ReportInputs) -> Iterator[Advice]:

@@ -439,6 +439,23 @@ def test_an_elbow_that_is_no_hinge_is_advised_about(inputs: ReportInputs) -> Non
     assert (advice.do, advice.because) == ("Strap it.", "the left elbow bends 2.1 cm out of its plane")
 
 
+def test_a_t_pose_that_helps_several_constants_is_advised_once(inputs: ReportInputs) -> None:
+    merge = inputs.merge
+    assert merge is not None
+
+    def advised(*cameras: str) -> list[str]:
+        text = "known to 11°; to know it better, swing the elbow, or stand in a T-pose for two seconds first"
+        report = {"mounts": {name: {"known_to": text, "sigma_deg": 11.0} for name in cameras}}
+        found = advise(replace(inputs, merge=replace(merge, report=report)), {})
+        return [each.do for each in found if "T-pose" in each.do or "elbow" in each.do]
+
+    (alone,) = advised("left_palm")
+    assert "elbow, or stand in a T-pose" in alone
+    first, *others = advised("left_palm", "right_palm")
+    assert first.startswith("Stand still for two seconds")
+    assert [each.split(";")[0] for each in others] == ["Swing the elbow", "Swing the elbow"]
+
+
 def test_shared_points_count_what_both_cameras_see(inputs: ReportInputs) -> None:
     counts = shared_points(inputs.maps, inputs.cameras)
     scene = inputs.maps[0]
