@@ -13,7 +13,7 @@ from bodycap_batch.cli.base import app
 from bodycap_batch.errors import StoreError
 
 
-@app.command()
+@app.command(short_help="Check this machine: libraries, memory, disk, extras.")
 def doctor(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Where results will be written (default: out).")

@@ -26,7 +26,7 @@ _UNITS = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
 _CAUSE_CHARACTERS = 200
 
 
-@app.command()
+@app.command(short_help="List the jobs of a watched folder and how they are.")
 def status(
     spool: SpoolArgument = Path("jobs"),
     as_json: Annotated[bool, typer.Option("--json", help="Print jobs and watchers as JSON.")] = False,

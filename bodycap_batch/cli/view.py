@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _REPORT = ("report.html", "partial/report.html")
 
 
-@app.command()
+@app.command(short_help="Look at a finished job beside its real videos.")
 def view(
     job: JobArgument,
     out: OutOption = None,

@@ -49,7 +49,7 @@ TokenOption = Annotated[
 ]
 
 
-@app.command()
+@app.command(short_help="Work on every folder of videos dropped into an inbox.")
 def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
     inbox: Annotated[
         Path,

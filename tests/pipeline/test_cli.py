@@ -331,6 +331,13 @@ def test_an_unwritable_place_for_results_is_named(bench: Bench) -> None:
     assert "hint:" in err
 
 
+def test_the_list_of_commands_says_each_in_a_whole_sentence(capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    listed = capfd.readouterr().out.partition("Commands:")[2]
+    assert "gc " in listed
+    assert "..." not in listed
+
+
 def test_a_disk_that_does_not_answer_is_no_bug(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
