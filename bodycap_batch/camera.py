@@ -80,11 +80,6 @@ class Camera:
         return float(np.mean([self.params[i] for i in _FOCAL_PARAMS[self.model]]))
 
     @property
-    def focal_count(self) -> int:
-        """How many of the parameters, the first ones, are focal lengths."""
-        return len(_FOCAL_PARAMS[self.model])
-
-    @property
     def principal_point_px(self) -> tuple[float, float]:
         """Principal point (cx, cy)."""
         first = len(_FOCAL_PARAMS[self.model])

@@ -52,7 +52,10 @@ def test_a_contradicted_lens_starts_from_what_fits_and_is_refined() -> None:
     found = freed_where_contradicted(_mapped(0.9, {"left_palm": 1.31}), CAPTURE, build)
     (capture,) = seen
     assert not capture.camera("left_palm").calibrated
-    assert np.allclose(capture.camera("left_palm").camera.params, [1.31 * 480, 1.31 * 490, 318, 242])
+    start = capture.camera("left_palm").camera
+    # As if the lens were not given: mapping looks for its kind, too.
+    assert (start.model, start.refine) == ("SIMPLE_RADIAL", True)
+    assert np.allclose(start.params, [1.31 * 485, 318, 242, 0])
     assert capture.camera("torso") is CAPTURE.camera("torso")
     assert found.log["misfitting_lenses"] == {"left_palm": 1.33}
     assert found.log[FREED] == ["left_palm"]
