@@ -148,9 +148,12 @@ def _change_model(camera: Any, name: str) -> None:
 def misfit_note(camera: str, factor: float, *, freed: bool = False) -> str:
     """What a misfit means and what to do; `freed`: what fits was used instead of what was given."""
     instead = "; what fits was used instead" if freed else ""
-    way = "longer" if factor > 1.0 else "shorter"
+    percent = round(100 * abs(factor - 1.0))
+    fits = (
+        f"a focal length {percent} % {'longer' if factor > 1.0 else 'shorter'}" if percent else "another lens"
+    )
     return (
-        f"{camera}: the pictures fit a focal length {100 * abs(factor - 1.0):.0f} % {way} than the "
+        f"{camera}: the pictures fit {fits} than the "
         f"calibration says{instead}: was stabilisation or digital zoom on, or another lens mode or size "
         "calibrated? Film with these off, calibrate in the same mode, "
         "or use calibration: auto"

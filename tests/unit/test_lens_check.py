@@ -63,6 +63,7 @@ def test_the_note_says_what_to_do():
     assert "12 % longer" in misfit_note("torso", 1.12)
     assert "12 % shorter" in misfit_note("torso", 0.88)
     assert "stabilisation" in misfit_note("torso", 0.88)
+    assert "fit another lens than" in misfit_note("torso", 1.002, freed=True)
 
 
 def test_a_guessed_lens_that_fits_keeps_its_model():
