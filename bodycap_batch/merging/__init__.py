@@ -26,6 +26,7 @@ def merge_trajectories(inputs: MergeInputs, options: MergeOptions, context: Stag
         sparse Gaussian process regression", RSS 2014).
     """
     # gtsam takes a second to import.
+    from bodycap_batch.merging.choosing import share_priors
     from bodycap_batch.merging.stage import merge
 
-    return merge(inputs, options, context)
+    return merge(share_priors(inputs), options, context)

@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from bodycap_batch.body import MergeInputs
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.initial import anchor_and_reach
 from bodycap_batch.merging.joining import Together, use_together
+from bodycap_batch.merging.rolls import is_open
 from bodycap_batch.scene import Trajectory
+from bodycap_batch.skeleton import Mount
 
 MIN_FRAMES = 15
 """Localised frames below which a camera tells nothing about a motion: half a second at 30 fps."""
@@ -50,6 +54,33 @@ def bring_together(
         hint="a skeleton needs one map with two cameras on trunk, head or the same limb; frames.csv has the "
         "reasons of lost frames, more texture, light or a slower start help",
     )
+
+
+def share_priors(inputs: MergeInputs) -> MergeInputs:
+    """Cameras that are expected at the same place by their names alone are off it together, as a rig is.
+
+    Each alone would say where the body is as if the others had been strapped on by somebody else.
+    """
+    useless = seldom_localised(inputs)
+    paths = [each.camera for each in inputs.trajectories if each.camera not in useless]
+    worn = [inputs.mount_of(camera) for camera in paths]
+
+    def shared(mount: Mount) -> Mount:
+        beside = sum(
+            is_open(other) and other.role == mount.role and _same(other, mount)
+            for other in worn
+            if other.camera != mount.camera
+        )
+        if not beside or not is_open(mount):
+            return mount
+        factor = float(np.sqrt(1.0 + beside))
+        return replace(mount, sigma_rad=factor * mount.sigma_rad, sigma_m=factor * mount.sigma_m)
+
+    return replace(inputs, mounts=tuple(shared(mount) for mount in inputs.mounts))
+
+
+def _same(first: Mount, second: Mount) -> bool:
+    return bool(np.allclose(first.joint_from_cam[:3, 3], second.joint_from_cam[:3, 3]))
 
 
 def seldom_localised(inputs: MergeInputs) -> dict[str, str]:

@@ -87,14 +87,17 @@ def take_samples(
     white_map = np.array(
         [max(float(np.median(track.sigma_map)), MIN_SIGMA_M / provisional) for track in tracks]
     )
-    sigma_map = np.sqrt(white_map**2 + repeats * (MAP_ERROR_M / provisional) ** 2)
+    # The map is off by the same for all cameras of a segment: together they count as one.
+    bones = np.array([track.bone for track in tracks])
+    alike = (bones[:, None] == bones).sum(axis=1)
+    sigma_map = np.sqrt(white_map**2 + alike * repeats * (MAP_ERROR_M / provisional) ** 2)
     return Samples(
         times_ns=times_ns,
         cameras=tuple(track.camera for track in tracks),
         bones=tuple(track.bone for track in tracks),
         map_from_cam=np.array([poses for poses, _ in looks]),
         valid=np.array([valid for _, valid in looks]),
-        sigma_rad=np.sqrt(white_rad**2 + repeats * MAP_ERROR_RAD**2),
+        sigma_rad=np.sqrt(white_rad**2 + alike * repeats * MAP_ERROR_RAD**2),
         sigma_map=sigma_map,
         repeats=repeats,
         white_share=float(((white_map / sigma_map) ** 2).mean()),

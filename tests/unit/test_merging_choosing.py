@@ -13,8 +13,9 @@ from bodycap_batch.merging import choosing, joining, placing
 from bodycap_batch.merging.choosing import bring_together, choices, seldom_localised
 from bodycap_batch.merging.constants import early_up
 from bodycap_batch.merging.joining import Joined, use_together
+from bodycap_batch.merging.samples import MAP_ERROR_RAD, take_samples
 from bodycap_batch.merging.stage import timeline
-from bodycap_batch.merging.tracks import make_track
+from bodycap_batch.merging.tracks import MIN_SIGMA_RAD, make_track
 from bodycap_batch.scene import FrameStatus
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.posed import posed
@@ -159,3 +160,48 @@ def test_one_bad_map_does_not_take_the_others_with_it(capture, monkeypatch):
 def test_equations_without_an_answer_are_an_estimation_error():
     with pytest.raises(EstimationError, match="does not determine"):
         placing._solved(np.zeros((2, 2)), np.ones(2))
+
+
+def _with_twin(inputs, **changes):
+    """A second camera beside the torso's, on the same path."""
+    twin = replace(next(each for each in inputs.trajectories if each.camera == "torso"), camera="torso_2")
+    mount = replace(inputs.mount_of("torso"), camera="torso_2", **changes)
+    return replace(
+        inputs,
+        trajectories=(*inputs.trajectories, twin),
+        mounts=(*inputs.mounts, mount),
+        clocks={**inputs.clocks, "torso_2": inputs.clocks["torso"]},
+    )
+
+
+def test_cameras_at_one_place_know_it_together_no_better_than_one(capture):
+    inputs = capture.inputs
+    alone = inputs.mount_of("torso")
+    shared = choosing.share_priors(_with_twin(inputs))
+    for camera in ("torso", "torso_2"):
+        mount = shared.mount_of(camera)
+        assert mount.sigma_m == pytest.approx(np.sqrt(2.0) * alone.sigma_m)
+        assert mount.sigma_rad == pytest.approx(np.sqrt(2.0) * alone.sigma_rad)
+    assert shared.mount_of("left_palm") == inputs.mount_of("left_palm")
+    # Elsewhere on the bone, measured by the job, or never localised: no twin.
+    behind = alone.joint_from_cam.copy()
+    behind[1, 3] += 0.2
+    for other in ({"joint_from_cam": behind}, {"sigma_rad": 0.02, "sigma_m": 0.01}):
+        assert choosing.share_priors(_with_twin(inputs, **other)).mount_of("torso") == alone
+    assert choosing.share_priors(_lose(_with_twin(inputs), "torso_2", 6)).mount_of("torso") == alone
+    assert choosing.share_priors(inputs).mounts == inputs.mounts
+
+
+def test_a_map_that_bends_two_cameras_of_a_bone_alike_counts_once(capture):
+    bones = choosing.graph_bones(capture.inputs.skeleton, {mount.role for mount in capture.inputs.mounts})
+    index = {bone.role: place for place, bone in enumerate(bones)}
+    for inputs, alike in ((capture.inputs, 1), (_with_twin(capture.inputs), 2)):
+        tracks = [
+            make_track(inputs, each, index[inputs.mount_of(each.camera).role]) for each in inputs.trajectories
+        ]
+        samples = take_samples(tracks, 1.0, 40)
+        for track, sigma in zip(tracks, samples.sigma_rad, strict=True):
+            count = alike if track.camera.startswith("torso") else 1
+            # Their own noise is not alike.
+            own = max(float(np.median(track.sigma_rad)), MIN_SIGMA_RAD)
+            assert sigma**2 - own**2 == pytest.approx(count * samples.repeats * MAP_ERROR_RAD**2)
