@@ -97,8 +97,7 @@ def _t_pose_once(found: Sequence[Advice]) -> list[Advice]:
     once = Advice(
         do="Stand still for two seconds before you start, arms stretched out to the sides (a T-pose): it "
         "tells more of every constant below that is not well known.",
-        because=f"{len(helped)} of the body's constants are known less well than they could be, and none "
-        "was seen",
+        because=f"no T-pose was seen, and {len(helped)} of the body's constants are not well known",
         weight=max(each.weight for each in helped) + 1e-3,
     )
     return [*others, once]

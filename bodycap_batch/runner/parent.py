@@ -13,6 +13,10 @@ from bodycap_batch.runner.children import Executor, Making
 from bodycap_batch.runner.task import Task
 from bodycap_batch.store import Artefact, Store
 
+_HINT = (
+    "run the job first (`bodycap run`); where it was run before, `bodycap why` tells what has changed since"
+)
+
 
 class NotStored(StoreError):
     """An artefact would have to be made, which was not wanted.
@@ -23,7 +27,7 @@ class NotStored(StoreError):
 
     def __init__(self, tasks: Sequence[Task], path: Path) -> None:
         labels = ", ".join(task.label for task in tasks)
-        super().__init__(f"{labels}: not computed yet", path=path, hint="run the job first (`bodycap run`)")
+        super().__init__(f"{labels}: not computed yet", path=path, hint=_HINT)
         self.tasks = tuple(tasks)
 
 

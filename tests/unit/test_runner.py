@@ -305,6 +305,7 @@ def test_what_is_not_stored_is_not_computed_when_nothing_may_be(bench: Bench) ->
     with pytest.raises(NotStored, match="work torso: not computed yet") as caught:
         looking.run(a_task("work", 2))
     assert caught.value.tasks == (a_task("work", 2),)
+    assert "bodycap why" in str(caught.value.hint)
 
 
 def test_a_stage_to_be_done_again_replaces_what_is_stored(bench: Bench) -> None:
