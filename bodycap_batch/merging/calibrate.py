@@ -40,6 +40,7 @@ from bodycap_batch.merging.spread import (
     joined,
     map_bends,
     mount_slope,
+    proportions,
     scale_direction,
 )
 from bodycap_batch.merging.t_pose import t_posed
@@ -161,6 +162,7 @@ class Calibration:
         sigma_log: float,
         slope: Mapping[str, FloatArray],
         placed: Mapping[str, tuple[float, float]],
+        length_share: float = 0.0,
     ) -> tuple[Spread, Spread]:
         """How far off the last solution may be, and what comes and goes while it is used.
 
@@ -171,18 +173,22 @@ class Calibration:
             sigma_log: Sigma of the scale's logarithm.
             slope: By camera, change of joint_from_cam (4,4) per unit of log scale.
             placed: By camera whose map was joined by the body, sigmas (rad, m) of where it lies.
+            length_share: Sigma of each bone's length as a share of it.
         """
         samples, cameras = self._samples, self._samples.cameras
         mounts = self.solved()
         solved = mounts.eliminated()
         factors = self.row_variance(mounts, solved)
         bent = self._bent(mounts, solved)
+        person = [habits(self._at_ease, cameras, BETWEEN_SHARE)]
+        if length_share > 0.0:
+            person.append(proportions(self._bones, cameras, length_share))
         follow = {name: mount_slope(self.mounts[name], slope[name]) for name in cameras}
         bends = np.sqrt(bent) * np.stack([samples.sigma_rad, self._scale * samples.sigma_map], axis=1)
         bends = np.hypot(bends, [placed.get(name, (0.0, 0.0)) for name in cameras])
         constant = joined(
             [
-                mounts.spread(solved, factors, habits(self._at_ease, cameras, BETWEEN_SHARE)),
+                mounts.spread(solved, factors, joined(person)),
                 scale_direction(self._bones, sigma_log, follow),
             ]
         )

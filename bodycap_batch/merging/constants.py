@@ -130,7 +130,8 @@ def calibrate_body(
         sigma = float(np.hypot(sigma, STATURE_SIGMA))
     if scale != estimate.scale:
         calibration.solve(scale)
-    constant, passing = calibration.spread(sigma, estimate.mount_slope, cleaned.placed)
+    lengths = 0.0 if inputs.skeleton_is_measured else PROPORTION_SIGMA
+    constant, passing = calibration.spread(sigma, estimate.mount_slope, cleaned.placed, lengths)
     return Calibrated(
         scale=scale,
         sigma_log=sigma,

@@ -80,6 +80,30 @@ def test_a_camera_never_seen_with_others_keeps_its_usual_mount_and_weighs_as_lit
     assert loosened(tracks[1], turned) is tracks[1]
 
 
+def test_bones_of_a_height_alone_may_be_longer_on_both_sides_alike(body):
+    inputs, bones, tracks = body
+    samples = take_samples(tracks, 1.0, 12)
+    mounts = {mount.camera: mount for mount in inputs.mounts}
+    calibration = Calibration(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
+    calibration.solve(1.0)
+    follow = {name: np.zeros((4, 4)) for name in ROLES}
+    known, likely = (calibration.spread(0.01, follow, {}, share)[0] for share in (0.0, 0.04))
+    assert not known.offsets_m.any()
+    index = {bone.role: place for place, bone in enumerate(bones)}
+    for side in ("Left", "Right"):
+        hand = index[f"{side}Hand"]
+        longer = likely.offsets_m[hand]
+        assert np.linalg.norm(longer) == pytest.approx(0.04 * np.linalg.norm(bones[hand].offset_m))
+    columns = [
+        np.flatnonzero(np.abs(likely.offsets_m[index[f"{side}Hand"]]).sum(axis=0))
+        for side in ("Left", "Right")
+    ]
+    assert columns[0].tolist() == columns[1].tolist()
+    # What a palm's mount follows of an arm that is longer adds to what was uncertain of it.
+    before, after = (np.linalg.norm(each.mounts["left_palm"][3:]) for each in (known, likely))
+    assert before < after < 2.0 * before
+
+
 def test_a_camera_never_seen_with_the_trunk_is_sampled_beside_another(body):
     trunk, left, right = body[2]
     samples = take_samples([_only(trunk, 0.0, 3.0), left, _only(right, 3.5, 6.0)], 1.0, 12)
