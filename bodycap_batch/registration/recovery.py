@@ -40,8 +40,8 @@ _MAX_DISAGREEMENT = 11.3
 _LONE_EVIDENCE = 4
 _ROUNDS = 5
 """A walk goes as far as motion leads it; from poses smoothed and vouched for it goes further, until nothing
-more is found. Room131's right palm has 94 of 150 frames after the first round, 104 after the second, 110
-after the fourth (off by 2.6 cm both), a rendered one with arms thrown about 105, 107, 108 of 120."""
+more is found. Room131's right palm has 94 of 150 frames after the first round, 104 after the second, 108
+in the end (off by 2.6 cm both), a rendered one with arms thrown about 105, 107, 108 of 120."""
 
 
 def recover_lost(
