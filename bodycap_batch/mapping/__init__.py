@@ -17,7 +17,7 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.mapping.confirmed import drop_unconfirmed
-from bodycap_batch.mapping.consistency import require_consistent
+from bodycap_batch.mapping.consistency import inconsistent
 from bodycap_batch.mapping.convert import to_map
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, add_keyframes, image_ids
 from bodycap_batch.mapping.freeing import as_mapped, freed_where_contradicted
@@ -74,11 +74,16 @@ def build_map(
 
     Source: Schönberger, Frahm, "Structure-from-motion revisited", CVPR 2016 (COLMAP).
     """
-    result = _build(capture, selections, options, context, reach)
+    result, refused = _build(capture, selections, options, context, reach)
     apart = replace(context, work_dir=context.work_dir / "freed")
-    return freed_where_contradicted(
-        result, capture, lambda other: _build(other, selections, options, apart, reach)
-    )
+
+    def again(other: Capture) -> MapResult:
+        found, unusable = _build(other, selections, options, apart, reach)
+        if unusable is not None:
+            raise unusable
+        return found
+
+    return freed_where_contradicted(result, capture, again, refused)
 
 
 def _build(
@@ -87,8 +92,12 @@ def _build(
     options: MapOptions,
     context: StageContext,
     reach: Reach | None,
-) -> MapResult:
-    """`build_map` with the lenses as the capture has them: held where calibrated, else refined."""
+) -> tuple[MapResult, EstimationError | None]:
+    """`build_map` with the lenses as the capture has them: held where calibrated, else refined.
+
+    Where the map holds too few keyframes or they contradict it, what to say of it comes with it: other lenses
+    may give one that can be used.
+    """
     import pycolmap
 
     workspace = context.work_dir / "workspace"
@@ -110,14 +119,16 @@ def _build(
     if models:
         models[0], log["repair"] = repair(models[0], tried, shop)
         log["unconfirmed_points"] = _settled(models, shop, capture)
-    _require_coverage(models, len(refs), log.get("initial_candidates", log["initial_pair_ladder"]), options)
+    refused = _too_few(models, len(refs), log.get("initial_candidates", log["initial_pair_ladder"]), options)
+    if refused is not None and not models:
+        raise refused
     write_models(workspace, models)
     given = {number: name for name, number in cameras.items() if capture.camera(name).calibrated}
     log["misfitting_lenses"] = misfitting_lenses(models[0], shop.settings(), given)
     result = _result(models, workspace, log)
     verdict = check_reach(result.maps[0], _common_ns(capture), reach).to_log() if reach else None
-    require_consistent(log["repair"]["contradicted_share"], verdict)
-    return replace(result, log={**result.log, "reach": verdict})
+    refused = refused or inconsistent(log["repair"]["contradicted_share"], verdict)
+    return replace(result, log={**result.log, "reach": verdict}), refused
 
 
 def _shop(
@@ -355,14 +366,17 @@ def _constant(capture: Capture, ids: Mapping[str, int]) -> list[int]:
     return sorted(number for name, number in ids.items() if capture.camera(name).calibrated)
 
 
-def _require_coverage(models: Sequence[Any], keyframes: int, ladder: object, options: MapOptions) -> None:
+def _too_few(
+    models: Sequence[Any], keyframes: int, ladder: object, options: MapOptions
+) -> EstimationError | None:
     registered = models[0].num_reg_images() if models else 0
-    if registered < max(2, options.min_coverage * keyframes):
-        raise EstimationError(
-            f"the map holds {registered} of {keyframes} keyframes, "
-            f"fewer than {options.min_coverage:.0%}; initial pairs: {ladder}",
-            hint="film sideways movement over textured, well lit surfaces; check the calibration",
-        )
+    if registered >= max(2, options.min_coverage * keyframes):
+        return None
+    return EstimationError(
+        f"the map holds {registered} of {keyframes} keyframes, "
+        f"fewer than {options.min_coverage:.0%}; initial pairs: {ladder}",
+        hint="film sideways movement over textured, well lit surfaces; check the calibration",
+    )
 
 
 def _result(models: Sequence[Any], workspace: Path, log: dict[str, Any]) -> MapResult:

@@ -113,23 +113,23 @@ def contradicted_share(links: Sequence[Link]) -> float:
     return wrong / max(1, sum(link.inliers for link in links))
 
 
-def require_consistent(share: float, reach: Mapping[str, object] | None) -> None:
-    """Refuse a map that a good part of its own pairs contradict: rooms whose parts look the same.
+def inconsistent(share: float, reach: Mapping[str, object] | None) -> EstimationError | None:
+    """What to say of a map that a good part of its own pairs contradict: rooms whose parts look the same.
 
     Args:
         share: `contradicted_share` of the map.
         reach: What the body's reach says, if there is a body.
 
-    Raises:
-        EstimationError: The map cannot be right.
+    Returns:
+        The error; None where the map can be right.
     """
     if share <= MAX_CONTRADICTED_SHARE:
-        return
+        return None
     body = ""
     if reach is not None:
         found = reach.get("reason", f"{reach.get('keyframes_out_of_reach')} keyframes out of it")
         body = f"; the body's reach: {found}"
-    raise EstimationError(
+    return EstimationError(
         f"{share:.0%} of the matches between keyframes contradict the map: places that look the same "
         f"(repeated pictures, tiles, windows) were taken for one{body}",
         hint="film what tells the places apart, or cover repeated pictures; check the calibration",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -15,11 +17,16 @@ from bodycap_batch.scene import Map, MapResult
 FREED = "freed_lenses"
 """The log's list of cameras whose given lens was replaced by what fits the pictures."""
 
+_FOUND = "found_lenses"
+"""The log's account of these cameras' lenses: a map that grows may lose all keyframes of one."""
 _AS_MANY = 0.95
 
 
 def freed_where_contradicted(
-    result: MapResult, capture: Capture, build: Callable[[Capture], MapResult]
+    result: MapResult,
+    capture: Capture,
+    build: Callable[[Capture], MapResult],
+    refused: EstimationError | None = None,
 ) -> MapResult:
     """The map with misfitting lenses found along with it, where that is the better map.
 
@@ -30,7 +37,20 @@ def freed_where_contradicted(
             contradicts.
         capture: All cameras.
         build: Builds a map of the capture with other lenses.
+        refused: Why that map cannot be used as it is, if it cannot: wrong lenses break maps, too.
+
+    Raises:
+        EstimationError: `refused`, where no other lenses give a better map.
     """
+    freed = _freed(result, capture, build, usable=refused is None)
+    if refused is not None and FREED not in freed.log:
+        raise refused
+    return freed
+
+
+def _freed(
+    result: MapResult, capture: Capture, build: Callable[[Capture], MapResult], *, usable: bool
+) -> MapResult:
     misfits: Mapping[str, float] = result.log["misfitting_lenses"]
     if not misfits:
         return result
@@ -41,21 +61,39 @@ def freed_where_contradicted(
         )
     except EstimationError as error:
         return replace(result, log={**result.log, "freeing_failed": error.message})
-    if not _better(again.maps[0], result.maps[0]):
-        return result
-    found = {
-        name: round(again.maps[0].cameras[name].focal_px / lens.focal_px, 3)
-        for name, lens in given.items()
-        if name in again.maps[0].cameras
+    other = again.maps[0]
+    if not (misfits.keys() <= other.cameras.keys() and (not usable or _better(other, result.maps[0]))):
+        told = {"keyframes": _keyframes(other), "mean_error_px": round(other.mean_error_px(), 4)}
+        return replace(result, log={**result.log, "freeing_refused": told})
+    lenses = {name: other.cameras[name] for name in sorted(misfits)}
+    factors = {name: round(lens.focal_px / given[name].focal_px, 3) for name, lens in lenses.items()}
+    log = {
+        **again.log,
+        "misfitting_lenses": {**again.log["misfitting_lenses"], **factors},
+        FREED: list(lenses),
+        _FOUND: {
+            name: {"model": lens.model, "params": lens.params.tolist()} for name, lens in lenses.items()
+        },
     }
-    told = {**again.log["misfitting_lenses"], **found}
-    return replace(again, log={**again.log, "misfitting_lenses": told, FREED: sorted(found)})
+    return replace(again, log=log)
 
 
 def as_mapped(capture: Capture, previous: MapResult) -> Capture:
-    """The capture with the lenses that an earlier map of it freed as that map found them."""
-    lenses = previous.maps[0].cameras
-    return with_free_lenses(capture, {name: lenses[name] for name in previous.log.get(FREED, ())})
+    """The capture with the lenses that an earlier map of it freed as that map found them.
+
+    Of a camera that has no keyframes in it any more, as they were when it was freed.
+    """
+    held = previous.maps[0].cameras
+    lenses = {
+        name: held[name] if name in held else replace(capture.camera(name).camera, **_restored(told))
+        for name, told in previous.log.get(_FOUND, {}).items()
+    }
+    return with_free_lenses(capture, lenses)
+
+
+def _restored(told: Mapping[str, Any]) -> dict[str, Any]:
+    """A lens that the log tells of."""
+    return {"model": told["model"], "params": np.array(told["params"])}
 
 
 def with_free_lenses(capture: Capture, lenses: Mapping[str, Camera]) -> Capture:
@@ -81,6 +119,13 @@ def _unknown(lens: Camera, factor: float) -> Camera:
 
 
 def _better(other: Map, one: Map) -> bool:
-    """Whether another map holds hardly fewer keyframes, and lies nearer to what they see."""
-    many = len(other.keyframe_camera) >= _AS_MANY * len(one.keyframe_camera)
-    return many and other.mean_error_px() < one.mean_error_px()
+    """Whether another map holds hardly fewer keyframes, of any camera, and lies nearer to what they see."""
+    have, had = _keyframes(other), _keyframes(one)
+    many = sum(have.values()) >= _AS_MANY * sum(had.values())
+    each = all(have.get(name, 0) >= max(1, int(_AS_MANY * count)) for name, count in had.items())
+    return many and each and other.mean_error_px() < one.mean_error_px()
+
+
+def _keyframes(scene_map: Map) -> dict[str, int]:
+    """How many keyframes of each camera a map holds."""
+    return dict(sorted(Counter(scene_map.keyframe_camera).items()))

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bodycap_batch import mapping
 from bodycap_batch.capture import Capture
 from bodycap_batch.capture.cameras import CaptureCamera
+from bodycap_batch.config import MapOptions
+from bodycap_batch.context import StageContext
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.mapping.freeing import FREED, as_mapped, freed_where_contradicted
 from bodycap_batch.scene import MapResult
@@ -78,6 +82,70 @@ def test_the_given_lens_stays_where_freeing_it_gives_no_better_map(again: MapRes
     assert found.log["misfitting_lenses"] == {"left_palm": 1.31}
     assert FREED not in found.log
     assert as_mapped(CAPTURE, found).cameras == CAPTURE.cameras
+
+
+def _without_palm(mapped: MapResult) -> MapResult:
+    """The same after all keyframes of the palm's camera were cut out."""
+    scene = mapped.maps[0]
+    rows = [row for row, name in enumerate(scene.keyframe_camera) if name == "torso"]
+    seen = np.isin(scene.obs_keyframe, rows)
+    less = replace(
+        scene,
+        cameras={"torso": scene.cameras["torso"]},
+        keyframe_camera=("torso",) * len(rows),
+        keyframe_frame=scene.keyframe_frame[rows],
+        map_from_cam=scene.map_from_cam[rows],
+        obs_keyframe=scene.obs_keyframe[seen],
+        obs_point=scene.obs_point[seen],
+        obs_feature=scene.obs_feature[seen],
+        obs_px=scene.obs_px[seen],
+    )
+    return replace(mapped, maps=(less,))
+
+
+def test_a_freed_lens_outlives_its_cameras_keyframes() -> None:
+    found = freed_where_contradicted(
+        _mapped(0.9, {"left_palm": 1.31}), CAPTURE, lambda capture: _mapped(0.5, {}, zoom=1.33)
+    )
+    lens = as_mapped(CAPTURE, _without_palm(found)).camera("left_palm")
+    assert not lens.calibrated
+    assert np.allclose(lens.camera.params, found.maps[0].cameras["left_palm"].params)
+    assert json.loads(json.dumps(found.log)) == found.log
+
+
+def test_a_map_that_loses_the_contradicted_camera_is_no_better() -> None:
+    first = _mapped(0.9, {"left_palm": 1.31})
+    found = freed_where_contradicted(first, CAPTURE, lambda capture: _without_palm(_mapped(0.5, {})))
+    assert found.maps == first.maps
+    assert found.log["misfitting_lenses"] == {"left_palm": 1.31}
+    assert found.log["freeing_refused"] == {"keyframes": {"torso": 3}, "mean_error_px": 0.5}
+
+
+def test_a_map_that_cannot_be_used_is_refused_after_its_lenses_were_freed() -> None:
+    refused = EstimationError("30% of the matches contradict the map", hint="x")
+    bad = _mapped(0.4, {"left_palm": 1.31})
+    found = freed_where_contradicted(bad, CAPTURE, lambda capture: _mapped(0.5, {}, zoom=1.33), refused)
+    assert found.log[FREED] == ["left_palm"]
+    with pytest.raises(EstimationError, match="30%"):
+        freed_where_contradicted(bad, CAPTURE, lambda capture: _without_palm(_mapped(0.5, {})), refused)
+    with pytest.raises(EstimationError, match="30%"):
+        freed_where_contradicted(_mapped(0.4, {}), CAPTURE, lambda capture: pytest.fail("built"), refused)
+
+
+def test_freeing_is_tried_before_a_map_is_given_up(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    refused = EstimationError("30% of the matches contradict the map", hint="x")
+
+    def build(capture: Capture, *_: object) -> tuple[MapResult, EstimationError | None]:
+        if capture.camera("left_palm").calibrated:
+            return _mapped(0.4, {"left_palm": 1.31}), refused
+        return _mapped(0.5, {}, zoom=1.33), None
+
+    monkeypatch.setattr(mapping, "_build", build)
+    found = mapping.build_map(CAPTURE, [], MapOptions(), StageContext(work_dir=tmp_path))
+    assert found.log[FREED] == ["left_palm"]
+    monkeypatch.setattr(mapping, "_build", lambda *_: (_mapped(0.4, {"left_palm": 1.31}), refused))
+    with pytest.raises(EstimationError, match="30%"):
+        mapping.build_map(CAPTURE, [], MapOptions(), StageContext(work_dir=tmp_path))
 
 
 def test_lenses_that_fit_cost_no_second_map() -> None:
