@@ -58,8 +58,14 @@ def test_a_rig_carries_its_camera_through_the_dark(tmp_path: Path) -> None:
     rows, metrics, together = _run(tmp_path, "synced")
     dark = {row["status"] for row in rows if row["camera"] == "torso_2" and int(row["frame"]) in DARK}
     assert dark == {"RIG"}
-    # How it was before the two were held to it: their own poses scatter.
-    assert metrics["relative_poses"] == [relative]
+    # How it was before the two were held to it: their own poses scatter, a little more than after the
+    # second look for lost frames, which steadies the path and which a rig goes without.
+    (measured,) = metrics["relative_poses"]
+    assert all(measured[key] == relative[key] for key in ("cameras", "instants", "rigid"))
+    assert measured["translation"] == pytest.approx(relative["translation"], rel=5e-3)
+    assert measured["turn_deg"] == pytest.approx(relative["turn_deg"], abs=0.01)
+    assert measured["spread"] == pytest.approx(relative["spread"], rel=0.1)
+    assert measured["spread_deg"] == pytest.approx(relative["spread_deg"], rel=0.1)
     assert relative["rigid"]
     assert together.total.coverage == 1.0
     # 320 px and 210 px focal length at some 3 m: a pixel is 14 mm, a pose of its own is off by some 3 mm.
