@@ -42,7 +42,7 @@ def sides_sentence(exchanged: Mapping[str, float]) -> str:
     """What limbs on the wrong side of the body mean."""
     return (
         f"{' and '.join(sorted(exchanged))} stay on the other side of the body: left and right are "
-        "exchanged in the cameras' names, or the trunk's camera looks backward"
+        "exchanged in the cameras' names, or the trunk's camera looks back and its mount is not torso_back"
     )
 
 

@@ -66,6 +66,7 @@ class Calibrated:
         sources: All that know the scale, used or not.
         limbs: The scale at which each limb alone fits.
         mounts: Solved mounts with their sigmas.
+        trunk: The prior of the leading camera's, the way up it sits.
         spread: How far off all of this may be, and what passing postures add.
         up: The vertical.
         height_over_floor_m: Of the trunk's joint, where a walked floor was seen.
@@ -80,6 +81,7 @@ class Calibrated:
     sources: tuple[ScaleSource, ...]
     limbs: tuple[ScaleSource, ...]
     mounts: tuple[Mount, ...]
+    trunk: Mount
     spread: Spread
     up: Direction
     height_over_floor_m: float | None
@@ -139,6 +141,7 @@ def calibrate_body(
         sources=sources,
         limbs=limb_scales(inputs, tracks, scale, (known_up, t_pose_ns), step),
         mounts=calibration.solved_mounts(constant),
+        trunk=priors[tracks[0].camera],
         spread=joined([constant, passing]),
         up=up,
         height_over_floor_m=height,

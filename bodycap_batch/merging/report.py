@@ -109,8 +109,8 @@ def _sides(
 ) -> dict[str, Any]:
     """Limbs' cameras on the other side of the body, where all are; nothing of joined maps."""
     own = [each for each in tracks if each.camera not in joined]
-    roles = {mount.camera: mount.role for mount in inputs.mounts}
-    wrong = exchanged_sides(own, roles, calibrated.up.up)
+    mounts = {mount.camera: mount for mount in (*inputs.mounts, calibrated.trunk)}
+    wrong = exchanged_sides(own, mounts, calibrated.up.up)
     return {"cameras": wrong, "says": sides_sentence(wrong)} if wrong else {}
 
 

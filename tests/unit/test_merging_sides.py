@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bodycap_batch.geometry import make_transform, so3_exp
 from bodycap_batch.merging.advice import sides_sentence
+from bodycap_batch.merging.rolls import rolled
 from bodycap_batch.merging.sides import exchanged_sides
 from bodycap_batch.merging.tracks import Track
+from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount
 
 ROLES = {"torso": "Spine1", "left_palm": "LeftHand", "right_palm": "RightHand", "head": "Head"}
+BODY = load_skeleton("upper_body", 1.75)
+MOUNTS = {camera: nominal_mount(camera, role, BODY) for camera, role in ROLES.items()}
+BACK = replace(nominal_mount("torso_back", "Spine1", BODY), camera="torso")
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -42,7 +49,7 @@ def _tracks(*sides: tuple[str, float], down_rad: float = 0.0, count: int = 90) -
 
 
 def test_exchanged_names_are_told() -> None:
-    wrong = exchanged_sides(_tracks(("left_palm", 0.3), ("right_palm", -0.3), ("head", 0.0)), ROLES, UP)
+    wrong = exchanged_sides(_tracks(("left_palm", 0.3), ("right_palm", -0.3), ("head", 0.0)), MOUNTS, UP)
     assert wrong == {"left_palm": 1.0, "right_palm": 1.0}
     assert sides_sentence(wrong).startswith("left_palm and right_palm stay on the other side")
 
@@ -61,8 +68,28 @@ def test_exchanged_names_are_told() -> None:
     ids=["right", "one arm across", "in the middle", "no limb", "looking down"],
 )
 def test_sides_that_do_not_tell_are_left_alone(tracks: list[Track]) -> None:
-    assert exchanged_sides(tracks, ROLES, UP) == {}
+    assert exchanged_sides(tracks, MOUNTS, UP) == {}
 
 
 def test_a_camera_on_its_head_does_not_tell() -> None:
-    assert exchanged_sides(_tracks(("left_palm", 0.3), ("right_palm", -0.3)), ROLES, -UP) == {}
+    assert exchanged_sides(_tracks(("left_palm", 0.3), ("right_palm", -0.3)), MOUNTS, -UP) == {}
+
+
+@pytest.mark.parametrize("roll_deg", [0.0, 180.0])
+def test_a_back_camera_has_the_left_hand_on_its_right(roll_deg: float) -> None:
+    own, exchanged = (_tracks(("left_palm", side * 0.3), ("right_palm", side * -0.3)) for side in (1.0, -1.0))
+    mounts = {**MOUNTS, "torso": rolled(BACK, roll_deg)}
+    turn = so3_exp(np.array([0.0, 0.0, np.radians(roll_deg)]))
+    for tracks in (own, exchanged):
+        poses = tracks[0].map_from_cam.copy()
+        poses[:, :3, :3] = poses[:, :3, :3] @ turn
+        tracks[0] = replace(tracks[0], map_from_cam=poses)
+    assert exchanged_sides(own, mounts, UP) == {}
+    assert exchanged_sides(exchanged, mounts, UP) == {"left_palm": 1.0, "right_palm": 1.0}
+
+
+def test_a_limbs_camera_that_leads_does_not_tell() -> None:
+    tracks = _tracks(("left_palm", 0.3), ("right_palm", -0.3))
+    arm = replace(BACK, role="LeftArm")
+    for worn in (arm, replace(MOUNTS["torso"], role="LeftArm")):
+        assert exchanged_sides(tracks, {**MOUNTS, "torso": worn}, UP) == {}
