@@ -72,6 +72,7 @@ class Mount:
         joint_from_cam: (4,4) nominal or solved pose of the camera in the joint's frame.
         sigma_rad: Uncertainty of the rotation, per axis.
         sigma_m: Uncertainty of the position, per axis.
+        by_name: Whether how it is turned, and how well that is known, rests on the camera's name alone.
     """
 
     camera: str
@@ -79,6 +80,7 @@ class Mount:
     joint_from_cam: FloatArray
     sigma_rad: float
     sigma_m: float
+    by_name: bool = False
 
     def __post_init__(self) -> None:
         set_array(self, "joint_from_cam", (4, 4))

@@ -189,6 +189,7 @@ def nominal_mount(camera: str, role: str, skeleton: SkeletonModel) -> Mount:
         joint_from_cam=make_transform(rotation, axes @ centre),
         sigma_rad=NOMINAL_SIGMA_RAD,
         sigma_m=NOMINAL_SIGMA_M,
+        by_name=True,
     )
 
 

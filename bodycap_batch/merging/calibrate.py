@@ -330,7 +330,7 @@ class Calibration:
         """Factors of how cameras are turned that rest on the camera's name."""
         out, first = [], 0
         for camera, name in enumerate(self._samples.cameras):
-            if self._priors[name].sigma_rad >= NOMINAL_SIGMA_RAD:
+            if self._priors[name].by_name:
                 out += [first + 1, first + 2, first + 3]  # the first is the centre's
             first += 4 + 4 * int(self._samples.valid[camera].sum())
         return np.array(out, dtype=np.int64)

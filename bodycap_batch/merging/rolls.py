@@ -15,7 +15,7 @@ from bodycap_batch.merging.calibrate import Calibration
 from bodycap_batch.merging.samples import take_samples
 from bodycap_batch.merging.tracks import SAMPLE_REACH_NS, Track
 from bodycap_batch.skeleton import Mount
-from bodycap_batch.skeleton_presets import NOMINAL_SIGMA_RAD, split_side
+from bodycap_batch.skeleton_presets import split_side
 
 ROLLS_DEG = (0.0, 90.0, 180.0, 270.0)
 CLEARLY = 8.0
@@ -82,8 +82,8 @@ def search_rolls(
 
 
 def is_open(mount: Mount) -> bool:
-    """Whether a mount's orientation rests on its name alone."""
-    return mount.sigma_rad >= NOMINAL_SIGMA_RAD
+    """Whether a mount's orientation rests on its name alone: a job that states its sigma vouches for it."""
+    return mount.by_name
 
 
 def _search(

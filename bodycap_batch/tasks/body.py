@@ -45,6 +45,7 @@ def mount_prior(block: Json, skeleton: SkeletonModel) -> Mount:
         joint_from_cam=nominal.joint_from_cam if pose is None else np.array(pose, dtype=np.float64),
         sigma_rad=usual[0] if sigma_deg is None else float(np.radians(sigma_deg)),
         sigma_m=usual[1] if sigma_m is None else sigma_m,
+        by_name=pose is None and sigma_deg is None,
     )
 
 

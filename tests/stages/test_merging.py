@@ -50,7 +50,10 @@ def _recorded(walk: Walk, gauge: Similarity = GAUGE, **changes: dict) -> list:
 
 
 def _known(walk: Walk) -> dict:
-    mounts = tuple(replace(mount, sigma_rad=np.radians(0.5), sigma_m=0.003) for mount in walk.mounts.values())
+    mounts = tuple(
+        replace(mount, sigma_rad=np.radians(0.5), sigma_m=0.003, by_name=False)
+        for mount in walk.mounts.values()
+    )
     return {"mounts": mounts}
 
 

@@ -155,7 +155,10 @@ def test_a_mounts_name_is_believed_better_than_it_is_weighed(arms):
     # 15 degrees an axis against 15 in all; three differences of three rows for each of five cameras.
     assert calibration.row_variance(mounts, mounts.eliminated())[NAMED] == pytest.approx(1.0 / 3.0)
     assert (mounts.kinds == NAMED).sum() == 5 * 9
-    told = {mount.camera: replace(mount, sigma_rad=0.1) for mount in inputs.mounts}
+    # A job that knows it to 20 degrees only has said so, and no name.
+    told = {
+        mount.camera: replace(mount, sigma_rad=np.radians(20.0), by_name=False) for mount in inputs.mounts
+    }
     stated = Calibration(inputs.skeleton, mounts.body.bones, samples, told, metric, lambda: None)
     stated.solve(metric, iterations=1)
     assert not (stated.solved().kinds == NAMED).any()

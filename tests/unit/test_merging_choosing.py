@@ -186,7 +186,7 @@ def test_cameras_at_one_place_know_it_together_no_better_than_one(capture):
     # Elsewhere on the bone, measured by the job, or never localised: no twin.
     behind = alone.joint_from_cam.copy()
     behind[1, 3] += 0.2
-    for other in ({"joint_from_cam": behind}, {"sigma_rad": 0.02, "sigma_m": 0.01}):
+    for other in ({"joint_from_cam": behind}, {"sigma_rad": 0.02, "sigma_m": 0.01, "by_name": False}):
         assert choosing.share_priors(_with_twin(inputs, **other)).mount_of("torso") == alone
     assert choosing.share_priors(_lose(_with_twin(inputs), "torso_2", 6)).mount_of("torso") == alone
     assert choosing.share_priors(inputs).mounts == inputs.mounts

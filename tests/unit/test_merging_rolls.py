@@ -37,9 +37,10 @@ def test_a_palm_camera_worn_sideways_is_found_out(camera, roll):
     assert found[camera].runner_up()[1] > 0.0
 
 
-def test_a_stated_orientation_is_not_tried():
+@pytest.mark.parametrize("sigma_rad", [STATED_SIGMA_RAD, np.radians(40.0)])
+def test_a_stated_orientation_is_not_tried(sigma_rad):
     inputs, tracks = _worn({})
-    stated = tuple(replace(mount, sigma_rad=STATED_SIGMA_RAD) for mount in inputs.mounts)
+    stated = tuple(replace(mount, sigma_rad=sigma_rad, by_name=False) for mount in inputs.mounts)
     assert not any(is_open(mount) for mount in stated)
     assert search_rolls(replace(inputs, mounts=stated), tracks, 1.0, (UP, None), lambda: None) == ()
 

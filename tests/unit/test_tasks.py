@@ -47,6 +47,7 @@ def test_a_mount_known_by_name_is_the_nominal_one(tmp_path: Path) -> None:
     nominal = nominal_mount("torso", "Spine1", load_skeleton("upper_body", 1.75))
     assert np.array_equal(found.joint_from_cam, nominal.joint_from_cam)
     assert found.sigma_rad == NOMINAL_SIGMA_RAD
+    assert found.by_name
 
 
 def test_a_stated_mount_is_trusted_more(tmp_path: Path) -> None:
@@ -60,6 +61,13 @@ def test_stated_sigmas_win(tmp_path: Path) -> None:
     found = mount(tmp_path, joint_from_cam=QUARTER_TURN, sigma_deg=1.0, sigma_m=0.002)
     assert found.sigma_rad == pytest.approx(np.radians(1.0))
     assert found.sigma_m == 0.002
+
+
+@pytest.mark.parametrize("pose", [QUARTER_TURN, None])
+def test_a_stated_uncertainty_is_no_name_however_large(tmp_path: Path, pose: Any) -> None:
+    found = mount(tmp_path, joint_from_cam=pose, sigma_deg=20.0)
+    assert found.sigma_rad == pytest.approx(np.radians(20.0))
+    assert not found.by_name
 
 
 def test_the_mount_says_where_it_sits_and_the_name_only_names(tmp_path: Path) -> None:
