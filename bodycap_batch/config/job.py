@@ -58,8 +58,8 @@ def load_job(
     """Load a job and resolve it: absolute paths, chapters and sidecars listed, calibrations read.
 
     Args:
-        path: A YAML file (paths in it are relative to it), or a folder of videos: its ``job.yaml`` decides,
-            where there is one.
+        path: A YAML file (paths in it are relative to it, or to the file a link leads to), or a folder of
+            videos: its ``job.yaml`` decides, where there is one, and paths in it are relative to the folder.
         overrides: Values of the command line.
         prepare: Makes the videos of a job with `capture.synthetic` before they are looked for.
         policy: Which files the job may name; any, where it is the user's own.
@@ -73,9 +73,12 @@ def load_job(
         CaptureError: A calibration or a folder of videos cannot be used.
     """
     full = path.resolve()
+    # Beside a file that came alone lies what others dropped.
+    alone = policy is not None and policy.folder is None and not full.is_dir()
     try:
         full = _deciding(full, policy)
-        return _loaded(full, _source(full, limits or Limits()), overrides or Overrides(), prepare, policy)
+        source = _source(full, limits or Limits())
+        return _loaded(full, source, overrides or Overrides(), prepare, policy, alone=alone)
     except PermissionError as error:
         kind = JobError if error.filename == str(full) else CaptureError
         raise kind(
@@ -86,13 +89,13 @@ def load_job(
 
 
 def _deciding(full: Path, policy: PathPolicy | None) -> Path:
-    """The job file: of a folder that one that decides for it, or the folder itself."""
+    """The job file: of a folder that one that decides for it, link or not, or the folder itself."""
     found = job_file_in(full) if full.is_dir() else None
     if found is None:
         return full
     if policy is not None:
         policy.require(found)
-    return found.resolve()
+    return found
 
 
 def _source(full: Path, limits: Limits) -> YamlSource | None:
@@ -110,13 +113,15 @@ def _loaded(
     overrides: Overrides,
     prepare: Prepare | None,
     policy: PathPolicy | None,
+    *,
+    alone: bool,
 ) -> Job:
     if source is None:
         data, base, name = {"capture": folder_capture(full)}, full, full.name
     else:
         base = full.parent
         data = _mapping(source)
-        if policy is None or policy.folder is not None:  # beside one that came alone lies what others dropped
+        if not alone:
             data = _with_videos_beside(data, base)
         name = base.name if full.name in JOB_FILES else full.stem
     job = _with_overrides(_validated(data, full, source), overrides)

@@ -62,11 +62,11 @@ def read_drop(drop: Drop, look: Look, terms: Terms) -> Job:
         raise JobError(
             f"{look.special} is neither a file nor a folder", path=drop.path, hint="remove it from the folder"
         )
-    source = drop.path if drop.is_file else job_file_in(drop.path) or drop.path
-    if source != drop.path:
-        policy.require(source)
-    job = load_job(source, policy=policy, limits=terms.limits)
-    if source != drop.path and job.name == safe_name(source.resolve().parent.name):
+    decides = None if drop.is_file else job_file_in(drop.path)
+    if decides is not None:
+        policy.require(decides)
+    job = load_job(drop.path, policy=policy, limits=terms.limits)
+    if decides is not None and job.name == safe_name(drop.path.resolve().name):
         # Its file gives no name of its own: the drop's, which may be a link to a folder of another.
         job = job.model_copy(update={"name": safe_name(drop.name)})
     _require_sizes(job, terms.limits)

@@ -103,6 +103,16 @@ def test_the_job_file_of_a_folder_decides(tmp_path: Path) -> None:
     assert len(load_job(root).capture.cameras) == 3, "that of results does not speak for videos"
 
 
+def test_a_folder_whose_job_file_is_a_link_keeps_its_name_and_videos(tmp_path: Path) -> None:
+    root = folder(tmp_path / "monday", "torso.mp4", "left_palm.mp4")
+    (folder(tmp_path / "shared", "torso.mp4") / "usual.yaml").write_text("height_m: 1.8\n")
+    (root / "job.yaml").symlink_to("../shared/usual.yaml")
+    job = load_job(root)
+    assert (job.name, job.height_m) == ("monday", 1.8)
+    assert {video.parent for camera in job.capture.cameras for video in camera.video} == {root.resolve()}
+    assert len(job.capture.cameras) == 2
+
+
 def test_a_job_that_names_no_cameras_means_the_videos_beside_it(tmp_path: Path) -> None:
     root = folder(tmp_path, "torso.mp4", "left_palm.mp4")
     (root / "calib.json").write_text(json.dumps(LENS))

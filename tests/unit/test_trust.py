@@ -50,6 +50,16 @@ def test_nothing_outside_is_read_before_it_is_refused(folder: Path, tmp_path: Pa
         load_job(folder)
 
 
+def test_videos_beside_its_job_file_are_those_of_an_opened_folder_but_not_of_a_lone_file(
+    folder: Path,
+) -> None:
+    (folder / "job.yaml").write_text("height_m: 1.75\n")
+    policy = PathPolicy(folder=None, roots=(folder,))
+    assert [camera.name for camera in load_job(folder, policy=policy).capture.cameras] == ["torso"]
+    with pytest.raises(JobError, match="missing"):
+        load_job(folder / "job.yaml", policy=policy)
+
+
 def test_a_chapter_that_leads_outside_is_refused(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "secret.mp4").touch()
     (folder / "head").mkdir()

@@ -12,10 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from bodycap_batch.errors import StoreError
+from bodycap_batch.errors import JobError, StoreError
 from bodycap_batch.watch.changes import Changes, on_network_disk
 from bodycap_batch.watch.claim import Onlooker, first_claim, take_over
 from bodycap_batch.watch.drops import Drop, Settling, drops_in, look_at
+from bodycap_batch.watch.intake import Terms, read_drop
 from bodycap_batch.watch.options import WatchOptions
 from bodycap_batch.watch.spool import JobDir, Spool, move, spool_at, spool_name
 
@@ -195,6 +196,19 @@ def test_the_spool_is_found_from_its_inbox_and_from_its_folder(tmp_path: Path) -
     want = Spool(inbox=tmp_path / "jobs" / "inbox", root=tmp_path / "jobs")
     assert spool_at(tmp_path / "jobs") == want
     assert spool_at(tmp_path / "jobs" / "inbox") == want
+
+
+def test_the_videos_of_a_linked_drop_are_those_beside_its_job_file(tmp_path: Path) -> None:
+    footage = tmp_path / "footage"
+    footage.mkdir()
+    (footage / "torso.mp4").touch()
+    (footage / "job.yaml").write_text("height_m: 1.75\n")
+    (tmp_path / "tuesday").symlink_to(footage)
+    drop = Drop(tmp_path / "tuesday")
+    job = read_drop(drop, look_at(drop, 100), Terms(roots=(footage,)))
+    assert (job.name, [camera.name for camera in job.capture.cameras]) == ("tuesday", ["torso"])
+    with pytest.raises(JobError, match="outside"):
+        read_drop(drop, look_at(drop, 100), Terms())
 
 
 def test_an_unknown_folder_holds_the_inbox_and_what_is_in_it_is_no_job(tmp_path: Path) -> None:
