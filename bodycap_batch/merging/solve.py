@@ -239,11 +239,9 @@ class MotionGraph:
             keys = self._measured_keys[track.camera]
             solved = np.array([values.atPose3(key).matrix() for key in keys]).reshape(-1, 4, 4) @ mount
             world_from_cam[track.camera] = solved
-            off = invert(track.map_from_cam) @ solved
-            residual_m[track.camera] = np.linalg.norm(off[:, :3, 3], axis=1)
-            residual_rad[track.camera] = np.linalg.norm(so3_log(off[:, :3, :3]), axis=1)
-            whitened = np.linalg.solve(np.linalg.cholesky(camera_covariance(track)), _log(off)[..., None])
-            weights[track.camera] = _geman_mcclure(np.linalg.norm(whitened[..., 0], axis=1))
+            residual_m[track.camera], residual_rad[track.camera], weights[track.camera] = missed(
+                track, solved
+            )
         errors, first = {}, 0
         for kind, size in self._sizes.items():
             errors[kind] = float(sum(self._graph.at(i).error(values) for i in range(first, first + size)))
@@ -257,6 +255,14 @@ class MotionGraph:
             iterations=count,
             errors=errors,
         )
+
+
+def missed(track: Track, world_from_cam: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """How far (N,) the measured poses lie from solved ones, metres and rad, and the weights they keep."""
+    off = invert(track.map_from_cam) @ world_from_cam
+    whitened = np.linalg.solve(np.linalg.cholesky(camera_covariance(track)), _log(off)[..., None])
+    distance_m, turn_rad = (np.linalg.norm(part, axis=1) for part in (off[:, :3, 3], so3_log(off[:, :3, :3])))
+    return distance_m, turn_rad, _geman_mcclure(np.linalg.norm(whitened[..., 0], axis=1))
 
 
 def _shared_time(taken: dict[int, int], time_ns: int) -> int:

@@ -74,7 +74,7 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         tick_times,
         [loosened(track, mount) for track, mount in zip(metric, calibrated.mounts, strict=True)],
         step,
-        chunk_ticks=longest_stretch(len(bones), tracks),
+        chunk_ticks=longest_stretch(len(bones), tracks, tick_times),
         spread=calibrated.spread,
     )
     world_from_solved, joints, solved, floor = _place(inputs, bones, solution, calibrated, fps)

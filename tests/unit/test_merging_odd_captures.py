@@ -14,7 +14,7 @@ from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging import calibrate
 from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.calibrate import Calibration
-from bodycap_batch.merging.chunks import CHUNK_TICKS, longest_stretch, with_overlap
+from bodycap_batch.merging.chunks import with_overlap
 from bodycap_batch.merging.common_walk import require_common_time
 from bodycap_batch.merging.distance import known_distance
 from bodycap_batch.merging.initial import anchor_and_reach
@@ -220,9 +220,3 @@ def test_stretches_share_three_seconds_at_any_rate(fps):
     ticks = np.round(np.arange(20 * fps) * 1e9 / fps).astype(np.int64)
     assert with_overlap(ticks, 8 * fps, 12 * fps) == (5 * fps, 15 * fps)
     assert with_overlap(ticks, 0, 19 * fps) == (0, 20 * fps)
-
-
-def test_stretches_get_shorter_with_many_cameras(body):
-    tracks = body[2]
-    assert longest_stretch(9, tracks) == CHUNK_TICKS
-    assert 300 <= longest_stretch(15, [*tracks, *tracks, *tracks, *tracks]) < 600
