@@ -68,11 +68,14 @@ def _expanded(luma: Image) -> Image:
 def work_planes(frame: VideoFrame, orientation: Orientation, size: tuple[int, int]) -> tuple[Planes, Colours]:
     """Luma and halved chroma, upright, at (width, height) filled up to even sides, in the frame's own range.
 
-    Where the size is the frame's own and its chroma is halved already, they are its planes, unchanged.
+    Where the size is the frame's own and it has 8 bits and halved chroma already (4:2:0), they are its
+    planes, unchanged; of another format luma is within one level.
     """
-    colours = (_FULL_RANGE if _is_full_range(frame) else int(frame.color_range), int(frame.colorspace))
+    full = _is_full_range(frame)
+    colours = (_FULL_RANGE if full else int(frame.color_range), int(frame.colorspace))
     if frame.format.name not in ("yuv420p", "yuvj420p"):
-        frame = frame.reformat(format="yuv420p")
+        # Left to itself it makes studio range of grey and of what only its format tells to be full.
+        frame = frame.reformat(format="yuv420p", dst_color_range=_FULL_RANGE if full else None)
     half = ((size[0] + 1) // 2, (size[1] + 1) // 2)
     luma = _resized(_plane(frame, 0), orientation, size)
     luma = np.pad(luma, ((0, size[1] % 2), (0, size[0] % 2)), mode="edge")

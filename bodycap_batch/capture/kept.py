@@ -96,7 +96,8 @@ class Shot:
 def keeps_all(stored_size: tuple[int, int], work_size: tuple[int, int]) -> bool:
     """True for videos so large that all of their frames are kept, very nearly as they are.
 
-    Of others the keyframes are, without any loss: these alone are read more than twice.
+    Of others the keyframes are, without any loss where they have 8 bits and 4:2:0 chroma, else within a level
+    of grey: these alone are read more than twice.
     """
     return stored_size[0] * stored_size[1] >= _LARGE * work_size[0] * work_size[1]
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
 from bodycap_batch.capture import CaptureCamera, FrameKeeper, open_camera
+from bodycap_batch.capture.images import grey_of, work_image, work_planes
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.context import StageContext
 from bodycap_batch.tasks import STAGES
@@ -60,6 +62,34 @@ def test_keyframes_are_kept_bit_by_bit_and_need_no_video(tmp_path: Path, pix_fmt
     wanted = both(camera, CHOSEN)
     video.unlink()
     assert_same(both(kept, CHOSEN), wanted)
+
+
+@pytest.mark.parametrize("told", [0, 1, 2], ids=["range not told", "studio range", "full range"])
+@pytest.mark.parametrize(
+    ("pix_fmt", "off"),
+    [
+        *((name, 0) for name in ("gray", "gray10le", "gray16le", "nv12", "yuv444p", "yuvj422p", "yuvj444p")),
+        *((name, 1) for name in ("yuv420p10le", "yuv422p10le", "rgb24", "bgr0", "gbrp")),
+    ],
+)
+def test_luma_of_any_format_is_kept_in_the_range_that_is_told(pix_fmt: str, off: int, told: int) -> None:
+    ramp = np.tile(np.arange(256, dtype=np.uint8), (16, 1))
+    frame = av.VideoFrame.from_ndarray(np.stack([ramp, ramp[::-1], 255 - ramp], axis=-1), format="rgb24")
+    frame = frame.reformat(format=pix_fmt)
+    frame.color_range = told
+    upright = ((1, 0), (0, 1))
+    grey = work_image(frame, upright, (256, 16), colour=False)
+    kept = grey_of(work_planes(frame, upright, (256, 16)), (256, 16))
+    assert np.ptp(grey) > 100
+    assert np.abs(kept.astype(int) - grey).max() <= off
+
+
+@pytest.mark.parametrize("pix_fmt", ["gray", "gray10le"])
+def test_a_grey_video_is_kept_in_its_own_shades(tmp_path: Path, pix_fmt: str) -> None:
+    frames = [frame[..., 0] for frame in noisy_frames(64, 48)]
+    camera = opened(write_video(tmp_path / "a.mkv", frames, codec="ffv1", pix_fmt=pix_fmt))
+    shades = zip(both(with_kept(camera, tmp_path), CHOSEN), both(camera, CHOSEN), strict=True)
+    assert max(np.abs(a.astype(int) - b).max() for (_, a), (_, b) in shades) <= 2 * (pix_fmt != "gray")
 
 
 def test_one_frame_more_is_read_from_the_video_in_its_place(tmp_path: Path) -> None:
