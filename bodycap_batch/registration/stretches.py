@@ -58,7 +58,8 @@ def all_tracks(
         done = set(zip([None, *known.keyframes], [*known.keyframes, None], strict=True))
         parts.append(_inside(known.tracks, [stretch for stretch in stretches if stretch in done], count))
     todo = _joined([stretch for stretch in stretches if stretch not in done], count)
-    tracks = Tracks.join(parts + _track(camera, anchors, _shared_out(todo, frames, context.threads), context))
+    parts += _track(camera, anchors, _shared_out(todo, frames, context.threads), context)
+    tracks = Tracks.join(parts)  # which takes them out one by one: nothing else may hold them
     give_back()  # the many small pieces: 330 MB after ten minutes of video
     return tracks
 
