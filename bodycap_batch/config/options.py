@@ -61,11 +61,6 @@ class RegistrationOptions(Options):
     )
 
 
-LEAST_LOST, LEAST_POSED = 3, 20
-"""A camera's lost frames are looked for once more where there are so many, among so many with poses: fewer
-are not worth decoding the keyframes of all cameras again; from fewer poses nobody knows how it moves."""
-
-
 MARKER_COUNTS = {
     **{f"{n}X{n}_{count}": count for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
     "ARUCO_ORIGINAL": 1024,

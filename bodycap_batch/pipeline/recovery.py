@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
+from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_POSED
 from bodycap_batch.config.models import Job
-from bodycap_batch.config.options import LEAST_LOST, LEAST_POSED
 from bodycap_batch.pipeline.inputs import beside_others, key_of
 from bodycap_batch.runner import Task
 from bodycap_batch.store import Artefact

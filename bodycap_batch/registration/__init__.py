@@ -10,7 +10,7 @@ import numpy as np
 from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import RegistrationOptions
-from bodycap_batch.config.options import LEAST_LOST
+from bodycap_batch.config.lost_frames import LEAST_LOST
 from bodycap_batch.context import StageContext
 from bodycap_batch.registration.growth import wanted_keyframes
 from bodycap_batch.registration.pose import FramePose, PoseLimits

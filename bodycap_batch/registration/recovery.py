@@ -10,7 +10,7 @@ import numpy as np
 from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.config import RegistrationOptions
-from bodycap_batch.config.options import LEAST_POSED
+from bodycap_batch.config.lost_frames import LEAST_POSED
 from bodycap_batch.context import StageContext
 from bodycap_batch.geometry import invert
 from bodycap_batch.registration.confirmed import confirmed_points

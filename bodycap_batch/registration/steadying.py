@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from bodycap_batch.arrays import BoolArray
-from bodycap_batch.config.options import LEAST_POSED
+from bodycap_batch.config.lost_frames import LEAST_POSED
 from bodycap_batch.geometry import invert
 from bodycap_batch.registration.finding import Fix
 from bodycap_batch.registration.smoothing import Steadiness, smooth_centres

@@ -112,6 +112,10 @@ def test_what_only_talks_does_not_count(copied: Path) -> None:
     assert changed_by(copied / "config" / "options.py") == set()
 
 
+def test_when_lost_frames_are_looked_for_counts(copied: Path) -> None:
+    assert changed_by(copied / "config" / "lost_frames.py") == {"registration", "recover", "rig"}
+
+
 def test_libraries_are_named_with_their_versions() -> None:
     found = identity.library_versions(("numpy", "not-a-library|pydantic", "nothing-of-that-name"))
     assert found["numpy"].count(".") >= 1

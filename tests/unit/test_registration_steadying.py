@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.config.options import LEAST_LOST
+from bodycap_batch.config.lost_frames import LEAST_LOST
 from bodycap_batch.geometry import make_transform, so3_exp
 from bodycap_batch.registration import _finished
 from bodycap_batch.registration.steadying import steadied
