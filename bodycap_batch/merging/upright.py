@@ -75,7 +75,8 @@ class Direction:
         sigma_deg: How far off it may be.
         others: The best each other source has to say, and the best that is far from what was taken.
         nats: How strange all of the rest is with it.
-        margin_nats: How much stranger it is with the best far one; None where there is none.
+        margin_nats: How much stranger it is with the best far one, of those that the job states if it does;
+            None where there is none.
     """
 
     up: FloatArray
@@ -147,7 +148,8 @@ def find_up(body: BodyUp, around: Around, rng: np.random.Generator, stated: Sequ
         )
         for say, lean in zip(says, leans.tolist(), strict=True)
     ]
-    return _direction(_choose(says, {say.source for say in stated}), says, hints[2])
+    sources = {say.source for say in stated}
+    return _direction(_choose(says, sources), says, sources, hints[2])
 
 
 def _choose(says: Sequence[Say], stated: Collection[str]) -> Say:
@@ -161,12 +163,18 @@ def _choose(says: Sequence[Say], stated: Collection[str]) -> Say:
     return min(agree, key=lambda say: say.nats, default=best)
 
 
-def _direction(chosen: Say, says: Sequence[Say], erect: FloatArray) -> Direction:
+def _direction(chosen: Say, says: Sequence[Say], stated: Collection[str], erect: FloatArray) -> Direction:
+    """What was taken, beside what else might have been: of what the job states, another of that."""
     best: dict[str, Say] = {}
     for say in sorted(says, key=lambda say: say.nats):
         if say.source != chosen.source:
             best.setdefault(say.source, say)
-    far = [say for say in says if apart_deg(say.up, chosen.up) > _APART_DEG and say.source != "body"]
+    far = [
+        say
+        for say in says
+        if apart_deg(say.up, chosen.up) > _APART_DEG
+        and (say.source in stated if stated else say.source != "body")
+    ]
     rival = min(far, key=lambda say: say.nats, default=None)
     others = list(best.values())
     if rival is not None and all(rival is not say for say in others):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from bodycap_batch.geometry import make_transform, so3_exp
+from bodycap_batch.merging.advice import up_sentence
 from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.lean import BodyUp, body_up
 from bodycap_batch.merging.upright import Around, Direction, Say, find_up
@@ -134,6 +137,18 @@ def test_a_board_on_the_floor_tells_who_is_upside_down():
     lying = [Say(source="marker board", up=TURN @ UP, sigma_deg=1.5)]
     found = _found(so3_exp([np.pi, 0.0, 0.0]) @ axes, path, _box_room(rng), stated=lying)
     assert _off_deg(found) < 0.5
+    # However strange it is beside what the job does not say.
+    assert found.determined()
+    assert up_sentence(SimpleNamespace(up=found)).endswith("from the map")
+
+
+def test_a_board_hung_at_half_a_right_angle_leaves_two_of_its_edges():
+    rng = np.random.default_rng(1)
+    axes, path = _leaning(rng, 0.0, 1.0)
+    hung = TURN @ so3_exp([0.0, np.radians(45.0), 0.0])
+    ups = (-hung[:, 0], hung[:, 2])
+    edges = [Say(source="marker board", up=up, sigma_deg=1.5) for up in ups]
+    assert not _found(axes, path, np.zeros((0, 3)), stated=edges).determined()
 
 
 def test_two_directions_that_explain_as_much_are_told():
