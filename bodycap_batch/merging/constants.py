@@ -29,7 +29,7 @@ from bodycap_batch.skeleton import Mount, SkeletonModel
 from bodycap_batch.skeleton_presets import split_side
 
 _CALIBRATION_TICKS = 80
-_ENOUGH_WALKING = 10
+ENOUGH_WALKING = 10
 PROPORTION_SIGMA = 0.04
 """Spread of a limb's share of the stature between people, so also of a scale that rests on it (standard
 deviations of segment lengths over stature are 3 to 5 %: Winter's table gives means only; C. C. Gordon et al.,
@@ -102,8 +102,8 @@ def calibrate_body(
     points = points_around(inputs, tracks[0].camera)
     t_pose_ns = _t_pose(inputs, options, bones, cleaned)
     board = find_board(inputs, options, cleaned.places)
-    stated_up = _stated_up(options, board)
-    inputs, known_up, rolls = _right_way_up(inputs, bones, cleaned, (t_pose_ns, stated_up), step)
+    says = stated_up(options, board)
+    inputs, known_up, rolls = _right_way_up(inputs, bones, cleaned, (t_pose_ns, says), step)
     priors = {mount.camera: mount for mount in inputs.mounts}
     samples = take_samples(tracks, provisional, _CALIBRATION_TICKS, known_up, t_pose_ns)
     calibration = Calibration(inputs.skeleton, bones, samples, priors, provisional, step)
@@ -119,10 +119,10 @@ def calibrate_body(
         path_m=path_m,
         standing_m=gauge.standing_height(inputs.skeleton, bones[0].joint),
     )
-    up = find_up(body_up(inputs.skeleton, bones, poses), around, np.random.default_rng(0), stated_up)
+    up = find_up(body_up(inputs.skeleton, bones, poses), around, np.random.default_rng(0), says)
     walking = samples.posture.walking
     # Who bends down or sits is not as tall as who walks.
-    erect = poses[walking] if walking.sum() >= _ENOUGH_WALKING else poses
+    erect = poses[walking] if walking.sum() >= ENOUGH_WALKING else poses
     height = _height_over_floor(inputs, bones, erect, up, (estimate.scale * points, path_m))
     stated = (known_distance(inputs, options, cleaned.places), board.scale if board else None)
     known = tuple(source for source in stated if source is not None)
@@ -160,27 +160,46 @@ def _right_way_up(
 ) -> tuple[MergeInputs, FloatArray | None, tuple[RollSearch, ...]]:
     """The priors with each camera the way up it sits, the vertical where it is known, and what was tried."""
     t_pose_ns, stated = known
-    trunk = cleaned.tracks[0].scaled(cleaned.provisional)
-    points_m = cleaned.provisional * points_around(inputs, trunk.camera)
-    prior = inputs.mount_of(trunk.camera)
-    roll, up = trunk_roll(
-        inputs,
-        cleaned.tracks,
-        lambda degrees: early_up(inputs.skeleton, bones, (trunk, rolled(prior, degrees)), points_m, stated),
-    )
-    inputs = _rolled(inputs, {trunk.camera: roll})
+    roll, found = trunk_way_up(inputs, bones, cleaned.tracks, cleaned.provisional, stated)
+    up = None if found is None else found.up
+    inputs = rolled_mounts(inputs, {cleaned.tracks[0].camera: roll})
     rolls = search_rolls(inputs, cleaned.tracks, cleaned.provisional, (up, t_pose_ns), step)
-    return _rolled(inputs, {each.camera: each.chosen_deg for each in rolls}), up, rolls
+    return rolled_mounts(inputs, {each.camera: each.chosen_deg for each in rolls}), up, rolls
 
 
-def _stated_up(options: MergeOptions, board: Board | None) -> tuple[Say, ...]:
+def trunk_way_up(
+    inputs: MergeInputs,
+    bones: Sequence[Bone],
+    tracks: Sequence[Track],
+    provisional: float,
+    stated: Sequence[Say],
+) -> tuple[float, Direction | None]:
+    """Roll (degrees) of the leading camera of a map's tracks, and the vertical where it is known early."""
+    trunk = tracks[0].scaled(provisional)
+    points_m = provisional * points_around(inputs, trunk.camera)
+    prior = inputs.mount_of(trunk.camera)
+    ways: dict[float, Direction] = {}
+
+    def up_of(degrees: float) -> FloatArray | None:
+        found = early_up(inputs.skeleton, bones, (trunk, rolled(prior, degrees)), points_m, stated)
+        if found is None:
+            return None
+        ways[degrees] = found
+        return found.up
+
+    roll, _ = trunk_roll(inputs, tracks, up_of)
+    return roll, ways.get(roll)
+
+
+def stated_up(options: MergeOptions, board: Board | None) -> tuple[Say, ...]:
     """What the job itself says of up."""
     if board is None or options.marker_board is None:
         return ()
     return board.ups(options.marker_board.placed)
 
 
-def _rolled(inputs: MergeInputs, degrees: Mapping[str, float]) -> MergeInputs:
+def rolled_mounts(inputs: MergeInputs, degrees: Mapping[str, float]) -> MergeInputs:
+    """The priors with cameras turned about their optical axes."""
     mounts = tuple(rolled(mount, degrees.get(mount.camera, 0.0)) for mount in inputs.mounts)
     return replace(inputs, mounts=mounts)
 
@@ -207,8 +226,8 @@ def early_up(
     worn: tuple[Track, Mount],
     points_m: FloatArray,
     stated: Sequence[Say] = (),
-) -> FloatArray | None:
-    """The vertical (3,) where the job, planes or the walk tell it, before anything is solved.
+) -> Direction | None:
+    """The vertical where the job, planes or the walk tell it, before anything is solved.
 
     None from a limb's camera: a swinging arm tells neither the vertical nor the way the body faces.
     """
@@ -221,7 +240,7 @@ def early_up(
         standing_m=gauge.standing_height(skeleton, bones[trunk.bone].joint),
     )
     found = find_up(body_up_from_prior(bones, trunk, prior), around, np.random.default_rng(0), stated)
-    return None if found.source == "body" or not found.determined() else found.up
+    return None if found.source == "body" or not found.determined() else found
 
 
 def _height_over_floor(

@@ -19,12 +19,13 @@ from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging.bones import Bone, graph_bones
 from bodycap_batch.merging.calibrate import Calibration
-from bodycap_batch.merging.common_walk import require_common_time, starts_of
-from bodycap_batch.merging.constants import early_up, points_around
-from bodycap_batch.merging.known_scale import known_scales
+from bodycap_batch.merging.common_walk import Starts, require_common_time, starts_of
+from bodycap_batch.merging.constants import points_around, rolled_mounts, trunk_way_up
+from bodycap_batch.merging.known_scale import Stated, floor_scale, stated_in
 from bodycap_batch.merging.placing import Placing
 from bodycap_batch.merging.samples import take_samples
 from bodycap_batch.merging.tracks import Track, clean, in_gauge, make_track, moved
+from bodycap_batch.merging.upright import Direction
 from bodycap_batch.scene import Trajectory
 
 MAX_SIGMA_M = 0.06
@@ -177,6 +178,36 @@ def _cannot(gauge: str, trunk: tuple[str, str], why: str) -> str:
     return f"its map {gauge} shares no view with {trunk[0]}'s {trunk[1]}, and the body cannot place it: {why}"
 
 
+def _begin(
+    inputs: MergeInputs,
+    bones: Sequence[Bone],
+    main: Sequence[Track],
+    others: Sequence[tuple[str, Sequence[Track]]],
+    stated: Stated,
+) -> tuple[MergeInputs, Starts, Direction | None]:
+    """The trunk's camera the way up it sits, where the maps start then, and the vertical if known."""
+    start = starts_of(bones, main, others, {mount.camera: mount for mount in inputs.mounts})
+    own = _cleaned(inputs, main, start.metric)
+    roll, up = trunk_way_up(inputs, bones, own, start.metric, stated.ups)
+    if roll:
+        inputs = rolled_mounts(inputs, {main[0].camera: roll})
+        start = starts_of(bones, main, others, {mount.camera: mount for mount in inputs.mounts})
+    return inputs, start, up
+
+
+def _require_one_scale(strain: float, reach_sigma: float) -> None:
+    if strain > _MAX_STRAIN:
+        raise EstimationError(
+            f"the limbs' reach and the way the cameras move disagree on the scale by "
+            f"{100 * strain * reach_sigma:.0f} %",
+            hint="a longer walk with turns tells more",
+        )
+
+
+def _cleaned(inputs: MergeInputs, tracks: Sequence[Track], scale: float) -> list[Track]:
+    return [clean(each, scale, inputs.clocks[each.camera].nominal_fps)[0] for each in tracks]
+
+
 def join_maps(
     inputs: MergeInputs,
     options: MergeOptions,
@@ -197,31 +228,28 @@ def join_maps(
         EstimationError: The cameras' distances or their movement fit no person, or they were hardly localised
             together.
     """
+    (here, main), *others = tracks.items()
+    stated = stated_in(inputs, options, here)
+    inputs, start, up = _begin(inputs, bones, main, others, stated)
     mounts = {mount.camera: mount for mount in inputs.mounts}
-    (_, main), *others = tracks.items()
-    start = starts_of(bones, main, others, mounts)
     starts, provisional = start.places, start.metric
     together = [*main, *(moved(track, starts[gauge]) for gauge, group in others for track in group)]
-    together = [clean(each, provisional, inputs.clocks[each.camera].nominal_fps)[0] for each in together]
-    trunk = together[0].scaled(provisional)
-    points_m = provisional * points_around(inputs, trunk.camera)
-    known_up = early_up(inputs.skeleton, bones, (trunk, mounts[trunk.camera]), points_m)
-    samples = take_samples(together, provisional, _SAMPLES, known_up)
+    together = _cleaned(inputs, together, provisional)
+    samples = take_samples(together, provisional, _SAMPLES, None if up is None else up.up)
     calibration = Calibration(inputs.skeleton, bones, samples, mounts, provisional, step)
     names = {gauge: tuple(track.camera for track in group) for gauge, group in others}
     known = _REACH_SIGMA if start.spanned else _APART_SIGMA
     reach_sigma = known if start.told else _UNTOLD_SIGMA
-    problem = Placing(calibration, list(names.values()), provisional, reach_sigma=reach_sigma)
+    problem = Placing(
+        calibration, list(names.values()), provisional, reach_sigma=reach_sigma, stated=stated.scales
+    )
     problem.solve()
-    strain = abs(problem.from_reach())
-    if strain > _MAX_STRAIN:
-        raise EstimationError(
-            f"the limbs' reach and the way the cameras move disagree on the scale by "
-            f"{100 * strain * reach_sigma:.0f} %",
-            hint="a longer walk with turns tells more",
-        )
-    seen = together[0], known_up
-    problem.know(known_scales(inputs, options, seen, problem.scale(), points_around(inputs, trunk.camera)))
+    # Reach and movement may disagree on what the job states.
+    if not stated.scales:
+        _require_one_scale(abs(problem.from_reach()), reach_sigma)
+        points = points_around(inputs, together[0].camera)
+        floor = floor_scale(inputs, (together[0], up), problem.scale(), points)
+        problem.know(() if floor is None else (floor,))
     out = []
     for index, (gauge, cameras) in enumerate(names.items()):
         sigma_rad, sigma_m = problem.sigmas(index)

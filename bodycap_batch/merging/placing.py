@@ -29,6 +29,7 @@ class Placing:
         groups: The cameras of each further map.
         scale: Metres per unit of the main map, provisional.
         reach_sigma: Of its logarithm.
+        stated: What the job itself says of it.
     """
 
     def __init__(
@@ -38,10 +39,12 @@ class Placing:
         scale: float,
         *,
         reach_sigma: float,
+        stated: Sequence[ScaleSource] = (),
     ) -> None:
         self._calibration, self._scale = calibration, scale
         self._sources: tuple[ScaleSource, ...] = (
             ScaleSource(name="reach", scale=scale, sigma_log=reach_sigma),
+            *stated,
         )
         cameras = calibration.samples.cameras
         self._members = [[cameras.index(name) for name in group] for group in groups]

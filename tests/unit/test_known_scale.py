@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from bodycap_batch.config.options import MergeOptions
+from bodycap_batch.errors import EstimationError
+from bodycap_batch.geometry import make_transform, so3_exp
+from bodycap_batch.merging import joining
 from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.choosing import choices
+from bodycap_batch.merging.constants import trunk_way_up
 from bodycap_batch.merging.joining import use_together
-from bodycap_batch.merging.known_scale import known_scales
+from bodycap_batch.merging.known_scale import Stated, floor_scale, stated_in
+from bodycap_batch.merging.placing import Placing
 from bodycap_batch.merging.scale import ScaleSource
-from bodycap_batch.merging.tracks import make_track
+from bodycap_batch.merging.tracks import Track, make_track
+from bodycap_batch.merging.upright import Direction, Say
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.joining import SPLITS, _off
 from tests.bench.posed import posed
@@ -30,7 +38,11 @@ def short():
     return _drawn(6.0)
 
 
-def _asked(capture, options, points=None, off=1.1, up=True):
+def _direction(up, source="map"):
+    return Direction(up, source, None, 0.0)
+
+
+def _asked(capture, options, points=None, off=1.1, up="map"):
     """What is known of the trunk's map, by a body whose own scale is off by a factor."""
     inputs = capture.inputs
     bones = graph_bones(inputs.skeleton, {mount.role for mount in inputs.mounts})
@@ -38,11 +50,13 @@ def _asked(capture, options, points=None, off=1.1, up=True):
     index = [bone.role for bone in bones].index(inputs.mount_of("torso").role)
     gauge = capture.gauges[trunk.gauge]
     body = ScaleSource(name="body", scale=off / gauge.scale, sigma_log=0.1)
-    seen = make_track(inputs, trunk, index), gauge.rotation @ UP if up else None
+    seen = make_track(inputs, trunk, index), _direction(gauge.rotation @ UP, up) if up else None
     points = np.zeros((0, 3)) if points is None else gauge.apply(points)
+    stated = stated_in(inputs, options, trunk.gauge).scales
+    floor = floor_scale(inputs, seen, body, points)
     return [
         (each.name, each.scale * gauge.scale, each.sigma_log)
-        for each in known_scales(inputs, options, seen, body, points)
+        for each in (*stated, *(() if floor is None else (floor,)))
     ]
 
 
@@ -65,7 +79,8 @@ def test_the_height_over_the_walked_floor_tells_the_scale(short):
     assert scale == pytest.approx(1.0, abs=0.06)
     assert 0.02 < sigma < 0.1
     # Neither without the vertical, nor by a table, nor from what is no floor of this body's.
-    assert _asked(short, options, _floor(short, 0.0), up=False) == []
+    assert _asked(short, options, _floor(short, 0.0), up=None) == []
+    assert _asked(short, options, _floor(short, 0.0), up="walk") == []
     assert _asked(short, options, _floor(short, 0.7)) == []
     assert _asked(short, options, _floor(short, 0.0), off=1.5) == []
     assert _asked(short, options) == []
@@ -80,8 +95,40 @@ def _distance(capture, camera):
     return MergeOptions(known_distance=(f"{camera}:{ends[0]}", f"{camera}:{ends[1]}", metres))
 
 
-def test_a_stated_distance_in_the_trunks_map_overrules_the_floor(short):
-    ((name, scale, sigma),) = _asked(short, _distance(short, "torso"), _floor(short, 0.0))
+def _sitter(inputs, walks):
+    """A torso's track that walks to and fro for a share of its 600 frames, then sits 35 cm lower."""
+    count = np.arange(600)
+    walking = count < walks * 600
+    sway = 1.5 * np.sin(count / 40.0)
+    path = np.stack([sway, 0.4 * np.cos(count / 30.0), np.full(600, 1.30)], axis=1)
+    first = path[int(walking.sum()) - 1] if walks else path[0]
+    path[~walking] = first - [0.0, 0.0, 0.35]
+    heading = np.where(np.diff(sway, append=sway[-1]) > 0.0, 0.0, np.pi)
+    level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    turned = so3_exp(heading[:, None] * UP) @ level
+    return Track(
+        camera="torso",
+        bone=0,
+        frames=count,
+        times_ns=count * 33_333_333,
+        map_from_cam=make_transform(turned, path),
+        sigma_rad=np.full(600, 0.005),
+        sigma_map=np.full(600, 0.005),
+    )
+
+
+def test_who_sits_is_not_as_tall_as_who_walks(short):
+    inputs, rng = short.inputs, np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform(-2.0, 2.0, (300, 2)), rng.normal(scale=0.005, size=300)])
+    body = ScaleSource(name="body", scale=1.0, sigma_log=0.15)
+    seen = [(_sitter(inputs, walks), _direction(UP)) for walks in (1.0, 0.4, 0.0)]
+    always, seldom, never = (floor_scale(inputs, each, body, floor) for each in seen)
+    assert seldom.scale == pytest.approx(always.scale, abs=0.02)
+    assert never is None
+
+
+def test_a_stated_distance_in_the_trunks_map_is_known_beside_the_floor(short):
+    (name, scale, sigma), _ = _asked(short, _distance(short, "torso"), _floor(short, 0.0))
     assert name == "known distance"
     assert scale == pytest.approx(1.0, abs=1e-6)
     assert sigma < 0.01
@@ -90,6 +137,71 @@ def test_a_stated_distance_in_the_trunks_map_overrules_the_floor(short):
 def test_a_distance_in_another_map_waits_until_that_is_placed(short):
     told = _asked(short, _distance(short, "left_palm"), _floor(short, 0.0))
     assert [name for name, _, _ in told] == ["floor"]
+
+
+def test_a_join_is_told_what_the_job_states_of_up_and_how_the_trunks_camera_is_rolled(short, monkeypatch):
+    lying, told = Say(source="marker board", up=UP, sigma_deg=1.5), []
+
+    def way_up(*arguments):
+        told.append(arguments[-1])
+        return 180.0, None
+
+    def calibration(skeleton, bones, samples, mounts, *_):
+        told.append(mounts["torso"])
+        raise EstimationError("enough")
+
+    monkeypatch.setattr(joining, "stated_in", lambda *_: Stated(ups=(lying,)))
+    monkeypatch.setattr(joining, "trunk_way_up", way_up)
+    monkeypatch.setattr(joining, "Calibration", calibration)
+    main, further = choices(short.inputs)[0]
+    assert "enough" in use_together(short.inputs, main, further[:1], lambda: None).unused[further[0].camera]
+    assert told[0] == (lying,)
+    usual = short.inputs.mount_of("torso").joint_from_cam
+    assert np.allclose(told[1].joint_from_cam[:3, :2], -usual[:3, :2])
+
+
+def test_what_is_stated_or_seen_early_says_where_it_is_from(short):
+    inputs = short.inputs
+    bones = graph_bones(inputs.skeleton, {mount.role for mount in inputs.mounts})
+    trunk = next(each for each in inputs.trajectories if each.camera == "torso")
+    tracks = [make_track(inputs, trunk, [bone.role for bone in bones].index("Spine1"))]
+    unit = short.gauges[trunk.gauge]
+    lying = Say(source="marker board", up=unit.rotation @ UP, sigma_deg=1.5)
+    roll, up = trunk_way_up(inputs, bones, tracks, 1.0 / unit.scale, (lying,))
+    assert (roll, up.source) == (0.0, "marker board")
+
+
+class _Strained(Placing):
+    """Maps whose cameras move as if the scale were nine sigmas from what the limbs reach."""
+
+    def solve(self):
+        self._covariance = 1e-4 * np.eye(1 + 7 * len(self.moved))
+
+    def from_reach(self):
+        return 9.0
+
+
+def test_a_stated_scale_saves_a_join_on_whose_scale_reach_and_movement_disagree(short, monkeypatch):
+    monkeypatch.setattr(joining, "Placing", _Strained)
+    main, further = choices(short.inputs)[0]
+    refused, placed = (
+        use_together(short.inputs, main, further[:1], lambda: None, options).unused
+        for options in (MergeOptions(), _distance(short, "torso"))
+    )
+    assert "disagree on the scale" in refused[further[0].camera]
+    assert not placed
+
+
+def test_maps_are_placed_at_the_stated_scale():
+    problem = Placing(
+        SimpleNamespace(samples=SimpleNamespace(cameras=())),
+        [],
+        1.0,
+        reach_sigma=0.05,
+        stated=(ScaleSource(name="known distance", scale=1.2, sigma_log=0.01),),
+    )
+    assert problem._from_sources() == pytest.approx([0.0, -np.log(1.2) / 0.01])
+    assert problem.from_reach() == 0.0
 
 
 @pytest.mark.slow
