@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -15,8 +16,16 @@ from bodycap_batch.skeleton import Mount, SkeletonModel
 
 Activity = Literal["walk", "generic"]
 
-STANDING_M_PER_S = 0.05
-"""Speed of a standing foot's ankle, one sigma: the shin rolls over the foot."""
+_STANDING_M_PER_S, _STANDING_HZ = 0.05, 30.0
+"""Speed of a standing foot's ankle, one sigma at 30 ticks a second: the shin rolls over the foot."""
+
+
+def standing_sigma_m(fps: float) -> float:
+    """How far a standing foot's ankle moves from tick to tick, one sigma.
+
+    Per tick the square root of the rate less: over a second a foot is held as firmly at every rate.
+    """
+    return _STANDING_M_PER_S / math.sqrt(_STANDING_HZ * fps)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

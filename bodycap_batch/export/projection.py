@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.arrays import BoolArray, FloatArray
-from bodycap_batch.body import STANDING_M_PER_S, CameraClock, MergeResult
+from bodycap_batch.body import CameraClock, MergeResult, standing_sigma_m
 from bodycap_batch.export.corrections import Correction, Planted, Problem, Tracked, solve_correction
 from bodycap_batch.geometry import invert, poses_at, rotation_angle_rad
 from bodycap_batch.skeleton import Motion, SkeletonModel, forward_kinematics
@@ -79,7 +79,7 @@ def _planted(merge: MergeResult) -> tuple[Planted, ...]:
     if merge.standing is None:
         return ()
     held = merge.standing[1:] & merge.standing[:-1]
-    sigma_m = STANDING_M_PER_S / merge.fps
+    sigma_m = standing_sigma_m(merge.fps)
     return tuple(
         Planted(joint=int(joint), held=held[:, joint], sigma_m=sigma_m)
         for joint in np.flatnonzero(held.any(axis=0))

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.body import STANDING_M_PER_S
+from bodycap_batch.body import standing_sigma_m
 from bodycap_batch.geometry import invert, make_transform
 from bodycap_batch.merging.bones import Bone
 from bodycap_batch.merging.graph import bone_key
@@ -98,9 +98,8 @@ def find_contacts(
             centre = (poses @ invert(mounts[track.camera]) @ np.append(ankle_m, 1.0))[:, :3]
             tick_s = 1e-9 * float(np.median(np.diff(tick_times_ns)))
             standing = _standing(centre, seen, centre @ up, tick_s)
-            out.append(
-                Contact(f"{side} foot", ankle, track.bone, ankle_m, standing, STANDING_M_PER_S * tick_s)
-            )
+            sigma_m = standing_sigma_m(1.0 / tick_s)
+            out.append(Contact(f"{side} foot", ankle, track.bone, ankle_m, standing, sigma_m))
             break
     return tuple(out)
 

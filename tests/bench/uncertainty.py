@@ -8,7 +8,8 @@ times as many. Below the band the stated sigmas are too large, above it too smal
 
 A claim about people is tested on people: each seed's walker holds its joints as one of them does
 (``--posture-spread 1``). Walkers who are all everyone's mean (``--posture-spread 0``) leave most of what is
-stated of shoulders and elbows untested, and lie far below the band. A T-pose is exact in all of them.
+stated of shoulders and elbows untested, and lie far below the band. In a T-pose all
+stretch their arms out, from a trunk and shoulders held as ever: the arms of some are a few degrees off level.
 """
 
 from __future__ import annotations

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
 
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.context import StageContext
+from bodycap_batch.export.projection import _planted
 from bodycap_batch.geometry import make_transform, so3_exp
 from bodycap_batch.merging import merge_trajectories
 from bodycap_batch.merging.bones import graph_bones
@@ -17,6 +20,7 @@ from bodycap_batch.merging.tracks import Track
 from bodycap_batch.skeleton_presets import load_skeleton
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.posed import posed
+from tests.bodies import merged, reaching
 
 FPS, COUNT, STAND = 30.0, 60, 25
 TICKS = np.round(np.arange(COUNT) * 1e9 / FPS).astype(np.int64)
@@ -80,6 +84,27 @@ def test_an_ankle_that_rests_costs_nothing_however_the_shin_turns(shin):
     assert max(graph.at(tick).error(values) for tick in range(STAND - 1)) < 1e-3
     # Swinging, the ankle goes several centimetres a tick: tens of sigmas, which Huber's loss counts once.
     assert graph.at(STAND + 10).error(values) > 10.0
+
+
+@pytest.mark.parametrize("fps", [24.0, 60.0, 120.0, 240.0])
+def test_a_foot_is_held_as_firmly_over_a_second_at_every_rate(shin, fps):
+    skeleton, bones, index, poses = shin
+    ticks = np.round(np.arange(COUNT) * 1e9 / fps).astype(np.int64)
+    (found,) = find_contacts(
+        skeleton,
+        bones,
+        [replace(_track(index, poses), times_ns=ticks)],
+        {"left_shin": np.eye(4)},
+        UP,
+        ticks,
+    )
+    result, _ = merged(reaching(10))
+    standing = np.zeros(result.observed.shape, dtype=bool)
+    standing[:, skeleton.index_of_role("LeftLeg")] = True
+    (planted,) = _planted(replace(result, fps=fps, standing=standing))
+    # What sliding by 2 cm in a second costs; at 30 ticks a second each is held to 0.05 m/s.
+    costs = [fps * (0.02 / fps / sigma_m) ** 2 for sigma_m in (found.sigma_m, planted.sigma_m)]
+    assert costs == pytest.approx([30.0 * (0.02 / 0.05) ** 2] * 2, rel=1e-3)
 
 
 def test_standing_feet_are_held_in_the_solved_motion(tmp_path):
