@@ -18,8 +18,9 @@ from bodycap_batch.merging.samples import take_samples
 from bodycap_batch.merging.tracks import make_track
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.joining import run_case
-from tests.bench.posed import GAUGE, posed
+from tests.bench.posed import posed
 from tests.bench.simulation import ARMS
+from tests.calibrations import calibration_of
 from tests.stages.walker import ROLES, make_inputs, make_walk, record
 
 FURTHER = Similarity(1.7, so3_exp([0.4, 1.1, -0.3]), np.array([0.5, -3.0, 1.0]))
@@ -52,15 +53,7 @@ def _tracks(walk, recorded):
 @pytest.fixture(scope="module")
 def arms():
     """Five cameras in one map: samples of five a second, their calibration, metres per map unit."""
-    capture = posed(SynthOptions(seconds=12.0, cameras=ARMS, outliers=0.0, poses_only=True))
-    inputs, roles = capture.inputs, {mount.camera: mount.role for mount in capture.mounts}
-    bones = graph_bones(inputs.skeleton, set(roles.values()))
-    index = {bone.role: place for place, bone in enumerate(bones)}
-    tracks = [make_track(inputs, each, index[roles[each.camera]]) for each in inputs.trajectories]
-    metric = 1.0 / capture.gauges[GAUGE].scale
-    samples = take_samples(tracks, metric, 60)
-    mounts = {mount.camera: mount for mount in inputs.mounts}
-    return samples, Calibration(inputs.skeleton, bones, samples, mounts, metric, lambda: None), metric
+    return calibration_of(SynthOptions(seconds=12.0, cameras=ARMS, outliers=0.0, poses_only=True))
 
 
 def _off_m(place: Similarity, track) -> float:

@@ -7,13 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.calibrate import PRIOR_SCALE, Calibration
+from bodycap_batch.merging.calibrate import PRIOR_SCALE
 from bodycap_batch.merging.liveliness import passing_shares
-from bodycap_batch.merging.samples import take_samples
-from bodycap_batch.merging.tracks import make_track
 from bodycap_batch.synthetic import SynthOptions
-from tests.bench.posed import GAUGE, posed
+from tests.calibrations import calibration_of
 
 EVERYDAY = 0.75
 """Of the everyday range's variance, what is no habit."""
@@ -22,15 +19,7 @@ EVERYDAY = 0.75
 @pytest.fixture(scope="module")
 def solved():
     """Three cameras on a walk of 20 s, calibrated at the true scale."""
-    capture = posed(SynthOptions(seconds=20.0, outliers=0.0, poses_only=True))
-    inputs, roles = capture.inputs, {mount.camera: mount.role for mount in capture.mounts}
-    bones = graph_bones(inputs.skeleton, set(roles.values()))
-    index = {bone.role: place for place, bone in enumerate(bones)}
-    tracks = [make_track(inputs, each, index[roles[each.camera]]) for each in inputs.trajectories]
-    metric = 1.0 / capture.gauges[GAUGE].scale
-    samples = take_samples(tracks, metric, 60)
-    mounts = {mount.camera: mount for mount in inputs.mounts}
-    calibration = Calibration(inputs.skeleton, bones, samples, mounts, metric, lambda: None)
+    samples, calibration, metric = calibration_of(SynthOptions(seconds=20.0, outliers=0.0, poses_only=True))
     calibration.solve(metric)
     return calibration.solved(), samples.times_ns
 

@@ -1,0 +1,23 @@
+"""Mounts of a simulated capture, ready to be calibrated at its true scale."""
+
+from __future__ import annotations
+
+from bodycap_batch.merging.bones import graph_bones
+from bodycap_batch.merging.calibrate import Calibration
+from bodycap_batch.merging.samples import Samples, take_samples
+from bodycap_batch.merging.tracks import make_track
+from bodycap_batch.synthetic import SynthOptions
+from tests.bench.posed import GAUGE, posed
+
+
+def calibration_of(options: SynthOptions) -> tuple[Samples, Calibration, float]:
+    """Sixty samples of a walk in one map, their calibration, not yet solved, and metres per map unit."""
+    capture = posed(options)
+    inputs, roles = capture.inputs, {mount.camera: mount.role for mount in capture.mounts}
+    bones = graph_bones(inputs.skeleton, set(roles.values()))
+    index = {bone.role: place for place, bone in enumerate(bones)}
+    tracks = [make_track(inputs, each, index[roles[each.camera]]) for each in inputs.trajectories]
+    metric = 1.0 / capture.gauges[GAUGE].scale
+    samples = take_samples(tracks, metric, 60)
+    mounts = {mount.camera: mount for mount in inputs.mounts}
+    return samples, Calibration(inputs.skeleton, bones, samples, mounts, metric, lambda: None), metric
