@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bodycap_batch.arrays import IntArray
 from bodycap_batch.capture import CaptureCamera, open_camera
 from bodycap_batch.check.advice import advice_on
 from bodycap_batch.check.files import check_files
@@ -104,6 +105,7 @@ def _finding(camera: CaptureCamera, config: CameraConfig, notes: list[str]) -> C
         files=tuple(path.name for path in camera.chapters),
         frames=sum(len(video.pts) for video in camera.videos),
         used_frames=len(camera.frame_numbers),
+        used_runs=_runs(camera.frame_numbers),
         start_s=float(times_s[0]),
         end_s=float(times_s[-1]),
         fps=camera.nominal_fps,
@@ -121,6 +123,12 @@ def _finding(camera: CaptureCamera, config: CameraConfig, notes: list[str]) -> C
             *_short(duration),
         ),
     )
+
+
+def _runs(numbers: IntArray) -> tuple[tuple[int, int], ...]:
+    """First and last of each run of successive numbers."""
+    runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
+    return tuple((int(run[0]), int(run[-1])) for run in runs)
 
 
 def _lens(camera: CaptureCamera) -> str:
@@ -249,15 +257,25 @@ def _check_formats(job: Job, _findings: list[CameraFinding]) -> list[str]:
 
 
 def _check_named_frames(job: Job, findings: list[CameraFinding]) -> list[str]:
-    """Frames that the job names must be there; else a map would be made before they are missed."""
-    counts = {camera.name: camera.frames for camera in findings}
+    """Frames that the job names must be there and used; else a map would be made before they are missed."""
+    known = {camera.name: camera for camera in findings}
     for (block, field, _), camera, number in named_frames(job):
-        if number >= counts.get(camera, number + 1):
+        finding = known.get(camera)
+        if finding is None or any(first <= number <= last for first, last in finding.used_runs):
+            continue
+        if number >= finding.frames:
             raise JobError(
                 f"camera {camera} has no frame {number}",
                 field=f"{block}.{field}",
-                hint=f"its frames are counted from 0 to {counts[camera] - 1}",
+                hint=f"its frames are counted from 0 to {finding.frames - 1}",
             )
+        first, last = finding.used_runs[0][0], finding.used_runs[-1][1]
+        raise JobError(
+            f"frame {number} of camera {camera} is not used",
+            field=f"{block}.{field}",
+            hint=f"of its frames, counted from the video's first as 0, {first} to {last} lie between start_s "
+            "and end_s (those with unusable times left out)",
+        )
     return []
 
 

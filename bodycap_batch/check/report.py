@@ -25,6 +25,7 @@ class CameraFinding:
         files: Names of its video files.
         frames: Frames in all.
         used_frames: Frames between start_s and end_s.
+        used_runs: First and last number, in the joined video, of each stretch of used frames without a hole.
         start_s: Common time of the first used frame.
         end_s: Common time of the last used frame.
         fps: Nominal rate.
@@ -41,6 +42,7 @@ class CameraFinding:
     files: tuple[str, ...]
     frames: int
     used_frames: int
+    used_runs: tuple[tuple[int, int], ...]
     start_s: float
     end_s: float
     fps: float

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 FrameName = Annotated[str, StringConstraints(pattern=r"^.+:\d{1,9}$")]
-"""One frame of one camera, ``camera:frame``."""
+"""One frame of one camera, ``camera:frame``, counted from 0 in its joined video whatever ``start_s`` says."""
 
 FileFormat = Literal["ply", "bvh", "glb", "fbx", "usd", "c3d", "trc", "tum", "csv", "npz", "colmap"]
 NamePreset = Literal["hik", "mixamo", "biped", "unreal"]

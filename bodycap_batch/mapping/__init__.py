@@ -142,6 +142,7 @@ def _shop(
         settings=lambda: mapper_options(options, constant, scale),
         constant=constant,
         context=context,
+        frame_numbers={camera.name: camera.frame_numbers for camera in capture.cameras},
     )
 
 
@@ -155,14 +156,12 @@ def _settled(models: Sequence[Any], shop: Workshop, capture: Capture) -> int:
     return total
 
 
-def _starts(
-    workspace: Path, options: MapOptions, lenses: Mapping[str, tuple[Camera, bool]]
-) -> tuple[list[Start], dict[str, object]]:
+def _starts(shop: Workshop, options: MapOptions) -> tuple[list[Start], dict[str, object]]:
     """The pair the user named, if it can be used, then the best ranked; what to tell of the first."""
-    ranked = [start for start in rank_starts(workspace, lenses)[:_STARTS] if start.usable]
+    ranked = [start for start in rank_starts(shop.workspace, shop.lenses)[:_STARTS] if start.usable]
     if options.init_frames is None:
         return ranked, {}
-    start = named_start(workspace, options.init_frames, lenses)
+    start = named_start(shop.workspace, options.init_frames, shop.lenses, shop.frame_numbers)
     told = {"failed": "no verified matches"} if start is None else start.to_log()
     return ranked if start is None else [start, *ranked], {"named_initial_pair": told}
 
@@ -186,7 +185,7 @@ def _begun(
 
 def _started(shop: Workshop, options: MapOptions, total: int) -> tuple[list[Any], dict[str, Any]]:
     """Models from the pair the user named or the best ranked, and what each of the pairs gave."""
-    starts, named = _starts(shop.workspace, options, shop.lenses)
+    starts, named = _starts(shop, options)
     models, ladder = reconstruct(shop.workspace, shop.settings(), shop.context, total, starts)
     log: dict[str, Any] = {**named, "initial_pair_ladder": ladder}
     if len(ladder) > 1:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.camera import Camera
 from bodycap_batch.errors import JobError
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, image_ids
@@ -98,9 +98,18 @@ def rank_starts(workspace: Path, lenses: Mapping[str, tuple[Camera, bool]]) -> l
 
 
 def named_start(
-    workspace: Path, named: tuple[str, str], lenses: Mapping[str, tuple[Camera, bool]]
+    workspace: Path,
+    named: tuple[str, str],
+    lenses: Mapping[str, tuple[Camera, bool]],
+    numbers: Mapping[str, IntArray],
 ) -> Start | None:
     """The start a user names as two ``camera:frame``: each camera's keyframe nearest to the frame.
+
+    Args:
+        workspace: Folder of the database.
+        named: Frames by their number in the camera's joined video.
+        lenses: Of each camera.
+        numbers: `CaptureCamera.frame_numbers` of each camera: keyframes are known by their place among them.
 
     Returns:
         The pair, or None where its two keyframes share no verified matches.
@@ -112,7 +121,7 @@ def named_start(
 
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         known = image_ids(database)
-        ids = sorted(known[_nearest(name, known)] for name in named)
+        ids = sorted(known[_nearest(name, known, numbers)] for name in named)
         if ids[0] == ids[1]:
             raise JobError(f"{' and '.join(named)} are one keyframe", field="map.init_frames")
         if not database.exists_two_view_geometry(*ids):
@@ -120,7 +129,7 @@ def named_start(
         return _start(database, (ids[0], ids[1]), lenses)
 
 
-def _nearest(name: str, known: Collection[ImageRef]) -> ImageRef:
+def _nearest(name: str, known: Collection[ImageRef], numbers: Mapping[str, IntArray]) -> ImageRef:
     camera, _, frame = name.rpartition(":")
     mine = sorted(ref for ref in known if ref.camera == camera)
     if not mine:
@@ -129,7 +138,7 @@ def _nearest(name: str, known: Collection[ImageRef]) -> ImageRef:
             field="map.init_frames",
             hint=f"cameras: {', '.join(sorted({ref.camera for ref in known}))}",
         )
-    return min(mine, key=lambda ref: abs(ref.frame - int(frame)))
+    return min(mine, key=lambda ref: abs(int(numbers[camera][ref.frame]) - int(frame)))
 
 
 def _start(

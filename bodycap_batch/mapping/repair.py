@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bodycap_batch.arrays import IntArray
 from bodycap_batch.camera import Camera
 from bodycap_batch.context import StageContext
 from bodycap_batch.mapping.consistency import contradicted_share, doubtful, links_of
@@ -32,6 +33,7 @@ class Workshop:
         settings: Makes the mapper's settings.
         constant: Ids of calibrated cameras.
         context: Threads, progress, cancellation.
+        frame_numbers: `CaptureCamera.frame_numbers` of each camera.
     """
 
     workspace: Path
@@ -39,6 +41,7 @@ class Workshop:
     settings: Callable[[], Any]
     constant: Collection[int]
     context: StageContext
+    frame_numbers: Mapping[str, IntArray]
 
 
 def repair(model: pycolmap.Reconstruction, tried: set[Pair], shop: Workshop) -> tuple[Any, dict[str, object]]:

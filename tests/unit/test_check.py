@@ -99,6 +99,15 @@ def test_cameras_that_never_ran_together(walk: Path) -> None:
         ("merge: {known_distance: ['torso:0', 'trso:9', 2.5]}", "there is no camera 'trso'"),
         ("map: {init_frames: ['left_palm:400', 'torso:9']}", "camera left_palm has no frame 400"),
         ("map: {init_frames: ['left_palm:74', 'torso:9']}", ""),
+        (
+            "capture: {start_s: 1.0}\nmerge: {known_distance: ['torso:0', 'torso:60', 2.5]}",
+            "frame 0 of camera torso is not used",
+        ),
+        (
+            "capture: {end_s: 1.0}\nmap: {init_frames: ['left_palm:9', 'torso:31']}",
+            "frame 31 of camera torso is not used",
+        ),
+        ("capture: {start_s: 1.0}\nmerge: {known_distance: ['torso:30', 'torso:74', 2.5]}", ""),
     ],
 )
 def test_frames_that_are_not_there_are_missed_beforehand(walk: Path, named: str, told: str) -> None:
@@ -106,6 +115,8 @@ def test_frames_that_are_not_there_are_missed_beforehand(walk: Path, named: str,
     report = check_path(walk)
     assert report.exit_code == (2 if told else 0)
     assert [error.message for error in report.errors] == ([told] if told else [])
+    if "frame 0 of" in told:
+        assert "30 to 74 lie between start_s and end_s" in str(report.errors[0].hint)
 
 
 def test_every_problem_is_collected(walk: Path) -> None:

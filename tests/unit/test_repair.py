@@ -32,6 +32,8 @@ from bodycap_batch.mapping.solve import mapper_options, reconstruct, refine, set
 _LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
 _LENSES = {"cam": (_LENS, True)}
 _KEYFRAMES = 16
+_NUMBERS = {"cam": np.arange(30, 30 + _KEYFRAMES)}
+"""Frames before start_s are counted, too: users name what they see in their video."""
 _MOVED = (6, 7, 8)
 
 
@@ -100,6 +102,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, FloatArray, Wo
         settings=lambda: mapper_options(MapOptions(), [1], 1.0),
         constant=[1],
         context=context,
+        frame_numbers=_NUMBERS,
     )
     models, _ = reconstruct(folder, shop.settings(), context, _KEYFRAMES)
     return models[0], poses, shop, set(pairs)
@@ -323,7 +326,7 @@ def test_a_start_on_the_side_that_leads_nowhere_loses_no_keyframes(tmp_path: Pat
     poses = _workspace(tmp_path)
     _link_one_way(tmp_path)
     context = StageContext(work_dir=tmp_path, threads=1)
-    start = named_start(tmp_path, ("cam:1", "cam:5"), _LENSES)
+    start = named_start(tmp_path, ("cam:31", "cam:35"), _LENSES, _NUMBERS)
     assert start is not None
     settings = mapper_options(MapOptions(), [1], 1.0)
     models, _ = reconstruct(tmp_path, settings, context, _KEYFRAMES, [start])
@@ -334,18 +337,18 @@ def test_a_start_on_the_side_that_leads_nowhere_loses_no_keyframes(tmp_path: Pat
 @pytest.mark.slow
 def test_a_named_start_is_used(built: tuple[Any, FloatArray, Workshop, set[Any]]) -> None:
     _, poses, shop, _ = built
-    start = named_start(shop.workspace, ("cam:2", "cam:6"), _LENSES)
+    start = named_start(shop.workspace, ("cam:32", "cam:36"), _LENSES, _NUMBERS)
     assert start is not None
     assert start.names == ("cam/0000002", "cam/0000006")
     models, ladder = reconstruct(shop.workspace, shop.settings(), shop.context, _KEYFRAMES, [start])
     assert ladder[-1]["pair"] == ["cam/0000002", "cam/0000006"]
     assert models[0].num_reg_images() == _KEYFRAMES
     assert _rms(models[0], poses) < 0.01
-    assert named_start(shop.workspace, ("cam:0", "cam:15"), _LENSES) is None
+    assert named_start(shop.workspace, ("cam:30", "cam:45"), _LENSES, _NUMBERS) is None
     with pytest.raises(JobError, match="one keyframe"):
-        named_start(shop.workspace, ("cam:3", "cam:3"), _LENSES)
+        named_start(shop.workspace, ("cam:33", "cam:33"), _LENSES, _NUMBERS)
     with pytest.raises(JobError, match="camera 'hat'"):
-        named_start(shop.workspace, ("hat:3", "cam:3"), _LENSES)
+        named_start(shop.workspace, ("hat:33", "cam:33"), _LENSES, _NUMBERS)
 
 
 def test_a_named_start_is_used_again_where_a_guessed_lens_changes_its_model(
@@ -360,12 +363,13 @@ def test_a_named_start_is_used_again_where_a_guessed_lens_changes_its_model(
         settings=lambda: mapper_options(MapOptions(), [], 1.0),
         constant=[],
         context=context,
+        frame_numbers=_NUMBERS,
     )
     other = Camera(model="RADIAL", width_px=640, height_px=480, params=np.array([421.0, 320, 240, 0, 0]))
     changed = other.to_pycolmap()
     changed.camera_id = 1
     monkeypatch.setattr(lens, "better_lenses", lambda *_: {1: changed})
-    options = MapOptions(init_frames=("cam:1", "cam:5"))
+    options = MapOptions(init_frames=("cam:31", "cam:35"))
     models, log = _begun(shop, options, {1: "cam"}, _KEYFRAMES)
     assert log["better_lenses"] == {"cam": "RADIAL"}
     assert models[0].camera(1).model_name == "RADIAL"
