@@ -26,6 +26,8 @@ _QUALITY = 60
 _PROBES = 6
 _PER_SECOND = 5.0
 """More pictures a second than this only make the page larger: the motion itself is drawn at every tick."""
+_NEAR_S = 1.0
+"""How far from where it is wanted a kept frame may lie: keyframes are half a second apart at most."""
 _DARK = 30.0
 _CORNER_QUALITY = 0.02
 
@@ -125,12 +127,14 @@ def _contrasted(grey: Any, corners: FloatArray) -> FloatArray:
 def _cheap(camera: CaptureCamera, indices: IntArray) -> IntArray:
     """The same spread on the nearest frames that are kept: between keyframes little new comes into view.
 
-    Where none are, on frames that decode without their neighbours, as far as such are near.
+    Where none are, on frames that decode without their neighbours; where no such is near, as they are.
     """
     keys = camera.key_indices() if camera.kept is None else camera.kept.frames
     if len(indices) < 3 or len(keys) == 0:
         return indices
-    half = 0.5 * float(np.median(np.diff(indices))) if camera.kept is None else np.inf
+    half = 0.5 * float(np.median(np.diff(indices)))
+    if camera.kept is not None:
+        half = max(half, _NEAR_S * camera.nominal_fps)
     right = np.clip(np.searchsorted(keys, indices), 0, len(keys) - 1)
     left = np.maximum(right - 1, 0)
     nearest = np.where(np.abs(keys[left] - indices) <= np.abs(keys[right] - indices), keys[left], keys[right])

@@ -20,6 +20,7 @@ class Film:
         self.levels = levels
         self.kept = kept
         self.frame_numbers = np.arange(90)
+        self.nominal_fps = 30.0
         self.passes = 0
 
     def key_indices(self) -> np.ndarray:
@@ -58,3 +59,13 @@ def test_where_frames_are_kept_the_video_is_left_alone(tmp_path: Path) -> None:
     film: Any = Film(kept=kept)
     found = series(film, np.arange(90) / 30.0, 15 * 60_000, StageContext(work_dir=tmp_path))
     assert [picture.index for picture in found] == kept.frames.tolist()
+
+
+def test_where_none_are_kept_for_long_the_video_is_read(tmp_path: Path) -> None:
+    """As of a second chapter in another range."""
+    kept = KeptFrames(path=tmp_path, frames=np.arange(3, 30, 6), width_px=320, height_px=240, group=1)
+    film: Any = Film(kept=kept)
+    found = series(film, np.arange(90) / 30.0, 15 * 60_000, StageContext(work_dir=tmp_path))
+    assert {3, 15, 27} < {picture.index for picture in found}
+    assert sum(picture.index > 57 for picture in found) == 5
+    assert found[-1].index == 89
