@@ -90,13 +90,16 @@ def recover_lost(
         seeds=_seeds(scene_map, camera.name, lost),
         tracked=frozenset(np.flatnonzero(~lost).tolist()),
     )
-    stretches = lost_runs(~lost)
+    stretches, reached = lost_runs(~lost), 0
     for _ in range(_ROUNDS):
+        if not stretches:
+            break
         poses: dict[int, Fix] = {}
         known = _known(path)
         for start, stop in stretches:
             context.check_cancelled()
-            context.progress(start, len(lost), "lost frames looked at")
+            reached = max(reached, start)  # a further round begins in front again
+            context.progress(reached, len(lost), "lost frames looked at")
             poses |= search.within(start, stop, known)
         before, path = path.localised, _with_poses(path, poses, finder.limits)
         stretches = _beside(path.localised, before)

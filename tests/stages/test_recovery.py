@@ -376,3 +376,22 @@ def test_what_is_left_beside_found_frames_is_looked_through_again(
     assert asked == [(18, 26), (20, 26)]
     assert path.localised[[18, 19]].all()
     assert not path.localised[20:26].any()
+
+
+def test_progress_grows_over_the_rounds_which_end_with_nothing_left(
+    pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[int] = []
+    rounds = [[(18, 20), (23, 25)], []]
+    monkeypatch.setattr(recovery, "lost_runs", lambda _: [(18, 22), (22, 26)])
+    monkeypatch.setattr(recovery, "_beside", lambda *_: rounds.pop(0))
+    monkeypatch.setattr(recovery._LostFrames, "within", lambda *_: {})
+
+    def progress(done: int, _: int, what: str = "") -> None:
+        if what.startswith("lost"):
+            told.append(done)
+
+    context = StageContext(work_dir=tmp_path, progress=progress)
+    capture = cast("Capture", _Capture(_Video(pictures)))
+    recover_lost(_tracked(), _map(pictures), capture, RegistrationOptions(), context)
+    assert told == [18, 22, 22, 23]
