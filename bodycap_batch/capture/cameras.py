@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ from bodycap_batch.capture.images import Colours, Image, Planes, grey_of, work_i
 from bodycap_batch.capture.kept import KeptFrames, Shot, keeps_all
 from bodycap_batch.capture.prefetch import prefetched
 from bodycap_batch.capture.video import VideoFile
+from bodycap_batch.errors import CaptureError
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
@@ -169,9 +170,14 @@ class CaptureCamera:
         else:
             held[:] = False
         others = self._frames(indices[~held])
-        for index, is_held in zip(indices.tolist(), held.tolist(), strict=True):
+        for position, (index, is_held) in enumerate(zip(indices.tolist(), held.tolist(), strict=True)):
             if is_held:
-                yield index, next(copies)
+                try:
+                    image = next(copies)
+                except CaptureError:  # a copy that cannot be read: the video has all there is
+                    yield from replace(self, kept=None)._decode(indices[position:], colour=colour)
+                    return
+                yield index, image
             else:
                 _, frame, video = next(others)
                 yield index, work_image(frame, video.orientation, size, colour=colour)

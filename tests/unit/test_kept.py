@@ -97,6 +97,15 @@ def test_one_frame_more_is_read_from_the_video_in_its_place(tmp_path: Path) -> N
     assert_same(both(with_kept(camera, tmp_path), [0, 3, 4, 7, 11]), both(camera, [0, 3, 4, 7, 11]))
 
 
+@pytest.mark.parametrize("size", [0, 2000])
+def test_copies_that_cannot_be_read_are_replaced_by_the_video(tmp_path: Path, size: int) -> None:
+    camera = opened(write_video(tmp_path / "a.mp4", noisy_frames(64, 48)))
+    kept = with_kept(camera, tmp_path)
+    copy = tmp_path / "kept.mp4"
+    copy.write_bytes(copy.read_bytes()[:size])
+    assert_same(both(kept, [0, 3, 4, 7, 11]), both(camera, [0, 3, 4, 7, 11]))
+
+
 def test_a_whole_video_is_not_decoded_twice(tmp_path: Path) -> None:
     camera = opened(write_video(tmp_path / "a.mp4", noisy_frames(64, 48)))
     kept = with_kept(camera, tmp_path)
