@@ -18,6 +18,7 @@ from bodycap_batch.merging.calibrate import Calibration
 from bodycap_batch.merging.distance import known_distance
 from bodycap_batch.merging.lean import body_up, body_up_from_prior
 from bodycap_batch.merging.limbs import limb_scales
+from bodycap_batch.merging.posture import mostly_walks
 from bodycap_batch.merging.rolls import RollSearch, rolled, search_rolls, trunk_roll
 from bodycap_batch.merging.samples import take_samples
 from bodycap_batch.merging.scale import ScaleEstimate, ScaleSource, combine, find_scale, floor_source
@@ -118,6 +119,7 @@ def calibrate_body(
         points_m=estimate.scale * points,
         path_m=path_m,
         standing_m=gauge.standing_height(inputs.skeleton, bones[0].joint),
+        walks=not split_side(bones[0].role)[0] and mostly_walks(tracks[0].scaled(estimate.scale)),
     )
     up = find_up(body_up(inputs.skeleton, bones, poses), around, np.random.default_rng(0), says)
     walking = samples.posture.walking

@@ -15,7 +15,7 @@ from bodycap_batch.skeleton_presets import split_side
 
 _USUAL_RAD = float(np.radians(15.0))
 """A trunk sways by less than this about its usual direction in walking and standing."""
-_MOMENTS = 300
+_MOMENTS, _DIRECTIONS = 300, 1000
 _ERECT_DEG = 12.0
 """Spread of a standing or walking trunk's lean: 5 degrees of habit, the rest its camera's mount."""
 _SIDE_DEG = 12.0
@@ -58,16 +58,31 @@ class BodyUp:
 
         Only differences count: a trunk that is erect all the time has about 0.
         """
+        return self._strangeness(ups, _ANYHOW)
+
+    def habit_deg(self, up: FloatArray) -> float:
+        """How far `up` (3,) is off in the mean square, degrees, where nothing but the leaning tells it.
+
+        A lean that lasts does not show: however many moments there are, together they tell as much as one
+        does. What one moment in a hundred is counts for nothing here: it may be any direction.
+        """
+        ups = _sphere(_DIRECTIONS)
+        nats = self._strangeness(ups, 0.0)
+        likely = np.exp(nats.min() - nats)
+        off = np.degrees(np.arccos(np.clip(ups @ up, -1.0, 1.0)))
+        return float(np.sqrt(np.average(off**2, weights=likely)))
+
+    def _strangeness(self, ups: FloatArray, anyhow: float) -> FloatArray:
         seen = np.einsum("nji,cj->cni", _some(self.axes), ups)
         if not self.sided:
             angle = np.degrees(np.arccos(np.clip(seen[..., 2], -1.0, 1.0)))
-            return np.asarray(_lean(angle).mean(axis=1))
+            return np.asarray(_lean(angle, anyhow).mean(axis=1))
         pitch = np.degrees(np.arctan2(seen[..., 1], seen[..., 2]))
         side = np.degrees(np.arcsin(np.clip(seen[..., 0], -1.0, 1.0)))
-        return np.asarray((_lean(pitch) + _beside(side)).mean(axis=1))
+        return np.asarray((_lean(pitch, anyhow) + _beside(side, anyhow)).mean(axis=1))
 
 
-def _lean(pitch_deg: FloatArray) -> FloatArray:
+def _lean(pitch_deg: FloatArray, anyhow: float) -> FloatArray:
     """−log of the density of a lean, forwards positive, over that of none."""
 
     def density(pitch: FloatArray) -> FloatArray:
@@ -76,16 +91,23 @@ def _lean(pitch_deg: FloatArray) -> FloatArray:
             _ERECT / (_ERECT_DEG * np.sqrt(2.0 * np.pi)) * np.exp(-0.5 * (pitch / _ERECT_DEG) ** 2)
             + (pitch > 0.0) * _FORWARD / _FORWARD_DEG * np.exp(-forward / _FORWARD_DEG)
             + (pitch <= 0.0) * _BACKWARD / _BACKWARD_DEG * np.exp(-backward / _BACKWARD_DEG)
-            + _ANYHOW / (2.0 * _ANYHOW_DEG)
+            + anyhow / (2.0 * _ANYHOW_DEG)
         )
 
     return np.asarray(-np.log(density(pitch_deg) / density(np.zeros(1))))
 
 
-def _beside(side_deg: FloatArray) -> FloatArray:
+def _beside(side_deg: FloatArray, anyhow: float) -> FloatArray:
     """The same of a lean to a side."""
-    density = (1.0 - _ANYHOW) * np.exp(-0.5 * (side_deg / _SIDE_DEG) ** 2) + _ANYHOW
+    density = (1.0 - anyhow) * np.exp(-0.5 * (side_deg / _SIDE_DEG) ** 2) + anyhow
     return np.asarray(-np.log(density))
+
+
+def _sphere(count: int) -> FloatArray:
+    """Directions (C,3) spread evenly: a spiral whose turns are the golden angle apart."""
+    place = np.arange(count) + 0.5
+    polar, turn = np.arccos(1.0 - 2.0 * place / count), np.pi * (1.0 + np.sqrt(5.0)) * place
+    return np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
 
 
 def body_up(skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray) -> BodyUp:

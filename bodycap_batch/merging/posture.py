@@ -18,7 +18,7 @@ from bodycap_batch.geometry import so3_log
 from bodycap_batch.merging.bones import Bone, proper_axes
 from bodycap_batch.merging.graph import bone_key
 from bodycap_batch.merging.spread import BETWEEN_SHARE
-from bodycap_batch.merging.tracks import Track
+from bodycap_batch.merging.tracks import Track, evenly
 from bodycap_batch.skeleton import SkeletonModel
 
 WALKING_M_PER_S = 0.5
@@ -46,6 +46,7 @@ _NARROWEST_M = 0.3
 """Standard deviation of the path across: at 0.3 m, steps whose bounce is 2 cm tilt the plane of ten of them
 by a degree."""
 _OFF_BODY_RAD = float(np.radians(30.0))
+_MOMENTS = 300
 GESTURE_S = 4.0
 """A posture tells little of the one within two seconds before or after it: gestures last about as long."""
 _TRUNK = ("Spine1", "Spine", "Hips")
@@ -115,6 +116,14 @@ def find_posture(
         ahead=np.where(walking[:, None], ahead, np.nan),
         standing=standing & ~posture.t_pose,
     )
+
+
+def mostly_walks(track: Track) -> bool:
+    """Whether a trunk's camera (metres) goes as fast as a walk for more than half of the time."""
+    times_ns = track.times_ns[evenly(np.arange(len(track.times_ns)), _MOMENTS)]
+    before, after = (track.at(times_ns + sign * _STRIDE_NS // 2, reach_ns=_STRIDE_NS) for sign in (-1, 1))
+    speed = np.linalg.norm((after[0] - before[0])[:, :3, 3], axis=1) / (1e-9 * _STRIDE_NS)
+    return bool((before[1] & after[1] & (speed > WALKING_M_PER_S)).mean() > 0.5)
 
 
 def _standing(track: Track, height_m: FloatArray, up: FloatArray) -> BoolArray:

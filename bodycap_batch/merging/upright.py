@@ -89,8 +89,14 @@ class Direction:
     margin_nats: float | None = None
 
     def determined(self) -> bool:
-        """Whether the next best direction is clearly worse."""
+        """Whether the next best direction is clearly worse, and a lasting lean would have shown."""
+        if self.by_habit():
+            return False
         return self.margin_nats is None or self.margin_nats >= _DETERMINED_NATS
+
+    def by_habit(self) -> bool:
+        """Whether it rests on nothing but a leaning that may have lasted all the time."""
+        return self.source == "body" and self.sigma_deg > _APART_DEG
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,11 +107,13 @@ class Around:
         points_m: (P,3) map points in the solved frame.
         path_m: (N,3) path of the trunk's camera.
         standing_m: Height of the trunk's joint over the soles of who stands.
+        walks: Whether the body walks most of the time.
     """
 
     points_m: FloatArray
     path_m: FloatArray
     standing_m: float
+    walks: bool = False
 
 
 def find_up(body: BodyUp, around: Around, rng: np.random.Generator, stated: Sequence[Say] = ()) -> Direction:
@@ -132,7 +140,7 @@ def find_up(body: BodyUp, around: Around, rng: np.random.Generator, stated: Sequ
             if up is not None
         ),
         *(
-            Say(source="body", up=up, sigma_deg=_body_sigma_deg(body, up), nats=_BODY_NATS)
+            Say(source="body", up=up, sigma_deg=_body_sigma_deg(body, up, around.walks), nats=_BODY_NATS)
             for up in hints[2:]
         ),
         *stated,
@@ -225,8 +233,13 @@ def _plane_sigma_deg(planes: Sequence[Plane], up: FloatArray) -> float:
     return float(np.hypot(_LEAST_SIGMA_DEG, np.sqrt((near**2).sum()) / max(len(near) - 1, 1)))
 
 
-def _body_sigma_deg(body: BodyUp, up: FloatArray) -> float:
-    """A lean and a camera's tilt look alike: half of how far it moves off `up`, and the tilt."""
+def _body_sigma_deg(body: BodyUp, up: FloatArray, walks: bool) -> float:
+    """Who walks is upright but for a camera's tilt, which looks like a lean: that, and half of how it moves.
+
+    Who sits, stands or works may lean all the time, and nothing tells by how much.
+    """
+    if not walks:
+        return body.habit_deg(up)
     moved = np.degrees(np.arccos(np.clip(body.axes[:, :, 2] @ up, -1.0, 1.0)))
     return float(np.hypot(_BODY_SIGMA_DEG, 0.5 * np.sqrt((moved**2).mean())))
 

@@ -11,6 +11,8 @@ from bodycap_batch.geometry import make_transform, so3_exp
 from bodycap_batch.merging.advice import up_sentence
 from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.lean import BodyUp, body_up
+from bodycap_batch.merging.posture import mostly_walks
+from bodycap_batch.merging.tracks import Track
 from bodycap_batch.merging.upright import Around, Direction, Say, find_up
 from bodycap_batch.skeleton_presets import load_skeleton
 
@@ -41,9 +43,9 @@ def _leaning(rng, forward_deg, share, side_deg=0.0):
     return axes, 0.45 * axes[:, :, 2] + [0.0, 0.0, STANDING_M - 0.45]
 
 
-def _found(axes, path, points, sided=True, stated=()) -> Direction:
+def _found(axes, path, points, sided=True, stated=(), walks=False) -> Direction:
     """What is found in a frame that is turned, and turned back."""
-    around = Around(points_m=points @ TURN.T, path_m=path @ TURN.T, standing_m=STANDING_M)
+    around = Around(points_m=points @ TURN.T, path_m=path @ TURN.T, standing_m=STANDING_M, walks=walks)
     return find_up(BodyUp(TURN @ axes, sided), around, np.random.default_rng(0), stated)
 
 
@@ -87,13 +89,48 @@ def test_a_room_seen_from_one_side_is_not_laid_on_its_side_either():
 def test_the_body_alone_is_upright_where_it_bends_from():
     rng = np.random.default_rng(1)
     axes, path = _leaning(rng, 60.0, 0.6)
-    found = _found(axes, path, np.zeros((0, 3)))
+    found = _found(axes, path, np.zeros((0, 3)), walks=True)
     assert found.source == "body"
     assert found.body_off_deg is None
     # The mean leans by 36 degrees, and the usual direction by 60.
     assert _off_deg(found) < 5.0
     # Half of the 46 degrees that the trunk moves in the mean square, and a mount's 15.
     assert 20.0 < found.sigma_deg < 35.0
+
+
+@pytest.mark.parametrize(("forward_deg", "share"), [(0, 1.0), (60, 1.0), (90, 1.0), (-30, 1.0), (90, 0.6)])
+def test_a_lean_that_lasts_does_not_show_unless_it_walks(forward_deg, share):
+    axes, path = _leaning(np.random.default_rng(1), forward_deg, share)
+    found = _found(axes, path, np.zeros((0, 3)))
+    assert found.source == "body"
+    assert 38.0 < found.sigma_deg < 50.0
+    assert _off_deg(found) < 2.5 * found.sigma_deg
+    assert not found.determined()
+    assert "not for certain: nothing else tells it" in up_sentence(SimpleNamespace(up=found))
+    if share == 1.0:
+        walked = _found(axes, path, np.zeros((0, 3)), walks=True)
+        assert walked.sigma_deg == pytest.approx(15.0, abs=0.5)
+        assert walked.determined()
+
+
+def test_who_walks_most_of_the_time_is_told_from_who_bends_on_the_spot():
+    seconds = np.arange(300) / 30.0
+    still = np.zeros(300)
+    for path, walks in (
+        (np.column_stack([0.9 * seconds, still, 0.02 * np.sin(12.0 * seconds)]), True),
+        (np.column_stack([0.2 * np.sin(1.5 * seconds), still, 0.2 * np.cos(1.5 * seconds)]), False),
+        (np.column_stack([np.minimum(0.9 * seconds, 2.7), still, still]), False),
+    ):
+        track = Track(
+            camera="torso",
+            bone=0,
+            frames=np.arange(300),
+            times_ns=np.round(seconds * 1e9).astype(np.int64),
+            map_from_cam=make_transform(np.tile(TURN, (300, 1, 1)), path @ TURN.T),
+            sigma_rad=np.full(300, 0.005),
+            sigma_map=np.full(300, 0.005),
+        )
+        assert mostly_walks(track) == walks
 
 
 def test_a_wall_and_a_sloping_roof_do_not_tilt_a_level_walk():
