@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bodycap_batch.export import corrections
 from bodycap_batch.export.corrections import (
     Correction,
     Planted,
@@ -181,6 +182,29 @@ def test_what_stands_in_the_graph_stands_in_the_file() -> None:
     assert "feet" not in free.gap
     # The cameras are met as well as they were: their noise is no longer followed, that is all.
     assert held.gap["cameras"]["left_palm"]["p95_m"] < 1.2 * free.gap["cameras"]["left_palm"]["p95_m"]
+
+
+def test_a_long_motion_is_corrected_in_stretches_as_of_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    result, clocks = merged(reaching(120), noise_m=0.005)
+    standing = np.zeros((120, len(result.skeleton.joints)), dtype=bool)
+    standing[50:70, result.skeleton.index_of_role("LeftHand")] = True
+    standing[10:30, result.skeleton.index_of_role("RightHand")] = True
+    result = replace(result, standing=standing)
+    whole = project_motion(result, clocks).motion.world_from_joint()
+    solved: list[int] = []
+    equations = corrections._normal_equations
+
+    def counted(problem, now, reach):  # type: ignore[no-untyped-def]
+        solved.append(len(now.root))
+        return equations(problem, now, reach)
+
+    monkeypatch.setattr(corrections, "_normal_equations", counted)
+    monkeypatch.setattr(corrections, "_STRETCH_TICKS", 40)
+    monkeypatch.setattr(corrections, "_OVERLAP_TICKS", 25)
+    pieces = project_motion(result, clocks).motion.world_from_joint()
+    # A correction is forgotten at a tenth a tick and faster where cameras measure.
+    assert np.abs(pieces - whole)[..., :3, 3].max() < 1e-4
+    assert set(solved) == {65, 90}
 
 
 def problem_of(result, clocks) -> Problem:  # type: ignore[no-untyped-def]
