@@ -163,7 +163,10 @@ def test_what_the_job_states_is_taken_and_the_others_are_told_against_it(hung_de
     found = _found(axes, path, room, stated=edges)
     assert found.source == taken
     assert _off_deg(found) == pytest.approx(0.0 if taken == "map" else hung_deg, abs=0.5)
-    told = {say.source: np.degrees(np.arccos(say.up @ found.up)) for say in reversed(found.others)}
+    told = {
+        say.source: np.degrees(np.arccos(np.clip(say.up @ found.up, -1.0, 1.0)))
+        for say in reversed(found.others)
+    }
     assert told["map" if taken == "marker board" else "marker board"] == pytest.approx(hung_deg, abs=0.5)
     assert "body" in told
 
