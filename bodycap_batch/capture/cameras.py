@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -22,6 +23,8 @@ from bodycap_batch.errors import CaptureError
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
+
+logger = logging.getLogger(__name__)
 
 _MOSTLY = 0.75
 """Share of the frames asked for that must be kept: with many others between them the video is decoded from
@@ -174,7 +177,8 @@ class CaptureCamera:
             if is_held:
                 try:
                     image = next(copies)
-                except CaptureError:  # a copy that cannot be read: the video has all there is
+                except CaptureError as error:  # the video has all there is
+                    logger.warning("%s: read from the video, since its kept copy fails: %s", self.name, error)
                     yield from replace(self, kept=None)._decode(indices[position:], colour=colour)
                     return
                 yield index, image

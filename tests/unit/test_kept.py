@@ -98,12 +98,15 @@ def test_one_frame_more_is_read_from_the_video_in_its_place(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("size", [0, 2000])
-def test_copies_that_cannot_be_read_are_replaced_by_the_video(tmp_path: Path, size: int) -> None:
+def test_copies_that_cannot_be_read_are_replaced_by_the_video_and_told(
+    tmp_path: Path, size: int, caplog: pytest.LogCaptureFixture
+) -> None:
     camera = opened(write_video(tmp_path / "a.mp4", noisy_frames(64, 48)))
     kept = with_kept(camera, tmp_path)
     copy = tmp_path / "kept.mp4"
     copy.write_bytes(copy.read_bytes()[:size])
     assert_same(both(kept, [0, 3, 4, 7, 11]), both(camera, [0, 3, 4, 7, 11]))
+    assert any("kept copy" in message and str(copy) in message for message in caplog.messages)
 
 
 def test_a_whole_video_is_not_decoded_twice(tmp_path: Path) -> None:
