@@ -7,6 +7,7 @@ import numpy as np
 from bodycap_batch.arrays import IntArray
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.capture.images import Image
+from bodycap_batch.check.stillness import outline, standing_still
 from bodycap_batch.errors import CaptureError
 
 _SAMPLES = 8
@@ -16,7 +17,8 @@ _BLACK_LEVEL = 20.0
 _FLAT_CONTRAST = 12.0
 # Decoding this many frames for one sample takes a second or two.
 _STRETCH, _STRETCH_PIXELS = 250, 640 * 480
-"""So many frames of that size are decoded to see the last one: a second of work. Of 4K no more than nine."""
+"""So many frames of that size are decoded to see the last one, and as many where key frames are rare: a
+second of work each. Of 4K no more than nine."""
 # Sound captures have a median grey of 100 and more.
 _DARK_LEVEL = 45.0
 # FAST corners that stand out by this much: 229 and more in every picture looked at of four captures that
@@ -42,13 +44,14 @@ def look_at_frames(camera: CaptureCamera) -> list[str]:
             hint="copy the video again, or leave the camera out",
         )
     dark, bright = [], []
-    pictures = set()
     grey, corners = [], []
-    for _, image in camera.read(sample_indices(camera, _SAMPLES)):
+    seen, outlines = [], []
+    for index, image in camera.read(sample_indices(camera, _SAMPLES)):
         low, high = np.percentile(image, (1, 99))
         dark.append(float(low))
         bright.append(float(high))
-        pictures.add(image.tobytes())
+        seen.append(index)
+        outlines.append(outline(image))
         grey.append(float(np.median(image)))
         corners.append(_corners(image))
     black = int(np.sum(np.array(bright) < _BLACK_LEVEL))
@@ -63,8 +66,7 @@ def look_at_frames(camera: CaptureCamera) -> list[str]:
         notes.append(
             "interlaced: make whole pictures of it first (ffmpeg -i in -vf bwdif=send_frame out.mp4)"
         )
-    if len(pictures) == 1 and len(bright) > 1:
-        notes.append("the picture stands still throughout: nothing can be solved from it")
+    notes += standing_still(outlines, camera.common_times_ns()[seen] / 1e9)
     if black:
         notes.append(
             f"{black} of {len(bright)} pictures looked at are black; cut them off with start_s and end_s"
@@ -105,7 +107,10 @@ def _hard_to_track(grey: list[float], corners: list[float]) -> list[str]:
 
 
 def sample_indices(camera: CaptureCamera, count: int) -> IntArray:
-    """Evenly spread frames that decode without their neighbours, the first and, if near one, the last."""
+    """Evenly spread frames: such as decode without their neighbours, the first and, if near one, the last.
+
+    Where those are rarer than the frames wanted, frames between them, as far as can be decoded in a second.
+    """
     last = len(camera.frame_numbers) - 1
     even = np.unique(np.linspace(0, last, min(count, last + 1)).round().astype(np.int64))
     keys = camera.key_indices()
@@ -114,5 +119,19 @@ def sample_indices(camera: CaptureCamera, count: int) -> IntArray:
     picked = keys[np.abs(keys[None] - even[:, None]).argmin(axis=1)]
     # The end is where a broken recording shows; without a key frame near it, it costs too much.
     width, height = camera.videos[-1].stored_size
-    end = min(last, int(keys[-1]) + round(_STRETCH * min(1.0, _STRETCH_PIXELS / (width * height))))
-    return np.unique(np.append(picked, [0, end]))
+    stretch = round(_STRETCH * min(1.0, _STRETCH_PIXELS / (width * height)))
+    end = min(last, int(keys[-1]) + stretch)
+    far = even[2 * np.abs(picked - even) * max(1, len(even) - 1) > last]
+    return np.unique(np.concatenate([picked, _between(far, keys, last, stretch), [0, end]]))
+
+
+def _between(wanted: IntArray, keys: IntArray, last: int, stretch: int) -> IntArray:
+    """Frames in the place of those that no key frame is near; `stretch` frames are decoded for all of them."""
+    before = np.searchsorted(keys, wanted, side="right") - 1
+    starts, counts = np.unique(before[before >= 0], return_counts=True)
+    out = [np.zeros(0, dtype=np.int64)]
+    for start, frames in zip(starts.tolist(), counts.tolist(), strict=True):
+        behind = int(keys[start + 1]) - 1 if start + 1 < len(keys) else last
+        reach = min(behind - int(keys[start]), stretch // len(starts))
+        out.append(keys[start] + np.linspace(0, reach, frames + 1).round().astype(np.int64)[1:])
+    return np.concatenate(out)

@@ -1,0 +1,63 @@
+"""A picture that stands still is told, sensor noise and all; one that moves is not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bodycap_batch.capture import open_capture
+from bodycap_batch.check import check_path
+from bodycap_batch.check.pictures import sample_indices
+from bodycap_batch.config.job import load_job
+from tests.videos import Image, textured_frame, write_video
+
+RNG = np.random.default_rng(3)
+ROOM = np.kron(RNG.integers(60, 200, (30, 60)), np.ones((8, 8)))
+COUNT = 80
+
+
+def _moving(index: int) -> Image:
+    return ROOM[:, 4 * index : 4 * index + 160].astype(np.uint8)
+
+
+def _still(index: int) -> Image:
+    light = 1.0 + 0.2 * np.sin(0.2 * index)
+    return np.clip(light * ROOM[:, :160] + RNG.normal(0, 4, (240, 160)), 0, 255).astype(np.uint8)
+
+
+def _notes(root: Path, picture: Callable[[int], Image], gop: int) -> list[str]:
+    write_video(root / "left_palm.mp4", [picture(index) for index in range(COUNT)], gop=gop)
+    (camera,) = check_path(root).cameras
+    return [note for note in camera.notes if "stands still" in note]
+
+
+@pytest.mark.parametrize("gop", [8, 1000])
+def test_a_camera_on_a_table_is_told_and_a_worn_one_is_not(tmp_path: Path, gop: int) -> None:
+    (note,) = _notes(tmp_path / "table", _still, gop)
+    assert "throughout" in note
+    assert not _notes(tmp_path / "worn", _moving, gop)
+
+
+def test_it_is_told_when_the_picture_stopped(tmp_path: Path) -> None:
+    (note,) = _notes(tmp_path, lambda index: _moving(index) if index < 35 else _still(index), 8)
+    assert "from about 1.6 to 2.6 s (5 pictures" in note
+
+
+def test_where_nothing_is_to_be_seen_nothing_stands_still(tmp_path: Path) -> None:
+    black = np.full((240, 160), 16, np.uint8)
+    assert not _notes(tmp_path, lambda index: black if index > 20 else _moving(index), 8)
+
+
+def test_pictures_are_looked_at_although_key_frames_are_rare(tmp_path: Path) -> None:
+    def samples(name: str, *, gop: int, size: tuple[int, int] = (64, 48)) -> list[int]:
+        frames = [textured_frame(index % 40, *size) for index in range(75)]
+        write_video(tmp_path / name / "torso.mp4", frames, gop=gop, bframes=False)
+        return sample_indices(open_capture(load_job(tmp_path / name).capture).cameras[0], 8).tolist()
+
+    assert samples("lone", gop=1000) == [0, 11, 21, 32, 42, 53, 63, 74]
+    # Four times the pixels of 640 by 480: a quarter of 250 frames.
+    assert samples("large", gop=1000, size=(1280, 960)) == [0, 9, 18, 27, 35, 44, 53, 62]
+    assert samples("two", gop=40) == [0, 13, 26, 39, 40, 51, 63, 74]
