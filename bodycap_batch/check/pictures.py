@@ -126,7 +126,7 @@ def sample_indices(camera: CaptureCamera, count: int) -> IntArray:
 
 
 def _between(wanted: IntArray, keys: IntArray, last: int, stretch: int) -> IntArray:
-    """Frames in the place of those that no key frame is near; `stretch` frames are decoded for all of them."""
+    """Frames in the place of those that no key frame is near; `stretch` of them are decoded for it."""
     before = np.searchsorted(keys, wanted, side="right") - 1
     starts, counts = np.unique(before[before >= 0], return_counts=True)
     out = [np.zeros(0, dtype=np.int64)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -36,7 +37,7 @@ def standing_still(outlines: Sequence[FloatArray], times_s: FloatArray) -> list[
         outlines: Of pictures in the order of time.
         times_s: (N,) when they were taken, on the common clock.
     """
-    same = np.array([_alike(*pair) for pair in zip(outlines, outlines[1:], strict=False)], dtype=bool)
+    same = np.array([_alike(*pair) for pair in pairwise(outlines)], dtype=bool)
     if len(same) and same.all():
         return [
             "the picture stands still throughout: a frozen recording, or a camera that nobody wears; nothing "
@@ -47,8 +48,8 @@ def standing_still(outlines: Sequence[FloatArray], times_s: FloatArray) -> list[
         return []
     first, last = times_s[start], times_s[stop]
     return [
-        f"the picture stands still from about {first:.1f} to {last:.1f} s ({stop - start + 1} pictures looked "
-        "at are alike): does the person stand still, or is the recording frozen or the camera taken off? "
+        f"the picture stands still from about {first:.1f} to {last:.1f} s ({stop - start + 1} pictures "
+        "looked at are alike): does the person stand still, is the recording frozen, or the camera off? "
         "start_s and end_s cut it off"
     ]
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from bodycap_batch.body import MergeInputs
 from bodycap_batch.config.options import MergeOptions
@@ -21,6 +22,9 @@ MIN_FRAMES = 15
 """Localised frames below which a camera tells nothing about a motion: half a second at 30 fps."""
 TRUNK = ("Spine1", "Spine", "Hips", "Neck", "Head")
 """Bones whose camera can lead, the best first: limbs are judged against it."""
+_STANDS_STILL, _STANDS_STILL_RAD = 0.005, float(np.radians(0.3))
+"""A camera strays so little, beside the one of its map that strays furthest, and turns so little where it
+lies on a table: one does by 0.0004 and 0.01 deg; 15 worn ones of five captures by more than 0.8 and 5 deg."""
 _SHORT = 0.25
 """Share of the longest camera's time below which a camera does not lead, nor its map become the main one."""
 
@@ -38,7 +42,7 @@ def bring_together(
     Raises:
         EstimationError: No map holds two cameras whose distance the body knows.
     """
-    useless = seldom_localised(inputs)
+    useless = of_no_use(inputs)
     left_out: dict[str, str] = {}
     for main, further in choices(inputs):
         together = use_together(inputs, main, further, step, options)
@@ -61,7 +65,7 @@ def share_priors(inputs: MergeInputs) -> MergeInputs:
 
     Each alone would say where the body is as if the others had been strapped on by somebody else.
     """
-    useless = seldom_localised(inputs)
+    useless = of_no_use(inputs)
     paths = [each.camera for each in inputs.trajectories if each.camera not in useless]
     worn = [inputs.mount_of(camera) for camera in paths]
 
@@ -81,6 +85,28 @@ def share_priors(inputs: MergeInputs) -> MergeInputs:
 
 def _same(first: Mount, second: Mount) -> bool:
     return bool(np.allclose(first.joint_from_cam[:3, 3], second.joint_from_cam[:3, 3]))
+
+
+def of_no_use(inputs: MergeInputs) -> dict[str, str]:
+    """By camera that tells nothing of the body's motion, why."""
+    seldom = seldom_localised(inputs)
+    rest = [each for each in inputs.trajectories if each.camera not in seldom]
+    still = {}
+    for each in rest:
+        furthest = max(_strays(other)[0] for other in rest if other.gauge == each.gauge)
+        away, turned_rad = _strays(each)
+        if away < _STANDS_STILL * furthest and turned_rad < _STANDS_STILL_RAD:
+            still[each.camera] = "it stands still while the others move: nobody wears it, or it is frozen"
+    return {**seldom, **still}
+
+
+def _strays(trajectory: Trajectory) -> tuple[float, float]:
+    """How far a camera strays from its middle (map units), and turns (rad), for nine tenths of the time."""
+    poses = trajectory.gauge_from_cam[trajectory.localised]
+    away = np.linalg.norm(poses[:, :3, 3] - np.median(poses[:, :3, 3], axis=0), axis=1)
+    turns = Rotation.from_matrix(poses[:, :3, :3])
+    turned = (turns.mean().inv() * turns).magnitude()
+    return float(np.percentile(away, 90)), float(np.percentile(turned, 90))
 
 
 def seldom_localised(inputs: MergeInputs) -> dict[str, str]:
@@ -107,7 +133,7 @@ def choices(inputs: MergeInputs) -> list[tuple[list[Trajectory], list[Trajectory
         short = seconds[camera] < _SHORT * max(seconds.values())
         return short, TRUNK.index(role) if role in TRUNK else len(TRUNK), -counts[camera]
 
-    useless = seldom_localised(inputs)
+    useless = of_no_use(inputs)
     ranked = sorted((each for each in inputs.trajectories if each.camera not in useless), key=rank)
     return [
         ([each for each in ranked if each.gauge == gauge], [each for each in ranked if each.gauge != gauge])

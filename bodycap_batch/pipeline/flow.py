@@ -220,7 +220,9 @@ class Flow:
         }
         task = Task(key=key_of("merge", options, inputs), arguments=arguments, threads=self._settings.threads)
         filming = self._job.export.preview and self._settings.threads > 1
-        return self._one(task, [STAGES["preview"].modules] if filming else [])
+        artefact = self._one(task, [STAGES["preview"].modules] if filming else [])
+        self._tell_notes(artefact, "merge")
+        return artefact
 
     def export(
         self,

@@ -27,7 +27,8 @@ def _merge(options: Json, arguments: Json, context: StageContext, files: Path) -
     result = merge_trajectories(inputs, options_, context)
     write_bundle(result, files, "merge")
     doubts = [*result.report.get("doubted_clocks", {}).values(), result.report.get("exchanged_sides", {})]
-    notes = [str(doubt["says"]) for doubt in doubts if doubt]
+    notes = [f"camera {name} is no part of the body: {why}" for name, why in result.unused_cameras.items()]
+    notes += [str(doubt["says"]) for doubt in doubts if doubt]
     write_summary(files, unused_cameras=dict(result.unused_cameras), notes=notes)
 
 

@@ -10,7 +10,7 @@ import pytest
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging import choosing, joining, placing
-from bodycap_batch.merging.choosing import bring_together, choices, seldom_localised
+from bodycap_batch.merging.choosing import bring_together, choices, of_no_use, seldom_localised
 from bodycap_batch.merging.constants import early_up
 from bodycap_batch.merging.joining import Joined, use_together
 from bodycap_batch.merging.samples import MAP_ERROR_RAD, take_samples
@@ -60,6 +60,29 @@ def test_the_trunk_leads_then_the_head(capture):
     lost = _lose(capture.inputs, "torso", 6)
     assert _names(choices(lost)[0][0])[0] == "head"
     assert seldom_localised(lost) == {"torso": f"6 localised frames of {6 * 30}, 15 needed"}
+
+
+def test_a_camera_that_nobody_wears_is_left_out(capture):
+    def with_palm(moved):
+        """The inputs with another path (N,4,4) of the left palm, made of its own."""
+        changed = []
+        for each in capture.inputs.trajectories:
+            path = moved(np.array(each.gauge_from_cam)) if each.camera == "left_palm" else each.gauge_from_cam
+            changed.append(replace(each, gauge_from_cam=path))
+        return replace(capture.inputs, trajectories=tuple(changed))
+
+    def lying(poses):
+        return np.where(np.isfinite(poses), poses[np.isfinite(poses).all(axis=(1, 2))][0], np.nan)
+
+    def swaying(poses):
+        out = lying(poses)
+        out[:, :3, 3] += 0.05 * np.sin(np.arange(len(poses)))[:, None]
+        return out
+
+    assert of_no_use(capture.inputs) == of_no_use(with_palm(swaying)) == {}
+    together = bring_together(with_palm(lying), lambda: None)
+    assert "left_palm" not in _names(together.trajectories)
+    assert "stands still" in together.unused["left_palm"]
 
 
 def test_a_trunk_that_was_hardly_localised_does_not_lead(capture):
