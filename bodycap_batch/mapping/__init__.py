@@ -23,6 +23,7 @@ from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, 
 from bodycap_batch.mapping.freeing import as_mapped, freed_where_contradicted
 from bodycap_batch.mapping.initial import Start, named_start, rank_starts
 from bodycap_batch.mapping.lens import change_lenses, misfitting_lenses
+from bodycap_batch.mapping.mirrored import told, without_mirrored
 from bodycap_batch.mapping.pairs import PairChooser, link_keyframes
 from bodycap_batch.mapping.reach import Reach, check_reach
 from bodycap_batch.mapping.repair import Workshop, cut_doubtful, place_again, repair
@@ -108,6 +109,9 @@ def _build(
         (capture.camera(item.camera), cameras[item.camera], np.asarray(item.frames)) for item in selections
     ]
     add_keyframes(workspace, wanted, options, context)
+    if len(straight := without_mirrored(workspace, selections)) < len(selections):
+        apart = replace(context, work_dir=context.work_dir / "straight")
+        return told(_build(capture, straight, options, apart, reach), selections, straight)
     refs = [ImageRef(item.camera, int(frame)) for item in selections for frame in item.frames]
     chooser = PairChooser(workspace, refs, _common_ns(capture), options, context.threads)
     tried, linked = link_keyframes(chooser, workspace, _lenses(capture), context)

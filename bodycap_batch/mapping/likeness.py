@@ -71,7 +71,7 @@ def likeness(
     todo = _looked_at(short, rows, place)
 
     def work(number: int) -> IntArray:
-        return _alike(every, rows[number], todo[number])
+        return clear_matches(every[rows[number]], every[todo[number]])
 
     with ThreadPoolExecutor(threads) as pool:
         for number, found in enumerate(pool.map(work, range(len(rows)))):
@@ -92,12 +92,12 @@ def _looked_at(short: BoolArray, rows: Sequence[int], place: Mapping[int, int]) 
     return [np.flatnonzero(each) for each in left]
 
 
-def _alike(every: npt.NDArray[np.float32], row: int, others: IntArray) -> IntArray:
-    """(K,) clear matches of an image with some others."""
+def clear_matches(image: npt.NDArray[np.float32], others: npt.NDArray[np.float32]) -> IntArray:
+    """Clear mutual matches (K,) of an image's `largest` features with those (K,F,128) of some others."""
     parts = [np.zeros(0, dtype=np.int64)]
     for start in range(0, len(others), _BLOCK):
         some = others[start : start + _BLOCK]
-        alike = every[row] @ every[some].reshape(-1, 128).T
+        alike = image @ some.reshape(-1, 128).T
         parts.append(_clear(alike.reshape(_LARGEST, len(some), _LARGEST)))
     return np.concatenate(parts)
 
