@@ -190,23 +190,34 @@ def _of_map(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
         why="A camera outside the main map has no known place in the room; nothing of it reaches the body, "
         "unless the body itself tells where it was, and then less exactly.",
     )
-    reach = metrics.get("mapping", {}).get("reach")  # None without a body, whose reach is unknown then
-    if reach and reach["judged"]:
-        share = float(reach["within_reach"])
-        yield Criterion(
-            about="cameras",
-            name="Cameras within the body's reach",
-            grade=graded(share, 0.98, 0.9, more_is_better=True),
-            says=f"{percent(share, 1)} of {reach['distances']:,} distances between cameras",
-            why="Cameras on one body cannot be further apart than it reaches: a map folded over two places "
-            "that look alike shows here although its error in pixels is small.",
-            metric="mapping.reach.within_reach",
-            value=share,
-        )
+    yield from _of_reach(metrics.get("mapping", {}).get("reach"))
     mapping = metrics.get("mapping", {})
     misfits, freed = mapping.get("misfitting_lenses", {}), mapping.get("freed_lenses", ())
     # A lens of the wrong kind, a wide one given as a pinhole, leaves more than sharp corners do.
     yield from _of_lenses(misfits, freed if error is not None and float(error) <= _SHARP_PX else ())
+
+
+def _of_reach(reach: Mapping[str, Any] | None) -> Iterator[Criterion]:
+    """Distances between cameras against the body's reach; None without a body, whose reach is unknown then.
+
+    A share too small to judge single keyframes by is a finding all the same; too few distances are none.
+    """
+    if not reach or "within_reach" not in reach:
+        return
+    share = float(reach["within_reach"])
+    unfit = (
+        "" if reach["judged"] else " at most, whatever the scale: body, clocks or map do not suit each other"
+    )
+    yield Criterion(
+        about="cameras",
+        name="Cameras within the body's reach",
+        grade=graded(share, 0.98, 0.9, more_is_better=True),
+        says=f"{percent(share, 1)} of {reach['distances']:,} distances between cameras{unfit}",
+        why="Cameras on one body cannot be further apart than it reaches: a map folded over two places "
+        "that look alike shows here although its error in pixels is small.",
+        metric="mapping.reach.within_reach",
+        value=share,
+    )
 
 
 def _of_lenses(misfits: Mapping[str, float], freed: Collection[str]) -> Iterator[Criterion]:

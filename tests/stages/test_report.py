@@ -259,6 +259,21 @@ def test_every_link_of_the_page_leads_somewhere(inputs: ReportInputs, tmp_path: 
         assert sections - links <= {"verdict", "about"}
 
 
+def test_a_body_that_no_scale_brings_within_reach_is_told(inputs: ReportInputs) -> None:
+    metrics = json.loads(json.dumps(inputs.metrics))
+    metrics["mapping"]["reach"] = {
+        "judged": False,
+        "distances": 120,
+        "within_reach": 0.62,
+        "keyframes_out_of_reach": 0,
+        "reason": "no scale puts 80% of the distances within the body's reach",
+    }
+    (found,) = [each for each in judge(metrics, None).criteria if "reach" in each.name]
+    assert found.grade is Grade.POOR
+    assert found.says.startswith("62")
+    assert "do not suit" in found.says
+
+
 @pytest.mark.parametrize("reach", [None, {"judged": False, "reason": "3 distances are too few"}])
 def test_a_map_that_no_body_was_held_against_has_no_reach_to_judge(
     inputs: ReportInputs, reach: dict[str, Any] | None
