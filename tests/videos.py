@@ -33,11 +33,13 @@ def write_video(
     bframes: bool = True,
     codec: str = "libx264",
     ticks: int = 10,
+    pixel_aspect: Fraction | None = None,
 ) -> Path:
     """Encode grey (H,W) or RGB (H,W,3) images; `pts` in units of 1/(ticks·fps) s.
 
     Args:
         rotation: Counter-clockwise degrees a player turns the stored frames by.
+        pixel_aspect: Width of a pixel over its height, as the file tells players.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
@@ -51,6 +53,8 @@ def write_video(
         stream.height, stream.width = frames[0].shape[:2]
         stream.pix_fmt = pix_fmt
         stream.time_base = stream.codec_context.time_base = Fraction(1, ticks * fps)
+        if pixel_aspect is not None:
+            stream.codec_context.sample_aspect_ratio = pixel_aspect
         if rotation:
             stream.set_display_rotation(rotation)
         for index, image in enumerate(frames):

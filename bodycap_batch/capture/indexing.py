@@ -29,6 +29,10 @@ if TYPE_CHECKING:
 
 # Later than any Unix time of a recording, and far from the end of 64-bit nanoseconds.
 _MAX_SECONDS = 4e9
+# HDV's and AVCHD's 4:3 is the usual one, television's and anamorphic lenses' lie between 1:2 and 2:1.
+_THINNEST = Fraction(2, 5)
+# Sizes rounded to even numbers; stretching them would blur every picture for less than a pixel.
+_SQUARE = 0.004
 
 
 def index_video(path: Path) -> VideoFile:
@@ -45,6 +49,7 @@ def index_video(path: Path) -> VideoFile:
         pts, key_pts, end = _scan_packets(path, container, stream, listed)
         metadata = {**container.metadata, **stream.metadata}
         time_base, rate = Fraction(stream.time_base or 0), stream.average_rate or stream.guessed_rate
+        pixel_aspect = _pixel_aspect(stream.sample_aspect_ratio)
     if max(abs(int(pts[0])), abs(int(pts[-1]))) * time_base > _MAX_SECONDS or time_base <= 0:
         raise CaptureError("its timestamps are out of all bounds", path=path, hint=COPY_AGAIN)
     video = VideoFile(
@@ -58,6 +63,7 @@ def index_video(path: Path) -> VideoFile:
         orientation=((1, 0), (0, 1)),
         created_s=_creation_time(metadata),
         focal_35mm=_focal_35mm(metadata),
+        pixel_aspect=pixel_aspect,
     )
     return _with_first_frame(video, container_format)
 
@@ -101,6 +107,13 @@ def _nominal_fps(pts: IntArray, time_base: Fraction, rate: Fraction | None) -> f
         return float(rate)
     steps = np.diff(pts)
     return float(1 / (int(np.median(steps)) * time_base)) if len(steps) else 0.0
+
+
+def _pixel_aspect(stated: Fraction | None) -> Fraction:
+    """Width of a stored pixel over its height; square where nothing, or what no camera makes, is stated."""
+    aspect = Fraction(stated or 1)
+    usual = _THINNEST <= aspect <= 1 / _THINNEST
+    return aspect if usual and abs(aspect - 1) > _SQUARE else Fraction(1)
 
 
 def _creation_time(metadata: dict[str, str]) -> float | None:

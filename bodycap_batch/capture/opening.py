@@ -69,9 +69,20 @@ def open_camera(spec: CaptureConfig, config: CameraConfig) -> CaptureCamera:
     )
 
 
-def work_size(shown_size: tuple[int, int], work_px: int) -> tuple[int, int]:
-    """Size frames are worked at: the long side at most `work_px`, never enlarged."""
-    scale = min(1.0, work_px / max(shown_size))
+def work_size(
+    shown_size: tuple[int, int], work_px: int, turned_size: tuple[int, int] | None = None
+) -> tuple[int, int]:
+    """Size frames are worked at: the long side at most `work_px`, never enlarged.
+
+    Args:
+        shown_size: Width and height as a player shows them, in square pixels.
+        work_px: The longest side wanted.
+        turned_size: The same in stored pixels, where these are not square: neither side is enlarged.
+    """
+    stored = turned_size or shown_size
+    scale = min(
+        1.0, work_px / max(shown_size), *(own / side for own, side in zip(stored, shown_size, strict=True))
+    )
     width, height = (max(1, round(side * scale)) for side in shown_size)
     return width, height
 
@@ -79,12 +90,14 @@ def work_size(shown_size: tuple[int, int], work_px: int) -> tuple[int, int]:
 def work_camera(calibration: Calibration, video: VideoFile, work_px: int) -> Camera:
     """Scale a calibration to the work size.
 
+    One made on stored pixels that are not square is stretched as its pictures are.
+
     Raises:
         CaptureError: The calibration is of another aspect than the video.
     """
     width, height = video.shown_size
-    if abs(width * calibration.height / (height * calibration.width) - 1.0) > _ASPECT_TOLERANCE:
-        turned = abs(height * calibration.height / (width * calibration.width) - 1.0) <= _ASPECT_TOLERANCE
+    if not any(_same_aspect(calibration, *size) for size in (video.shown_size, video.turned_size)):
+        turned = _same_aspect(calibration, height, width)
         raise CaptureError(
             f"calibrated at {calibration.width}×{calibration.height}, but the video shows {width}×{height}: "
             "another aspect",
@@ -95,15 +108,19 @@ def work_camera(calibration: Calibration, video: VideoFile, work_px: int) -> Cam
             else "calibrate in the video mode that was recorded (a crop cannot be guessed), or use `auto`",
         )
     camera = calibration.camera()
-    size = work_size((width, height), work_px)
+    size = work_size((width, height), work_px, video.turned_size)
     if size[0] * camera.height_px != size[1] * camera.width_px:
         camera = without_single_focal(camera)
     return camera.scaled(*size)
 
 
+def _same_aspect(calibration: Calibration, width: int, height: int) -> bool:
+    return abs(width * calibration.height / (height * calibration.width) - 1.0) <= _ASPECT_TOLERANCE
+
+
 def guessed_camera(video: VideoFile, work_px: int, fov_deg: float | None) -> Camera:
     """A first guess for mapping to refine: field of view given, from the metadata, or typical."""
-    width, height = work_size(video.shown_size, work_px)
+    width, height = work_size(video.shown_size, work_px, video.turned_size)
     long_side = max(width, height)
     if fov_deg is not None:
         focal = 0.5 * long_side / np.tan(0.5 * np.radians(fov_deg))

@@ -43,6 +43,7 @@ class VideoFile:
         counted: True where decoders return no timestamps to know a frame by (AVI with B-frames):
             frames are counted from the start, and are evenly spaced.
         interlaced: True where a frame holds two half pictures of different times.
+        pixel_aspect: Width of a stored pixel over its height; 4/3 where 1440 columns are shown as 1920.
     """
 
     path: Path
@@ -57,11 +58,21 @@ class VideoFile:
     focal_35mm: float | None = None
     counted: bool = False
     interlaced: bool = False
+    pixel_aspect: Fraction = Fraction(1)
+
+    @property
+    def turned_size(self) -> tuple[int, int]:
+        """Width and height after the display rotation, in stored pixels."""
+        return self._turned(*self.stored_size)
 
     @property
     def shown_size(self) -> tuple[int, int]:
-        """Width and height after the display rotation."""
+        """Width and height after the display rotation, in square pixels."""
         width, height = self.stored_size
+        wide, high = max(self.pixel_aspect, Fraction(1)), min(self.pixel_aspect, Fraction(1))
+        return self._turned(round(width * wide), round(height / high))
+
+    def _turned(self, width: int, height: int) -> tuple[int, int]:
         return (width, height) if self.orientation[0][0] else (height, width)
 
     def times_ns(self) -> IntArray:

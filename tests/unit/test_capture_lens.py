@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,43 @@ def test_frames_are_never_enlarged() -> None:
     assert work_size((640, 480), 960) == (640, 480)
     assert work_size((1920, 1080), 960) == (960, 540)
     assert work_size((1080, 1920), 960) == (540, 960)
+
+
+@pytest.mark.parametrize(
+    ("stored", "aspect", "rotation", "worked"),
+    [
+        ((480, 360), Fraction(4, 3), 0, (480, 270)),
+        ((360, 288), Fraction(16, 15), 0, (360, 270)),
+        ((480, 360), Fraction(4, 3), 90, (270, 480)),
+        ((240, 480), Fraction(1, 2), 0, (120, 480)),
+        ((480, 360), Fraction(1000, 1001), 0, (480, 360)),
+        ((480, 360), Fraction(9, 1), 0, (480, 360)),
+    ],
+)
+def test_pixels_that_are_not_square_are_worked_on_as_square_ones(
+    tmp_path: Path, stored: tuple[int, int], aspect: Fraction, rotation: int, worked: tuple[int, int]
+) -> None:
+    frames = [textured_frame(0, *stored)] * 2
+    path = write_video(tmp_path / "a.mp4", frames, pixel_aspect=aspect, rotation=rotation)
+    config = CameraConfig(name="torso", video=(path,))
+    camera = open_camera(CaptureConfig(cameras=(config,), work_px=960), config)
+    assert (camera.camera.width_px, camera.camera.height_px) == worked
+    (image,) = [image for _, image in camera.grey_frames(0, 1)]
+    assert image.shape == worked[::-1]
+
+
+@pytest.mark.parametrize("size", [(480, 360), (640, 360)])
+def test_stored_and_shown_pixels_may_both_be_calibrated(tmp_path: Path, size: tuple[int, int]) -> None:
+    """480 columns shown as 640: a lens in either's pixels sees the same picture."""
+    frames = [textured_frame(0, 480, 360)] * 2
+    path = write_video(tmp_path / "a.mp4", frames, pixel_aspect=Fraction(4, 3))
+    share = size[0] / 640
+    calibration = Calibration(
+        model="PINHOLE", params=(400.0 * share, 400.0, 320.0 * share, 180.0), width=size[0], height=360
+    )
+    lens = lens_of(path, calibration=calibration)
+    assert (lens.width_px, lens.height_px) == (480, 270)
+    assert np.allclose(lens.params, [300.0, 300.0, 240.0, 135.0])
 
 
 def test_intrinsics_scale_with_the_pixel_origin(wide: Path) -> None:
