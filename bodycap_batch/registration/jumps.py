@@ -15,6 +15,12 @@ _GAP_SIGMAS = 4.0
 _GAP_TIMES_USUAL = 5.0
 """The same for the ends of lost stretches. On 14 results with truth six of some 150 such ends bend the path
 so much: five beside poses that are off by 6 to 16 cm, one beside a pose off by 3 cm."""
+_RUNS = (2, 3)
+_TIMES_KINK = 2.0
+"""A body that stops dead leaves the line between before and after, too: wrong poses by so many times more."""
+_ASTRAY = 0.5
+"""Of that offset, by which the pose behind the run may miss where the way before it leads: a path that steps
+aside for good has nothing to be judged by."""
 _SURELY_FIRST, _SURELY_SECOND, _SURELY_THIRD = 0.25, 0.45, 1.0
 """Answers of the third pose's bend to the second's: between 0.25 and 0.45 either of the first two may be
 wrong, beyond 1 neither is."""
@@ -24,7 +30,7 @@ _LONE_GAP = 3
 
 
 def pose_jumps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
-    """Frames whose centre leaves the line between its neighbours as nothing around it does.
+    """Frames, up to three in a row, whose centre leaves the line between its neighbours as nothing near does.
 
     The bend of a frame is its offset from the middle of the frames before and after it. A jump bends itself
     by its full height and both neighbours by half of it, the other way; a body that stops dead or starts with
@@ -38,6 +44,12 @@ def pose_jumps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
     Returns:
         (N,) True where the pose is to be refused. Scaling the map changes nothing.
     """
+    runs = np.zeros(len(centres), dtype=bool)
+    usual = np.linalg.norm(_bends(centres, sigma)[0], axis=1)
+    for length in _RUNS:
+        runs |= _wrong_runs(centres, sigma, usual, length)
+    # Beside one of several wrong poses a right one would be blamed.
+    centres = np.where(runs[:, None], np.nan, centres)
     offset, noise = _bends(centres, sigma)
     bend = np.linalg.norm(offset, axis=1)
     out = np.zeros(len(centres), dtype=bool)
@@ -54,7 +66,42 @@ def pose_jumps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
         if np.isfinite(near).sum() >= _AROUND // 2:
             out[frame] = bend[frame] > _TIMES_USUAL * np.nanmedian(near)
     backwards = _jumps_after_gaps(centres[::-1], sigma[::-1])[::-1]
-    return np.asarray(out | _jumps_after_gaps(centres, sigma) | backwards)
+    return np.asarray(runs | out | _jumps_after_gaps(centres, sigma) | backwards)
+
+
+def _wrong_runs(centres: FloatArray, sigma: FloatArray, bend: FloatArray, length: int) -> BoolArray:
+    """Frames (N,) of runs of so many poses that all leave the way from before the run to behind it.
+
+    Args:
+        centres: (N,3).
+        sigma: (N,).
+        bend: (N,) every frame's own.
+        length: How many poses.
+    """
+    out = np.zeros(len(centres), dtype=bool)
+    steps = length + 1
+    share = np.arange(1, steps)[:, None] / steps
+    for first in range(2, len(centres) - length - 1):
+        before, behind = first - 1, first + length
+        if not np.isfinite(centres[before - 1 : behind + 2]).all():
+            continue
+        way = centres[behind] - centres[before]
+        away = np.linalg.norm(centres[first:behind] - centres[before] - share * way, axis=1)
+        noise = np.sqrt(sigma[first:behind] ** 2 + 0.5 * (sigma[before] ** 2 + sigma[behind] ** 2))
+        start, end = centres[before] - centres[before - 1], centres[behind + 1] - centres[behind]
+        kink = 0.25 * steps * float(np.linalg.norm(end - start))
+        astray = float(np.linalg.norm(way - 0.5 * steps * (start + end)))
+        near = np.concatenate(
+            [bend[max(0, before - _AROUND) : before], bend[behind + 1 : behind + _AROUND + 1]]
+        )
+        if np.isfinite(near).sum() < _AROUND // 2:
+            continue
+        # What a steady bend amounts to over the run.
+        usual = float(np.nanmedian(near)) * 0.25 * steps**2
+        least = max(_TIMES_USUAL * usual, _TIMES_KINK * kink, astray / _ASTRAY)
+        if (away > np.maximum(_SIGMAS * noise, least)).all():
+            out[first:behind] = True
+    return out
 
 
 def _bends(centres: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -23,6 +23,30 @@ def test_one_wrong_pose_is_found_at_any_scale(scale: float) -> None:
     assert np.flatnonzero(pose_jumps(scale * centres, scale * SIGMA)).tolist() == [31]
 
 
+@pytest.mark.parametrize("scale", [0.1, 10.0])
+@pytest.mark.parametrize("together", [True, False])
+@pytest.mark.parametrize("length", [2, 3])
+def test_wrong_poses_in_a_row_are_found_and_no_right_one(
+    *, length: int, together: bool, scale: float
+) -> None:
+    rng = np.random.default_rng(6)
+    centres = _swing(1.0) + rng.normal(0, 0.002, (60, 3))
+    off = rng.normal(size=(1 if together else length, 3))
+    centres[31 : 31 + length] += 0.4 * off / np.linalg.norm(off, axis=1, keepdims=True)
+    found = np.flatnonzero(pose_jumps(scale * centres, 0.5 * scale * SIGMA))
+    assert found.tolist() == list(range(31, 31 + length))
+
+
+def test_a_path_that_steps_aside_or_rebounds_is_no_run_of_wrong_poses() -> None:
+    rng = np.random.default_rng(7)
+    aside = np.cumsum(np.full((60, 3), 0.02), axis=0) + rng.normal(0, 0.0002, (60, 3))
+    aside[30:] += [0.0, 0.3, 0.0]
+    assert pose_jumps(aside, 0.0003 * np.ones(60)).sum() <= 1
+    # A hand at 3 m/s that hits a wall and comes back as fast.
+    rebound = np.abs(np.arange(60) - 30.4)[:, None] * [0.1, 0.0, 0.0] + rng.normal(0, 0.0002, (60, 3))
+    assert not pose_jumps(rebound, 0.0003 * np.ones(60)).any()
+
+
 def test_a_violent_swing_is_no_jump() -> None:
     rng = np.random.default_rng(1)
     for hz in (0.5, 2.0, 4.0):
