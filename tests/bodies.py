@@ -38,10 +38,10 @@ Frame Time: 0.0333333
 """Two joints, two frames: the smallest file with all that a BVH file has."""
 
 
-def reaching(ticks: int = 60, skeleton: SkeletonModel | None = None) -> Motion:
+def reaching(ticks: int = 60, skeleton: SkeletonModel | None = None, fps: float = 30.0) -> Motion:
     """A body that walks forward (−Y), turns and swings its arms; its legs stay at rest."""
     body = skeleton or load_skeleton("upper_body", 1.75)
-    time = np.arange(ticks) / 30.0
+    time = np.arange(ticks) / fps
     local = np.tile(np.eye(3), (ticks, len(body.joints), 1, 1))
 
     def turn(role: str, *vector: FloatArray) -> None:
@@ -57,7 +57,7 @@ def reaching(ticks: int = 60, skeleton: SkeletonModel | None = None) -> Motion:
         turn(f"{side}Hand", 0.2 * np.sin(5 * time), 0 * time, 0 * time)
     return Motion(
         skeleton=body,
-        fps=30.0,
+        fps=fps,
         start_ns=5_000_000_000,
         root_in_world_m=np.stack([0 * time, -1.1 * time, 0.93 + 0.02 * np.sin(9 * time)], axis=1),
         local_rotation=local,

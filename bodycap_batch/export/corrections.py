@@ -27,7 +27,11 @@ _GRAPH_SIGMA = np.repeat([np.deg2rad(3.0), 0.01], 3)
 """How far a joint may leave the graph: its pose priors are wider (20-45°), its joints' slack is 5 mm."""
 
 _CHANGE_SIGMA = np.repeat([0.002, np.deg2rad(0.3)], 3)
-"""Change of the correction a tick, root shift and rotations: below what a viewer sees as jitter."""
+"""Change of the correction over a thirtieth of a second, root shift and rotations: below what a viewer sees
+as jitter. It grows with the square root of the time: 1.1 cm and 1.6° over a second."""
+
+_USUAL_HZ = 30.0
+"""So many errors a second count as independent: at other rates a tick counts for the time it stands for."""
 
 _SLIPS = 2.0
 """Sigmas beyond which a standing foot slips after all (Huber), as in the graph."""
@@ -43,8 +47,8 @@ _CHUNK_TICKS = 1000
 
 _STRETCH_TICKS = 2000
 """Solved at once: with 15 joints, four blocks of 18 kB a tick, that takes 180 MB."""
-_OVERLAP_TICKS = 200
-"""Either side of a stretch: 0.3° a tick against 3° are forgotten at a tenth a tick, here to e^-20."""
+_OVERLAP_S = 4.0
+"""Either side of a stretch: 0.3° in 1/30 s against 3° are forgotten by a tenth in it, to e^-12 here."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,8 +73,12 @@ class Planted:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Problem:
-    """What the corrected motion should meet: graph poses (T,J,4,4) of the solved joints, cameras, ground."""
+    """What the corrected motion should meet: graph poses (T,J,4,4) of the solved joints, cameras, ground.
 
+    Its ticks follow each other at `fps` a second.
+    """
+
+    fps: float
     skeleton: SkeletonModel
     solved: IntArray
     world_from_joint: FloatArray
@@ -86,6 +94,11 @@ class Problem:
                 out[joint, self.solved == ancestor] = 1.0
                 ancestor = int(self.skeleton.parents[ancestor])
         return out
+
+    @property
+    def tick_share(self) -> float:
+        """How much a tick's errors count for: as many ticks as stand for the same time count alike."""
+        return _USUAL_HZ / self.fps
 
     def between(self, low: int, high: int) -> Problem:
         """The same of ticks `low` to before `high` alone."""
@@ -113,11 +126,11 @@ class Correction:
 
 def solve_correction(problem: Problem, start: Correction) -> Correction:
     """Fit the rigid motion, a long one stretch by stretch."""
-    count = len(start.root)
+    count, overlap = len(start.root), round(_OVERLAP_S * problem.fps)
     root, local = np.empty_like(start.root), np.empty_like(start.local)
     cuts = np.linspace(0, count, max(1, -(-count // _STRETCH_TICKS)) + 1).round().astype(int).tolist()
     for first, last in pairwise(cuts):
-        low, high = max(first - _OVERLAP_TICKS, 0), min(last + _OVERLAP_TICKS, count)
+        low, high = max(first - overlap, 0), min(last + overlap, count)
         part = Correction(root=start.root[low:high], local=start.local[low:high])
         found = _solve_stretch(problem.between(low, high), part)
         own = slice(first - low, last - low)
@@ -180,7 +193,9 @@ def _change(problem: Problem, now: Correction, graph: FloatArray) -> FloatArray:
 
 
 def _change_sigma(problem: Problem) -> FloatArray:
-    return np.concatenate([_CHANGE_SIGMA[:3], np.tile(_CHANGE_SIGMA[3:], len(problem.solved))])
+    """(3+3S,) of the change from one tick to the next."""
+    sigma = _CHANGE_SIGMA * np.sqrt(problem.tick_share)
+    return np.concatenate([sigma[:3], np.tile(sigma[3:], len(problem.solved))])
 
 
 def _cost(problem: Problem, now: Correction) -> float:
@@ -188,10 +203,11 @@ def _cost(problem: Problem, now: Correction) -> float:
     world = forward_kinematics(problem.skeleton, now.root, now.local)
     graph = _graph_error(problem, world, everything)
     cost = float(((graph / _GRAPH_SIGMA) ** 2).sum())
-    cost += float((np.diff(_change(problem, now, graph), axis=0) ** 2).sum())
     for tracked in problem.cameras:
         squared = (_camera_error(tracked, world, everything)[0] ** 2).sum(axis=1)
         cost += float((_OUTLIER_SCALE * squared / (_OUTLIER_SCALE + squared)).sum())
+    cost *= problem.tick_share
+    cost += float((np.diff(_change(problem, now, graph), axis=0) ** 2).sum())
     for planted in problem.planted:
         size = np.linalg.norm(_slip(planted, world), axis=1)
         cost += float(np.where(size < _SLIPS, size**2, _SLIPS * (2.0 * size - _SLIPS)).sum())
@@ -214,7 +230,7 @@ def _normal_equations(
     for first in range(0, ticks, _CHUNK_TICKS):
         chunk = slice(first, min(first + _CHUNK_TICKS, ticks))
         for jacobian, error in _rows(problem, world[chunk], reach, chunk):
-            transposed = np.swapaxes(jacobian, -1, -2)
+            transposed = problem.tick_share * np.swapaxes(jacobian, -1, -2)
             blocks[chunk] += transposed @ jacobian
             gradient[chunk] += (transposed @ error[..., None])[..., 0]
     change = _change(problem, now, _graph_error(problem, world, slice(None)))

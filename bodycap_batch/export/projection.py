@@ -56,6 +56,7 @@ def project_motion(
     solved = np.flatnonzero(merge.solved)
     start = _start(merge.skeleton, merge.world_from_joint, merge.solved)
     problem = Problem(
+        fps=merge.fps,
         skeleton=merge.skeleton,
         solved=solved,
         world_from_joint=merge.world_from_joint,
