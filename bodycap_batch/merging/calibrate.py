@@ -40,7 +40,6 @@ from bodycap_batch.merging.spread import (
     joined,
     map_bends,
     mount_slope,
-    proportions,
     scale_direction,
 )
 from bodycap_batch.merging.t_pose import t_posed
@@ -162,7 +161,7 @@ class Calibration:
         sigma_log: float,
         slope: Mapping[str, FloatArray],
         placed: Mapping[str, tuple[float, float]],
-        length_share: float = 0.0,
+        bodies: Sequence[tuple[Spread, Spread]] = (),
     ) -> tuple[Spread, Spread]:
         """How far off the last solution may be, and what comes and goes while it is used.
 
@@ -173,16 +172,15 @@ class Calibration:
             sigma_log: Sigma of the scale's logarithm.
             slope: By camera, change of joint_from_cam (4,4) per unit of log scale.
             placed: By camera whose map was joined by the body, sigmas (rad, m) of where it lies.
-            length_share: Sigma of each bone's length as a share of it.
+            bodies: How bones may differ from those believed, between people and between rigs; how another
+                rig is built says nothing of how well this one's mounts are known.
         """
         samples, cameras = self._samples, self._samples.cameras
         mounts = self.solved()
         solved = mounts.eliminated()
         factors = self.row_variance(mounts, solved)
         bent = self._bent(mounts, solved)
-        person = [habits(self._at_ease, cameras, BETWEEN_SHARE)]
-        if length_share > 0.0:
-            person.append(proportions(self._bones, cameras, length_share))
+        person = [habits(self._at_ease, cameras, BETWEEN_SHARE), *(people for people, _ in bodies)]
         follow = {name: mount_slope(self.mounts[name], slope[name]) for name in cameras}
         bends = np.sqrt(bent) * np.stack([samples.sigma_rad, self._scale * samples.sigma_map], axis=1)
         bends = np.hypot(bends, [placed.get(name, (0.0, 0.0)) for name in cameras])
@@ -195,6 +193,7 @@ class Calibration:
         passing = [
             habits(self._bones, cameras, self._passing(mounts, solved)),
             map_bends(self._bones, dict(zip(cameras, bends, strict=True))),
+            *(mounts.followed(solved, rigs) for _, rigs in bodies),
         ]
         return constant, joined(passing)
 

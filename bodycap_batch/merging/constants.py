@@ -12,6 +12,7 @@ from bodycap_batch.body import MergeInputs
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging import gauge
+from bodycap_batch.merging.anthropometry import PROPORTION_SIGMA, placements, proportions
 from bodycap_batch.merging.board import Board, find_board
 from bodycap_batch.merging.bones import Bone
 from bodycap_batch.merging.calibrate import Calibration
@@ -27,14 +28,10 @@ from bodycap_batch.merging.t_pose import arm_span, find_t_pose
 from bodycap_batch.merging.tracks import Track
 from bodycap_batch.merging.upright import Around, Direction, Say, find_up
 from bodycap_batch.skeleton import Mount, SkeletonModel
-from bodycap_batch.skeleton_presets import split_side
+from bodycap_batch.skeleton_presets import MEAN_HEIGHT_M, split_side
 
 _CALIBRATION_TICKS = 80
 ENOUGH_WALKING = 10
-PROPORTION_SIGMA = 0.04
-"""Spread of a limb's share of the stature between people, so also of a scale that rests on it (standard
-deviations of segment lengths over stature are 3 to 5 %: Winter's table gives means only; C. C. Gordon et al.,
-"2012 Anthropometric Survey of U.S. Army Personnel", Natick 2014)."""
 STATURE_SIGMA = 0.055
 """Spread of adults' stature about one mean for both sexes (7 cm within each, means 14 cm apart)."""
 
@@ -134,8 +131,8 @@ def calibrate_body(
         sigma = float(np.hypot(sigma, STATURE_SIGMA))
     if scale != estimate.scale:
         calibration.solve(scale)
-    lengths = 0.0 if inputs.skeleton_is_measured else PROPORTION_SIGMA
-    constant, passing = calibration.spread(sigma, estimate.mount_slope, cleaned.placed, lengths)
+    bodies = () if inputs.skeleton_is_measured else (_bodies(inputs, bones, samples.cameras),)
+    constant, passing = calibration.spread(sigma, estimate.mount_slope, cleaned.placed, bodies)
     return Calibrated(
         scale=scale,
         sigma_log=sigma,
@@ -151,6 +148,12 @@ def calibrate_body(
         rolls=rolls,
         off_hinge_m=calibration.off_hinge_m(),
     )
+
+
+def _bodies(inputs: MergeInputs, bones: Sequence[Bone], cameras: Sequence[str]) -> tuple[Spread, Spread]:
+    """How people, and rigs, of one stature differ."""
+    stature_m = MEAN_HEIGHT_M if inputs.height_m is None else inputs.height_m
+    return proportions(bones, cameras), placements(bones, cameras, stature_m)
 
 
 def _right_way_up(

@@ -127,15 +127,20 @@ class SolvedMounts:
         noise = change @ (gain * factors[self.kinds]) @ gain.T @ change.T
         values, vectors = np.linalg.eigh(0.5 * (noise + noise.T))
         white = vectors * np.sqrt(np.maximum(values, 0.0))
-        shifts = joint_shifts(self.linear, self.body, self.first_joint, self.world_from_bone, bias)
-        shifts = sparse.diags_array((self.kinds != PRIOR).astype(np.float64)) @ shifts
-        follow = change @ np.asarray(shifts.T @ gain.T).T
         count = len(white)
         nothing = np.zeros((len(self.body.bones), 3, count))
         noisy = Spread(
             mounts=self._by_camera(white), log_scale=np.zeros(count), rest=nothing, offsets_m=nothing
         )
-        return joined([noisy, replace(bias, mounts=self._by_camera(follow))])
+        return joined([noisy, self.followed(solved, bias)])
+
+    def followed(self, solved: Eliminated, bias: Spread) -> Spread:
+        """Directions in which the body differs from what was believed, with the mounts that follow it."""
+        gain = solved.covariance @ solved.influence.T
+        shifts = joint_shifts(self.linear, self.body, self.first_joint, self.world_from_bone, bias)
+        shifts = sparse.diags_array((self.kinds != PRIOR).astype(np.float64)) @ shifts
+        follow = block_diag(*self.mount_change.values()) @ np.asarray(shifts.T @ gain.T).T
+        return replace(bias, mounts=self._by_camera(follow))
 
     def _by_camera(self, changes: FloatArray) -> dict[str, FloatArray]:
         return {camera: changes[6 * index : 6 * index + 6] for index, camera in enumerate(self.mount_columns)}

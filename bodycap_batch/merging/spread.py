@@ -14,7 +14,6 @@ from bodycap_batch.geometry import invert, make_transform
 from bodycap_batch.merging.bones import Bone, Hinge
 from bodycap_batch.merging.graph import bone_key
 from bodycap_batch.merging.linear import Linear
-from bodycap_batch.skeleton_presets import split_side
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,22 +141,6 @@ def habits(bones: Sequence[Bone], cameras: Sequence[str], share: float | FloatAr
         log_scale=np.zeros(rest.shape[-1]),
         rest=rest,
         offsets_m=np.zeros_like(rest),
-    )
-
-
-def proportions(bones: Sequence[Bone], cameras: Sequence[str], share: float) -> Spread:
-    """The ways in which bones may be longer than a height has them, each by that share, both sides alike."""
-    parts = [split_side(bone.role)[1] for bone in bones]
-    names = sorted({part for part, bone in zip(parts, bones, strict=True) if bone.parent >= 0})
-    offsets_m = np.zeros((len(bones), 3, len(names)))
-    for index, bone in enumerate(bones):
-        if bone.parent >= 0:
-            offsets_m[index, :, names.index(parts[index])] = share * bone.offset_m
-    return Spread(
-        mounts={camera: np.zeros((6, len(names))) for camera in cameras},
-        log_scale=np.zeros(len(names)),
-        rest=np.zeros_like(offsets_m),
-        offsets_m=offsets_m,
     )
 
 

@@ -10,6 +10,8 @@ from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.errors import EstimationError, JobError
 from bodycap_batch.geometry import Similarity, so3_exp
 from bodycap_batch.merging.advice import mount_sentence, scale_sentence
+from bodycap_batch.merging.anthropometry import placements, proportions
+from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.distance import known_distance
 from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount
 from tests.stages.walker import make_inputs, make_walk, record
@@ -97,3 +99,29 @@ def test_the_scales_advice_follows_from_where_cameras_sit(roles, advice):
     assert "known to 27.0 % (1 sigma)" in sentence
     assert advice in sentence
     assert "merge.known_distance" in sentence
+
+
+def test_where_rigs_differ_the_rest_of_the_body_stays():
+    """A chest's joint that lies higher in its rig leaves shoulders where they were beside the hips."""
+    skeleton = load_skeleton("full_body", 1.80)
+    bones = graph_bones(skeleton, {"Hips", "LeftHand", "RightHand", "Head"})
+    elsewhere = placements(bones, ("torso",), 1.80)
+    index = {bone.role: position for position, bone in enumerate(bones)}
+    moved = np.zeros_like(elsewhere.offsets_m)
+    for position, bone in enumerate(bones):
+        above = moved[bone.parent] if bone.parent >= 0 else 0.0
+        moved[position] = elsewhere.offsets_m[position] + above
+    # Along the trunk 5.5 % of the stature.
+    assert np.abs(moved[index["Spine1"], 2]).max() == pytest.approx(0.055 * 1.80)
+    trunk = np.abs(moved[index["Spine1"]]).max(axis=0) > 0.0
+    for role in ("LeftShoulder", "RightHand", "Neck", "Head"):
+        np.testing.assert_allclose(moved[index[role]][:, trunk], 0.0, atol=1e-12)
+    # Both arms grow alike, and so does all of a person.
+    np.testing.assert_allclose(moved[index["LeftHand"], 0], -moved[index["RightHand"], 0])
+    assert np.linalg.norm(moved[index["LeftHand"], 0]) == pytest.approx(
+        np.hypot(0.02, np.hypot(0.024, 0.03)) * 1.8
+    )
+    people = proportions(bones, ("torso",))
+    assert people.offsets_m[index["LeftForeArm"]].sum() == pytest.approx(0.04 * 0.186 * 1.80)
+    assert not people.mounts["torso"].any()
+    assert not elsewhere.mounts["torso"].any()
