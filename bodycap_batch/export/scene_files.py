@@ -10,6 +10,7 @@ from bodycap_batch.arrays import FloatArray
 from bodycap_batch.export.inputs import ExportInputs
 from bodycap_batch.export.placed import WORLD, PlacedMap, main_frame, place_maps, place_trajectories
 from bodycap_batch.formats.colmap import write_colmap_model
+from bodycap_batch.formats.palette import camera_colours
 from bodycap_batch.formats.ply import PointCloud, with_paths, write_ply
 from bodycap_batch.formats.tum import TimedPoses, write_tum
 from bodycap_batch.scene import Trajectory
@@ -27,6 +28,7 @@ def write_maps(inputs: ExportInputs) -> list[Path]:
     """
     frame = main_frame(inputs)
     written = []
+    colours = camera_colours(item.camera for item in inputs.trajectories)
     groups: dict[str, list[PlacedMap]] = {}
     for placed in place_maps(inputs):
         groups.setdefault(placed.frame, []).append(placed)
@@ -38,7 +40,7 @@ def write_maps(inputs: ExportInputs) -> list[Path]:
         paths = {item.camera: _centres(item) for item in place_trajectories(inputs) if item.gauge == name}
         spacing = PATH_SPACING_M if name == WORLD else _PATH_SPACING_SHARE * _extent(cloud.points)
         file = inputs.out_dir / ("map.ply" if name == frame else f"map_{number}.ply")
-        write_ply(file, with_paths(cloud, paths, spacing) if paths else cloud)
+        write_ply(file, with_paths(cloud, paths, spacing, colours) if paths else cloud)
         written.append(file)
     return written
 

@@ -14,11 +14,9 @@ from bodycap_batch.arrays import FloatArray, set_array
 from bodycap_batch.errors import StoreError
 from bodycap_batch.formats.files import replacing
 from bodycap_batch.formats.open3d_library import load_open3d
+from bodycap_batch.formats.palette import Colour, camera_colours
 
 Colors = npt.NDArray[np.uint8]
-
-# Okabe and Ito's palette, told apart by colour-blind eyes too, without its black and yellow.
-PATH_COLORS = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (213, 94, 0), (204, 121, 167), (0, 114, 178))
 
 
 _VERTEX_BYTES = 3 * 8 + 3
@@ -42,20 +40,26 @@ class PointCloud:
         set_array(self, "colors", (len(self.points), 3), np.uint8)
 
 
-def with_paths(cloud: PointCloud, paths: Mapping[str, FloatArray], spacing: float) -> PointCloud:
+def with_paths(
+    cloud: PointCloud,
+    paths: Mapping[str, FloatArray],
+    spacing: float,
+    colours: Mapping[str, Colour] | None = None,
+) -> PointCloud:
     """Add each camera's path as a string of points in a colour of its own.
 
     Args:
         cloud: The map.
         paths: (N,3) camera centres in time order, NaN where there is a gap, by camera name.
         spacing: Largest distance between two samples, in the cloud's unit.
+        colours: By camera name, where there are more cameras than these paths'.
     """
     points, colors = [cloud.points], [cloud.colors]
-    for number, name in enumerate(sorted(paths)):
+    colours = colours or camera_colours(paths)
+    for name in sorted(paths):
         samples = _sampled(np.asarray(paths[name], dtype=np.float64).reshape(-1, 3), spacing)
         points.append(samples)
-        color = np.array(PATH_COLORS[number % len(PATH_COLORS)], dtype=np.uint8)
-        colors.append(np.broadcast_to(color, samples.shape))
+        colors.append(np.broadcast_to(np.array(colours[name], dtype=np.uint8), samples.shape))
     return PointCloud(points=np.concatenate(points), colors=np.concatenate(colors))
 
 

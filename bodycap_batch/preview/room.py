@@ -22,12 +22,6 @@ _OUTLINE = (15, 16, 19)
 _MAX_POINTS = 40_000
 _SUBPIXEL = 4
 _BONE_M = 0.022
-_PATH_COLOURS = (
-    (0, 178, 130), (240, 228, 66), (214, 131, 177), (150, 140, 240), (225, 100, 20), (70, 150, 235),
-)  # fmt: skip
-"""Told apart by the colour-blind (after M. Okabe, K. Ito, Color Universal Design), lighter on dark.
-
-Blue and orange, the limbs' own, come last."""
 _FRUSTUM = np.array([[0, 0, 0], [-0.6, -0.45, 1], [0.6, -0.45, 1], [0.6, 0.45, 1], [-0.6, 0.45, 1.0]])
 _FRUSTUM_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
 
@@ -43,11 +37,6 @@ class Cloud:
         """At most so many that a picture is drawn in a few milliseconds, evenly taken."""
         stride = -(-len(self.points) // _MAX_POINTS) or 1
         return Cloud(points=self.points[::stride], colours=self.colours[::stride])
-
-
-def path_colour(number: int) -> Colour:
-    """The colour of a camera's path, by its place among the job's cameras."""
-    return _PATH_COLOURS[number % len(_PATH_COLOURS)]
 
 
 def blank(size: tuple[int, int]) -> Picture:

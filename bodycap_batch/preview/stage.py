@@ -15,6 +15,7 @@ from bodycap_batch.capture import Capture
 from bodycap_batch.context import StageContext
 from bodycap_batch.formats.files import replacing
 from bodycap_batch.formats.mp4 import VideoWriter
+from bodycap_batch.formats.palette import camera_colours
 from bodycap_batch.overlay import Body, CameraView
 from bodycap_batch.preview import room
 from bodycap_batch.preview.layout import HEIGHT, ROOM_WIDTH, WIDTH, place_videos
@@ -68,7 +69,7 @@ def render_preview(inputs: PreviewInputs, context: StageContext) -> Path:
         StoreError: The file cannot be written.
     """
     timeline = _timeline(inputs)
-    tiles = _tiles(inputs, timeline)
+    tiles = film_tiles(inputs, timeline)
     stage = _Room.build(inputs, timeline, tiles)
     count = len(timeline.times_ns)
     empty = room.blank((WIDTH, HEIGHT))
@@ -124,9 +125,11 @@ def _timeline(inputs: PreviewInputs) -> Timeline:
     return make_timeline(int(min(each[0] for each in own)), int(max(each[-1] for each in own)), fps)
 
 
-def _tiles(inputs: PreviewInputs, timeline: Timeline) -> list[Tile]:
+def film_tiles(inputs: PreviewInputs, timeline: Timeline) -> list[Tile]:
+    """Every camera, where its video stands in the picture, and its colour."""
     views = {view.camera: view for view in inputs.views}
     cameras = inputs.capture.cameras
+    colours = camera_colours(camera.name for camera in cameras)
     boxes = place_videos([camera.camera.width_px / camera.camera.height_px for camera in cameras])
     return [
         Tile(
@@ -135,9 +138,9 @@ def _tiles(inputs: PreviewInputs, timeline: Timeline) -> list[Tile]:
             frames=frames_at(camera, timeline.times_ns),
             picture=picture,
             bar=bar,
-            colour=room.path_colour(number),
+            colour=colours[camera.name],
         )
-        for number, (camera, (picture, bar)) in enumerate(zip(cameras, boxes, strict=True))
+        for camera, (picture, bar) in zip(cameras, boxes, strict=True)
     ]
 
 

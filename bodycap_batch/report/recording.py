@@ -10,6 +10,7 @@ import numpy as np
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.body import MergeResult
 from bodycap_batch.errors import JobError, StoreError
+from bodycap_batch.formats.palette import Colour, camera_colours
 from bodycap_batch.geometry import quat_xyzw_from_rotation
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.marks import solved_body
@@ -49,8 +50,9 @@ def write_recording(inputs: ReportInputs, target: Path) -> None:
     stream = rr.RecordingStream("bodycap", recording_id=inputs.name)
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     _log_maps(stream, placed)
+    colours = camera_colours(inputs.cameras)
     for path in placed.paths:
-        _log_path(stream, path)
+        _log_path(stream, path, colours[path.camera])
     if inputs.merge is not None:
         _log_body(stream, inputs.merge)
     try:
@@ -71,7 +73,7 @@ def _log_maps(stream: rr.RecordingStream, placed: Placed) -> None:
         stream.log(f"world/map_{number}", cloud, static=True)
 
 
-def _log_path(stream: rr.RecordingStream, path: PlacedPath) -> None:
+def _log_path(stream: rr.RecordingStream, path: PlacedPath, colour: Colour) -> None:
     """The stretches of a path between its gaps, and the camera moving along it."""
     import rerun as rr
 
@@ -81,7 +83,7 @@ def _log_path(stream: rr.RecordingStream, path: PlacedPath) -> None:
     centres, name = path.poses[posed, :3, 3], f"world/cameras/{path.camera}"
     gaps = np.flatnonzero(np.diff(np.flatnonzero(posed)) > 1) + 1
     stretches = [each for each in np.split(centres, gaps) if len(each)]
-    stream.log(f"{name}/path", rr.LineStrips3D(stretches), static=True)
+    stream.log(f"{name}/path", rr.LineStrips3D(stretches, colors=[colour]), static=True)
     stream.send_columns(
         f"{name}/now",
         indexes=[rr.TimeColumn("time", duration=path.times_s[posed])],

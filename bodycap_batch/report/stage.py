@@ -8,6 +8,7 @@ from typing import Any
 
 from bodycap_batch.context import StageContext
 from bodycap_batch.formats.files import write_text
+from bodycap_batch.formats.palette import as_hex, camera_colours
 from bodycap_batch.report.content import page_content
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.lost import lost_frames
@@ -22,7 +23,6 @@ REPORT_FILE = "report.html"
 MAX_BYTES = 15_000_000
 _SHARES = (1.0, *(0.6**step for step in range(1, 16)))
 """Of every budget, one after the other; at the last one hardly more than words and tables is left."""
-_TONES = ("#c8503c", "#14808f", "#c98b1a", "#7a5ba8", "#4c8a45", "#b4508a", "#5773b8", "#8a6a45")
 
 
 def write_report(inputs: ReportInputs, path: Path, context: StageContext) -> None:
@@ -39,7 +39,7 @@ def write_report(inputs: ReportInputs, path: Path, context: StageContext) -> Non
         StoreError: The file cannot be written.
     """
     placed = place(inputs)
-    tones = {name: _TONES[index % len(_TONES)] for index, name in enumerate(inputs.cameras)}
+    tones = {name: as_hex(colour) for name, colour in camera_colours(inputs.cameras).items()}
     context.progress(0, 3, "pictures")
     lost = lost_frames(inputs, context)
     pictures = _pictures(inputs, context) if placed.drawn else []

@@ -21,7 +21,7 @@ from bodycap_batch.export import ExportInputs, export_results
 from bodycap_batch.export.layout import lay_out
 from bodycap_batch.export.projection import project_motion
 from bodycap_batch.formats.fbx import find_blender, write_fbx
-from bodycap_batch.formats.ply import PATH_COLORS
+from bodycap_batch.formats.palette import CAMERA_COLOURS
 from bodycap_batch.geometry import Similarity, invert, rotation_angle_rad
 from bodycap_batch.skeleton import Motion
 from tests.bodies import merged, reaching
@@ -203,7 +203,7 @@ def test_room_and_body_share_one_scene(case: Case, blender: Path, tmp_path: Path
     poses = seen.joint_poses(case.motion)
     assert case.inputs.merge is not None
     for number, mount in enumerate(sorted(case.inputs.merge.mounts, key=lambda each: each.camera)):
-        path = cloud[(np.abs(shade - PATH_COLORS[number]) <= 1).all(axis=1)]
+        path = cloud[(np.abs(shade - CAMERA_COLOURS[number]) <= 1).all(axis=1)]
         assert len(path) > 100
         joint = case.motion.skeleton.roles.index(mount.role)
         trajectory = next(t for t in case.inputs.merge.trajectories if t.camera == mount.camera)

@@ -11,7 +11,8 @@ import pytest
 
 from bodycap_batch.errors import StoreError
 from bodycap_batch.formats.open3d_library import load_open3d
-from bodycap_batch.formats.ply import PATH_COLORS, PointCloud, read_ply, with_paths, write_ply
+from bodycap_batch.formats.palette import camera_colours
+from bodycap_batch.formats.ply import PointCloud, read_ply, with_paths, write_ply
 
 
 def cloud(count: int) -> PointCloud:
@@ -41,7 +42,7 @@ def test_paths_keep_every_vertex_and_leave_gaps_open() -> None:
     both = with_paths(cloud(10), {"b": path, "a": np.full((2, 3), np.nan)}, spacing=0.25)
     mine = both.points[10:]
     np.testing.assert_allclose(mine[:, 0], [0, 0.25, 0.5, 0.75, 1, 5, 5])
-    assert (both.colors[10:] == PATH_COLORS[1]).all()
+    assert (both.colors[10:] == camera_colours("ab")["b"]).all()
 
 
 def test_a_missing_folder_is_made_and_a_forbidden_one_named(tmp_path: Path) -> None:

@@ -1,0 +1,66 @@
+"""One colour a camera, wherever it is drawn."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bodycap_batch.capture import open_capture
+from bodycap_batch.config.job import load_job
+from bodycap_batch.formats.palette import CAMERA_COLOURS, as_hex, camera_colours
+from bodycap_batch.formats.ply import PointCloud, with_paths
+from bodycap_batch.preview import PreviewInputs
+from bodycap_batch.preview.room import BACKGROUND
+from bodycap_batch.preview.stage import film_tiles
+from bodycap_batch.preview.timeline import make_timeline
+from tests.reports import report_inputs, written
+from tests.videos import textured_frame, write_video
+
+
+def _luminance(colour: tuple[int, ...]) -> float:
+    """Of sRGB, as the Web Content Accessibility Guidelines count it."""
+    share = np.array(colour) / 255.0
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return float(linear @ (0.2126, 0.7152, 0.0722))
+
+
+@pytest.mark.parametrize("colour", CAMERA_COLOURS)
+def test_each_is_seen_on_white_paper_and_on_the_dark_ground(colour: tuple[int, int, int]) -> None:
+    for ground in ((255, 255, 255), (28, 32, 36), tuple(BACKGROUND.tolist())):
+        light, dark = sorted((_luminance(colour), _luminance(ground)), reverse=True)
+        assert (light + 0.05) / (dark + 0.05) >= 3.0
+    assert re.fullmatch("#[0-9a-f]{6}", as_hex(colour))
+
+
+def test_a_camera_has_its_colour_whatever_the_order_and_whoever_is_missing() -> None:
+    every = camera_colours(["torso", "left_palm", "right_palm"])
+    assert every == camera_colours(["right_palm", "torso", "left_palm"])
+    assert len(set(camera_colours(f"camera {number}" for number in range(8)).values())) == 8
+    nothing = PointCloud(points=np.zeros((0, 3)), colors=np.zeros((0, 3), np.uint8))
+    cloud = with_paths(nothing, {"torso": np.zeros((1, 3))}, 0.1, every)
+    assert tuple(cloud.colors[0].tolist()) == every["torso"]
+
+
+def test_page_and_film_have_it_from_there(tmp_path: Path) -> None:
+    inputs = report_inputs(frames=30)
+    own = camera_colours(inputs.cameras)
+    told = re.search(r'"tones": ?(\{[^}]*\})', written(inputs, tmp_path))
+    assert told is not None
+    assert json.loads(told.group(1)) == {name: as_hex(colour) for name, colour in own.items()}
+    for name in ("left_palm", "torso"):
+        write_video(tmp_path / "videos" / f"{name}.mp4", [textured_frame(index) for index in range(9)])
+    capture = open_capture(load_job(tmp_path / "videos").capture)
+    film = PreviewInputs(
+        path=tmp_path / "preview.mp4",
+        capture=capture,
+        views=(),
+        frame="map-0",
+        points=np.zeros((0, 3)),
+        colours=np.zeros((0, 3), np.uint8),
+    )
+    tiles = film_tiles(film, make_timeline(0, 250_000_000, 30.0))
+    assert {tile.camera.name: tile.colour for tile in tiles} == camera_colours(["torso", "left_palm"])
