@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -191,6 +191,7 @@ def _of_map(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
         "unless the body itself tells where it was, and then less exactly.",
     )
     yield from _of_reach(metrics.get("mapping", {}).get("reach"))
+    yield from _of_shared_segments(metrics.get("relative_poses", ()))
     mapping = metrics.get("mapping", {})
     misfits, freed = mapping.get("misfitting_lenses", {}), mapping.get("freed_lenses", ())
     # A lens of the wrong kind, a wide one given as a pinhole, leaves more than sharp corners do.
@@ -218,6 +219,24 @@ def _of_reach(reach: Mapping[str, Any] | None) -> Iterator[Criterion]:
         metric="mapping.reach.within_reach",
         value=share,
     )
+
+
+def _of_shared_segments(relative: Sequence[Mapping[str, Any]]) -> Iterator[Criterion]:
+    """Cameras on one bone beside each other; without common frames nothing is known of them."""
+    known = [each for each in relative if each["spread_deg"] is not None]
+    worst = max(known, key=lambda each: float(each["spread_deg"]), default=None)
+    if worst is not None:
+        spread = float(worst["spread_deg"])
+        yield Criterion(
+            about="cameras",
+            name="Cameras on one bone",
+            grade=graded(spread, 2.0, 6.0),
+            says=f"{' and '.join(worst['cameras'])} are turned by {spread:.1f}° against their usual places "
+            f"(median of {worst['instants']:,} frames)",
+            why="They keep their places beside each other, but for soft straps. Where they do not, one has "
+            "come loose, or a clock is off (offset_s): 0.4 s made 5° of a camera that was moved slowly.",
+            value=spread,
+        )
 
 
 def _of_lenses(misfits: Mapping[str, float], freed: Collection[str]) -> Iterator[Criterion]:

@@ -259,6 +259,21 @@ def test_every_link_of_the_page_leads_somewhere(inputs: ReportInputs, tmp_path: 
         assert sections - links <= {"verdict", "about"}
 
 
+@pytest.mark.parametrize(("spread_deg", "grade"), [(0.3, Grade.GOOD), (4.8, Grade.FAIR), (15.0, Grade.POOR)])
+def test_cameras_on_one_bone_that_move_against_each_other_are_told(
+    inputs: ReportInputs, spread_deg: float, grade: Grade
+) -> None:
+    metrics = json.loads(json.dumps(inputs.metrics))
+    pair = {"cameras": ["torso", "torso_back"], "instants": 130}
+    never = {"cameras": ["torso", "torso_2"], "instants": 0, "spread_deg": None}
+    metrics["relative_poses"] = [never, {**pair, "spread_deg": spread_deg}]
+    (found,) = [each for each in judge(metrics, None).criteria if each.name == "Cameras on one bone"]
+    assert found.grade is grade
+    assert "torso and torso_back" in found.says
+    metrics["relative_poses"] = [never]
+    assert not [each for each in judge(metrics, None).criteria if each.name == "Cameras on one bone"]
+
+
 def test_a_body_that_no_scale_brings_within_reach_is_told(inputs: ReportInputs) -> None:
     metrics = json.loads(json.dumps(inputs.metrics))
     metrics["mapping"]["reach"] = {
