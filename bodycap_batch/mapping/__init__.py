@@ -179,10 +179,11 @@ def _begun(
     kind of camera.
     """
     models, log = _started(shop, options, total)
-    if models and guessed:
-        found = change_lenses(shop.workspace, models[0], shop.settings(), guessed)
-        if found:
-            models, log = _started(replace(shop, lenses={**shop.lenses, **found}), options, total)
+    for again in (False, True) if guessed else ():
+        found = change_lenses(shop.workspace, models, shop.settings(), guessed, again=again)
+        if not found:
+            break
+        models, log = _started(shop := replace(shop, lenses={**shop.lenses, **found}), options, total)
         log["better_lenses"] = {name: lens.model for name, (lens, _) in sorted(found.items())}
     return models, log
 
