@@ -35,6 +35,38 @@ def test_it_draws_in_3d_without_a_word_of_complaint_or_the_network(pages: Pages,
     assert [url for url in pages.fetched if url.startswith("file:")] == [report.as_uri()]
 
 
+SEEN = """() => {
+  const { view } = bodycap;
+  const p = new view.three.Vector3();
+  const ends = [0, 0];
+  for (const each of [view.data.body.centres, ...view.data.paths.map((path) => path.centre)])
+    for (let i = 0; i < each.length; i += 3) {
+      if (!Number.isFinite(each[i])) continue;
+      p.fromArray(each, i).project(view.camera);
+      ends[0] = Math.max(ends[0], Math.abs(p.x));
+      ends[1] = Math.max(ends[1], Math.abs(p.y));
+    }
+  return ends;
+}"""
+
+
+@pytest.mark.parametrize("width", [1400, 400])
+def test_it_starts_with_the_whole_body_and_all_paths_in_view(pages: Pages, report: Path, width: int) -> None:
+    page = pages.open(report.as_uri())
+    page.set_viewport_size({"width": width, "height": 900})
+    page.wait_for_selector("section.viewer[data-mode=webgl]")
+    page.wait_for_timeout(400)
+    across, up = page.evaluate(SEEN)
+    # In the picture, and not lost in it.
+    assert max(across, up) < 1.0
+    assert max(across, up) > 0.8
+    page.evaluate("bodycap.view.orbit.zoom(0.5)")
+    near = page.evaluate("bodycap.view.orbit.distance")
+    page.set_viewport_size({"width": width + 100, "height": 900})
+    page.wait_for_timeout(400)
+    assert page.evaluate("bodycap.view.orbit.distance") == near, "who looked around is left there"
+
+
 def test_the_slider_moves_the_skeleton(pages: Pages, report: Path) -> None:
     page = pages.open(report.as_uri())
     page.wait_for_selector("section.viewer[data-mode=webgl]")

@@ -1,4 +1,6 @@
 // Looking around a point, Z up: drag turns, shift-drag or two fingers move, wheel or pinch comes nearer.
+const FILLED = 0.92;
+
 class Orbit {
   constructor(view, onChange) {
     this.home = { target: [...view.centre], distance: 2.1 * view.radius, azimuth: -1.1, height: 0.42 };
@@ -7,23 +9,50 @@ class Orbit {
     this.reset();
   }
 
+  // Start where all of these points (x, y, z one after the other) are in the picture, unless somebody looked around.
+  frame(points, aspect, view) {
+    const high = Math.tan((0.5 * view * Math.PI) / 180) * FILLED;
+    const [low, top] = [[Infinity, Infinity, Infinity], [-Infinity, -Infinity, -Infinity]];
+    points.forEach((value, i) => {
+      low[i % 3] = Math.min(low[i % 3], value);
+      top[i % 3] = Math.max(top[i % 3], value);
+    });
+    const { home } = this;
+    if (points.length) home.target = low.map((value, axis) => 0.5 * (value + top[axis]));
+    const [sin, cos] = [Math.sin(home.azimuth), Math.cos(home.azimuth)];
+    const [rise, level] = [Math.sin(home.height), Math.cos(home.height)];
+    let distance = points.length ? 0.5 * this.radius : home.distance;
+    for (let i = 0; i < points.length; i += 3) {
+      const [x, y, z] = home.target.map((value, axis) => points[i + axis] - value);
+      const near = level * (cos * x + sin * y) + rise * z;
+      const across = Math.abs(cos * y - sin * x) / (high * aspect);
+      const up = Math.abs(level * z - rise * (cos * x + sin * y)) / high;
+      distance = Math.max(distance, near + Math.max(across, up));
+    }
+    home.distance = distance;
+    if (this.untouched) this.reset();
+  }
+
   reset() {
-    Object.assign(this, this.home, { target: [...this.home.target] });
+    Object.assign(this, this.home, { target: [...this.home.target], untouched: true });
     this.onChange();
   }
 
   turn(azimuth, height) {
+    this.untouched = false;
     this.azimuth += azimuth;
     this.height = Math.min(Math.max(this.height + height, -1.5), 1.5);
     this.onChange();
   }
 
   zoom(factor) {
+    this.untouched = false;
     this.distance = Math.min(Math.max(this.distance * factor, 0.02 * this.radius), 60 * this.radius);
     this.onChange();
   }
 
   move(right, up) {
+    this.untouched = false;
     const [sin, cos] = [Math.sin(this.azimuth), Math.cos(this.azimuth)];
     const scale = this.distance;
     this.target[0] += scale * (-right * sin - up * Math.sin(this.height) * cos);

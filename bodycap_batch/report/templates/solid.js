@@ -53,6 +53,7 @@ class Solid {
     this.scene.add(sun);
     this.orbit = new Orbit(data.solid.view, () => (this.dirty = true));
     this.orbit.listen(holder);
+    this.whole = this.everything();
     this.unit = data.solid.metric ? 1 : data.solid.view.radius / 2.5;
     this.addPoints();
     this.addPaths();
@@ -70,6 +71,28 @@ class Solid {
       requestAnimationFrame(loop);
     };
     requestAnimationFrame(loop);
+  }
+
+  // The whole body at all times, and the cameras' paths but for what lies far off: what to show from the start.
+  everything() {
+    const { body, paths, solid } = this.data;
+    const out = [];
+    if (body) {
+      const ticks = body.centres.length / (3 * body.count);
+      const step = Math.max(1, Math.floor(ticks / 100));
+      for (let tick = 0; tick < ticks; tick += step) {
+        out.push(...body.centres.subarray(3 * body.count * tick, 3 * body.count * (tick + 1)));
+      }
+    }
+    const { centre, radius } = solid.view;
+    for (const path of paths) {
+      const step = Math.max(1, Math.floor(path.times.length / 200));
+      for (let i = 0; i < path.times.length; i += step) {
+        const place = [...path.centre.subarray(3 * i, 3 * i + 3)];
+        if (Math.hypot(...place.map((value, axis) => value - centre[axis])) < 2 * radius) out.push(...place);
+      }
+    }
+    return out;
   }
 
   layer(name, object) {
@@ -233,6 +256,7 @@ class Solid {
     if (this.splat) this.splat.resize(width, height);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
+    this.orbit.frame(this.whole, width / height, this.camera.fov);
     this.dirty = true;
   }
 
