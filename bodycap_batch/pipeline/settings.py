@@ -11,6 +11,7 @@ from bodycap_batch.errors import Cancelled
 from bodycap_batch.progress import Listener
 from bodycap_batch.runner import CHILD, Children, Executor, Rules, Runner, Task
 from bodycap_batch.runner.parent import allow, always
+from bodycap_batch.runner.turns import TakingTurns, Turns
 from bodycap_batch.store import Store
 
 
@@ -41,6 +42,7 @@ class Settings:
         priority: Higher goes first where several jobs wait.
         results_ready: Called with the folder of the results where they are there before their video.
         limits: How large the videos may be; None where they are the user's own.
+        turns: What other jobs of this process are making; None where there are none.
     """
 
     store: Store
@@ -56,6 +58,7 @@ class Settings:
     priority: int = 0
     results_ready: Callable[[Path], None] = _tell_nobody
     limits: Limits | None = None
+    turns: Turns | None = None
 
     def runner(
         self, logs: Path, also: Callable[[], bool] = _no, before: Callable[[Task], None] = allow
@@ -67,9 +70,10 @@ class Settings:
             also: Another reason to stop.
             before: Called before a task is made; may raise to forbid it.
         """
+        executor = self.executor or Children(self.command)
         return Runner(
             self.store,
-            self.executor or Children(self.command),
+            executor if self.turns is None else TakingTurns(executor, self.turns),
             logs=logs,
             listener=self.listener,
             rules=Rules(

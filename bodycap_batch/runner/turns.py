@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from bodycap_batch.errors import Cancelled
-from bodycap_batch.runner.children import STOPPED, Making
+from bodycap_batch.runner.children import STOPPED, Executor, Making
 from bodycap_batch.runner.task import Task
 
 _POLL_S = 0.1
@@ -41,3 +41,26 @@ class Turns:
             with self._changed:
                 self._under_way.remove(place)
                 self._changed.notify_all()
+
+
+class TakingTurns:
+    """An executor of one job that leaves to others of this process what they are making already.
+
+    Args:
+        executor: Makes what nobody else does.
+        turns: Shared by the jobs.
+    """
+
+    def __init__(self, executor: Executor, turns: Turns) -> None:
+        self._executor = executor
+        self._turns = turns
+
+    def make(self, task: Task, making: Making) -> None:
+        """Make and commit the task's artefact, or wait until another job has. Raises `BodycapError`."""
+        with self._turns.taken(task, making) as made:
+            if not made:
+                self._executor.make(task, making)
+
+    def close(self, logs: Path) -> None:
+        """The job with these logs has ended."""
+        self._executor.close(logs)

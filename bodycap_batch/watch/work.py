@@ -13,6 +13,7 @@ from pathlib import Path
 from bodycap_batch.errors import BodycapError, Cancelled, DiskAway, JobError, StoreError, error_from_dict
 from bodycap_batch.pipeline import Settings, run_job
 from bodycap_batch.references import StoreBusy, moving
+from bodycap_batch.runner.turns import Turns
 from bodycap_batch.store import Store, store_error
 from bodycap_batch.watch.claim import Claim, clear_claim
 from bodycap_batch.watch.intake import read_job, rewrite_results
@@ -57,6 +58,7 @@ class Worker:
         self._options = options
         self._stop = stop
         self._setbacks: Counter[str] = Counter()
+        self._turns = Turns()
         self._store = Store(options.store or spool.root / ".store")
 
     def work(self, claim: Claim, refused: BodycapError | None = None) -> Outcome:
@@ -121,6 +123,7 @@ class Worker:
             command=self._options.command,
             may_commit=claim.guard.holds,
             limits=self._options.terms.limits,
+            turns=self._turns,
         )
         try:
             run_job(job, out_dir=place.result, settings=settings)

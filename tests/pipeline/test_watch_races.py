@@ -11,9 +11,10 @@ import pytest
 
 from bodycap_batch.cli import main
 from bodycap_batch.errors import JobError
+from bodycap_batch.pipeline import Settings
 from bodycap_batch.references import collect_garbage
 from bodycap_batch.store import Store
-from bodycap_batch.watch import cancel_job, claiming, commands, retry_job
+from bodycap_batch.watch import cancel_job, claiming, commands, retry_job, work
 from bodycap_batch.watch.claim import process_mark
 from bodycap_batch.watch.drops import Drop, look_at
 from bodycap_batch.watch.spool import CLAIM_PREFIX, RETRY_PREFIX, JobDir
@@ -213,3 +214,19 @@ def test_a_job_that_ends_while_it_is_cancelled_is_not_called_cancelled(
     monkeypatch.setattr(Path, "touch", end)
     assert main(["cancel", "walk"]) == 0
     assert "it ended before it could be stopped: done" in capfd.readouterr().out
+
+
+def test_jobs_side_by_side_do_not_make_the_same_twice(
+    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shared: list[object] = []
+
+    def run(job: object, *, out_dir: Path, settings: Settings) -> None:
+        shared.append(settings.turns)
+
+    monkeypatch.setattr(work, "run_job", run)
+    bench.drop("one")
+    bench.drop("two")
+    assert bench.work_off(jobs=2) == 0
+    assert len(shared) == 2
+    assert shared[0] is shared[1] is not None

@@ -12,7 +12,7 @@ import pytest
 from bodycap_batch.errors import Cancelled
 from bodycap_batch.runner import Making, Task
 from bodycap_batch.runner.pool import Slots, machine_memory_mb
-from bodycap_batch.runner.turns import Turns
+from bodycap_batch.runner.turns import TakingTurns, Turns
 from bodycap_batch.store import ArtefactKey, Store
 
 
@@ -141,6 +141,37 @@ def test_what_two_jobs_need_is_made_once_unless_it_is_to_be_made_again(tmp_path:
         thread.join(10)
     assert len(made) == (4 if again else 1)
     assert (store.find(task.key) or pytest.fail("lost")).path.joinpath("made_by").read_text() == str(made[-1])
+
+
+class Counting:
+    """Makes an artefact slowly and counts how often."""
+
+    def __init__(self) -> None:
+        self.made = self.closed = 0
+
+    def make(self, task: Task, making: Making) -> None:
+        self.made += 1
+        time.sleep(0.05)
+        with making.store.draft(task.key) as draft:
+            (draft.files / "made_by").write_text("somebody")
+            making.store.commit(draft, task.key, {})
+
+    def close(self, logs: Path) -> None:
+        self.closed += 1
+
+
+def test_jobs_side_by_side_leave_to_each_other_what_is_being_made(tmp_path: Path) -> None:
+    store, turns, each = Store(tmp_path), Turns(), [Counting() for _ in range(3)]
+    jobs = [TakingTurns(own, turns) for own in each]
+    threads = [threading.Thread(target=job.make, args=[a_task(), making_in(store)]) for job in jobs]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(10)
+    for job in jobs:
+        job.close(tmp_path)
+    assert sum(own.made for own in each) == 1
+    assert [own.closed for own in each] == [1, 1, 1]
 
 
 def test_who_waits_for_another_job_can_be_stopped_or_takes_over_where_that_failed(tmp_path: Path) -> None:
