@@ -205,8 +205,8 @@ class Flow:
         tasks = recovery_tasks(self._job, self._digests, scene, keyframes, registrations)
         return {**registrations, **self._all(tasks)}
 
-    def merge(self, scene: Artefact, registrations: ByCamera) -> Artefact:
-        """The skeleton's motion, in the world."""
+    def merge(self, scene: Artefact, registrations: ByCamera, keyframes: ByCamera) -> Artefact:
+        """The skeleton's motion, in the world; a board is looked for in the pictures that keyframes keep."""
         options = self._job.merge.model_dump(mode="json")
         inputs = {
             "map": scene.digest,
@@ -216,7 +216,7 @@ class Flow:
         arguments = {
             "map": str(scene.path),
             "registrations": [str(artefact.path) for artefact in registrations.values()],
-            **merge_arguments(self._job),
+            **merge_arguments(self._job, keyframes),
         }
         task = Task(key=key_of("merge", options, inputs), arguments=arguments, threads=self._settings.threads)
         filming = self._job.export.preview and self._settings.threads > 1

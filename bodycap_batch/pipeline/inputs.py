@@ -122,14 +122,15 @@ def body_arguments(job: Job) -> dict[str, Any]:
     }
 
 
-def merge_arguments(job: Job) -> dict[str, Any]:
-    """The body, and the videos where the merge looks for a board in them.
+def merge_arguments(job: Job, keyframes: Mapping[str, Artefact]) -> dict[str, Any]:
+    """The body, and the videos and their kept pictures where the merge looks for a board in them.
 
     Raises:
         JobError: A camera's place on the body is not known.
     """
-    shown = {} if job.merge.marker_board is None else {"capture": all_cameras(job.capture)}
-    return {**body_arguments(job), **shown}
+    if job.merge.marker_board is None:
+        return body_arguments(job)
+    return {**body_arguments(job), "capture": all_cameras(job.capture), "kept": kept_in(keyframes)}
 
 
 def body_digest(job: Job, digests: FileDigests) -> dict[str, Any]:

@@ -105,7 +105,7 @@ def run_stages(job: Job, flow: Flow, made: Made) -> Iterator[str]:
     made.registrations = flow.recover(made.scene, found, made.keyframes)
     yield "registration"
     made.stage = "merge"
-    made.merged, made.failure = _merge(job, flow, made.scene, made.registrations)
+    made.merged, made.failure = _merge(job, flow, made)
     yield "merge"
     made.filming = flow.start_preview(made) if job.export.preview else None
     made.exported = flow.export(made.keyframes, made.scene, made.registrations, made.merged, made.failure)
@@ -185,14 +185,12 @@ def _hand_over(job: Job, flow: Flow, made: Made, out_dir: Path, settings: Settin
     return partial
 
 
-def _merge(
-    job: Job, flow: Flow, scene: Artefact, registrations: Mapping[str, Artefact]
-) -> tuple[Artefact | None, EstimationError | None]:
+def _merge(job: Job, flow: Flow, made: Made) -> tuple[Artefact | None, EstimationError | None]:
     """The skeleton, or the reason why the data did not support one."""
-    if not has_body(job):
+    if not has_body(job) or made.scene is None:
         return None, None
     try:
-        return flow.merge(scene, registrations), None
+        return flow.merge(made.scene, made.registrations, made.keyframes), None
     except EstimationError as error:
         return None, error
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -46,9 +48,11 @@ class Watched(Children):
     def __init__(self) -> None:
         super().__init__(CHILD)
         self.meanwhile: dict[str, set[str]] = {}
+        self.arguments: dict[str, Mapping[str, Any]] = {}
 
     def make(self, task: Task, making: Making) -> None:
         self.meanwhile[task.key.stage] = {name for modules in making.meanwhile for name in modules}
+        self.arguments[task.key.stage] = task.arguments
         super().make(task, making)
 
 
@@ -68,3 +72,18 @@ def test_what_comes_later_is_loaded_while_a_core_is_idle(bench: Bench, threads: 
     assert children.meanwhile["map"] == (wanted if threads > 1 else set())
     if skeleton != "none":
         assert children.meanwhile["merge"] == (set(STAGES["preview"].modules) if threads > 1 else set())
+
+
+@pytest.mark.parametrize("board", [None, {"square_m": 0.1, "columns": 7, "rows": 5}])
+def test_a_board_is_looked_for_in_the_pictures_that_keyframes_keep(bench: Bench, board: Any) -> None:
+    children = Watched()
+    settings = Settings(
+        store=Store(bench.folder / "store"),
+        threads=1,
+        listener=bench.events.append,
+        cancelled=bench.stop.is_set,
+        executor=children,
+    )
+    run_job(bench.job(merge={"marker_board": board}), out_dir=bench.out, settings=settings)
+    kept = children.arguments["merge"].get("kept")
+    assert kept == (None if board is None else children.arguments["map"]["kept"])
