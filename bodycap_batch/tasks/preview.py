@@ -69,13 +69,15 @@ def _shown(maps: Sequence[Map], merge: MergeResult | None) -> dict[str, Similari
 
 
 def _trunk_first(capture: Capture, merge: MergeResult | None) -> Capture:
-    """The trunk's cameras, which see the arms, come first: they are shown largest."""
+    """The trunk's cameras, which see the arms, come first and are shown largest; those of nobody last."""
     from dataclasses import replace
 
     from bodycap_batch.skeleton_presets import split_side
 
-    roles = {} if merge is None else {mount.camera: mount.role for mount in merge.mounts}
-    order = sorted(capture.cameras, key=lambda camera: split_side(roles.get(camera.name, ""))[0] != "")
+    if merge is None:
+        return capture
+    limb = {mount.camera: split_side(mount.role)[0] != "" for mount in merge.mounts}
+    order = sorted(capture.cameras, key=lambda camera: (camera.name not in limb, limb.get(camera.name)))
     return replace(capture, cameras=tuple(order))
 
 

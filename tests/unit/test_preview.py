@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bodycap_batch.capture import open_capture
+from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.formats.mp4 import planes_of
 from bodycap_batch.overlay import SeenPoints
 from bodycap_batch.preview import room
@@ -16,6 +19,9 @@ from bodycap_batch.preview.tiles import status_line
 from bodycap_batch.preview.timeline import MAX_FRAMES, make_timeline
 from bodycap_batch.preview.viewpoint import Viewpoint, follow
 from bodycap_batch.scene import FrameStatus
+from bodycap_batch.tasks.preview import _trunk_first
+from tests.bodies import merged, reaching
+from tests.videos import textured_frame, write_video
 
 SECOND = 1_000_000_000
 
@@ -69,6 +75,18 @@ def test_videos_fit_beside_the_room_without_touching_each_other(count: int, aspe
     for picture in boxes[::2]:
         # Whole pixels: half a pixel off in width and height.
         assert abs(picture.width - aspect * picture.height) <= 1 + aspect
+
+
+def test_the_trunks_video_is_the_first_and_one_that_nobody_wears_the_last(tmp_path: Path) -> None:
+    result, _ = merged(reaching(10))
+    for name in ("a_camera_on_a_table", *(mount.camera for mount in result.mounts)):
+        write_video(tmp_path / f"{name}.mp4", [textured_frame(index) for index in range(4)])
+    cameras = tuple(CameraConfig(name=path.stem, video=(path,)) for path in sorted(tmp_path.glob("*.mp4")))
+    capture = open_capture(CaptureConfig(cameras=cameras))
+    names = [camera.name for camera in _trunk_first(capture, result).cameras]
+    assert names[0] == next(mount.camera for mount in result.mounts if mount.role == "Spine1")
+    assert names[-1] == "a_camera_on_a_table"
+    assert _trunk_first(capture, None) is capture
 
 
 def test_three_videos_are_one_large_over_two() -> None:
