@@ -78,7 +78,8 @@ def advise(inputs: ReportInputs, lost: Mapping[str, Counter[Cause]]) -> list[Adv
         lost: Lost frames by camera and cause.
     """
     found = [
-        *_of_losses(inputs, lost),
+        *_of_losses(inputs, {name: each for name, each in lost.items() if name not in _mirrored(inputs)}),
+        *_of_mirrored(inputs),
         *_of_lenses(inputs),
         *_of_overlap(inputs),
         *_of_motion(inputs),
@@ -101,6 +102,22 @@ def _t_pose_once(found: Sequence[Advice]) -> list[Advice]:
         weight=max(each.weight for each in helped) + 1e-3,
     )
     return [*others, once]
+
+
+def _mirrored(inputs: ReportInputs) -> Sequence[str]:
+    """Cameras that the map left out for it."""
+    return list((inputs.metrics or {}).get("mapping", {}).get("mirrored_cameras", ()))
+
+
+def _of_mirrored(inputs: ReportInputs) -> Iterator[Advice]:
+    """A flipped picture: nothing that is done in front of the camera mends it."""
+    if names := _mirrored(inputs):
+        yield Advice(
+            do=f"Flip the video of {', '.join(names)} back (ffmpeg -i in -vf hflip out.mp4), and switch the "
+            "mirroring of the front camera or the app off.",
+            because="it shows what the other cameras see with left and right exchanged, and was left out",
+            weight=3.0,
+        )
 
 
 def _of_lenses(inputs: ReportInputs) -> Iterator[Advice]:

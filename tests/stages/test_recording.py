@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 import rerun as rr
 
 from bodycap_batch.errors import JobError, StoreError
+from bodycap_batch.formats.palette import Colour, camera_colours
 from bodycap_batch.report import ReportInputs
 from bodycap_batch.report.marks import solved_body
 from bodycap_batch.report.recording import write_recording
@@ -29,6 +31,8 @@ class Told:
         self.times: list[float] = []
         self.columns: list[np.ndarray] = []
         self._last: list[np.ndarray] = []
+        self._colours: tuple[Colour, ...] = ()
+        self.colours: dict[str, tuple[Colour, ...]] = {}
         strips, column, set_time, log = (
             rr.LineStrips3D,
             rr.TimeColumn,
@@ -36,9 +40,10 @@ class Told:
             rr.RecordingStream.log,
         )
 
-        def spy_strips(lines: list[np.ndarray]) -> object:
+        def spy_strips(lines: list[np.ndarray], colors: Sequence[Colour] = ()) -> object:
             self._last = lines
-            return strips(lines)
+            self._colours = tuple(colors)
+            return strips(lines, colors=colors or None)
 
         def spy_column(name: str, *, duration: np.ndarray) -> object:
             self.columns.append(duration)
@@ -51,6 +56,7 @@ class Told:
         def spy_log(stream: object, name: str, thing: object, **options: bool) -> None:
             if isinstance(thing, strips):
                 self.strips.setdefault(name, []).append(self._last)
+                self.colours[name] = self._colours
             log(stream, name, thing, **options)
 
         monkeypatch.setattr(rr, "LineStrips3D", spy_strips)
@@ -89,6 +95,7 @@ def test_camera_paths_are_on_the_common_clock_and_broken_at_their_gaps(
     # frames 20 to 24 are lost
     (stretches,) = told.strips["world/cameras/torso/path"]
     assert [len(each) for each in stretches] == [20, 15]
+    assert told.colours["world/cameras/torso/path"] == (camera_colours(inputs.cameras)["torso"],)
     assert "world/body" not in told.strips
 
 

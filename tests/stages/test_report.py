@@ -118,6 +118,17 @@ def test_the_verdict_takes_the_worst_of_its_criteria(inputs: ReportInputs) -> No
     assert judge(None, {"message": "x"}).grade is Grade.NONE
 
 
+def test_a_mirrored_camera_is_to_be_flipped_not_to_see_more(inputs: ReportInputs, tmp_path: Path) -> None:
+    metrics = json.loads(json.dumps(inputs.metrics))
+    metrics["mapping"]["mirrored_cameras"] = ["left_palm"]
+    lost = {"left_palm": Counter({Cause.NO_MAP: 60})}
+    assert any("see the same places" in each.do for each in advise(inputs, lost))
+    first, *others = advise(replace(inputs, metrics=metrics), lost)
+    assert first.do.startswith("Flip the video of left_palm back")
+    assert not any("see the same places" in each.do for each in others)
+    assert "Flip the video of left_palm back" in written(replace(inputs, metrics=metrics), tmp_path)
+
+
 def test_a_verdict_names_cameras_that_only_the_body_places_and_a_job_without_any_pose(
     inputs: ReportInputs,
 ) -> None:
