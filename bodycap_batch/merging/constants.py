@@ -192,7 +192,12 @@ def trunk_way_up(
         ways[degrees] = found
         return found.up
 
-    roll, _ = trunk_roll(inputs, tracks, up_of)
+    def own_up(degrees: float) -> FloatArray | None:
+        if split_side(bones[trunk.bone].role)[0]:
+            return None
+        return body_up_from_prior(bones, trunk, rolled(prior, degrees)).erect()
+
+    roll, _ = trunk_roll(inputs, tracks, up_of, own_up)
     return roll, ways.get(roll)
 
 

@@ -127,7 +127,10 @@ def _both_sides(inputs: MergeInputs, limbs: Sequence[Track]) -> bool:
 
 
 def trunk_roll(
-    inputs: MergeInputs, tracks: Sequence[Track], up_of: Callable[[float], FloatArray | None]
+    inputs: MergeInputs,
+    tracks: Sequence[Track],
+    up_of: Callable[[float], FloatArray | None],
+    own_up: Callable[[float], FloatArray | None] = lambda _: None,
 ) -> tuple[float, FloatArray | None]:
     """Roll (degrees) of the trunk's camera and the vertical: limbs hang below it more often than not.
 
@@ -135,6 +138,8 @@ def trunk_roll(
         inputs: The mounts' priors.
         tracks: Cleaned tracks, the trunk's first.
         up_of: Gives, for a roll, the vertical (3,) of the walk or the walls near that roll's own up, or None.
+        own_up: Gives, for a roll, where the trunk itself points (3,), None where it tells nothing. It decides
+            where nothing around does, and is no vertical then.
     """
     usual = up_of(0.0)
     hang = 0.0 if usual is None else hanging(inputs, tracks, usual)
@@ -147,5 +152,18 @@ def trunk_roll(
     found = [
         (hanging(inputs, tracks, up), roll, up) for roll in ROLLS_DEG[1:] if (up := up_of(roll)) is not None
     ]
+    if usual is None and not found:
+        return _own_way_up(inputs, tracks, own_up), None
     best = max(found, key=lambda each: each[0], default=(0.0, 0.0, usual))
     return (best[1], best[2]) if best[0] > hang + _CLEARLY_BELOW else (0.0, usual)
+
+
+def _own_way_up(
+    inputs: MergeInputs, tracks: Sequence[Track], own_up: Callable[[float], FloatArray | None]
+) -> float:
+    """The roll (degrees) at which limbs hang below the trunk as it points itself; 0 unless that is clear."""
+    hang = {roll: hanging(inputs, tracks, up) for roll in ROLLS_DEG if (up := own_up(roll)) is not None}
+    if not hang:
+        return 0.0
+    best = max(hang, key=lambda roll: hang[roll])
+    return best if hang[best] > max(_CLEARLY_BELOW, hang.get(0.0, 0.0) + _CLEARLY_BELOW) else 0.0

@@ -45,20 +45,49 @@ def test_a_stated_orientation_is_not_tried(sigma_rad):
     assert search_rolls(replace(inputs, mounts=stated), tracks, 1.0, (UP, None), lambda: None) == ()
 
 
-@pytest.mark.parametrize("roll", [0.0, 90.0, 180.0])
-def test_the_trunks_camera_is_above_the_hands(roll):
-    inputs, tracks = _worn({"torso": roll})
+def _own_up(inputs, tracks):
+    """Where a trunk points whose camera sits at its name's place, by the camera's roll."""
     mount = inputs.mount_of("torso")
 
-    def up_of(degrees):
-        # Walls and floor agree with any of the four: each roll's own up is a direction of the room.
+    def own_up(degrees):
         tilted = tracks[0].map_from_cam[:, :3, :3] @ rolled(mount, degrees).joint_from_cam[:3, :3].T
         own = tilted[:, :, 2].mean(axis=0)
         return own / np.linalg.norm(own)
 
-    chosen, up = trunk_roll(inputs, tracks, up_of)
+    return own_up
+
+
+@pytest.mark.parametrize("roll", [0.0, 90.0, 180.0])
+def test_the_trunks_camera_is_above_the_hands(roll):
+    inputs, tracks = _worn({"torso": roll})
+    # Walls and floor agree with any of the four: each roll's own up is a direction of the room.
+    chosen, up = trunk_roll(inputs, tracks, _own_up(inputs, tracks))
     assert chosen == roll
     assert up @ UP > 0.9
+
+
+@pytest.mark.parametrize("roll", [0.0, 90.0, 180.0, 270.0])
+def test_hands_tell_the_trunk_which_way_up_it_is_where_nothing_around_does(roll):
+    inputs, tracks = _worn({"torso": roll})
+    own_up = _own_up(inputs, tracks)
+    assert trunk_roll(inputs, tracks, lambda _: None, own_up) == (roll, None)
+    # One hand alone, or no word of the trunk's own, tells nothing.
+    assert trunk_roll(inputs, tracks[:2], lambda _: None, own_up) == (0.0, None)
+    assert trunk_roll(inputs, tracks, lambda _: None) == (0.0, None)
+
+
+def test_hands_that_are_lifted_half_of_the_time_turn_no_trunk():
+    inputs, tracks = _worn({})
+    own_up = _own_up(inputs, tracks)
+    lifted = []
+    for track in tracks[1:]:
+        poses = track.map_from_cam.copy()
+        trunk, seen = tracks[0].at(track.times_ns, reach_ns=100_000_000)
+        late = seen & (track.times_ns > np.median(track.times_ns))
+        below = (trunk[late, :3, 3] - poses[late, :3, 3]) @ UP
+        poses[late, :3, 3] += 2.0 * below[:, None] * UP
+        lifted.append(replace(track, map_from_cam=poses))
+    assert trunk_roll(inputs, [tracks[0], *lifted], lambda _: None, own_up) == (0.0, None)
 
 
 def test_the_runner_up_is_the_best_of_the_rest():
