@@ -12,6 +12,7 @@ from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging import calibrate
+from bodycap_batch.merging.anthropometry import placements, proportions
 from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.calibrate import Calibration
 from bodycap_batch.merging.chunks import with_overlap
@@ -87,7 +88,8 @@ def test_bones_of_a_height_alone_may_be_longer_on_both_sides_alike(body):
     calibration = Calibration(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
     calibration.solve(1.0)
     follow = {name: np.zeros((4, 4)) for name in ROLES}
-    known, likely = (calibration.spread(0.01, follow, {}, share)[0] for share in (0.0, 0.04))
+    bodies = proportions(bones, tuple(ROLES)), placements(bones, tuple(ROLES), 1.75)
+    (known, _), (likely, passing) = (calibration.spread(0.01, follow, {}, each) for each in ((), (bodies,)))
     assert not known.offsets_m.any()
     index = {bone.role: place for place, bone in enumerate(bones)}
     for side in ("Left", "Right"):
@@ -102,6 +104,8 @@ def test_bones_of_a_height_alone_may_be_longer_on_both_sides_alike(body):
     # What a palm's mount follows of an arm that is longer adds to what was uncertain of it.
     before, after = (np.linalg.norm(each.mounts["left_palm"][3:]) for each in (known, likely))
     assert before < after < 2.0 * before
+    # Where another rig has its joints is none of this, but of how far the joints may be off.
+    assert passing.offsets_m.any()
 
 
 def test_a_camera_never_seen_with_the_trunk_is_sampled_beside_another(body):
