@@ -27,6 +27,9 @@ _MIN_GAIN = 0.05
 """On four captures, real and rendered, a right lens was found again to 0.3 % (3 % with a rolling shutter
 still in the map) and freeing it lowered the cost by 1 % at most; a lens 7 % off was found to be that to 0.5 %
 (3 %), and the cost fell by 10 to 50 %."""
+_WRONG_CENTRE = 0.03
+"""Right centres of six captures were found again to 0.5 % of the long side; one stated 9 % off was found to
+half a percent (the cost fell by 51 %), and had put the cameras 16 cm off."""
 _CANDIDATES = ("RADIAL", "SIMPLE_RADIAL_FISHEYE")
 _WORTH_CHANGING = 0.15
 """A fisheye lens guessed as a usual one: the cost falls by 75 % with the fisheye model (and the focal length
@@ -46,9 +49,9 @@ _TANGENT_CUBIC = 1.0 / 3.0
 def misfitting_lenses(
     model: Any, settings: pycolmap.IncrementalPipelineOptions, given: Mapping[int, str]
 ) -> dict[str, float]:
-    """Given focal lengths that the map contradicts.
+    """Given lenses that the map contradicts.
 
-    A part of the map is adjusted twice, with the lenses as given and with their focal lengths free.
+    A part of the map is adjusted twice, with the lenses as given and with focal lengths and centres free.
 
     Args:
         model: The reconstruction; stays as it is.
@@ -56,7 +59,8 @@ def misfitting_lenses(
         given: Names of the calibrated cameras by id.
 
     Returns:
-        By camera name, the focal length that fits over the one that was given, where they differ.
+        By camera name, the focal length that fits over the one that was given, where it differs or the
+        principal point lies elsewhere.
 
     Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999.
     """
@@ -64,15 +68,28 @@ def misfitting_lenses(
     given = {number: name for number, name in given.items() if part.exists_camera(number)}
     if not given or part.num_reg_images() < _MIN_KEYFRAMES:
         return {}
-    stated = {number: part.camera(number).mean_focal_length() for number in given}
+    stated = {number: copy.deepcopy(part.camera(number)) for number in given}
     held = _cost(part, settings, free=False)
-    freed = _cost(part, settings, free=True)
+    freed = _cost(part, settings, free=True, centre=True)
     if held is None or freed is None or freed > (1.0 - _MIN_GAIN) * held:
         return {}
     factors = {
-        name: part.camera(number).mean_focal_length() / stated[number] for number, name in given.items()
+        number: part.camera(number).mean_focal_length() / stated[number].mean_focal_length()
+        for number in given
     }
-    return {name: round(value, 3) for name, value in factors.items() if abs(value - 1.0) > _WRONG_FOCAL}
+    return {
+        given[number]: round(value, 3)
+        for number, value in factors.items()
+        if abs(value - 1.0) > _WRONG_FOCAL or _moved(stated[number], part.camera(number)) > _WRONG_CENTRE
+    }
+
+
+def _moved(one: Any, other: Any) -> float:
+    """How far the principal points of two lenses of one picture lie apart, as a share of its long side."""
+    apart = np.subtract(
+        [one.principal_point_x, one.principal_point_y], [other.principal_point_x, other.principal_point_y]
+    )
+    return float(np.hypot(*apart)) / float(max(one.width, one.height))
 
 
 def better_lenses(
@@ -209,9 +226,8 @@ def misfit_note(camera: str, factor: float, *, freed: bool = False) -> str:
     """What a misfit means and what to do; `freed`: what fits was used instead of what was given."""
     instead = "; what fits was used instead" if freed else ""
     percent = round(100 * abs(factor - 1.0))
-    fits = (
-        f"a focal length {percent} % {'longer' if factor > 1.0 else 'shorter'}" if percent else "another lens"
-    )
+    longer = "longer" if factor > 1.0 else "shorter"
+    fits = f"a focal length {percent} % {longer}" if percent else "another lens"
     return (
         f"{camera}: the pictures fit {fits} than the "
         f"calibration says{instead}: was stabilisation or digital zoom on, or another lens mode or size "

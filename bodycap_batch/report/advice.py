@@ -128,7 +128,7 @@ def _of_lenses(inputs: ReportInputs) -> Iterator[Advice]:
         yield Advice(
             do="Run again with `calibration: auto`, or calibrate in the mode that was filmed in, with "
             "stabilisation and digital zoom off.",
-            because=f"the pictures contradict the given focal lengths; what fits, as a share of them: {fits}",
+            because=f"the pictures contradict given lenses; focal lengths that fit, over given ones: {fits}",
             weight=3.0,
         )
 

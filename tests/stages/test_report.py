@@ -285,6 +285,14 @@ def test_cameras_on_one_bone_that_move_against_each_other_are_told(
     assert not [each for each in judge(metrics, None).criteria if each.name == "Cameras on one bone"]
 
 
+def test_a_lens_off_its_centre_is_never_good(inputs: ReportInputs) -> None:
+    metrics = json.loads(json.dumps(inputs.metrics))
+    metrics["mapping"]["misfitting_lenses"] = {"torso": 1.0}
+    (found,) = [each for each in judge(metrics, None).criteria if each.name.startswith("Lenses")]
+    assert found.grade is Grade.FAIR
+    assert "another lens" in found.says
+
+
 def test_a_body_that_no_scale_brings_within_reach_is_told(inputs: ReportInputs) -> None:
     metrics = json.loads(json.dumps(inputs.metrics))
     metrics["mapping"]["reach"] = {

@@ -49,6 +49,16 @@ def test_a_wrong_focal_length_is_found_and_measured(factor):
     assert all((first == second).all() for first, second in zip(before, after, strict=True))
 
 
+def test_a_centre_that_was_given_wrongly_is_found():
+    model, settings = _guessed("SIMPLE_RADIAL", [1280, 512, 384, 0.0], [1280, 600, 330, 0.0])
+    for camera in model.cameras.values():
+        camera.params = [1280, 600, 330, 0.0]
+    adjust(model, settings, list(model.cameras), 60)
+    found = misfitting_lenses(model, settings, _names(model))
+    assert set(found) == set(_names(model).values())
+    assert all(value == pytest.approx(1.0, abs=0.03) for value in found.values())
+
+
 def test_only_given_lenses_are_judged_and_a_handful_of_pictures_is_not():
     model, settings = _model(0.85)
     assert misfitting_lenses(model, settings, {}) == {}
