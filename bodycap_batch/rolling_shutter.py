@@ -17,7 +17,8 @@ from bodycap_batch.scene import Map, Registration
 _MIN_POINTS = 30
 _MAX_RESIDUAL_PX = 4.0
 _LOSS_PX = 0.5
-_PART = 200_000
+_PART = 1 << 14
+"""Observations whose poses are held at a time, each in a frame of its own."""
 _SCREENED = 100_000
 """About so many observations tell whether the shutter rolls, from frames spread over the video."""
 _MIN_APPARENT_S = 0.0005
@@ -42,13 +43,21 @@ def image_velocity(
     posed: BoolArray = np.asarray(np.isfinite(map_from_cam).all(axis=(1, 2)))
     cam_from_map = np.full_like(map_from_cam, np.nan)
     cam_from_map[posed] = invert(map_from_cam[posed])
-    last = len(posed) - 1
-    before = np.where(posed[np.maximum(frame - 1, 0)], np.maximum(frame - 1, 0), frame)
-    after = np.where(posed[np.minimum(frame + 1, last)], np.minimum(frame + 1, last), frame)
-    elapsed_s = (times_ns[after] - times_ns[before]) * 1e-9
-    shift = _projected(camera, cam_from_map, after, points) - _projected(camera, cam_from_map, before, points)
-    velocity = shift / np.where(elapsed_s > 0, elapsed_s, np.inf)[:, None]
-    return np.asarray(np.nan_to_num(velocity, posinf=0.0, neginf=0.0))
+    out = np.empty((len(frame), 2))
+    for start in range(0, len(frame), _PART):
+        some = slice(start, start + _PART)
+        before, after = _neighbours(posed, frame[some])
+        elapsed_s = (times_ns[after] - times_ns[before]) * 1e-9
+        later, earlier = (_projected(camera, cam_from_map, at, points[some]) for at in (after, before))
+        velocity = (later - earlier) / np.where(elapsed_s > 0, elapsed_s, np.inf)[:, None]
+        out[some] = np.nan_to_num(velocity, posinf=0.0, neginf=0.0)
+    return out
+
+
+def _neighbours(posed: BoolArray, frame: IntArray) -> tuple[IntArray, IntArray]:
+    """The frames before and after each (M,) that have a pose, or the frame itself."""
+    before, after = np.maximum(frame - 1, 0), np.minimum(frame + 1, len(posed) - 1)
+    return np.where(posed[before], before, frame), np.where(posed[after], after, frame)
 
 
 def _projected(camera: Camera, cam_from_map: FloatArray, frame: IntArray, points: FloatArray) -> FloatArray:

@@ -17,6 +17,8 @@ from bodycap_batch.geometry import make_transform, transform_points
 _RAY_STEP = 1e-4
 _CHUNK = 48
 """Frames solved together: enough to hide numpy's overhead, few enough to stay in the cache."""
+_PART = 1 << 14
+"""Views that the lens is asked for at a time: what that takes is ten times what is kept of it."""
 _ROUNDS = 20
 _CONVERGED_PX = 1e-2
 """A third of what 200 points at 0.5 px leave open; 2e-3 gives the same errors for half as much time again."""
@@ -106,7 +108,9 @@ def make_views(
     camera: Camera, bounds: IntArray, points: FloatArray, px: FloatArray, weight: FloatArray | None = None
 ) -> Views:
     """Undistort pixels (M,2) once, with the lens's derivative there: a pose then costs no lens model."""
-    rays = camera.unproject(px)
+    rays = np.empty((len(px), 2))
+    for start in range(0, len(px), _PART):
+        rays[start : start + _PART] = camera.unproject(px[start : start + _PART])
     return Views(
         bounds=bounds,
         points=points,
@@ -118,12 +122,14 @@ def make_views(
 
 def lens_jacobian(camera: Camera, rays: FloatArray) -> FloatArray:
     """Derivative (N,2,2) of the pixel by the ray (x/z, y/z), by central differences."""
-    one = np.ones((len(rays), 1))
-    columns = []
-    for step in np.eye(2) * _RAY_STEP:
-        ahead, behind = (camera.project(np.hstack([rays + sign * step, one])) for sign in (1.0, -1.0))
-        columns.append((ahead - behind) / (2.0 * _RAY_STEP))
-    return np.stack(columns, axis=2)
+    out = np.empty((len(rays), 2, 2))
+    for start in range(0, len(rays), _PART):
+        some = rays[start : start + _PART]
+        one = np.ones((len(some), 1))
+        for axis, step in enumerate(np.eye(2) * _RAY_STEP):
+            ahead, behind = (camera.project(np.hstack([some + sign * step, one])) for sign in (1.0, -1.0))
+            out[start : start + _PART, :, axis] = (ahead - behind) / (2.0 * _RAY_STEP)
+    return out
 
 
 def refine_poses(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> FloatArray:

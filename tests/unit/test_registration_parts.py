@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -98,6 +99,23 @@ def test_threads_of_a_task_solve_the_same_poses(monkeypatch: pytest.MonkeyPatch)
         found[threads] = batch.refine_poses(views, start, LIMITS.max_error_px)
         assert workers == {name}
     assert (found["1"] == found["2"]).all()
+
+
+def test_the_lens_is_asked_for_some_views_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    count = 200_000
+    px = np.random.default_rng(0).uniform((20.0, 20.0), (620.0, 460.0), (count, 2))
+    points = np.ones((count, 3))
+    tracemalloc.start()
+    views = make_views(CAMERA, np.array([0, count]), points, px)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    kept = views.rays.nbytes + views.px_from_ray.nbytes + views.weight.nbytes
+    # Beside what is kept: a part's ray, pixel and point, of which several are held, 24 bytes each at most.
+    assert kept <= peak < kept + 16 * 24 * batch._PART
+    monkeypatch.setattr(batch, "_PART", count)
+    whole = make_views(CAMERA, np.array([0, count]), points, px)
+    assert np.array_equal(whole.rays, views.rays)
+    assert np.array_equal(whole.px_from_ray, views.px_from_ray)
 
 
 def test_frames_solved_together_do_not_influence_each_other() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bodycap_batch import rolling_shutter
 from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.camera import Camera
 from bodycap_batch.config import MapOptions
@@ -229,3 +231,20 @@ def test_a_rolling_shutter_shows_in_the_residuals(readout_s: float, shows: bool)
     )
     assert (abs(apparent_s) > 8 * sigma_s) is shows
     assert not shows or 0.001 < apparent_s < 0.021
+
+
+def test_velocities_of_a_long_video_are_found_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    count = 200_000
+    times_s = np.arange(FRAMES) * FRAME_S
+    frame = np.sort(rng.integers(FRAMES, size=count))
+    points = rng.uniform((-1.0, -1.0, 3.0), (1.0, 1.0, 5.0), (count, 3))
+    poses, times_ns = poses_at(times_s), np.round(times_s * 1e9).astype(np.int64)
+    tracemalloc.start()
+    found = image_velocity(LENS, poses, times_ns, frame, points)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # Beside the velocities: a part's poses (128 bytes an observation) and what is made of them.
+    assert found.nbytes <= peak < found.nbytes + 4 * 128 * rolling_shutter._PART
+    monkeypatch.setattr(rolling_shutter, "_PART", count)
+    assert np.array_equal(image_velocity(LENS, poses, times_ns, frame, points), found)
