@@ -15,6 +15,7 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.mapping.features import features_of
+from bodycap_batch.memory import give_back
 
 if TYPE_CHECKING:
     import pycolmap
@@ -100,6 +101,7 @@ def add_keyframes(
                 np.save(colours / f"{image_id}.npy", found.rgb)
                 done += 1
                 context.progress(done, total, "features")
+    give_back()  # the detectors' pyramids: 90 MB with two threads, on top of which all else would come
 
 
 def keypoint_colours(workspace: Path, image_id: int) -> npt.NDArray[np.uint8]:

@@ -16,6 +16,7 @@ from bodycap_batch.context import StageContext
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, Pair, image_ids
 from bodycap_batch.mapping.likeness import CHANCE, LIKELY, largest, likeness
 from bodycap_batch.mapping.matching import match_pairs
+from bodycap_batch.memory import give_back
 
 _NEIGHBOURS = (1, 2, 3, 4, 6, 9, 14)
 """Steps along a camera's own keyframes."""
@@ -184,6 +185,7 @@ def link_keyframes(
     while fresh := chooser.wider(held, tried) or chooser.unlinked(held, tried):
         held |= match_pairs(workspace, fresh, lenses, context)
         tried |= set(fresh)
+    give_back()
     between = Counter(f"{a.camera} - {b.camera}" for a, b in held if a.camera != b.camera)
     log = {
         "pairs": len(tried),

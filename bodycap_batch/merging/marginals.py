@@ -11,6 +11,7 @@ from scipy import sparse
 
 from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.geometry import invert
+from bodycap_batch.memory import give_back
 from bodycap_batch.merging.bones import Bone
 from bodycap_batch.merging.graph import bone_key
 from bodycap_batch.merging.linear import Chain, Linear, linearise
@@ -62,12 +63,14 @@ def joint_covariance(solved: SolvedGraph, world_from_bone: FloatArray, spread: S
         NaN throughout where the graph's equations are singular.
     """
     linear = linearise(solved.graph, solved.values)
+    give_back()  # GTSAM's own derivatives
     order, bounds = _blocks(solved, linear)
     try:
         chain = Chain((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
     except np.linalg.LinAlgError:
         # A state that nothing holds: the solution stands, how well it is known cannot be told.
         return np.full((*world_from_bone.shape[:2], 3, 3), np.nan)
+    give_back()
     shifts = _measurement_shifts(solved, linear, spread)
     shifts = shifts + joint_shifts(linear, solved.body, solved.first_joint, world_from_bone, spread)
     rights = (linear.matrix.T @ shifts).tocsc()

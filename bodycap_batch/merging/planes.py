@@ -16,6 +16,8 @@ _MIN_POINTS = 100
 _SMALLEST = 25
 _MOST = 10
 _HYPOTHESES = 600
+_PART = 32
+"""Hypotheses whose distances from all points are held at a time."""
 _NEAR_M = 1.5
 _MOST_POINTS = 20_000
 """Points that tell as much as all: a long capture's map has hundreds of thousands."""
@@ -91,7 +93,11 @@ def _fullest(points: FloatArray, rng: np.random.Generator) -> Plane | None:
         return None
     normals, first = normals[good] / length[good, None], first[good]
     offsets = (normals * first).sum(axis=1)
-    counts = (np.abs(points @ normals.T - offsets) < THICKNESS_M).sum(axis=0)
+    # All at once they take 60 MB for a walk of nine seconds, 200 with the most points there may be.
+    parts = (slice(start, start + _PART) for start in range(0, len(normals), _PART))
+    counts = np.concatenate(
+        [(np.abs(points @ normals[part].T - offsets[part]) < THICKNESS_M).sum(axis=0) for part in parts]
+    )
     best = int(np.argmax(counts))
     normal, offset = normals[best], float(offsets[best])
     for _ in range(3):
