@@ -352,6 +352,7 @@ class Flow:
                 round=task.round,
                 reused=not made,
                 seconds=float(artefact.made["seconds"]),
+                cpu_seconds=artefact.made.get("cpu_seconds"),
                 peak_memory_mb=float(artefact.made["peak_memory_mb"]),
                 artefact=artefact.path.relative_to(self._settings.store.root).as_posix(),
             )

@@ -96,6 +96,7 @@ class StageRecord:
     """One stage of a run: what it cost when it was computed, and whether that was now.
 
     Attributes:
+        cpu_seconds: Processor seconds of all its threads; None where an earlier version did not count them.
         artefact: Its folder in the store, relative to the store.
     """
 
@@ -104,5 +105,6 @@ class StageRecord:
     round: int
     reused: bool
     seconds: float
+    cpu_seconds: float | None
     peak_memory_mb: float
     artefact: str

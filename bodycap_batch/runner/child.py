@@ -116,7 +116,7 @@ def _send_prints_to(log: Path) -> None:
 
 
 def _run(task: Task, store: Store, function: TaskFunction, link: _Link) -> None:
-    started = time.monotonic()
+    started, cpu_before = time.monotonic(), time.process_time()
     _pin_threads(task.threads)
     give_back()
     _forget_peak_memory()
@@ -132,6 +132,7 @@ def _run(task: Task, store: Store, function: TaskFunction, link: _Link) -> None:
         function(task.key.options, task.arguments, context, draft.files)
         made = {
             "seconds": round(time.monotonic() - started, 3),
+            "cpu_seconds": round(time.process_time() - cpu_before, 3),
             "peak_memory_mb": round(peak_memory_mb(), 1),
             "threads": task.threads,
         }

@@ -124,6 +124,7 @@ def test_all_stages_run_and_the_results_are_there(bench: Bench) -> None:
     assert sorted(record["files"]) == sorted(names)
     assert {stage["stage"] for stage in record["stages"]} == {name.split()[0] for name in ALL}
     assert all(stage["peak_memory_mb"] > 0 for stage in record["stages"])
+    assert all(stage["cpu_seconds"] > 0 for stage in record["stages"])
 
 
 def test_a_finished_job_executes_nothing(done: Bench) -> None:

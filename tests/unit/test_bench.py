@@ -70,6 +70,12 @@ def test_a_stage_on_two_cameras_at_once_counts_once(monkeypatch):
     assert ours._wall_seconds(["no event", '{"exit": 0}', *lines]) == {"registration": 5.0}
 
 
+def test_registration_is_told_with_its_first_round_apart():
+    each = [("registration", 0, 2.0), ("registration", 0, 3.0), ("extend", 1, 9.0), ("registration", 1, 0.5)]
+    stages = [{"stage": stage, "round": number, "cpu_seconds": cpu} for stage, number, cpu in each]
+    assert ours.registration_cpu_s(stages) == (5.0, 5.5)
+
+
 def test_the_ratio_is_that_of_map_and_registration():
     own = {"wall_seconds": {"keyframes": 9.0, "map": 3.0, "registration": 1.0}}
     total = {"registered": 9, "frames": 10, "ate_m": {"rmse": 0.01, "max": 0.02}}

@@ -189,6 +189,7 @@ def test_cost_is_recorded_outside_the_content(bench: Bench) -> None:
     made, _ = bench.runner.run(a_task("work"))
     assert made.made["peak_memory_mb"] > 1
     assert made.made["seconds"] >= 0
+    assert made.made["cpu_seconds"] > 0
     assert "manifest.json" not in made.files
 
 
