@@ -73,7 +73,7 @@ def joint_covariance(solved: SolvedGraph, world_from_bone: FloatArray, spread: S
     give_back()
     shifts = _measurement_shifts(solved, linear, spread)
     shifts = shifts + joint_shifts(linear, solved.body, solved.first_joint, world_from_bone, spread)
-    rights = (linear.matrix.T @ shifts).tocsc()
+    shifts = shifts.tocsc()
     place = np.argsort(order)
     ticks, count = world_from_bone.shape[:2]
     out = np.zeros((ticks, count, 3, 3))
@@ -94,9 +94,11 @@ def joint_covariance(solved: SolvedGraph, world_from_bone: FloatArray, spread: S
         out[tick, 1:] += reader @ covariance @ reader.swapaxes(1, 2)
 
     chain.covariances(read)
-    for first in range(0, rights.shape[1], _DIRECTIONS):
+    give_back()
+    for first in range(0, shifts.shape[1], _DIRECTIONS):
         # A few directions at a time: all of eleven cameras' at once take gigabytes.
-        moved = chain.solve(rights[:, first : first + _DIRECTIONS].toarray())
+        right = (linear.matrix.T @ shifts[:, first : first + _DIRECTIONS]).toarray()
+        moved = chain.solve(right)
         for tick, each in enumerate(moved):
             shift = readers(tick) @ each
             out[tick, 1:] += shift @ shift.swapaxes(1, 2)
