@@ -44,29 +44,30 @@ def pose_jumps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
     Returns:
         (N,) True where the pose is to be refused. Scaling the map changes nothing.
     """
+    bend = np.linalg.norm(_bends(centres, sigma)[0], axis=1)
     runs = np.zeros(len(centres), dtype=bool)
-    usual = np.linalg.norm(_bends(centres, sigma)[0], axis=1)
     for length in _RUNS:
-        runs |= _wrong_runs(centres, sigma, usual, length)
+        runs |= _wrong_runs(centres, sigma, bend, length)
     # Beside one of several wrong poses a right one would be blamed.
     centres = np.where(runs[:, None], np.nan, centres)
+    backwards = _jumps_after_gaps(centres[::-1], sigma[::-1])[::-1]
+    ends = _jumps_after_gaps(centres, sigma) | backwards
+    return np.asarray(runs | _single_jumps(centres, sigma) | ends)
+
+
+def _single_jumps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
+    """Frames (N,) that leave the line between their neighbours by themselves."""
     offset, noise = _bends(centres, sigma)
     bend = np.linalg.norm(offset, axis=1)
     out = np.zeros(len(centres), dtype=bool)
-    for frame in np.flatnonzero(np.isfinite(bend) & (bend > _SIGMAS * noise)).tolist():
-        three = bend[max(0, frame - 1) : frame + 2]
-        # Without both neighbours' own bends the wrong one of the three could be blamed.
-        if not np.isfinite(three).all() or bend[frame] < three.max():
-            continue
-        answer = -(offset[frame - 1] + offset[frame + 1]) @ offset[frame] / bend[frame] ** 2
-        if answer < _ANSWERED:
-            continue
-        before = bend[max(0, frame - _AROUND) : frame - 1]
-        near = np.concatenate([before, bend[frame + 2 : frame + _AROUND + 1]])
-        if np.isfinite(near).sum() >= _AROUND // 2:
-            out[frame] = bend[frame] > _TIMES_USUAL * np.nanmedian(near)
-    backwards = _jumps_after_gaps(centres[::-1], sigma[::-1])[::-1]
-    return np.asarray(runs | out | _jumps_after_gaps(centres, sigma) | backwards)
+    # Without both neighbours' own bends the wrong one of the three could be blamed.
+    frames = 1 + _starts(np.isfinite(bend), 3)
+    highest = np.maximum(bend[frames - 1], bend[frames + 1])
+    frames = frames[(bend[frames] > _SIGMAS * noise[frames]) & (bend[frames] >= highest)]
+    answer = -np.sum((offset[frames - 1] + offset[frames + 1]) * offset[frames], axis=1)
+    for frame in frames[answer >= _ANSWERED * bend[frames] ** 2].tolist():
+        out[frame] = bend[frame] > _TIMES_USUAL * _usual_bend(bend, frame - 1, frame + 2, _AROUND - 1)
+    return out
 
 
 def _wrong_runs(centres: FloatArray, sigma: FloatArray, bend: FloatArray, length: int) -> BoolArray:
@@ -80,28 +81,36 @@ def _wrong_runs(centres: FloatArray, sigma: FloatArray, bend: FloatArray, length
     """
     out = np.zeros(len(centres), dtype=bool)
     steps = length + 1
-    share = np.arange(1, steps)[:, None] / steps
-    for first in range(2, len(centres) - length - 1):
-        before, behind = first - 1, first + length
-        if not np.isfinite(centres[before - 1 : behind + 2]).all():
-            continue
-        way = centres[behind] - centres[before]
-        away = np.linalg.norm(centres[first:behind] - centres[before] - share * way, axis=1)
-        noise = np.sqrt(sigma[first:behind] ** 2 + 0.5 * (sigma[before] ** 2 + sigma[behind] ** 2))
-        start, end = centres[before] - centres[before - 1], centres[behind + 1] - centres[behind]
-        kink = 0.25 * steps * float(np.linalg.norm(end - start))
-        astray = float(np.linalg.norm(way - 0.5 * steps * (start + end)))
-        near = np.concatenate(
-            [bend[max(0, before - _AROUND) : before], bend[behind + 1 : behind + _AROUND + 1]]
-        )
-        if np.isfinite(near).sum() < _AROUND // 2:
-            continue
+    first = 2 + _starts(np.asarray(np.isfinite(centres).all(axis=1)), length + 4)
+    before, behind, run = first - 1, first + length, first[:, None] + np.arange(length)
+    way = centres[behind] - centres[before]
+    line = np.arange(1, steps)[:, None] / steps * way[:, None]
+    away = np.linalg.norm(centres[run] - centres[before][:, None] - line, axis=2)
+    noise = np.sqrt(sigma[run] ** 2 + 0.5 * (sigma[before] ** 2 + sigma[behind] ** 2)[:, None])
+    start, end = centres[before] - centres[before - 1], centres[behind + 1] - centres[behind]
+    kink = 0.25 * steps * np.linalg.norm(end - start, axis=1)
+    astray = np.linalg.norm(way - 0.5 * steps * (start + end), axis=1)
+    off = away.min(axis=1)
+    enough = (away > _SIGMAS * noise).all(axis=1) & (off > np.maximum(_TIMES_KINK * kink, astray / _ASTRAY))
+    for row in np.flatnonzero(enough).tolist():
         # What a steady bend amounts to over the run.
-        usual = float(np.nanmedian(near)) * 0.25 * steps**2
-        least = max(_TIMES_USUAL * usual, _TIMES_KINK * kink, astray / _ASTRAY)
-        if (away > np.maximum(_SIGMAS * noise, least)).all():
-            out[first:behind] = True
+        usual = _usual_bend(bend, before[row], behind[row] + 1, _AROUND) * 0.25 * steps**2
+        out[run[row]] |= off[row] > _TIMES_USUAL * usual
     return out
+
+
+def _usual_bend(bend: FloatArray, start: int, stop: int, reach: int) -> float:
+    """Median bend of `reach` frames on either side of start:stop; infinite where too few are known."""
+    near = np.concatenate([bend[max(0, start - reach) : start], bend[stop : stop + reach]])
+    return float(np.nanmedian(near)) if np.isfinite(near).sum() >= _AROUND // 2 else np.inf
+
+
+def _starts(known: BoolArray, length: int) -> IntArray:
+    """First ones of so many known frames in a row."""
+    if len(known) < length:
+        return np.zeros(0, dtype=np.int64)
+    rows = np.lib.stride_tricks.sliding_window_view(known, length)
+    return np.flatnonzero(rows.all(axis=1))
 
 
 def _bends(centres: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
