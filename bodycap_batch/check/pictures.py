@@ -66,7 +66,8 @@ def look_at_frames(camera: CaptureCamera) -> list[str]:
         notes.append(
             "interlaced: make whole pictures of it first (ffmpeg -i in -vf bwdif=send_frame out.mp4)"
         )
-    notes += standing_still(outlines, camera.common_times_ns()[seen] / 1e9)
+    times_s = camera.common_times_ns() / 1e9
+    notes += standing_still(outlines, times_s[seen], float(times_s[-1] - times_s[0]))
     if black:
         notes.append(
             f"{black} of {len(bright)} pictures looked at are black; cut them off with start_s and end_s"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import combinations
 
 import numpy as np
 
@@ -19,7 +19,13 @@ _ALIKE = 0.9
 _STILL_SHARE = 0.7
 """Of the blocks that show something. Pictures an eighth of a recording apart: at most 0.11 with 15 worn
 cameras of five captures, 1.0 with a frozen picture and a camera on a table, sensor noise and all."""
-_LEAST_RUN = 3
+_LEAST_S, _LEAST_LENGTH = 1.0, 0.125
+"""Pictures less than a second or an eighth of the recording apart may well be alike: nobody moves all the
+time, and a slow turn of the body does not show in a few frames."""
+_LEAST_RUN, _RUN_STEPS = 3, 2
+"""A part of a recording stands still with so many pictures alike, over so many of those steps of time."""
+_THROUGHOUT = 0.7
+"""Share of a recording that pictures have to span to tell of all of it."""
 
 
 def outline(image: Image) -> FloatArray:
@@ -30,25 +36,32 @@ def outline(image: Image) -> FloatArray:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float64)
 
 
-def standing_still(outlines: Sequence[FloatArray], times_s: FloatArray) -> list[str]:
+def standing_still(outlines: Sequence[FloatArray], times_s: FloatArray, length_s: float) -> list[str]:
     """Tell of pictures that do not move, if there are any.
+
+    Where all pictures lie close together in a longer recording, nothing is known of the rest of it.
 
     Args:
         outlines: Of pictures in the order of time.
         times_s: (N,) when they were taken, on the common clock.
+        length_s: How long the recording is, seconds.
     """
-    same = np.array([_alike(*pair) for pair in pairwise(outlines)], dtype=bool)
-    if len(same) and same.all():
+    same = np.eye(len(outlines), dtype=bool)
+    for one, other in combinations(range(len(outlines)), 2):
+        same[one, other] = same[other, one] = _alike(outlines[one], outlines[other])
+    start, stop = _longest(same, times_s)
+    first, last = times_s[start], times_s[stop]
+    step = max(_LEAST_S, _LEAST_LENGTH * length_s)
+    pictures = stop - start + 1
+    if pictures == len(outlines) and last - first >= max(step, _THROUGHOUT * length_s):
         return [
             "the picture stands still throughout: a frozen recording, or a camera that nobody wears; nothing "
             "can be solved from it, record it again or leave the camera out"
         ]
-    start, stop = _longest(same)
-    if stop - start + 1 < _LEAST_RUN:
+    if pictures < _LEAST_RUN or last - first < _RUN_STEPS * step:
         return []
-    first, last = times_s[start], times_s[stop]
     return [
-        f"the picture stands still from about {first:.1f} to {last:.1f} s ({stop - start + 1} pictures "
+        f"the picture stands still from about {first:.1f} to {last:.1f} s ({pictures} pictures "
         "looked at are alike): does the person stand still, is the recording frozen, or the camera off? "
         "start_s and end_s cut it off"
     ]
@@ -71,8 +84,12 @@ def _blocks(picture: FloatArray) -> tuple[FloatArray, FloatArray]:
     return cut - cut.mean(axis=1, keepdims=True), cut.std(axis=1)
 
 
-def _longest(same: BoolArray) -> tuple[int, int]:
-    """First and last picture of the longest run of alike ones; twice the same where there is none."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
-    runs = [(0, 0), *zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)]
-    return max(runs, key=lambda run: run[1] - run[0])
+def _longest(same: BoolArray, times_s: FloatArray) -> tuple[int, int]:
+    """First and last of those successive pictures, each alike to each (N,N), that span the longest time."""
+    runs = [
+        (start, stop)
+        for start in range(len(same))
+        for stop in range(start, len(same))
+        if same[start : stop + 1, start : stop + 1].all()
+    ]
+    return max(runs, key=lambda run: float(times_s[run[1]] - times_s[run[0]]))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bodycap_batch.capture import open_capture
-from bodycap_batch.check import check_path
+from bodycap_batch.check import check_path, pictures
 from bodycap_batch.check.pictures import sample_indices
 from bodycap_batch.config.job import load_job
 from tests.videos import Image, textured_frame, write_video
@@ -28,8 +28,11 @@ def _still(index: int) -> Image:
     return np.clip(light * ROOM[:, :160] + RNG.normal(0, 4, (240, 160)), 0, 255).astype(np.uint8)
 
 
-def _notes(root: Path, picture: Callable[[int], Image], gop: int) -> list[str]:
-    write_video(root / "left_palm.mp4", [picture(index) for index in range(COUNT)], gop=gop)
+def _notes(
+    root: Path, picture: Callable[[int], Image], gop: int, *, count: int = COUNT, fps: int = 30
+) -> list[str]:
+    frames = [picture(index) for index in range(count)]
+    write_video(root / "left_palm.mp4", frames, gop=gop, fps=fps, bframes=gop < count)
     (camera,) = check_path(root).cameras
     return [note for note in camera.notes if "stands still" in note]
 
@@ -42,8 +45,33 @@ def test_a_camera_on_a_table_is_told_and_a_worn_one_is_not(tmp_path: Path, gop: 
 
 
 def test_it_is_told_when_the_picture_stopped(tmp_path: Path) -> None:
-    (note,) = _notes(tmp_path, lambda index: _moving(index) if index < 35 else _still(index), 8)
-    assert "from about 1.6 to 2.6 s (5 pictures" in note
+    def stopping(index: int) -> Image:
+        return _moving(index) if index < 35 else _still(index)
+
+    (note,) = _notes(tmp_path / "seconds", stopping, 8, fps=10)
+    assert "from about 4.8 to 7.9 s (5 pictures" in note
+    # The same pictures in a third of the time are of somebody who waits for a second.
+    assert not _notes(tmp_path / "moment", stopping, 8)
+
+
+def test_nothing_is_told_of_what_lies_behind_the_pictures_looked_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As of large pictures, few frames are decoded after a key frame.
+    monkeypatch.setattr(pictures, "_STRETCH", 25)
+    assert not _notes(tmp_path / "ready", lambda index: _moving(max(0, index - 30)), 1000)
+    assert not _notes(tmp_path / "slow", lambda index: _wide(0.25 * index), 40)
+
+
+def _wide(left: float) -> Image:
+    whole, part = divmod(left, 1.0)
+    first, second = (ROOM[:, int(whole) + step : int(whole) + step + 160] for step in (0, 1))
+    return np.round((1.0 - part) * first + part * second).astype(np.uint8)
+
+
+def test_a_moment_is_no_standstill(tmp_path: Path) -> None:
+    assert not _notes(tmp_path / "moving", lambda index: _wide(0.5 * index), 30, count=9)
+    assert not _notes(tmp_path / "still", _still, 30, count=9)
 
 
 def test_where_nothing_is_to_be_seen_nothing_stands_still(tmp_path: Path) -> None:
