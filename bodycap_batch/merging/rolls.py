@@ -23,6 +23,16 @@ CLEARLY = 8.0
 wearing cameras are known better than that the names' usual places are usual."""
 _HANGING, _CLEARLY_BELOW = 0.3, 0.4
 """Hands that hang lie 45° and more below a chest's camera (cosine 0.7); about a level axis they average 0."""
+_LEGS = frozenset({"UpLeg", "Leg", "Foot", "ToeBase"})
+_HANGS_BELOW = {
+    "Hips": _LEGS,
+    "Spine": _LEGS,
+    "Spine1": _LEGS | {"ForeArm", "Hand"},
+    "Neck": _LEGS | {"Arm", "ForeArm", "Hand"},
+    "Head": _LEGS | {"Shoulder", "Arm", "ForeArm", "Hand"},
+}
+"""Parts whose cameras lie below the trunk's while elbows are bent, too: hands at work are above the belt, and
+shoulders always above the chest's camera."""
 _TICKS, _ITERATIONS = 30, 12
 _ENOUGH_TOGETHER = 15
 
@@ -109,21 +119,26 @@ def _search(
     return RollSearch(camera, tuple(off.tolist()), ROLLS_DEG[best] if off[best] < -CLEARLY else 0.0)
 
 
-def hanging(inputs: MergeInputs, tracks: Sequence[Track], up: FloatArray) -> float:
-    """Mean cosine between down and the way from the trunk's camera to the arms' and legs', 0 without any."""
-    trunk, cosines = tracks[0], []
-    for track in tracks[1:]:
-        if split_side(inputs.mount_of(track.camera).role)[0]:
-            poses, valid = track.at(trunk.times_ns, reach_ns=SAMPLE_REACH_NS)
-            way = trunk.map_from_cam[valid, :3, 3] - poses[valid, :3, 3]
-            cosines.append((way @ up) / np.maximum(np.linalg.norm(way, axis=1), 1e-12))
-    return float(np.concatenate(cosines).mean()) if cosines else 0.0
+def _hangers(inputs: MergeInputs, tracks: Sequence[Track]) -> list[Track]:
+    """The cameras that hang below the trunk's, the first: none where those of one side alone do.
+
+    One hand alone lies beside the chest, which is no hanging.
+    """
+    below = _HANGS_BELOW.get(inputs.mount_of(tracks[0].camera).role, frozenset())
+    sides = [split_side(inputs.mount_of(track.camera).role) for track in tracks]
+    found = [(side, track) for (side, part), track in zip(sides, tracks, strict=True) if part in below]
+    return [track for _, track in found] if {"Left", "Right"} <= {side for side, _ in found} else []
 
 
-def _both_sides(inputs: MergeInputs, limbs: Sequence[Track]) -> bool:
-    """Whether limbs of both sides are seen: one hand alone lies beside the chest, which is no hanging."""
-    roles = [inputs.mount_of(track.camera).role for track in limbs]
-    return all(any(role.startswith(side) for role in roles) for side in ("Left", "Right"))
+def hanging(trunk: Track, limbs: Sequence[Track], up: FloatArray) -> float:
+    """Mean cosine between down and the way from the trunk's camera to the limbs', else 0."""
+    cosines = [np.zeros(0)]
+    for track in limbs:
+        poses, valid = track.at(trunk.times_ns, reach_ns=SAMPLE_REACH_NS)
+        way = trunk.map_from_cam[valid, :3, 3] - poses[valid, :3, 3]
+        cosines.append((way @ up) / np.maximum(np.linalg.norm(way, axis=1), 1e-12))
+    together = np.concatenate(cosines)
+    return float(together.mean()) if len(together) else 0.0
 
 
 def trunk_roll(
@@ -141,28 +156,22 @@ def trunk_roll(
         own_up: Gives, for a roll, where the trunk itself points (3,), None where it tells nothing. It decides
             where nothing around does, and is no vertical then.
     """
-    usual = up_of(0.0)
-    hang = 0.0 if usual is None else hanging(inputs, tracks, usual)
-    if (
-        not is_open(inputs.mount_of(tracks[0].camera))
-        or hang > _HANGING
-        or not _both_sides(inputs, tracks[1:])
-    ):
+    trunk, limbs, usual = tracks[0], _hangers(inputs, tracks), up_of(0.0)
+    hang = 0.0 if usual is None else hanging(trunk, limbs, usual)
+    if not is_open(inputs.mount_of(trunk.camera)) or not limbs or hang > _HANGING:
         return 0.0, usual
     found = [
-        (hanging(inputs, tracks, up), roll, up) for roll in ROLLS_DEG[1:] if (up := up_of(roll)) is not None
+        (hanging(trunk, limbs, up), roll, up) for roll in ROLLS_DEG[1:] if (up := up_of(roll)) is not None
     ]
     if usual is None and not found:
-        return _own_way_up(inputs, tracks, own_up), None
+        return _own_way_up(trunk, limbs, own_up), None
     best = max(found, key=lambda each: each[0], default=(0.0, 0.0, usual))
     return (best[1], best[2]) if best[0] > hang + _CLEARLY_BELOW else (0.0, usual)
 
 
-def _own_way_up(
-    inputs: MergeInputs, tracks: Sequence[Track], own_up: Callable[[float], FloatArray | None]
-) -> float:
+def _own_way_up(trunk: Track, limbs: Sequence[Track], own_up: Callable[[float], FloatArray | None]) -> float:
     """The roll (degrees) at which limbs hang below the trunk as it points itself; 0 unless that is clear."""
-    hang = {roll: hanging(inputs, tracks, up) for roll in ROLLS_DEG if (up := own_up(roll)) is not None}
+    hang = {roll: hanging(trunk, limbs, up) for roll in ROLLS_DEG if (up := own_up(roll)) is not None}
     if not hang:
         return 0.0
     best = max(hang, key=lambda roll: hang[roll])

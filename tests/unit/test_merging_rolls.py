@@ -8,8 +8,8 @@ import pytest
 from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.rolls import ROLLS_DEG, RollSearch, is_open, rolled, search_rolls, trunk_roll
 from bodycap_batch.merging.tracks import make_track
-from bodycap_batch.skeleton_presets import STATED_SIGMA_RAD
-from tests.stages.walker import ROLES, make_inputs, make_walk, record
+from bodycap_batch.skeleton_presets import STATED_SIGMA_RAD, load_skeleton, nominal_mount
+from tests.stages.walker import ROLES, Walk, make_inputs, make_walk, record
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -47,7 +47,7 @@ def test_a_stated_orientation_is_not_tried(sigma_rad):
 
 def _own_up(inputs, tracks):
     """Where a trunk points whose camera sits at its name's place, by the camera's roll."""
-    mount = inputs.mount_of("torso")
+    mount = inputs.mount_of(tracks[0].camera)
 
     def own_up(degrees):
         tilted = tracks[0].map_from_cam[:, :3, :3] @ rolled(mount, degrees).joint_from_cam[:3, :3].T
@@ -74,6 +74,44 @@ def test_hands_tell_the_trunk_which_way_up_it_is_where_nothing_around_does(roll)
     # One hand alone, or no word of the trunk's own, tells nothing.
     assert trunk_roll(inputs, tracks[:2], lambda _: None, own_up) == (0.0, None)
     assert trunk_roll(inputs, tracks, lambda _: None) == (0.0, None)
+
+
+def _beside(roles, over_m=None):
+    """Inputs and tracks of those roles, the first leading; the others are that far over it."""
+    rng, skeleton = np.random.default_rng(4), load_skeleton("full_body", 1.75)
+    mounts = {role: nominal_mount(role, role, skeleton) for role in roles}
+    walk = Walk(skeleton, mounts)
+    inputs = make_inputs(walk, [record(walk, role, rng) for role in roles], mounts=tuple(mounts.values()))
+    index = {bone.role: position for position, bone in enumerate(graph_bones(skeleton, roles))}
+    tracks = [make_track(inputs, each, index[each.camera]) for each in inputs.trajectories]
+    if over_m is not None:
+        for track in tracks[1:]:
+            track.map_from_cam[:, 2, 3] = tracks[0].map_from_cam[:, 2, 3] + over_m
+    return inputs, tracks
+
+
+@pytest.mark.parametrize("role", ["Hips", "Spine"])
+def test_hands_at_work_do_not_turn_a_camera_at_the_belt(role):
+    inputs, tracks = _beside((role, "LeftHand", "RightHand"), over_m=0.18)
+    own_up = _own_up(inputs, tracks)
+    assert trunk_roll(inputs, tracks, lambda _: None, own_up) == (0.0, None)
+    # Nor where walls and floor agree with any of the four.
+    assert trunk_roll(inputs, tracks, own_up)[0] == 0.0
+
+
+@pytest.mark.parametrize("part", ["Shoulder", "Arm"])
+def test_shoulders_are_over_the_chest_and_do_not_turn_it(part):
+    inputs, tracks = _beside(("Spine1", f"Left{part}", f"Right{part}"), over_m=0.17)
+    assert trunk_roll(inputs, tracks, lambda _: None, _own_up(inputs, tracks)) == (0.0, None)
+
+
+@pytest.mark.parametrize("roll", [90.0, 180.0])
+def test_legs_tell_a_camera_at_the_belt_which_way_up_it_is(roll):
+    inputs, tracks = _beside(("Hips", "LeftHand", "RightHand", "LeftLeg", "RightLeg"))
+    turn = rolled(replace(inputs.mounts[0], joint_from_cam=np.eye(4)), roll).joint_from_cam
+    leading = replace(tracks[0], map_from_cam=tracks[0].map_from_cam @ turn)
+    turned = [leading, *tracks[1:]]
+    assert trunk_roll(inputs, turned, lambda _: None, _own_up(inputs, turned)) == (roll, None)
 
 
 def test_hands_that_are_lifted_half_of_the_time_turn_no_trunk():
