@@ -113,7 +113,7 @@ def _build(
         apart = replace(context, work_dir=context.work_dir / "straight")
         return told(_build(capture, straight, options, apart, reach), selections, straight)
     refs = [ImageRef(item.camera, int(frame)) for item in selections for frame in item.frames]
-    chooser = PairChooser(workspace, refs, _common_ns(capture), options, context.threads)
+    chooser = PairChooser(workspace, refs, _common_ns(capture), options, context)
     tried, linked = link_keyframes(chooser, workspace, _lenses(capture), context)
     constant = _constant(capture, cameras)
     shop = _shop(workspace, capture, options, constant, context)
@@ -234,7 +234,7 @@ def extend_map(
         for name in sorted({ref.camera for ref in new})
     ]
     add_keyframes(workspace, wanted, options, context)
-    chooser = PairChooser(workspace, new, _common_ns(capture), options, context.threads)
+    chooser = PairChooser(workspace, new, _common_ns(capture), options, context)
     _, linked = link_keyframes(chooser, workspace, _lenses(capture), context)
     constant = _constant(capture, cameras)
     doubted = {known[ref] for ref in _refs(extra_frames) if ref in known}

@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from bodycap_batch.arrays import BoolArray, IntArray
+from bodycap_batch.context import StageContext
 
-_LARGEST = 128
+LARGEST = 128
 """Features of an image that are looked at. Large ones survive blur and distance; with 64 and the threshold of
 `CHANCE` one pair in forty is missed that the full match would hold, with 128 one in a hundred."""
 _MAX_RATIO = 0.8
@@ -23,6 +24,8 @@ _SHORTLIST_OF_EACH = 24
 """Images that are looked at closely, of all and of each camera: two and three times what may be matched. On
 walk131 (288 keyframes, 48 % of the pairs looked at) 96 % as many of the chosen pairs hold as when all are;
 with 96 and 16 91 %, with 64 and 16 80 %. Pooling and ranking cost a hundredth of looking."""
+_STEPS = 2048.0
+"""Of a pooled feature's unit vector: products stay below 2^23, which a float32 holds exactly."""
 _TINY = 1e-9
 
 CHANCE = 4
@@ -42,39 +45,40 @@ def largest(descriptors: Descriptors, keypoints: npt.NDArray[np.float32]) -> npt
         descriptors: (N,128) root-normalised bytes.
         keypoints: (N,4) as `Features` has them.
     """
-    out = np.zeros((_LARGEST, 128), dtype=np.float32)
-    picked = np.argsort(-keypoints[:, 2], kind="stable")[:_LARGEST]
+    out = np.zeros((LARGEST, 128), dtype=np.float32)
+    picked = np.argsort(-keypoints[:, 2], kind="stable")[:LARGEST]
     out[: len(picked)] = descriptors[picked]
     return out
 
 
 def likeness(
-    images: Sequence[npt.NDArray[np.float32]], rows: Sequence[int], cameras: Sequence[str], threads: int = 1
-) -> IntArray:
+    images: npt.NDArray[np.float32], rows: Sequence[int], cameras: Sequence[str], context: StageContext
+) -> npt.NDArray[np.int16]:
     """Clear mutual matches among the largest features of some images and those that could be alike.
 
     Args:
-        images: N images' `largest`.
+        images: (N,128,128) `largest` of every image.
         rows: R of them.
         cameras: N images' cameras.
-        threads: How many images are looked at side by side; what is found is the same.
+        context: Threads (what is found is the same with any number of them), progress, cancellation.
 
     Returns:
         (R,N); 0 with itself and with those whose pooled features already say that others are more alike.
 
     Source: Wu, "Towards linear-time incremental structure from motion", 3DV 2013 (preemptive matching).
     """
-    every = np.array(images, dtype=np.float32).reshape(-1, _LARGEST, 128)
-    short = _shortlists(_pooled(every), rows, np.array(cameras))
-    out = np.zeros((len(rows), len(every)), dtype=np.int64)
+    short = _shortlists(_pooled(images), rows, np.array(cameras), context)
+    out = np.zeros((len(rows), len(images)), dtype=np.int16)
     place = {row: number for number, row in enumerate(rows)}
     todo = _looked_at(short, rows, place)
 
     def work(number: int) -> IntArray:
-        return clear_matches(every[rows[number]], every[todo[number]])
+        context.check_cancelled()
+        return clear_matches(images[rows[number]], images[todo[number]])
 
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(context.threads) as pool:
         for number, found in enumerate(pool.map(work, range(len(rows)))):
+            context.progress(number, len(rows), "keyframes compared")
             out[number, todo[number]] = found
             for other, count in zip(todo[number].tolist(), found.tolist(), strict=True):
                 if other in place:
@@ -98,22 +102,27 @@ def clear_matches(image: npt.NDArray[np.float32], others: npt.NDArray[np.float32
     for start in range(0, len(others), _BLOCK):
         some = others[start : start + _BLOCK]
         alike = image @ some.reshape(-1, 128).T
-        parts.append(_clear(alike.reshape(_LARGEST, len(some), _LARGEST)))
+        parts.append(_clear(alike.reshape(LARGEST, len(some), LARGEST)))
     return np.concatenate(parts)
 
 
 def _shortlists(
-    pooled: npt.NDArray[np.float32], rows: Sequence[int], cameras: npt.NDArray[np.str_]
+    pooled: npt.NDArray[np.float32],
+    rows: Sequence[int],
+    cameras: npt.NDArray[np.str_],
+    context: StageContext,
 ) -> BoolArray:
     """(R,N) the most alike of all images, and of each camera's, for each of the rows."""
     out = np.zeros((len(rows), len(pooled)), dtype=bool)
     groups = [np.flatnonzero(cameras == name) for name in np.unique(cameras)]
-    for number, row in enumerate(rows):
-        # Rounded: the last digits of a sum of floats depend on the machine.
-        far = -np.round(pooled @ pooled[row], 4)
-        out[number, np.argsort(far, kind="stable")[:_SHORTLIST]] = True
-        for group in groups:
-            out[number, group[np.argsort(far[group], kind="stable")[:_SHORTLIST_OF_EACH]]] = True
+    # Whole numbers, whose sums are exact: the last digits of a sum of floats depend on the machine.
+    whole = np.round(_STEPS * pooled)
+    for start in range(0, len(rows), _BLOCK):
+        context.check_cancelled()
+        for number, far in enumerate(-whole[rows[start : start + _BLOCK]] @ whole.T, start):
+            out[number, np.argsort(far, kind="stable")[:_SHORTLIST]] = True
+            for group in groups:
+                out[number, group[np.argsort(far[group], kind="stable")[:_SHORTLIST_OF_EACH]]] = True
     return out
 
 
@@ -142,7 +151,7 @@ def _pooled(every: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 
 def _clear(alike: npt.NDArray[np.float32]) -> IntArray:
     """Matches (B,) in products (F,B,F) of one image's features with those of B images."""
-    features = np.arange(_LARGEST)[:, None]
+    features = np.arange(LARGEST)[:, None]
     others = np.arange(alike.shape[1])[None, :]
     nearest = alike.argmax(axis=2)
     best = alike[features, others, nearest]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from bodycap_batch.camera import Camera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, Pair, image_ids
-from bodycap_batch.mapping.likeness import CHANCE, LIKELY, largest, likeness
+from bodycap_batch.mapping.likeness import CHANCE, LARGEST, LIKELY, largest, likeness
 from bodycap_batch.mapping.matching import match_pairs
 from bodycap_batch.memory import give_back
 
@@ -33,6 +34,8 @@ stood 15 cm off."""
 _STRONG = 20
 _BESIDE = 4
 """Keyframes of one camera nearer than this show the same; a hand is back within a second."""
+_RETRIED = 50_000
+"""Pairs that are tried at most of a camera without any link: some minutes; what holds beside them follows."""
 _FEW = 120
 """Keyframes up to which every pair is matched."""
 
@@ -45,7 +48,7 @@ class PairChooser:
         new: Keyframes not matched yet.
         common_ns: Common time of every frame, by camera.
         options: ``pairs``: "retrieval" or "exhaustive"; few keyframes are always matched exhaustively.
-        threads: How many keyframes are looked at side by side.
+        context: Threads, progress, cancellation.
     """
 
     def __init__(
@@ -54,7 +57,7 @@ class PairChooser:
         new: Collection[ImageRef],
         common_ns: Mapping[str, IntArray],
         options: MapOptions,
-        threads: int = 1,
+        context: StageContext,
     ) -> None:
         import pycolmap
 
@@ -65,18 +68,16 @@ class PairChooser:
             self._new = [row for row, ref in enumerate(self._images) if ref in wanted]
             self.exhaustive = options.pairs == "exhaustive" or len(self._images) <= _FEW
             if not self.exhaustive:
-                images = [
-                    largest(
-                        np.asarray(database.read_descriptors(ids[ref]).data),
-                        np.asarray(database.read_keypoints(ids[ref])),
-                    )
-                    for ref in self._images
-                ]
-                alike = likeness(images, self._new, [ref.camera for ref in self._images], threads)
+                images = np.empty((len(self._images), LARGEST, 128), np.float32)
+                for row, ref in enumerate(self._images):
+                    found = np.asarray(database.read_descriptors(ids[ref]).data)
+                    images[row] = largest(found, np.asarray(database.read_keypoints(ids[ref])))
+                alike = likeness(images, self._new, [ref.camera for ref in self._images], context)
                 self._alike = dict(zip(self._new, alike, strict=True))
         self._times = np.array([common_ns[ref.camera][ref.frame] for ref in self._images], dtype=np.int64)
         self._cameras = np.array([ref.camera for ref in self._images])
         self._row = {ref: row for row, ref in enumerate(self._images)}
+        self._rows_of = {name: np.flatnonzero(self._cameras == name) for name in np.unique(self._cameras)}
 
     def first(self) -> list[Pair]:
         """Neighbours in time, the same instant of other cameras, and what looks most alike."""
@@ -111,16 +112,17 @@ class PairChooser:
         return [pair for pair in self._sorted(beside) if pair not in tried]
 
     def unlinked(self, held: Mapping[Pair, int], tried: Collection[Pair]) -> list[Pair]:
-        """Every pair of a camera that has no link to any other camera."""
+        """Every pair of a camera that has no link to any other camera; of very many evenly spread ones."""
         tied = {ref.camera for a, b in held if a.camera != b.camera for ref in (a, b)}
         alone = [row for row in self._new if self._images[row].camera not in tied]
         if self.exhaustive or len(set(self._cameras)) == 1:
             return []
-        every = {
-            (row, int(other))
-            for row in alone
-            for other in np.flatnonzero(self._cameras != self._cameras[row])
-        }
+        every = set[tuple[int, int]]()
+        for camera in sorted({self._images[row].camera for row in alone}):
+            mine = [row for row in alone if self._images[row].camera == camera]
+            others = np.flatnonzero(self._cameras != camera)
+            step = math.ceil(math.sqrt(len(mine) * len(others) / _RETRIED))
+            every |= set(product(mine[::step], others[::step].tolist()))
         return [pair for pair in self._sorted(every) if pair not in tried]
 
     def _beside(self, a: int, b: int) -> Iterator[tuple[int, int]]:
@@ -143,12 +145,13 @@ class PairChooser:
 
     def _partners(self, row: int) -> set[int]:
         """Rows of the keyframes that one keyframe is matched with."""
-        own = np.flatnonzero(self._cameras == self._cameras[row])
+        own = self._rows_of[self._cameras[row]]
         place = int(np.searchsorted(own, row))
         steps = [step * sign for step in _NEIGHBOURS for sign in (-1, 1)]
         out = {int(own[place + step]) for step in steps if 0 <= place + step < len(own)}
-        for camera in np.unique(self._cameras[self._cameras != self._cameras[row]]):
-            rows = np.flatnonzero(self._cameras == camera)
+        for camera, rows in self._rows_of.items():
+            if camera == self._cameras[row]:
+                continue
             apart = np.abs(self._times[rows] - self._times[row])
             out |= set(rows[np.argsort(apart, kind="stable")[:_SAME_INSTANT]].tolist())
         return out | self._look_alikes(row)

@@ -9,6 +9,8 @@ import pycolmap
 import pytest
 
 from bodycap_batch.config import MapOptions
+from bodycap_batch.context import StageContext
+from bodycap_batch.errors import Cancelled
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef
 from bodycap_batch.mapping.likeness import CHANCE, _clear, largest, likeness
 from bodycap_batch.mapping.pairs import PairChooser
@@ -25,7 +27,7 @@ def _rooted(rng: np.random.Generator, count: int) -> np.ndarray:
     return np.asarray(np.round(rooted).clip(0, 255), np.uint8)
 
 
-def test_two_views_of_a_place_are_alike_and_others_not() -> None:
+def test_two_views_of_a_place_are_alike_and_others_not(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     images = []
     for _ in range(40):  # more than are looked at together
@@ -33,16 +35,20 @@ def test_two_views_of_a_place_are_alike_and_others_not() -> None:
         noisy = np.clip(descriptors + rng.normal(0, 4, descriptors.shape), 0, 255).astype(np.uint8)
         images += [largest(descriptors, keypoints), largest(noisy, keypoints)]
     rows = list(range(0, 80, 7))
-    alike = likeness(images, rows, ["a"] * 80)
-    assert (likeness(images, rows, ["a"] * 80, threads=3) == alike).all()
+    every = np.array(images)
+    alike = likeness(every, rows, ["a"] * 80, StageContext(work_dir=tmp_path))
+    assert (likeness(every, rows, ["a"] * 80, StageContext(work_dir=tmp_path, threads=3)) == alike).all()
     partner = np.array(rows) ^ 1
     assert (alike[np.arange(len(rows)), partner] >= 50).all()
     alike[np.arange(len(rows)), partner] = 0
     assert (alike < CHANCE).mean() > 0.99
-    assert not likeness([largest(_rooted(rng, 0), _keypoints(rng, 0))] * 2, [0], ["a", "a"]).any()
+    empty = np.array([largest(_rooted(rng, 0), _keypoints(rng, 0))] * 2)
+    assert not likeness(empty, [0], ["a", "a"], StageContext(work_dir=tmp_path)).any()
 
 
-def test_what_could_be_alike_is_found_without_looking_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_could_be_alike_is_found_without_looking_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rng = np.random.default_rng(2)
     monkeypatch.setattr("bodycap_batch.mapping.likeness._SHORTLIST", 12)
     monkeypatch.setattr("bodycap_batch.mapping.likeness._SHORTLIST_OF_EACH", 2)
@@ -62,12 +68,24 @@ def test_what_could_be_alike_is_found_without_looking_at_all(monkeypatch: pytest
         images += [largest(descriptors, keypoints), largest(noisy, keypoints)]
         cameras += ["a", "b" if number else "c"]
     rows = list(range(240))
-    alike = likeness(images, rows, cameras)
+    told = list[tuple[int, int]]()
+    context = StageContext(work_dir=tmp_path, progress=lambda done, total, _: told.append((done, total)))
+    alike = likeness(np.array(images), rows, cameras, context)
+    assert told == [(number, 240) for number in rows]
     partner = np.array(rows) ^ 1
     assert (alike[rows, partner] >= 20).mean() > 0.99
     assert (alike == alike.T).all()
     # 12 of all and 2 of each of three cameras.
     assert sum(looked) <= 18 * len(rows)
+    # How many rows are looked at together changes nothing.
+    monkeypatch.setattr("bodycap_batch.mapping.likeness._BLOCK", 7)
+    assert (likeness(np.array(images), rows, cameras, context) == alike).all()
+
+
+def test_looking_for_likenesses_stops_on_request(tmp_path: Path) -> None:
+    context = StageContext(work_dir=tmp_path, cancelled=lambda: True)
+    with pytest.raises(Cancelled):
+        likeness(np.zeros((3, 128, 128), np.float32), [0, 1, 2], ["a"] * 3, context)
 
 
 def _database(folder: Path, keyframes: int) -> dict[str, np.ndarray]:
@@ -90,26 +108,39 @@ def _database(folder: Path, keyframes: int) -> dict[str, np.ndarray]:
 def test_pairs_per_keyframe_are_bounded(tmp_path: Path, keyframes: int) -> None:
     times = _database(tmp_path, keyframes)
     refs = [ImageRef(camera, frame) for camera in times for frame in range(keyframes)]
-    pairs = PairChooser(tmp_path, refs, times, MapOptions(pairs="retrieval")).first()
+    pairs = PairChooser(
+        tmp_path, refs, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
+    ).first()
     # Per keyframe: 14 neighbours (each pair counts twice), 2 at the same instant, up to 64 that look alike.
     assert len(pairs) <= (7 + 2 + 64) * len(refs)
     assert len(set(pairs)) == len(pairs)
     assert (ImageRef("a", 7), ImageRef("b", 7)) in pairs
     assert (ImageRef("a", 7), ImageRef("a", 8)) in pairs
-    every = PairChooser(tmp_path, refs, times, MapOptions(pairs="exhaustive")).first()
+    every = PairChooser(
+        tmp_path, refs, times, MapOptions(pairs="exhaustive"), StageContext(work_dir=tmp_path)
+    ).first()
     assert len(every) == len(refs) * (len(refs) - 1) // 2
 
 
 def test_few_keyframes_are_matched_exhaustively(tmp_path: Path) -> None:
     times = _database(tmp_path, 20)
     refs = [ImageRef(camera, frame) for camera in times for frame in range(20)]
-    assert len(PairChooser(tmp_path, refs, times, MapOptions(pairs="retrieval")).first()) == 40 * 39 // 2
+    assert (
+        len(
+            PairChooser(
+                tmp_path, refs, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
+            ).first()
+        )
+        == 40 * 39 // 2
+    )
 
 
 def test_growing_matches_new_keyframes_only(tmp_path: Path) -> None:
     times = _database(tmp_path, 70)
     new = [ImageRef("a", 5), ImageRef("b", 30)]
-    chooser = PairChooser(tmp_path, new, times, MapOptions(pairs="retrieval"))
+    chooser = PairChooser(
+        tmp_path, new, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
+    )
     pairs = chooser.first()
     assert all(a in new or b in new for a, b in pairs)
     assert len(pairs) <= (14 + 2 + 64) * len(new)
@@ -120,7 +151,9 @@ def test_growing_matches_new_keyframes_only(tmp_path: Path) -> None:
 def test_what_hangs_by_few_links_is_matched_beside_what_held(tmp_path: Path) -> None:
     times = _database(tmp_path, 80)
     refs = [ImageRef(camera, frame) for camera in times for frame in range(80)]
-    chooser = PairChooser(tmp_path, refs, times, MapOptions(pairs="retrieval"))
+    chooser = PairChooser(
+        tmp_path, refs, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
+    )
     a, b = ImageRef("a", 40), ImageRef("b", 10)
     held = {(a, b): 50}
     expected = {
@@ -135,3 +168,19 @@ def test_what_hangs_by_few_links_is_matched_beside_what_held(tmp_path: Path) -> 
     assert chooser.wider(tied, set()) == []
     assert chooser.unlinked(held, {(a, b)}) == []
     assert len(chooser.unlinked({(a, ImageRef("a", 41)): 50}, set())) == 80 * 80
+
+
+def test_a_long_camera_without_links_is_not_matched_with_everything(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bodycap_batch.mapping.pairs._RETRIED", 500)
+    times = _database(tmp_path, 80)
+    refs = [ImageRef(camera, frame) for camera in times for frame in range(80)]
+    chooser = PairChooser(
+        tmp_path, refs, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
+    )
+    pairs = chooser.unlinked({(refs[0], refs[1]): 50}, set())
+    assert 200 < len(pairs) <= 500
+    # From one end to the other of both.
+    assert {a.frame // 20 for a, _ in pairs} == {b.frame // 20 for _, b in pairs} == {0, 1, 2, 3}
+    assert chooser.unlinked({(refs[0], refs[1]): 50}, set(pairs)) == []
