@@ -19,7 +19,7 @@ deviations of segment lengths over stature are 3 to 5 %: Winter's table gives me
 _RIGS = {
     "Spine1": (0.0, 0.01, 0.055),
     "Arm": (0.02, 0.0, 0.0),
-    "ForeArm": (0.024, 0.0, 0.0),
+    "ForeArm": (0.025, 0.0, 0.0),
     "Hand": (0.03, 0.0, 0.0),
 }
 """How far other rigs' centres lie from ours, [outwards, back, up] in a T-pose, as shares of the stature.
@@ -28,7 +28,8 @@ In rigs of three makers (two bodies of the CMU Graphics Lab Motion Capture Datab
 of Wisconsin's) the joint that carries the shoulders lies 3, 5, 4.5 and 22 % of the stature below them (ours
 11.8) and up to 2.6 % behind them (1.5); half the distance of the shoulders is 12.9, 10.4, 10.0 and 9.3 %
 (12.9), the upper arm 16.5, 14.8, 17.7 and 16.6 % (18.6), the forearm 9.5, 11.4, 14.4 and 13.8 % (14.6). Taken
-is the root mean square distance from ours, were every rig between the extremes as likely as any other."""
+is the root mean square distance from ours, were every rig between the extremes as likely as any other;
+backwards a round 1 %."""
 
 
 def proportions(bones: Sequence[Bone], cameras: Sequence[str]) -> Spread:
