@@ -62,7 +62,8 @@ def solve_rig(
         start = np.where(np.isfinite(path), invert(path), start)
         solved = _solve(rig, start, limits, solved.votes, path if rig.rolling else None)
     poses = _with_evidence(solved.poses, solved.confirmed)
-    return _without_doubtful(_named(poses, rig, solved.own, limits), limits)
+    times_ns = rig.members[0].camera.times_ns
+    return _without_doubtful(_named(poses, rig, solved.own, limits), times_ns, limits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +153,7 @@ def _with_evidence(poses: list[FramePose], confirmed: IntArray) -> list[FramePos
     return _refused(poses, posed & (confirmed < _LEAST_CONFIRMED), FrameStatus.UNCONFIRMED)
 
 
-def _without_doubtful(poses: list[FramePose], limits: PoseLimits) -> list[FramePose]:
+def _without_doubtful(poses: list[FramePose], times_ns: IntArray, limits: PoseLimits) -> list[FramePose]:
     """Refuse the poses that jump away from both neighbours and back, and weak ones that stand alone."""
     centres = np.full((len(poses), 3), np.nan)
     sigma = np.full(len(poses), np.nan)
@@ -161,7 +162,7 @@ def _without_doubtful(poses: list[FramePose], limits: PoseLimits) -> list[FrameP
             centres[frame] = pose.gauge_from_cam[:3, 3]
             # Neighbours share the map's error.
             sigma[frame] = np.sqrt(np.trace(pose.covariance[3:, 3:]) / MAP_VARIANCE_RATIO)
-    out = _refused(poses, pose_jumps(centres, sigma), FrameStatus.POSE_JUMP)
+    out = _refused(poses, pose_jumps(centres, sigma, times_ns), FrameStatus.POSE_JUMP)
     localised = np.array([pose.gauge_from_cam is not None for pose in out], dtype=bool)
     inliers = np.array([pose.inliers for pose in out], dtype=np.int64)
     lone = lone_poses(localised, inliers, _LONE_EVIDENCE * limits.min_inliers)
