@@ -23,7 +23,7 @@ from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, 
 from bodycap_batch.mapping.freeing import as_mapped, freed_where_contradicted
 from bodycap_batch.mapping.initial import Start, named_start, rank_starts
 from bodycap_batch.mapping.lens import change_lenses, misfitting_lenses
-from bodycap_batch.mapping.mirrored import told, without_mirrored
+from bodycap_batch.mapping.mirrored import explained, without_mirrored
 from bodycap_batch.mapping.pairs import PairChooser, link_keyframes
 from bodycap_batch.mapping.reach import Reach, check_reach
 from bodycap_batch.mapping.repair import Workshop, cut_doubtful, place_again, repair
@@ -109,9 +109,8 @@ def _build(
         (capture.camera(item.camera), cameras[item.camera], np.asarray(item.frames)) for item in selections
     ]
     add_keyframes(workspace, wanted, options, context)
-    if len(straight := without_mirrored(workspace, selections)) < len(selections):
-        apart = replace(context, work_dir=context.work_dir / "straight")
-        return told(_build(capture, straight, options, apart, reach), selections, straight)
+    selections, options, mirror = without_mirrored(workspace, selections, options)
+    cameras = _camera_ids(workspace)
     refs = [ImageRef(item.camera, int(frame)) for item in selections for frame in item.frames]
     chooser = PairChooser(workspace, refs, _common_ns(capture), options, context)
     tried, linked = link_keyframes(chooser, workspace, _lenses(capture), context)
@@ -119,11 +118,12 @@ def _build(
     shop = _shop(workspace, capture, options, constant, context)
     guessed = {number: name for name, number in cameras.items() if capture.camera(name).camera.refine}
     models, begun = _begun(shop, options, guessed, len(refs))
-    log: dict[str, Any] = {"keyframes": len(refs), **linked, **begun}
+    log: dict[str, Any] = {"keyframes": len(refs), **linked, **begun, **mirror}
     if models:
         models[0], log["repair"] = repair(models[0], tried, shop)
         log["unconfirmed_points"] = _settled(models, shop, capture)
     refused = _too_few(models, len(refs), log.get("initial_candidates", log["initial_pair_ladder"]), options)
+    refused = explained(refused, mirror)
     if refused is not None and not models:
         raise refused
     write_models(workspace, models)
@@ -131,7 +131,7 @@ def _build(
     log["misfitting_lenses"] = misfitting_lenses(models[0], shop.settings(), given)
     result = _result(models, workspace, log)
     verdict = check_reach(result.maps[0], _common_ns(capture), reach).to_log() if reach else None
-    refused = refused or inconsistent(log["repair"]["contradicted_share"], verdict)
+    refused = refused or explained(inconsistent(log["repair"]["contradicted_share"], verdict), mirror)
     return replace(result, log={**result.log, "reach": verdict}), refused
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -53,10 +53,14 @@ def image_ids(database: pycolmap.Database) -> dict[ImageRef, int]:
 
 def add_camera(database: pycolmap.Database, camera: CaptureCamera) -> int:
     """Write one camera with a rig of its own (no synchrony is assumed); returns the camera id."""
-    import pycolmap
-
     model = camera.camera.to_pycolmap()
     model.has_prior_focal_length = camera.calibrated
+    return _write_camera(database, model)
+
+
+def _write_camera(database: pycolmap.Database, model: pycolmap.Camera) -> int:
+    import pycolmap
+
     camera_id = database.write_camera(model)
     rig = pycolmap.Rig()
     rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id))
@@ -102,6 +106,40 @@ def add_keyframes(
                 done += 1
                 context.progress(done, total, "features")
     give_back()  # the detectors' pyramids: 90 MB with two threads, on top of which all else would come
+
+
+def drop_images(workspace: Path, cameras: Collection[str]) -> None:
+    """Write the database anew without some cameras, ids as if they had never been in it.
+
+    Args:
+        workspace: Folder of the database: keyframes and their features, nothing matched yet.
+        cameras: Names; the features of all others are kept as they are.
+    """
+    import pycolmap
+
+    colours = workspace / _COLOURS
+    before = (workspace / DATABASE_NAME).rename(workspace / f"whole_{DATABASE_NAME}")
+    with (
+        pycolmap.Database.open(str(before)) as source,
+        pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database,
+        pycolmap.DatabaseTransaction(database),
+    ):
+        images = sorted((number, ref) for ref, number in image_ids(source).items())
+        lens = {number: int(source.read_image(number).camera_id) for number, _ in images}
+        dropped = {lens[number] for number, ref in images if ref.camera in cameras}
+        models = sorted(source.read_all_cameras(), key=lambda model: int(model.camera_id))
+        new = {int(each.camera_id): each for each in models if each.camera_id not in dropped}
+        ids = {number: _write_camera(database, model) for number, model in new.items()}
+        for number, ref in images:
+            mine = colours / f"{number}.npy"
+            if ref.camera in cameras:
+                mine.unlink()
+                continue
+            image_id = write_image(database, ref, ids[lens[number]])
+            database.write_keypoints(image_id, source.read_keypoints(number))
+            database.write_descriptors(image_id, source.read_descriptors(number))
+            mine.rename(colours / f"{image_id}.npy")  # ids only grow smaller: it is free by now
+    before.unlink()
 
 
 def keypoint_colours(workspace: Path, image_id: int) -> npt.NDArray[np.uint8]:

@@ -118,6 +118,13 @@ def _of_mirrored(inputs: ReportInputs) -> Iterator[Advice]:
             because="it shows what the other cameras see with left and right exchanged, and was left out",
             weight=3.0,
         )
+    for one, other in (inputs.metrics or {}).get("mapping", {}).get("mirror_images", ()):
+        yield Advice(
+            do=f"See whether text reads backwards in the video of {', '.join(one)} or {', '.join(other)}: "
+            "flip that one back (ffmpeg -i in -vf hflip out.mp4). If none does, cover wall mirrors.",
+            because="they see mirror images of each other, and nothing tells which is right",
+            weight=3.0,
+        )
 
 
 def _of_lenses(inputs: ReportInputs) -> Iterator[Advice]:

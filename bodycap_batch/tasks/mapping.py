@@ -54,7 +54,7 @@ def _save_map(result: MapResult, files: Path) -> None:
     from bodycap_batch.formats.bundle import write_bundle
     from bodycap_batch.mapping.freeing import FREED
     from bodycap_batch.mapping.lens import misfit_note
-    from bodycap_batch.mapping.mirrored import MIRRORED, mirror_note
+    from bodycap_batch.mapping.mirrored import mirror_notes
 
     workspace = files / "workspace"
     os.rename(result.workspace, workspace)
@@ -66,7 +66,7 @@ def _save_map(result: MapResult, files: Path) -> None:
         keyframes=len(largest.keyframe_camera),
         points=len(largest.points),
         notes=[
-            *map(mirror_note, result.log.get(MIRRORED, ())),
+            *mirror_notes(result.log),
             *(
                 misfit_note(camera, factor, freed=camera in result.log.get(FREED, ()))
                 for camera, factor in sorted(wrong.items())

@@ -129,6 +129,13 @@ def test_a_mirrored_camera_is_to_be_flipped_not_to_see_more(inputs: ReportInputs
     assert "Flip the video of left_palm back" in written(replace(inputs, metrics=metrics), tmp_path)
 
 
+def test_cameras_that_see_mirror_images_are_to_be_looked_at(inputs: ReportInputs) -> None:
+    metrics = json.loads(json.dumps(inputs.metrics))
+    metrics["mapping"]["mirror_images"] = [[["left_palm"], ["torso"]]]
+    first, *_ = advise(replace(inputs, metrics=metrics), {})
+    assert first.do.startswith("See whether text reads backwards in the video of left_palm or torso")
+
+
 def test_a_verdict_names_cameras_that_only_the_body_places_and_a_job_without_any_pose(
     inputs: ReportInputs,
 ) -> None:

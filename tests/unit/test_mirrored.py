@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import permutations
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -10,18 +11,24 @@ from typing import Any, cast
 import cv2
 import numpy as np
 import pycolmap
-import pytest
 
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import EstimationError
-from bodycap_batch.mapping.database import DATABASE_NAME, add_keyframes
+from bodycap_batch.mapping.database import DATABASE_NAME, add_keyframes, image_ids, keypoint_colours
 from bodycap_batch.mapping.likeness import clear_matches, largest
-from bodycap_batch.mapping.mirrored import flipped, mirror_note, without_mirrored
+from bodycap_batch.mapping.mirrored import (
+    MIRROR_IMAGES,
+    MIRRORED,
+    _judged,
+    explained,
+    flipped,
+    mirror_note,
+    mirror_notes,
+    without_mirrored,
+)
 from bodycap_batch.scene import KeyframeSelection
-
-FRAMES = np.arange(6)
 
 
 def _wall() -> np.ndarray:
@@ -44,7 +51,10 @@ class _Pan:
 
     mask = None
 
-    def __init__(self, name: str, start: int, *, mirrored: bool = False, upside_down: bool = False) -> None:
+    def __init__(
+        self, name: str, start: int, *, mirrored: bool = False, upside_down: bool = False, count: int = 6
+    ) -> None:
+        self.frames = np.arange(count)
         self.name, self._start, self._mirrored, self._turned = name, start, mirrored, upside_down
 
     def read(self, frames: np.ndarray, *, colour: bool) -> Iterator[tuple[int, np.ndarray]]:
@@ -59,9 +69,10 @@ class _Pan:
             )
 
 
-def _left(tmp_path: Path, *cameras: _Pan) -> list[str]:
-    """Names of the cameras that are not left out."""
-    with pycolmap.Database.open(str(tmp_path / DATABASE_NAME)) as database:
+def _workspace(folder: Path, *cameras: _Pan) -> list[KeyframeSelection]:
+    """A database of the cameras' keyframes in a folder, and what was selected."""
+    folder.mkdir(exist_ok=True)
+    with pycolmap.Database.open(str(folder / DATABASE_NAME)) as database:
         lens = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[420.0, 420.0, 320.0, 240.0])
         ids = [database.write_camera(lens) for _ in cameras]
         for each in ids:
@@ -69,11 +80,36 @@ def _left(tmp_path: Path, *cameras: _Pan) -> list[str]:
             rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, each))
             database.write_rig(rig)
     wanted = [
-        (cast(CaptureCamera, camera), number, FRAMES) for camera, number in zip(cameras, ids, strict=True)
+        (cast(CaptureCamera, camera), number, camera.frames)
+        for camera, number in zip(cameras, ids, strict=True)
     ]
-    add_keyframes(tmp_path, wanted, MapOptions(), StageContext(work_dir=tmp_path, threads=1))
-    chosen: list[Any] = [SimpleNamespace(camera=camera.name, frames=FRAMES) for camera in cameras]
-    return [item.camera for item in without_mirrored(tmp_path, cast(list[KeyframeSelection], chosen))]
+    add_keyframes(folder, wanted, MapOptions(), StageContext(work_dir=folder, threads=1))
+    chosen: list[Any] = [SimpleNamespace(camera=camera.name, frames=camera.frames) for camera in cameras]
+    return cast(list[KeyframeSelection], chosen)
+
+
+def _left(folder: Path, *cameras: _Pan) -> tuple[list[str], dict[str, Any]]:
+    """Names of the cameras that are not left out, and the log."""
+    left, _, log = without_mirrored(folder, _workspace(folder, *cameras), MapOptions())
+    return [item.camera for item in left], log
+
+
+def _content(folder: Path) -> list[tuple[Any, ...]]:
+    """All that a database holds of its images."""
+    with pycolmap.Database.open(str(folder / DATABASE_NAME)) as database:
+        assert database.num_cameras() == database.num_rigs()
+        assert database.num_images() == database.num_frames()
+        return [
+            (
+                ref,
+                number,
+                database.read_image(number).camera_id,
+                np.asarray(database.read_keypoints(number)).tobytes(),
+                np.asarray(database.read_descriptors(number).data).tobytes(),
+                keypoint_colours(folder, number).tobytes(),
+            )
+            for ref, number in sorted(image_ids(database).items())
+        ]
 
 
 def test_descriptors_of_a_mirrored_picture_are_known_without_it() -> None:
@@ -95,18 +131,69 @@ def test_descriptors_of_a_mirrored_picture_are_known_without_it() -> None:
 
 def test_the_mirrored_one_of_three_is_left_out(tmp_path: Path) -> None:
     cameras = _Pan("head", 300), _Pan("left", 0, mirrored=True), _Pan("torso", 150, upside_down=True)
-    assert _left(tmp_path, *cameras) == ["head", "torso"]
+    assert _left(tmp_path, *cameras) == (["head", "torso"], {MIRRORED: ["left"]})
     assert "camera left shows the room mirrored" in mirror_note("left")
 
 
+def test_the_database_is_then_as_if_it_had_never_been_there(tmp_path: Path) -> None:
+    head, left, torso = _Pan("head", 300), _Pan("left", 0, mirrored=True), _Pan("torso", 150)
+    _left(tmp_path / "all", left, head, torso)
+    _workspace(tmp_path / "two", head, torso)
+    assert _content(tmp_path / "all") == _content(tmp_path / "two")
+    for folder in ("all", "two"):
+        files = sorted(each.name for each in (tmp_path / folder).rglob("*") if each.is_file())
+        assert files == sorted([*(f"{number}.npy" for number in range(1, 13)), DATABASE_NAME])
+
+
 def test_cameras_that_see_the_same_way_round_are_kept(tmp_path: Path) -> None:
-    assert _left(tmp_path, _Pan("head", 300), _Pan("left", 0), _Pan("torso", 150)) == [
-        "head",
-        "left",
-        "torso",
+    cameras = _Pan("head", 300), _Pan("left", 0), _Pan("torso", 150)
+    assert _left(tmp_path, *cameras) == (["head", "left", "torso"], {})
+
+
+def test_a_camera_without_keyframes_is_kept(tmp_path: Path) -> None:
+    cameras = _Pan("head", 300, count=0), _Pan("left", 0), _Pan("torso", 150)
+    assert _left(tmp_path, *cameras)[0] == ["head", "left", "torso"]
+
+
+def test_two_that_see_mirror_images_are_both_kept_and_named(tmp_path: Path) -> None:
+    left, log = _left(tmp_path, _Pan("left", 0, mirrored=True), _Pan("torso", 150))
+    assert (left, log) == (["left", "torso"], {MIRROR_IMAGES: [[["left"], ["torso"]]]})
+    (note,) = mirror_notes(log)
+    assert note.startswith("cameras left and torso see mirror images of each other: that is right where")
+    error = explained(EstimationError("too few", hint="film more"), log)
+    assert error is not None
+    assert error.hint is not None
+    assert error.hint.startswith("cameras left and torso see mirror images")
+    assert error.hint.endswith("; film more")
+
+
+def test_a_first_pair_of_a_camera_that_is_left_out_is_not_used(tmp_path: Path) -> None:
+    cameras = _Pan("head", 300), _Pan("left", 0, mirrored=True), _Pan("torso", 150)
+    named = MapOptions(init_frames=("left:1", "torso:2"))
+    _, options, log = without_mirrored(tmp_path, _workspace(tmp_path, *cameras), named)
+    assert options.init_frames is None
+    assert "left out" in log["named_initial_pair"]["failed"]
+    assert "map.init_frames names camera left, which is left out: it is not used" in mirror_notes(log)
+
+
+def _told(evidence: dict[str, int]) -> tuple[set[str], list[list[list[str]]]]:
+    """The judgement on five cameras of one letter; it is the same in whatever order they come."""
+    found = [
+        _judged(cameras, {(pair[0], pair[1]): each for pair, each in evidence.items()})
+        for cameras in permutations("abcde")
     ]
+    assert all(each == found[0] for each in found)
+    return found[0]
 
 
-def test_which_of_two_is_mirrored_cannot_be_told(tmp_path: Path) -> None:
-    with pytest.raises(EstimationError, match="left and torso see mirror images of each other"):
-        _left(tmp_path, _Pan("left", 0, mirrored=True), _Pan("torso", 150))
+def test_a_tie_of_two_leaves_the_other_cameras_judged() -> None:
+    assert _told({"ab": 90, "ae": -80, "cd": -300}) == ({"e"}, [[["c"], ["d"]]])
+    assert _told({"ab": 90, "cd": 80, "ac": -70}) == (set(), [[["a", "b"], ["c", "d"]]])
+
+
+def test_evidence_that_contradicts_itself_leaves_nobody_out() -> None:
+    assert _told({"ab": 100, "bc": 100, "ac": -90, "cd": 100}) == (set(), [[["a"], ["c"]]])
+    # Three times as strong is believed: b, c and d agree with a, whatever a and c seem to say.
+    assert _told({"ab": 300, "bc": 300, "ac": -90, "cd": 100, "ae": -100}) == ({"e"}, [])
+    assert _told({"ab": -300, "bc": -290, "ac": -100}) == (set(), [[["a"], ["b"]]])
+    assert _told({"ab": -300, "bc": -290, "ac": -70}) == ({"b"}, [])
