@@ -12,7 +12,7 @@ from bodycap_batch.scene import Trajectory
 
 _ROUNDS = 100
 _CONVERGED_RAD = 1e-9
-_MIN_INSTANTS = 30
+MIN_INSTANTS = 30
 """A second of frames in which both cameras have a pose of their own; fewer say too little of how they sit."""
 _MAX_RATIO = 1.5
 """Spread of the relative turn over what the poses' own covariances explain (they hold the map's error too,
@@ -53,7 +53,7 @@ class RelativePose:
     @property
     def rigid(self) -> bool:
         """Whether enough instants agree that the two are held together and exposed in step."""
-        return self.instants >= _MIN_INSTANTS and self.spread_rad < _MAX_RATIO * self.explained_rad
+        return self.instants >= MIN_INSTANTS and self.spread_rad < _MAX_RATIO * self.explained_rad
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -152,7 +152,7 @@ def _frame_ns(times_ns: IntArray) -> float:
 def loose_note(found: RelativePose) -> str:
     """Why two cameras that the job says are a rig were not taken for one."""
     pair = " and ".join(found.cameras)
-    if found.instants < _MIN_INSTANTS:
+    if found.instants < MIN_INSTANTS:
         return (
             f"{pair}: {found.instants} common frames in one map say too little of how they sit: each is on "
             "its own"

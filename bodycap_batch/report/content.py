@@ -12,13 +12,14 @@ from bodycap_batch.report.figures.body import before_and_after, before_optimisat
 from bodycap_batch.report.figures.matrix import matrix
 from bodycap_batch.report.figures.shared import shared
 from bodycap_batch.report.figures.strips import COLUMNS, columns_at, strip
+from bodycap_batch.report.grades import Grade
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.losses import Cause
 from bodycap_batch.report.lost import LostFrame, causes_by_camera
 from bodycap_batch.report.packing import Shown
 from bodycap_batch.report.placing import Placed, common_times_s
 from bodycap_batch.report.tables import headline_figures, tables_of
-from bodycap_batch.report.verdict import Grade, judge
+from bodycap_batch.report.verdict import judge
 
 _SHEET = 24
 _DONE = {

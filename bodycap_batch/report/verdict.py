@@ -2,52 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any
 
+from bodycap_batch.report.beside import of_reach, of_shared_segments
+from bodycap_batch.report.grades import Criterion, Grade, graded
 from bodycap_batch.shares import percent
 
 _SHARP_PX = 1.0
 """Mean reprojection error that sharp corners and a lens that fits stay below."""
-
-
-class Grade(IntEnum):
-    """How far a result can be relied on; the worst of its criteria counts."""
-
-    GOOD = 0
-    FAIR = 1
-    POOR = 2
-    NONE = 3
-
-    @property
-    def word(self) -> str:
-        """For a person."""
-        return ("good", "usable with care", "poor", "no result")[self]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Criterion:
-    """One graded figure.
-
-    Attributes:
-        about: ``cameras`` or ``body``: which half of the verdict it belongs to.
-        name: What is judged.
-        grade: How it is.
-        says: The figure in words.
-        why: Where the thresholds stand and for what reason.
-        metric: Where ``metrics.json`` holds the figure, dotted; "" for what is derived from several.
-        value: The figure itself.
-    """
-
-    about: str
-    name: str
-    grade: Grade
-    says: str
-    why: str
-    metric: str = ""
-    value: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,13 +53,6 @@ def judge(metrics: Mapping[str, Any] | None, failure: Mapping[str, Any] | None) 
         body=body,
         criteria=criteria,
     )
-
-
-def graded(value: float, good: float, fair: float, *, more_is_better: bool = False) -> Grade:
-    """Where a value stands between two bounds."""
-    if more_is_better:
-        value, good, fair = -value, -good, -fair
-    return Grade.GOOD if value <= good else Grade.FAIR if value <= fair else Grade.POOR
 
 
 def _worst(criteria: tuple[Criterion, ...], about: str) -> Grade:
@@ -190,53 +147,13 @@ def _of_map(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
         why="A camera outside the main map has no known place in the room; nothing of it reaches the body, "
         "unless the body itself tells where it was, and then less exactly.",
     )
-    yield from _of_reach(metrics.get("mapping", {}).get("reach"))
-    yield from _of_shared_segments(metrics.get("relative_poses", ()))
-    mapping = metrics.get("mapping", {})
+    mapping, merge = metrics.get("mapping", {}), metrics.get("merge", {})
+    unused = merge.get("unused_cameras", {})
+    yield from of_reach(mapping.get("reach"), unused)
+    yield from of_shared_segments(metrics.get("relative_poses", ()), merge.get("mounts", {}), unused)
     misfits, freed = mapping.get("misfitting_lenses", {}), mapping.get("freed_lenses", ())
     # A lens of the wrong kind, a wide one given as a pinhole, leaves more than sharp corners do.
     yield from _of_lenses(misfits, freed if error is not None and float(error) <= _SHARP_PX else ())
-
-
-def _of_reach(reach: Mapping[str, Any] | None) -> Iterator[Criterion]:
-    """Distances between cameras against the body's reach; None without a body, whose reach is unknown then.
-
-    A share too small to judge single keyframes by is a finding all the same; too few distances are none.
-    """
-    if not reach or "within_reach" not in reach:
-        return
-    share = float(reach["within_reach"])
-    unfit = (
-        "" if reach["judged"] else " at most, whatever the scale: body, clocks or map do not suit each other"
-    )
-    yield Criterion(
-        about="cameras",
-        name="Cameras within the body's reach",
-        grade=graded(share, 0.98, 0.9, more_is_better=True),
-        says=f"{percent(share, 1)} of {reach['distances']:,} distances between cameras{unfit}",
-        why="Cameras on one body cannot be further apart than it reaches: a map folded over two places "
-        "that look alike shows here although its error in pixels is small.",
-        metric="mapping.reach.within_reach",
-        value=share,
-    )
-
-
-def _of_shared_segments(relative: Sequence[Mapping[str, Any]]) -> Iterator[Criterion]:
-    """Cameras on one bone beside each other; without common frames nothing is known of them."""
-    known = [each for each in relative if each["spread_deg"] is not None]
-    worst = max(known, key=lambda each: float(each["spread_deg"]), default=None)
-    if worst is not None:
-        spread = float(worst["spread_deg"])
-        yield Criterion(
-            about="cameras",
-            name="Cameras on one bone",
-            grade=graded(spread, 2.0, 6.0),
-            says=f"{' and '.join(worst['cameras'])} are turned by {spread:.1f}° against their usual places "
-            f"(median of {worst['instants']:,} frames)",
-            why="They keep their places beside each other, but for soft straps. Where they do not, one has "
-            "come loose, or a clock is off (offset_s): 0.4 s made 5° of a camera that was moved slowly.",
-            value=spread,
-        )
 
 
 def _of_lenses(misfits: Mapping[str, float], freed: Collection[str]) -> Iterator[Criterion]:
@@ -253,7 +170,7 @@ def _of_lenses(misfits: Mapping[str, float], freed: Collection[str]) -> Iterator
             name="Lenses fit the pictures",
             # A lens may be contradicted although its focal length fits.
             grade=max(Grade.FAIR, graded(abs(worst - 1.0), 0.0, 0.1)) if held else Grade.FAIR,
-            says=f"{name}: the pictures fit {_other_lens(worst)} than the calibration says"
+            says=f"{name}: the pictures fit {other_lens(worst)} than the calibration says"
             f"{'' if held else '; what fits was used instead'}",
             why="A wrong lens bends the whole map although its error in pixels is small: on a walk of 2 m, "
             "25 % of focal length put every camera 9 cm off, a centre 9 % off its place 16 cm.",
@@ -262,7 +179,7 @@ def _of_lenses(misfits: Mapping[str, float], freed: Collection[str]) -> Iterator
         )
 
 
-def _other_lens(factor: float) -> str:
+def other_lens(factor: float) -> str:
     """What fits over what was given; a wrong centre alone can leave the focal length as it was."""
     percent = round(100 * abs(factor - 1.0))
     return (

@@ -22,13 +22,14 @@ from bodycap_batch.report import ReportInputs
 from bodycap_batch.report.advice import advise, shared_points
 from bodycap_batch.report.figures.body import before_optimisation
 from bodycap_batch.report.figures.strips import strip
+from bodycap_batch.report.grades import Criterion, Grade
 from bodycap_batch.report.losses import Cause, cause_of, find_losses
 from bodycap_batch.report.packing import NONE, Shown, pack_scaled, thinned
 from bodycap_batch.report.pictures import Look, Picture
 from bodycap_batch.report.placing import common_times_s, place
 from bodycap_batch.report.solid import solid_data
 from bodycap_batch.report.tables import look_up
-from bodycap_batch.report.verdict import Grade, judge
+from bodycap_batch.report.verdict import judge
 from bodycap_batch.scene import FrameStatus, Trajectory
 from bodycap_batch.tasks.report import load_inputs
 from tests.reports import written
@@ -277,19 +278,49 @@ def test_every_link_of_the_page_leads_somewhere(inputs: ReportInputs, tmp_path: 
         assert sections - links <= {"verdict", "about"}
 
 
+PAIR = {"cameras": ["torso", "torso_back"], "instants": 130, "rigid": False, "explained_deg": 1.0}
+
+
+def _on_one_bone(inputs: ReportInputs, *pairs: dict[str, Any], **merge: Any) -> list[Criterion]:
+    metrics = json.loads(json.dumps(inputs.metrics))
+    metrics["relative_poses"] = pairs
+    metrics["merge"] |= merge
+    return [each for each in judge(metrics, None).criteria if each.name == "Cameras on one bone"]
+
+
 @pytest.mark.parametrize(("spread_deg", "grade"), [(0.3, Grade.GOOD), (4.8, Grade.FAIR), (15.0, Grade.POOR)])
 def test_cameras_on_one_bone_that_move_against_each_other_are_told(
     inputs: ReportInputs, spread_deg: float, grade: Grade
 ) -> None:
-    metrics = json.loads(json.dumps(inputs.metrics))
-    pair = {"cameras": ["torso", "torso_back"], "instants": 130}
-    never = {"cameras": ["torso", "torso_2"], "instants": 0, "spread_deg": None}
-    metrics["relative_poses"] = [never, {**pair, "spread_deg": spread_deg}]
-    (found,) = [each for each in judge(metrics, None).criteria if each.name == "Cameras on one bone"]
+    never = {
+        **PAIR,
+        "cameras": ["torso", "torso_2"],
+        "instants": 0,
+        "spread_deg": None,
+        "explained_deg": None,
+    }
+    (found,) = _on_one_bone(inputs, never, {**PAIR, "spread_deg": spread_deg})
     assert found.grade is grade
     assert "torso and torso_back" in found.says
-    metrics["relative_poses"] = [never]
-    assert not [each for each in judge(metrics, None).criteria if each.name == "Cameras on one bone"]
+    assert not _on_one_bone(inputs, never)
+
+
+def test_what_says_too_little_of_cameras_on_one_bone_is_not_held_against_them(inputs: ReportInputs) -> None:
+    loose = {**PAIR, "spread_deg": 15.0}
+    assert not _on_one_bone(inputs, {**loose, "instants": 29})
+    assert not _on_one_bone(inputs, loose, unused_cameras={"torso_back": "no link"})
+    noisy = {**PAIR, "spread_deg": 8.1, "explained_deg": 8.0}
+    assert [each.grade for each in _on_one_bone(inputs, noisy)] == [Grade.GOOD]
+    in_step = {**PAIR, "spread_deg": 10.0, "explained_deg": 8.0, "rigid": True}
+    assert [each.grade for each in _on_one_bone(inputs, in_step)] == [Grade.GOOD]
+    # A forearm's two ends turn against each other; what is loose elsewhere is worse.
+    arm = {**loose, "cameras": ["left_palm", "left_wrist"], "spread_deg": 30.0}
+    mounts = {**inputs.metrics["merge"]["mounts"]}
+    mounts["left_palm"] = {**mounts["left_palm"], "role": "LeftForeArm"}
+    assert [each.grade for each in _on_one_bone(inputs, arm, mounts=mounts)] == [Grade.FAIR]
+    (worst,) = _on_one_bone(inputs, arm, loose, mounts=mounts)
+    assert worst.grade is Grade.POOR
+    assert "torso_back" in worst.says
 
 
 def test_a_lens_off_its_centre_is_never_good(inputs: ReportInputs) -> None:
@@ -313,6 +344,12 @@ def test_a_body_that_no_scale_brings_within_reach_is_told(inputs: ReportInputs) 
     assert found.grade is Grade.POOR
     assert found.says.startswith("62")
     assert "do not suit" in found.says
+    # With a camera that nobody wore nothing else is to be blamed.
+    metrics["merge"]["unused_cameras"] = {"left_palm": "it lies on a table"}
+    (found,) = [each for each in judge(metrics, None).criteria if "reach" in each.name]
+    assert found.grade is Grade.FAIR
+    assert "left_palm" in found.says
+    assert "do not suit" not in found.says
 
 
 @pytest.mark.parametrize("reach", [None, {"judged": False, "reason": "3 distances are too few"}])
