@@ -14,6 +14,7 @@ from bodycap_batch.arrays import IntArray
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.losses import Cause
 from bodycap_batch.report.placing import common_times_s
+from bodycap_batch.report.verdict import other_lens
 from bodycap_batch.scene import Map
 from bodycap_batch.shares import percent
 
@@ -131,11 +132,11 @@ def _of_lenses(inputs: ReportInputs) -> Iterator[Advice]:
     """Calibrations that the map contradicts: nothing else can be right before they are."""
     misfits = (inputs.metrics or {}).get("mapping", {}).get("misfitting_lenses", {})
     if misfits:
-        fits = ", ".join(f"{name} {factor:.2f}" for name, factor in sorted(misfits.items()))
+        fits = "; ".join(f"{name} has {other_lens(factor)}" for name, factor in sorted(misfits.items()))
         yield Advice(
             do="Run again with `calibration: auto`, or calibrate in the mode that was filmed in, with "
             "stabilisation and digital zoom off.",
-            because=f"the pictures contradict given lenses; focal lengths that fit, over given ones: {fits}",
+            because=f"by the pictures, {fits} than the calibration says",
             weight=3.0,
         )
 

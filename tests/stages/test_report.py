@@ -329,6 +329,8 @@ def test_a_lens_off_its_centre_is_never_good(inputs: ReportInputs) -> None:
     (found,) = [each for each in judge(metrics, None).criteria if each.name.startswith("Lenses")]
     assert found.grade is Grade.FAIR
     assert "another lens" in found.says
+    told = [each.because for each in advise(replace(inputs, metrics=metrics), {}) if "calibration" in each.do]
+    assert told == ["by the pictures, torso has another lens than the calibration says"]
 
 
 def test_a_body_that_no_scale_brings_within_reach_is_told(inputs: ReportInputs) -> None:
