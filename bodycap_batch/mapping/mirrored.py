@@ -89,10 +89,7 @@ def mirror_notes(log: Mapping[str, Any]) -> list[str]:
     return [
         *map(mirror_note, log.get(MIRRORED, ())),
         *(f"map.init_frames names camera {name}, which is left out: it is not used" for name in named),
-        *(
-            f"{_sides(each)}: {_MAYBE}, and that camera's motion is wrong"
-            for each in log.get(MIRROR_IMAGES, ())
-        ),
+        *(f"{_sides(each)}: {_MAYBE}; {_HINT}" for each in log.get(MIRROR_IMAGES, ())),
     ]
 
 

@@ -160,6 +160,8 @@ def test_two_that_see_mirror_images_are_both_kept_and_named(tmp_path: Path) -> N
     assert (left, log) == (["left", "torso"], {MIRROR_IMAGES: [[["left"], ["torso"]]]})
     (note,) = mirror_notes(log)
     assert note.startswith("cameras left and torso see mirror images of each other: that is right where")
+    assert note.count("wrong") == 1
+    assert note.endswith("flip it back: ffmpeg -i in -vf hflip out.mp4")
     error = explained(EstimationError("too few", hint="film more"), log)
     assert error is not None
     assert error.hint is not None
