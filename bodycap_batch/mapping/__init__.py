@@ -173,16 +173,14 @@ def _starts(shop: Workshop, options: MapOptions) -> tuple[list[Start], dict[str,
 def _begun(
     shop: Workshop, options: MapOptions, guessed: Mapping[int, str], total: int
 ) -> tuple[list[Any], dict[str, Any]]:
-    """The first models and how they came about.
-
-    They are built anew, from the pairs that then are best, where guessed lenses (names by id) need another
-    kind of camera.
-    """
+    """The first models, built anew where guessed lenses (names by id) need others; how they came about."""
     models, log = _started(shop, options, total)
-    for again in (False, True) if guessed else ():
-        found = change_lenses(shop.workspace, models, shop.settings(), guessed, again=again)
-        if not found:
+    found, decentred = dict[str, tuple[Camera, bool]](), None
+    for _ in range(2 if guessed else 0):
+        better, decentred = change_lenses(shop.workspace, models, shop.settings(), guessed, decentred)
+        if not better:
             break
+        found |= better
         models, log = _started(shop := replace(shop, lenses={**shop.lenses, **found}), options, total)
         log["better_lenses"] = {name: lens.model for name, (lens, _) in sorted(found.items())}
     return models, log

@@ -30,7 +30,10 @@ still in the map) and freeing it lowered the cost by 1 % at most; a lens 7 % off
 _WRONG_CENTRE = 0.03
 """Right centres of six captures were found again to 0.5 % of the long side; one stated 9 % off was found to
 half a percent (the cost fell by 51 %), and had put the cameras 16 cm off."""
-_CANDIDATES = ("RADIAL", "SIMPLE_RADIAL_FISHEYE")
+_FISHEYE, _FISHEYE_TWICE = "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"
+"""A second radial term, for what one finds to be a fisheye lens: the focal lengths of two made-up
+ones were found to 0.1 and 0.4 % instead of 1.8 and 1.2."""
+_CANDIDATES = ("RADIAL", _FISHEYE)
 _WORTH_CHANGING = 0.15
 """A fisheye lens guessed as a usual one: the cost falls by 75 % with the fisheye model (and the focal length
 from 25 % wrong to 0.4 %), by 52 % with a second radial term. A usual lens: by 1 % at most, or it rises."""
@@ -40,6 +43,11 @@ guessed lenses, two of them real: the cost falls by 2 % at most with the princip
 focal length for each axis (a fisheye lens's second radial term among it). Cropped to a corner, three videos:
 by 9 to 51 % (the real one least), and their error from 2.0, 31 and 32 cm to 0.9, 0.5 and 0.9. Squeezed to 3/4
 of its width, one: by 56 %."""
+_NOT_SQUARE = 0.02
+"""Its model bends in more ways than that: the cost falls for distortion that is not along the radius,
+too, with focal lengths that agree to 0.1 %."""
+_OBSERVATIONS_EACH = 10
+"""Mapped keypoints of a lens for each of its parameters, at least."""
 _WORTH_A_CENTRE = 0.05
 _WORTH_CENTRING = 0.005
 """Once it is known to be off, all that a second map tells is taken: 1.6 to 0.9 cm, for 0.9 % of the cost."""
@@ -94,7 +102,7 @@ def _moved(one: Any, other: Any) -> float:
 
 def better_lenses(
     model: Any, settings: pycolmap.IncrementalPipelineOptions, guessed: Collection[int]
-) -> dict[int, pycolmap.Camera]:
+) -> tuple[dict[int, pycolmap.Camera], frozenset[int]]:
     """Lenses that explain the pictures of guessed ones much better than one radial term about the centre.
 
     A part of the map is adjusted with each candidate in turn, for all guessed lenses alike: another model,
@@ -106,33 +114,50 @@ def better_lenses(
         guessed: Ids of the cameras whose lens was not given.
 
     Returns:
-        Adjusted cameras by id, for those that need another model.
+        Adjusted cameras by id, for those that need another model or centre; the ids of those whose principal
+        point was found to lie off where it was.
     """
     import pycolmap
 
     part = _part(model)
     out: dict[int, pycolmap.Camera] = {}
+    decentred: frozenset[int] = frozenset()
     wanted = [number for number in sorted(guessed) if part.exists_camera(number)]
     if not wanted or part.num_reg_images() < _MIN_KEYFRAMES:
-        return out
+        return out, decentred
     held = set(part.cameras) - set(wanted)
     best = _cost(part, settings, free=True, distortion=True, held=held)
     plain = chosen = part
-    for name, centre in (*((name, False) for name in _CANDIDATES), (_DECENTRED, True), (_STRETCHED, False)):
+    for name in (*_CANDIDATES, _FISHEYE_TWICE, _DECENTRED, _STRETCHED):
+        centre = name == _DECENTRED
+        if name == _FISHEYE_TWICE and chosen.camera(wanted[0]).model_name != _FISHEYE:
+            continue
         # All at once: while one lens is wrong the map is bent, and no other fits it.
         trial = copy.deepcopy(plain if name in _CANDIDATES else chosen)
         for number in wanted:
             _change_model(trial.camera(number), name)
         cost = _cost(trial, settings, free=True, distortion=True, centre=centre, held=held)
         worth = _WORTH_A_CENTRE if centre else _WORTH_CHANGING
-        if best is not None and cost is not None and cost < (1.0 - worth) * best:
-            best, chosen = cost, trial
-            out = {number: pycolmap.Camera(trial.camera(number).todict()) for number in wanted}
-    return out
+        if best is None or cost is None or cost >= (1.0 - worth) * best:
+            continue
+        taken = [number for number in wanted if name != _STRETCHED or _is_stretched(trial, number)]
+        out |= {number: pycolmap.Camera(trial.camera(number).todict()) for number in taken}
+        best, chosen = cost, trial
+        decentred = frozenset(wanted) if centre else decentred
+    return out, decentred
+
+
+def _is_stretched(part: Any, number: int) -> bool:
+    """Whether the two focal lengths of a camera differ, by keypoints enough to tell."""
+    camera = part.camera(number)
+    mine = (image for image in map(part.image, part.reg_image_ids()) if image.camera_id == number)
+    seen = sum(int(image.num_points3D) for image in mine)
+    aspect = camera.focal_length_x / camera.focal_length_y
+    return bool(abs(aspect - 1.0) > _NOT_SQUARE and seen >= _OBSERVATIONS_EACH * len(camera.params))
 
 
 def recentred_lenses(
-    model: Any, settings: pycolmap.IncrementalPipelineOptions, guessed: Collection[int]
+    model: Any, settings: pycolmap.IncrementalPipelineOptions, decentred: Collection[int]
 ) -> dict[int, pycolmap.Camera]:
     """Lenses found off the centre of the picture, found anew where the map built with them tells more.
 
@@ -142,7 +167,7 @@ def recentred_lenses(
     Args:
         model: The reconstruction; stays as it is.
         settings: The mapper's settings.
-        guessed: Ids of the cameras whose lens was not given.
+        decentred: Ids of the cameras whose principal point was found off (`better_lenses`).
 
     Returns:
         Adjusted cameras by id, where the cost falls.
@@ -150,9 +175,7 @@ def recentred_lenses(
     import pycolmap
 
     part = _part(model)
-    wanted = [
-        number for number in sorted(guessed) if part.exists_camera(number) and _off(part.camera(number))
-    ]
+    wanted = [number for number in sorted(decentred) if part.exists_camera(number)]
     held = set(part.cameras) - set(wanted)
     best = _cost(part, settings, free=True, distortion=True, held=held) if wanted else None
     if best is None:
@@ -163,19 +186,13 @@ def recentred_lenses(
     return {number: pycolmap.Camera(part.camera(number).todict()) for number in wanted}
 
 
-def _off(camera: Any) -> bool:
-    """True where the principal point is not the guess, the middle of the picture."""
-    return bool(camera.principal_point_x != camera.width / 2 or camera.principal_point_y != camera.height / 2)
-
-
 def change_lenses(
     workspace: Path,
     models: Sequence[Any],
     settings: pycolmap.IncrementalPipelineOptions,
     guessed: Mapping[int, str],
-    *,
-    again: bool = False,
-) -> dict[str, tuple[Camera, bool]]:
+    decentred: Collection[int] | None = None,
+) -> tuple[dict[str, tuple[Camera, bool]], Collection[int]]:
     """Write the better lenses of guessed cameras into the database.
 
     Args:
@@ -183,22 +200,28 @@ def change_lenses(
         models: Reconstructions, the one to tell from first; they stay as they are.
         settings: The mapper's settings.
         guessed: Names of the cameras whose lens was not given, by id.
-        again: They were built with what this found before: only what it tells better is of interest.
+        decentred: The models were built with what this found before, and these are the lenses it then found
+            off the centre: only what is told better of them is of interest.
 
     Returns:
-        By camera name the lens that was written, and that it is none that was given (`better_lenses`).
+        By camera name the lens that was written, and that it is none that was given (`better_lenses`); the
+        ids of the lenses that were found off the centre.
     """
     import pycolmap
 
-    find = recentred_lenses if again else better_lenses
-    lenses = find(models[0], settings, guessed) if models else {}
+    lenses: dict[int, pycolmap.Camera] = {}
+    if models and decentred is not None:
+        lenses = recentred_lenses(models[0], settings, decentred)
+    elif models:
+        lenses, decentred = better_lenses(models[0], settings, guessed)
     if lenses:
         with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
             for lens in lenses.values():
                 # COLMAP looks for no initial pair among fisheye cameras whose focal length is a mere guess.
                 lens.has_prior_focal_length = True
                 database.update_camera(lens)
-    return {guessed[number]: (lens_of(lens), False) for number, lens in sorted(lenses.items())}
+    found = {guessed[number]: (lens_of(lens), False) for number, lens in sorted(lenses.items())}
+    return found, decentred or ()
 
 
 def _change_model(camera: Any, name: str) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from bodycap_batch import mapping
 from bodycap_batch.arrays import FloatArray
 from bodycap_batch.camera import Camera
 from bodycap_batch.capture import CaptureCamera
@@ -351,27 +352,74 @@ def test_a_named_start_is_used(built: tuple[Any, FloatArray, Workshop, set[Any]]
         named_start(shop.workspace, ("hat:33", "cam:33"), _LENSES, _NUMBERS)
 
 
-def test_a_named_start_is_used_again_where_a_guessed_lens_changes_its_model(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _workspace(tmp_path)
-    _link_one_way(tmp_path)
-    context = StageContext(work_dir=tmp_path, threads=1)
-    shop = Workshop(
-        workspace=tmp_path,
+def _guessed_shop(workspace: Path) -> Workshop:
+    """What maps the keyframes of `_workspace`, their lens being a guess."""
+    _workspace(workspace)
+    _link_one_way(workspace)
+    return Workshop(
+        workspace=workspace,
         lenses=_LENSES,
         settings=lambda: mapper_options(MapOptions(), [], 1.0),
         constant=[],
-        context=context,
+        context=StageContext(work_dir=workspace, threads=1),
         frame_numbers=_NUMBERS,
     )
-    other = Camera(model="RADIAL", width_px=640, height_px=480, params=np.array([421.0, 320, 240, 0, 0]))
-    changed = other.to_pycolmap()
+
+
+def _radial() -> Camera:
+    return Camera(model="RADIAL", width_px=640, height_px=480, params=np.array([421.0, 320, 240, 0, 0]))
+
+
+def test_a_named_start_is_used_again_where_a_guessed_lens_changes_its_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shop = _guessed_shop(tmp_path)
+    changed = _radial().to_pycolmap()
     changed.camera_id = 1
-    monkeypatch.setattr(lens, "better_lenses", lambda *_: {1: changed})
+    monkeypatch.setattr(lens, "better_lenses", lambda *_: ({1: changed}, frozenset()))
     options = MapOptions(init_frames=("cam:31", "cam:35"))
     models, log = _begun(shop, options, {1: "cam"}, _KEYFRAMES)
     assert log["better_lenses"] == {"cam": "RADIAL"}
     assert models[0].camera(1).model_name == "RADIAL"
     assert log["initial_pair_ladder"][0]["pair"] == ["cam/0000001", "cam/0000005"]
     assert log["named_initial_pair"]["pair"] == ["cam/0000001", "cam/0000005"]
+
+
+@pytest.mark.parametrize("crop", [1.0, 0.9])
+def test_only_a_centre_that_was_found_off_is_found_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, crop: float
+) -> None:
+    """A calibrated centre is hardly ever the very middle of the picture."""
+    shop = _guessed_shop(tmp_path)
+    with pycolmap.Database.open(str(tmp_path / DATABASE_NAME)) as database:
+        camera = database.read_camera(1)
+        camera.model, camera.params = pycolmap.CameraModelId.SIMPLE_RADIAL, [420.0, 321.5, 238.5, 0.0]
+        database.update_camera(camera)
+    freed_centre = []
+
+    def cost(part: Any, settings: Any, *, centre: bool = False, **_: Any) -> float:
+        """The second radial term halves what is left; a free centre takes a hundredth, or `crop` of it."""
+        freed_centre.append(centre)
+        left = 50.0 if part.camera(1).model_name == "RADIAL" else 100.0
+        return left * min(0.99, crop) if centre else left
+
+    monkeypatch.setattr(lens, "_cost", cost)
+    _, log = _begun(shop, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam"}, _KEYFRAMES)
+    assert log["better_lenses"] == {"cam": "RADIAL"}
+    first_map = [False, False, False, True, False]
+    assert freed_centre == first_map + ([False, True] if crop < 0.95 else [])
+
+
+def test_the_log_holds_what_both_looks_at_the_lenses_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shop = _guessed_shop(tmp_path)
+    looks = iter([({"cam": _radial(), "hat": _radial()}, {1}), ({"cam": _radial()}, {1})])
+
+    def change(*_: Any, **__: Any) -> tuple[dict[str, tuple[Camera, bool]], set[int]]:
+        found, decentred = next(looks)
+        return {name: (camera, False) for name, camera in found.items()}, decentred
+
+    monkeypatch.setattr(mapping, "change_lenses", change)
+    _, log = _begun(shop, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam", 2: "hat"}, _KEYFRAMES)
+    assert log["better_lenses"] == {"cam": "RADIAL", "hat": "RADIAL"}
