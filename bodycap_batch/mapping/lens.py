@@ -248,14 +248,19 @@ def _change_model(camera: Any, name: str) -> None:
 def misfit_note(camera: str, factor: float, *, freed: bool = False) -> str:
     """What a misfit means and what to do; `freed`: what fits was used instead of what was given."""
     instead = "; what fits was used instead" if freed else ""
-    percent = round(100 * abs(factor - 1.0))
-    longer = "longer" if factor > 1.0 else "shorter"
-    fits = f"a focal length {percent} % {longer}" if percent else "another lens"
+    if abs(factor - 1.0) > _WRONG_FOCAL:
+        longer = "longer" if factor > 1.0 else "shorter"
+        fits = f"a focal length {round(100 * abs(factor - 1.0))} % {longer} than"
+        cause = (
+            "stabilisation or digital zoom on, or another lens mode or size calibrated? Film with these off"
+        )
+    else:
+        # What was freed had its distortion found as well; else the centre alone can have told.
+        fits = "another centre or distortion than" if freed else "a centre that lies elsewhere than where"
+        cause = "the picture cropped, or another lens mode or size calibrated? Film the whole picture"
     return (
-        f"{camera}: the pictures fit {fits} than the "
-        f"calibration says{instead}: was stabilisation or digital zoom on, or another lens mode or size "
-        "calibrated? Film with these off, calibrate in the same mode, "
-        "or use calibration: auto"
+        f"{camera}: the pictures fit {fits} the calibration says{instead}: "
+        f"was {cause}, calibrate in the same mode, or use calibration: auto"
     )
 
 

@@ -74,7 +74,15 @@ def test_the_note_says_what_to_do():
     assert "12 % longer" in misfit_note("torso", 1.12)
     assert "12 % shorter" in misfit_note("torso", 0.88)
     assert "stabilisation" in misfit_note("torso", 0.88)
-    assert "fit another lens than" in misfit_note("torso", 1.002, freed=True)
+    assert "another centre or distortion than" in misfit_note("torso", 1.002, freed=True)
+
+
+@pytest.mark.parametrize("factor", [0.95, 1.0, 1.006, 1.05])
+def test_a_lens_flagged_for_its_centre_alone_is_not_said_to_have_another_focal_length(factor):
+    note = misfit_note("torso", factor)
+    assert "focal length" not in note
+    assert "a centre that lies elsewhere" in note
+    assert "cropped" in note
 
 
 def test_a_guessed_lens_that_fits_keeps_its_model():
