@@ -67,6 +67,20 @@ def test_it_starts_with_the_whole_body_and_all_paths_in_view(pages: Pages, repor
     assert page.evaluate("bodycap.view.orbit.distance") == near, "who looked around is left there"
 
 
+def test_what_is_followed_stays_in_the_middle_when_the_window_changes(pages: Pages, report: Path) -> None:
+    page = pages.open(report.as_uri())
+    page.wait_for_selector("section.viewer[data-mode=webgl]")
+    page.check("[data-layer=follow]")
+    page.locator("#time").focus()
+    page.keyboard.press("End")
+    page.wait_for_timeout(400)
+    followed = page.evaluate("bodycap.view.orbit.target")
+    assert followed != page.evaluate("bodycap.view.orbit.home.target")
+    page.set_viewport_size({"width": 500, "height": 900})
+    page.wait_for_timeout(400)
+    assert page.evaluate("bodycap.view.orbit.target") == followed
+
+
 def test_the_slider_moves_the_skeleton(pages: Pages, report: Path) -> None:
     page = pages.open(report.as_uri())
     page.wait_for_selector("section.viewer[data-mode=webgl]")

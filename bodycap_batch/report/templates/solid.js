@@ -256,7 +256,9 @@ class Solid {
     if (this.splat) this.splat.resize(width, height);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
+    const { target } = this.orbit;
     this.orbit.frame(this.whole, width / height, this.camera.fov);
+    if (this.follow) this.orbit.target = target;
     this.dirty = true;
   }
 
