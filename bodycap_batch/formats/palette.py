@@ -7,11 +7,13 @@ from collections.abc import Iterable
 Colour = tuple[int, int, int]
 
 CAMERA_COLOURS: tuple[Colour, ...] = (
-    (0, 158, 115), (204, 100, 165), (175, 138, 0), (135, 115, 220), (213, 80, 20), (50, 125, 210),
-    (0, 150, 175), (150, 105, 70),
+    (21, 164, 122), (207, 102, 167), (191, 138, 0), (133, 111, 230), (191, 63, 17), (115, 142, 216),
+    (10, 118, 126), (144, 102, 69),
 )  # fmt: skip
-"""Told apart by the colour-blind (after M. Okabe, K. Ito, Color Universal Design), each with a contrast of 3
-and more on white paper and on the preview's dark ground. Orange and blue, the limbs' own there, come late."""
+"""Told apart by those who see no red, no green or no blue: 16 and more of CIELAB (1976) lie between any two,
+simulated after G. Machado et al., A physiologically-based model for simulation of color vision deficiency,
+2009. Each has a contrast of 3 and more on white paper and on the preview's dark ground. Orange and blue, the
+limbs' own there, come late."""
 
 
 def camera_colours(cameras: Iterable[str]) -> dict[str, Colour]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import re
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bodycap_batch.arrays import FloatArray
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config.job import load_job
 from bodycap_batch.formats.palette import CAMERA_COLOURS, as_hex, camera_colours
@@ -20,12 +22,42 @@ from bodycap_batch.preview.timeline import make_timeline
 from tests.reports import report_inputs, written
 from tests.videos import textured_frame, write_video
 
+SEEN_WITHOUT = {
+    "nothing": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    "red": (
+        (0.152286, 1.052583, -0.204868),
+        (0.114503, 0.786281, 0.099216),
+        (-0.003882, -0.048116, 1.051998),
+    ),
+    "green": ((0.367322, 0.860646, -0.227968), (0.280085, 0.672501, 0.047413), (-0.01182, 0.04294, 0.968881)),
+    "blue": ((1.255528, -0.076749, -0.178779), (-0.078411, 0.930809, 0.147602), (0.004733, 0.691367, 0.3039)),
+}
+"""Linear sRGB as seen without one kind of cones (Machado et al. 2009)."""
+XYZ_OF_WHITE = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+
+
+def _linear(colour: tuple[int, ...]) -> FloatArray:
+    share = np.array(colour) / 255.0
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+
 
 def _luminance(colour: tuple[int, ...]) -> float:
     """Of sRGB, as the Web Content Accessibility Guidelines count it."""
-    share = np.array(colour) / 255.0
-    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-    return float(linear @ (0.2126, 0.7152, 0.0722))
+    return float(_linear(colour) @ (0.2126, 0.7152, 0.0722))
+
+
+def _lab(linear: FloatArray) -> FloatArray:
+    """CIELAB of linear sRGB."""
+    xyz = XYZ_OF_WHITE @ linear / XYZ_OF_WHITE.sum(axis=1)
+    x, y, z = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+@pytest.mark.parametrize("lacking", SEEN_WITHOUT)
+def test_any_two_are_told_apart_by_the_colour_blind(lacking: str) -> None:
+    sight = np.array(SEEN_WITHOUT[lacking])
+    seen = [_lab(np.clip(sight @ _linear(colour), 0.0, 1.0)) for colour in CAMERA_COLOURS]
+    assert min(np.linalg.norm(one - other) for one, other in combinations(seen, 2)) >= 16.0
 
 
 @pytest.mark.parametrize("colour", CAMERA_COLOURS)
@@ -36,7 +68,7 @@ def test_each_is_seen_on_white_paper_and_on_the_dark_ground(colour: tuple[int, i
     assert re.fullmatch("#[0-9a-f]{6}", as_hex(colour))
 
 
-def test_a_camera_has_its_colour_whatever_the_order_and_whoever_is_missing() -> None:
+def test_a_camera_has_its_colour_whatever_the_order_and_keeps_it_where_others_are_not_drawn() -> None:
     every = camera_colours(["torso", "left_palm", "right_palm"])
     assert every == camera_colours(["right_palm", "torso", "left_palm"])
     assert len(set(camera_colours(f"camera {number}" for number in range(8)).values())) == 8
