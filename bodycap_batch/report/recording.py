@@ -44,9 +44,9 @@ def write_recording(inputs: ReportInputs, target: Path) -> None:
         ) from error
     placed = place(inputs)
     if not placed.drawn:
-        raise JobError(
-            f"the store holds neither map nor camera paths of {inputs.name}", hint="run the job again"
-        )
+        failure = inputs.failure or {}
+        lacking = failure.get("message", f"the store holds neither map nor camera paths of {inputs.name}")
+        raise JobError(lacking, hint=failure.get("hint") or "run the job again")
     stream = rr.RecordingStream("bodycap", recording_id=inputs.name)
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     _log_maps(stream, placed)

@@ -15,6 +15,7 @@ from bodycap_batch.formats.palette import Colour, camera_colours
 from bodycap_batch.report import ReportInputs
 from bodycap_batch.report.marks import solved_body
 from bodycap_batch.report.recording import write_recording
+from bodycap_batch.runner import NotStored
 from tests.reports import report_inputs
 
 
@@ -102,6 +103,11 @@ def test_camera_paths_are_on_the_common_clock_and_broken_at_their_gaps(
 def test_nothing_stored_is_no_recording(tmp_path: Path) -> None:
     with pytest.raises(JobError, match="neither map nor camera paths"):
         write_recording(ReportInputs(name="x"), tmp_path / "x.rrd")
+    # Stages that are stored may be of another version; the report says so likewise.
+    failure = NotStored([], tmp_path).to_dict()
+    with pytest.raises(JobError, match="not computed yet") as caught:
+        write_recording(ReportInputs(name="x", failure=failure), tmp_path / "x.rrd")
+    assert "bodycap why" in str(caught.value.hint)
 
 
 def test_a_place_that_takes_no_file_is_told(inputs: ReportInputs, tmp_path: Path) -> None:
