@@ -26,7 +26,6 @@ def merge_trajectories(inputs: MergeInputs, options: MergeOptions, context: Stag
         sparse Gaussian process regression", RSS 2014).
     """
     # gtsam takes a second to import.
-    from bodycap_batch.merging.choosing import share_priors
     from bodycap_batch.merging.stage import merge
 
-    return merge(share_priors(inputs), options, context)
+    return merge(inputs, options, context)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bodycap_batch.body import MergeInputs
 from bodycap_batch.config.options import MergeOptions
@@ -15,6 +14,7 @@ from bodycap_batch.merging.bones import graph_bones
 from bodycap_batch.merging.initial import anchor_and_reach
 from bodycap_batch.merging.joining import Together, use_together
 from bodycap_batch.merging.rolls import is_open
+from bodycap_batch.merging.unworn import unworn
 from bodycap_batch.scene import Trajectory
 from bodycap_batch.skeleton import Mount
 
@@ -22,17 +22,14 @@ MIN_FRAMES = 15
 """Localised frames below which a camera tells nothing about a motion: half a second at 30 fps."""
 TRUNK = ("Spine1", "Spine", "Hips", "Neck", "Head")
 """Bones whose camera can lead, the best first: limbs are judged against it."""
-_STANDS_STILL, _STANDS_STILL_RAD = 0.005, float(np.radians(0.3))
-"""A camera strays so little, beside the one of its map that strays furthest, and turns so little where it
-lies on a table: one does by 0.0004 and 0.01 deg; 15 worn ones of five captures by more than 0.8 and 5 deg."""
 _SHORT = 0.25
 """Share of the longest camera's time below which a camera does not lead, nor its map become the main one."""
 
 
-def bring_together(
-    inputs: MergeInputs, step: Callable[[], None], options: MergeOptions | None = None
-) -> Together:
-    """Gather the cameras that can be used together, from the first main map that makes a body.
+def gather(
+    inputs: MergeInputs, step: Callable[[], None], options: MergeOptions
+) -> tuple[MergeInputs, Together]:
+    """The inputs with priors that cameras at one place share, and the cameras that make the body.
 
     Args:
         inputs: Trajectories, skeleton, mounts and clocks.
@@ -43,8 +40,30 @@ def bring_together(
         EstimationError: No map holds two cameras whose distance the body knows.
     """
     useless = of_no_use(inputs)
+    shared = share_priors(inputs, useless)
+    return shared, bring_together(shared, step, options, useless)
+
+
+def bring_together(
+    inputs: MergeInputs,
+    step: Callable[[], None],
+    options: MergeOptions | None = None,
+    useless: Mapping[str, str] | None = None,
+) -> Together:
+    """Gather the cameras that can be used together, from the first main map that makes a body.
+
+    Args:
+        inputs: Trajectories, skeleton, mounts and clocks.
+        step: Called after each iteration; may raise to stop.
+        options: What the job states of the scale.
+        useless: What `of_no_use` says, where that is known.
+
+    Raises:
+        EstimationError: No map holds two cameras whose distance the body knows.
+    """
+    useless = of_no_use(inputs) if useless is None else useless
     left_out: dict[str, str] = {}
-    for main, further in choices(inputs):
+    for main, further in choices(inputs, useless):
         together = use_together(inputs, main, further, step, options)
         if _make_a_body(inputs, together.trajectories):
             return replace(together, unused={**useless, **together.unused})
@@ -60,12 +79,12 @@ def bring_together(
     )
 
 
-def share_priors(inputs: MergeInputs) -> MergeInputs:
+def share_priors(inputs: MergeInputs, useless: Mapping[str, str] | None = None) -> MergeInputs:
     """Cameras that are expected at the same place by their names alone are off it together, as a rig is.
 
     Each alone would say where the body is as if the others had been strapped on by somebody else.
     """
-    useless = of_no_use(inputs)
+    useless = of_no_use(inputs) if useless is None else useless
     paths = [each.camera for each in inputs.trajectories if each.camera not in useless]
     worn = [inputs.mount_of(camera) for camera in paths]
 
@@ -90,23 +109,9 @@ def _same(first: Mount, second: Mount) -> bool:
 def of_no_use(inputs: MergeInputs) -> dict[str, str]:
     """By camera that tells nothing of the body's motion, why."""
     seldom = seldom_localised(inputs)
-    rest = [each for each in inputs.trajectories if each.camera not in seldom]
-    still = {}
-    for each in rest:
-        furthest = max(_strays(other)[0] for other in rest if other.gauge == each.gauge)
-        away, turned_rad = _strays(each)
-        if away < _STANDS_STILL * furthest and turned_rad < _STANDS_STILL_RAD:
-            still[each.camera] = "it stands still while the others move: nobody wears it, or it is frozen"
-    return {**seldom, **still}
-
-
-def _strays(trajectory: Trajectory) -> tuple[float, float]:
-    """How far a camera strays from its middle (map units), and turns (rad), for nine tenths of the time."""
-    poses = trajectory.gauge_from_cam[trajectory.localised]
-    away = np.linalg.norm(poses[:, :3, 3] - np.median(poses[:, :3, 3], axis=0), axis=1)
-    turns = Rotation.from_matrix(poses[:, :3, :3])
-    turned = (turns.mean().inv() * turns).magnitude()
-    return float(np.percentile(away, 90)), float(np.percentile(turned, 90))
+    still = unworn(inputs, [each for each in inputs.trajectories if each.camera not in seldom])
+    why = "it stands still while the others move: nobody wears it, or it is frozen"
+    return {**seldom, **dict.fromkeys(still, why)}
 
 
 def seldom_localised(inputs: MergeInputs) -> dict[str, str]:
@@ -119,7 +124,9 @@ def seldom_localised(inputs: MergeInputs) -> dict[str, str]:
     }
 
 
-def choices(inputs: MergeInputs) -> list[tuple[list[Trajectory], list[Trajectory]]]:
+def choices(
+    inputs: MergeInputs, useless: Mapping[str, str] | None = None
+) -> list[tuple[list[Trajectory], list[Trajectory]]]:
     """Each map as the main one, the best first: its cameras, the leading one first, and those of other maps.
 
     A trunk's camera leads before a head's, a head's before a limb's; one that was hardly localised leads
@@ -133,8 +140,8 @@ def choices(inputs: MergeInputs) -> list[tuple[list[Trajectory], list[Trajectory
         short = seconds[camera] < _SHORT * max(seconds.values())
         return short, TRUNK.index(role) if role in TRUNK else len(TRUNK), -counts[camera]
 
-    useless = of_no_use(inputs)
-    ranked = sorted((each for each in inputs.trajectories if each.camera not in useless), key=rank)
+    without = of_no_use(inputs) if useless is None else useless
+    ranked = sorted((each for each in inputs.trajectories if each.camera not in without), key=rank)
     return [
         ([each for each in ranked if each.gauge == gauge], [each for each in ranked if each.gauge != gauge])
         for gauge in dict.fromkeys(each.gauge for each in ranked)

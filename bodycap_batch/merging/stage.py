@@ -15,7 +15,7 @@ from bodycap_batch.context import StageContext
 from bodycap_batch.geometry import Similarity
 from bodycap_batch.merging import gauge
 from bodycap_batch.merging.bones import Bone, graph_bones
-from bodycap_batch.merging.choosing import bring_together
+from bodycap_batch.merging.choosing import gather
 from bodycap_batch.merging.chunks import MAX_ITERATIONS, longest_stretch, solve_motion
 from bodycap_batch.merging.complete import complete_body, observed_joints
 from bodycap_batch.merging.constants import Calibrated, Cleaned, calibrate_body, points_around
@@ -51,7 +51,7 @@ class _Progress:
 def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> MergeResult:
     """See `bodycap_batch.merging.merge_trajectories`."""
     step = _Progress(context)
-    together = bring_together(inputs, step, options)
+    inputs, together = gather(inputs, step, options)
     used = together.trajectories
     bones = graph_bones(inputs.skeleton, {inputs.mount_of(each.camera).role for each in used})
     fps = options.fps or inputs.clocks[used[0].camera].nominal_fps

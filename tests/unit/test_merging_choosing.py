@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bodycap_batch.config.options import MergeOptions
+from bodycap_batch.context import StageContext
 from bodycap_batch.errors import EstimationError
-from bodycap_batch.geometry import Similarity
-from bodycap_batch.merging import choosing, joining, placing
+from bodycap_batch.geometry import Similarity, make_transform, so3_exp
+from bodycap_batch.merging import choosing, joining, merge_trajectories, placing
 from bodycap_batch.merging.choosing import bring_together, choices, of_no_use, seldom_localised
 from bodycap_batch.merging.constants import early_up
 from bodycap_batch.merging.joining import Joined, use_together
@@ -19,6 +21,7 @@ from bodycap_batch.merging.tracks import MIN_SIGMA_RAD, make_track
 from bodycap_batch.scene import FrameStatus
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.posed import posed
+from tests.stages.walker import NOISE_M, NOISE_RAD, ROLES, make_inputs, make_walk, record
 
 CAMERAS = ("torso", "head", "left_palm", "right_palm", "left_upper_arm")
 
@@ -26,6 +29,13 @@ CAMERAS = ("torso", "head", "left_palm", "right_palm", "left_upper_arm")
 @pytest.fixture(scope="module")
 def capture():
     return posed(SynthOptions(seconds=6.0, cameras=CAMERAS, seed=2, poses_only=True))
+
+
+@pytest.fixture
+def walked():
+    rng = np.random.default_rng(0)
+    walk = make_walk(rng)
+    return make_inputs(walk, [record(walk, name, rng) for name in ROLES])
 
 
 def _lose(inputs, camera, kept):
@@ -62,27 +72,116 @@ def test_the_trunk_leads_then_the_head(capture):
     assert seldom_localised(lost) == {"torso": f"6 localised frames of {6 * 30}, 15 needed"}
 
 
+def _noise(rng, count, sigma_rad=NOISE_RAD, sigma_m=NOISE_M):
+    """Errors (N,4,4) of poses, one standard deviation per axis."""
+    return make_transform(
+        so3_exp(rng.normal(scale=sigma_rad, size=(count, 3))), rng.normal(scale=sigma_m, size=(count, 3))
+    )
+
+
+def _with_palm(inputs, moved):
+    """The inputs with another path (N,4,4) of the left palm, made of its own; NaN: not localised."""
+    changed = []
+    for each in inputs.trajectories:
+        if each.camera == "left_palm":
+            path = moved(np.array(each.gauge_from_cam))
+            lost = ~np.isfinite(path).all(axis=(1, 2))
+            covariance = np.where(
+                lost[:, None, None], np.nan, np.diag(np.repeat([NOISE_RAD, NOISE_M], 3) ** 2)
+            )
+            status = tuple(FrameStatus.FEW_TRACKS if no else FrameStatus.REGISTERED for no in lost)
+            each = replace(each, gauge_from_cam=path, covariance=covariance, status=status)  # noqa: PLW2901
+        changed.append(each)
+    return replace(inputs, trajectories=tuple(changed))
+
+
+def _lying(poses):
+    """Where the camera is first, as registration sees it in each frame."""
+    first = poses[np.isfinite(poses).all(axis=(1, 2))][0]
+    return np.asarray(first @ _noise(np.random.default_rng(7), len(poses)))
+
+
 def test_a_camera_that_nobody_wears_is_left_out(capture):
-    def with_palm(moved):
-        """The inputs with another path (N,4,4) of the left palm, made of its own."""
-        changed = []
-        for each in capture.inputs.trajectories:
-            path = moved(np.array(each.gauge_from_cam)) if each.camera == "left_palm" else each.gauge_from_cam
-            changed.append(replace(each, gauge_from_cam=path))
-        return replace(capture.inputs, trajectories=tuple(changed))
-
-    def lying(poses):
-        return np.where(np.isfinite(poses), poses[np.isfinite(poses).all(axis=(1, 2))][0], np.nan)
-
-    def swaying(poses):
-        out = lying(poses)
-        out[:, :3, 3] += 0.05 * np.sin(np.arange(len(poses)))[:, None]
-        return out
-
-    assert of_no_use(capture.inputs) == of_no_use(with_palm(swaying)) == {}
-    together = bring_together(with_palm(lying), lambda: None)
+    lying = _with_palm(capture.inputs, _lying)
+    assert list(of_no_use(lying)) == ["left_palm"]
+    together = bring_together(lying, lambda: None)
     assert "left_palm" not in _names(together.trajectories)
     assert "stands still" in together.unused["left_palm"]
+
+
+@pytest.mark.parametrize(
+    "sway", ["metres", "slowly turned", "waved"], ids=["sways", "turns slowly", "waves on the spot"]
+)
+def test_a_camera_that_is_worn_stays_however_little_it_moves(capture, sway):
+    def moved(poses):
+        out, phase = _lying(poses), np.arange(len(poses)) / 30.0
+        if sway == "metres":
+            out[:, :3, 3] += 0.05 * np.sin(phase)[:, None]
+            return out
+        # A wave at 2 Hz is over in each window: only single frames show it.
+        deg, turns_s = (1.5, 0.2) if sway == "slowly turned" else (4.0, 2.0)
+        angle = np.radians(deg) * np.sin(2.0 * np.pi * turns_s * phase)
+        return out @ make_transform(so3_exp(np.outer(angle, [0.0, 1.0, 0.0])), np.zeros((len(out), 3)))
+
+    assert of_no_use(_with_palm(capture.inputs, moved)) == of_no_use(capture.inputs) == {}
+
+
+def test_a_camera_that_was_localised_for_a_second_while_the_person_stood_is_worn(capture):
+    def seen_first(poses):
+        out, phase = np.repeat(poses[:1], len(poses), axis=0), np.arange(len(poses)) / 30.0
+        out[:, :3, 3] += 0.005 * np.sin(2.0 * phase)[:, None] * np.array([1.0, 0.0, 0.0])
+        out[30:] = np.nan
+        return out
+
+    assert of_no_use(_with_palm(capture.inputs, seen_first)) == {}
+
+
+def test_a_camera_that_was_lost_when_the_person_set_off_is_worn(capture):
+    ready, rng = 110, np.random.default_rng(9)
+
+    def standing_first(each):
+        path = np.array(each.gauge_from_cam)
+        seen = np.flatnonzero(each.localised)
+        early = seen[seen < ready]
+        path[early] = path[seen[0]] @ _noise(rng, len(early))
+        return replace(each, gauge_from_cam=path)
+
+    def lost_then(poses):
+        poses[ready:] = np.nan
+        return poses
+
+    whole = _with_palm(capture.inputs, lambda poses: poses)
+    stood = replace(whole, trajectories=tuple(standing_first(each) for each in whole.trajectories))
+    assert of_no_use(_with_palm(stood, lost_then)) == {}
+
+
+def test_cameras_that_all_stand_still_are_worn(capture):
+    """Noise alone strays: there is none that moves beside it."""
+    count, rng = 90, np.random.default_rng(8)
+    still = []
+    for each in capture.inputs.trajectories:
+        first = each.gauge_from_cam[np.flatnonzero(each.localised)[0]]
+        path, frames = first @ _noise(rng, count), slice(0, count)
+        still.append(
+            replace(
+                each,
+                frame_numbers=each.frame_numbers[frames],
+                times_ns=each.times_ns[frames],
+                gauge_from_cam=path,
+                covariance=np.tile(np.diag(np.repeat([NOISE_RAD, NOISE_M], 3) ** 2), (count, 1, 1)),
+                status=(FrameStatus.REGISTERED,) * count,
+                inliers=np.full(count, 60),
+                error_px=np.full(count, 0.5),
+            )
+        )
+    assert of_no_use(replace(capture.inputs, trajectories=tuple(still))) == {}
+
+
+def test_still_cameras_are_looked_for_once(walked, monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr(choosing, "unworn", lambda *args: asked.append(args) or [])
+    merge_trajectories(walked, MergeOptions(), StageContext(work_dir=tmp_path))
+    assert len(asked) == 1
 
 
 def test_a_trunk_that_was_hardly_localised_does_not_lead(capture):
