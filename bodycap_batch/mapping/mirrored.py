@@ -99,7 +99,7 @@ def mirror_note(camera: str) -> str:
 
 
 def explained(error: EstimationError | None, log: Mapping[str, Any]) -> EstimationError | None:
-    """The error; its hint begins with who sees mirror images of whom, where that was left open."""
+    """The same error; its hint begins with who sees mirror images of whom, where the log leaves that open."""
     if error is not None and log.get(MIRROR_IMAGES):
         error.hint = "; ".join([*map(_sides, log[MIRROR_IMAGES]), _MAYBE, _HINT, *filter(None, [error.hint])])
     return error

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bodycap_batch.context import StageContext
+from bodycap_batch.errors import EstimationError
 from bodycap_batch.tasks.body import load_body
 from bodycap_batch.tasks.loading import load_capture, load_map
 from bodycap_batch.tasks.registered import Registered
@@ -24,7 +25,13 @@ def _merge(options: Json, arguments: Json, context: StageContext, files: Path) -
     inputs, options_ = _merge_inputs(arguments), MergeOptions.model_validate(options)
     if options_.marker_board is not None:
         inputs = _with_board(inputs, arguments, options_.marker_board, context)
-    result = merge_trajectories(inputs, options_, context)
+    try:
+        result = merge_trajectories(inputs, options_, context)
+    except EstimationError as error:
+        from bodycap_batch.mapping.mirrored import explained
+
+        explained(error, load_map(arguments["map"]).log)
+        raise
     write_bundle(result, files, "merge")
     doubts = [*result.report.get("doubted_clocks", {}).values(), result.report.get("exchanged_sides", {})]
     notes = [f"camera {name} is no part of the body: {why}" for name, why in result.unused_cameras.items()]

@@ -11,7 +11,9 @@ from typing import Any, cast
 import cv2
 import numpy as np
 import pycolmap
+import pytest
 
+from bodycap_batch import merging
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
@@ -29,6 +31,7 @@ from bodycap_batch.mapping.mirrored import (
     without_mirrored,
 )
 from bodycap_batch.scene import KeyframeSelection
+from bodycap_batch.tasks import merge
 
 
 def _wall() -> np.ndarray:
@@ -167,6 +170,22 @@ def test_two_that_see_mirror_images_are_both_kept_and_named(tmp_path: Path) -> N
     assert error.hint is not None
     assert error.hint.startswith("cameras left and torso see mirror images")
     assert error.hint.endswith("; film more")
+
+
+def test_a_body_that_cannot_be_solved_then_tells_of_the_mirror(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise EstimationError("the body cannot place left", hint="film more")
+
+    mapped = SimpleNamespace(log={MIRROR_IMAGES: [[["left"], ["torso"]]]})
+    monkeypatch.setattr(merging, "merge_trajectories", refuse)
+    monkeypatch.setattr(merge, "_merge_inputs", lambda _: None)
+    monkeypatch.setattr(merge, "load_map", lambda _: mapped)
+    with pytest.raises(EstimationError) as caught:
+        merge.MERGE.function({}, {"map": "map"}, StageContext(work_dir=tmp_path, threads=1), tmp_path)
+    assert str(caught.value.hint).startswith("cameras left and torso see mirror images of each other")
+    assert str(caught.value.hint).endswith("film more")
 
 
 def test_a_first_pair_of_a_camera_that_is_left_out_is_not_used(tmp_path: Path) -> None:
