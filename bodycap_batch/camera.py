@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -59,6 +59,8 @@ class Camera:
         height_px: Image height.
         params: The model's parameters in COLMAP's order, pixels and COLMAP's pixel origin.
         refine: True where the parameters are a guess that mapping may refine.
+        sideways: True where the sensor's rows run along the picture's columns, as where a phone was held
+            upright; a rolling shutter alone asks.
     """
 
     model: str
@@ -66,6 +68,7 @@ class Camera:
     height_px: int
     params: FloatArray
     refine: bool = False
+    sideways: bool = False
 
     def __post_init__(self) -> None:
         if self.model not in _PARAM_COUNT:
@@ -121,9 +124,7 @@ class Camera:
             params[1] *= scale_y
         params[len(focal)] *= scale_x
         params[len(focal) + 1] *= scale_y
-        return Camera(
-            model=self.model, width_px=width_px, height_px=height_px, params=params, refine=self.refine
-        )
+        return replace(self, width_px=width_px, height_px=height_px, params=params)
 
 
 _TWO_FOCAL_TWIN = {
@@ -144,10 +145,4 @@ def without_single_focal(camera: Camera) -> Camera:
     params = np.zeros(_PARAM_COUNT[model])
     params[:4] = focal, focal, cx, cy
     params[4 : 4 + radial] = distortion[:radial]
-    return Camera(
-        model=model,
-        width_px=camera.width_px,
-        height_px=camera.height_px,
-        params=params,
-        refine=camera.refine,
-    )
+    return replace(camera, model=model, params=params)

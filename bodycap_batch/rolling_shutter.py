@@ -1,11 +1,13 @@
 """Rolling shutter: rows exposed one after another, moved to the instant of the middle row.
 
-Image row r of h is exposed at the frame's time + (r/h − ½) · readout_s.
+Image row r of h is exposed at the frame's time + (r/h − ½) · readout_s; where a quarter turn lets the
+sensor's rows run along the picture's columns (`Camera.sideways`), column c of w at (c/w − ½) · readout_s.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -73,7 +75,8 @@ def _projected(camera: Camera, cam_from_map: FloatArray, frame: IntArray, points
 
 def row_delay(camera: Camera, px: FloatArray) -> FloatArray:
     """Exposure (M,) of pixels (M,2) relative to the frame's time, as a share of the readout time."""
-    return np.asarray(px[:, 1] / camera.height_px - 0.5, dtype=np.float64)
+    along = px[:, 0] / camera.width_px if camera.sideways else px[:, 1] / camera.height_px
+    return np.asarray(along - 0.5, dtype=np.float64)
 
 
 def at_mid_row(camera: Camera, px: FloatArray, velocity_px_s: FloatArray, readout_s: float) -> FloatArray:
@@ -81,10 +84,15 @@ def at_mid_row(camera: Camera, px: FloatArray, velocity_px_s: FloatArray, readou
     return np.asarray(px - velocity_px_s * (row_delay(camera, px) * readout_s)[:, None])
 
 
-def looks_rolling(found: Registration, maps: Sequence[Map]) -> bool:
+def looks_rolling(found: Registration, maps: Sequence[Map], *, either_way: bool = False) -> bool:
     """Whether a rolling shutter shows in the residuals of a camera's tracks.
 
     Global shutters show less than 0.3 ms of it, a readout time of 24 ms shows 3 ms.
+
+    Args:
+        found: The camera's poses and tracks.
+        maps: The maps they are in.
+        either_way: The sensor's rows may run along the picture's columns, too.
     """
     path = found.trajectory
     scene = next((each for each in maps if each.gauge == path.gauge), None)
@@ -101,8 +109,12 @@ def looks_rolling(found: Registration, maps: Sequence[Map]) -> bool:
     pose[path.localised] = invert(path.gauge_from_cam[path.localised])
     residual = np.nan_to_num(px - _projected(lens, pose, frame, points), nan=np.inf)
     velocity = image_velocity(lens, path.gauge_from_cam, path.times_ns, frame, points)
-    readout_s, sigma_s = apparent_readout(lens, frame, px, residual, velocity)
-    return abs(readout_s) > max(_MIN_APPARENT_S, _MIN_SIGMAS * sigma_s)
+    for sideways in (False, True) if either_way else (lens.sideways,):
+        turned = replace(lens, sideways=sideways)
+        readout_s, sigma_s = apparent_readout(turned, frame, px, residual, velocity)
+        if abs(readout_s) > max(_MIN_APPARENT_S, _MIN_SIGMAS * sigma_s):
+            return True
+    return False
 
 
 def apparent_readout(

@@ -46,6 +46,8 @@ class CaptureCamera:
         offset_s: Common time = camera time + offset_s.
         rolling_shutter_s: Time from the first row's exposure to the last's.
         rolling_shutter_known: False where the job does not state it: mapping looks for it in the data.
+        turned: True where the sensor's rows may run along the picture's columns: `camera.sideways` says
+            whether they do where the rolling shutter is known, else the data tell.
         notes: What opening found worth telling: gaps and overlaps of chapters, dropped frames.
         videos: Frame index of each chapter.
         mask: (H,W) at the work size, True where the room is seen; None where that is everywhere.
@@ -62,6 +64,7 @@ class CaptureCamera:
     offset_s: float
     rolling_shutter_s: float
     rolling_shutter_known: bool = True
+    turned: bool = False
     notes: tuple[str, ...] = ()
     videos: tuple[VideoFile, ...] = field(default=(), repr=False)
     mask: BoolArray | None = field(default=None, repr=False)
@@ -97,8 +100,12 @@ class CaptureCamera:
         return np.asarray(np.flatnonzero(keys), dtype=np.int64)
 
     def row_times_ns(self, index: int, rows_px: npt.ArrayLike) -> IntArray:
-        """Common times at which pixel rows (M,) of one frame were exposed (rolling shutter)."""
-        delay_ns = rolling_shutter_delay_s(rows_px, self.camera.height_px, self.rolling_shutter_s) * 1e9
+        """Common times at which pixel rows (M,) of one frame were exposed (rolling shutter).
+
+        Columns, where the sensor's rows run along them.
+        """
+        extent_px = self.camera.width_px if self.camera.sideways else self.camera.height_px
+        delay_ns = rolling_shutter_delay_s(rows_px, extent_px, self.rolling_shutter_s) * 1e9
         return np.asarray(self.common_times_ns()[index] + np.round(delay_ns), dtype=np.int64)
 
     def grey_frames(self, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, Image]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from bodycap_batch.arrays import BoolArray, IntArray
@@ -41,7 +43,6 @@ def open_camera(spec: CaptureConfig, config: CameraConfig) -> CaptureCamera:
     _check_one_format(videos)
     timeline = join_chapters(videos, config.timestamps)
     offset_s = config.offset_s or 0.0
-    rolling_shutter_s, rolling_notes = _shown_rolling_shutter(config.rolling_shutter_s or 0.0, videos[0])
     used = timeline.usable & _inside(timeline.times_ns, offset_s, spec)
     if not used.any():
         raise _nothing_left(spec, config, timeline.times_ns, offset_s)
@@ -54,16 +55,17 @@ def open_camera(spec: CaptureConfig, config: CameraConfig) -> CaptureCamera:
     return CaptureCamera(
         name=config.name,
         chapters=config.video,
-        camera=camera,
+        camera=replace(camera, sideways=_is_sideways(videos[0]) and config.rolling_shutter_s is not None),
         calibrated=calibration is not None,
         frame_numbers=np.flatnonzero(used),
         times_ns=timeline.times_ns[used],
         nominal_fps=videos[0].fps,
         offset_s=offset_s,
-        rolling_shutter_s=rolling_shutter_s,
-        # A quarter turn lets rows run along columns: nothing looks for a rolling shutter there.
-        rolling_shutter_known=config.rolling_shutter_s is not None or not videos[0].orientation[1][1],
-        notes=(*timeline.notes, *rolling_notes),
+        rolling_shutter_s=_shown_rolling_shutter_s(config.rolling_shutter_s or 0.0, videos[0]),
+        rolling_shutter_known=config.rolling_shutter_s is not None,
+        # Sensors lie across: pictures taller than wide were turned, if only by who cut the video.
+        turned=_is_sideways(videos[0]) or camera.height_px > camera.width_px,
+        notes=timeline.notes,
         videos=videos,
         mask=None if config.mask is None else read_mask(config.mask, (camera.width_px, camera.height_px)),
     )
@@ -132,11 +134,14 @@ def guessed_camera(video: VideoFile, work_px: int, fov_deg: float | None) -> Cam
     return Camera(model="SIMPLE_RADIAL", width_px=width, height_px=height, params=params, refine=True)
 
 
-def _shown_rolling_shutter(rolling_shutter_s: float, video: VideoFile) -> tuple[float, tuple[str, ...]]:
-    """Read-out time along the rows as shown: a sensor upside down is read from below."""
-    if rolling_shutter_s and not video.orientation[1][1]:
-        return 0.0, ("a quarter turn in the video: its rolling shutter runs along columns and is left out",)
-    return rolling_shutter_s * (video.orientation[1][1] or 1), ()
+def _is_sideways(video: VideoFile) -> bool:
+    """Whether a player turns the video by a quarter, so that stored rows are shown as columns."""
+    return not video.orientation[1][1]
+
+
+def _shown_rolling_shutter_s(rolling_shutter_s: float, video: VideoFile) -> float:
+    """Read-out time along the rows (or columns) as shown: a sensor upside down is read from below."""
+    return rolling_shutter_s * (video.orientation[1][1] or video.orientation[0][1])
 
 
 def _check_one_format(videos: tuple[VideoFile, ...]) -> None:

@@ -27,7 +27,7 @@ from bodycap_batch.mapping.mirrored import explained, without_mirrored
 from bodycap_batch.mapping.pairs import PairChooser, link_keyframes
 from bodycap_batch.mapping.reach import Reach, check_reach
 from bodycap_batch.mapping.repair import Workshop, cut_doubtful, place_again, repair
-from bodycap_batch.mapping.rolling import Readout, RollingModel
+from bodycap_batch.mapping.rolling import RollingModel, readouts, with_readouts
 from bodycap_batch.mapping.solve import (
     MODELS_NAME,
     mapper_options,
@@ -293,14 +293,14 @@ def refine_map(
     shutil.copytree(previous.workspace, workspace)
     settings, constant = _settings(capture, workspace, options)
     cameras = {camera.name: camera for camera in capture.cameras}
-    models, readouts = [], []
+    models, found_in = [], []
     for number, scene_map in enumerate(previous.maps):
         context.check_cancelled()
         context.progress(number, len(previous.maps), "maps refined")
         model = pycolmap.Reconstruction(str(workspace / MODELS_NAME / str(number)))
         paths = {path.camera: path for path in trajectories if path.gauge == scene_map.gauge}
         rolling = RollingModel(model, paths, cameras)
-        found = _readouts(rolling, settings, constant)
+        rolling, found = readouts(rolling, cameras, settings, constant)
         readout_s = {name: each.seconds for name, each in found.items() if each.seconds}
         if readout_s:
             moved = rolling.moved(readout_s)
@@ -309,28 +309,12 @@ def refine_map(
             rolling.move(moved, {})
             model = moved
         models.append(model)
-        readouts.append(found)
+        found_in.append(found)
     write_models(workspace, models)
-    log = {"rolling_shutter": [{name: asdict(each) for name, each in found.items()} for found in readouts]}
+    log = {"rolling_shutter": [{name: asdict(each) for name, each in found.items()} for found in found_in]}
     result = _result(models, workspace, {**previous.log, **log})
-    maps = [
-        replace(
-            item,
-            readout_s={name: each.seconds for name, each in found.items() if each.seconds},
-        )
-        for item, found in zip(result.maps, readouts, strict=True)
-    ]
+    maps = [with_readouts(item, each) for item, each in zip(result.maps, found_in, strict=True)]
     return replace(result, maps=tuple(maps))
-
-
-def _readouts(
-    rolling: RollingModel, settings: pycolmap.IncrementalPipelineOptions, constant: Sequence[int]
-) -> dict[str, Readout]:
-    """Readout times by camera; where trial adjustments fail none is used, and the log says so."""
-    try:
-        return rolling.fastest().find(settings, constant)
-    except EstimationError as error:
-        return rolling.undetermined(error.message)
 
 
 def _settings(

@@ -99,7 +99,13 @@ def _restored(told: Mapping[str, Any]) -> dict[str, Any]:
 def with_free_lenses(capture: Capture, lenses: Mapping[str, Camera]) -> Capture:
     """The capture with some cameras' lenses as a start that mapping refines."""
     cameras = tuple(
-        replace(each, camera=lenses[each.name], calibrated=False) if each.name in lenses else each
+        replace(
+            each,
+            camera=replace(lenses[each.name], sideways=each.camera.sideways),
+            calibrated=False,
+        )
+        if each.name in lenses
+        else each
         for each in capture.cameras
     )
     return replace(capture, cameras=cameras)

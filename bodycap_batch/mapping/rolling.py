@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.errors import EstimationError
 from bodycap_batch.mapping.convert import lens_of
 from bodycap_batch.mapping.database import ImageRef
 from bodycap_batch.mapping.residuals import image_residuals
 from bodycap_batch.mapping.solve import adjust, part_of
 from bodycap_batch.rolling_shutter import at_mid_row, image_velocity
-from bodycap_batch.scene import Trajectory
+from bodycap_batch.scene import Map, Trajectory
 
 if TYPE_CHECKING:
     import pycolmap
@@ -44,12 +45,19 @@ class Readout:
         sigma_s: Standard deviation; 0 where it was stated.
         source: "stated", "estimated", "none found", or why it could not be determined.
         best_s: Where the residuals are smallest, found or not.
+        sideways: The sensor's rows run along the picture's columns.
     """
 
     seconds: float
     sigma_s: float
     source: str
     best_s: float
+    sideways: bool = False
+
+    @property
+    def clearness(self) -> float:
+        """How many standard deviations the readout time is off none; 0 where none was found."""
+        return abs(self.seconds) / self.sigma_s if self.sigma_s else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +134,14 @@ class RollingModel:
             start = int(np.argmax(total[size:] - total[: len(total) - size]))
             kept |= {item.image_id for item in mine[start : start + size]}
         part = part_of(self._model, kept)
-        return RollingModel(part, self._trajectories, self._cameras)
+        sideways = [name for name, lens in self._lenses.items() if lens.sideways]
+        return RollingModel(part, self._trajectories, self._cameras).read_along(sideways)
+
+    def read_along(self, sideways: Collection[str]) -> RollingModel:
+        """The same model, these cameras' sensors read along the picture's columns, all others' along rows."""
+        out = copy.copy(self)
+        out._lenses = {name: replace(lens, sideways=name in sideways) for name, lens in self._lenses.items()}
+        return out
 
     def find(
         self, settings: pycolmap.IncrementalPipelineOptions, constant: Sequence[int]
@@ -245,6 +260,41 @@ class _Slope:
         sigma_s = float(np.sqrt(self.spread / self.information))
         found = max(_MIN_READOUT_S, _MIN_SIGMAS * sigma_s) < abs(best_s) < _MAX_FRAMES * frame_s
         return Readout(best_s if found else 0.0, sigma_s, "estimated" if found else "none found", best_s)
+
+
+def readouts(
+    rolling: RollingModel,
+    cameras: Mapping[str, CaptureCamera],
+    settings: pycolmap.IncrementalPipelineOptions,
+    constant: Sequence[int],
+) -> tuple[RollingModel, dict[str, Readout]]:
+    """Readout times by camera, and the model read the way its cameras' sensors turn out to lie.
+
+    Where trial adjustments fail none is used, and the log says so.
+    """
+    stated = {name for name, camera in cameras.items() if camera.camera.sideways}
+    rolling = rolling.read_along(stated)
+    try:
+        part = rolling.fastest()
+        found = part.find(settings, constant)
+        turned = {name for name in found if cameras[name].turned and not cameras[name].rolling_shutter_known}
+        across = part.read_along(stated | turned).find(settings, constant) if turned else {}
+    except EstimationError as error:
+        found, turned, across = rolling.undetermined(error.message), set(), {}
+    better = {name for name in turned if across[name].clearness > found[name].clearness}
+    found |= {name: across[name] for name in better}
+    found = {name: replace(each, sideways=name in stated | better) for name, each in found.items()}
+    return rolling.read_along(stated | better), found
+
+
+def with_readouts(scene: Map, found: Mapping[str, Readout]) -> Map:
+    """A map of the cameras' middle rows that says how long their sensors took, and which way they lie."""
+    read = {name: each for name, each in found.items() if each.seconds}
+    cameras = {
+        name: replace(lens, sideways=name in read and read[name].sideways)
+        for name, lens in scene.cameras.items()
+    }
+    return replace(scene, cameras=cameras, readout_s={name: each.seconds for name, each in read.items()})
 
 
 def _stated(readout_s: float) -> Readout:

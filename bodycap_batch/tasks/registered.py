@@ -84,12 +84,18 @@ class Registered:
 
 
 def row_fraction(found: Registration, camera: Camera) -> FloatArray:
-    """(N,) mean row of the observations behind each pose over the image height; NaN without a pose."""
+    """(N,) mean row of the observations behind each pose over the image height; NaN without a pose.
+
+    Column over width, where the sensor's rows run along columns.
+    """
     import numpy as np
+
+    from bodycap_batch.rolling_shutter import row_delay
 
     count = len(found.trajectory.status)
     seen = np.bincount(found.obs_frame, minlength=count)
-    rows = np.bincount(found.obs_frame, weights=found.obs_px[:, 1].astype(np.float64), minlength=count)
+    late = row_delay(camera, found.obs_px.astype(np.float64)) + 0.5
+    rows = np.bincount(found.obs_frame, weights=late, minlength=count)
     mean = np.full(count, 0.5)
-    np.divide(rows, seen * camera.height_px, out=mean, where=seen > 0)
+    np.divide(rows, seen, out=mean, where=seen > 0)
     return np.where(found.trajectory.localised, mean, np.nan)

@@ -28,7 +28,9 @@ def _registration(options: Json, arguments: Json, context: StageContext, files: 
         camera, maps, selection, RegistrationOptions.model_validate(options), context, previous
     )
     known = camera.rolling_shutter_known
-    rolling = bool(camera.rolling_shutter_s) if known else looks_rolling(found, maps)
+    rolling = (
+        bool(camera.rolling_shutter_s) if known else looks_rolling(found, maps, either_way=camera.turned)
+    )
     save_registration(found, camera, files, rolling=rolling)
 
 

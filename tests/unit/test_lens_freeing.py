@@ -46,6 +46,15 @@ def _mapped(error_px: float, misfits: dict[str, float], zoom: float = 1.0) -> Ma
     return MapResult(maps=(scene,), workspace=Path(), log={"misfitting_lenses": misfits})
 
 
+def test_a_sensor_that_lies_sideways_does_so_behind_any_lens() -> None:
+    palm = CAPTURE.camera("left_palm")
+    turned = replace(palm, camera=replace(palm.camera, sideways=True))
+    capture = replace(CAPTURE, cameras=(turned, CAPTURE.camera("torso")))
+    found = freed_where_contradicted(_mapped(0.9, {"left_palm": 1.31}), capture, lambda _: _mapped(0.5, {}))
+    later = as_mapped(capture, found)
+    assert {each.name: each.camera.sideways for each in later.cameras} == {"left_palm": True, "torso": False}
+
+
 def test_a_contradicted_lens_starts_from_what_fits_and_is_refined() -> None:
     seen = []
 
@@ -64,7 +73,8 @@ def test_a_contradicted_lens_starts_from_what_fits_and_is_refined() -> None:
     assert found.log["misfitting_lenses"] == {"left_palm": 1.33}
     assert found.log[FREED] == ["left_palm"]
     later = as_mapped(CAPTURE, found)
-    assert later.camera("left_palm").camera is found.maps[0].cameras["left_palm"]
+    kept, mapped = later.camera("left_palm").camera, found.maps[0].cameras["left_palm"]
+    assert (kept.model, kept.params.tolist()) == (mapped.model, mapped.params.tolist())
     assert not later.camera("left_palm").calibrated
     assert later.camera("torso").calibrated
 

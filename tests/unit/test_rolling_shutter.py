@@ -14,12 +14,13 @@ from bodycap_batch import rolling_shutter
 from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.camera import Camera
 from bodycap_batch.config import MapOptions
+from bodycap_batch.errors import EstimationError
 from bodycap_batch.export.metrics import observation_errors
 from bodycap_batch.geometry import invert, make_transform, so3_exp
-from bodycap_batch.mapping.rolling import RollingModel
+from bodycap_batch.mapping.rolling import Readout, RollingModel, readouts, with_readouts
 from bodycap_batch.mapping.solve import mapper_options
-from bodycap_batch.rolling_shutter import apparent_readout, at_mid_row, image_velocity
-from bodycap_batch.scene import FrameStatus, Map, Trajectory
+from bodycap_batch.rolling_shutter import apparent_readout, at_mid_row, image_velocity, looks_rolling
+from bodycap_batch.scene import FrameStatus, Map, Registration, Trajectory
 
 LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([400.0, 400.0, 320.0, 240.0]))
 FRAMES = 90
@@ -37,9 +38,10 @@ def poses_at(time_s: FloatArray) -> FloatArray:
 
 @dataclass
 class Film:
-    """Points seen by a camera whose rows are exposed one after another."""
+    """Points seen by a camera whose rows (columns, where it lies sideways) are exposed one after another."""
 
     readout_s: float
+    sideways: bool = False
 
     def __post_init__(self) -> None:
         self.rng = np.random.default_rng(5)
@@ -55,7 +57,8 @@ class Film:
             px = LENS.project(
                 np.einsum("mij,mj->mi", cam_from_map[:, :3, :3], self.points) + cam_from_map[:, :3, 3]
             )
-            delay = (np.clip(px[:, 1] / 480.0, 0, 1) - 0.5) * self.readout_s
+            along = px[:, 0] / 640.0 if self.sideways else px[:, 1] / 480.0
+            delay = (np.clip(along, 0, 1) - 0.5) * self.readout_s
         inside = ((px > 0) & (px < (640, 480))).all(axis=1)
         return np.flatnonzero(inside), px[inside] + self.rng.normal(0, NOISE_PX, (int(inside.sum()), 2))
 
@@ -95,12 +98,41 @@ def the_map(film: Film, keyframes: range) -> Any:
     return model
 
 
-def rolling_model(film: Film, *, known: bool = False, stated_s: float = 0.0, posed: bool = True) -> Any:
-    camera = SimpleNamespace(
-        rolling_shutter_known=known, rolling_shutter_s=stated_s, times_ns=film.trajectory().times_ns
+def camera_of(film: Film, *, known: bool = False, stated_s: float = 0.0, turned: bool = False) -> Any:
+    return SimpleNamespace(
+        camera=replace(LENS, sideways=film.sideways and known),
+        turned=turned,
+        rolling_shutter_known=known,
+        rolling_shutter_s=stated_s,
+        times_ns=film.trajectory().times_ns,
     )
+
+
+def misfit_px(model: Any, film: Film) -> float:
+    """Mean distance of a model's pixels from its points under the true poses."""
+    off = []
+    for image_id in model.reg_image_ids():
+        image = model.image(image_id)
+        points = np.array(
+            [model.point3D(each.point3D_id).xyz for each in image.points2D if each.has_point3D()]
+        )
+        px = np.array([each.xy for each in image.points2D if each.has_point3D()])
+        cam_from_map = invert(film.map_from_cam[int(image.name[-7:])])
+        off.append(LENS.project(points @ cam_from_map[:3, :3].T + cam_from_map[:3, 3]) - px)
+    return float(np.linalg.norm(np.concatenate(off), axis=1).mean())
+
+
+def rolling_model(film: Film, *, known: bool = False, stated_s: float = 0.0, posed: bool = True) -> Any:
+    camera = camera_of(film, known=known, stated_s=stated_s)
     paths = {"head": film.trajectory()} if posed else {}
-    return RollingModel(the_map(film, range(1, FRAMES, 5)), paths, {"head": camera})  # type: ignore[dict-item]
+    return RollingModel(the_map(film, range(1, FRAMES, 5)), paths, {"head": camera})
+
+
+def readouts_of(film: Film, camera: Any) -> tuple[Any, Any]:
+    """The model as `readouts` leaves it, and what it tells of its camera."""
+    model = RollingModel(the_map(film, range(1, FRAMES, 5)), {"head": film.trajectory()}, {"head": camera})
+    model, told = readouts(model, {"head": camera}, mapper_options(MapOptions(), [1], 1.0), [1])
+    return model, told["head"]
 
 
 def found(readout_s: float, *, known: bool = False, stated_s: float = 0.0) -> Any:
@@ -126,6 +158,69 @@ def test_a_global_shutter_is_left_alone() -> None:
 def test_a_stated_readout_time_is_not_looked_for() -> None:
     readout = found(0.02, known=True, stated_s=0.017)
     assert (readout.seconds, readout.source) == (0.017, "stated")
+
+
+@pytest.mark.parametrize("sideways", [False, True])
+@pytest.mark.parametrize("readout_s", [0.02, -0.02, 0.0])
+def test_the_data_tell_which_way_a_turned_sensor_is_read(readout_s: float, sideways: bool) -> None:
+    film = Film(readout_s, sideways)
+    model, told = readouts_of(film, camera_of(film, turned=True))
+    assert told.source == ("estimated" if readout_s else "none found")
+    assert abs(told.seconds - readout_s) <= 0.1 * abs(readout_s)
+    assert told.sideways == (sideways and readout_s != 0.0)
+    # Moved pixels lie where the true poses see their points, but for noise and the velocities' curvature.
+    assert misfit_px(model.moved({"head": told.seconds}), film) < 1.0
+    assert readout_s == 0.0 or misfit_px(model.moved({}), film) > 1.5
+
+
+def test_a_stated_readout_runs_the_way_the_video_is_turned() -> None:
+    film = Film(0.02, sideways=True)
+    _, told = readouts_of(film, camera_of(film, known=True, stated_s=0.02, turned=True))
+    assert (told.seconds, told.source, told.sideways) == (0.02, "stated", True)
+
+
+def test_a_stated_readout_keeps_its_way_where_none_could_be_looked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fails(*_: Any) -> None:
+        raise EstimationError("no convergence")
+
+    monkeypatch.setattr(RollingModel, "find", fails)
+    film = Film(0.02, sideways=True)
+    _, told = readouts_of(film, camera_of(film, known=True, stated_s=0.02, turned=True))
+    assert (told.seconds, told.sideways) == (0.02, True)
+    _, told = readouts_of(film, camera_of(film, turned=True))
+    assert (told.seconds, told.source) == (0.0, "not determined: no convergence")
+
+
+def test_a_sensor_that_was_not_turned_is_read_along_rows_alone() -> None:
+    film = Film(0.02, sideways=True)
+    _, told = readouts_of(film, camera_of(film))
+    assert not told.sideways
+
+
+def test_a_map_says_which_way_its_sensors_are_read() -> None:
+    scene = Map(
+        gauge="a",
+        cameras={"head": LENS, "torso": LENS},
+        keyframe_camera=(),
+        keyframe_frame=np.zeros(0, np.int64),
+        map_from_cam=np.zeros((0, 4, 4)),
+        points=np.zeros((0, 3)),
+        colors=np.zeros((0, 3), np.uint8),
+        point_error_px=np.zeros(0),
+        obs_keyframe=np.zeros(0, np.int64),
+        obs_point=np.zeros(0, np.int64),
+        obs_feature=np.zeros(0, np.int64),
+        obs_px=np.zeros((0, 2)),
+    )
+    told = {
+        "head": Readout(0.02, 0.0, "stated", 0.02, True),
+        "torso": Readout(0.0, 1.0, "none found", 0.0, True),
+    }
+    read = with_readouts(scene, told)
+    assert read.readout_s == {"head": 0.02}
+    assert {name: lens.sideways for name, lens in read.cameras.items()} == {"head": True, "torso": False}
 
 
 def test_a_camera_whose_frames_lie_in_another_map_is_left_alone() -> None:
@@ -212,9 +307,10 @@ def test_velocity_is_zero_without_neighbours() -> None:
     assert (velocity == 0).all()
 
 
+@pytest.mark.parametrize("sideways", [False, True])
 @pytest.mark.parametrize(("readout_s", "shows"), [(0.02, True), (0.0, False)])
-def test_a_rolling_shutter_shows_in_the_residuals(readout_s: float, shows: bool) -> None:
-    film = Film(readout_s)
+def test_a_rolling_shutter_shows_in_the_residuals(readout_s: float, shows: bool, sideways: bool) -> None:
+    film = Film(readout_s, sideways)
     frames, pixels, residuals, seen = [], [], [], []
     for frame in range(5, 60, 3):
         points, px = film.seen(frame)
@@ -227,10 +323,57 @@ def test_a_rolling_shutter_shows_in_the_residuals(readout_s: float, shows: bool)
     frame_of, points_of = np.concatenate(frames), np.concatenate(seen)
     velocity = image_velocity(LENS, film.map_from_cam, film.trajectory().times_ns, frame_of, points_of)
     apparent_s, sigma_s = apparent_readout(
-        LENS, frame_of, np.concatenate(pixels), np.concatenate(residuals), velocity
+        replace(LENS, sideways=sideways),
+        frame_of,
+        np.concatenate(pixels),
+        np.concatenate(residuals),
+        velocity,
     )
     assert (abs(apparent_s) > 8 * sigma_s) is shows
     assert not shows or 0.001 < apparent_s < 0.021
+
+
+@pytest.mark.parametrize(
+    ("film", "either_way", "shows"),
+    [
+        (Film(0.02), False, True),
+        (Film(0.02), True, True),
+        (Film(0.02, sideways=True), True, True),
+        (Film(0.0), True, False),
+    ],
+)
+def test_a_turned_sensor_is_looked_at_both_ways(film: Film, either_way: bool, shows: bool) -> None:
+    assert looks_rolling(*tracked(film), either_way=either_way) is shows
+
+
+def tracked(film: Film) -> tuple[Registration, list[Map]]:
+    """Tracks of a keyframe's points through the film, and the map they are in."""
+    count = len(film.points)
+    scene = Map(
+        gauge="a",
+        cameras={"head": LENS},
+        keyframe_camera=("head",),
+        keyframe_frame=np.zeros(1, np.int64),
+        map_from_cam=film.map_from_cam[:1],
+        points=film.points,
+        colors=np.zeros((count, 3), np.uint8),
+        point_error_px=np.zeros(count),
+        obs_keyframe=np.zeros(count, np.int64),
+        obs_point=np.arange(count),
+        obs_feature=np.arange(count),
+        obs_px=np.zeros((count, 2)),
+    )
+    seen = {frame: film.seen(frame) for frame in range(5, 60, 3)}
+    found = Registration(
+        trajectory=film.trajectory(),
+        obs_frame=np.concatenate([np.full(len(points), frame) for frame, (points, _) in seen.items()]),
+        obs_keyframe=np.zeros(sum(len(points) for points, _ in seen.values()), np.int64),
+        obs_feature=np.concatenate([points for points, _ in seen.values()]),
+        obs_px=np.concatenate([px for _, px in seen.values()]).astype(np.float32),
+        wanted_keyframes=np.zeros(0, np.int64),
+        tried_keyframes=np.zeros(0, np.int64),
+    )
+    return found, [scene]
 
 
 def test_velocities_of_a_long_video_are_found_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:

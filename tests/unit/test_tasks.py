@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +114,8 @@ def test_the_mean_row_follows_the_observations() -> None:
     # frame 1 has no observation of its own: the middle row; frame 2 has no pose
     expected = [15 / 48, 0.5, np.nan, 36 / 48]
     assert np.array_equal(row_fraction(found, camera), expected, equal_nan=True)
+    across = [5 / 64, 0.5, np.nan, 5 / 64]
+    assert np.array_equal(row_fraction(found, replace(camera, sideways=True)), across, equal_nan=True)
 
 
 @pytest.mark.parametrize(
