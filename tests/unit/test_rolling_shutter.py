@@ -297,6 +297,19 @@ def test_pixels_move_to_where_they_are_at_the_middle_row() -> None:
     assert after < 2.0 * NOISE_PX, "little but the pixels' own noise (√2 σ) is left"
 
 
+def test_velocity_is_not_taken_across_a_hole_in_the_video() -> None:
+    film = Film(0.0)
+    point = np.array([[0.0, 0.0, 5.0]])
+    kept = np.r_[0:30, 60:FRAMES]
+    times_ns = film.trajectory().times_ns
+    for frame, inwards in ((29, -1), (30, 1)):  # the last before a hole of a second and the first after it
+        beside = kept[frame] + np.array([0, inwards])
+        whole = image_velocity(LENS, film.map_from_cam, times_ns, beside, np.repeat(point, 2, axis=0))
+        holed = image_velocity(LENS, film.map_from_cam[kept], times_ns[kept], np.array([frame]), point)
+        # From one side: the speed half a frame further inwards.
+        assert np.linalg.norm(holed - whole.mean(axis=0)) < 0.02 * np.linalg.norm(whole[0])
+
+
 def test_velocity_is_zero_without_neighbours() -> None:
     film = Film(0.0)
     lonely = np.full_like(film.map_from_cam, np.nan)
