@@ -17,14 +17,22 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.mapping.confirmed import drop_unconfirmed
-from bodycap_batch.mapping.consistency import inconsistent
+from bodycap_batch.mapping.consistency import inconsistent, too_few
 from bodycap_batch.mapping.convert import to_map
-from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, add_keyframes, image_ids
+from bodycap_batch.mapping.database import (
+    DATABASE_NAME,
+    ImageRef,
+    add_camera,
+    add_keyframes,
+    camera_ids,
+    image_ids,
+)
 from bodycap_batch.mapping.freeing import as_mapped, freed_where_contradicted
 from bodycap_batch.mapping.initial import Start, named_start, rank_starts
 from bodycap_batch.mapping.lens import change_lenses, misfitting_lenses
 from bodycap_batch.mapping.mirrored import explained, without_mirrored
 from bodycap_batch.mapping.pairs import PairChooser, link_keyframes
+from bodycap_batch.mapping.placing import place_others
 from bodycap_batch.mapping.reach import Reach, check_reach
 from bodycap_batch.mapping.repair import Workshop, cut_doubtful, place_again, repair
 from bodycap_batch.mapping.rolling import RollingModel, readouts, with_readouts
@@ -36,6 +44,7 @@ from bodycap_batch.mapping.solve import (
     settle,
     write_models,
 )
+from bodycap_batch.mapping.spanning import MANY
 from bodycap_batch.scene import KeyframeSelection, MapResult, Trajectory
 from bodycap_batch.tracking import pixel_scale
 
@@ -57,6 +66,8 @@ def build_map(
     options: MapOptions,
     context: StageContext,
     reach: Reach | None = None,
+    *,
+    many: int = MANY,
 ) -> MapResult:
     """Reconstruct the room and the keyframes' poses by incremental structure from motion.
 
@@ -66,6 +77,7 @@ def build_map(
         options: The stage's options.
         context: Work folder (holds the database and models afterwards), threads, progress.
         reach: How near and how far two cameras can be on the body; without it that is not checked.
+        many: Keyframes beyond which the map is built from some of them; the others are placed in it.
 
     Returns:
         The models, largest first, each in its own gauge.
@@ -75,11 +87,11 @@ def build_map(
 
     Source: Schönberger, Frahm, "Structure-from-motion revisited", CVPR 2016 (COLMAP).
     """
-    result, refused = _build(capture, selections, options, context, reach)
+    result, refused = _build(capture, selections, options, context, reach, many)
     apart = replace(context, work_dir=context.work_dir / "freed")
 
     def again(other: Capture) -> MapResult:
-        found, unusable = _build(other, selections, options, apart, reach)
+        found, unusable = _build(other, selections, options, apart, reach, many)
         if unusable is not None:
             raise unusable
         return found
@@ -93,6 +105,7 @@ def _build(
     options: MapOptions,
     context: StageContext,
     reach: Reach | None,
+    many: int,
 ) -> tuple[MapResult, EstimationError | None]:
     """`build_map` with the lenses as the capture has them: held where calibrated, else refined.
 
@@ -110,19 +123,22 @@ def _build(
     ]
     add_keyframes(workspace, wanted, options, context)
     selections, options, mirror = without_mirrored(workspace, selections, options)
-    cameras = _camera_ids(workspace)
+    cameras = camera_ids(workspace)
     refs = [ImageRef(item.camera, int(frame)) for item in selections for frame in item.frames]
     chooser = PairChooser(workspace, refs, _common_ns(capture), options, context)
-    tried, linked = link_keyframes(chooser, workspace, _lenses(capture), context)
+    carrying = chooser.spanning() if len(refs) > many else chooser
+    tried, linked = link_keyframes(carrying, workspace, _lenses(capture), context)
     constant = _constant(capture, cameras)
     shop = _shop(workspace, capture, options, constant, context)
     guessed = {number: name for name, number in cameras.items() if capture.camera(name).camera.refine}
-    models, begun = _begun(shop, options, guessed, len(refs))
+    models, begun = _begun(shop, options, guessed, len(carrying.refs))
     log: dict[str, Any] = {"keyframes": len(refs), **linked, **begun, **mirror}
     if models:
-        models[0], log["repair"] = repair(models[0], tried, shop)
+        models[0], log["repair"] = repair(models[0], tried, shop, carrying.refs)
+        if carrying is not chooser:
+            log["placed"] = place_others(models, chooser, shop)
         log["unconfirmed_points"] = _settled(models, shop, capture)
-    refused = _too_few(models, len(refs), log.get("initial_candidates", log["initial_pair_ladder"]), options)
+    refused = too_few(models, len(refs), log.get("initial_candidates", log["initial_pair_ladder"]), options)
     refused = explained(refused, mirror)
     if refused is not None and not models:
         raise refused
@@ -225,7 +241,7 @@ def extend_map(
     shutil.copytree(previous.workspace, workspace)
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         known = image_ids(database)
-    cameras = _camera_ids(workspace)
+    cameras = camera_ids(workspace)
     new = [ref for ref in _refs(extra_frames) if ref not in known]
     wanted = [
         (capture.camera(name), cameras[name], np.array(sorted(r.frame for r in new if r.camera == name)))
@@ -321,17 +337,8 @@ def _settings(
     capture: Capture, workspace: Path, options: MapOptions
 ) -> tuple[pycolmap.IncrementalPipelineOptions, list[int]]:
     """The mapper's settings for a workspace that exists, and the ids of its calibrated cameras."""
-    constant = _constant(capture, _camera_ids(workspace))
+    constant = _constant(capture, camera_ids(workspace))
     return mapper_options(options, constant, _scale(capture)), constant
-
-
-def _camera_ids(workspace: Path) -> dict[str, int]:
-    """Database id of each camera that has keyframes."""
-    import pycolmap
-
-    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
-        images = database.read_all_images()
-    return {ImageRef.parse(image.name).camera: int(image.camera_id) for image in images}
 
 
 def _common_ns(capture: Capture) -> dict[str, IntArray]:
@@ -350,19 +357,6 @@ def _scale(capture: Capture) -> float:
 def _constant(capture: Capture, ids: Mapping[str, int]) -> list[int]:
     """Database ids of the calibrated cameras."""
     return sorted(number for name, number in ids.items() if capture.camera(name).calibrated)
-
-
-def _too_few(
-    models: Sequence[Any], keyframes: int, ladder: object, options: MapOptions
-) -> EstimationError | None:
-    registered = models[0].num_reg_images() if models else 0
-    if registered >= max(2, options.min_coverage * keyframes):
-        return None
-    return EstimationError(
-        f"the map holds {registered} of {keyframes} keyframes, "
-        f"fewer than {options.min_coverage:.0%}; initial pairs: {ladder}",
-        hint="film sideways movement over textured, well lit surfaces; check the calibration",
-    )
 
 
 def _result(models: Sequence[Any], workspace: Path, log: dict[str, Any]) -> MapResult:

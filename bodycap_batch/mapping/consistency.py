@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bodycap_batch.arrays import FloatArray
+from bodycap_batch.config import MapOptions
 from bodycap_batch.errors import EstimationError
 from bodycap_batch.mapping.database import DATABASE_NAME
 
@@ -133,4 +134,18 @@ def inconsistent(share: float, reach: Mapping[str, object] | None) -> Estimation
         f"{share:.0%} of the matches between keyframes contradict the map: places that look the same "
         f"(repeated pictures, tiles, windows) were taken for one{body}",
         hint="film what tells the places apart, or cover repeated pictures; check the calibration",
+    )
+
+
+def too_few(
+    models: Sequence[Any], keyframes: int, ladder: object, options: MapOptions
+) -> EstimationError | None:
+    """What to say of models that hold too few of the keyframes; None where they hold enough."""
+    registered = models[0].num_reg_images() if models else 0
+    if registered >= max(2, options.min_coverage * keyframes):
+        return None
+    return EstimationError(
+        f"the map holds {registered} of {keyframes} keyframes, "
+        f"fewer than {options.min_coverage:.0%}; initial pairs: {ladder}",
+        hint="film sideways movement over textured, well lit surfaces; check the calibration",
     )

@@ -51,6 +51,24 @@ def image_ids(database: pycolmap.Database) -> dict[ImageRef, int]:
     return {ImageRef.parse(image.name): int(image.image_id) for image in database.read_all_images()}
 
 
+def camera_ids(workspace: Path) -> dict[str, int]:
+    """Database id of each camera that has keyframes."""
+    import pycolmap
+
+    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+        images = database.read_all_images()
+    return {ImageRef.parse(image.name).camera: int(image.camera_id) for image in images}
+
+
+def matched_names(database: pycolmap.Database) -> set[str]:
+    """Names of the keyframes that hold to another one."""
+    import pycolmap
+
+    pairs, _ = database.read_two_view_geometry_num_inliers()
+    held = {int(number) for pair in pairs for number in pycolmap.pair_id_to_image_pair(pair)}
+    return {image.name for image in database.read_all_images() if image.image_id in held}
+
+
 def add_camera(database: pycolmap.Database, camera: CaptureCamera) -> int:
     """Write one camera with a rig of its own (no synchrony is assumed); returns the camera id."""
     model = camera.camera.to_pycolmap()

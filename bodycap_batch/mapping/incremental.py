@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,8 @@ def grow(
     settings: pycolmap.IncrementalPipelineOptions,
     model: pycolmap.Reconstruction,
     tick: Callable[[], None],
+    *,
+    whole: bool = True,
 ) -> bool:
     """Put the database's keyframes into a model, which may be empty, until no further one finds a place.
 
@@ -33,21 +35,16 @@ def grow(
         settings: The mapper's settings; the initial pair is theirs where the model is empty.
         model: What there is, changed in place.
         tick: Called after each keyframe; what it raises ends the run.
+        whole: False: what stands is left as it is, only what comes to it is adjusted.
 
     Returns:
         False where the model was empty and there is no initial pair, or it does not hold.
 
     Source: Schönberger, Frahm, "Structure-from-motion revisited", CVPR 2016, as COLMAP has it.
     """
-    import pycolmap
-
-    options = pycolmap.DatabaseCacheOptions()
-    options.min_num_matches, options.image_names = settings.min_num_matches, set(settings.image_names)
-    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
-        cache = pycolmap.DatabaseCache.create(database, options)
-    mapper = pycolmap.IncrementalMapper(cache)
+    mapper = _mapper(workspace, settings)
     mapper.begin_reconstruction(model)
-    run = _Run(mapper, settings)
+    run = _Run(mapper, settings, whole=whole)
     if not model.num_reg_frames() and not run.start():
         mapper.end_reconstruction(True)
         return False
@@ -56,6 +53,49 @@ def grow(
     model.update_point_3d_errors()
     mapper.end_reconstruction(False)
     return True
+
+
+def place(
+    workspace: Path,
+    settings: pycolmap.IncrementalPipelineOptions,
+    model: pycolmap.Reconstruction,
+    wanted: Collection[int],
+    tick: Callable[[], None],
+) -> set[int]:
+    """Put keyframes into a model that shows what they see: nothing is adjusted, its poses stay.
+
+    Args:
+        workspace: Folder of the database.
+        settings: The mapper's settings.
+        model: What there is, changed in place: poses and observations are added, points where they see more.
+        wanted: Ids of the keyframes' images.
+        tick: Called after each keyframe; what it raises ends the run.
+
+    Returns:
+        Ids of those that found a place.
+    """
+    mapper = _mapper(workspace, settings)
+    mapper.begin_reconstruction(model)
+    options, triangulation = settings.get_mapper(), settings.get_triangulation()
+    placed = set[int]()
+    for image_id in sorted(wanted):
+        if mapper.register_next_image(options, image_id):
+            mapper.triangulate_image(triangulation, image_id)
+            placed.add(image_id)
+        tick()
+    model.update_point_3d_errors()
+    mapper.end_reconstruction(False)
+    return placed
+
+
+def _mapper(workspace: Path, settings: pycolmap.IncrementalPipelineOptions) -> pycolmap.IncrementalMapper:
+    import pycolmap
+
+    options = pycolmap.DatabaseCacheOptions()
+    options.min_num_matches, options.image_names = settings.min_num_matches, set(settings.image_names)
+    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+        cache = pycolmap.DatabaseCache.create(database, options)
+    return pycolmap.IncrementalMapper(cache)
 
 
 def _eased(options: Any) -> Iterator[Any]:
@@ -73,8 +113,13 @@ class _Run:
     """One model's growth."""
 
     def __init__(
-        self, mapper: pycolmap.IncrementalMapper, settings: pycolmap.IncrementalPipelineOptions
+        self,
+        mapper: pycolmap.IncrementalMapper,
+        settings: pycolmap.IncrementalPipelineOptions,
+        *,
+        whole: bool = True,
     ) -> None:
+        self._whole = whole
         self._mapper = mapper
         self._settings = settings
         self._model: Any = mapper.reconstruction
@@ -163,6 +208,8 @@ class _Run:
         )
 
     def _adjust_all(self) -> None:
+        if not self._whole:
+            return
         self._mapper.iterative_global_refinement(
             self._settings.ba_global_max_refinements,
             self._settings.ba_global_max_refinement_change,

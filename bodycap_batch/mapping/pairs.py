@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
@@ -17,6 +18,7 @@ from bodycap_batch.context import StageContext
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, Pair, image_ids
 from bodycap_batch.mapping.likeness import CHANCE, LARGEST, LIKELY, largest, likeness
 from bodycap_batch.mapping.matching import match_pairs
+from bodycap_batch.mapping.spanning import spanning_rows
 from bodycap_batch.memory import give_back
 
 _NEIGHBOURS = (1, 2, 3, 4, 6, 9, 14)
@@ -38,6 +40,8 @@ _RETRIED = 50_000
 """Pairs that are tried at most of a camera without any link: some minutes; what holds beside them follows."""
 _FEW = 120
 """Keyframes up to which every pair is matched."""
+_PLACING = 8
+"""Most alike keyframes of the map that one that is placed in it is matched with."""
 
 
 class PairChooser:
@@ -75,9 +79,53 @@ class PairChooser:
                 alike = likeness(images, self._new, [ref.camera for ref in self._images], context)
                 self._alike = dict(zip(self._new, alike, strict=True))
         self._times = np.array([common_ns[ref.camera][ref.frame] for ref in self._images], dtype=np.int64)
+        self._number()
+
+    def _number(self) -> None:
         self._cameras = np.array([ref.camera for ref in self._images])
         self._row = {ref: row for row, ref in enumerate(self._images)}
         self._rows_of = {name: np.flatnonzero(self._cameras == name) for name in np.unique(self._cameras)}
+
+    def spanning(self) -> PairChooser:
+        """The same among keyframes that carry a map of all; of all of them where every pair is matched."""
+        if self.exhaustive:
+            return self
+        rows = spanning_rows(np.array([self._alike[row] for row in self._new]), self._times)
+        out = copy.copy(self)
+        out.exhaustive = len(rows) <= _FEW
+        out._images = [self._images[row] for row in rows]
+        out._new = list(range(len(rows)))
+        out._alike = {new: self._alike[row][rows] for new, row in enumerate(rows)}
+        out._times = self._times[rows]
+        out._number()
+        return out
+
+    @property
+    def refs(self) -> list[ImageRef]:
+        """The keyframes among which pairs are chosen."""
+        return list(self._images)
+
+    def placing(self, carrying: Collection[ImageRef], wanted: Collection[ImageRef]) -> list[Pair]:
+        """Pairs that place keyframes in a map of others: neighbours in time and what looks most alike.
+
+        Args:
+            carrying: Keyframes of the map.
+            wanted: Keyframes to be placed.
+        """
+        inside = np.zeros(len(self._images), dtype=bool)
+        inside[[self._row[ref] for ref in carrying]] = True
+        pairs = set[tuple[int, int]]()
+        for row in sorted(self._row[ref] for ref in wanted):
+            for rows in self._rows_of.values():
+                mine = rows[inside[rows]]
+                apart = np.abs(self._times[mine] - self._times[row])
+                own = self._cameras[rows[0]] == self._cameras[row]
+                near = mine[np.argsort(apart, kind="stable")[: _BESIDE if own else 1]]
+                pairs |= {(row, int(other)) for other in near}
+            likely = np.flatnonzero(inside & (self._alike[row] >= CHANCE))
+            best = likely[np.argsort(-self._alike[row][likely], kind="stable")[:_PLACING]]
+            pairs |= {(row, int(other)) for other in best} | set(self._beside(row, row))
+        return self._sorted(pairs)
 
     def first(self) -> list[Pair]:
         """Neighbours in time, the same instant of other cameras, and what looks most alike."""

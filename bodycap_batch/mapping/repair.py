@@ -14,6 +14,7 @@ from bodycap_batch.mapping.consistency import contradicted_share, doubtful, link
 from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, Pair, image_ids
 from bodycap_batch.mapping.matching import match_pairs
 from bodycap_batch.mapping.solve import extend, part_of, refine
+from bodycap_batch.mapping.spanning import MANY
 
 if TYPE_CHECKING:
     import pycolmap
@@ -44,13 +45,19 @@ class Workshop:
     frame_numbers: Mapping[str, IntArray]
 
 
-def repair(model: pycolmap.Reconstruction, tried: set[Pair], shop: Workshop) -> tuple[Any, dict[str, object]]:
+def repair(
+    model: pycolmap.Reconstruction,
+    tried: set[Pair],
+    shop: Workshop,
+    among: Collection[ImageRef] | None = None,
+) -> tuple[Any, dict[str, object]]:
     """Take doubtful keyframes out, match them and the unregistered ones again, place them again or cut them.
 
     Args:
         model: The largest model; not changed.
         tried: Pairs that were matched; those matched here are added.
         shop: Workspace, lenses, settings.
+        among: Keyframes that belong in it; by default all of the database.
 
     Returns:
         The better of the old and the new model without what is doubtful still, and an account for the log.
@@ -60,6 +67,8 @@ def repair(model: pycolmap.Reconstruction, tried: set[Pair], shop: Workshop) -> 
     log: list[dict[str, object]] = []
     with pycolmap.Database.open(str(shop.workspace / DATABASE_NAME)) as database:
         ids = image_ids(database)
+    if among is not None:
+        ids = {ref: ids[ref] for ref in among}
     links = links_of(shop.workspace, model)
     suspects = doubtful(links)
     for _ in range(_ROUNDS):
@@ -107,7 +116,7 @@ def _without(model: Any, suspects: set[int], shop: Workshop) -> tuple[Any, list[
     cut = sorted(model.image(number).name for number in suspects)
     # Points that only they see go with them; tracking finds their frames' poses from what is left.
     model = part_of(model, set(map(int, model.reg_image_ids())) - suspects)
-    refine(model, shop.settings(), shop.constant)
+    _refine_few(model, shop)
     return model, cut
 
 
@@ -128,5 +137,11 @@ def place_again(model: pycolmap.Reconstruction, suspects: Collection[int], shop:
     """
     rest = part_of(model, set(model.reg_image_ids()) - set(suspects))
     grown = extend(shop.workspace, rest, shop.settings(), shop.context, total)
-    refine(grown, shop.settings(), shop.constant)
+    _refine_few(grown, shop)
     return grown
+
+
+def _refine_few(model: pycolmap.Reconstruction, shop: Workshop) -> None:
+    """Refine a model in place; one of very many keyframes is left to the last adjustment."""
+    if model.num_reg_images() <= MANY:
+        refine(model, shop.settings(), shop.constant)

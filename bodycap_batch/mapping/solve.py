@@ -13,10 +13,11 @@ import numpy as np
 from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.errors import EstimationError
-from bodycap_batch.mapping.database import DATABASE_NAME
+from bodycap_batch.mapping.database import DATABASE_NAME, matched_names
 from bodycap_batch.mapping.incremental import grow
 from bodycap_batch.mapping.initial import Start
 from bodycap_batch.mapping.residuals import typical_residual_px
+from bodycap_batch.mapping.spanning import MANY
 
 if TYPE_CHECKING:
     import pycolmap
@@ -170,13 +171,13 @@ def _from_start(
 
     settings.init_image_id1, settings.init_image_id2 = start.ids
     first = pycolmap.Reconstruction()
-    if not grow(workspace, settings, first, _ticker(context, total, context.check_cancelled)):
+    if not grow(workspace, settings, first, ticker(context, total, context.check_cancelled)):
         return []
     models = [first]
     if first.num_reg_images() < _MIN_STANDING * total:
         return models
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
-        left = sorted({image.name for image in database.read_all_images()} - _keyframes(models[0]))
+        left = sorted(matched_names(database) - _keyframes(models[0]))
     if len(left) >= _MIN_MODEL_KEYFRAMES:
         settings.image_names = left
         further = _search(workspace, settings, context, total)
@@ -202,7 +203,7 @@ def _grown(
 ) -> Any:
     """A model with all keyframes that find a place in it."""
     grown = copy.deepcopy(model)
-    grow(workspace, settings, grown, _ticker(context, total, context.check_cancelled))
+    grow(workspace, settings, grown, ticker(context, total, context.check_cancelled))
     return min([grown, model], key=_size)
 
 
@@ -216,7 +217,8 @@ def extend(
     """A model with the database's new images registered in it; its own poses stay where they are."""
     settings.fix_existing_frames = True
     grown = copy.deepcopy(model)
-    grow(workspace, settings, grown, _ticker(context, total, context.check_cancelled))
+    few = model.num_reg_frames() <= MANY  # all of very many are adjusted once, at the end
+    grow(workspace, settings, grown, ticker(context, total, context.check_cancelled), whole=few)
     return grown
 
 
@@ -239,7 +241,7 @@ def _run(
         str(images),
         str(target),
         settings,
-        next_image_callback=_ticker(context, total, token.cancel),
+        next_image_callback=ticker(context, total, token.cancel),
         cancellation_token=token,
     )
     shutil.rmtree(target, ignore_errors=True)
@@ -252,8 +254,8 @@ def _size(model: Any) -> tuple[int, int]:
     return -model.num_reg_images(), -model.num_points3D()
 
 
-def _ticker(context: StageContext, total: int, stop: Callable[[], None]) -> Callable[[], None]:
-    done = 0
+def ticker(context: StageContext, total: int, stop: Callable[[], None], done: int = 0) -> Callable[[], None]:
+    """What tells of one more keyframe in the map each time it is called, and calls `stop` once it should."""
 
     def tick() -> None:
         nonlocal done
@@ -275,14 +277,16 @@ def write_models(workspace: Path, models: list[Any]) -> None:
 
 
 def refine(
-    model: Any, settings: pycolmap.IncrementalPipelineOptions, constant_cameras: Collection[int]
+    model: Any,
+    settings: pycolmap.IncrementalPipelineOptions,
+    constant_cameras: Collection[int],
+    iterations: int | None = None,
 ) -> None:
     """One bundle adjustment over the whole model, every pose free, outliers taken out; the gauge moves.
 
-    Raises:
-        EstimationError: The adjustment failed.
+    Arguments and errors are those of `adjust`.
     """
-    adjust(model, settings, constant_cameras)
+    adjust(model, settings, constant_cameras, iterations)
     _filter(model, settings)
 
 
@@ -363,7 +367,8 @@ def adjust(
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         adjustment.ceres.loss_function_scale = loss_px
         adjustment.ceres.solver_options.function_tolerance = _SETTLED_TOLERANCE
-    iterative = loss_px is not None and _track_length(model) > _LONG_TRACKS
+    settling = loss_px is not None and _track_length(model) > _LONG_TRACKS
+    iterative = settling or model.num_reg_images() > MANY
     if iterative:
         # By the least numbers that COLMAP accepts, everything beyond which is solved that way.
         adjustment.ceres.max_num_images_direct_dense_cpu_solver = 1
