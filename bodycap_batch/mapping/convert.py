@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.camera import Camera
 from bodycap_batch.geometry import invert, make_transform
 from bodycap_batch.mapping.database import ImageRef, keypoint_colours
@@ -32,15 +32,16 @@ def to_map(model: pycolmap.Reconstruction, workspace: Path) -> Map:
         cam_from_map = np.asarray(image.cam_from_world().matrix())
         poses.append(make_transform(cam_from_map[:, :3], cam_from_map[:, 3]))
         colours = keypoint_colours(workspace, image_id)
-        for feature in image.get_observation_point2D_idxs():
-            point = image.point2D(feature)
-            point_row = row_of_point[point.point3D_id]
-            keyframe_rows.append(row)
-            point_rows.append(point_row)
-            features.append(feature)
-            pixels.append(point.xy)
-            colour_sum[point_row] += colours[feature]
-    counts = np.bincount(np.array(point_rows, dtype=np.int64), minlength=len(point_ids))
+        feature = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
+        seen = [image.point2D(index) for index in feature.tolist()]
+        rows = np.array([row_of_point[point.point3D_id] for point in seen], dtype=np.int64)
+        keyframe_rows.append(np.full(len(rows), row))
+        point_rows.append(rows)
+        features.append(feature)
+        pixels.append(np.array([point.xy for point in seen]).reshape(-1, 2))
+        np.add.at(colour_sum, rows, colours[feature])
+    obs_point = _joined(point_rows)
+    counts = np.bincount(obs_point, minlength=len(point_ids))
     map_from_cam = invert(np.array(poses))
     return Map(
         gauge=_gauge(map_from_cam),
@@ -51,11 +52,15 @@ def to_map(model: pycolmap.Reconstruction, workspace: Path) -> Map:
         points=np.array([model.point3D(point_id).xyz for point_id in point_ids]).reshape(-1, 3),
         colors=np.round(colour_sum / np.maximum(counts, 1)[:, None]).astype(np.uint8),
         point_error_px=np.array([model.point3D(point_id).error for point_id in point_ids]),
-        obs_keyframe=np.array(keyframe_rows, dtype=np.int64),
-        obs_point=np.array(point_rows, dtype=np.int64),
-        obs_feature=np.array(features, dtype=np.int64),
-        obs_px=np.array(pixels, dtype=np.float64).reshape(-1, 2),
+        obs_keyframe=_joined(keyframe_rows),
+        obs_point=obs_point,
+        obs_feature=_joined(features),
+        obs_px=np.concatenate([np.zeros((0, 2)), *pixels]),
     )
+
+
+def _joined(parts: list[IntArray]) -> IntArray:
+    return np.concatenate([np.zeros(0, dtype=np.int64), *parts])
 
 
 def _gauge(map_from_cam: FloatArray) -> str:

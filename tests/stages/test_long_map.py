@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
+import pycolmap
 import pytest
 
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.geometry import align_points
-from bodycap_batch.mapping import build_map
+from bodycap_batch.mapping import build_map, extend_map
 from bodycap_batch.scene import KeyframeSelection, MapResult
 from tests.rooms import stroll
 from tests.stages.conftest import DARK, FRAMES, context
@@ -47,13 +51,42 @@ def test_some_carry_the_map_and_all_others_are_placed_in_it(result: MapResult) -
     assert told["carrying"] < 0.8 * count
 
 
-def test_who_was_placed_stands_as_right_as_who_carries(result: MapResult) -> None:
+def _off(result: MapResult) -> np.ndarray:
+    """How far each keyframe of the map stands from where it was."""
     found = result.maps[0]
     mine = found.map_from_cam[:, :3, 3]
     poses = stroll(FRAMES)
     pairs = zip(found.keyframe_camera, found.keyframe_frame.tolist(), strict=True)
     true = np.array([poses[camera][frame][:3, 3] for camera, frame in pairs])
-    off = np.linalg.norm(align_points(mine, true).apply(mine) - true, axis=1)
+    return np.asarray(np.linalg.norm(align_points(mine, true).apply(mine) - true, axis=1))
+
+
+def test_who_was_placed_stands_as_right_as_who_carries(result: MapResult) -> None:
+    off = _off(result)
     # A quarter of a pixel at 3 m and 240 px is 3 mm a point; a pose has dozens, not all well spread.
     assert np.sqrt((off**2).mean()) < 0.01
     assert off.max() < 0.03
+
+
+def test_a_large_map_grows_without_adjusting_all_of_it_again_and_again(
+    result: MapResult, stroll_capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("solve", "repair"):
+        monkeypatch.setattr(sys.modules[f"bodycap_batch.mapping.{name}"], "MANY", 40)
+    adjusted: list[int] = []
+    create = pycolmap.create_default_bundle_adjuster
+
+    def noted(options: object, config: object, model: pycolmap.Reconstruction) -> object:
+        adjusted.append(model.num_reg_images())
+        return create(options, config, model)
+
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("what stands was adjusted while keyframes came to it")
+
+    monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", noted)
+    monkeypatch.setattr(pycolmap.IncrementalMapper, "iterative_global_refinement", never)
+    extra = {"torso": np.array([21, 31]), "left_palm": np.array([11])}
+    grown = extend_map(stroll_capture, result, extra, MapOptions(), context(tmp_path))
+    assert len(grown.maps[0].keyframe_camera) == len(result.maps[0].keyframe_camera) + 3
+    assert adjusted == [len(grown.maps[0].keyframe_camera)]
+    assert _off(grown).max() < 0.03
