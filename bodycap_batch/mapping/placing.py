@@ -39,10 +39,12 @@ def place_others(models: list[Any], chooser: PairChooser, shop: Workshop) -> dic
     tick = ticker(shop.context, len(ids), shop.context.check_cancelled, len(carrying))
     cut: list[str] = []
     for number, model in enumerate(models):
-        left -= place(shop.workspace, shop.settings(), model, left, tick)
-        refine(model, shop.settings(), shop.constant, _ITERATIONS)
-        models[number], names = cut_doubtful(model, shop)
-        cut += names
+        placed = place(shop.workspace, shop.settings(), model, left, tick)
+        left -= placed
+        if placed:
+            refine(model, shop.settings(), shop.constant, _ITERATIONS)
+            models[number], names = cut_doubtful(model, shop)
+            cut += names
     return {
         "carrying": len(carrying),
         "placed": len(wanted) - len(left),

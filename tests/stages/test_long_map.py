@@ -11,6 +11,7 @@ import pytest
 
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
+from bodycap_batch.context import StageContext
 from bodycap_batch.geometry import align_points
 from bodycap_batch.mapping import build_map, extend_map
 from bodycap_batch.scene import KeyframeSelection, MapResult
@@ -23,15 +24,14 @@ _EVERY = [frame for frame in range(0, FRAMES, 2) if frame not in DARK]
 @pytest.fixture(scope="module")
 def result(stroll_capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> MapResult:
     """The stroll's map, as of a capture of more than 40 keyframes."""
+    return _built(stroll_capture, MapOptions(), context(tmp_path_factory.mktemp("long")))
+
+
+def _built(capture: Capture, options: MapOptions, surroundings: StageContext) -> MapResult:
+    selections = [_selection(camera.name) for camera in capture.cameras]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bodycap_batch.mapping.pairs._FEW", 10)
-        return build_map(
-            stroll_capture,
-            [_selection(camera.name) for camera in stroll_capture.cameras],
-            MapOptions(),
-            context(tmp_path_factory.mktemp("long")),
-            many=40,
-        )
+        return build_map(capture, selections, options, surroundings, many=40)
 
 
 def _selection(name: str) -> KeyframeSelection:
@@ -49,6 +49,19 @@ def test_some_carry_the_map_and_all_others_are_placed_in_it(result: MapResult) -
     count = 2 * len(_EVERY)
     assert told["carrying"] + told["placed"] == len(result.maps[0].keyframe_camera) == count
     assert told["carrying"] < 0.8 * count
+
+
+def test_one_thread_gives_the_same_map(result: MapResult, stroll_capture: Capture, tmp_path: Path) -> None:
+    again = _built(stroll_capture, MapOptions(), StageContext(work_dir=tmp_path, threads=1))
+    assert again.maps[0].gauge == result.maps[0].gauge
+    assert (again.maps[0].points == result.maps[0].points).all()
+
+
+def test_who_wants_every_pair_gets_every_pair(stroll_capture: Capture, tmp_path: Path) -> None:
+    every = _built(stroll_capture, MapOptions(pairs="exhaustive"), context(tmp_path))
+    count = 2 * len(_EVERY)
+    assert every.log["pairs"] == count * (count - 1) // 2
+    assert "placed" not in every.log
 
 
 def _off(result: MapResult) -> np.ndarray:

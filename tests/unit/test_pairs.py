@@ -148,6 +148,23 @@ def test_growing_matches_new_keyframes_only(tmp_path: Path) -> None:
     assert all(a in new or b in new for a, b in more)
 
 
+def test_who_is_placed_is_matched_with_those_beside_it_and_some_of_the_map(tmp_path: Path) -> None:
+    times = _database(tmp_path, 80)
+    refs = [ImageRef(camera, frame) for camera in times for frame in range(80)]
+    chooser = PairChooser(
+        tmp_path, refs, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
+    )
+    carrying = [ref for ref in refs if ref.frame % 5 == 0]
+    pairs = chooser.placing(carrying, [ImageRef("a", 42), ImageRef("a", 43)])
+    assert all(ImageRef("a", frame) in sum(pairs, ()) for frame in (41, 44))
+    assert {(ImageRef("a", at), ImageRef("a", 42)) for at in (35, 40)} <= set(pairs)
+    assert (ImageRef("a", 43), ImageRef("b", 45)) in pairs
+    wanted = {ImageRef("a", 42), ImageRef("a", 43)}
+    assert all(not wanted.isdisjoint(pair) for pair in pairs)
+    # Four in time, one at the same time, eight alike, one on either side.
+    assert len(pairs) <= 2 * (4 + 1 + 8 + 2) - 1
+
+
 def test_what_hangs_by_few_links_is_matched_beside_what_held(tmp_path: Path) -> None:
     times = _database(tmp_path, 80)
     refs = [ImageRef(camera, frame) for camera in times for frame in range(80)]
