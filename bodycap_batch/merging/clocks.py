@@ -30,7 +30,9 @@ def doubted_clocks(tracks: Sequence[Track]) -> dict[str, dict[str, float]]:
     """Cameras that sit more steadily on the body when their clock is shifted.
 
     Where a limb's camera is in the axes of the trunk's scatters by what the limb does; with a wrong clock by
-    where the whole body went in the meantime as well. Straight walks tell nothing: they move it to one side.
+    where the whole body went in the meantime as well. Straight walks tell nothing: they move it to one side,
+    and there a swinging arm may happen to follow the trunk's turns; but it lies farther off then, as it hardly
+    ever does with the right clock.
 
     Args:
         tracks: Paths in one map, the trunk's first.
@@ -41,7 +43,9 @@ def doubted_clocks(tracks: Sequence[Track]) -> dict[str, dict[str, float]]:
     out = {}
     for limb in tracks[1:]:
         found = best_shift(tracks[0], limb)
-        if found is not None and abs(found[0]) >= _LEAST_S and found[1] <= _LEAST_GAIN:
+        if found is None or abs(found[0]) < _LEAST_S or found[1] > _LEAST_GAIN:
+            continue
+        if _distance(tracks[0], limb, found[0]) < _distance(tracks[0], limb, 0.0):
             out[limb.camera] = {"shift_s": round(found[0], 2), "scatter_left": round(found[1], 3)}
     return out
 
@@ -70,8 +74,22 @@ def best_shift(trunk: Track, limb: Track) -> tuple[float, float] | None:
 
 def _scatter(trunk: Track, limb: Track, shift_s: float) -> float:
     """Root mean square distance of a limb's camera from its usual place in the trunk camera's axes."""
-    poses, known = trunk.at(limb.times_ns + round(1e9 * shift_s), reach_ns=SAMPLE_REACH_NS)
-    if known.sum() < _FEWEST:
+    seen = _seen(trunk, limb, shift_s)
+    if len(seen) < _FEWEST:
         return np.inf
-    seen: FloatArray = (invert(poses[known]) @ limb.map_from_cam[known])[:, :3, 3]
     return float(np.sqrt(((seen - np.median(seen, axis=0)) ** 2).sum(axis=1).mean()))
+
+
+def _distance(trunk: Track, limb: Track, shift_s: float) -> float:
+    """Median distance of a limb's camera from the trunk's.
+
+    The right clock brought 47 of 49 nearer (by 8 to 62 %) for which it was found, in six captures, and took two
+    1 and 3 % farther. A right clock that was doubted: 6 % farther.
+    """
+    return float(np.median(np.linalg.norm(_seen(trunk, limb, shift_s), axis=1)))
+
+
+def _seen(trunk: Track, limb: Track, shift_s: float) -> FloatArray:
+    """(N,3) where a limb's camera is in the trunk camera's axes, its times shifted."""
+    poses, known = trunk.at(limb.times_ns + round(1e9 * shift_s), reach_ns=SAMPLE_REACH_NS)
+    return np.asarray((invert(poses[known]) @ limb.map_from_cam[known])[:, :3, 3])

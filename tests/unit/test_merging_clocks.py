@@ -38,6 +38,17 @@ def _walk(turns: float, seconds: float = 8.0) -> tuple[Track, Track]:
     return _track("torso", trunk, times_s), _track("palm", palm, times_s)
 
 
+def _straight_walk_of_turns_and_swings() -> tuple[Track, Track]:
+    """A trunk that walks straight ahead and turns with each step, and a palm that swings across it."""
+    times_s = np.arange(0.0, 8.0, 1.0 / 30.0)
+    step = np.sin(2.0 * np.pi * times_s / 1.1)
+    place = np.column_stack([0.9 * times_s, 0.0 * times_s, 0.0 * times_s])
+    trunk = make_transform(so3_exp(0.2 * step[:, None] * [0.0, 0.0, 1.0]), place)
+    in_trunk = np.column_stack([np.full(len(times_s), 0.1), 0.05 + 0.1 * step, np.full(len(times_s), -0.3)])
+    palm = trunk @ make_transform(np.tile(np.eye(3), (len(times_s), 1, 1)), in_trunk)
+    return _track("torso", trunk, times_s), _track("palm", palm, times_s)
+
+
 def _late(track: Track, seconds: float) -> Track:
     return replace(track, times_ns=track.times_ns + round(1e9 * seconds))
 
@@ -60,5 +71,12 @@ def test_right_clocks_straight_walks_and_short_clips_are_not_doubted() -> None:
     straight, swinging = _walk(turns=0.0)
     # The body is moved along its way, which looks like another mount.
     assert doubted_clocks([straight, _late(swinging, 0.5)]) == {}
+    # Half a step later the trunk's turns undo the arm's swing, but the arm is half a metre ahead.
+    trunk_turns, arm_swings = _straight_walk_of_turns_and_swings()
+    found = best_shift(trunk_turns, arm_swings)
+    assert found is not None
+    assert found[0] > 0.25
+    assert found[1] < 0.7
+    assert doubted_clocks([trunk_turns, arm_swings]) == {}
     assert best_shift(trunk, palm.keep(palm.times_ns < 1_000_000_000)) is None
     assert best_shift(trunk, _late(palm, 9.0)) is None
