@@ -31,8 +31,8 @@ def doubted_clocks(tracks: Sequence[Track]) -> dict[str, dict[str, float]]:
 
     Where a limb's camera is in the axes of the trunk's scatters by what the limb does; with a wrong clock by
     where the whole body went in the meantime as well. Straight walks tell nothing: they move it to one side,
-    and there a swinging arm may happen to follow the trunk's turns; but it lies farther off then, as it hardly
-    ever does with the right clock.
+    and there a swinging arm may happen to follow the trunk's turns; but then it lies farther off, as it hardly
+    does with the right clock.
 
     Args:
         tracks: Paths in one map, the trunk's first.
@@ -83,8 +83,8 @@ def _scatter(trunk: Track, limb: Track, shift_s: float) -> float:
 def _distance(trunk: Track, limb: Track, shift_s: float) -> float:
     """Median distance of a limb's camera from the trunk's.
 
-    The right clock brought 47 of 49 nearer (by 8 to 62 %) for which it was found, in six captures, and took two
-    1 and 3 % farther. A right clock that was doubted: 6 % farther.
+    The right clock brought 47 of 49 nearer (by 8 to 62 %) for which it was found, in six captures, and took
+    two 1 and 3 % farther. A right clock that was doubted: 6 % farther.
     """
     return float(np.median(np.linalg.norm(_seen(trunk, limb, shift_s), axis=1)))
 
