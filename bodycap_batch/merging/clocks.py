@@ -31,8 +31,8 @@ def doubted_clocks(tracks: Sequence[Track]) -> dict[str, dict[str, float]]:
 
     Where a limb's camera is in the axes of the trunk's scatters by what the limb does; with a wrong clock by
     where the whole body went in the meantime as well. Straight walks tell nothing: they move it to one side,
-    and there a swinging arm may happen to follow the trunk's turns; but then it lies farther off, as it hardly
-    does with the right clock.
+    and there a swinging arm may happen to follow the trunk's turns; but then it lies farther off, as it
+    hardly does with the right clock.
 
     Args:
         tracks: Paths in one map, the trunk's first.
