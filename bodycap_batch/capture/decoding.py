@@ -22,19 +22,21 @@ if TYPE_CHECKING:
 def decode_frames(video: VideoFile, indices: IntArray) -> Iterator[tuple[int, VideoFrame]]:
     """Decode the frames with these increasing indices.
 
+    Frames between them that no other frame is built on (most B-frames of H.264) are not decoded.
+
     Raises:
         CaptureError: A frame cannot be decoded.
     """
     import av
 
-    cursor = _Cursor(video)
+    cursor = _Cursor(video, indices)
     try:
         for wanted in map(int, indices):
             frame = cursor.advance(wanted)
-            if frame is None and cursor.sought:
+            if frame is None and not cursor.plain:
                 # Some containers seek badly (MPEG program streams): the plain way, from the start.
                 cursor.close()
-                cursor = _Cursor(video, seek=False)
+                cursor = _Cursor(video)
                 frame = cursor.advance(wanted)
             if frame is None:
                 raise _lost(video, wanted)
@@ -81,16 +83,23 @@ def decoder(container: InputContainer, video: VideoFile) -> VideoStream:
 
 
 class _Cursor:
-    """A decoder's place in a video, moving forwards only."""
+    """A decoder's place in a video, moving forwards only.
 
-    def __init__(self, video: VideoFile, *, seek: bool = True) -> None:
+    Args:
+        video: The video.
+        indices: The frames that will be asked for: others may be passed over. Without them all are decoded.
+    """
+
+    def __init__(self, video: VideoFile, indices: IntArray | None = None) -> None:
         self.position = -1  # index of the last decoded frame, −1 before the first
-        self.sought = False
+        self.plain = indices is None or video.counted
         self._video = video
-        self._may_seek = seek and not video.counted
         self._container = open_container(video.path)
         self._stream = decoder(self._container, video)
-        self._frames: Iterator[VideoFrame] = self._container.decode(self._stream)
+        # The halves of an interlaced frame may come one by one.
+        skips = indices is not None and not self.plain and not video.interlaced
+        self._wanted = frozenset(video.pts[indices].tolist()) if skips else None
+        self._frames = self._decoded()
         self._key_index = np.searchsorted(video.pts, video.key_pts)
 
     def close(self) -> None:
@@ -99,7 +108,7 @@ class _Cursor:
 
     def advance(self, wanted: int) -> VideoFrame | None:
         """Decode up to a frame; None where it does not come."""
-        if self._may_seek:
+        if not self.plain:
             keys = self._key_index[: int(np.searchsorted(self._key_index, wanted, side="right"))]
             if len(keys) and keys[-1] > self.position + 1:
                 self._seek(int(keys[-1]))
@@ -118,8 +127,15 @@ class _Cursor:
     def _seek(self, index: int) -> None:
         """Go to a key frame, or to an earlier one where the container cannot do better."""
         self._container.seek(int(self._video.pts[index]), stream=self._stream, backward=True)
-        self._frames = self._container.decode(self._stream)
-        self.sought = True
+        self._frames = self._decoded()
+
+    def _decoded(self) -> Iterator[VideoFrame]:
+        """Frames as they are shown, from here on; those to be passed over may be missing."""
+        for packet in self._container.demux(self._stream):
+            if self._wanted is not None:
+                needed = packet.pts is None or packet.pts in self._wanted
+                self._stream.codec_context.skip_frame = "DEFAULT" if needed else "NONREF"
+            yield from self._stream.decode(packet)
 
 
 def _lost(video: VideoFile, index: int) -> CaptureError:

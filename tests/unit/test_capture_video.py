@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
 import pytest
+from av.video.frame import VideoFrame
 
 from bodycap_batch.capture import CaptureCamera, decoding, open_camera
 from bodycap_batch.capture.images import turn_upright
@@ -168,6 +169,33 @@ def remuxed(source: Path, target: Path, shift: int = 0, skip: int = 0, **options
                 packet.stream = stream
                 new.mux(packet)
     return target
+
+
+@pytest.mark.parametrize("threads", ["1", "2"])
+@pytest.mark.parametrize("codec", ["libx264", "mpeg4", "libx265"])
+def test_frames_that_nothing_is_built_on_are_passed_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, codec: str, threads: str
+) -> None:
+    monkeypatch.setenv(THREADS_VARIABLE, threads)
+    camera = opened(write_video(tmp_path / "a.mp4", FRAMES, codec=codec, gop=40))
+    stream = dict(camera.grey_frames())
+    decoded: list[VideoFrame] = []
+    original = decoding._Cursor._decoded
+
+    def counted(self: decoding._Cursor) -> Iterator[VideoFrame]:
+        for frame in original(self):
+            decoded.append(frame)
+            yield frame
+
+    monkeypatch.setattr(decoding._Cursor, "_decoded", counted)
+    for wanted in ([1], [2], [39], [20, 38], list(range(0, 40, 2)), list(range(1, 40, 2))):
+        decoded.clear()
+        got = dict(camera.read(wanted))
+        assert list(got) == wanted
+        assert all(np.array_equal(image, stream[k]) for k, image in got.items())
+        # Of 40 frames about every second one is a B-frame; H.265's decoder passes over none.
+        if codec == "libx264" and wanted[0] >= 20:
+            assert len(decoded) <= 30
 
 
 @pytest.mark.parametrize(
