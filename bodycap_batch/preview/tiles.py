@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -57,15 +57,29 @@ class Tile:
 
     def images(self) -> Generator[Picture | None, None, None]:
         """The video's picture (H,W,3) at the tile's size for each picture of the preview."""
-        lens = self.camera.camera.scaled(self.picture.width, self.picture.height)
-        small = replace(self.camera, camera=lens, mask=None)
+        size = (self.picture.width, self.picture.height)
         wanted = np.unique(self.frames[self.frames >= 0])
         index, image = -1, None
-        with closing(small.read(wanted, colour=True)) as stream:
+        with closing(self.camera.read(wanted, colour=True)) as stream:
             for frame in self.frames.tolist():
                 while index < frame:
-                    index, image = next(stream)
+                    index, full = next(stream)
+                    image = resized(full, size)
                 yield image if frame >= 0 else None
+
+
+def resized(image: Picture, size: tuple[int, int]) -> Picture:
+    """A picture (H,W,3) at (width, height): halved while it is twice as large, then interpolated.
+
+    Averaging right to the size, which aliases hardly less, takes 3 ms for 640×480, this a fifth of it.
+    """
+    import cv2
+
+    height, width = image.shape[:2]
+    while width >= 2 * size[0] and height >= 2 * size[1]:
+        width, height = width // 2, height // 2
+        image = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
 
 
 def frames_at(camera: CaptureCamera, times_ns: IntArray) -> IntArray:

@@ -15,7 +15,7 @@ from bodycap_batch.overlay import SeenPoints
 from bodycap_batch.preview import room
 from bodycap_batch.preview.layout import HEIGHT, ROOM_WIDTH, WIDTH, Box, place_videos
 from bodycap_batch.preview.room import Cloud
-from bodycap_batch.preview.tiles import status_line
+from bodycap_batch.preview.tiles import resized, status_line
 from bodycap_batch.preview.timeline import MAX_FRAMES, make_timeline
 from bodycap_batch.preview.viewpoint import Viewpoint, follow
 from bodycap_batch.scene import FrameStatus
@@ -218,3 +218,21 @@ def test_a_frame_says_what_its_pose_rests_on(status: FrameStatus, points: int, s
         point=np.arange(points), px=px, observed_px=px, depth=np.ones(points), error_px=np.full(points, 0.5)
     )
     assert status_line(status, seen)[0] == says
+
+
+@pytest.mark.parametrize("size", [(572, 429), (286, 214), (641, 480), (90, 67), (600, 30), (2, 2)])
+def test_a_picture_is_shown_whole_at_every_size(size: tuple[int, int]) -> None:
+    ramp = np.linspace(0.0, 255.0, 640)[None, :, None] * np.ones((480, 1, 3))
+    image = resized(np.round(ramp).astype(np.uint8), size)
+    assert image.shape == (size[1], size[0], 3)
+    # A pixel shows the middle of its share of the width: rounding, halves of odd widths.
+    middle = (np.arange(size[0]) + 0.5) / size[0] * 640 - 0.5
+    expected = np.interp(middle, np.arange(640), ramp[0, :, 0])
+    assert np.abs(image.astype(float) - expected[None, :, None]).max() <= 255.0 / size[0] / 2 + 1.5
+
+
+def test_a_reduced_picture_does_not_flicker_with_single_pixels() -> None:
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 256, (480, 640, 3)).astype(np.uint8)
+    # Of 2.24 by 2.24 pixels one is made: their mean scatters 1 / 2.24 as much; 0.6 for what is left out.
+    assert resized(noise, (286, 214)).std() < 0.6 * noise.std()
