@@ -14,9 +14,10 @@ from bodycap_batch.config.lost_frames import LEAST_LOST
 from bodycap_batch.context import StageContext
 from bodycap_batch.registration.growth import wanted_keyframes
 from bodycap_batch.registration.pose import FramePose, PoseLimits
-from bodycap_batch.registration.recovery import recover_lost
+from bodycap_batch.registration.recovery import recover_lost, recoverable
 from bodycap_batch.registration.rigs import RigCamera, first_poses, members_of, relative_poses
 from bodycap_batch.registration.seams import misplaced, without_keyframes
+from bodycap_batch.registration.settling import settled_points, without_weak_ends
 from bodycap_batch.registration.solving import matrices, solve_frames, solve_rig
 from bodycap_batch.registration.steadying import steadied
 from bodycap_batch.registration.stretches import Known, all_tracks
@@ -24,7 +25,14 @@ from bodycap_batch.registration.tracks import Tracks, anchors_of, track_scale
 from bodycap_batch.rig import RelativePose
 from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 
-__all__ = ["RigCamera", "recover_lost", "register_frames", "register_in_rig", "without_contradicted"]
+__all__ = [
+    "RigCamera",
+    "recover_lost",
+    "register_frames",
+    "register_in_rig",
+    "settled",
+    "without_contradicted",
+]
 
 _MAP_NOISE_PX = 0.6
 _THRESHOLD_SIGMAS = 3.5
@@ -134,6 +142,45 @@ def without_contradicted(
             limits = _limits(each.camera, selection, options)
             wrong.append(misplaced(each.camera.name, scene_map, each.tracks, limits))
     return without_keyframes(scene_map, np.concatenate([np.zeros(0, np.int64), *wrong]))
+
+
+def settled(
+    own: RigCamera,
+    others: Sequence[Trajectory],
+    scene_map: Map,
+    selection: KeyframeSelection,
+    options: RegistrationOptions,
+) -> tuple[Map, Registration]:
+    """What a camera's lost frames are to be looked for with.
+
+    Poses at the ends of lost stretches that little speaks for are taken out, of all cameras; the map's points
+    are moved to where the other frames see them, and the camera's frames are solved against these.
+
+    Args:
+        own: The camera with its registration, which is its own and no rig's.
+        others: The other cameras' paths.
+        scene_map: The map.
+        selection: Its keyframes.
+        options: Limits.
+
+    Returns:
+        The map, in the same gauge, and the registration; both as they were where no pose is taken out (moved
+        points are no better then: walk12 with covered lenses 0.34, 0.35 cm), or too few are left to look for
+        others.
+    """
+    before = [own.found.trajectory, *others]
+    paths = [without_weak_ends(path, options.min_inliers) for path in before]
+    none_taken = all(path is known for path, known in zip(paths, before, strict=True))
+    if none_taken or not recoverable(paths[0]):
+        return scene_map, own.found
+    settled_map = settled_points(scene_map, paths)
+    limits = _limits(own.camera, selection, options)
+    poses = solve_frames(own.camera, settled_map, own.tracks, limits)
+    path = _trajectory(own.camera, scene_map.gauge, poses, selection.sharpness)
+    path = without_weak_ends(path, options.min_inliers)
+    if not recoverable(path):
+        return scene_map, own.found
+    return settled_map, replace(own.found, trajectory=path)
 
 
 def _without_misplaced(

@@ -35,5 +35,6 @@ def confirmed_points(camera: CaptureCamera, scene_map: Map) -> BoolArray:
     seen = np.bincount(
         scene_map.obs_keyframe[mine], weights=out[point], minlength=len(scene_map.keyframe_camera)
     )
-    tells = len(rows) > 0 and bool((seen[rows] >= _ENOUGH).mean() >= _MOSTLY)
+    seeing = np.intersect1d(rows, scene_map.obs_keyframe)  # a refused one may be kept that sees nothing
+    tells = len(seeing) > 0 and bool((seen[seeing] >= _ENOUGH).mean() >= _MOSTLY)
     return out if tells else np.ones(count, dtype=bool)

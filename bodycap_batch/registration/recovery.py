@@ -72,14 +72,10 @@ def recover_lost(
     """
     path = found.trajectory
     camera = capture.camera(path.camera)
-    lost = ~path.localised
-    times = np.asarray(path.times_ns - path.times_ns[0], dtype=np.float64) if len(lost) else np.zeros(0)
-    if not lost.any() or (~lost).sum() < LEAST_POSED:
-        return found
-    times = times / np.median(np.diff(times))
-    steadiness = Steadiness.of(times, path.gauge_from_cam[:, :3, 3])
+    lost, steadiness = ~path.localised, _steadiness(path)
     if steadiness is None:
         return found
+    times = _times(path)
     finder = _finder(scene_map, capture, path, options, context)
     search = _LostFrames(
         camera=camera,
@@ -104,6 +100,25 @@ def recover_lost(
         before, path = path.localised, _with_poses(path, poses, finder.limits)
         stretches = _beside(path.localised, before)
     return replace(found, trajectory=steadied(path, ~lost))
+
+
+def recoverable(path: Trajectory) -> bool:
+    """Whether a path has lost frames, and poses enough to look for them from."""
+    return _steadiness(path) is not None
+
+
+def _steadiness(path: Trajectory) -> Steadiness | None:
+    """How evenly a camera moves; None where no frame is lost or too few have poses."""
+    posed = path.localised
+    if posed.all() or posed.sum() < LEAST_POSED:
+        return None
+    return Steadiness.of(_times(path), path.gauge_from_cam[:, :3, 3])
+
+
+def _times(path: Trajectory) -> FloatArray:
+    """(N,) in frame intervals, from the first one on."""
+    times = (path.times_ns - path.times_ns[0]).astype(np.float64)
+    return np.asarray(times / np.median(np.diff(times)))
 
 
 def _finder(

@@ -22,12 +22,12 @@ from bodycap_batch.geometry import (
     so3_log,
     transform_points,
 )
-from bodycap_batch.registration import recover_lost, recovery
+from bodycap_batch.registration import RigCamera, recover_lost, recovery, settled
 from bodycap_batch.registration.finding import Finder, Fix
 from bodycap_batch.registration.marching import March
 from bodycap_batch.registration.pose import PoseLimits
 from bodycap_batch.registration.templates import Found, Gallery, View
-from bodycap_batch.scene import FrameStatus, Map, Registration, Trajectory
+from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 from bodycap_batch.tracking import detect_corners
 from tests.rooms import HALF_M, LENS, Room
 
@@ -72,6 +72,16 @@ class _Video:
     def read(self, indices: object) -> Iterator[tuple[int, np.ndarray]]:
         for index in np.asarray(indices).tolist():
             yield index, self.pictures[index]
+
+
+class _SolvedVideo(_Video):
+    """One whose frames are solved again."""
+
+    camera = CAMERA
+
+    @property
+    def frame_numbers(self) -> np.ndarray:
+        return np.arange(COUNT)
 
 
 @dataclass
@@ -395,3 +405,88 @@ def test_progress_grows_over_the_rounds_which_end_with_nothing_left(
     capture = cast("Capture", _Capture(_Video(pictures)))
     recover_lost(_tracked(), _map(pictures), capture, RegistrationOptions(), context)
     assert told == [18, 22, 22, 23]
+
+
+def _selection() -> KeyframeSelection:
+    return KeyframeSelection(
+        camera="torso",
+        frames=np.arange(0, COUNT, 4),
+        frame_count=COUNT,
+        sharpness=np.ones(COUNT),
+        noise_px=0.2,
+    )
+
+
+def _with_tracks(found: Registration, scene: Map, weak: int) -> Registration:
+    """Every point seen by a keyframe before, tracked into the frames after it; few of them into one frame."""
+    frames, keyframes, features, px = [], [], [], []
+    for frame in np.flatnonzero(found.trajectory.localised).tolist():
+        row = int(np.searchsorted(scene.keyframe_frame, frame, side="right")) - 1
+        point = scene.obs_point[scene.obs_keyframe == row]
+        seen_px = CAMERA.project(transform_points(invert(PATH[frame]), scene.points[point]))
+        with np.errstate(invalid="ignore"):
+            inside = np.flatnonzero(((seen_px > 2) & (seen_px < (318, 238))).all(axis=1))
+        inside = inside[:20] if frame == weak else inside
+        frames.append(np.full(len(inside), frame))
+        keyframes.append(np.full(len(inside), scene.keyframe_frame[row]))
+        features.append(point[inside])
+        px.append(seen_px[inside])
+    return replace(
+        found,
+        obs_frame=np.concatenate(frames),
+        obs_keyframe=np.concatenate(keyframes),
+        obs_feature=np.concatenate(features),
+        obs_px=np.concatenate(px).astype(np.float32),
+    )
+
+
+def test_a_wrong_end_of_a_lost_stretch_is_looked_for_again(
+    pictures: list[np.ndarray], context: StageContext
+) -> None:
+    """Twenty tracks that slipped together say to a millimetre that the last frame before it is 20 cm off."""
+    scene, end = _map(pictures), LOST[0] - 1
+    found = _with_tracks(_tracked(), scene, end)
+    wrong = make_transform(np.eye(3), [0.2, 0.0, 0.0]) @ PATH[end]
+    slipped = found.obs_frame == end
+    points = scene.points[found.obs_feature[slipped]]
+    px = found.obs_px.copy()
+    px[slipped] = CAMERA.project(transform_points(invert(wrong), points))
+    poses, inliers = found.trajectory.gauge_from_cam.copy(), found.trajectory.inliers.copy()
+    poses[end], inliers[end] = wrong, 20
+    path = replace(found.trajectory, gauge_from_cam=poses, inliers=inliers)
+    found = replace(found, trajectory=path, obs_px=px)
+    capture = cast(Capture, _Capture(_Video(pictures)))
+    own = RigCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), found=found)
+    options = RegistrationOptions()
+    settled_map, left = settled(own, [], scene, _selection(), options)
+    assert not left.trajectory.localised[end]
+    off_m = [
+        np.linalg.norm((each.gauge_from_cam - PATH)[:, :3, 3], axis=1)
+        for each in (
+            recover_lost(found, scene, capture, options, context).trajectory,
+            recover_lost(left, settled_map, capture, options, context).trajectory,
+        )
+    ]
+    assert off_m[0][end] > 0.1
+    assert np.nanmax(off_m[1]) < 0.03
+    assert np.isfinite(off_m[1][list(LOST)]).sum() >= len(LOST) - 1
+
+
+def test_few_poses_are_left_as_they_are(monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray]) -> None:
+    scene = _map(pictures)
+    found = _with_tracks(_tracked(), scene, -1)
+    few = replace(found, trajectory=replace(found.trajectory, inliers=np.full(COUNT, 20)))
+    own = RigCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), found=few)
+    monkeypatch.setattr(recovery, "LEAST_POSED", COUNT - len(LOST) - 10)
+    settled_map, left = settled(own, [], scene, _selection(), RegistrationOptions())
+    assert settled_map is scene
+    assert left is few
+
+
+def test_where_every_end_is_well_seen_all_stays(pictures: list[np.ndarray]) -> None:
+    scene = _map(pictures)
+    found = _with_tracks(_tracked(), scene, -1)
+    own = RigCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), found=found)
+    settled_map, left = settled(own, [found.trajectory], scene, _selection(), RegistrationOptions())
+    assert settled_map is scene
+    assert left is found

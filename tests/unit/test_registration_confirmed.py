@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
@@ -118,3 +119,17 @@ def test_a_camera_alone_that_always_moves_on_is_trusted() -> None:
         }
     )
     assert confirmed_points(_camera(), single).all()
+
+
+def test_keyframes_that_see_nothing_do_not_say_that_the_test_tells_nothing() -> None:
+    """Of a refused keyframe a settled map keeps the place, without what it saw."""
+    scene_map, _ = _capture()
+    unseeing = replace(
+        scene_map,
+        keyframe_camera=(*scene_map.keyframe_camera, *("palm",) * 5),
+        keyframe_frame=np.append(scene_map.keyframe_frame, np.arange(5) + 4),
+        map_from_cam=np.concatenate([scene_map.map_from_cam, np.tile(np.eye(4), (5, 1, 1))]),
+    )
+    before, after = (confirmed_points(_camera(), each) for each in (scene_map, unseeing))
+    assert not before.all()
+    np.testing.assert_array_equal(after, before)
