@@ -41,7 +41,7 @@ def without_weak_ends(path: Trajectory, min_inliers: int) -> Trajectory:
     any lost frame is.
 
     Without and with this and `settled_points`, on the same maps, frames with a pose, their error and the
-    worst in cm: room131 370, 1.7, 7.4 and 380, 1.8, 8.6; two rendered ones 260, 3.0, 17.2 and 261, 2.0, 9.3,
+    worst in cm: room131 370, 1.7, 7.4 and 380, 1.8, 8.6; two rendered ones 260, 3.0, 17.2 and 260, 2.0, 10.5,
     and 250, 2.2, 12.2 and 256, 2.4, 14.9. Poses inside their 95 %: 61, 65, 59 and 67, 72, 63 of 100.
 
     Args:
