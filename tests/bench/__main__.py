@@ -19,6 +19,7 @@ from tests.bench import (
     batch,
     field,
     joining,
+    long,
     ours,
     peers,
     scaling,
@@ -31,20 +32,21 @@ from tests.bench import (
 )
 from tests.bench.rows import DATA, LAB, Row, row_of, rows_in
 
-_OF_ONE_STAGE = {
+_WITH_OPTIONS = {
     "simulation": simulation.main,
     "uncertainty": uncertainty.main,
     "joining": joining.main,
     "solving": solving.main,
     "seeds": seeds.main,
+    "long": long.main,
 }
-"""Benchmarks of one stage alone; they take options of their own."""
+"""Benchmarks that take options of their own: of one stage alone, and of a capture of ten minutes."""
 
 
 def main() -> int:
     """Run the chosen benchmarks; the exit code says whether every job of ours ran."""
-    if sys.argv[1:2] and sys.argv[1] in _OF_ONE_STAGE:
-        return _OF_ONE_STAGE[sys.argv[1]](sys.argv[2:])
+    if sys.argv[1:2] and sys.argv[1] in _WITH_OPTIONS:
+        return _WITH_OPTIONS[sys.argv[1]](sys.argv[2:])
     parser = argparse.ArgumentParser(prog="make bench ARGS=...", description=__doc__)
     parser.add_argument(
         "only",
@@ -52,8 +54,8 @@ def main() -> int:
         help="rows to run, or folders of captures with truth (default: all), `scaling` (or `length`, "
         "`cameras`, `size` of it), `field` (rendered captures with what phones do to them), `batch`, "
         "`spool`, `viewer`; with options of their own: `simulation`, "
-        "`uncertainty`, `joining` or `solving`, the skeleton stage on simulated poses, and `seeds`, the map "
-        "with several seeds",
+        "`uncertainty`, `joining` or `solving`, the skeleton stage on simulated poses, `seeds`, the map "
+        "with several seeds, and `long`, ten minutes of three cameras",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)

@@ -1,12 +1,14 @@
 """The benchmark's own parts: the peers' pairs, stopping them, reading a job's events."""
 
+import av
 import numpy as np
 
 from bodycap_batch.geometry import Similarity, make_transform, so3_exp
-from tests.bench import ours, peers, poses, scaling, seeds, solving
+from tests.bench import long, ours, peers, poses, scaling, seeds, solving
 from tests.bench.peer_pairs import AWAY_NS, FROM_OTHER, OWN_AGAIN, STEPS, pairs_of
 from tests.bench.rows import Row, row_of
 from tests.scenes import small_map
+from tests.videos import write_video
 
 
 def _frames(count, cameras=("a", "b")):
@@ -170,3 +172,26 @@ def test_stated_covariances_of_poses_score_one_in_any_gauge():
     wide = poses.figures(poses.least_errors(mine, true, 4.0 * stated), 4.0 * stated)
     assert np.isclose(wide["centre"], found["centre"] / 4.0, rtol=0.02)
     assert wide["centre_inside"] > 0.97
+
+
+def test_a_long_capture_is_a_short_one_played_to_and_fro(tmp_path):
+    once, long_one = tmp_path / "once", tmp_path / "long"
+    (once / "gt").mkdir(parents=True)
+    frames = [np.full((48, 64), 60 + 30 * number, np.uint8) for number in range(4)]
+    write_video(once / "torso.mp4", frames)
+    for name in ("calib.json", "skeleton.bvh"):
+        (once / name).write_text(name)
+    truth = np.column_stack([np.arange(4) / 30.0, np.arange(4), np.zeros((4, 5)), np.ones(4)])
+    np.savetxt(once / "gt" / "torso.tum", truth)
+    replay = long.Replay(times=3, noise=1.0)
+    assert replay.order(4) == [0, 1, 2, 3, 2, 1, 0, 1, 2, 3]
+    long.play(once, long_one, replay)
+    played = np.loadtxt(long_one / "gt" / "torso.tum")
+    assert played[:, 1].tolist() == replay.order(4)
+    assert np.allclose(played[:, 0], np.arange(10) / 30.0, atol=1e-6)
+    with av.open(str(long_one / "torso.mp4")) as opened:
+        seen = [frame.to_ndarray(format="gray").mean() for frame in opened.decode(opened.streams.video[0])]
+    assert len(seen) == 10
+    assert np.argmax(seen[:4]) == 3
+    # Brighter by a tenth the second time, with noise of its own.
+    assert 1.05 < seen[5] / seen[1] < 1.2
