@@ -135,9 +135,10 @@ def _build(
     log: dict[str, Any] = {"keyframes": len(refs), **linked, **begun, **mirror}
     if models:
         models[0], log["repair"] = repair(models[0], tried, shop, carrying.refs)
+        placed: Sequence[set[int] | None] = [None] * len(models)
         if carrying is not chooser:
-            log["placed"] = place_others(models, chooser, shop)
-        log["unconfirmed_points"] = _settled(models, shop, capture)
+            placed, log["placed"] = place_others(models, chooser, shop)
+        log["unconfirmed_points"] = _settled(models, shop, capture, placed)
     refused = too_few(models, len(refs), log.get("initial_candidates", log["initial_pair_ladder"]), options)
     refused = explained(refused, mirror)
     if refused is not None and not models:
@@ -166,13 +167,21 @@ def _shop(
     )
 
 
-def _settled(models: Sequence[Any], shop: Workshop, capture: Capture) -> int:
-    """Take unconfirmed points out of models, in place, and adjust what is left once more; how many."""
+def _settled(
+    models: Sequence[Any], shop: Workshop, capture: Capture, placed: Sequence[set[int] | None]
+) -> int:
+    """Take unconfirmed points out of models, in place, and adjust what is left once more; how many.
+
+    Where it is told which images of a model were placed in it after it had settled, these alone.
+    """
     times_ns = _common_ns(capture)
     total = 0
-    for model in models:
+    for number, (model, mine) in enumerate(zip(models, placed, strict=True)):
+        shop.context.progress(number, len(models), "maps adjusted")
         total += drop_unconfirmed(model, times_ns)
-        settle(model, shop.settings(), shop.constant)
+        only = None if mine is None else mine & set(map(int, model.reg_image_ids()))
+        if only is None or only:
+            settle(model, shop.settings(), shop.constant, only)
     return total
 
 
@@ -253,14 +262,16 @@ def extend_map(
     constant = _constant(capture, cameras)
     doubted = {known[ref] for ref in _refs(extra_frames) if ref in known}
     shop = _shop(workspace, capture, options, constant, context)
-    models, cut = [], []
+    models, cut, placed = [], list[str](), list[set[int] | None]()
     for number in range(len(previous.maps)):
         model = pycolmap.Reconstruction(str(workspace / MODELS_NAME / str(number)))
-        inside = doubted & set(map(int, model.reg_image_ids()))
+        standing = set(map(int, model.reg_image_ids())) - doubted
+        inside = set(map(int, model.reg_image_ids())) & doubted
         model, names = cut_doubtful(place_again(model, inside, shop, len(known) + len(new)), shop)
         models.append(model)
         cut += names
-    dropped = _settled(models, shop, capture)
+        placed.append(set(map(int, model.reg_image_ids())) - standing if len(standing) > MANY else None)
+    dropped = _settled(models, shop, capture, placed)
     write_models(workspace, models)
     told = {"placed_again": len(doubted), "cut": cut, "unconfirmed_points": dropped}
     entry = {"new_keyframes": len(new), **told, **linked}

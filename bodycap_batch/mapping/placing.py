@@ -9,14 +9,16 @@ from bodycap_batch.mapping.incremental import place
 from bodycap_batch.mapping.matching import match_pairs
 from bodycap_batch.mapping.pairs import PairChooser
 from bodycap_batch.mapping.repair import Workshop, cut_doubtful
-from bodycap_batch.mapping.solve import refine, ticker
-
-_ITERATIONS = 10
-"""Of an adjustment by squares: what stands off by more than a pixel is out of the last one's reach."""
+from bodycap_batch.mapping.solve import refine, settle, ticker
 
 
-def place_others(models: list[Any], chooser: PairChooser, shop: Workshop) -> dict[str, object]:
-    """Place keyframes that carry no part of the maps in them, in place; no pose that stands is moved.
+def place_others(
+    models: list[Any], chooser: PairChooser, shop: Workshop
+) -> tuple[list[set[int]], dict[str, object]]:
+    """Settle maps, and place the keyframes in them, in place, that carry none; no pose that stands is moved.
+
+    All at once would be adjusted by passes over millions of observations, hundreds of them: so who was placed
+    is adjusted alone, to points that stay.
 
     Args:
         models: Reconstructions from some of the chooser's keyframes, the largest first; changed in place.
@@ -24,7 +26,7 @@ def place_others(models: list[Any], chooser: PairChooser, shop: Workshop) -> dic
         shop: Workspace, lenses, settings.
 
     Returns:
-        An account for the log.
+        Ids of the images placed in each of the models, and an account for the log.
     """
     import pycolmap
 
@@ -37,17 +39,20 @@ def place_others(models: list[Any], chooser: PairChooser, shop: Workshop) -> dic
     held = match_pairs(shop.workspace, pairs, shop.lenses, shop.context)
     left = {ids[ref] for ref in wanted}
     tick = ticker(shop.context, len(ids), shop.context.check_cancelled, len(carrying))
-    cut: list[str] = []
+    cut, count = list[str](), len(left)
+    placed = list[set[int]]()
     for number, model in enumerate(models):
-        placed = place(shop.workspace, shop.settings(), model, left, tick)
-        left -= placed
-        if placed:
-            refine(model, shop.settings(), shop.constant, _ITERATIONS)
+        settle(model, shop.settings(), shop.constant)
+        found = place(shop.workspace, shop.settings(), model, left, tick)
+        left -= found
+        if found:
+            refine(model, shop.settings(), shop.constant, found)
             models[number], names = cut_doubtful(model, shop)
             cut += names
-    return {
+        placed.append(found)
+    return placed, {
         "carrying": len(carrying),
-        "placed": len(wanted) - len(left),
+        "placed": count - len(left),
         "cut": cut,
         "placing_pairs": len(pairs),
         "placing_pairs_verified": len(held),

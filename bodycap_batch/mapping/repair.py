@@ -142,6 +142,6 @@ def place_again(model: pycolmap.Reconstruction, suspects: Collection[int], shop:
 
 
 def _refine_few(model: pycolmap.Reconstruction, shop: Workshop) -> None:
-    """Refine a model in place; one of very many keyframes is left to the last adjustment."""
+    """Refine a model in place; in one of very many keyframes only what is new to it is, at the end."""
     if model.num_reg_images() <= MANY:
         refine(model, shop.settings(), shop.constant)

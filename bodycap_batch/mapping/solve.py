@@ -280,18 +280,18 @@ def refine(
     model: Any,
     settings: pycolmap.IncrementalPipelineOptions,
     constant_cameras: Collection[int],
-    iterations: int | None = None,
+    only: Collection[int] | None = None,
 ) -> None:
-    """One bundle adjustment over the whole model, every pose free, outliers taken out; the gauge moves.
-
-    Arguments and errors are those of `adjust`.
-    """
-    adjust(model, settings, constant_cameras, iterations)
+    """One bundle adjustment by squares, outliers taken out. Arguments and errors are those of `adjust`."""
+    adjust(model, settings, constant_cameras, only=only)
     _filter(model, settings)
 
 
 def settle(
-    model: Any, settings: pycolmap.IncrementalPipelineOptions, constant_cameras: Collection[int]
+    model: Any,
+    settings: pycolmap.IncrementalPipelineOptions,
+    constant_cameras: Collection[int],
+    only: Collection[int] | None = None,
 ) -> None:
     """The last adjustment of a model that stands: what lies off by more than is usual hardly pulls.
 
@@ -309,7 +309,7 @@ def settle(
         the loss; its width is the most likely scale of a Cauchy distribution.
     """
     width_px = max(_MIN_LOSS_PX, typical_residual_px(model))
-    adjust(model, settings, constant_cameras, loss_px=width_px)
+    adjust(model, settings, constant_cameras, loss_px=width_px, only=only)
     _filter(model, settings)
 
 
@@ -343,8 +343,11 @@ def adjust(
     constant_cameras: Collection[int],
     iterations: int | None = None,
     loss_px: float | None = None,
+    only: Collection[int] | None = None,
 ) -> None:
     """One bundle adjustment over the whole model, every pose free; the gauge moves.
+
+    Of some keyframes alone: all other poses stay, and so do the points that others see and the lenses.
 
     Args:
         model: A reconstruction, changed in place.
@@ -352,6 +355,7 @@ def adjust(
         constant_cameras: Ids of calibrated cameras.
         iterations: At most so many; the settings' own number by default.
         loss_px: Width of a Cauchy loss; squares by default.
+        only: Ids of the images that are adjusted; all by default.
 
     Raises:
         EstimationError: The adjustment failed.
@@ -367,17 +371,16 @@ def adjust(
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         adjustment.ceres.loss_function_scale = loss_px
         adjustment.ceres.solver_options.function_tolerance = _SETTLED_TOLERANCE
-    settling = loss_px is not None and _track_length(model) > _LONG_TRACKS
-    iterative = settling or model.num_reg_images() > MANY
+    iterative = only is not None or (loss_px is not None and _track_length(model) > _LONG_TRACKS)
     if iterative:
         # By the least numbers that COLMAP accepts, everything beyond which is solved that way.
         adjustment.ceres.max_num_images_direct_dense_cpu_solver = 1
         adjustment.ceres.max_num_images_direct_sparse_cpu_solver = 2
         adjustment.ceres.solver_options.eta = _STEP_ACCURACY
     config = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
+    for image_id in model.reg_image_ids() if only is None else sorted(only):
         config.add_image(image_id)
-    for camera_id in constant_cameras:
+    for camera_id in constant_cameras if only is None else sorted(model.cameras):
         if model.exists_camera(camera_id):
             config.set_constant_cam_intrinsics(camera_id)
     if not iterative:
