@@ -29,6 +29,7 @@ from bodycap_batch.mapping.database import (
 )
 from bodycap_batch.mapping.freeing import as_mapped, freed_where_contradicted
 from bodycap_batch.mapping.initial import Start, named_start, rank_starts
+from bodycap_batch.mapping.large import refine_large
 from bodycap_batch.mapping.lens import change_lenses, misfitting_lenses
 from bodycap_batch.mapping.mirrored import explained, without_mirrored
 from bodycap_batch.mapping.pairs import PairChooser, link_keyframes
@@ -331,8 +332,11 @@ def refine_map(
         readout_s = {name: each.seconds for name, each in found.items() if each.seconds}
         if readout_s:
             moved = rolling.moved(readout_s)
-            refine(moved, settings, constant)
-            settle(moved, settings, constant)
+            if moved.num_reg_images() > MANY:
+                refine_large(moved, settings, constant)
+            else:
+                refine(moved, settings, constant)
+                settle(moved, settings, constant)
             rolling.move(moved, {})
             model = moved
         models.append(model)

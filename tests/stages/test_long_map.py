@@ -15,6 +15,8 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.context import StageContext
 from bodycap_batch.geometry import align_points
 from bodycap_batch.mapping import build_map, extend_map
+from bodycap_batch.mapping.large import refine_large
+from bodycap_batch.mapping.solve import mapper_options
 from bodycap_batch.scene import KeyframeSelection, MapResult
 from tests.rooms import stroll
 from tests.stages.conftest import DARK, FRAMES, context
@@ -80,6 +82,46 @@ def test_who_was_placed_stands_as_right_as_who_carries(result: MapResult) -> Non
     # A quarter of a pixel at 3 m and 240 px is 3 mm a point; a pose has dozens, not all well spread.
     assert np.sqrt((off**2).mean()) < 0.01
     assert off.max() < 0.03
+
+
+def test_a_large_map_is_adjusted_in_two_steps(result: MapResult, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = pycolmap.Reconstruction(str(result.workspace / "sparse" / "0"))
+    rng = np.random.default_rng(5)
+    spread = np.ptp(
+        [model.image(number).projection_center() for number in model.reg_image_ids()], axis=0
+    ).max()
+    for number in model.point3D_ids():
+        model.point3D(number).xyz += rng.normal(0.0, 0.02 * spread, 3)
+    for number in model.reg_image_ids():
+        pose = model.image(number).cam_from_world()
+        moved = pycolmap.Rigid3d(pose.rotation, pose.translation + rng.normal(0.0, 0.01 * spread, 3))
+        model.frame(model.image(number).frame_id).set_cam_from_world(model.image(number).camera_id, moved)
+    before = _centres_off(model)
+    adjusted: list[int] = []
+    create = pycolmap.create_default_bundle_adjuster
+
+    def noted(options: object, config: pycolmap.BundleAdjustmentConfig, part: object) -> object:
+        adjusted.append(len(config.images))
+        return create(options, config, part)
+
+    monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", noted)
+    refine_large(model, mapper_options(MapOptions(), sorted(model.cameras), 1.0), sorted(model.cameras))
+    assert adjusted[0] + adjusted[2] == model.num_reg_images()
+    assert before > 0.02
+    assert _centres_off(model) < 0.005
+
+
+def _centres_off(model: pycolmap.Reconstruction) -> float:
+    """How far a model's keyframes stand from where they were, root mean square."""
+    poses = stroll(FRAMES)
+    found, true = [], []
+    for number in sorted(model.reg_image_ids()):
+        image = model.image(number)
+        camera, frame = image.name.split("/")
+        found.append(image.projection_center())
+        true.append(poses[camera][int(frame)][:3, 3])
+    mine, right = np.array(found), np.array(true)
+    return float(np.sqrt(((align_points(mine, right).apply(mine) - right) ** 2).sum(axis=1).mean()))
 
 
 def test_a_large_map_grows_without_adjusting_all_of_it_again_and_again(
