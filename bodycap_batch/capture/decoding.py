@@ -96,8 +96,9 @@ class _Cursor:
         self._video = video
         self._container = open_container(video.path)
         self._stream = decoder(self._container, video)
-        # The halves of an interlaced frame may come one by one.
+        # The halves of an interlaced frame may come one by one; AV1's decoder loses the first frame by it.
         skips = indices is not None and not self.plain and not video.interlaced
+        skips = skips and self._stream.codec_context.name == "h264"
         self._wanted = frozenset(video.pts[indices].tolist()) if skips else None
         self._frames = self._decoded()
         self._key_index = np.searchsorted(video.pts, video.key_pts)

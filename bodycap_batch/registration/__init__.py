@@ -168,7 +168,7 @@ def settled(
         points are no better then: walk12 with covered lenses 0.34, 0.35 cm), or too few are left to look for
         others.
     """
-    before = [own.found.trajectory, *others]
+    before = [own.found.trajectory, *(path for path in others if path.gauge == scene_map.gauge)]
     paths = [without_weak_ends(path, options.min_inliers) for path in before]
     none_taken = all(path is known for path, known in zip(paths, before, strict=True))
     if none_taken or not recoverable(paths[0]):

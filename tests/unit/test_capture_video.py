@@ -198,6 +198,26 @@ def test_frames_that_nothing_is_built_on_are_passed_over(
             assert len(decoded) <= 30
 
 
+@pytest.mark.parametrize("codec", ["libx264", "libx265", "mpeg4", "libsvtav1", "libvpx-vp9"])
+def test_a_sparse_read_does_not_begin_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, codec: str
+) -> None:
+    if codec not in av.codecs_available:
+        pytest.skip(f"this PyAV has no {codec}")
+    camera = opened(write_video(tmp_path / "a.mp4", FRAMES, codec=codec, gop=10))
+    made: list[decoding._Cursor] = []
+    original = decoding._Cursor.__init__
+
+    def noted(self: decoding._Cursor, *arguments: Any) -> None:
+        made.append(self)
+        original(self, *arguments)
+
+    monkeypatch.setattr(decoding._Cursor, "__init__", noted)
+    wanted = list(range(1, 40, 3))
+    assert list(dict(camera.read(wanted))) == wanted
+    assert len(made) == 1
+
+
 @pytest.mark.parametrize(
     ("suffix", "codec", "ticks"),
     [
