@@ -138,7 +138,7 @@ def _build(
         models[0], log["repair"] = repair(models[0], tried, shop, carrying.refs)
         placed: Sequence[set[int] | None] = [None] * len(models)
         if carrying is not chooser:
-            placed, log["placed"] = place_others(models, chooser, shop)
+            placed, log["placed"] = place_others(models, chooser, tried, shop)
         log["unconfirmed_points"] = _settled(models, shop, capture, placed)
     refused = too_few(models, len(refs), log.get("initial_candidates", log["initial_pair_ladder"]), options)
     refused = explained(refused, mirror)
@@ -149,7 +149,8 @@ def _build(
     log["misfitting_lenses"] = misfitting_lenses(models[0], shop.settings(), given)
     result = _result(models, workspace, log)
     verdict = check_reach(result.maps[0], _common_ns(capture), reach).to_log() if reach else None
-    refused = refused or explained(inconsistent(log["repair"]["contradicted_share"], verdict), mirror)
+    shares = [log[step]["contradicted_share"] for step in ("repair", "placed") if step in log]
+    refused = refused or explained(inconsistent(max(shares), verdict), mirror)
     return replace(result, log={**result.log, "reach": verdict}), refused
 
 

@@ -68,8 +68,8 @@ def place(
         workspace: Folder of the database.
         settings: The mapper's settings.
         model: What there is, changed in place: poses and observations are added, points where they see more.
-        wanted: Ids of the keyframes' images.
-        tick: Called after each keyframe; what it raises ends the run.
+        wanted: Ids of the keyframes' images; who matches none has no place.
+        tick: Called after each keyframe that found a place; what it raises ends the run.
 
     Returns:
         Ids of those that found a place.
@@ -78,11 +78,11 @@ def place(
     mapper.begin_reconstruction(model)
     options, triangulation = settings.get_mapper(), settings.get_triangulation()
     placed = set[int]()
-    for image_id in sorted(wanted):
+    for image_id in sorted(number for number in wanted if model.exists_image(number)):
         if mapper.register_next_image(options, image_id):
             mapper.triangulate_image(triangulation, image_id)
             placed.add(image_id)
-        tick()
+            tick()
     model.update_point_3d_errors()
     mapper.end_reconstruction(False)
     return placed

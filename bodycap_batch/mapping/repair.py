@@ -110,6 +110,16 @@ def cut_doubtful(model: pycolmap.Reconstruction, shop: Workshop) -> tuple[Any, l
     return _without(model, doubtful(links_of(shop.workspace, model)), shop)
 
 
+def uncontradicted(model: pycolmap.Reconstruction, shop: Workshop) -> tuple[Any, list[str], float]:
+    """`cut_doubtful` with all poses left as they are, and the share of links that contradicted it."""
+    links = links_of(shop.workspace, model)
+    suspects = doubtful(links)
+    cut = sorted(model.image(number).name for number in suspects)
+    if suspects:
+        model = part_of(model, set(map(int, model.reg_image_ids())) - suspects)
+    return model, cut, round(contradicted_share(links), 4)
+
+
 def _without(model: Any, suspects: set[int], shop: Workshop) -> tuple[Any, list[str]]:
     if not suspects:
         return model, []

@@ -186,7 +186,7 @@ def _from_start(
             further[0] = _grown(further[0], workspace, settings, context, total)
             models = [model for model in models if not _keyframes(model) <= _keyframes(further[0])]
         models += further
-    return sorted(models, key=_size)
+    return sorted(models, key=size)
 
 
 def _keyframes(model: Any) -> set[str]:
@@ -204,7 +204,7 @@ def _grown(
     """A model with all keyframes that find a place in it."""
     grown = copy.deepcopy(model)
     grow(workspace, settings, grown, ticker(context, total, context.check_cancelled))
-    return min([grown, model], key=_size)
+    return min([grown, model], key=size)
 
 
 def extend(
@@ -246,10 +246,10 @@ def _run(
     )
     shutil.rmtree(target, ignore_errors=True)
     context.check_cancelled()
-    return sorted(found.values(), key=_size)
+    return sorted(found.values(), key=size)
 
 
-def _size(model: Any) -> tuple[int, int]:
+def size(model: Any) -> tuple[int, int]:
     """Sorts the largest model first."""
     return -model.num_reg_images(), -model.num_points3D()
 

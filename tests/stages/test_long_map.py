@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -16,7 +18,7 @@ from bodycap_batch.context import StageContext
 from bodycap_batch.geometry import align_points
 from bodycap_batch.mapping import build_map, extend_map
 from bodycap_batch.mapping.large import refine_large
-from bodycap_batch.mapping.solve import mapper_options
+from bodycap_batch.mapping.solve import mapper_options, part_of
 from bodycap_batch.scene import KeyframeSelection, MapResult
 from tests.rooms import stroll
 from tests.stages.conftest import DARK, FRAMES, context
@@ -30,17 +32,19 @@ def result(stroll_capture: Capture, tmp_path_factory: pytest.TempPathFactory) ->
     return _built(stroll_capture, MapOptions(), context(tmp_path_factory.mktemp("long")))
 
 
-def _built(capture: Capture, options: MapOptions, surroundings: StageContext) -> MapResult:
-    selections = [_selection(camera.name) for camera in capture.cameras]
+def _built(
+    capture: Capture, options: MapOptions, surroundings: StageContext, frames: Sequence[int] = _EVERY
+) -> MapResult:
+    selections = [_selection(camera.name, frames) for camera in capture.cameras]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bodycap_batch.mapping.pairs._FEW", 10)
         return build_map(capture, selections, options, surroundings, many=40)
 
 
-def _selection(name: str) -> KeyframeSelection:
+def _selection(name: str, frames: Sequence[int]) -> KeyframeSelection:
     return KeyframeSelection(
         camera=name,
-        frames=np.array(_EVERY),
+        frames=np.array(frames),
         frame_count=FRAMES,
         sharpness=np.ones(FRAMES),
         noise_px=0.3,
@@ -65,6 +69,35 @@ def test_who_wants_every_pair_gets_every_pair(stroll_capture: Capture, tmp_path:
     count = 2 * len(_EVERY)
     assert every.log["pairs"] == count * (count - 1) // 2
     assert "placed" not in every.log
+
+
+def test_keyframes_that_see_nothing_are_left_out(stroll_capture: Capture, tmp_path: Path) -> None:
+    with_dark = list(range(0, FRAMES, 2))
+    found = _built(stroll_capture, MapOptions(), context(tmp_path), with_dark)
+    inside = zip(found.maps[0].keyframe_camera, found.maps[0].keyframe_frame.tolist(), strict=True)
+    dark = {("left_palm", frame) for frame in DARK if frame in with_dark}
+    wanted = {(camera.name, frame) for camera in stroll_capture.cameras for frame in with_dark}
+    assert set(inside) == wanted - dark
+
+
+def test_a_carrying_keyframe_that_was_cut_is_placed(
+    stroll_capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mended, cut = mapping.repair, list[str]()
+
+    def cutting(*arguments: Any) -> tuple[Any, dict[str, object]]:
+        model, log = mended(*arguments)
+        number = sorted(model.reg_image_ids())[-1]
+        cut.append(model.image(number).name)
+        return part_of(model, set(model.reg_image_ids()) - {number}), log
+
+    monkeypatch.setattr(mapping, "repair", cutting)
+    found = _built(stroll_capture, MapOptions(), context(tmp_path))
+    told = found.log["placed"]
+    assert told["carrying"] + told["placed"] == len(found.maps[0].keyframe_camera)
+    camera, frame = cut[0].split("/")
+    inside = zip(found.maps[0].keyframe_camera, found.maps[0].keyframe_frame.tolist(), strict=True)
+    assert (camera, int(frame)) in set(inside)
 
 
 def _off(result: MapResult) -> np.ndarray:

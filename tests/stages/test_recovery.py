@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
+import cv2
 import numpy as np
 import pytest
 
 from bodycap_batch.camera import Camera
 from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.config import RegistrationOptions
-from bodycap_batch.context import StageContext
+from bodycap_batch.context import THREADS_VARIABLE, StageContext
 from bodycap_batch.geometry import (
     interpolate_pose,
     invert,
@@ -470,6 +471,31 @@ def test_a_wrong_end_of_a_lost_stretch_is_looked_for_again(
     assert off_m[0][end] > 0.1
     assert np.nanmax(off_m[1]) < 0.03
     assert np.isfinite(off_m[1][list(LOST)]).sum() >= len(LOST) - 1
+
+
+def test_a_second_thread_changes_nothing(
+    monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray], tmp_path: Path
+) -> None:
+    scene, end = _map(pictures), LOST[0] - 1
+    found = _with_tracks(_tracked(), scene, end)
+    inliers = found.trajectory.inliers.copy()
+    inliers[end] = 20
+    found = replace(found, trajectory=replace(found.trajectory, inliers=inliers))
+    own = RigCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), found=found)
+    capture, options = cast(Capture, _Capture(_Video(pictures))), RegistrationOptions()
+    before = cv2.getNumThreads()
+    paths = []
+    for threads in (1, 2):
+        monkeypatch.setenv(THREADS_VARIABLE, str(threads))
+        cv2.setNumThreads(threads)
+        context = StageContext(work_dir=tmp_path, threads=threads)
+        settled_map, left = settled(own, [], scene, _selection(), options)
+        paths.append(recover_lost(left, settled_map, capture, options, context).trajectory)
+    cv2.setNumThreads(before)
+    assert not left.trajectory.localised[end]
+    assert paths[0].localised[list(LOST)].any()
+    assert paths[0].gauge_from_cam.tobytes() == paths[1].gauge_from_cam.tobytes()
+    assert paths[0].covariance.tobytes() == paths[1].covariance.tobytes()
 
 
 def test_few_poses_are_left_as_they_are(monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray]) -> None:

@@ -208,7 +208,7 @@ def test_a_sparse_read_does_not_begin_anew(
     made: list[decoding._Cursor] = []
     original = decoding._Cursor.__init__
 
-    def noted(self: decoding._Cursor, *arguments: Any) -> None:
+    def noted(self: decoding._Cursor, *arguments: object) -> None:
         made.append(self)
         original(self, *arguments)
 
