@@ -101,33 +101,30 @@ def repair(
             break
         model, suspects, links = other, left, other_links
     share = round(contradicted_share(links), 4)
-    model, cut = _without(model, suspects, shop)
+    model, cut = _without(model, suspects)
+    if cut:
+        _refine_few(model, shop)
     return model, {"rounds": log, "cut": cut, "contradicted_share": share}
 
 
 def cut_doubtful(model: pycolmap.Reconstruction, shop: Workshop) -> tuple[Any, list[str]]:
-    """The model without keyframes that contradict it, and their names."""
-    return _without(model, doubtful(links_of(shop.workspace, model)), shop)
+    """The model without keyframes that contradict it, adjusted then, and their names."""
+    kept, cut, _ = uncontradicted(model, shop)
+    if cut:
+        _refine_few(kept, shop)
+    return kept, cut
 
 
 def uncontradicted(model: pycolmap.Reconstruction, shop: Workshop) -> tuple[Any, list[str], float]:
-    """`cut_doubtful` with all poses left as they are, and the share of links that contradicted it."""
+    """`cut_doubtful` with all poses left as they are, and the share of links that contradicted the model."""
     links = links_of(shop.workspace, model)
-    suspects = doubtful(links)
-    cut = sorted(model.image(number).name for number in suspects)
-    if suspects:
-        model = part_of(model, set(map(int, model.reg_image_ids())) - suspects)
-    return model, cut, round(contradicted_share(links), 4)
+    return *_without(model, doubtful(links)), round(contradicted_share(links), 4)
 
 
-def _without(model: Any, suspects: set[int], shop: Workshop) -> tuple[Any, list[str]]:
-    if not suspects:
-        return model, []
+def _without(model: Any, suspects: set[int]) -> tuple[Any, list[str]]:
+    """Points that only suspects see go with them; tracking finds their frames' poses from what is left."""
     cut = sorted(model.image(number).name for number in suspects)
-    # Points that only they see go with them; tracking finds their frames' poses from what is left.
-    model = part_of(model, set(map(int, model.reg_image_ids())) - suspects)
-    _refine_few(model, shop)
-    return model, cut
+    return part_of(model, set(map(int, model.reg_image_ids())) - suspects) if cut else model, cut
 
 
 def _untried(ids: Mapping[ImageRef, int], images: set[int], tried: set[Pair]) -> list[Pair]:

@@ -6,10 +6,12 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
+from bodycap_batch import mapping
 from bodycap_batch.arrays import FloatArray
-from bodycap_batch.capture import CaptureCamera, open_capture
+from bodycap_batch.capture import Capture, open_capture
 from bodycap_batch.config import KeyframeOptions, MapOptions, RegistrationOptions
 from bodycap_batch.config.job import load_job
 from bodycap_batch.context import StageContext
@@ -19,7 +21,7 @@ from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build_map, refine_map
 from bodycap_batch.registration import register_frames
 from bodycap_batch.rolling_shutter import looks_rolling
-from bodycap_batch.scene import Map, MapResult, Registration, Trajectory
+from bodycap_batch.scene import KeyframeSelection, Map, MapResult, Registration, Trajectory
 
 pytestmark = [pytest.mark.data, pytest.mark.slow]
 
@@ -35,7 +37,8 @@ OPTIONS = MapOptions(features=640)
 class Outcome:
     """What the first three stages make of the video."""
 
-    camera: CaptureCamera
+    capture: Capture
+    selection: KeyframeSelection
     maps: tuple[MapResult, MapResult]
     before: Registration
     refined: MapResult
@@ -55,7 +58,7 @@ def outcome(data_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Outcom
     before = register_frames(camera, first.maps, selection, RegistrationOptions(), context())
     refined = refine_map(capture, first, [before.trajectory], OPTIONS, context())
     after = register_frames(camera, refined.maps, selection, RegistrationOptions(), context(), before)
-    return Outcome(camera, (first, again), before, refined, after)
+    return Outcome(capture, selection, (first, again), before, refined, after)
 
 
 def ate_m(path: Trajectory, truth_file: Path) -> tuple[float, int]:
@@ -90,6 +93,33 @@ def test_the_rolling_shutter_is_found_and_taken_out(outcome: Outcome, data_root:
     assert count > 700
     assert after < MAX_ATE_M
     assert after < 0.6 * before
+
+
+def test_a_very_large_map_loses_its_rolling_shutter_too(
+    outcome: Outcome, data_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mapping, "MANY", 20)
+    adjusted = list[int]()
+    create = pycolmap.create_default_bundle_adjuster
+
+    def noted(
+        options: object, config: pycolmap.BundleAdjustmentConfig, model: pycolmap.Reconstruction
+    ) -> object:
+        adjusted.append(len(config.images))
+        return create(options, config, model)
+
+    monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", noted)
+    surroundings = StageContext(work_dir=tmp_path, threads=2)
+    refined = refine_map(outcome.capture, outcome.maps[0], [outcome.before.trajectory], OPTIONS, surroundings)
+    assert max(adjusted) < len(refined.maps[0].keyframe_camera)
+    camera = outcome.capture.cameras[0]
+    after = register_frames(
+        camera, refined.maps, outcome.selection, RegistrationOptions(), surroundings, outcome.before
+    )
+    truth = data_root / "tum_fr1_xyz" / "groundtruth.txt"
+    before_m, _ = ate_m(outcome.before.trajectory, truth)
+    assert after.trajectory.localised.all()
+    assert ate_m(after.trajectory, truth)[0] < 0.6 * before_m
 
 
 def test_the_same_capture_twice_gives_the_same_map(outcome: Outcome) -> None:
