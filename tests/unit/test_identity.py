@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import hashlib
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -87,6 +88,81 @@ def test_the_glue_of_a_task_counts_for_its_stages(copied: Path) -> None:
     assert changed_by(copied / "tasks" / "export.py") == {"export"}
     assert changed_by(copied / "tasks" / "mapping.py") == {"map", "extend", "refine"}
     assert changed_by(copied / "tasks" / "stage.py") == set(STAGES)
+
+
+def test_words_do_not_count(copied: Path) -> None:
+    """A reworded sentence must not compute a user's results anew."""
+    before = versions()
+    for path in copied.rglob("*.py"):
+        path.write_text(reworded(path.read_text(encoding="utf-8")), encoding="utf-8")
+    assert versions() == before
+
+
+def reworded(source: str) -> str:
+    """The same code with other docstrings, other notes on assignments, and no comments."""
+    tree = ast.parse(source)
+    notes = (node.value for node in ast.walk(tree) if isinstance(node, ast.Expr))
+    for note in notes:
+        if isinstance(note, ast.Constant) and isinstance(note.value, str):
+            note.value = "Other words."
+    return ast.unparse(tree)
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("LIMIT = 1", "LIMIT = 1.0"),
+        ("LIMIT = 1", "LIMIT = True"),
+        ('NAME = "a"', 'NAME = b"a"'),
+        ("value = a + b", "value = a - b"),
+        ('text = f"{a}"', 'text = f"{a!r}"'),
+        ('text = f"{a:.1f}"', 'text = f"{a:.2f}"'),
+        ("def f(a, *, b=1): return a", "def f(a, *, b=2): return a"),
+        ("def f(a, b): return a", "def f(a, *, b): return a"),
+        ("x = [1, 2]", "x = [1], 2"),
+        ("from bodycap_batch.a import b", "from bodycap_batch.a import b as c"),
+        ("call('word')", "call('other word')"),
+    ],
+)
+def test_changed_code_counts(before: str, after: str) -> None:
+    assert identity.code_text(ast.parse(before)) != identity.code_text(ast.parse(after))
+
+
+@pytest.mark.parametrize(
+    ("written", "other"),
+    [
+        ('"""Old."""\nA = 1\n"""Note."""\n', "A = 1  # comment"),
+        ("A = (\n    1\n)", "A = 1"),
+        ("text = f'{a}' f''", "text = f'{a}'"),
+    ],
+)
+def test_layout_and_words_of_a_file_do_not_count(written: str, other: str) -> None:
+    assert identity.code_text(ast.parse(written)) == identity.code_text(ast.parse(other))
+
+
+SYNTAX = """
+@dataclass(frozen=True)
+class Box(Base):
+    size: int = 1
+
+    def grow(self, by=2, *rest, key=None, **more) -> "Box":
+        with lock, open(f"{self.size:>{by}.1f} {key!r}") as stream:
+            return [x for x in rest if x is not ... and not x] or {**more, "a": lambda: (yield)}
+
+match box:
+    case Box(size=1 | 2) as found if found:
+        pass
+try:
+    a, *b = c[1:2, ...] if d else -1j
+except* (ValueError, KeyError):
+    raise
+"""
+
+
+def test_the_version_is_the_same_on_each_python() -> None:
+    """The digest was computed with Python 3.11.7, 3.12.1 and 3.13.0."""
+    text = identity.code_text(ast.parse(SYNTAX))
+    assert hashlib.sha256(text.encode()).hexdigest()[:16] == "35e3d844b46998a0"
 
 
 def test_a_further_stage_changes_no_other(copied: Path) -> None:
