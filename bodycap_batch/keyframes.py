@@ -7,14 +7,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray, FloatArray
-from bodycap_batch.camera import Camera
 from bodycap_batch.capture import CaptureCamera, FrameKeeper, Shot
 from bodycap_batch.config import KeyframeOptions
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import CaptureError
-from bodycap_batch.scene import KeyframeSelection
-from bodycap_batch.tracking import (
+from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.optical_flow import (
     GreyImage,
     Pixels,
     bearings,
@@ -25,6 +24,7 @@ from bodycap_batch.tracking import (
     sharpness,
     track_points,
 )
+from bodycap_batch.model.scene import KeyframeSelection
 
 _CORNERS = 120
 _CORNER_SPACING_PX = 12.0

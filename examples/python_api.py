@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.config.job import Overrides, load_job
+from bodycap_batch.core.progress import Event
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.pipeline import Settings, run_job
-from bodycap_batch.progress import Event
 from bodycap_batch.store import Store
 
 

@@ -13,7 +13,7 @@ import av
 import cv2
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.formats.tum import TimedPoses, read_tum, write_tum
 from tests.videos import Image
 

@@ -7,8 +7,8 @@ from functools import cache
 import cv2
 import numpy as np
 
-from bodycap_batch.camera import Camera
-from bodycap_batch.geometry import so3_exp
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.synthetic.lens import ray_grid
 
 SQUARE_TEXELS = 48

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.body import CameraClock, MergeResult
-from bodycap_batch.geometry import Similarity, make_transform, so3_exp
-from bodycap_batch.scene import FrameStatus, Trajectory
-from bodycap_batch.skeleton import Motion, Mount, SkeletonModel
-from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
+from bodycap_batch.model.merge_data import CameraClock, MergeResult
+from bodycap_batch.model.scene import FrameStatus, Trajectory
+from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
+from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
 
 CAMERAS = {"torso": "Spine1", "left_palm": "LeftHand", "right_palm": "RightHand"}
 ARMS = ("Spine1", "LeftArm", "LeftForeArm", "LeftHand", "RightArm", "RightForeArm", "RightHand")

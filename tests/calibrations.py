@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.calibrate import Calibration
-from bodycap_batch.merging.samples import Samples, take_samples
-from bodycap_batch.merging.tracks import make_track
+from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
+from bodycap_batch.merging.body_calibration.samples import Samples, take_samples
+from bodycap_batch.merging.cameras.track import make_track
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.posed import GAUGE, posed
 

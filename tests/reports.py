@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.body import CameraClock
-from bodycap_batch.camera import Camera
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.export.inputs import ExportInputs
 from bodycap_batch.export.metrics import collect_metrics
 from bodycap_batch.export.projection import project_motion
-from bodycap_batch.geometry import Similarity, invert, transform_points
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import Similarity, invert, transform_points
+from bodycap_batch.model.merge_data import CameraClock
+from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 from bodycap_batch.report import ReportInputs, write_report
-from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 from tests.bodies import CAMERAS, merged, reaching
 
 LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))

@@ -10,10 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bodycap_batch.camera import Camera
 from bodycap_batch.capture import Capture, open_capture
 from bodycap_batch.config.job import load_job
-from bodycap_batch.geometry import make_transform, so3_exp
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import make_transform, so3_exp
 from tests.videos import write_video
 
 HALF_M = np.array([3.0, 2.5, 1.4])

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bodycap_batch.camera import Camera
-from bodycap_batch.geometry import invert, make_transform, transform_points
-from bodycap_batch.scene import Map
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import invert, make_transform, transform_points
+from bodycap_batch.model.scene import Map
 
 
 def small_map(gauge: str = "map-0", *, seed: int = 11, points: int = 60, noise_px: float = 0.0) -> Map:

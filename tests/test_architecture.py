@@ -114,7 +114,7 @@ def imports(module: Module) -> Iterator[tuple[int, str]]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{module}:{node.lineno}: imports are absolute here"
             source = node.module or ""
-            # `from bodycap_batch import store` names a room, `from bodycap_batch.store import Store` does too
+            # Both `from bodycap_batch import store` and `from bodycap_batch.store import Store` name a package.
             yield from ((node.lineno, f"{source}.{alias.name}") for alias in node.names)
 
 

@@ -91,7 +91,7 @@ def failures(names: list[str], folder: Path) -> str:
 def test_each_module_can_be_the_first_one() -> None:
     """No circle of imports, wherever one enters it: each in a copy of an interpreter with the libraries."""
     names = module_names()
-    assert {"bodycap_batch.geometry", "bodycap_batch.config.options"} <= set(names)
+    assert {"bodycap_batch.model.geometry", "bodycap_batch.config.options"} <= set(names)
     done = run_python("-c", ALONE, *names)
     assert (done.returncode, done.stdout) == (0, ""), done.stdout + done.stderr
 
@@ -104,7 +104,7 @@ def test_the_package_alone_leaves_compression_working(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_each_room_alone_leaves_compression_working(tmp_path: Path) -> None:
     rooms = [name for name in module_names() if name.count(".") <= 1]
-    assert "bodycap_batch.geometry" in rooms
+    assert "bodycap_batch.model.geometry" in rooms
     assert not failures(rooms, tmp_path)
 
 

@@ -9,12 +9,13 @@ from pathlib import Path
 import pytest
 import typer
 
-from bodycap_batch import cli, errors
+from bodycap_batch import cli
 from bodycap_batch.cli.base import app
 from bodycap_batch.config.calibration import read_calibration
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import Job
-from bodycap_batch.scene import FrameStatus
+from bodycap_batch.core import errors
+from bodycap_batch.model.scene import FrameStatus
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 README = re.sub(r"<!--.*?-->", "", (REPOSITORY / "README.md").read_text(encoding="utf-8"), flags=re.DOTALL)

@@ -8,8 +8,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.errors import JobError
 
 GreyImage = npt.NDArray[np.uint8]
 MIN_CORNERS = 8

@@ -11,13 +11,13 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
 from bodycap_batch.calibration.boards import Board, GreyImage, View
 from bodycap_batch.calibration.solve import Fit, Size, fit_lens
 from bodycap_batch.capture import CaptureCamera, open_camera
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import CaptureError, EstimationError
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import CaptureError, EstimationError
 
 LensChoice = Literal["auto", "pinhole", "opencv", "fisheye"]
 _MODELS: dict[str, tuple[str, ...]] = {

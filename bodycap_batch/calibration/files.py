@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from bodycap_batch.calibration.clip import CalibrationResult
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.files import replacing, write_text
 
 

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray, IntArray
-from bodycap_batch.body import BoardView
 from bodycap_batch.calibration.boards import Board
-from bodycap_batch.camera import CV2_PIXEL_OFFSET_PX, Camera
 from bodycap_batch.capture import Capture
 from bodycap_batch.config.options import MarkerBoard
-from bodycap_batch.context import StageContext
-from bodycap_batch.geometry import make_transform
+from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX, Camera
+from bodycap_batch.model.geometry import make_transform
+from bodycap_batch.model.merge_data import BoardView
 
 
 def find_board_views(

@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
 from bodycap_batch.calibration.boards import View
+from bodycap_batch.core.arrays import FloatArray
 
 Size = tuple[int, int]
 _FISHEYE_STARTS = (0.5, 0.35, 0.7)

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import BoolArray, FloatArray, IntArray, set_array
-from bodycap_batch.camera import Camera
 from bodycap_batch.capture.decoding import decode_frames
 from bodycap_batch.capture.images import Colours, Image, Planes, grey_of, work_image, work_planes
 from bodycap_batch.capture.kept import KeptFrames, Shot, keeps_all
 from bodycap_batch.capture.prefetch import prefetched
 from bodycap_batch.capture.video import VideoFile
-from bodycap_batch.errors import CaptureError
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
+from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.model.camera import Camera
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bodycap_batch.arrays import IntArray
 from bodycap_batch.capture.video import COPY_AGAIN, VideoFile, open_container, reason_of, video_stream
-from bodycap_batch.context import THREADS_VARIABLE
-from bodycap_batch.errors import CaptureError
+from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.core.context import THREADS_VARIABLE
+from bodycap_batch.core.errors import CaptureError
 
 if TYPE_CHECKING:
     from av.container import InputContainer

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bodycap_batch.arrays import IntArray
 from bodycap_batch.capture.decoding import first_frame
 from bodycap_batch.capture.video import (
     COPY_AGAIN,
@@ -21,7 +20,8 @@ from bodycap_batch.capture.video import (
     reason_of,
     video_stream,
 )
-from bodycap_batch.errors import CaptureError
+from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.core.errors import CaptureError
 
 if TYPE_CHECKING:
     from av.container import InputContainer

@@ -11,10 +11,10 @@ from typing import Self
 
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray, IntArray, set_array
 from bodycap_batch.capture.decoding import decode_frames
 from bodycap_batch.capture.images import Colours, Image, Planes, work_image
 from bodycap_batch.capture.video import VideoFile
+from bodycap_batch.core.arrays import BoolArray, IntArray, set_array
 from bodycap_batch.formats.mp4 import TIME_BASE, Quality, VideoWriter
 
 NAME = "kept"

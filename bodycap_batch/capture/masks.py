@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray
-from bodycap_batch.errors import CaptureError
+from bodycap_batch.core.arrays import BoolArray
+from bodycap_batch.core.errors import CaptureError
 
 _WHITE = 128
 _ASPECT_TOLERANCE = 0.01

@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray, IntArray
-from bodycap_batch.camera import Camera, without_single_focal
 from bodycap_batch.capture.cameras import Capture, CaptureCamera
 from bodycap_batch.capture.indexing import index_video
 from bodycap_batch.capture.masks import read_mask
@@ -15,7 +13,9 @@ from bodycap_batch.capture.timeline import join_chapters
 from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.config.calibration import Calibration
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
-from bodycap_batch.errors import CaptureError
+from bodycap_batch.core.arrays import BoolArray, IntArray
+from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.model.camera import Camera, without_single_focal
 
 # Widest lens in common use as webcam or phone camera; mapping refines it.
 _GUESSED_FOV_DEG = 70.0

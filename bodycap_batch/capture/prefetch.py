@@ -8,7 +8,7 @@ from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-from bodycap_batch.context import THREADS_VARIABLE
+from bodycap_batch.core.context import THREADS_VARIABLE
 
 Item = TypeVar("Item")
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.arrays import IntArray
 from bodycap_batch.capture.video import VideoFile
-from bodycap_batch.errors import CaptureError
+from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.core.errors import CaptureError
 
 _NS = 1_000_000_000
 _MAX_BYTES = 256 << 20

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bodycap_batch.arrays import IntArray
-from bodycap_batch.errors import CaptureError
+from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.core.errors import CaptureError
 
 if TYPE_CHECKING:
     from av.container import InputContainer

@@ -8,7 +8,7 @@ from itertools import combinations, pairwise
 from pathlib import Path
 
 from bodycap_batch.config.models import CameraConfig, Job
-from bodycap_batch.errors import CaptureError
+from bodycap_batch.core.errors import CaptureError
 
 _GOPRO_CHAPTER = re.compile(r"G[HXL](?P<chapter>[0-9]{2})(?P<video>[0-9]{4})", re.IGNORECASE)
 

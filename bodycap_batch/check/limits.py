@@ -7,7 +7,7 @@ from pathlib import Path
 from bodycap_batch.capture.video import open_container, video_stream
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.models import Job
-from bodycap_batch.errors import CaptureError
+from bodycap_batch.core.errors import CaptureError
 
 
 def require_within(job: Job, limits: Limits) -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodycap_batch.arrays import IntArray
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.capture.images import Image
 from bodycap_batch.check.stillness import outline, standing_still
-from bodycap_batch.errors import CaptureError
+from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.core.errors import CaptureError
 
 _SAMPLES = 8
 # Sensor noise of a covered lens stays below this grey value (of 255) in 99 of 100 pixels.

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.arrays import IntArray
 from bodycap_batch.capture import CaptureCamera, open_camera
 from bodycap_batch.check.advice import advice_on
 from bodycap_batch.check.files import check_files
@@ -21,10 +20,11 @@ from bodycap_batch.config.folder import job_file_in
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, CaptureConfig, Job
 from bodycap_batch.config.rules import named_frames
-from bodycap_batch.disk_room import require_room
-from bodycap_batch.errors import BodycapError, CaptureError, JobError
+from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.core.errors import BodycapError, CaptureError, JobError
 from bodycap_batch.formats.bvh import RigOptions, read_rig
 from bodycap_batch.formats.needs import require_libraries
+from bodycap_batch.store.disk_space import require_room
 
 # Frames whose distance differs by more than this share from the usual one make a variable rate.
 _RATE_TOLERANCE = 0.2

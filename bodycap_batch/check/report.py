@@ -9,7 +9,7 @@ from typing import Any
 
 from bodycap_batch.capture.kept import keeps_all
 from bodycap_batch.config.models import Job
-from bodycap_batch.errors import BodycapError
+from bodycap_batch.core.errors import BodycapError
 
 _MANY_FILES = 3
 _LINE = 100

@@ -9,9 +9,9 @@ from typing import BinaryIO
 
 import numpy as np
 
-from bodycap_batch.arrays import IntArray
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.capture.video import open_container
+from bodycap_batch.core.arrays import IntArray
 
 _CONTAINERS = (b"moov", b"udta")
 _GOPRO = b"GPMF"

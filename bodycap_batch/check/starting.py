@@ -17,7 +17,7 @@ from bodycap_batch.capture.indexing import index_video
 from bodycap_batch.config.folder import recordings_in
 from bodycap_batch.config.models import Job
 from bodycap_batch.config.mounts import MOUNT_NAMES, mount_of
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.files import write_text
 
 FILE = "job.yaml"

@@ -7,8 +7,8 @@ from itertools import combinations
 
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray, FloatArray
 from bodycap_batch.capture.images import Image
+from bodycap_batch.core.arrays import BoolArray, FloatArray
 
 _COLUMNS, _ROWS, _BLOCK_PX = 8, 6, 8
 _LEAST_CONTRAST = 3.0

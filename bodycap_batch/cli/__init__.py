@@ -25,7 +25,7 @@ from bodycap_batch.cli import (
 )
 from bodycap_batch.cli.base import app
 from bodycap_batch.cli.stop import exit_code_of_stop, stop_by_exception
-from bodycap_batch.errors import EXIT_BUG, BodycapError, Cancelled, DiskAway
+from bodycap_batch.core.errors import EXIT_BUG, BodycapError, Cancelled, DiskAway
 
 __all__ = [
     "batch",
@@ -89,7 +89,7 @@ def _disk_away(error: Exception) -> BodycapError | None:
     """A disk that does not answer, which no look at a path expects; None for anything else."""
     if not isinstance(error, OSError):
         return None
-    from bodycap_batch.store import store_error  # takes longer than all else about `--help`
+    from bodycap_batch.store.artefacts import store_error  # takes longer than all else about `--help`
 
     found = store_error(error, Path.cwd())
     return found if isinstance(found, DiskAway) else None

@@ -19,14 +19,14 @@ from bodycap_batch.cli.base import app
 from bodycap_batch.cli.display import sentence
 from bodycap_batch.cli.options import BatchOutOption, BatchStoreOption, cores, default_out, results_folder
 from bodycap_batch.cli.stop import stoppable
-from bodycap_batch.errors import Cancelled, JobError
-from bodycap_batch.progress import Event
+from bodycap_batch.core.errors import Cancelled, JobError
+from bodycap_batch.core.progress import Event
 
 if TYPE_CHECKING:
-    from bodycap_batch.cluster import Cluster
     from bodycap_batch.config.models import Job
     from bodycap_batch.pipeline import BatchJob, Outcome, Settings
     from bodycap_batch.runner import Executor
+    from bodycap_batch.runner.dask_cluster import Cluster
 
 _JOBS_ON_A_CLUSTER = 32
 """A job at work is a thread that waits; its tasks wait at the scheduler, in order of priority."""
@@ -76,7 +76,7 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap batch jobs/*.yaml --executor tcp://scheduler:8786
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.pipeline import Batch, Settings
-    from bodycap_batch.store import Store
+    from bodycap_batch.store.artefacts import Store
 
     wanted = _prioritised(list(dict.fromkeys(jobs)), priority or [])
     folder = (out or default_out()).resolve()
@@ -114,7 +114,7 @@ def _executor(kind: str, threads: int, workers: int, memory_mb: int) -> Iterator
         finally:
             pool.shutdown()
         return
-    from bodycap_batch.cluster import QUEUES, SCHEMES, Cluster, start_queue
+    from bodycap_batch.runner.dask_cluster import QUEUES, SCHEMES, Cluster, start_queue
 
     if kind in QUEUES:
         with (

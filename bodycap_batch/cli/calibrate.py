@@ -14,8 +14,8 @@ import typer
 from bodycap_batch.cli.base import app
 from bodycap_batch.cli.display import make_display
 from bodycap_batch.cli.stop import stoppable
-from bodycap_batch.errors import JobError
-from bodycap_batch.progress import Event
+from bodycap_batch.core.errors import JobError
+from bodycap_batch.core.progress import Event
 
 
 class Lens(StrEnum):
@@ -70,7 +70,7 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap calibrate wide.mp4 --chessboard 9x6 --lens fisheye
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.calibration import Board, calibrate_clip, write_calibration, write_preview
-    from bodycap_batch.context import StageContext
+    from bodycap_batch.core.context import StageContext
 
     kind, columns, rows = _board_size(chessboard, charuco)
     printed = {"dictionary": dictionary, "marker": marker, "legacy": legacy}

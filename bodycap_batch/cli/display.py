@@ -9,8 +9,8 @@ import time
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol, Self
 
-from bodycap_batch.progress import Event
-from bodycap_batch.shares import percent
+from bodycap_batch.core.percent import percent
+from bodycap_batch.core.progress import Event
 
 if TYPE_CHECKING:
     from rich.progress import Progress, Task, TaskID

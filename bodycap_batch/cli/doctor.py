@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from bodycap_batch.cli.base import app
-from bodycap_batch.errors import StoreError
+from bodycap_batch.core.errors import StoreError
 
 
 @app.command(short_help="Check this machine: libraries, memory, disk, extras.")

@@ -13,8 +13,8 @@ from typing import Annotated, Any
 import typer
 
 from bodycap_batch.cli.base import app
-from bodycap_batch.errors import JobError
-from bodycap_batch.shares import percent
+from bodycap_batch.core.errors import JobError
+from bodycap_batch.core.percent import percent
 
 TUM_SUFFIXES = (".tum", ".txt")
 _MOTION = "motion.bvh"

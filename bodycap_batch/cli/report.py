@@ -43,7 +43,7 @@ def report(
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.config.job import Overrides, load_job
     from bodycap_batch.pipeline import Settings, remake_report
-    from bodycap_batch.store import Store
+    from bodycap_batch.store.artefacts import Store
 
     file, folder = job_of(job)
     resolved = load_job(file, Overrides(out=out or folder, skeleton=skeleton, height_m=height))

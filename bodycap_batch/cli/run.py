@@ -26,8 +26,8 @@ from bodycap_batch.cli.options import (
     results_folder,
 )
 from bodycap_batch.cli.stop import stoppable
-from bodycap_batch.errors import BodycapError, JobError
-from bodycap_batch.progress import Event
+from bodycap_batch.core.errors import BodycapError, JobError
+from bodycap_batch.core.progress import Event
 from bodycap_batch.tasks import ORDER, StageName, stages_from
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
     from bodycap_batch.config.folder import job_file_in
     from bodycap_batch.config.job import Overrides, load_job
     from bodycap_batch.pipeline import Settings, prepare_capture, run_job
-    from bodycap_batch.store import Store
+    from bodycap_batch.store.artefacts import Store
 
     if force and from_ is not None:
         raise JobError("--force does every stage again, --from some of them", hint="leave one of them out")

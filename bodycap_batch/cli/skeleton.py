@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bodycap_batch.cli.base import app
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 
 if TYPE_CHECKING:
     from bodycap_batch.formats.bvh import RigOptions
-    from bodycap_batch.skeleton import Motion, SkeletonModel
+    from bodycap_batch.model.skeleton import Motion, SkeletonModel
 
 
 @app.command()
@@ -77,7 +77,7 @@ def _heading(file: Path, rig: SkeletonModel, motion: Motion | None, frame: int |
     import numpy as np
 
     from bodycap_batch.formats.bvh.mapping import pose_words
-    from bodycap_batch.skeleton import rest_pose
+    from bodycap_batch.model.skeleton import rest_pose
 
     rest = rest_pose(rig)
     tips = rest[:, :3, 3] + (rest[:, :3, :3] @ np.nan_to_num(rig.end_offsets_m)[:, :, None])[..., 0]

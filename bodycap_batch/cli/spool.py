@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bodycap_batch.cli.base import app
-from bodycap_batch.shares import percent
+from bodycap_batch.core.percent import percent
 
 if TYPE_CHECKING:
     from bodycap_batch.watch import JobRow, Spool
@@ -38,7 +38,7 @@ def status(
       bodycap status
       bodycap status /mnt/nas/jobs --json
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.store import disk_errors
+    from bodycap_batch.store.artefacts import disk_errors
     from bodycap_batch.watch import rows_of, watchers_of
 
     place = _spool(spool)
@@ -91,7 +91,7 @@ def cancel(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
 
 
 def _spool(path: Path) -> Spool:
-    from bodycap_batch.errors import JobError
+    from bodycap_batch.core.errors import JobError
     from bodycap_batch.watch import spool_at
 
     if not path.is_dir():

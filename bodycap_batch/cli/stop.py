@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from bodycap_batch.errors import Cancelled
+from bodycap_batch.core.errors import Cancelled
 
 _received: list[int] = []
 

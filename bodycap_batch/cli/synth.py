@@ -14,8 +14,8 @@ from bodycap_batch.cli.base import app
 from bodycap_batch.cli.display import make_display
 from bodycap_batch.cli.options import ThreadsOption, cores
 from bodycap_batch.cli.stop import stoppable
-from bodycap_batch.errors import JobError
-from bodycap_batch.progress import Event
+from bodycap_batch.core.errors import JobError
+from bodycap_batch.core.progress import Event
 
 
 @app.command()
@@ -56,7 +56,7 @@ def synth(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap synth hidden/ --set body_in_view=true --set "pressed_s={left_palm: [2, 4]}"
       bodycap synth other/ --motion walk.bvh --cameras torso,head --size 960x540
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.context import StageContext
+    from bodycap_batch.core.context import StageContext
     from bodycap_batch.synthetic import synthesise
 
     values: dict[str, Any] = {"seconds": seconds, "fps": fps, "seed": seed, "motion": motion}

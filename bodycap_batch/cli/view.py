@@ -12,7 +12,7 @@ import typer
 from bodycap_batch.cli.base import app
 from bodycap_batch.cli.options import JobArgument, OutOption, StoreOption, default_store, results_folder
 from bodycap_batch.cli.report import job_of
-from bodycap_batch.errors import BodycapError, JobError
+from bodycap_batch.core.errors import BodycapError, JobError
 
 if TYPE_CHECKING:
     from bodycap_batch.config.models import Job
@@ -75,7 +75,7 @@ def view(
 def _stored_inputs(job: Job, out_dir: Path, store: Path) -> ReportInputs:
     """What the store holds of a job."""
     from bodycap_batch.pipeline import Settings, stored_for_report
-    from bodycap_batch.store import Store
+    from bodycap_batch.store.artefacts import Store
     from bodycap_batch.tasks.report import load_inputs
 
     settings = Settings(store=Store(store), threads=1, listener=lambda _: None, cancelled=lambda: False)

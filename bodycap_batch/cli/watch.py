@@ -147,7 +147,7 @@ def _live_page(watcher: Watcher, options: WatchOptions, address: str | None, tok
 
 
 def _folder(path: Path) -> Path:
-    from bodycap_batch.errors import JobError
+    from bodycap_batch.core.errors import JobError
 
     if not path.is_dir():
         raise JobError("no such folder", path=path, field="--root", hint="name a folder that exists")

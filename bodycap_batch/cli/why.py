@@ -23,7 +23,7 @@ from bodycap_batch.cli.options import (
     default_store,
     results_folder,
 )
-from bodycap_batch.errors import StoreError
+from bodycap_batch.core.errors import StoreError
 
 
 @app.command()
@@ -46,7 +46,7 @@ def why(
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.config.job import Overrides, load_job
     from bodycap_batch.pipeline import Settings, explain_job
-    from bodycap_batch.store import Store
+    from bodycap_batch.store.artefacts import Store
 
     resolved = load_job(job, Overrides(out=out, skeleton=skeleton, height_m=height))
     out_dir = results_folder(resolved)
@@ -85,8 +85,8 @@ def gc(
     Example:
       bodycap gc out/.store --delete
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.references import collect_garbage
-    from bodycap_batch.store import Store
+    from bodycap_batch.store.artefacts import Store
+    from bodycap_batch.store.references import collect_garbage
 
     named = store or Path(os.environ.get(STORE_VARIABLE) or default_store(default_out()))
     if not (named / "artefacts").is_dir():

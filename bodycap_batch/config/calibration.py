@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from bodycap_batch.camera import CAMERA_MODELS, CV2_PIXEL_OFFSET_PX, Camera, param_count
-from bodycap_batch.errors import CaptureError
+from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.model.camera import CAMERA_MODELS, CV2_PIXEL_OFFSET_PX, Camera, param_count
 
 _MAX_BYTES = 1 << 20
 _MAX_SECONDS = 1e10

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from bodycap_batch.config.yaml_source import Location, YamlSource, dotted
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 
 _ALSO = 5
 _MISSING = "this is missing"

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from bodycap_batch.config.mounts import MOUNT_NAMES, mount_of
-from bodycap_batch.errors import CaptureError, JobError
+from bodycap_batch.core.errors import CaptureError, JobError
 
 VIDEO_SUFFIXES = frozenset(
     {

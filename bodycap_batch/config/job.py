@@ -27,7 +27,7 @@ from bodycap_batch.config.models import SKELETON_PRESETS, CameraConfig, CaptureC
 from bodycap_batch.config.rules import problems_in, skeleton_of
 from bodycap_batch.config.trust import PathPolicy
 from bodycap_batch.config.yaml_source import YamlSource, read_yaml
-from bodycap_batch.errors import CaptureError, JobError
+from bodycap_batch.core.errors import CaptureError, JobError
 
 _HEIGHT_M = (0.4, 2.6)
 _LISTS = ("video", "timestamps")

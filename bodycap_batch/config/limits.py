@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from bodycap_batch.config.yaml_source import MAX_BYTES, MAX_DEPTH
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 
 _DEEPEST = 100
 """Blocks are read by recursion: far below Python's own limit."""

@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
 
-from bodycap_batch.arrays import FloatArray
 from bodycap_batch.config.calibration import Calibration
 from bodycap_batch.config.mounts import mount_of, role_of_segment
 from bodycap_batch.config.options import (
@@ -18,7 +17,8 @@ from bodycap_batch.config.options import (
     MergeOptions,
     RegistrationOptions,
 )
-from bodycap_batch.geometry import make_transform, rotation_from_quat_xyzw
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.geometry import make_transform, rotation_from_quat_xyzw
 
 NO_SKELETON = "none"
 SKELETON_PRESETS = (NO_SKELETON, "upper_body", "full_body")

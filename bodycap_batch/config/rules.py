@@ -13,7 +13,7 @@ from bodycap_batch.config.explain import Problem
 from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, Job, MountPose
 from bodycap_batch.config.mounts import MOUNT_NAMES, ROLES
 from bodycap_batch.config.options import MARKER_COUNTS
-from bodycap_batch.skeleton_presets import split_side
+from bodycap_batch.model.skeleton_presets import split_side
 
 _FREE_LIMB = {"Arm": "arm", "ForeArm": "arm", "Hand": "arm", "Leg": "leg", "Foot": "leg"}
 """Bones whose joint is not held to the trunk, and the limb that they belong to."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bodycap_batch.config.models import SKELETON_PRESETS, CaptureConfig, Job
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

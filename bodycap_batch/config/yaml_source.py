@@ -12,7 +12,7 @@ from pathlib import Path
 
 import yaml
 
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 20

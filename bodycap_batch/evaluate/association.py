@@ -6,9 +6,9 @@ from typing import Literal
 
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.formats.tum import TimedPoses
-from bodycap_batch.geometry import poses_at
+from bodycap_batch.model.geometry import poses_at
 
 Association = Literal["interpolate", "nearest"]
 

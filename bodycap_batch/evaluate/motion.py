@@ -9,14 +9,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray, IntArray
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.evaluate.association import interpolate_truth
 from bodycap_batch.evaluate.trajectories import ErrorSummary
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.tum import TimedPoses
-from bodycap_batch.geometry import Similarity, align_points, rotation_angle_rad
-from bodycap_batch.skeleton import Motion
+from bodycap_batch.model.geometry import Similarity, align_points, rotation_angle_rad
+from bodycap_batch.model.skeleton import Motion
 
 _ROLE_OF_TRUTH = {
     "root": "Hips",

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.evaluate.trajectories import ErrorSummary, TrajectoryOptions, truth_at
 from bodycap_batch.formats.tum import TimedPoses
-from bodycap_batch.geometry import align_points, invert, so3_log
+from bodycap_batch.model.geometry import align_points, invert, so3_log
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,11 +9,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.evaluate.association import Association, interpolate_truth, nearest_truth
 from bodycap_batch.formats.tum import TimedPoses, read_tum
-from bodycap_batch.geometry import Similarity, align_points, invert, rotation_angle_rad
+from bodycap_batch.model.geometry import Similarity, align_points, invert, rotation_angle_rad
 
 Alignment = Literal["sim3", "se3", "none"]
 

@@ -16,9 +16,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.geometry import so3_exp, so3_log
-from bodycap_batch.skeleton import SkeletonModel, forward_kinematics
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.model.geometry import so3_exp, so3_log
+from bodycap_batch.model.skeleton import SkeletonModel, forward_kinematics
 
 _CAMERA_SIGMA = np.repeat([np.deg2rad(0.5), 0.005], 3)
 """Rotation and centre of a localised camera: what easy captures reach (0.3-0.5°, 5 mm)."""

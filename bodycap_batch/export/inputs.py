@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.body import CameraClock, MergeResult
-from bodycap_batch.rig import RelativePose
-from bodycap_batch.scene import KeyframeSelection, Map, Trajectory
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.merge_data import CameraClock, MergeResult
+from bodycap_batch.model.relative_pose import RelativePose
+from bodycap_batch.model.scene import KeyframeSelection, Map, Trajectory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

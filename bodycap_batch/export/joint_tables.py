@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.formats.bundle import write_npz
 from bodycap_batch.formats.files import replacing, write_text
 from bodycap_batch.formats.tum import seconds_text
-from bodycap_batch.geometry import continuous_quat_xyzw
-from bodycap_batch.skeleton import Motion
+from bodycap_batch.model.geometry import continuous_quat_xyzw
+from bodycap_batch.model.skeleton import Motion
 
 COLUMNS = "time,joint,x_m,y_m,z_m,qx,qy,qz,qw,local_qx,local_qy,local_qz,local_qw,observed,sigma_m"
 

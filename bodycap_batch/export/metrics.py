@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.export.inputs import ExportInputs
 from bodycap_batch.export.placed import WORLD, main_frame, place_maps, place_trajectories
-from bodycap_batch.geometry import invert, rotation_angle_rad, transform_points
-from bodycap_batch.rig import RelativePose
-from bodycap_batch.rolling_shutter import at_mid_row, image_velocity
-from bodycap_batch.scene import Map, Trajectory
-from bodycap_batch.skeleton import Motion
+from bodycap_batch.model.geometry import invert, rotation_angle_rad, transform_points
+from bodycap_batch.model.relative_pose import RelativePose
+from bodycap_batch.model.rolling_shutter import at_mid_row, image_velocity
+from bodycap_batch.model.scene import Map, Trajectory
+from bodycap_batch.model.skeleton import Motion
 
 
 def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.errors import JobError, StoreError
+from bodycap_batch.core.arrays import BoolArray
+from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.bvh import read_bvh, write_bvh
 from bodycap_batch.formats.c3d import Points
 from bodycap_batch.formats.gltf import read_glb, write_glb
 from bodycap_batch.formats.usd import read_usd, write_usd
-from bodycap_batch.geometry import rotation_angle_rad
-from bodycap_batch.skeleton import Motion, SkeletonModel
+from bodycap_batch.model.geometry import rotation_angle_rad
+from bodycap_batch.model.skeleton import Motion, SkeletonModel
 
 POSITION_TOLERANCE_M = 1e-4
 ANGLE_TOLERANCE_DEG = 0.01

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from bodycap_batch.export.inputs import ExportInputs
-from bodycap_batch.geometry import Similarity
-from bodycap_batch.scene import Map, Trajectory
+from bodycap_batch.model.geometry import Similarity
+from bodycap_batch.model.scene import Map, Trajectory
 
 WORLD = "world"
 

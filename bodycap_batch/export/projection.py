@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray, FloatArray
-from bodycap_batch.body import CameraClock, MergeResult, standing_sigma_m
+from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.export.corrections import Correction, Planted, Problem, Tracked, solve_correction
-from bodycap_batch.geometry import invert, poses_at, rotation_angle_rad
-from bodycap_batch.skeleton import Motion, SkeletonModel, forward_kinematics
+from bodycap_batch.model.geometry import invert, poses_at, rotation_angle_rad
+from bodycap_batch.model.merge_data import CameraClock, MergeResult, standing_sigma_m
+from bodycap_batch.model.skeleton import Motion, SkeletonModel, forward_kinematics
 
 _MAX_GAP_FRAMES = 1.6
 """A measured pose is interpolated between neighbouring frames, never across a lost one."""

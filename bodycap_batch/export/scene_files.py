@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.export.inputs import ExportInputs
 from bodycap_batch.export.placed import WORLD, PlacedMap, main_frame, place_maps, place_trajectories
 from bodycap_batch.formats.colmap import write_colmap_model
 from bodycap_batch.formats.palette import camera_colours
 from bodycap_batch.formats.ply import PointCloud, with_paths, write_ply
 from bodycap_batch.formats.tum import TimedPoses, write_tum
-from bodycap_batch.scene import Trajectory
+from bodycap_batch.model.scene import Trajectory
 
 PATH_SPACING_M = 0.01
 _PATH_SPACING_SHARE = 1e-3

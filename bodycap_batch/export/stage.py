@@ -7,10 +7,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.body import MergeResult
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.export.inputs import ExportInputs
 from bodycap_batch.export.joint_tables import write_joint_arrays, write_joint_table
 from bodycap_batch.export.layout import lay_out
@@ -24,7 +23,8 @@ from bodycap_batch.formats.fbx import write_fbx
 from bodycap_batch.formats.files import write_text
 from bodycap_batch.formats.needs import require_libraries
 from bodycap_batch.formats.trc import write_trc
-from bodycap_batch.skeleton import Motion, as_in_file
+from bodycap_batch.model.merge_data import MergeResult
+from bodycap_batch.model.skeleton import Motion, as_in_file
 
 
 def export_results(inputs: ExportInputs, options: ExportOptions, context: StageContext) -> tuple[Path, ...]:

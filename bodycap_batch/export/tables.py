@@ -12,7 +12,7 @@ from bodycap_batch.export.inputs import ExportInputs
 from bodycap_batch.export.placed import place_trajectories
 from bodycap_batch.formats.files import write_text
 from bodycap_batch.formats.tum import seconds_text
-from bodycap_batch.scene import FrameStatus
+from bodycap_batch.model.scene import FrameStatus
 
 COLUMNS = ("camera", "frame", "time", "common_time", "status", "reason", "inliers", "error")
 LOST = "LOST"

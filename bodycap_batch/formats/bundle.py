@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from bodycap_batch.errors import StoreError
+from bodycap_batch.core.errors import StoreError
 
 T = TypeVar("T")
 Arrays = dict[str, np.ndarray[Any, Any]]

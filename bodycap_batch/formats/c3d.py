@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray, set_array
-from bodycap_batch.errors import JobError, StoreError
+from bodycap_batch.core.arrays import FloatArray, set_array
+from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.files import replacing
 
 _MM_PER_M = 1000.0

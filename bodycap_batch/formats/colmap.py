@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray, IntArray
-from bodycap_batch.camera import Camera
+from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.formats.files import replacing
-from bodycap_batch.geometry import Similarity, invert, quat_xyzw_from_rotation
-from bodycap_batch.scene import Map
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import Similarity, invert, quat_xyzw_from_rotation
+from bodycap_batch.model.scene import Map
 
 _MODEL_IDS = {
     "SIMPLE_PINHOLE": 0,

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray, IntArray
-from bodycap_batch.skeleton import SkeletonModel, rest_pose
+from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.model.skeleton import SkeletonModel, rest_pose
 
 _WAIST = 0.15
 """Where along the bone its spindle is widest."""

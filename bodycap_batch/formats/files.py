@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from bodycap_batch.errors import StoreError
+from bodycap_batch.core.errors import StoreError
 
 _REMEDIES = {
     errno.ENOSPC: "the disk is full: free some space, or write elsewhere with --out",

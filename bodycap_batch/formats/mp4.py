@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal, Self
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.errors import StoreError
+from bodycap_batch.core.errors import StoreError
 from bodycap_batch.formats.files import store_error
 
 if TYPE_CHECKING:

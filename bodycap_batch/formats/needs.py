@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from importlib.util import find_spec
 
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 
 _MODULES = {"usd": "pxr", "c3d": "ezc3d"}
 

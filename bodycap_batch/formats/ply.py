@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import FloatArray, set_array
-from bodycap_batch.errors import StoreError
+from bodycap_batch.core.arrays import FloatArray, set_array
+from bodycap_batch.core.errors import StoreError
 from bodycap_batch.formats.files import replacing
 from bodycap_batch.formats.open3d_library import load_open3d
 from bodycap_batch.formats.palette import Colour, camera_colours

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray, frozen_array
+from bodycap_batch.core.arrays import FloatArray, frozen_array
 from bodycap_batch.formats.c3d import Points
 from bodycap_batch.formats.files import write_text
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray, IntArray, set_array
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.arrays import FloatArray, IntArray, set_array
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.files import write_text
-from bodycap_batch.geometry import make_transform, quat_xyzw_from_rotation, rotation_from_quat_xyzw
+from bodycap_batch.model.geometry import make_transform, quat_xyzw_from_rotation, rotation_from_quat_xyzw
 
 _NS_PER_S = 1_000_000_000
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.errors import JobError, StoreError
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.figure import Figure, stick_figure
 from bodycap_batch.formats.files import replacing
-from bodycap_batch.geometry import continuous_quat_xyzw, invert, rotation_from_quat_xyzw
-from bodycap_batch.skeleton import Motion, SkeletonModel, rest_pose
+from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, rotation_from_quat_xyzw
+from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 
 _BODY, _SKELETON, _FIGURE = "/Body", "/Body/Skeleton", "/Body/Figure"
 _MOTION = "/Body/Skeleton/Motion"

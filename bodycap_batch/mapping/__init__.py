@@ -10,16 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bodycap_batch.arrays import IntArray
-from bodycap_batch.camera import Camera
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import EstimationError
-from bodycap_batch.mapping.confirmed import drop_unconfirmed
-from bodycap_batch.mapping.consistency import inconsistent, too_few
-from bodycap_batch.mapping.convert import to_map
-from bodycap_batch.mapping.database import (
+from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.mapping.intrinsics.intrinsics_check import change_lenses, misfitting_lenses
+from bodycap_batch.mapping.intrinsics.readout_time import RollingModel, readouts, with_readouts
+from bodycap_batch.mapping.intrinsics.recalibration import as_mapped, freed_where_contradicted
+from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     ImageRef,
     add_camera,
@@ -27,17 +26,12 @@ from bodycap_batch.mapping.database import (
     camera_ids,
     image_ids,
 )
-from bodycap_batch.mapping.freeing import as_mapped, freed_where_contradicted
-from bodycap_batch.mapping.initial import Start, named_start, rank_starts
-from bodycap_batch.mapping.large import refine_large
-from bodycap_batch.mapping.lens import change_lenses, misfitting_lenses
-from bodycap_batch.mapping.mirrored import explained, without_mirrored
-from bodycap_batch.mapping.pairs import PairChooser, link_keyframes
-from bodycap_batch.mapping.placing import place_others
-from bodycap_batch.mapping.reach import Reach, check_reach
-from bodycap_batch.mapping.repair import Workshop, cut_doubtful, place_again, repair
-from bodycap_batch.mapping.rolling import RollingModel, readouts, with_readouts
-from bodycap_batch.mapping.solve import (
+from bodycap_batch.mapping.matching.flipped_cameras import explained, without_mirrored
+from bodycap_batch.mapping.matching.pair_selection import PairChooser, link_keyframes
+from bodycap_batch.mapping.matching.skeletal_set import MANY
+from bodycap_batch.mapping.reconstruction.conversion import to_map
+from bodycap_batch.mapping.reconstruction.initial_pair import Start, named_start, rank_starts
+from bodycap_batch.mapping.reconstruction.reconstruct import (
     MODELS_NAME,
     mapper_options,
     reconstruct,
@@ -45,9 +39,15 @@ from bodycap_batch.mapping.solve import (
     settle,
     write_models,
 )
-from bodycap_batch.mapping.spanning import MANY
-from bodycap_batch.scene import KeyframeSelection, MapResult, Trajectory
-from bodycap_batch.tracking import pixel_scale
+from bodycap_batch.mapping.reconstruction.two_step_adjustment import refine_large
+from bodycap_batch.mapping.validation.camera_distance_check import Reach, check_reach
+from bodycap_batch.mapping.validation.epipolar_consistency import inconsistent, too_few
+from bodycap_batch.mapping.validation.remaining_keyframes import place_others
+from bodycap_batch.mapping.validation.repair import Workshop, cut_doubtful, place_again, repair
+from bodycap_batch.mapping.validation.transient_points import drop_unconfirmed
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.optical_flow import pixel_scale
+from bodycap_batch.model.scene import KeyframeSelection, MapResult, Trajectory
 
 if TYPE_CHECKING:
     import pycolmap

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from bodycap_batch.body import MergeInputs, MergeResult
 from bodycap_batch.config.options import MergeOptions
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.model.merge_data import MergeInputs, MergeResult
 
 __all__ = ["merge_trajectories"]
 

@@ -8,26 +8,41 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray, IntArray
-from bodycap_batch.body import MergeInputs, MergeResult
 from bodycap_batch.config.options import MergeOptions
-from bodycap_batch.context import StageContext
-from bodycap_batch.geometry import Similarity
-from bodycap_batch.merging import gauge
-from bodycap_batch.merging.bones import Bone, graph_bones
-from bodycap_batch.merging.choosing import gather
-from bodycap_batch.merging.chunks import MAX_ITERATIONS, longest_stretch, solve_motion
-from bodycap_batch.merging.complete import complete_body, observed_joints
-from bodycap_batch.merging.constants import Calibrated, Cleaned, calibrate_body, points_around
-from bodycap_batch.merging.contact import accounts, during, find_contacts, standing_joints
-from bodycap_batch.merging.initial import provisional_scale
-from bodycap_batch.merging.marginals import joints_in_axes, sigma_summary
-from bodycap_batch.merging.paths import in_world, solved_with_body
-from bodycap_batch.merging.report import build_report
-from bodycap_batch.merging.rules import soft_rules
-from bodycap_batch.merging.solve import MotionGraph, Solution, hinge_errors, joint_gaps
-from bodycap_batch.merging.tracks import Track, adapt_psd, clean, loosened, make_track
-from bodycap_batch.scene import Trajectory
+from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.merging.body.bones import Bone, graph_bones
+from bodycap_batch.merging.body.completion import complete_body, observed_joints
+from bodycap_batch.merging.body.initial_poses import provisional_scale
+from bodycap_batch.merging.body_calibration.calibrate_body import (
+    Calibrated,
+    Cleaned,
+    calibrate_body,
+    points_around,
+)
+from bodycap_batch.merging.camera_paths import in_world, solved_with_body
+from bodycap_batch.merging.camera_selection import gather
+from bodycap_batch.merging.cameras.track import Track, adapt_psd, clean, loosened, make_track
+from bodycap_batch.merging.graph.foot_contact import accounts, during, find_contacts, standing_joints
+from bodycap_batch.merging.graph.joint_covariance import joints_in_axes, sigma_summary
+from bodycap_batch.merging.graph.joint_limits import soft_rules
+from bodycap_batch.merging.graph.motion_graph import MotionGraph, Solution, hinge_errors, joint_gaps
+from bodycap_batch.merging.graph.windows import MAX_ITERATIONS, longest_stretch, solve_motion
+from bodycap_batch.merging.reporting.report import build_report
+from bodycap_batch.merging.world.floor import (
+    WALKING_HEIGHT,
+    Floor,
+    feet_floor,
+    find_floor,
+    heading,
+    place,
+    standing_height,
+    upright,
+    walked_floor,
+)
+from bodycap_batch.model.geometry import Similarity
+from bodycap_batch.model.merge_data import MergeInputs, MergeResult
+from bodycap_batch.model.scene import Trajectory
 
 
 class _Progress:
@@ -150,24 +165,24 @@ def _turned(rotation: FloatArray, poses: FloatArray) -> FloatArray:
 
 def _place(
     inputs: MergeInputs, bones: Sequence[Bone], solution: Solution, calibrated: Calibrated, fps: float
-) -> tuple[Similarity, FloatArray, Any, gauge.Floor]:
+) -> tuple[Similarity, FloatArray, Any, Floor]:
     """Find the world and put the whole body into it."""
-    rotation = gauge.upright(calibrated.up.up)
+    rotation = upright(calibrated.up.up)
     turned = _turned(rotation, solution.world_from_bone)
     joints, solved = complete_body(inputs.skeleton, bones, turned)
     hips = joints[:, 0, :3, 3]
-    standing = gauge.standing_height(inputs.skeleton, 0)
+    standing = standing_height(inputs.skeleton, 0)
     # The first mount is the trunk camera's: in a long capture the first stretch may lack it.
     points = points_around(inputs, calibrated.mounts[0].camera)
     points_m, path_m = calibrated.scale * points, solution.world_from_bone[:, 0, :3, 3]
-    expected = float(np.median(hips[:, 2])) - gauge.WALKING_HEIGHT * standing
-    floor = gauge.walked_floor(points_m, path_m, calibrated.up, expected, standing) or gauge.find_floor(
+    expected = float(np.median(hips[:, 2])) - WALKING_HEIGHT * standing
+    floor = walked_floor(points_m, path_m, calibrated.up, expected, standing) or find_floor(
         points_m @ rotation[2], calibrated.up, expected, standing
     )
     if floor.source != "map":
-        floor = gauge.feet_floor(inputs.skeleton, joints, solved) or floor
+        floor = feet_floor(inputs.skeleton, joints, solved) or floor
     forward = -joints[:, 0, :3, 1]
-    placed = gauge.place(rotation, hips[0], floor.height_m, gauge.heading(forward, hips, fps))
+    placed = place(rotation, hips[0], floor.height_m, heading(forward, hips, fps))
     to_world = Similarity(1.0, placed.rotation @ rotation.T, placed.translation)
     return placed, to_world.apply_to_poses(joints), solved, floor
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray, FloatArray, IntArray, set_array
-from bodycap_batch.skeleton import Motion
-from bodycap_batch.skeleton_presets import split_side
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
+from bodycap_batch.model.skeleton import Motion
+from bodycap_batch.model.skeleton_presets import split_side
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.camera import CV2_PIXEL_OFFSET_PX
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX
 from bodycap_batch.overlay.projection import BoneLine
 from bodycap_batch.overlay.views import SeenPoints
 

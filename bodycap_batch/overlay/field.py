@@ -6,8 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.camera import Camera
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.camera import Camera
 
 _STEPS, _AZIMUTHS = 178, 16
 _WIDEST_RAD = float(np.deg2rad(89.0))

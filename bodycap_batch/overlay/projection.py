@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.camera import Camera
-from bodycap_batch.geometry import transform_points
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import transform_points
 from bodycap_batch.overlay.body import Bones
 from bodycap_batch.overlay.field import field_limit_rad, in_field
 

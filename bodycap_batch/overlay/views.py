@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray, IntArray, set_array
-from bodycap_batch.body import CameraClock, MergeResult
-from bodycap_batch.camera import Camera
-from bodycap_batch.geometry import invert, transform_points
-from bodycap_batch.scene import FrameStatus, Map, Registration
+from bodycap_batch.core.arrays import FloatArray, IntArray, set_array
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import invert, transform_points
+from bodycap_batch.model.merge_data import CameraClock, MergeResult
+from bodycap_batch.model.scene import FrameStatus, Map, Registration
 
 _INLIER_PX = 4.0
 """Largest reprojection error of an inlier at 640 px width: registration's threshold is four times a track's

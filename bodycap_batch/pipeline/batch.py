@@ -13,11 +13,11 @@ from typing import Any
 
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import Job
-from bodycap_batch.errors import EXIT_BUG, BodycapError, Cancelled, DiskAway, JobError
+from bodycap_batch.core.errors import EXIT_BUG, BodycapError, Cancelled, DiskAway, JobError
 from bodycap_batch.pipeline.run import RunSummary, run_job
 from bodycap_batch.pipeline.sample import prepare_capture
 from bodycap_batch.pipeline.settings import Settings
-from bodycap_batch.store import store_error
+from bodycap_batch.store.artefacts import store_error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.config.models import CameraConfig, Job
-from bodycap_batch.disk_room import require_room
-from bodycap_batch.errors import BodycapError, Cancelled, CaptureError, EstimationError, JobError
+from bodycap_batch.core.errors import BodycapError, Cancelled, CaptureError, EstimationError, JobError
+from bodycap_batch.core.progress import Event
 from bodycap_batch.formats.needs import require_libraries
 from bodycap_batch.pipeline.inputs import (
     all_cameras,
@@ -31,10 +31,10 @@ from bodycap_batch.pipeline.made import Made, preview_task, report_task
 from bodycap_batch.pipeline.recovery import recovery_tasks
 from bodycap_batch.pipeline.rigs import rig_tasks, segments_of
 from bodycap_batch.pipeline.settings import Settings, StageRecord
-from bodycap_batch.progress import Event
-from bodycap_batch.references import References, in_use
 from bodycap_batch.runner import NotStored, Task
-from bodycap_batch.store import Artefact
+from bodycap_batch.store.artefacts import Artefact
+from bodycap_batch.store.disk_space import require_room
+from bodycap_batch.store.references import References, in_use
 from bodycap_batch.tasks import STAGES, reach_rows, read_summary
 
 ByCamera = Mapping[str, Artefact]

@@ -8,11 +8,11 @@ from typing import Any
 
 from bodycap_batch.capture.video import MAY_READ
 from bodycap_batch.config.models import CameraConfig, CaptureConfig, Job
-from bodycap_batch.digests import FileDigests, json_digest
-from bodycap_batch.errors import Cancelled, CaptureError, JobError
-from bodycap_batch.identity import algorithm_version, library_versions
-from bodycap_batch.progress import Event, Listener
-from bodycap_batch.store import DISK_ERRORS, Artefact, ArtefactKey, store_error
+from bodycap_batch.core.errors import Cancelled, CaptureError, JobError
+from bodycap_batch.core.progress import Event, Listener
+from bodycap_batch.store.artefacts import DISK_ERRORS, Artefact, ArtefactKey, store_error
+from bodycap_batch.store.code_version import algorithm_version, library_versions
+from bodycap_batch.store.digests import FileDigests, json_digest
 from bodycap_batch.tasks import STAGES, read_summary
 
 _FILES = ("video", "timestamps", "mask")

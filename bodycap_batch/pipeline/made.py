@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bodycap_batch.config.models import Job
-from bodycap_batch.errors import BodycapError, EstimationError
+from bodycap_batch.core.errors import BodycapError, EstimationError
 from bodycap_batch.pipeline.inputs import all_cameras, body_arguments, content_of, has_body, kept_in, key_of
 from bodycap_batch.runner import Task
-from bodycap_batch.store import Artefact
+from bodycap_batch.store.artefacts import Artefact
 
 
 @dataclass(slots=True)

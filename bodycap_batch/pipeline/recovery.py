@@ -8,7 +8,7 @@ from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_POSED
 from bodycap_batch.config.models import Job
 from bodycap_batch.pipeline.inputs import beside_others, key_of
 from bodycap_batch.runner import Task
-from bodycap_batch.store import Artefact
+from bodycap_batch.store.artefacts import Artefact
 from bodycap_batch.tasks import read_summary
 
 

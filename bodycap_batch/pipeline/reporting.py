@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.config.models import Job
-from bodycap_batch.errors import BodycapError
+from bodycap_batch.core.errors import BodycapError
 from bodycap_batch.pipeline.flow import Flow
 from bodycap_batch.pipeline.made import Made, report_task
 from bodycap_batch.pipeline.results import PARTIAL, publish

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.config.folder import RUN_FILE
-from bodycap_batch.digests import remove_abandoned, temporary_beside, write_atomically
-from bodycap_batch.store import disk_errors, sync_folder
+from bodycap_batch.store.artefacts import disk_errors, sync_folder
+from bodycap_batch.store.digests import remove_abandoned, temporary_beside, write_atomically
 
 PARTIAL = "partial"
 

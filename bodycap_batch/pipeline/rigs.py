@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from bodycap_batch.config.models import CaptureConfig, Job
 from bodycap_batch.pipeline.inputs import beside_others, key_of
 from bodycap_batch.runner import Task
-from bodycap_batch.store import Artefact
+from bodycap_batch.store.artefacts import Artefact
 
 
 def segments_of(capture: CaptureConfig) -> list[list[str]]:

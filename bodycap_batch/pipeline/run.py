@@ -13,7 +13,7 @@ import yaml
 import bodycap_batch
 from bodycap_batch.config.folder import RUN_FILE
 from bodycap_batch.config.models import Job
-from bodycap_batch.errors import BodycapError, Cancelled, CaptureError, EstimationError, JobError
+from bodycap_batch.core.errors import BodycapError, Cancelled, CaptureError, EstimationError, JobError
 from bodycap_batch.pipeline.flow import Flow
 from bodycap_batch.pipeline.inputs import has_body
 from bodycap_batch.pipeline.made import Made
@@ -25,7 +25,7 @@ from bodycap_batch.pipeline.results import (
     write_results_file,
 )
 from bodycap_batch.pipeline.settings import Settings, StageRecord
-from bodycap_batch.store import Artefact
+from bodycap_batch.store.artefacts import Artefact
 from bodycap_batch.tasks import ORDER, RESULTS
 
 JOB_FILE = "job.yaml"

@@ -11,14 +11,14 @@ from typing import Any
 from pydantic import ValidationError
 
 from bodycap_batch.config.explain import job_error, problems_of
-from bodycap_batch.digests import FileDigests
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.pipeline.inputs import key_of
 from bodycap_batch.pipeline.results import publish, write_results_file
 from bodycap_batch.pipeline.settings import Settings
-from bodycap_batch.references import References, in_use
 from bodycap_batch.runner import Task
-from bodycap_batch.store import ArtefactKey
+from bodycap_batch.store.artefacts import ArtefactKey
+from bodycap_batch.store.digests import FileDigests
+from bodycap_batch.store.references import References, in_use
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.tasks import CAPTURE
 

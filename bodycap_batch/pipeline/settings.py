@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bodycap_batch.config.limits import Limits
-from bodycap_batch.errors import Cancelled
-from bodycap_batch.progress import Listener
+from bodycap_batch.core.errors import Cancelled
+from bodycap_batch.core.progress import Listener
 from bodycap_batch.runner import CHILD, Children, Executor, Rules, Runner, Task
 from bodycap_batch.runner.parent import allow, always
 from bodycap_batch.runner.turns import TakingTurns, Turns
-from bodycap_batch.store import Store
+from bodycap_batch.store.artefacts import Store
 
 
 def _no() -> bool:

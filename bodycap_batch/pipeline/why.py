@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.config.models import Job
+from bodycap_batch.core.progress import label_of
 from bodycap_batch.pipeline.flow import Flow
 from bodycap_batch.pipeline.inputs import has_body
 from bodycap_batch.pipeline.made import Made
 from bodycap_batch.pipeline.run import run_stages
 from bodycap_batch.pipeline.settings import Settings
-from bodycap_batch.progress import label_of
 from bodycap_batch.runner import NotStored, Task
-from bodycap_batch.store import MANIFEST, Store
+from bodycap_batch.store.artefacts import MANIFEST, Store
 from bodycap_batch.tasks import ORDER
 
 _INPUTS = {

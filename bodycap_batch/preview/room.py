@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.overlay import Bones
 from bodycap_batch.overlay.drawing import side_colour
 from bodycap_batch.preview.viewpoint import Viewpoint

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
 from bodycap_batch.capture import Capture
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.files import replacing
 from bodycap_batch.formats.mp4 import VideoWriter
 from bodycap_batch.formats.palette import camera_colours

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.model.scene import FrameStatus
 from bodycap_batch.overlay import Body, CameraView, SeenPoints, bone_lines, draw_overlay
 from bodycap_batch.preview.layout import Box
 from bodycap_batch.preview.text import AMBER, GREEN, GREY, RED, Colour, shortened, width_of, write
-from bodycap_batch.scene import FrameStatus
 
 Picture = npt.NDArray[np.uint8]
 

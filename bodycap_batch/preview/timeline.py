@@ -7,7 +7,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from bodycap_batch.arrays import IntArray, set_array
+from bodycap_batch.core.arrays import IntArray, set_array
 
 MAX_FRAMES = 720
 """48 seconds at 15 pictures a second, a minute at 12: what a person looks through, and what is rendered in a

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.geometry import transform_points
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.geometry import transform_points
 
 _FIELD_RAD = float(np.deg2rad(42.0))
 _ELEVATION_RAD = float(np.deg2rad(17.0))

@@ -7,23 +7,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.config.lost_frames import LEAST_LOST
-from bodycap_batch.context import StageContext
-from bodycap_batch.registration.growth import wanted_keyframes
-from bodycap_batch.registration.pose import FramePose, PoseLimits
-from bodycap_batch.registration.recovery import recover_lost, recoverable
-from bodycap_batch.registration.rigs import RigCamera, first_poses, members_of, relative_poses
-from bodycap_batch.registration.seams import misplaced, without_keyframes
-from bodycap_batch.registration.settling import settled_points, without_weak_ends
-from bodycap_batch.registration.solving import matrices, solve_frames, solve_rig
-from bodycap_batch.registration.steadying import steadied
-from bodycap_batch.registration.stretches import Known, all_tracks
-from bodycap_batch.registration.tracks import Tracks, anchors_of, track_scale
-from bodycap_batch.rig import RelativePose
-from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
+from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.model.relative_pose import RelativePose
+from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
+from bodycap_batch.registration.poses.keyframe_requests import wanted_keyframes
+from bodycap_batch.registration.poses.misplaced_keyframes import misplaced, without_keyframes
+from bodycap_batch.registration.poses.pnp import FramePose, PoseLimits
+from bodycap_batch.registration.poses.rig_members import RigCamera, first_poses, members_of, relative_poses
+from bodycap_batch.registration.poses.trajectory import matrices, solve_frames, solve_rig
+from bodycap_batch.registration.recovery.path_smoothing import steadied
+from bodycap_batch.registration.recovery.point_refinement import settled_points, without_weak_ends
+from bodycap_batch.registration.recovery.recover import recover_lost, recoverable
+from bodycap_batch.registration.tracking.frame_ranges import Known, all_tracks
+from bodycap_batch.registration.tracking.klt import Tracks, anchors_of, track_scale
 
 __all__ = [
     "RigCamera",

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.arrays import IntArray
+from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.core.percent import percent
+from bodycap_batch.model.scene import Map
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.losses import Cause
 from bodycap_batch.report.placing import common_times_s
 from bodycap_batch.report.verdict import other_lens
-from bodycap_batch.scene import Map
-from bodycap_batch.shares import percent
 
 _MATTERS = 0.02
 """Share of all frames from which a cause is worth a change of habit."""

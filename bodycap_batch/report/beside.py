@@ -6,10 +6,10 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
+from bodycap_batch.core.percent import percent
+from bodycap_batch.model.relative_pose import MIN_INSTANTS
+from bodycap_batch.model.skeleton_presets import split_side
 from bodycap_batch.report.grades import Criterion, Grade, graded
-from bodycap_batch.rig import MIN_INSTANTS
-from bodycap_batch.shares import percent
-from bodycap_batch.skeleton_presets import split_side
 
 _TWISTS = "ForeArm"
 """A bone that is turned along its length: a camera at the wrist turns against one near the elbow."""

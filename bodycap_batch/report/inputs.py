@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from bodycap_batch.body import CameraClock, MergeResult
 from bodycap_batch.capture import Capture
-from bodycap_batch.scene import KeyframeSelection, Map, Registration, Trajectory
-from bodycap_batch.skeleton import Mount
+from bodycap_batch.model.merge_data import CameraClock, MergeResult
+from bodycap_batch.model.scene import KeyframeSelection, Map, Registration, Trajectory
+from bodycap_batch.model.skeleton import Mount
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,12 +9,12 @@ from enum import StrEnum
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.geometry import rotation_angle_rad
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.geometry import rotation_angle_rad
+from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.pictures import Look
 from bodycap_batch.report.placing import common_times_s
-from bodycap_batch.scene import FrameStatus, Trajectory
 
 _BLURRED = 0.6
 """Sharpness over that of the camera's registered frames; registration calls a frame blurred at this too."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.losses import Cause, Loss, cause_of, find_losses
 from bodycap_batch.report.packing import thinned

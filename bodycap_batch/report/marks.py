@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.body import MergeResult
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.merge_data import MergeResult
+from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.overlay import Body, CameraView, bone_lines, camera_views
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.packing import pack_scaled
-from bodycap_batch.scene import Trajectory
 
 _MAX_INLIERS = 120
 _LINE_POINTS = 6

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import FloatArray, IntArray
+from bodycap_batch.core.arrays import FloatArray, IntArray
 
 NONE = 65535
 """The 16-bit code of a value that is not there."""

@@ -10,7 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.errors import StoreError
+from bodycap_batch.core.errors import StoreError
 
 LIBRARY = "k3d"
 """The package whose browser bundle, with all of three.js in it, is written into the page."""

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray, IntArray
 from bodycap_batch.capture import CaptureCamera
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import CaptureError
+from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.report.packing import thinned
 
 SERIES_BUDGET = 6_000_000

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray, IntArray
-from bodycap_batch.geometry import Similarity
+from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.model.geometry import Similarity
+from bodycap_batch.model.scene import Map, Trajectory
 from bodycap_batch.report.inputs import ReportInputs
-from bodycap_batch.scene import Map, Trajectory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.body import MergeResult
-from bodycap_batch.errors import JobError, StoreError
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.palette import Colour, camera_colours
-from bodycap_batch.geometry import quat_xyzw_from_rotation
+from bodycap_batch.model.geometry import quat_xyzw_from_rotation
+from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.marks import solved_body
 from bodycap_batch.report.placing import Placed, PlacedPath, place

@@ -16,7 +16,7 @@ import numpy as np
 
 from bodycap_batch.capture import Capture
 from bodycap_batch.capture.cameras import CaptureCamera
-from bodycap_batch.errors import StoreError
+from bodycap_batch.core.errors import StoreError
 
 LOOPBACK = "127.0.0.1"
 _TYPES = {".mp4": "video/mp4", ".m4v": "video/mp4", ".mov": "video/mp4", ".mkv": "video/x-matroska"}

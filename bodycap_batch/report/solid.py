@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.body import MergeResult
-from bodycap_batch.geometry import quat_xyzw_from_rotation
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.geometry import quat_xyzw_from_rotation
+from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.packing import Shown, affordable, pack_bytes, pack_scaled, thinned
 from bodycap_batch.report.placing import Placed, PlacedPath

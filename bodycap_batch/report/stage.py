@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.files import write_text
 from bodycap_batch.formats.palette import as_hex, camera_colours
 from bodycap_batch.report.content import page_content

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from bodycap_batch.core.percent import percent
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.solid import joint_sigma_m
-from bodycap_batch.shares import percent
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

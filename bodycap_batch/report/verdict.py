@@ -6,9 +6,9 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from bodycap_batch.core.percent import percent
 from bodycap_batch.report.beside import of_reach, of_shared_segments
 from bodycap_batch.report.grades import Criterion, Grade, graded
-from bodycap_batch.shares import percent
 
 _SHARP_PX = 1.0
 """Mean reprojection error that sharp corners and a lens that fits stay below."""

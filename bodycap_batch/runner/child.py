@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from bodycap_batch.context import THREADS_VARIABLE, StageContext
-from bodycap_batch.errors import (
+from bodycap_batch.core.context import THREADS_VARIABLE, StageContext
+from bodycap_batch.core.errors import (
     EXIT_BUG,
     BodycapError,
     Cancelled,
@@ -29,9 +29,9 @@ from bodycap_batch.errors import (
     JobError,
     StoreError,
 )
-from bodycap_batch.memory import give_back
+from bodycap_batch.core.memory import give_back
 from bodycap_batch.runner.task import Task, TaskFunction, task_from_json
-from bodycap_batch.store import DISK_ERRORS, Store, store_error
+from bodycap_batch.store.artefacts import DISK_ERRORS, Store, store_error
 
 _PROGRESS_PERIOD_S = 0.2
 _GRACE_S = 3.0

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from bodycap_batch.errors import BodycapError, Cancelled, error_from_dict
+from bodycap_batch.core.errors import BodycapError, Cancelled, error_from_dict
 from bodycap_batch.runner.child import FULL_DISK_BYTES, disk_full
 from bodycap_batch.runner.process import CHILD, Child, crash_hint, death
 from bodycap_batch.runner.task import Task
-from bodycap_batch.store import Store, disk_errors
+from bodycap_batch.store.artefacts import Store, disk_errors
 
 CHILDREN_LOG = "children.log"
 STOPPED = "stopped on request; finished stages are kept"

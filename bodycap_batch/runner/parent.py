@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.errors import BodycapError, Cancelled, StoreError
-from bodycap_batch.progress import Event, Listener
+from bodycap_batch.core.errors import BodycapError, Cancelled, StoreError
+from bodycap_batch.core.progress import Event, Listener
 from bodycap_batch.runner.children import Executor, Making
 from bodycap_batch.runner.task import Task
-from bodycap_batch.store import Artefact, Store
+from bodycap_batch.store.artefacts import Artefact, Store
 
 _HINT = (
     "run the job first (`bodycap run`); where it was run before, `bodycap why` tells what has changed since"

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from bodycap_batch.errors import Cancelled
+from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.runner.children import STOPPED, Children, Making
 from bodycap_batch.runner.process import CHILD
 from bodycap_batch.runner.task import Task

@@ -8,11 +8,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.errors import BodycapError, StoreError
-from bodycap_batch.identity import algorithm_version, library_versions
+from bodycap_batch.core.errors import BodycapError, StoreError
 from bodycap_batch.runner.children import Children, Making
 from bodycap_batch.runner.task import Task, task_from_json
-from bodycap_batch.store import Store
+from bodycap_batch.store.artefacts import Store
+from bodycap_batch.store.code_version import algorithm_version, library_versions
 from bodycap_batch.tasks import STAGES
 
 _children: dict[tuple[str, ...], Children] = {}

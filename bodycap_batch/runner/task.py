@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.context import StageContext
-from bodycap_batch.progress import label_of
-from bodycap_batch.store import ArtefactKey
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.progress import label_of
+from bodycap_batch.store.artefacts import ArtefactKey
 
 TaskFunction = Callable[[Mapping[str, Any], Mapping[str, Any], StageContext, Path], None]
 """Called with options, arguments, context and the folder that becomes the artefact."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from bodycap_batch.errors import Cancelled
+from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.runner.children import STOPPED, Executor, Making
 from bodycap_batch.runner.task import Task
 

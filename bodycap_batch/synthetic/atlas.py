@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray
 
 _OCTAVES = 5
 _STEPS = 2

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.bvh import read_bvh
-from bodycap_batch.geometry import interpolate_pose, make_transform
-from bodycap_batch.skeleton import Motion, SkeletonModel, forward_kinematics
+from bodycap_batch.model.geometry import interpolate_pose, make_transform
+from bodycap_batch.model.skeleton import Motion, SkeletonModel, forward_kinematics
 
 
 class Clip:

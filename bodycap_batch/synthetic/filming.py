@@ -9,8 +9,8 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.skeleton import Mount, SkeletonModel, forward_kinematics
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.skeleton import Mount, SkeletonModel, forward_kinematics
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
 from bodycap_batch.synthetic.lens import RayGrid
 from bodycap_batch.synthetic.render import Triangles, View, joined

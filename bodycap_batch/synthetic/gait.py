@@ -13,8 +13,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.skeleton import SkeletonModel, forward_kinematics
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.skeleton import SkeletonModel, forward_kinematics
 from bodycap_batch.synthetic.pressing import ArmAngles, Press
 
 _LAP_S = 13.0

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import BoolArray, FloatArray
-from bodycap_batch.camera import Camera
+from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.model.camera import Camera
 
 _NEWTON_STEPS = 30
 _DERIVATIVE_STEP = 1e-6

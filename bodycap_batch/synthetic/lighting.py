@@ -8,7 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.synthetic.raycast import RayScene
 from bodycap_batch.synthetic.surfaces import Surface
 from bodycap_batch.synthetic.textures import shaded

@@ -14,12 +14,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import JobError, StoreError
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.files import store_error
 from bodycap_batch.formats.mp4 import VideoWriter
-from bodycap_batch.skeleton import Mount
+from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
 from bodycap_batch.synthetic.clip import load_clip
 from bodycap_batch.synthetic.filming import Film, Moving, Sensor, camera_at

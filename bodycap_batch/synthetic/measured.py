@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.arrays import BoolArray, FloatArray
-from bodycap_batch.geometry import make_transform, so3_exp
+from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.synthetic.options import SynthOptions
 
 _BURST_FRAMES = (2, 7)

@@ -8,9 +8,9 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from bodycap_batch.camera import CAMERA_MODELS, Camera, param_count
 from bodycap_batch.config.mounts import mount_of
 from bodycap_batch.config.options import Options
+from bodycap_batch.model.camera import CAMERA_MODELS, Camera, param_count
 
 _EARLIEST_S = 3.0
 """The walk begins a little before the common clock's zero."""

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.skeleton import Mount, SkeletonModel
-from bodycap_batch.skeleton_presets import segment_axes
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.skeleton import Mount, SkeletonModel
+from bodycap_batch.model.skeleton_presets import segment_axes
 
 RAMP_S = 0.5
 """From walking to the chest and back: an unhurried hand."""

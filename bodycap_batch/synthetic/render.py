@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.synthetic.atlas import Atlas, Bytes, Filter, Float32, filter_for
 from bodycap_batch.synthetic.lens import RayGrid
 from bodycap_batch.synthetic.raycast import NOTHING, RayScene

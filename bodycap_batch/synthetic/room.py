@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.synthetic import pictures, textures
 from bodycap_batch.synthetic.lighting import light_surfaces
 from bodycap_batch.synthetic.surfaces import UINT8, Surface, box_faces, surface_facing

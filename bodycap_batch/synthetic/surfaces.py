@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.geometry import so3_exp
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.geometry import so3_exp
 
 UINT8 = npt.NDArray[np.uint8]
 

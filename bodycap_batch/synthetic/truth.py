@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray, IntArray
+from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.formats.bvh import write_bvh
 from bodycap_batch.formats.files import replacing, write_text
 from bodycap_batch.formats.tum import TimedPoses, seconds_text, write_tum
-from bodycap_batch.geometry import quat_xyzw_from_rotation
-from bodycap_batch.skeleton import Motion, Mount, SkeletonModel
+from bodycap_batch.model.geometry import quat_xyzw_from_rotation
+from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
 from bodycap_batch.synthetic.filming import Moving, joints_at
 from bodycap_batch.synthetic.options import SynthOptions
 

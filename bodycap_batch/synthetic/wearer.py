@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.skeleton import Mount, SkeletonModel
-from bodycap_batch.skeleton_presets import rest_positions, split_side
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.skeleton import Mount, SkeletonModel
+from bodycap_batch.model.skeleton_presets import rest_positions, split_side
 from bodycap_batch.synthetic import textures
 from bodycap_batch.synthetic.render import Triangles
 from bodycap_batch.synthetic.surfaces import UINT8

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from bodycap_batch.tasks.stage import Json
 
 if TYPE_CHECKING:
-    from bodycap_batch.skeleton import Mount, SkeletonModel
+    from bodycap_batch.model.skeleton import Mount, SkeletonModel
 
 
 def load_body(arguments: Json) -> tuple[SkeletonModel, tuple[Mount, ...]]:
@@ -23,7 +23,7 @@ def reach_rows(body: Json) -> list[tuple[str, str, float, float]]:
     Args:
         body: Skeleton and mounts, as the merge task takes them.
     """
-    from bodycap_batch.skeleton_presets import camera_reach
+    from bodycap_batch.model.skeleton_presets import camera_reach
 
     # A map has no scale, so only proportions matter to it: a stature stated later makes no other map.
     return camera_reach(*load_body({**body, "height_m": None}))
@@ -33,8 +33,8 @@ def mount_prior(block: Json, skeleton: SkeletonModel) -> Mount:
     """The prior of one camera's mount: nominal for its place, or what the job measured."""
     import numpy as np
 
-    from bodycap_batch.skeleton import Mount
-    from bodycap_batch.skeleton_presets import STATED_SIGMA_M, STATED_SIGMA_RAD, nominal_mount
+    from bodycap_batch.model.skeleton import Mount
+    from bodycap_batch.model.skeleton_presets import STATED_SIGMA_M, STATED_SIGMA_RAD, nominal_mount
 
     nominal = nominal_mount(block["place"], block["role"], skeleton)
     pose, sigma_deg, sigma_m = (block[name] for name in ("joint_from_cam", "sigma_deg", "sigma_m"))
@@ -52,10 +52,10 @@ def mount_prior(block: Json, skeleton: SkeletonModel) -> Mount:
 def _skeleton(arguments: Json) -> SkeletonModel:
     if arguments["skeleton_file"] is not None:
         from bodycap_batch.formats.bvh import RigOptions, read_rig
-        from bodycap_batch.skeleton import in_tpose
+        from bodycap_batch.model.skeleton import in_tpose
 
         rig = RigOptions(roles=arguments["skeleton_map"], tpose_frame=arguments["tpose_frame"])
         return in_tpose(read_rig(Path(arguments["skeleton_file"]), rig)[0])
-    from bodycap_batch.skeleton_presets import load_skeleton
+    from bodycap_batch.model.skeleton_presets import load_skeleton
 
     return load_skeleton(arguments["skeleton"], arguments["height_m"])

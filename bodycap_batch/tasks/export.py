@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.loading import load_keyframes, load_map
 from bodycap_batch.tasks.registered import Registered
 from bodycap_batch.tasks.stage import RESULTS, Json, Stage
 
 
 def _export(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
-    from bodycap_batch.body import MergeResult
     from bodycap_batch.config import ExportOptions
     from bodycap_batch.export import ExportInputs, export_results
     from bodycap_batch.formats.bundle import read_bundle
+    from bodycap_batch.model.merge_data import MergeResult
 
     scene = load_map(arguments["map"])
     found = Registered.load(arguments["registrations"], scene.maps)

@@ -10,7 +10,7 @@ from bodycap_batch.tasks.stage import Json
 
 if TYPE_CHECKING:
     from bodycap_batch.capture import Capture, KeptFrames
-    from bodycap_batch.scene import KeyframeSelection, MapResult, Registration
+    from bodycap_batch.model.scene import KeyframeSelection, MapResult, Registration
 
 
 def load_capture(arguments: Json) -> Capture:
@@ -36,7 +36,7 @@ def _kept(folder: str | None) -> KeptFrames | None:
 def load_keyframes(path: str) -> KeyframeSelection:
     """Read a camera's keyframes."""
     from bodycap_batch.formats.bundle import read_bundle
-    from bodycap_batch.scene import KeyframeSelection
+    from bodycap_batch.model.scene import KeyframeSelection
 
     return read_bundle(KeyframeSelection, Path(path), "keyframes")
 
@@ -44,7 +44,7 @@ def load_keyframes(path: str) -> KeyframeSelection:
 def load_map(path: str) -> MapResult:
     """Read a map with its workspace."""
     from bodycap_batch.formats.bundle import read_bundle
-    from bodycap_batch.scene import MapResult
+    from bodycap_batch.model.scene import MapResult
 
     return read_bundle(MapResult, Path(path), "map")
 
@@ -52,6 +52,6 @@ def load_map(path: str) -> MapResult:
 def load_registration(path: str) -> Registration:
     """Read a camera's poses."""
     from bodycap_batch.formats.bundle import read_bundle
-    from bodycap_batch.scene import Registration
+    from bodycap_batch.model.scene import Registration
 
     return read_bundle(Registration, Path(path), "registration")

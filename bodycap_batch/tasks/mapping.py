@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.stage import SEEING, VISION, Json, Stage, write_summary
 
 if TYPE_CHECKING:
-    from bodycap_batch.scene import MapResult
+    from bodycap_batch.model.scene import MapResult
 
 
 def _map(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
@@ -52,9 +52,9 @@ def _refine(options: Json, arguments: Json, context: StageContext, files: Path) 
 def _save_map(result: MapResult, files: Path) -> None:
     """Keep a map together with the workspace that is needed to extend it."""
     from bodycap_batch.formats.bundle import write_bundle
-    from bodycap_batch.mapping.freeing import FREED
-    from bodycap_batch.mapping.lens import misfit_note
-    from bodycap_batch.mapping.mirrored import mirror_notes
+    from bodycap_batch.mapping.intrinsics.intrinsics_check import misfit_note
+    from bodycap_batch.mapping.intrinsics.recalibration import FREED
+    from bodycap_batch.mapping.matching.flipped_cameras import mirror_notes
 
     workspace = files / "workspace"
     os.rename(result.workspace, workspace)

@@ -5,16 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import EstimationError
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.tasks.body import load_body
 from bodycap_batch.tasks.loading import load_capture, load_map
 from bodycap_batch.tasks.registered import Registered
 from bodycap_batch.tasks.stage import VISION, Json, Stage, write_summary
 
 if TYPE_CHECKING:
-    from bodycap_batch.body import MergeInputs
     from bodycap_batch.config.options import MarkerBoard
+    from bodycap_batch.model.merge_data import MergeInputs
 
 
 def _merge(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
@@ -28,7 +28,7 @@ def _merge(options: Json, arguments: Json, context: StageContext, files: Path) -
     try:
         result = merge_trajectories(inputs, options_, context)
     except EstimationError as error:
-        from bodycap_batch.mapping.mirrored import explained
+        from bodycap_batch.mapping.matching.flipped_cameras import explained
 
         explained(error, load_map(arguments["map"]).log)
         raise
@@ -40,7 +40,7 @@ def _merge(options: Json, arguments: Json, context: StageContext, files: Path) -
 
 
 def _merge_inputs(arguments: Json) -> MergeInputs:
-    from bodycap_batch.body import MergeInputs
+    from bodycap_batch.model.merge_data import MergeInputs
 
     scene = load_map(arguments["map"])
     found = Registered.load(arguments["registrations"], scene.maps)
@@ -67,7 +67,7 @@ def _with_board(
     import numpy as np
 
     from bodycap_batch.calibration.in_room import find_board_views
-    from bodycap_batch.scene import FrameStatus
+    from bodycap_batch.model.scene import FrameStatus
 
     frames, lenses = {}, {}
     maps = {item.gauge: item for item in load_map(arguments["map"]).maps}

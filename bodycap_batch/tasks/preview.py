@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.loading import load_capture, load_map, load_registration
 from bodycap_batch.tasks.registered import Registered
 from bodycap_batch.tasks.stage import RESULTS, SEEING, VISION, Json, Stage
@@ -13,11 +13,11 @@ from bodycap_batch.tasks.stage import RESULTS, SEEING, VISION, Json, Stage
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from bodycap_batch.body import MergeResult
     from bodycap_batch.capture import Capture
-    from bodycap_batch.geometry import Similarity
+    from bodycap_batch.model.geometry import Similarity
+    from bodycap_batch.model.merge_data import MergeResult
+    from bodycap_batch.model.scene import Map
     from bodycap_batch.preview import PreviewInputs
-    from bodycap_batch.scene import Map
 
 
 def _preview(_: Json, arguments: Json, context: StageContext, files: Path) -> None:
@@ -29,9 +29,9 @@ def _preview(_: Json, arguments: Json, context: StageContext, files: Path) -> No
 def _inputs(arguments: Json, path: Path) -> PreviewInputs:
     import numpy as np
 
-    from bodycap_batch.body import MergeResult
     from bodycap_batch.export import project_motion
     from bodycap_batch.formats.bundle import read_bundle
+    from bodycap_batch.model.merge_data import MergeResult
     from bodycap_batch.overlay import body_of, camera_views
     from bodycap_batch.preview import PreviewInputs
 
@@ -61,7 +61,7 @@ def _shown(maps: Sequence[Map], merge: MergeResult | None) -> dict[str, Similari
     """Where the maps stand that are in the room: those that merging placed, else the largest alone."""
     import numpy as np
 
-    from bodycap_batch.geometry import Similarity
+    from bodycap_batch.model.geometry import Similarity
 
     if merge is not None:
         return dict(merge.world_from_map)
@@ -72,7 +72,7 @@ def _trunk_first(capture: Capture, merge: MergeResult | None) -> Capture:
     """The trunk's cameras, which see the arms, come first and are shown largest; those of nobody last."""
     from dataclasses import replace
 
-    from bodycap_batch.skeleton_presets import split_side
+    from bodycap_batch.model.skeleton_presets import split_side
 
     if merge is None:
         return capture

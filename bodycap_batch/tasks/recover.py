@@ -6,14 +6,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.registered import RIG_POSES
 from bodycap_batch.tasks.registration import save_registration
 from bodycap_batch.tasks.stage import SEEING, VISION, Json, Stage, read_summary
 
 if TYPE_CHECKING:
-    from bodycap_batch.scene import Trajectory
+    from bodycap_batch.model.scene import Trajectory
 
 _MEMORY_MB = 900
 """With as many keyframes and frames held as recovery allows, at half a megabyte each."""
@@ -22,8 +22,8 @@ _MEMORY_MB = 900
 def _recover(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
     from bodycap_batch.config import RegistrationOptions
     from bodycap_batch.formats.bundle import read_bundle, write_bundle
+    from bodycap_batch.model.relative_pose import RigPoses
     from bodycap_batch.registration import RigCamera, recover_lost, settled, without_contradicted
-    from bodycap_batch.rig import RigPoses
 
     context.check_cancelled()
     capture, paths = load_capture(arguments), [Path(path) for path in arguments["registrations"]]

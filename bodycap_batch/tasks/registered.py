@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 from bodycap_batch.tasks.loading import load_registration
 
 if TYPE_CHECKING:
-    from bodycap_batch.arrays import FloatArray
-    from bodycap_batch.body import CameraClock
-    from bodycap_batch.camera import Camera
-    from bodycap_batch.rig import RelativePose
-    from bodycap_batch.scene import Map, Registration, Trajectory
+    from bodycap_batch.core.arrays import FloatArray
+    from bodycap_batch.model.camera import Camera
+    from bodycap_batch.model.merge_data import CameraClock
+    from bodycap_batch.model.relative_pose import RelativePose
+    from bodycap_batch.model.scene import Map, Registration, Trajectory
 
 RIG_POSES = "rig"
 """Name of the bundle that says where a rig's cameras sit beside each other."""
@@ -38,9 +38,9 @@ class Registered:
     @staticmethod
     def load(paths: Sequence[str], maps: Sequence[Map]) -> Registered:
         """Read one artefact per camera; rows matter where a rolling shutter is still in the poses."""
-        from bodycap_batch.body import CameraClock
-        from bodycap_batch.camera import Camera
         from bodycap_batch.formats.bundle import read_bundle
+        from bodycap_batch.model.camera import Camera
+        from bodycap_batch.model.merge_data import CameraClock
 
         corrected = {name for each in maps for name in each.readout_s}
         trajectories: list[Trajectory] = []
@@ -66,7 +66,7 @@ class Registered:
             segments: Names of the cameras on each segment that carries several.
         """
         from bodycap_batch.formats.bundle import read_bundle
-        from bodycap_batch.rig import RigPoses, relative_pose
+        from bodycap_batch.model.relative_pose import RigPoses, relative_pose
 
         path_of = {each.camera: each for each in self.trajectories}
         kept = {
@@ -90,7 +90,7 @@ def row_fraction(found: Registration, camera: Camera) -> FloatArray:
     """
     import numpy as np
 
-    from bodycap_batch.rolling_shutter import row_delay
+    from bodycap_batch.model.rolling_shutter import row_delay
 
     count = len(found.trajectory.status)
     seen = np.bincount(found.obs_frame, minlength=count)

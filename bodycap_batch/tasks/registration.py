@@ -6,19 +6,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.stage import SEEING, VISION, Json, Stage, write_summary
 
 if TYPE_CHECKING:
     from bodycap_batch.capture import CaptureCamera
-    from bodycap_batch.scene import Registration
+    from bodycap_batch.model.scene import Registration
 
 
 def _registration(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
     from bodycap_batch.config import RegistrationOptions
+    from bodycap_batch.model.rolling_shutter import looks_rolling
     from bodycap_batch.registration import register_frames
-    from bodycap_batch.rolling_shutter import looks_rolling
 
     camera = load_capture(arguments).cameras[0]
     selection = load_keyframes(arguments["selection"])
@@ -43,8 +43,8 @@ def save_registration(
     notes: Sequence[str] = (),
 ) -> None:
     """Keep a camera's poses with what the stages after it need to know of the camera."""
-    from bodycap_batch.body import CameraClock
     from bodycap_batch.formats.bundle import write_bundle
+    from bodycap_batch.model.merge_data import CameraClock
 
     write_bundle(found, files, "registration")
     clock = CameraClock(

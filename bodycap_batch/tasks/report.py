@@ -6,14 +6,14 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.body import load_body
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.stage import RESULTS, SEEING, VISION, Json, Stage
 
 if TYPE_CHECKING:
-    from bodycap_batch.body import MergeResult
     from bodycap_batch.capture import Capture
+    from bodycap_batch.model.merge_data import MergeResult
     from bodycap_batch.report import ReportInputs
 
 
@@ -25,8 +25,8 @@ def _report(_: Json, arguments: Json, context: StageContext, files: Path) -> Non
 
 def load_inputs(arguments: Json) -> ReportInputs:
     """Read what the stages before left; what a broken-off job lacks is None in the arguments."""
-    from bodycap_batch.body import CameraClock
     from bodycap_batch.formats.bundle import read_bundle
+    from bodycap_batch.model.merge_data import CameraClock
     from bodycap_batch.report import ReportInputs
 
     registrations = [load_registration(path) for path in arguments["registrations"]]
@@ -53,15 +53,15 @@ def load_inputs(arguments: Json) -> ReportInputs:
 
 
 def _merge(path: str | None) -> MergeResult | None:
-    from bodycap_batch.body import MergeResult
     from bodycap_batch.formats.bundle import read_bundle
+    from bodycap_batch.model.merge_data import MergeResult
 
     return None if path is None else read_bundle(MergeResult, Path(path), "merge")
 
 
 def _capture(arguments: Json) -> Capture | None:
     """The videos; None where it is they that stopped the job."""
-    from bodycap_batch.errors import CaptureError
+    from bodycap_batch.core.errors import CaptureError
 
     try:
         return load_capture(arguments)

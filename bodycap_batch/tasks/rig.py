@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.registered import RIG_POSES
 from bodycap_batch.tasks.registration import save_registration
@@ -14,8 +14,8 @@ from bodycap_batch.tasks.stage import SEEING, VISION, Json, Stage
 def _rig(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
     from bodycap_batch.config import RegistrationOptions
     from bodycap_batch.formats.bundle import write_bundle
+    from bodycap_batch.model.relative_pose import RigPoses, loose_note
     from bodycap_batch.registration import RigCamera, register_in_rig
-    from bodycap_batch.rig import RigPoses, loose_note
 
     context.check_cancelled()
     own, *others = (

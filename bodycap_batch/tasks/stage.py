@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 
 SUMMARY = "summary.json"
 CAPTURE = "capture"

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.digests import write_atomically
+from bodycap_batch.store.digests import write_atomically
 from bodycap_batch.watch.guard import MARKER, Guard, marker, read_owner
 from bodycap_batch.watch.spool import JobDir
 

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from bodycap_batch.config.models import Job
-from bodycap_batch.errors import BodycapError, StoreError
-from bodycap_batch.store import store_error
+from bodycap_batch.core.errors import BodycapError, StoreError
+from bodycap_batch.store.artefacts import store_error
 from bodycap_batch.watch.claim import Claim, first_claim, is_at_work
 from bodycap_batch.watch.drops import Drop, Look, look_at
 from bodycap_batch.watch.intake import Terms, other_job_files, read_drop, write_job

@@ -14,9 +14,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.errors import Cancelled, JobError
-from bodycap_batch.references import moving
-from bodycap_batch.store import Store, disk_errors
+from bodycap_batch.core.errors import Cancelled, JobError
+from bodycap_batch.store.artefacts import Store, disk_errors
+from bodycap_batch.store.references import moving
 from bodycap_batch.watch.claim import clear_claim, first_claim, host_key, process_mark, start_of
 from bodycap_batch.watch.claiming import dropped_in, give_back, is_there, settle_claim
 from bodycap_batch.watch.drops import NO_JOB, Drop, drops_in, look_at, strays_in

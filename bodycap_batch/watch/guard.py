@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.errors import Cancelled
+from bodycap_batch.core.errors import Cancelled
 
 MARKER = ".generation-"
 _EXPECTED: Mapping[str, type] = {"pid": int, "generation": int, "token": str, "machine": str, "process": str}

@@ -13,7 +13,7 @@ from bodycap_batch.config.job import load_job, safe_name
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.models import SKELETON_PRESETS, CameraConfig, Job
 from bodycap_batch.config.trust import PathPolicy
-from bodycap_batch.errors import CaptureError, JobError
+from bodycap_batch.core.errors import CaptureError, JobError
 from bodycap_batch.pipeline.results import write_results_file
 from bodycap_batch.watch.drops import YAML_SUFFIXES, Drop, Look
 from bodycap_batch.watch.spool import JobDir, visible

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.digests import write_atomically
+from bodycap_batch.store.digests import write_atomically
 from bodycap_batch.watch.claim import is_at_work, is_of_this_machine, process_mark
 from bodycap_batch.watch.spool import Spool
 from bodycap_batch.watch.status import time_text

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from bodycap_batch.errors import StoreError
-from bodycap_batch.store import disk_errors
+from bodycap_batch.core.errors import StoreError
+from bodycap_batch.store.artefacts import disk_errors
 
 INBOX, RUNNING, DONE, FAILED = "inbox", "running", "done", "failed"
 _MOVED_TO = (RUNNING, DONE, FAILED)

@@ -12,9 +12,9 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, Literal
 
-from bodycap_batch.errors import BodycapError
-from bodycap_batch.progress import Event
-from bodycap_batch.store import disk_errors
+from bodycap_batch.core.errors import BodycapError
+from bodycap_batch.core.progress import Event
+from bodycap_batch.store.artefacts import disk_errors
 from bodycap_batch.watch.spool import JobDir
 
 State = Literal["claimed", "running", "stopped", "done", "failed", "cancelled"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from bodycap_batch.errors import StoreError
-from bodycap_batch.store import store_error
+from bodycap_batch.core.errors import StoreError
+from bodycap_batch.store.artefacts import store_error
 from bodycap_batch.watch.spool import Spool
 
 _FIRST_PAUSE_S = 1.0

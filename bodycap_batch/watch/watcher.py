@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
-from bodycap_batch.errors import BodycapError, StoreError
+from bodycap_batch.core.errors import BodycapError, StoreError
 from bodycap_batch.watch.changes import Changes
 from bodycap_batch.watch.claim import Claim, Onlooker, take_over
 from bodycap_batch.watch.claiming import claim_drop, discard_empty, finish_retries, settle_claim

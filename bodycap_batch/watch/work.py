@@ -10,11 +10,11 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from bodycap_batch.errors import BodycapError, Cancelled, DiskAway, JobError, StoreError, error_from_dict
+from bodycap_batch.core.errors import BodycapError, Cancelled, DiskAway, JobError, StoreError, error_from_dict
 from bodycap_batch.pipeline import Settings, run_job
-from bodycap_batch.references import StoreBusy, moving
 from bodycap_batch.runner.turns import Turns
-from bodycap_batch.store import Store, store_error
+from bodycap_batch.store.artefacts import Store, store_error
+from bodycap_batch.store.references import StoreBusy, moving
 from bodycap_batch.watch.claim import Claim, clear_claim
 from bodycap_batch.watch.intake import read_job, rewrite_results
 from bodycap_batch.watch.options import WatchOptions

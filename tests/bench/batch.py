@@ -10,7 +10,7 @@ from typing import Any
 
 from bodycap_batch.cli import main
 from bodycap_batch.runner import Children, Executor, Making, Task
-from bodycap_batch.store import ArtefactKey, Store
+from bodycap_batch.store.artefacts import ArtefactKey, Store
 from tests.cluster.site import REAL, Site
 from tests.unit.test_runner import FAKE
 
@@ -95,7 +95,7 @@ def _batch(folder: Path, name: str, jobs: int, workers: int, threads: int) -> fl
 
 def _overhead(folder: Path) -> dict[str, float]:
     """Milliseconds of a task that does nothing, by a child that runs already."""
-    from bodycap_batch.cluster import Cluster
+    from bodycap_batch.runner.dask_cluster import Cluster
 
     folder.mkdir()
     site, store = Site(folder), Store(folder / "store")

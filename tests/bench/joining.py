@@ -44,8 +44,8 @@ PLACED_M = 0.05
 
 def run_case(split: str, seed: int, seconds: float) -> dict[str, Any]:
     """Draw one walk, place its maps, and compare with the truth."""
-    from bodycap_batch.merging.choosing import choices  # gtsam takes a second to import
-    from bodycap_batch.merging.joining import use_together
+    from bodycap_batch.merging.camera_selection import choices  # gtsam takes a second to import
+    from bodycap_batch.merging.map_alignment.align import use_together
 
     cameras = ARMS if len(SPLITS[split]) == len(ARMS) else PALMS
     options = SynthOptions(seconds=seconds, cameras=cameras, seed=seed, poses_only=True)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pycolmap
 
 from bodycap_batch.capture import Capture, CaptureCamera
-from bodycap_batch.tracking import pixel_scale
+from bodycap_batch.model.optical_flow import pixel_scale
 from tests.bench.peer_pairs import pairs_of
 from tests.bench.retrieval import similarity
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.body import CameraClock, MergeInputs
-from bodycap_batch.geometry import Similarity, so3_exp
-from bodycap_batch.scene import FrameStatus, Trajectory
-from bodycap_batch.skeleton import Mount
-from bodycap_batch.skeleton_presets import nominal_mount
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.geometry import Similarity, so3_exp
+from bodycap_batch.model.merge_data import CameraClock, MergeInputs
+from bodycap_batch.model.scene import FrameStatus, Trajectory
+from bodycap_batch.model.skeleton import Mount
+from bodycap_batch.model.skeleton_presets import nominal_mount
 from bodycap_batch.synthetic.filming import Moving, camera_at, joints_at
 from bodycap_batch.synthetic.making import Subject, draw_subject, frame_times_ns
 from bodycap_batch.synthetic.measured import measure

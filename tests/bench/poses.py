@@ -15,11 +15,11 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from bodycap_batch.arrays import BoolArray, FloatArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.evaluate.association import interpolate_truth
 from bodycap_batch.formats.tum import read_tum
-from bodycap_batch.geometry import Similarity, align_points, invert, so3_exp, so3_log
-from bodycap_batch.scene import Trajectory
+from bodycap_batch.model.geometry import Similarity, align_points, invert, so3_exp, so3_log
+from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.tasks.loading import load_registration
 
 _SOLVERS = ("registration", "recover", "rig")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray
 
 _WORDS = 64
 _SAMPLE = 30_000

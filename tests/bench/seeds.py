@@ -10,16 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config import KeyframeOptions, MapOptions
 from bodycap_batch.config.job import load_job
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.tum import read_tum
-from bodycap_batch.geometry import align_points
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build_map
-from bodycap_batch.scene import Map
+from bodycap_batch.model.geometry import align_points
+from bodycap_batch.model.scene import Map
 from tests.bench.rows import DATA
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.config.options import MergeOptions
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.posed import posed
 from tests.bench.simulation import PALMS

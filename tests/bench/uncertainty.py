@@ -24,10 +24,10 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from bodycap_batch.arrays import BoolArray, FloatArray
-from bodycap_batch.body import MergeResult
 from bodycap_batch.config.options import MergeOptions
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.model.merge_data import MergeResult
 from tests.bench.posed import GAUGE, Posed, posed
 from tests.bench.simulation import CAMERAS, Case
 

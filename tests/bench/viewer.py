@@ -23,7 +23,7 @@ def run(seconds: float = 4.0) -> dict[str, Any]:
     """Frames a second while the scene turns and plays, and the share of the points drawn meanwhile."""
     from playwright.sync_api import sync_playwright
 
-    from bodycap_batch.context import StageContext
+    from bodycap_batch.core.context import StageContext
     from bodycap_batch.report import write_report
     from tests.reports import report_inputs
 

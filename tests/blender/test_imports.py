@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.export import ExportInputs, export_results
 from bodycap_batch.export.layout import lay_out
 from bodycap_batch.export.projection import project_motion
 from bodycap_batch.formats.fbx import find_blender, write_fbx
 from bodycap_batch.formats.palette import CAMERA_COLOURS
-from bodycap_batch.geometry import Similarity, invert, rotation_angle_rad
-from bodycap_batch.skeleton import Motion
+from bodycap_batch.model.geometry import Similarity, invert, rotation_angle_rad
+from bodycap_batch.model.skeleton import Motion
 from tests.bodies import merged, reaching
 from tests.scenes import small_map
 

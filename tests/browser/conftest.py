@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.report import ReportInputs, write_report
 from tests.bench.viewer import FLAGS, chromium
 from tests.reports import report_inputs

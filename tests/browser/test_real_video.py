@@ -12,7 +12,7 @@ import pytest
 
 from bodycap_batch.capture import Capture, open_capture
 from bodycap_batch.config.models import CaptureConfig
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.report import write_report
 from bodycap_batch.report.marks import Marks
 from bodycap_batch.report.serving import LOOPBACK, MARKS_EACH, make_server, what_to_serve

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.report import ReportInputs, write_report
 from bodycap_batch.report.tables import look_up
 from tests.browser.conftest import NO_3D, Pages

@@ -223,7 +223,7 @@ def test_real_stages_with_a_worker_killed_give_the_bytes_of_one_machine(tmp_path
 
 def test_a_queue_starts_workers(site: Site) -> None:
     """Dask-Jobqueue's own stand-in for a machine room's queue: its job scripts run here."""
-    from bodycap_batch.cluster import Cluster, start_queue
+    from bodycap_batch.runner.dask_cluster import Cluster, start_queue
 
     with start_queue("local", 1, 1, 1600) as queue, Cluster(queue.scheduler_address) as cluster:
         found = wait_for(cluster.workers, "a worker of the queue")

@@ -11,11 +11,11 @@ import pytest
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config import KeyframeOptions, MapOptions, RegistrationOptions
 from bodycap_batch.config.job import load_job
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.tum import read_tum
-from bodycap_batch.geometry import align_points
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build_map
+from bodycap_batch.model.geometry import align_points
 from bodycap_batch.registration import register_frames
 
 pytestmark = [pytest.mark.data, pytest.mark.slow]

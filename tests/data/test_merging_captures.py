@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodycap_batch.body import CameraClock, MergeInputs, MergeResult
 from bodycap_batch.config.mounts import mount_of
 from bodycap_batch.config.options import MergeOptions
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.tum import read_tum
-from bodycap_batch.geometry import Similarity, align_points, make_transform, so3_exp
 from bodycap_batch.merging import merge_trajectories
-from bodycap_batch.scene import FrameStatus, Trajectory
-from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount
+from bodycap_batch.model.geometry import Similarity, align_points, make_transform, so3_exp
+from bodycap_batch.model.merge_data import CameraClock, MergeInputs, MergeResult
+from bodycap_batch.model.scene import FrameStatus, Trajectory
+from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
 
 pytestmark = pytest.mark.data
 

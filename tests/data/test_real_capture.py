@@ -10,18 +10,18 @@ import pycolmap
 import pytest
 
 from bodycap_batch import mapping
-from bodycap_batch.arrays import FloatArray
 from bodycap_batch.capture import Capture, open_capture
 from bodycap_batch.config import KeyframeOptions, MapOptions, RegistrationOptions
 from bodycap_batch.config.job import load_job
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.tum import read_tum
-from bodycap_batch.geometry import align_points
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build_map, refine_map
+from bodycap_batch.model.geometry import align_points
+from bodycap_batch.model.rolling_shutter import looks_rolling
+from bodycap_batch.model.scene import KeyframeSelection, Map, MapResult, Registration, Trajectory
 from bodycap_batch.registration import register_frames
-from bodycap_batch.rolling_shutter import looks_rolling
-from bodycap_batch.scene import KeyframeSelection, Map, MapResult, Registration, Trajectory
 
 pytestmark = [pytest.mark.data, pytest.mark.slow]
 

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import CaptureError, EstimationError
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import CaptureError, EstimationError
 from bodycap_batch.runner import child
 from bodycap_batch.tasks import STAGES
 

@@ -21,7 +21,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.runner import child
 from bodycap_batch.runner.task import TaskFunction
 from bodycap_batch.tasks import STAGES

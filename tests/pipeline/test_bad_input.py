@@ -11,7 +11,7 @@ import pytest
 from bodycap_batch.check import check_path, require_ready
 from bodycap_batch.cli import main
 from bodycap_batch.config.job import load_job
-from bodycap_batch.errors import BodycapError
+from bodycap_batch.core.errors import BodycapError
 from tests.broken import CASES, FRAMES, MIRRORED, Case, black, edit
 from tests.videos import textured_frame, write_video
 

@@ -12,7 +12,7 @@ from bodycap_batch.config.models import Job
 from bodycap_batch.pipeline import Settings, run_job
 from bodycap_batch.pipeline.flow import Flow
 from bodycap_batch.runner import Children, Making, Task
-from bodycap_batch.store import Store
+from bodycap_batch.store.artefacts import Store
 from bodycap_batch.tasks import STAGES
 from tests.pipeline.test_run import CHILD, Bench, bench
 

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from bodycap_batch.cli import main
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import EstimationError
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.evaluate import TrajectoryReport, evaluate_trajectories
 from bodycap_batch.synthetic import SynthOptions, synthesise
 from tests.altered import AS_A_PHONE, alter, covered, slower, zoomed

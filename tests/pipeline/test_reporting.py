@@ -8,7 +8,7 @@ import pytest
 
 from bodycap_batch.cli.view import _StoredMarks
 from bodycap_batch.pipeline import Settings, stored_for_report
-from bodycap_batch.store import Store
+from bodycap_batch.store.artefacts import Store
 from tests.pipeline.test_run import CAMERAS, Bench
 
 

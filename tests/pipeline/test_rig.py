@@ -12,7 +12,7 @@ import pytest
 
 from bodycap_batch.cli import main
 from bodycap_batch.evaluate import evaluate_trajectories
-from bodycap_batch.geometry import make_transform
+from bodycap_batch.model.geometry import make_transform
 from tests.rooms import look, stroll, write_capture
 
 pytestmark = pytest.mark.slow

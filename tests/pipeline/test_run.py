@@ -16,10 +16,10 @@ import pytest
 import yaml
 
 from bodycap_batch.config.models import Job
-from bodycap_batch.errors import BodycapError, Cancelled, CaptureError, EstimationError
+from bodycap_batch.core.errors import BodycapError, Cancelled, CaptureError, EstimationError
+from bodycap_batch.core.progress import Event
 from bodycap_batch.pipeline import RunSummary, Settings, run_job
-from bodycap_batch.progress import Event
-from bodycap_batch.store import Store
+from bodycap_batch.store.artefacts import Store
 from tests.pipeline.fake_stages import ORDERS
 from tests.pipeline.spools import wait_for
 from tests.results import results_of

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from bodycap_batch.errors import EstimationError, JobError
+from bodycap_batch.core.errors import EstimationError, JobError
+from bodycap_batch.core.progress import Event
 from bodycap_batch.pipeline import Settings, prepare_capture
-from bodycap_batch.progress import Event
-from bodycap_batch.store import Store
+from bodycap_batch.store.artefacts import Store
 from tests.pipeline.fake_stages import ORDERS
 
 CHILD = (sys.executable, str(Path(__file__).with_name("fake_stages.py")))

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from bodycap_batch.errors import Cancelled, StoreError
+from bodycap_batch.core.errors import Cancelled, StoreError
 from bodycap_batch.pipeline import Settings, explain_job, run_job
-from bodycap_batch.references import References, collect_garbage, in_use, moving
-from bodycap_batch.store import ArtefactKey, Store
+from bodycap_batch.store.artefacts import ArtefactKey, Store
+from bodycap_batch.store.references import References, collect_garbage, in_use, moving
 from bodycap_batch.tasks import StageName, stages_from
 from tests.pipeline.test_run import ALL, CHILD, PER_CAMERA, REGISTERED, Bench, bench, done, done_once
 

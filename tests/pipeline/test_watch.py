@@ -17,10 +17,10 @@ import yaml
 
 from bodycap_batch.cli import main
 from bodycap_batch.config.limits import Limits
-from bodycap_batch.errors import JobError, StoreError
-from bodycap_batch.progress import Event
-from bodycap_batch.references import collect_garbage
-from bodycap_batch.store import Store
+from bodycap_batch.core.errors import JobError, StoreError
+from bodycap_batch.core.progress import Event
+from bodycap_batch.store.artefacts import Store
+from bodycap_batch.store.references import collect_garbage
 from bodycap_batch.watch import Terms, cancel_job, claiming, retry_job, rows_of
 from bodycap_batch.watch.claim import Claim, first_claim, take_over
 from bodycap_batch.watch.commands import claimed_row

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 
 from bodycap_batch.cli import main
-from bodycap_batch.errors import DiskAway, StoreError
-from bodycap_batch.progress import Event
-from bodycap_batch.store import Store
+from bodycap_batch.core.errors import DiskAway, StoreError
+from bodycap_batch.core.progress import Event
+from bodycap_batch.store.artefacts import Store
 from bodycap_batch.watch import Watcher, claiming, rows_of, watchers_of
 from bodycap_batch.watch.presence import Presence
 from bodycap_batch.watch.spool import JobDir

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from bodycap_batch.config.limits import Limits
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.watch.web import Access, LivePage
 from bodycap_batch.watch.web.feed import Feed
 from tests.pipeline.spools import SpoolBench, wait_for

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from bodycap_batch.cli import main
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.pipeline import Settings
-from bodycap_batch.references import collect_garbage
-from bodycap_batch.store import Store
+from bodycap_batch.store.artefacts import Store
+from bodycap_batch.store.references import collect_garbage
 from bodycap_batch.watch import cancel_job, claiming, commands, retry_job, work
 from bodycap_batch.watch.claim import process_mark
 from bodycap_batch.watch.drops import Drop, look_at

@@ -10,12 +10,12 @@ import pytest
 
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import KeyframeOptions, MapOptions, RegistrationOptions
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build_map
+from bodycap_batch.model.scene import KeyframeSelection, MapResult, Registration
 from bodycap_batch.registration import register_frames
 from bodycap_batch.report import ReportInputs
-from bodycap_batch.scene import KeyframeSelection, MapResult, Registration
 from tests.reports import report_inputs
 from tests.rooms import stroll, write_capture
 

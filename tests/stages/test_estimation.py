@@ -11,12 +11,12 @@ import pytest
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config import KeyframeOptions, MapOptions, RegistrationOptions
 from bodycap_batch.config.job import load_job
-from bodycap_batch.errors import CaptureError, EstimationError
-from bodycap_batch.geometry import Similarity, align_points, rotation_angle_rad, so3_exp
+from bodycap_batch.core.errors import CaptureError, EstimationError
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build_map, extend_map
+from bodycap_batch.model.geometry import Similarity, align_points, rotation_angle_rad, so3_exp
+from bodycap_batch.model.scene import FrameStatus, Map
 from bodycap_batch.registration import register_frames
-from bodycap_batch.scene import FrameStatus, Map
 from tests.rooms import look, make_transform, write_capture
 from tests.stages.conftest import DARK, FRAMES, Estimated, context
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import Cancelled, JobError, StoreError
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import Cancelled, JobError, StoreError
 from bodycap_batch.export import ExportInputs, export_results
 from bodycap_batch.export.motion import motion_difference, only_solved
 from bodycap_batch.export.projection import project_motion
@@ -22,8 +22,8 @@ from bodycap_batch.formats.c3d import read_c3d
 from bodycap_batch.formats.ply import read_ply
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.formats.usd import read_usd
-from bodycap_batch.geometry import Similarity, so3_exp
-from bodycap_batch.scene import FrameStatus, KeyframeSelection
+from bodycap_batch.model.geometry import Similarity, so3_exp
+from bodycap_batch.model.scene import FrameStatus, KeyframeSelection
 from tests.bodies import CAMERAS, merged, reaching
 from tests.scenes import small_map
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bodycap_batch.body import MergeResult
 from bodycap_batch.config.options import ExportOptions, MergeOptions
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.export import ExportInputs, export_results
 from bodycap_batch.formats.bundle import read_bundle, write_bundle
 from bodycap_batch.formats.ply import read_ply
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.merging import merge_trajectories
+from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.joining import SPLITS
 from tests.bench.posed import posed

@@ -14,12 +14,12 @@ import pytest
 from bodycap_batch import mapping
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
-from bodycap_batch.context import StageContext
-from bodycap_batch.geometry import align_points
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.mapping import build_map, extend_map
-from bodycap_batch.mapping.large import refine_large
-from bodycap_batch.mapping.solve import mapper_options, part_of
-from bodycap_batch.scene import KeyframeSelection, MapResult
+from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options, part_of
+from bodycap_batch.mapping.reconstruction.two_step_adjustment import refine_large
+from bodycap_batch.model.geometry import align_points
+from bodycap_batch.model.scene import KeyframeSelection, MapResult
 from tests.rooms import stroll
 from tests.stages.conftest import DARK, FRAMES, context
 
@@ -37,7 +37,7 @@ def _built(
 ) -> MapResult:
     selections = [_selection(camera.name, frames) for camera in capture.cameras]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bodycap_batch.mapping.pairs._FEW", 10)
+        patch.setattr("bodycap_batch.mapping.matching.pair_selection._FEW", 10)
         return build_map(capture, selections, options, surroundings, many=40)
 
 

@@ -9,17 +9,17 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from bodycap_batch.body import CameraClock, MergeResult
 from bodycap_batch.config.options import MergeOptions
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import Cancelled, EstimationError
-from bodycap_batch.geometry import Similarity, align_points
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import Cancelled, EstimationError
 from bodycap_batch.merging import merge_trajectories
-from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.chunks import solve_motion, stretches
-from bodycap_batch.merging.solve import MotionGraph, Solution
-from bodycap_batch.merging.tracks import make_track
-from bodycap_batch.scene import FrameStatus
+from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.cameras.track import make_track
+from bodycap_batch.merging.graph.motion_graph import MotionGraph, Solution
+from bodycap_batch.merging.graph.windows import solve_motion, stretches
+from bodycap_batch.model.geometry import Similarity, align_points
+from bodycap_batch.model.merge_data import CameraClock, MergeResult
+from bodycap_batch.model.scene import FrameStatus
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.posed import posed
 from tests.stages.walker import FPS, ROLES, Walk, make_inputs, make_walk, record

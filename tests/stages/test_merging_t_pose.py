@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bodycap_batch.config.options import MergeOptions
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.merging import merge_trajectories
 from bodycap_batch.synthetic import synthesise
 from tests.bench import simulation

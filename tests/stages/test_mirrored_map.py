@@ -15,8 +15,8 @@ from bodycap_batch.config import KeyframeOptions, MapOptions
 from bodycap_batch.config.job import load_job
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build_map
-from bodycap_batch.mapping.mirrored import MIRROR_IMAGES, MIRRORED
-from bodycap_batch.scene import KeyframeSelection
+from bodycap_batch.mapping.matching.flipped_cameras import MIRROR_IMAGES, MIRRORED
+from bodycap_batch.model.scene import KeyframeSelection
 from tests.rooms import stroll, write_capture
 from tests.stages.conftest import context
 from tests.videos import write_video

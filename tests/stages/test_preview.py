@@ -9,9 +9,9 @@ import av
 import numpy as np
 import pytest
 
-from bodycap_batch.body import CameraClock
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import Cancelled, StoreError
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import Cancelled, StoreError
+from bodycap_batch.model.merge_data import CameraClock
 from bodycap_batch.overlay import Body, body_of, camera_views
 from bodycap_batch.preview import PreviewInputs, render_preview
 from bodycap_batch.preview.layout import place_videos

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from bodycap_batch.errors import JobError, StoreError
+from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.palette import Colour, camera_colours
 from bodycap_batch.report import ReportInputs
 from bodycap_batch.report.marks import solved_body

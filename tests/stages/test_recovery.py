@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from bodycap_batch.camera import Camera
 from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.config import RegistrationOptions
-from bodycap_batch.context import THREADS_VARIABLE, StageContext
-from bodycap_batch.geometry import (
+from bodycap_batch.core.context import THREADS_VARIABLE, StageContext
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import (
     interpolate_pose,
     invert,
     make_transform,
@@ -23,13 +23,14 @@ from bodycap_batch.geometry import (
     so3_log,
     transform_points,
 )
-from bodycap_batch.registration import RigCamera, recover_lost, recovery, settled
-from bodycap_batch.registration.finding import Finder, Fix
-from bodycap_batch.registration.marching import March
-from bodycap_batch.registration.pose import PoseLimits
-from bodycap_batch.registration.templates import Found, Gallery, View
-from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
-from bodycap_batch.tracking import detect_corners
+from bodycap_batch.model.optical_flow import detect_corners
+from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
+from bodycap_batch.registration import RigCamera, recover_lost, settled
+from bodycap_batch.registration.poses.pnp import PoseLimits
+from bodycap_batch.registration.recovery import recover
+from bodycap_batch.registration.recovery.guided_localisation import Finder, Fix
+from bodycap_batch.registration.recovery.patch_search import Found, Gallery, View
+from bodycap_batch.registration.recovery.propagation import March
 from tests.rooms import HALF_M, LENS, Room
 
 COUNT = 44
@@ -222,9 +223,9 @@ def test_what_the_mask_hides_is_no_room(pictures: list[np.ndarray], context: Sta
 
 
 def test_of_a_long_stretch_only_so_many_pictures_are_held(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recovery, "_MAX_HELD", 12)
+    monkeypatch.setattr(recover, "_MAX_HELD", 12)
     video = cast(CaptureCamera, _Video([np.zeros((240, 320), np.uint8)] * COUNT))
-    held = sorted(recovery._pictures(video, 4, 40, [20]))
+    held = sorted(recover._pictures(video, 4, 40, [20]))
     assert held == [3, 4, 5, 6, 18, 19, 20, 21, 22, 38, 39, 40]
 
 
@@ -331,7 +332,7 @@ def test_what_the_mask_hides_tells_nothing_of_the_exposure(
         score = np.array([0.9 - view.exposure, 0.5 + 0.1 * view.exposure])
         return Found(np.arange(2), px, px, score)
 
-    monkeypatch.setattr(recovery, "find_points", found)
+    monkeypatch.setattr(recover, "find_points", found)
     mask = np.ones((240, 320), dtype=bool)
     mask[:, :160] = False
     shares = []
@@ -344,10 +345,10 @@ def test_what_the_mask_hides_tells_nothing_of_the_exposure(
             usable=np.zeros(0, bool),
             seen=np.zeros(0, np.int64),
         )
-        monkeypatch.setattr(recovery, "choose_rows", lambda *_: np.arange(2))
+        monkeypatch.setattr(recover, "choose_rows", lambda *_: np.arange(2))
         limits = PoseLimits(max_error_px=1.0, min_inliers=12, max_sigma_depth=0.1)
         finder = Finder(lens=CAMERA, gallery=gallery, limits=limits, exposure=0.0, sees_room=camera.sees_room)
-        shares.append(recovery._exposure(camera, finder, _tracked().trajectory))
+        shares.append(recover._exposure(camera, finder, _tracked().trajectory))
     assert shares == [0.0, 0.6]
 
 
@@ -361,7 +362,7 @@ def test_decoding_the_keyframes_is_told(pictures: list[np.ndarray], tmp_path: Pa
     scene = _map(pictures)
     context = StageContext(work_dir=tmp_path, progress=progress)
     capture = cast(Capture, _Capture(_Video(pictures)))
-    recovery._gallery(scene, capture, capture.camera("torso"), context)
+    recover._gallery(scene, capture, capture.camera("torso"), context)
     count = len(scene.keyframe_camera)
     assert told == [(number + 1, count) for number in range(count)]
 
@@ -382,7 +383,7 @@ def test_what_is_left_beside_found_frames_is_looked_through_again(
         fix = replace(stretch.known[17], depth=1.0)
         return {18: fix, 19: fix}
 
-    monkeypatch.setattr(recovery, "_vouched", vouched)
+    monkeypatch.setattr(recover, "_vouched", vouched)
     path = _recovered(_map(pictures), pictures, context)
     assert asked == [(18, 26), (20, 26)]
     assert path.localised[[18, 19]].all()
@@ -394,9 +395,9 @@ def test_progress_grows_over_the_rounds_which_end_with_nothing_left(
 ) -> None:
     told: list[int] = []
     rounds = [[(18, 20), (23, 25)], []]
-    monkeypatch.setattr(recovery, "lost_runs", lambda _: [(18, 22), (22, 26)])
-    monkeypatch.setattr(recovery, "_beside", lambda *_: rounds.pop(0))
-    monkeypatch.setattr(recovery._LostFrames, "within", lambda *_: {})
+    monkeypatch.setattr(recover, "lost_runs", lambda _: [(18, 22), (22, 26)])
+    monkeypatch.setattr(recover, "_beside", lambda *_: rounds.pop(0))
+    monkeypatch.setattr(recover._LostFrames, "within", lambda *_: {})
 
     def progress(done: int, _: int, what: str = "") -> None:
         if what.startswith("lost"):
@@ -503,7 +504,7 @@ def test_few_poses_are_left_as_they_are(monkeypatch: pytest.MonkeyPatch, picture
     found = _with_tracks(_tracked(), scene, -1)
     few = replace(found, trajectory=replace(found.trajectory, inliers=np.full(COUNT, 20)))
     own = RigCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), found=few)
-    monkeypatch.setattr(recovery, "LEAST_POSED", COUNT - len(LOST) - 10)
+    monkeypatch.setattr(recover, "LEAST_POSED", COUNT - len(LOST) - 10)
     settled_map, left = settled(own, [], scene, _selection(), RegistrationOptions())
     assert settled_map is scene
     assert left is few

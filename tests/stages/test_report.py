@@ -16,7 +16,8 @@ import pytest
 
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config.models import CaptureConfig, Job
-from bodycap_batch.geometry import interpolate_pose
+from bodycap_batch.model.geometry import interpolate_pose
+from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.pipeline.made import Made, report_task
 from bodycap_batch.report import ReportInputs
 from bodycap_batch.report.advice import advise, shared_points
@@ -30,7 +31,6 @@ from bodycap_batch.report.placing import common_times_s, place
 from bodycap_batch.report.solid import solid_data
 from bodycap_batch.report.tables import look_up
 from bodycap_batch.report.verdict import judge
-from bodycap_batch.scene import FrameStatus, Trajectory
 from bodycap_batch.tasks.report import load_inputs
 from tests.reports import written
 from tests.videos import textured_frame, write_video

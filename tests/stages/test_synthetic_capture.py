@@ -10,13 +10,13 @@ import pytest
 
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config.job import load_job
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import Cancelled, JobError, StoreError
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import Cancelled, JobError, StoreError
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.files import store_error
 from bodycap_batch.formats.tum import read_tum
-from bodycap_batch.geometry import interpolate_pose, invert, rotation_angle_rad
-from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount, rest_positions
+from bodycap_batch.model.geometry import interpolate_pose, invert, rotation_angle_rad
+from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount, rest_positions
 from bodycap_batch.synthetic import SynthOptions, synthesise
 
 TINY = {"width": 64, "height": 48, "seconds": 0.3, "cameras": ("torso", "left_palm")}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodycap_batch.arrays import frozen_array
+from bodycap_batch.core.arrays import frozen_array
 
 
 def test_an_array_that_may_be_written_to_is_copied() -> None:

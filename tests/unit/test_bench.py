@@ -3,7 +3,7 @@
 import av
 import numpy as np
 
-from bodycap_batch.geometry import Similarity, make_transform, so3_exp
+from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
 from tests.bench import long, ours, peers, poses, scaling, seeds, solving
 from tests.bench.peer_pairs import AWAY_NS, FROM_OTHER, OWN_AGAIN, STEPS, pairs_of
 from tests.bench.rows import Row, row_of

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bodycap_batch.body import CameraClock, MergeResult
-from bodycap_batch.camera import Camera
-from bodycap_batch.errors import StoreError
+from bodycap_batch.core.errors import StoreError
 from bodycap_batch.formats.bundle import read_bundle, read_npz, write_bundle, write_npz
-from bodycap_batch.geometry import Similarity
-from bodycap_batch.scene import (
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import Similarity
+from bodycap_batch.model.merge_data import CameraClock, MergeResult
+from bodycap_batch.model.scene import (
     FrameStatus,
     KeyframeSelection,
     Map,
@@ -25,7 +25,7 @@ from bodycap_batch.scene import (
     Registration,
     Trajectory,
 )
-from bodycap_batch.skeleton import Mount, SkeletonModel
+from bodycap_batch.model.skeleton import Mount, SkeletonModel
 
 
 def same(first: Any, second: Any) -> bool:

@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.errors import JobError, StoreError
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.bvh import read_bvh, write_bvh
 from bodycap_batch.formats.bvh.euler import continuous_angles, rotation_from_angles
-from bodycap_batch.geometry import rotation_angle_rad
-from bodycap_batch.skeleton import Motion, SkeletonModel
+from bodycap_batch.model.geometry import rotation_angle_rad
+from bodycap_batch.model.skeleton import Motion, SkeletonModel
 from tests.bodies import BVH_PAIR
 
 ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")

@@ -11,13 +11,13 @@ from bodycap_batch.calibration import Board, calibrate_clip, write_calibration, 
 from bodycap_batch.calibration.boards import View
 from bodycap_batch.calibration.clip import coverage, spread
 from bodycap_batch.calibration.solve import fit_lens
-from bodycap_batch.camera import CV2_PIXEL_OFFSET_PX
 from bodycap_batch.capture import open_camera
 from bodycap_batch.config.calibration import read_calibration
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import CaptureError, JobError
-from bodycap_batch.geometry import so3_exp
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import CaptureError, JobError
+from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX
+from bodycap_batch.model.geometry import so3_exp
 from tests.boards import (
     FISHEYE_LENS,
     PINHOLE_LENS,

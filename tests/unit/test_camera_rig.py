@@ -9,16 +9,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bodycap_batch.camera import Camera
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import RegistrationOptions
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.bundle import read_bundle, write_bundle
-from bodycap_batch.geometry import invert, make_transform, rotation_angle_rad, so3_exp
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import invert, make_transform, rotation_angle_rad, so3_exp
+from bodycap_batch.model.relative_pose import RigPoses, mean_rotation, relative_pose, same_instants
+from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 from bodycap_batch.registration import RigCamera, register_in_rig
-from bodycap_batch.registration.batch import Views, linearise, make_views
-from bodycap_batch.rig import RigPoses, mean_rotation, relative_pose, same_instants
-from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
+from bodycap_batch.registration.poses.batched_pnp import Views, linearise, make_views
 from bodycap_batch.tasks import read_summary, recover
 from bodycap_batch.tasks.registered import RIG_POSES
 from bodycap_batch.tasks.registration import save_registration

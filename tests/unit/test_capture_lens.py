@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bodycap_batch.camera import Camera, without_single_focal
 from bodycap_batch.capture import open_camera, open_capture
 from bodycap_batch.capture.opening import work_size
 from bodycap_batch.config.calibration import Calibration, read_calibration
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
-from bodycap_batch.errors import CaptureError
+from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.model.camera import Camera, without_single_focal
 from tests.videos import textured_frame, write_video
 
 

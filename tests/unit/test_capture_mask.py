@@ -11,10 +11,10 @@ import pytest
 from bodycap_batch.capture import open_capture
 from bodycap_batch.capture.masks import read_mask
 from bodycap_batch.config.job import load_job
-from bodycap_batch.digests import FileDigests
-from bodycap_batch.errors import CaptureError
+from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.model.optical_flow import detect_corners
 from bodycap_batch.pipeline.inputs import camera_digest
-from bodycap_batch.tracking import detect_corners
+from bodycap_batch.store.digests import FileDigests
 from tests.videos import textured_frame, write_video
 
 

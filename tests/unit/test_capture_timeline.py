@@ -14,7 +14,7 @@ from bodycap_batch.capture.timeline import read_timestamps
 from bodycap_batch.config.folder import natural_key
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
-from bodycap_batch.errors import CaptureError
+from bodycap_batch.core.errors import CaptureError
 from tests.videos import textured_frame, write_video
 
 FRAMES = [textured_frame(index) for index in range(12)]

@@ -19,8 +19,8 @@ from bodycap_batch.capture.indexing import index_video
 from bodycap_batch.capture.prefetch import prefetched
 from bodycap_batch.capture.video import open_container
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
-from bodycap_batch.context import THREADS_VARIABLE
-from bodycap_batch.errors import CaptureError
+from bodycap_batch.core.context import THREADS_VARIABLE
+from bodycap_batch.core.errors import CaptureError
 from tests.videos import textured_frame, write_tone, write_video
 
 FRAMES = [textured_frame(index) for index in range(40)]

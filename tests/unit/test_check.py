@@ -14,10 +14,10 @@ from bodycap_batch.check import check_job, check_path, preflight, require_ready
 from bodycap_batch.check.pictures import sample_indices
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.disk_room import require_room
-from bodycap_batch.errors import Cancelled, JobError, StoreError
+from bodycap_batch.core.errors import Cancelled, JobError, StoreError
 from bodycap_batch.formats import needs
 from bodycap_batch.formats.bvh import write_bvh
+from bodycap_batch.store.disk_space import require_room
 from tests.bodies import reaching
 from tests.videos import textured_frame, write_video
 

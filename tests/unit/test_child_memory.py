@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from bodycap_batch.memory import give_back
+from bodycap_batch.core.memory import give_back
 
 _BLOCK, _COUNT = 64 * 1024, 1600
 

@@ -10,10 +10,9 @@ from typing import Any
 
 import pytest
 
-from bodycap_batch import cluster
-from bodycap_batch.errors import BodycapError, Cancelled
-from bodycap_batch.runner import Making, Task
-from bodycap_batch.store import ArtefactKey, Store
+from bodycap_batch.core.errors import BodycapError, Cancelled
+from bodycap_batch.runner import Making, Task, dask_cluster
+from bodycap_batch.store.artefacts import ArtefactKey, Store
 
 
 class Client:
@@ -53,7 +52,7 @@ def make(client: Client, folder: Path, told: list[str], *, cancelled: bool = Fal
         cancelled=lambda: cancelled,
         may_commit=lambda: True,
     )
-    cluster.Cluster("tcp://nowhere:1").make(Task(key=key, memory_mb=1500), making)
+    dask_cluster.Cluster("tcp://nowhere:1").make(Task(key=key, memory_mb=1500), making)
 
 
 def test_a_task_waits_for_the_first_worker_so_that_its_limits_are_known(
@@ -61,7 +60,7 @@ def test_a_task_waits_for_the_first_worker_so_that_its_limits_are_known(
 ) -> None:
     """And a message of another worker does not wait for the answer that waits for it."""
     client, told = Client(), list[str]()
-    monkeypatch.setattr(cluster, "_connect", lambda _: client)
+    monkeypatch.setattr(dask_cluster, "_connect", lambda _: client)
     with pytest.raises(RuntimeError, match=r"handed over with {'memory': 1500.0}"):
         make(client, tmp_path, told)
     assert client.answered == [True, True]
@@ -70,7 +69,7 @@ def test_a_task_waits_for_the_first_worker_so_that_its_limits_are_known(
 
 def test_waiting_for_a_worker_can_be_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     client = Client()
-    monkeypatch.setattr(cluster, "_connect", lambda _: client)
+    monkeypatch.setattr(dask_cluster, "_connect", lambda _: client)
     with pytest.raises(Cancelled):
         make(client, tmp_path, [], cancelled=True)
 
@@ -80,7 +79,7 @@ def test_a_scheduler_that_is_lost_while_it_is_asked_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     client = Client()
-    monkeypatch.setattr(cluster, "_connect", lambda _: client)
+    monkeypatch.setattr(dask_cluster, "_connect", lambda _: client)
 
     def fail() -> None:
         raise OSError("the connection is closed")
@@ -104,7 +103,7 @@ def test_a_scheduler_that_is_lost_with_the_answer_in_hand_is_told(
     future = SimpleNamespace(status="finished", result=lost, add_done_callback=lambda call: call(None))
     client = Client()
     monkeypatch.setattr(client, "submit", lambda *_, **__: future)
-    monkeypatch.setattr(cluster, "_connect", lambda _: client)
+    monkeypatch.setattr(dask_cluster, "_connect", lambda _: client)
     with pytest.raises(BodycapError, match="the scheduler was lost"):
         make(client, tmp_path, [])
 
@@ -117,9 +116,9 @@ def test_the_tasks_of_a_worker_share_its_cores(
         get_current_task=lambda: "key", state=SimpleNamespace(nthreads=tasks_at_once, tasks={})
     )
     monkeypatch.setattr("distributed.get_worker", lambda: worker)
-    monkeypatch.setattr(cluster.os, "cpu_count", lambda: 8)
-    monkeypatch.setattr(cluster, "perform", lambda order, *_: order["task"])
-    answer = cluster._on_worker({"task": {"threads": threads}}, "topic")
+    monkeypatch.setattr(dask_cluster.os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(dask_cluster, "perform", lambda order, *_: order["task"])
+    answer = dask_cluster._on_worker({"task": {"threads": threads}}, "topic")
     assert answer["threads"] == want
     assert answer["threads"] * tasks_at_once <= max(8, tasks_at_once)
 
@@ -135,7 +134,7 @@ def test_a_worker_tells_its_progress_not_more_often_than_once_a_second(
         log_event=lambda _, message: told.append(message["done"]),
     )
     monkeypatch.setattr("distributed.get_worker", lambda: worker)
-    monkeypatch.setattr(cluster.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(dask_cluster.time, "monotonic", lambda: now[0])
 
     def perform(_: object, progress: Callable[[int, int, str], None], __: object) -> dict[str, Any]:
         for done in range(10):  # five a second, as a child does
@@ -143,8 +142,8 @@ def test_a_worker_tells_its_progress_not_more_often_than_once_a_second(
             now[0] += 0.2
         return {}
 
-    monkeypatch.setattr(cluster, "perform", perform)
-    cluster._on_worker({"task": {"threads": 1}}, "topic")
+    monkeypatch.setattr(dask_cluster, "perform", perform)
+    dask_cluster._on_worker({"task": {"threads": 1}}, "topic")
     assert told[0] == 0
     # 2 s, rounding of the clock's steps aside.
     assert len(told) == 2

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bodycap_batch.camera import Camera
 from bodycap_batch.formats.colmap import write_colmap_model
-from bodycap_batch.geometry import Similarity, invert
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import Similarity, invert
 from tests.scenes import small_map
 
 
@@ -61,8 +61,8 @@ def test_observations_still_reproject(tmp_path: Path) -> None:
 def test_every_lens_model_has_colmaps_number(tmp_path: Path) -> None:
     import pycolmap
 
-    from bodycap_batch.camera import CAMERA_MODELS, param_count
     from bodycap_batch.formats.colmap import _MODEL_IDS
+    from bodycap_batch.model.camera import CAMERA_MODELS, param_count
 
     assert set(_MODEL_IDS) == set(CAMERA_MODELS)
     for model in CAMERA_MODELS:

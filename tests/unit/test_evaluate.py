@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.evaluate import (
     TrajectoryOptions,
     evaluate_trajectories,
@@ -20,7 +20,7 @@ from bodycap_batch.evaluate import (
     score_trajectories,
 )
 from bodycap_batch.formats.tum import TimedPoses, read_tum, write_tum
-from bodycap_batch.geometry import Similarity, make_transform, so3_exp
+from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
 
 RATE_NS = 33_333_333
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.evaluate import MotionOptions, evaluate_motion, score_motion
 from bodycap_batch.formats.bvh import write_bvh
-from bodycap_batch.geometry import so3_exp
-from bodycap_batch.skeleton import Motion
-from bodycap_batch.skeleton_presets import load_skeleton
+from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.skeleton import Motion
+from bodycap_batch.model.skeleton_presets import load_skeleton
 
 
 def swinging(

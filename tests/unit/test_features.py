@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from bodycap_batch.capture import CaptureCamera
-from bodycap_batch.context import StageContext
-from bodycap_batch.mapping.features import Features, features_of
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.mapping.matching.sift import Features, features_of
 
 _CENTRES = np.array([(x, y) for y in range(40, 460, 70) for x in range(45, 620, 80)], dtype=np.float64)
 

@@ -18,12 +18,12 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from bodycap_batch.camera import CAMERA_MODELS
 from bodycap_batch.config.calibration import read_calibration
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import Job
-from bodycap_batch.errors import BodycapError, CaptureError, JobError
+from bodycap_batch.core.errors import BodycapError, CaptureError, JobError
 from bodycap_batch.formats.bvh import read_bvh
+from bodycap_batch.model.camera import CAMERA_MODELS
 from tests.bodies import BVH_PAIR
 
 FAST = settings(

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from bodycap_batch.geometry import (
+from bodycap_batch.model.geometry import (
     Similarity,
     align_points,
     interpolate_pose,

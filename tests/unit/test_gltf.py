@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.gltf import read_glb, write_glb
-from bodycap_batch.geometry import so3_exp
-from bodycap_batch.skeleton import Motion, rest_pose
-from bodycap_batch.skeleton_presets import load_skeleton
+from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.skeleton import Motion, rest_pose
+from bodycap_batch.model.skeleton_presets import load_skeleton
 from tests.bodies import reaching
 
 # Single precision at 3 m from the origin, along seven joints.

@@ -10,16 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from bodycap_batch import identity
+from bodycap_batch.store import code_version
 from bodycap_batch.tasks import STAGES
 
-PACKAGE = Path(identity.__file__).parent
+PACKAGE = Path(code_version.__file__).parent
 IGNORED = {"errors", "context", "progress"}
 
 
 def forget() -> None:
     """What was read of the sources."""
-    for remembered in (identity.algorithm_version, identity._source, identity._files):
+    for remembered in (code_version.algorithm_version, code_version._source, code_version._files):
         remembered.cache_clear()
 
 
@@ -28,7 +28,7 @@ def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The package's sources in a folder of their own, where they may be changed."""
     folder = tmp_path / "bodycap_batch"
     shutil.copytree(PACKAGE, folder, ignore=shutil.ignore_patterns("__pycache__"))
-    monkeypatch.setattr(identity, "_PACKAGE", folder)
+    monkeypatch.setattr(code_version, "_PACKAGE", folder)
     forget()
     yield folder
     forget()
@@ -36,7 +36,7 @@ def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def versions() -> dict[str, str]:
     forget()
-    return {name: identity.algorithm_version(stage.code) for name, stage in STAGES.items()}
+    return {name: code_version.algorithm_version(stage.code) for name, stage in STAGES.items()}
 
 
 def changed_by(path: Path, text: str = "\nANOTHER = 1\n") -> set[str]:
@@ -60,7 +60,7 @@ def test_the_same_sources_have_the_same_version(copied: Path) -> None:
 
 @pytest.mark.parametrize("stage", sorted(STAGES))
 def test_everything_a_stage_imports_counts(copied: Path, stage: str) -> None:
-    found = identity._closure(STAGES[stage].code)
+    found = code_version._closure(STAGES[stage].code)
     rooms = {path.relative_to(copied).parts[0].removesuffix(".py") for path in found}
     wanted = {room for path in found if path.suffix == ".py" for room in imported_rooms(path)}
     assert wanted - rooms - IGNORED - {"config"} == set()
@@ -125,7 +125,7 @@ def reworded(source: str) -> str:
     ],
 )
 def test_changed_code_counts(before: str, after: str) -> None:
-    assert identity.code_text(ast.parse(before)) != identity.code_text(ast.parse(after))
+    assert code_version.code_text(ast.parse(before)) != code_version.code_text(ast.parse(after))
 
 
 @pytest.mark.parametrize(
@@ -137,7 +137,7 @@ def test_changed_code_counts(before: str, after: str) -> None:
     ],
 )
 def test_layout_and_words_of_a_file_do_not_count(written: str, other: str) -> None:
-    assert identity.code_text(ast.parse(written)) == identity.code_text(ast.parse(other))
+    assert code_version.code_text(ast.parse(written)) == code_version.code_text(ast.parse(other))
 
 
 SYNTAX = """
@@ -161,7 +161,7 @@ except* (ValueError, KeyError):
 
 def test_the_version_is_the_same_on_each_python() -> None:
     """The digest was computed with Python 3.11.7, 3.12.1 and 3.13.0."""
-    text = identity.code_text(ast.parse(SYNTAX))
+    text = code_version.code_text(ast.parse(SYNTAX))
     assert hashlib.sha256(text.encode()).hexdigest()[:16] == "35e3d844b46998a0"
 
 
@@ -193,7 +193,7 @@ def test_when_lost_frames_are_looked_for_counts(copied: Path) -> None:
 
 
 def test_libraries_are_named_with_their_versions() -> None:
-    found = identity.library_versions(("numpy", "not-a-library|pydantic", "nothing-of-that-name"))
+    found = code_version.library_versions(("numpy", "not-a-library|pydantic", "nothing-of-that-name"))
     assert found["numpy"].count(".") >= 1
     assert found["not-a-library"].count(".") >= 1
     assert found["nothing-of-that-name"] == "none"

@@ -13,10 +13,10 @@ from bodycap_batch.config.models import SKELETON_PRESETS, Job
 from bodycap_batch.config.mounts import MOUNT_NAMES, ROLES, mount_of, role_of_segment
 from bodycap_batch.config.rules import problems_in
 from bodycap_batch.config.trust import PathPolicy
-from bodycap_batch.errors import CaptureError, JobError
-from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.initial import anchor_and_reach
-from bodycap_batch.skeleton_presets import load_skeleton
+from bodycap_batch.core.errors import CaptureError, JobError
+from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body.initial_poses import anchor_and_reach
+from bodycap_batch.model.skeleton_presets import load_skeleton
 
 LENS = {"model": "PINHOLE", "params": [420, 420, 320, 240], "width": 640, "height": 480}
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import Job
 from bodycap_batch.config.options import MARKER_COUNTS
-from bodycap_batch.errors import CaptureError, JobError
+from bodycap_batch.core.errors import CaptureError, JobError
 
 MINIMAL = """\
 capture:

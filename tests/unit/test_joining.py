@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bodycap_batch.geometry import Similarity, so3_exp
-from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.calibrate import Calibration
-from bodycap_batch.merging.common_walk import start_of
-from bodycap_batch.merging.joining import use_together
-from bodycap_batch.merging.mount_spread import JOINED, MEASURED, NAMED
-from bodycap_batch.merging.samples import take_samples
-from bodycap_batch.merging.tracks import make_track
+from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
+from bodycap_batch.merging.body_calibration.mount_covariance import JOINED, MEASURED, NAMED
+from bodycap_batch.merging.body_calibration.samples import take_samples
+from bodycap_batch.merging.cameras.track import make_track
+from bodycap_batch.merging.map_alignment.align import use_together
+from bodycap_batch.merging.map_alignment.initial_alignment import start_of
+from bodycap_batch.model.geometry import Similarity, so3_exp
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.joining import run_case
 from tests.bench.posed import posed

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.errors import EstimationError
-from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.choosing import choices
-from bodycap_batch.merging.common_walk import starts_of
-from bodycap_batch.merging.initial import provisional_scale
-from bodycap_batch.merging.tracks import make_track
+from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body.initial_poses import provisional_scale
+from bodycap_batch.merging.camera_selection import choices
+from bodycap_batch.merging.cameras.track import make_track
+from bodycap_batch.merging.map_alignment.initial_alignment import starts_of
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.joining import SPLITS
 from tests.bench.posed import posed

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.errors import JobError, StoreError
+from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.export.joint_tables import write_joint_arrays, write_joint_table
 from bodycap_batch.export.layout import lay_out
 from bodycap_batch.export.motion import joint_centres, motion_difference
@@ -19,7 +19,7 @@ from bodycap_batch.formats import needs, usd
 from bodycap_batch.formats.c3d import Points, read_c3d, write_c3d
 from bodycap_batch.formats.fbx import blender
 from bodycap_batch.formats.trc import write_trc
-from bodycap_batch.geometry import rotation_from_quat_xyzw
+from bodycap_batch.model.geometry import rotation_from_quat_xyzw
 from tests.bodies import reaching
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodycap_batch.registration.jumps import lone_poses, pose_jumps
+from bodycap_batch.registration.poses.pose_outliers import lone_poses, pose_jumps
 
 SIGMA = np.full(60, 0.004)
 TIMES_NS = np.arange(60) * 33_333_333

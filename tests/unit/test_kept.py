@@ -12,7 +12,7 @@ import pytest
 from bodycap_batch.capture import CaptureCamera, FrameKeeper, open_camera
 from bodycap_batch.capture.images import grey_of, work_image, work_planes
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks import STAGES
 from bodycap_batch.tasks.loading import load_capture, load_keyframes
 from tests.videos import write_video

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from bodycap_batch.config.options import MergeOptions
-from bodycap_batch.errors import EstimationError
-from bodycap_batch.geometry import make_transform, so3_exp
-from bodycap_batch.merging import joining
-from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.choosing import choices
-from bodycap_batch.merging.constants import trunk_way_up
-from bodycap_batch.merging.joining import use_together
-from bodycap_batch.merging.known_scale import Stated, floor_scale, stated_in
-from bodycap_batch.merging.placing import Placing
-from bodycap_batch.merging.scale import ScaleSource
-from bodycap_batch.merging.tracks import Track, make_track
-from bodycap_batch.merging.upright import Direction, Say
+from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body_calibration.calibrate_body import trunk_way_up
+from bodycap_batch.merging.body_calibration.scale import ScaleSource
+from bodycap_batch.merging.camera_selection import choices
+from bodycap_batch.merging.cameras.track import Track, make_track
+from bodycap_batch.merging.map_alignment import align
+from bodycap_batch.merging.map_alignment.align import use_together
+from bodycap_batch.merging.map_alignment.gauss_newton import Placing
+from bodycap_batch.merging.map_alignment.scale_sources import Stated, floor_scale, stated_in
+from bodycap_batch.merging.world.vertical import Direction, Say
+from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.joining import SPLITS, _off
 from tests.bench.posed import posed
@@ -150,9 +150,9 @@ def test_a_join_is_told_what_the_job_states_of_up_and_how_the_trunks_camera_is_r
         told.append(mounts["torso"])
         raise EstimationError("enough")
 
-    monkeypatch.setattr(joining, "stated_in", lambda *_: Stated(ups=(lying,)))
-    monkeypatch.setattr(joining, "trunk_way_up", way_up)
-    monkeypatch.setattr(joining, "Calibration", calibration)
+    monkeypatch.setattr(align, "stated_in", lambda *_: Stated(ups=(lying,)))
+    monkeypatch.setattr(align, "trunk_way_up", way_up)
+    monkeypatch.setattr(align, "Calibration", calibration)
     main, further = choices(short.inputs)[0]
     assert "enough" in use_together(short.inputs, main, further[:1], lambda: None).unused[further[0].camera]
     assert told[0] == (lying,)
@@ -182,7 +182,7 @@ class _Strained(Placing):
 
 
 def test_a_stated_scale_saves_a_join_on_whose_scale_reach_and_movement_disagree(short, monkeypatch):
-    monkeypatch.setattr(joining, "Placing", _Strained)
+    monkeypatch.setattr(align, "Placing", _Strained)
     main, further = choices(short.inputs)[0]
     refused, placed = (
         use_together(short.inputs, main, further[:1], lambda: None, options).unused

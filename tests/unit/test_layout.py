@@ -16,8 +16,8 @@ from bodycap_batch.export.layout.rates import resample, smooth
 from bodycap_batch.export.layout.roots import heading_rad
 from bodycap_batch.export.motion import motion_difference
 from bodycap_batch.formats.bvh import assign_roles, read_bvh, write_bvh
-from bodycap_batch.geometry import rotation_angle_rad, so3_exp
-from bodycap_batch.skeleton import Motion
+from bodycap_batch.model.geometry import rotation_angle_rad, so3_exp
+from bodycap_batch.model.skeleton import Motion
 from tests.bodies import reaching
 
 NAMES = ("hik", "mixamo", "biped", "unreal")

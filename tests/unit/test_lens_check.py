@@ -5,9 +5,14 @@ import pycolmap
 import pytest
 
 from bodycap_batch.config import MapOptions
-from bodycap_batch.geometry import so3_exp
-from bodycap_batch.mapping.lens import better_lenses, misfit_note, misfitting_lenses, recentred_lenses
-from bodycap_batch.mapping.solve import adjust, mapper_options
+from bodycap_batch.mapping.intrinsics.intrinsics_check import (
+    better_lenses,
+    misfit_note,
+    misfitting_lenses,
+    recentred_lenses,
+)
+from bodycap_batch.mapping.reconstruction.reconstruct import adjust, mapper_options
+from bodycap_batch.model.geometry import so3_exp
 
 
 def _model(factor, noise_px=0.5):

@@ -13,10 +13,10 @@ from bodycap_batch import mapping
 from bodycap_batch.capture import Capture
 from bodycap_batch.capture.cameras import CaptureCamera
 from bodycap_batch.config import MapOptions
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import EstimationError
-from bodycap_batch.mapping.freeing import FREED, as_mapped, freed_where_contradicted
-from bodycap_batch.scene import MapResult
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.mapping.intrinsics.recalibration import FREED, as_mapped, freed_where_contradicted
+from bodycap_batch.model.scene import MapResult
 from tests.scenes import small_map
 
 CAPTURE = Capture(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodycap_batch.merging.report import longest_gap_s
-from bodycap_batch.merging.tracks import Track
+from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.merging.reporting.report import longest_gap_s
 
 SECOND = 1_000_000_000
 

@@ -12,14 +12,14 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import sparse
 
-from bodycap_batch.geometry import make_transform, so3_exp
-from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.graph import bone_key, optimise
-from bodycap_batch.merging.linear import Chain
-from bodycap_batch.merging.marginals import joint_covariance, sigma_summary
-from bodycap_batch.merging.solve import MotionGraph, Solution
-from bodycap_batch.merging.spread import Spread, adjoint, joined
-from bodycap_batch.merging.tracks import make_track
+from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.cameras.track import make_track
+from bodycap_batch.merging.graph.error_modes import Spread, adjoint, joined
+from bodycap_batch.merging.graph.factors import bone_key, optimise
+from bodycap_batch.merging.graph.joint_covariance import joint_covariance, sigma_summary
+from bodycap_batch.merging.graph.linearisation import Chain
+from bodycap_batch.merging.graph.motion_graph import MotionGraph, Solution
+from bodycap_batch.model.geometry import make_transform, so3_exp
 from tests.stages.walker import FPS, ROLES, make_inputs, make_walk, record
 
 
@@ -155,7 +155,7 @@ def test_without_a_spread_the_covariance_is_gtsams_marginal(walk):
 
 
 def _optimised(graph):
-    from bodycap_batch.merging.graph import optimise
+    from bodycap_batch.merging.graph.factors import optimise
 
     return optimise(graph._graph, graph._start(), iterations=60)
 

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from bodycap_batch.arrays import FloatArray, IntArray
-from bodycap_batch.camera import Camera
-from bodycap_batch.geometry import so3_exp
-from bodycap_batch.mapping.matching import View, mutual_matches, verified
+from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.mapping.matching.pair_matching import View, mutual_matches, verified
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import so3_exp
 
 _LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
 _NONE = np.zeros((0, 128), np.uint8)

@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from bodycap_batch.body import BoardView, CameraClock, MergeInputs
 from bodycap_batch.calibration.boards import Board
 from bodycap_batch.calibration.in_room import find_board_views
-from bodycap_batch.camera import Camera
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.options import MarkerBoard, MergeOptions
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import EstimationError
-from bodycap_batch.geometry import Similarity, invert, make_transform, so3_exp, transform_points
-from bodycap_batch.merging.board import find_board
-from bodycap_batch.merging.scale import ScaleSource
-from bodycap_batch.scene import FrameStatus, Trajectory
-from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.merging.body_calibration.marker_board import find_board
+from bodycap_batch.merging.body_calibration.scale import ScaleSource
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import Similarity, invert, make_transform, so3_exp, transform_points
+from bodycap_batch.model.merge_data import BoardView, CameraClock, MergeInputs
+from bodycap_batch.model.scene import FrameStatus, Trajectory
+from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
 from tests.rooms import LENS, look
 from tests.videos import write_video
 

@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 
 from bodycap_batch.config.options import MergeOptions
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import EstimationError
-from bodycap_batch.geometry import Similarity, make_transform, so3_exp
-from bodycap_batch.merging import choosing, joining, merge_trajectories, placing
-from bodycap_batch.merging.choosing import bring_together, choices, of_no_use, seldom_localised
-from bodycap_batch.merging.constants import early_up
-from bodycap_batch.merging.joining import Joined, use_together
-from bodycap_batch.merging.samples import MAP_ERROR_RAD, take_samples
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.merging import camera_selection, merge_trajectories
+from bodycap_batch.merging.body_calibration.calibrate_body import early_up
+from bodycap_batch.merging.body_calibration.samples import MAP_ERROR_RAD, take_samples
+from bodycap_batch.merging.camera_selection import bring_together, choices, of_no_use, seldom_localised
+from bodycap_batch.merging.cameras.track import MIN_SIGMA_RAD, make_track
+from bodycap_batch.merging.map_alignment import align, gauss_newton
+from bodycap_batch.merging.map_alignment.align import Joined, use_together
 from bodycap_batch.merging.stage import timeline
-from bodycap_batch.merging.tracks import MIN_SIGMA_RAD, make_track
-from bodycap_batch.scene import FrameStatus
+from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
+from bodycap_batch.model.scene import FrameStatus
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.posed import posed
 from tests.stages.walker import NOISE_M, NOISE_RAD, ROLES, make_inputs, make_walk, record
@@ -179,7 +180,7 @@ def test_cameras_that_all_stand_still_are_worn(capture):
 
 def test_still_cameras_are_looked_for_once(walked, monkeypatch, tmp_path):
     asked = []
-    monkeypatch.setattr(choosing, "unworn", lambda *args: asked.append(args) or [])
+    monkeypatch.setattr(camera_selection, "unworn", lambda *args: asked.append(args) or [])
     merge_trajectories(walked, MergeOptions(), StageContext(work_dir=tmp_path))
     assert len(asked) == 1
 
@@ -203,7 +204,7 @@ def test_a_trunk_alone_in_a_small_map_is_a_further_map(capture):
 def test_a_map_that_makes_no_body_gives_way_to_one_that_does(capture, monkeypatch):
     alone = _in_maps(capture.inputs, {"torso": "own"})
     monkeypatch.setattr(
-        joining, "join_maps", lambda *_: (_ for _ in ()).throw(EstimationError("nowhere to be placed"))
+        align, "join_maps", lambda *_: (_ for _ in ()).throw(EstimationError("nowhere to be placed"))
     )
     together = bring_together(alone, lambda: None)
     assert "torso" not in _names(together.trajectories)
@@ -231,7 +232,7 @@ def test_hands_alone_make_no_body_and_the_error_says_what_is_missing(capture):
 
 def test_a_limbs_camera_tells_no_vertical(capture):
     inputs = capture.inputs
-    bones = choosing.graph_bones(inputs.skeleton, {mount.role for mount in inputs.mounts})
+    bones = camera_selection.graph_bones(inputs.skeleton, {mount.role for mount in inputs.mounts})
     arm = next(mount for mount in inputs.mounts if mount.camera == "left_upper_arm")
     place = [bone.role for bone in bones].index(arm.role)
     trajectory = next(each for each in inputs.trajectories if each.camera == arm.camera)
@@ -270,7 +271,7 @@ def test_one_bad_map_does_not_take_the_others_with_it(capture, monkeypatch):
             ),
         )
 
-    monkeypatch.setattr(joining, "join_maps", place)
+    monkeypatch.setattr(align, "join_maps", place)
     main, further = choices(inputs)[0]
     together = use_together(inputs, main, further, lambda: None)
     assert asked == [("map-0", "good", "bad"), ("map-0", "good"), ("map-0", "bad")]
@@ -281,7 +282,7 @@ def test_one_bad_map_does_not_take_the_others_with_it(capture, monkeypatch):
 
 def test_equations_without_an_answer_are_an_estimation_error():
     with pytest.raises(EstimationError, match="does not determine"):
-        placing._solved(np.zeros((2, 2)), np.ones(2))
+        gauss_newton._solved(np.zeros((2, 2)), np.ones(2))
 
 
 def _with_twin(inputs, **changes):
@@ -299,7 +300,7 @@ def _with_twin(inputs, **changes):
 def test_cameras_at_one_place_know_it_together_no_better_than_one(capture):
     inputs = capture.inputs
     alone = inputs.mount_of("torso")
-    shared = choosing.share_priors(_with_twin(inputs))
+    shared = camera_selection.share_priors(_with_twin(inputs))
     for camera in ("torso", "torso_2"):
         mount = shared.mount_of(camera)
         assert mount.sigma_m == pytest.approx(np.sqrt(2.0) * alone.sigma_m)
@@ -309,13 +310,15 @@ def test_cameras_at_one_place_know_it_together_no_better_than_one(capture):
     behind = alone.joint_from_cam.copy()
     behind[1, 3] += 0.2
     for other in ({"joint_from_cam": behind}, {"sigma_rad": 0.02, "sigma_m": 0.01, "by_name": False}):
-        assert choosing.share_priors(_with_twin(inputs, **other)).mount_of("torso") == alone
-    assert choosing.share_priors(_lose(_with_twin(inputs), "torso_2", 6)).mount_of("torso") == alone
-    assert choosing.share_priors(inputs).mounts == inputs.mounts
+        assert camera_selection.share_priors(_with_twin(inputs, **other)).mount_of("torso") == alone
+    assert camera_selection.share_priors(_lose(_with_twin(inputs), "torso_2", 6)).mount_of("torso") == alone
+    assert camera_selection.share_priors(inputs).mounts == inputs.mounts
 
 
 def test_a_map_that_bends_two_cameras_of_a_bone_alike_counts_once(capture):
-    bones = choosing.graph_bones(capture.inputs.skeleton, {mount.role for mount in capture.inputs.mounts})
+    bones = camera_selection.graph_bones(
+        capture.inputs.skeleton, {mount.role for mount in capture.inputs.mounts}
+    )
     index = {bone.role: place for place, bone in enumerate(bones)}
     for inputs, alike in ((capture.inputs, 1), (_with_twin(capture.inputs), 2)):
         tracks = [

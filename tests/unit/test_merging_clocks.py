@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.geometry import make_transform, so3_exp
-from bodycap_batch.merging.advice import clock_sentence
-from bodycap_batch.merging.clocks import best_shift, doubted_clocks
-from bodycap_batch.merging.tracks import Track
+from bodycap_batch.merging.cameras.clock_check import best_shift, doubted_clocks
+from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.merging.reporting.advice import clock_sentence
+from bodycap_batch.model.geometry import make_transform, so3_exp
 
 
 def _track(camera: str, poses, times_s) -> Track:

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from bodycap_batch.config.options import MergeOptions
-from bodycap_batch.errors import EstimationError, JobError
-from bodycap_batch.geometry import Similarity, so3_exp
-from bodycap_batch.merging.advice import mount_sentence, scale_sentence
-from bodycap_batch.merging.anthropometry import placements, proportions
-from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.distance import known_distance
-from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount
+from bodycap_batch.core.errors import EstimationError, JobError
+from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body_calibration.anthropometry import placements, proportions
+from bodycap_batch.merging.body_calibration.known_distance import known_distance
+from bodycap_batch.merging.reporting.advice import mount_sentence, scale_sentence
+from bodycap_batch.model.geometry import Similarity, so3_exp
+from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
 from tests.stages.walker import make_inputs, make_walk, record
 
 GAUGE = Similarity(0.25, so3_exp([0.3, 1.0, -0.2]), np.array([2.0, 0.0, 1.0]))

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from bodycap_batch.config.options import MergeOptions
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.export.projection import _planted
-from bodycap_batch.geometry import make_transform, so3_exp
 from bodycap_batch.merging import merge_trajectories
-from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.contact import Contact, during, find_contacts
-from bodycap_batch.merging.graph import bone_key
-from bodycap_batch.merging.tracks import Track
-from bodycap_batch.skeleton_presets import load_skeleton
+from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.merging.graph.factors import bone_key
+from bodycap_batch.merging.graph.foot_contact import Contact, during, find_contacts
+from bodycap_batch.model.geometry import make_transform, so3_exp
+from bodycap_batch.model.skeleton_presets import load_skeleton
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.posed import posed
 from tests.bodies import merged, reaching

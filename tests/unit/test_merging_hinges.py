@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from bodycap_batch.geometry import so3_exp
-from bodycap_batch.merging.advice import hinge_sentence
-from bodycap_batch.merging.bones import graph_bones, hinges
-from bodycap_batch.merging.calibrate import Calibration
-from bodycap_batch.merging.hinge_give import FREE_M, told
-from bodycap_batch.merging.samples import take_samples
-from bodycap_batch.merging.tracks import Track
-from bodycap_batch.skeleton import forward_kinematics
-from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount
+from bodycap_batch.merging.body.bones import graph_bones, hinges
+from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
+from bodycap_batch.merging.body_calibration.hinge_test import FREE_M, told
+from bodycap_batch.merging.body_calibration.samples import take_samples
+from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.merging.reporting.advice import hinge_sentence
+from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.skeleton import forward_kinematics
+from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
 from tests.bodies import reaching
 
 ROLES = {

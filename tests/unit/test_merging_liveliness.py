@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.merging.calibrate import PRIOR_SCALE
-from bodycap_batch.merging.liveliness import passing_shares
+from bodycap_batch.merging.body_calibration.calibration_graph import PRIOR_SCALE
+from bodycap_batch.merging.body_calibration.joint_variability import passing_shares
 from bodycap_batch.synthetic import SynthOptions
 from tests.calibrations import calibration_of
 

@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 
 from bodycap_batch.config.options import MergeOptions
-from bodycap_batch.errors import EstimationError
-from bodycap_batch.geometry import Similarity
-from bodycap_batch.merging import calibrate
-from bodycap_batch.merging.anthropometry import placements, proportions
-from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.calibrate import Calibration
-from bodycap_batch.merging.chunks import with_overlap
-from bodycap_batch.merging.common_walk import require_common_time
-from bodycap_batch.merging.distance import known_distance
-from bodycap_batch.merging.initial import anchor_and_reach
-from bodycap_batch.merging.planes import find_planes
-from bodycap_batch.merging.samples import take_samples
-from bodycap_batch.merging.scale import find_scale
-from bodycap_batch.merging.solve import MotionGraph
-from bodycap_batch.merging.tracks import loosened, make_track
-from bodycap_batch.skeleton_presets import load_skeleton
+from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body.initial_poses import anchor_and_reach
+from bodycap_batch.merging.body_calibration import calibration_graph
+from bodycap_batch.merging.body_calibration.anthropometry import placements, proportions
+from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
+from bodycap_batch.merging.body_calibration.known_distance import known_distance
+from bodycap_batch.merging.body_calibration.samples import take_samples
+from bodycap_batch.merging.body_calibration.scale import find_scale
+from bodycap_batch.merging.cameras.track import loosened, make_track
+from bodycap_batch.merging.graph.motion_graph import MotionGraph
+from bodycap_batch.merging.graph.windows import with_overlap
+from bodycap_batch.merging.map_alignment.initial_alignment import require_common_time
+from bodycap_batch.merging.world.planes import find_planes
+from bodycap_batch.model.geometry import Similarity
+from bodycap_batch.model.skeleton_presets import load_skeleton
 from tests.stages.walker import ROLES, make_inputs, make_walk, record
 
 
@@ -138,7 +138,7 @@ def test_a_t_pose_is_no_gesture(body, monkeypatch):
     calibration = Calibration(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
     calibration.solve(1.0, iterations=1)
     asked = []
-    monkeypatch.setattr(calibrate, "widened", lambda *args: asked.append(args[2:]) or bones)
+    monkeypatch.setattr(calibration_graph, "widened", lambda *args: asked.append(args[2:]) or bones)
     calibration.widen_postures()
     ((poses, times_ns),) = asked
     assert 0 < len(times_ns) < len(posed)

@@ -9,12 +9,27 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bodycap_batch.body import CameraClock
-from bodycap_batch.errors import EstimationError
-from bodycap_batch.geometry import invert, make_transform, so3_exp, so3_log
-from bodycap_batch.merging.bones import graph_bones, hinges, proper_axes
-from bodycap_batch.merging.complete import complete_body, observed_joints
-from bodycap_batch.merging.gauge import (
+from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.merging.body.bones import graph_bones, hinges, proper_axes
+from bodycap_batch.merging.body.completion import complete_body, observed_joints
+from bodycap_batch.merging.body.initial_poses import (
+    anchor_and_reach,
+    fill_gaps,
+    pose_bones,
+    provisional_scale,
+)
+from bodycap_batch.merging.body_calibration.scale import ScaleSource, combine, disagreement, floor_source
+from bodycap_batch.merging.cameras.track import Track, adapt_psd, clean
+from bodycap_batch.merging.graph.factors import (
+    MountPoints,
+    add_mount_prior,
+    bone_key,
+    insert_mount,
+    mount_change,
+    read_mount,
+)
+from bodycap_batch.merging.graph.joint_limits import activity_rules, limit_rules, reach_rules
+from bodycap_batch.merging.world.floor import (
     feet_floor,
     find_floor,
     heading,
@@ -23,21 +38,11 @@ from bodycap_batch.merging.gauge import (
     upright,
     walked_floor,
 )
-from bodycap_batch.merging.graph import (
-    MountPoints,
-    add_mount_prior,
-    bone_key,
-    insert_mount,
-    mount_change,
-    read_mount,
-)
-from bodycap_batch.merging.initial import anchor_and_reach, fill_gaps, pose_bones, provisional_scale
-from bodycap_batch.merging.planes import BENT_LIMIT_DEG, TILT_LIMIT_DEG, find_planes, vertical
-from bodycap_batch.merging.rules import activity_rules, limit_rules, reach_rules
-from bodycap_batch.merging.scale import ScaleSource, combine, disagreement, floor_source
-from bodycap_batch.merging.tracks import Track, adapt_psd, clean
-from bodycap_batch.merging.upright import Direction
-from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount, rest_positions
+from bodycap_batch.merging.world.planes import BENT_LIMIT_DEG, TILT_LIMIT_DEG, find_planes, vertical
+from bodycap_batch.merging.world.vertical import Direction
+from bodycap_batch.model.geometry import invert, make_transform, so3_exp, so3_log
+from bodycap_batch.model.merge_data import CameraClock
+from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount, rest_positions
 
 SECOND = 1_000_000_000
 PAPER = ("Spine1", "LeftHand", "RightHand")

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bodycap_batch.geometry import make_transform, so3_exp
-from bodycap_batch.merging.bones import graph_bones, proper_axes
-from bodycap_batch.merging.lean import usual_direction
-from bodycap_batch.merging.posture import GESTURE_S, find_posture, walking_plane, widened
-from bodycap_batch.merging.spread import BETWEEN_SHARE
-from bodycap_batch.merging.t_pose import arm_span, find_t_pose, t_posed
-from bodycap_batch.merging.tracks import Track
-from bodycap_batch.skeleton import forward_kinematics
-from bodycap_batch.skeleton_presets import load_skeleton, rest_positions
+from bodycap_batch.merging.body.bones import graph_bones, proper_axes
+from bodycap_batch.merging.body.t_pose import arm_span, find_t_pose, t_posed
+from bodycap_batch.merging.body.trunk_lean import usual_direction
+from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.merging.graph.error_modes import BETWEEN_SHARE
+from bodycap_batch.merging.graph.posture import GESTURE_S, find_posture, walking_plane, widened
+from bodycap_batch.model.geometry import make_transform, so3_exp
+from bodycap_batch.model.skeleton import forward_kinematics
+from bodycap_batch.model.skeleton_presets import load_skeleton, rest_positions
 
 FPS = 30.0
 ROLES = ("Spine1", "LeftHand", "RightHand")

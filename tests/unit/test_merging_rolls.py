@@ -5,10 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.rolls import ROLLS_DEG, RollSearch, is_open, rolled, search_rolls, trunk_roll
-from bodycap_batch.merging.tracks import make_track
-from bodycap_batch.skeleton_presets import STATED_SIGMA_RAD, load_skeleton, nominal_mount
+from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body_calibration.camera_roll import (
+    ROLLS_DEG,
+    RollSearch,
+    is_open,
+    rolled,
+    search_rolls,
+    trunk_roll,
+)
+from bodycap_batch.merging.cameras.track import make_track
+from bodycap_batch.model.skeleton_presets import STATED_SIGMA_RAD, load_skeleton, nominal_mount
 from tests.stages.walker import ROLES, Walk, make_inputs, make_walk, record
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.geometry import make_transform, so3_exp
-from bodycap_batch.merging.advice import sides_sentence
-from bodycap_batch.merging.rolls import rolled
-from bodycap_batch.merging.sides import exchanged_sides
-from bodycap_batch.merging.tracks import Track
-from bodycap_batch.skeleton_presets import load_skeleton, nominal_mount
+from bodycap_batch.merging.body_calibration.camera_roll import rolled
+from bodycap_batch.merging.cameras.side_check import exchanged_sides
+from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.merging.reporting.advice import sides_sentence
+from bodycap_batch.model.geometry import make_transform, so3_exp
+from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
 
 ROLES = {"torso": "Spine1", "left_palm": "LeftHand", "right_palm": "RightHand", "head": "Head"}
 BODY = load_skeleton("upper_body", 1.75)

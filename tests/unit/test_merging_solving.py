@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bodycap_batch.geometry import make_transform, so3_exp
-from bodycap_batch.merging.graph import optimise, optimise_from_near
+from bodycap_batch.merging.graph.factors import optimise, optimise_from_near
+from bodycap_batch.model.geometry import make_transform, so3_exp
 
 REAL = gtsam.GaussNewtonOptimizer
 TURNED = make_transform(so3_exp([0.3, -0.2, 0.4]), [0.1, 0.2, -0.3])

@@ -8,10 +8,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bodycap_batch.geometry import rotation_angle_rad, so3_exp
-from bodycap_batch.merging.chunks import CHUNK_TICKS, longest_stretch, solve_motion, stretches, with_overlap
-from bodycap_batch.merging.solve import Solution
-from bodycap_batch.merging.tracks import Track
+from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.merging.graph.motion_graph import Solution
+from bodycap_batch.merging.graph.windows import (
+    CHUNK_TICKS,
+    longest_stretch,
+    solve_motion,
+    stretches,
+    with_overlap,
+)
+from bodycap_batch.model.geometry import rotation_angle_rad, so3_exp
 
 FPS = 30
 TICKS = np.round(np.arange(30 * FPS) * 1e9 / FPS).astype(np.int64)

@@ -7,14 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bodycap_batch.geometry import make_transform, so3_exp
-from bodycap_batch.merging.advice import up_sentence
-from bodycap_batch.merging.bones import graph_bones
-from bodycap_batch.merging.lean import BodyUp, body_up
-from bodycap_batch.merging.posture import mostly_walks
-from bodycap_batch.merging.tracks import Track
-from bodycap_batch.merging.upright import Around, Direction, Say, find_up
-from bodycap_batch.skeleton_presets import load_skeleton
+from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body.trunk_lean import BodyUp, body_up
+from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.merging.graph.posture import mostly_walks
+from bodycap_batch.merging.reporting.advice import up_sentence
+from bodycap_batch.merging.world.vertical import Around, Direction, Say, find_up
+from bodycap_batch.model.geometry import make_transform, so3_exp
+from bodycap_batch.model.skeleton_presets import load_skeleton
 
 UP = np.array([0.0, 0.0, 1.0])
 TURN = so3_exp([0.4, -0.9, 0.3])

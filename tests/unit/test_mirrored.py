@@ -16,11 +16,10 @@ import pytest
 from bodycap_batch import merging
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import EstimationError
-from bodycap_batch.mapping.database import DATABASE_NAME, add_keyframes, image_ids, keypoint_colours
-from bodycap_batch.mapping.likeness import clear_matches, largest
-from bodycap_batch.mapping.mirrored import (
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.mapping.matching.database import DATABASE_NAME, add_keyframes, image_ids, keypoint_colours
+from bodycap_batch.mapping.matching.flipped_cameras import (
     MIRROR_IMAGES,
     MIRRORED,
     _judged,
@@ -30,7 +29,8 @@ from bodycap_batch.mapping.mirrored import (
     mirror_notes,
     without_mirrored,
 )
-from bodycap_batch.scene import KeyframeSelection
+from bodycap_batch.mapping.matching.retrieval import clear_matches, largest
+from bodycap_batch.model.scene import KeyframeSelection
 from bodycap_batch.tasks import merge
 
 

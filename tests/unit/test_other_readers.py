@@ -13,7 +13,7 @@ from bodycap_batch.export.motion import joint_centres
 from bodycap_batch.formats.bvh import write_bvh
 from bodycap_batch.formats.c3d import write_c3d
 from bodycap_batch.formats.trc import write_trc
-from bodycap_batch.skeleton import Motion
+from bodycap_batch.model.skeleton import Motion
 from tests.bodies import reaching
 
 # Six decimals of a degree on a chain of seven bones of 2 m in all; bvhio and c3d compute in single precision.

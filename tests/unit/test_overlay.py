@@ -7,13 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.body import CameraClock
-from bodycap_batch.camera import Camera
-from bodycap_batch.geometry import Similarity, make_transform, so3_exp
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
+from bodycap_batch.model.merge_data import CameraClock
+from bodycap_batch.model.scene import FrameStatus, Map, Registration, Trajectory
 from bodycap_batch.overlay import Bones, body_of, bone_lines, camera_views, draw_overlay
 from bodycap_batch.overlay.field import field_limit_rad
-from bodycap_batch.scene import FrameStatus, Map, Registration, Trajectory
 from tests.bodies import merged, reaching
 from tests.scenes import small_map
 

@@ -9,11 +9,11 @@ import pycolmap
 import pytest
 
 from bodycap_batch.config import MapOptions
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import Cancelled
-from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef
-from bodycap_batch.mapping.likeness import CHANCE, _clear, largest, likeness
-from bodycap_batch.mapping.pairs import PairChooser
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import Cancelled
+from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef
+from bodycap_batch.mapping.matching.pair_selection import PairChooser
+from bodycap_batch.mapping.matching.retrieval import CHANCE, _clear, largest, likeness
 
 
 def _keypoints(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -50,15 +50,15 @@ def test_what_could_be_alike_is_found_without_looking_at_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(2)
-    monkeypatch.setattr("bodycap_batch.mapping.likeness._SHORTLIST", 12)
-    monkeypatch.setattr("bodycap_batch.mapping.likeness._SHORTLIST_OF_EACH", 2)
+    monkeypatch.setattr("bodycap_batch.mapping.matching.retrieval._SHORTLIST", 12)
+    monkeypatch.setattr("bodycap_batch.mapping.matching.retrieval._SHORTLIST_OF_EACH", 2)
     looked: list[int] = []
 
     def counted(alike: np.ndarray) -> np.ndarray:
         looked.append(alike.shape[1])
         return _clear(alike)
 
-    monkeypatch.setattr("bodycap_batch.mapping.likeness._clear", counted)
+    monkeypatch.setattr("bodycap_batch.mapping.matching.retrieval._clear", counted)
     images, cameras = [], []
     for number in range(120):
         descriptors, keypoints = _rooted(rng, 80), _keypoints(rng, 80)
@@ -78,7 +78,7 @@ def test_what_could_be_alike_is_found_without_looking_at_all(
     # 12 of all and 2 of each of three cameras.
     assert sum(looked) <= 18 * len(rows)
     # How many rows are looked at together changes nothing.
-    monkeypatch.setattr("bodycap_batch.mapping.likeness._BLOCK", 7)
+    monkeypatch.setattr("bodycap_batch.mapping.matching.retrieval._BLOCK", 7)
     assert (likeness(np.array(images), rows, cameras, context) == alike).all()
 
 
@@ -190,7 +190,7 @@ def test_what_hangs_by_few_links_is_matched_beside_what_held(tmp_path: Path) -> 
 def test_a_long_camera_without_links_is_not_matched_with_everything(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bodycap_batch.mapping.pairs._RETRIED", 500)
+    monkeypatch.setattr("bodycap_batch.mapping.matching.pair_selection._RETRIED", 500)
     times = _database(tmp_path, 80)
     refs = [ImageRef(camera, frame) for camera in times for frame in range(80)]
     chooser = PairChooser(

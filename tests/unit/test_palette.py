@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodycap_batch.arrays import FloatArray
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config.job import load_job
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.formats.palette import CAMERA_COLOURS, as_hex, camera_colours
 from bodycap_batch.formats.ply import PointCloud, with_paths
 from bodycap_batch.preview import PreviewInputs

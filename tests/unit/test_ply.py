@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodycap_batch.errors import StoreError
+from bodycap_batch.core.errors import StoreError
 from bodycap_batch.formats.open3d_library import load_open3d
 from bodycap_batch.formats.palette import camera_colours
 from bodycap_batch.formats.ply import PointCloud, read_ply, with_paths, write_ply

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from bodycap_batch.errors import Cancelled
+from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.runner import Making, Task
 from bodycap_batch.runner.pool import Slots, machine_memory_mb
 from bodycap_batch.runner.turns import TakingTurns, Turns
-from bodycap_batch.store import ArtefactKey, Store
+from bodycap_batch.store.artefacts import ArtefactKey, Store
 
 
 def a_task(threads: int = 1, memory_mb: int = 100, priority: int = 0) -> Task:

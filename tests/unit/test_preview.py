@@ -11,6 +11,7 @@ import pytest
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.formats.mp4 import planes_of
+from bodycap_batch.model.scene import FrameStatus
 from bodycap_batch.overlay import SeenPoints
 from bodycap_batch.preview import room
 from bodycap_batch.preview.layout import HEIGHT, ROOM_WIDTH, WIDTH, Box, place_videos
@@ -18,7 +19,6 @@ from bodycap_batch.preview.room import Cloud
 from bodycap_batch.preview.tiles import resized, status_line
 from bodycap_batch.preview.timeline import MAX_FRAMES, make_timeline
 from bodycap_batch.preview.viewpoint import Viewpoint, follow
-from bodycap_batch.scene import FrameStatus
 from bodycap_batch.tasks.preview import _trunk_first
 from tests.bodies import merged, reaching
 from tests.videos import textured_frame, write_video

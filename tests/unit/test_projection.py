@@ -18,7 +18,7 @@ from bodycap_batch.export.corrections import (
     solve_correction,
 )
 from bodycap_batch.export.projection import project_motion
-from bodycap_batch.geometry import rotation_angle_rad
+from bodycap_batch.model.geometry import rotation_angle_rad
 from tests.bodies import merged, reaching
 
 

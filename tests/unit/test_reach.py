@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.camera import Camera
-from bodycap_batch.mapping.consistency import Link, contradicted_share, inconsistent
-from bodycap_batch.mapping.reach import best_scale, check_reach
-from bodycap_batch.scene import Map
-from bodycap_batch.skeleton_presets import camera_reach, load_skeleton, nominal_mount
+from bodycap_batch.mapping.validation.camera_distance_check import best_scale, check_reach
+from bodycap_batch.mapping.validation.epipolar_consistency import Link, contradicted_share, inconsistent
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.scene import Map
+from bodycap_batch.model.skeleton_presets import camera_reach, load_skeleton, nominal_mount
 
 _LENS = Camera(model="PINHOLE", width_px=64, height_px=48, params=np.array([50.0, 50.0, 32.0, 24.0]))
 _KEYFRAMES = 30

@@ -8,8 +8,8 @@ import pycolmap
 import pytest
 
 from bodycap_batch.config import MapOptions
-from bodycap_batch.errors import EstimationError
-from bodycap_batch.mapping.solve import mapper_options, refine
+from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options, refine
 
 
 class _Failing:

@@ -8,15 +8,15 @@ from typing import cast
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.camera import Camera
 from bodycap_batch.capture import CaptureCamera
-from bodycap_batch.geometry import invert, make_transform, so3_exp, transform_points
-from bodycap_batch.registration.confirmed import confirmed_points
-from bodycap_batch.registration.pose import FramePose, PoseLimits
-from bodycap_batch.registration.solving import solve_frames
-from bodycap_batch.registration.tracks import Tracks
-from bodycap_batch.scene import Map
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import invert, make_transform, so3_exp, transform_points
+from bodycap_batch.model.scene import Map
+from bodycap_batch.registration.poses.pnp import FramePose, PoseLimits
+from bodycap_batch.registration.poses.static_points import confirmed_points
+from bodycap_batch.registration.poses.trajectory import solve_frames
+from bodycap_batch.registration.tracking.klt import Tracks
 
 _LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
 _LIMITS = PoseLimits(max_error_px=2.2, min_inliers=15, max_sigma_depth=0.05)

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bodycap_batch.camera import Camera
-from bodycap_batch.context import THREADS_VARIABLE
-from bodycap_batch.geometry import invert, make_transform, so3_exp, so3_log
-from bodycap_batch.registration import batch
-from bodycap_batch.registration.batch import make_views
-from bodycap_batch.registration.growth import lost_runs, wanted_keyframes
-from bodycap_batch.registration.pose import MAP_VARIANCE_RATIO, FramePose, PoseLimits, solve_poses
-from bodycap_batch.scene import FrameStatus
+from bodycap_batch.core.context import THREADS_VARIABLE
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import invert, make_transform, so3_exp, so3_log
+from bodycap_batch.model.scene import FrameStatus
+from bodycap_batch.registration.poses import batched_pnp
+from bodycap_batch.registration.poses.batched_pnp import make_views
+from bodycap_batch.registration.poses.keyframe_requests import lost_runs, wanted_keyframes
+from bodycap_batch.registration.poses.pnp import MAP_VARIANCE_RATIO, FramePose, PoseLimits, solve_poses
 
 CAMERA = Camera(
     model="OPENCV",
@@ -83,20 +83,20 @@ def test_threads_of_a_task_solve_the_same_poses(monkeypatch: pytest.MonkeyPatch)
     start = np.stack([make_transform(np.eye(3), [0.05, 0.0, 0.0]) @ invert(scene[2]) for scene in scenes])
     points, bounds = np.concatenate([scene[0] for scene in scenes]), np.arange(13) * 90
     views = make_views(CAMERA, bounds, points, px)
-    monkeypatch.setattr(batch, "_CHUNK", 2)
+    monkeypatch.setattr(batched_pnp, "_CHUNK", 2)
     workers: set[str] = set()
-    step = batch._step
+    step = batched_pnp._step
 
     def noted(*arguments: Any) -> Any:
         workers.add(threading.current_thread().name.partition("_")[0])
         return step(*arguments)
 
-    monkeypatch.setattr(batch, "_step", noted)
+    monkeypatch.setattr(batched_pnp, "_step", noted)
     found = {}
     for threads, name in (("1", "MainThread"), ("2", "poses")):
         monkeypatch.setenv(THREADS_VARIABLE, threads)
         workers.clear()
-        found[threads] = batch.refine_poses(views, start, LIMITS.max_error_px)
+        found[threads] = batched_pnp.refine_poses(views, start, LIMITS.max_error_px)
         assert workers == {name}
     assert (found["1"] == found["2"]).all()
 
@@ -111,8 +111,8 @@ def test_the_lens_is_asked_for_some_views_at_a_time(monkeypatch: pytest.MonkeyPa
     tracemalloc.stop()
     kept = views.rays.nbytes + views.px_from_ray.nbytes + views.weight.nbytes
     # Beside what is kept: a part's ray, pixel and point, of which several are held, 24 bytes each at most.
-    assert kept <= peak < kept + 16 * 24 * batch._PART
-    monkeypatch.setattr(batch, "_PART", count)
+    assert kept <= peak < kept + 16 * 24 * batched_pnp._PART
+    monkeypatch.setattr(batched_pnp, "_PART", count)
     whole = make_views(CAMERA, np.array([0, count]), points, px)
     assert np.array_equal(whole.rays, views.rays)
     assert np.array_equal(whole.px_from_ray, views.px_from_ray)

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodycap_batch.arrays import FloatArray, IntArray
-from bodycap_batch.camera import Camera
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import RegistrationOptions
-from bodycap_batch.geometry import invert, make_transform, transform_points
+from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import invert, make_transform, transform_points
+from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 from bodycap_batch.registration import RigCamera, without_contradicted
-from bodycap_batch.registration.pose import PoseLimits
-from bodycap_batch.registration.seams import misplaced, without_keyframes
-from bodycap_batch.registration.tracks import Tracks
-from bodycap_batch.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
+from bodycap_batch.registration.poses.misplaced_keyframes import misplaced, without_keyframes
+from bodycap_batch.registration.poses.pnp import PoseLimits
+from bodycap_batch.registration.tracking.klt import Tracks
 
 _LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([400.0, 400.0, 320.0, 240.0]))
 _KEYFRAMES = 12

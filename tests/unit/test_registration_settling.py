@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.camera import Camera
-from bodycap_batch.geometry import invert, make_transform, so3_exp, transform_points
-from bodycap_batch.registration import settling
-from bodycap_batch.registration.settling import settled_points, without_weak_ends
-from bodycap_batch.rolling_shutter import at_mid_row, image_velocity
-from bodycap_batch.scene import FrameStatus, Map, Trajectory
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import invert, make_transform, so3_exp, transform_points
+from bodycap_batch.model.rolling_shutter import at_mid_row, image_velocity
+from bodycap_batch.model.scene import FrameStatus, Map, Trajectory
+from bodycap_batch.registration.recovery import point_refinement
+from bodycap_batch.registration.recovery.point_refinement import settled_points, without_weak_ends
 
 COUNT, LOST = 40, range(18, 24)
 MIN_INLIERS = 15
@@ -68,7 +68,7 @@ def test_weak_poses_far_from_lost_frames_and_at_the_ends_of_a_video_stay() -> No
 
 def test_where_little_is_seen_all_the_time_a_path_is_kept() -> None:
     taken = _taken(_path(dict.fromkeys(range(COUNT), 30)))
-    reach = settling._FARTHEST
+    reach = point_refinement._FARTHEST
     assert taken == [*range(LOST[0] - reach, LOST[0]), *range(LOST[-1] + 1, LOST[-1] + 1 + reach)]
 
 
@@ -188,7 +188,7 @@ def test_a_rolling_shutter_is_undone() -> None:
 def test_a_few_at_a_time_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     path = _path()
     whole = settled_points(_map(path), [path])
-    monkeypatch.setattr(settling, "_CHUNK", 50)
+    monkeypatch.setattr(point_refinement, "_CHUNK", 50)
     parts = settled_points(_map(path), [path])
     np.testing.assert_allclose(parts.points, whole.points, atol=1e-9)
     np.testing.assert_array_equal(parts.obs_feature, whole.obs_feature)

@@ -6,7 +6,7 @@ import tracemalloc
 
 import numpy as np
 
-from bodycap_batch.registration.smoothing import CentreFilter, Place, Steadiness, smooth_centres
+from bodycap_batch.registration.recovery.motion_prior import CentreFilter, Place, Steadiness, smooth_centres
 
 TIMES = np.arange(40.0)
 PATH = np.column_stack([np.sin(TIMES / 6.0), np.cos(TIMES / 8.0), 0.02 * TIMES])

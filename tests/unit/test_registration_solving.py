@@ -8,15 +8,15 @@ from typing import cast
 import numpy as np
 import pytest
 
-from bodycap_batch.camera import Camera
 from bodycap_batch.capture import CaptureCamera
-from bodycap_batch.geometry import invert, make_transform, so3_exp
-from bodycap_batch.registration import seeing, solving
-from bodycap_batch.registration.pose import FramePose, PoseLimits
-from bodycap_batch.registration.seeing import Votes
-from bodycap_batch.registration.solving import solve_frames
-from bodycap_batch.registration.tracks import Tracks
-from bodycap_batch.scene import FrameStatus, Map
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import invert, make_transform, so3_exp
+from bodycap_batch.model.scene import FrameStatus, Map
+from bodycap_batch.registration.poses import observations, trajectory
+from bodycap_batch.registration.poses.observations import Votes
+from bodycap_batch.registration.poses.pnp import FramePose, PoseLimits
+from bodycap_batch.registration.poses.trajectory import solve_frames
+from bodycap_batch.registration.tracking.klt import Tracks
 
 LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
 LIMITS = PoseLimits(max_error_px=2.2, min_inliers=15, max_sigma_depth=0.05)
@@ -78,7 +78,7 @@ def _solve(scene_map: Map, tracks: Tracks) -> list[FramePose]:
 
 
 def _error_m(poses: list[FramePose]) -> float:
-    found = solving.matrices(poses)
+    found = trajectory.matrices(poses)
     return float(np.sqrt(((found[:, :3, 3] - _path()[:, :3, 3]) ** 2).sum(axis=1).mean()))
 
 
@@ -116,6 +116,6 @@ def test_a_point_counts_by_the_frames_that_agree_with_it() -> None:
 
 def test_a_long_video_is_solved_in_stretches_as_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
     scene_map, tracks = _capture(30, np.random.default_rng(1))
-    whole = solving.matrices(_solve(scene_map, tracks))
-    monkeypatch.setattr(seeing, "STRETCH", 7)
-    np.testing.assert_allclose(solving.matrices(_solve(scene_map, tracks)), whole, atol=1e-12)
+    whole = trajectory.matrices(_solve(scene_map, tracks))
+    monkeypatch.setattr(observations, "STRETCH", 7)
+    np.testing.assert_allclose(trajectory.matrices(_solve(scene_map, tracks)), whole, atol=1e-12)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from bodycap_batch.config.lost_frames import LEAST_LOST
-from bodycap_batch.geometry import make_transform, so3_exp
+from bodycap_batch.model.geometry import make_transform, so3_exp
+from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.registration import _finished
-from bodycap_batch.registration.steadying import steadied
-from bodycap_batch.scene import FrameStatus, Trajectory
+from bodycap_batch.registration.recovery.path_smoothing import steadied
 
 COUNT = 90
 WEAK = np.arange(40, 50)

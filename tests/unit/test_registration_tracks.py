@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from bodycap_batch.capture import CaptureCamera
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import Cancelled
-from bodycap_batch.registration import stretches
-from bodycap_batch.registration.stretches import Known, all_tracks
-from bodycap_batch.registration.tracks import Anchor, Tracks, track_stretch
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import Cancelled
+from bodycap_batch.registration.tracking import frame_ranges
+from bodycap_batch.registration.tracking.frame_ranges import Known, all_tracks
+from bodycap_batch.registration.tracking.klt import Anchor, Tracks, track_stretch
 
 STEP_PX = np.array([3.5, -1.25])
 COUNT = 48
@@ -155,7 +155,7 @@ def test_what_was_tracked_before_is_held_once_while_new_tracks_join_it(
     px = rng.random((len(frame), 2)).astype(np.float32)
     known = Known(Tracks(frame, np.full(len(frame), 2), np.arange(len(frame)), px), [2, COUNT - 2])
     video = _video()
-    monkeypatch.setattr(stretches, "_track", lambda *_: [Tracks.join([])])
+    monkeypatch.setattr(frame_ranges, "_track", lambda *_: [Tracks.join([])])
     tracemalloc.start()
     anchors = dict.fromkeys((2, COUNT - 2, COUNT - 1), Anchor(*np.zeros((2, 0), np.int64), np.zeros((0, 2))))
     joined = all_tracks(video, anchors, known, CONTEXT)

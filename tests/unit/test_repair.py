@@ -13,22 +13,29 @@ import pycolmap
 import pytest
 
 from bodycap_batch import mapping
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.camera import Camera
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
-from bodycap_batch.context import StageContext
-from bodycap_batch.errors import JobError
-from bodycap_batch.geometry import align_points, invert, make_transform, so3_exp
-from bodycap_batch.mapping import _begun, lens
-from bodycap_batch.mapping.confirmed import drop_unconfirmed
-from bodycap_batch.mapping.consistency import Link, doubtful, links_of
-from bodycap_batch.mapping.database import DATABASE_NAME, ImageRef, add_camera, image_ids, write_image
-from bodycap_batch.mapping.incremental import grow
-from bodycap_batch.mapping.initial import named_start, rank_starts
-from bodycap_batch.mapping.matching import match_pairs, mutual_matches
-from bodycap_batch.mapping.repair import Workshop, cut_doubtful, place_again, repair
-from bodycap_batch.mapping.solve import mapper_options, reconstruct, refine, settle
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import JobError
+from bodycap_batch.mapping import _begun
+from bodycap_batch.mapping.intrinsics import intrinsics_check
+from bodycap_batch.mapping.matching.database import (
+    DATABASE_NAME,
+    ImageRef,
+    add_camera,
+    image_ids,
+    write_image,
+)
+from bodycap_batch.mapping.matching.pair_matching import match_pairs, mutual_matches
+from bodycap_batch.mapping.reconstruction.incremental_mapper import grow
+from bodycap_batch.mapping.reconstruction.initial_pair import named_start, rank_starts
+from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options, reconstruct, refine, settle
+from bodycap_batch.mapping.validation.epipolar_consistency import Link, doubtful, links_of
+from bodycap_batch.mapping.validation.repair import Workshop, cut_doubtful, place_again, repair
+from bodycap_batch.mapping.validation.transient_points import drop_unconfirmed
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import align_points, invert, make_transform, so3_exp
 
 _LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
 _LENSES = {"cam": (_LENS, True)}
@@ -160,7 +167,7 @@ def test_long_tracks_are_settled_by_conjugate_gradients_to_the_same_map(
 
     monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", noted)
     for limit in (0.0, np.inf):
-        monkeypatch.setattr("bodycap_batch.mapping.solve._LONG_TRACKS", limit)
+        monkeypatch.setattr("bodycap_batch.mapping.reconstruction.reconstruct._LONG_TRACKS", limit)
         settled = copy.deepcopy(model)
         settle(settled, shop.settings(), shop.constant)
         assert _rms(settled, poses) < 0.01
@@ -376,7 +383,7 @@ def test_a_named_start_is_used_again_where_a_guessed_lens_changes_its_model(
     shop = _guessed_shop(tmp_path)
     changed = _radial().to_pycolmap()
     changed.camera_id = 1
-    monkeypatch.setattr(lens, "better_lenses", lambda *_: ({1: changed}, frozenset()))
+    monkeypatch.setattr(intrinsics_check, "better_lenses", lambda *_: ({1: changed}, frozenset()))
     options = MapOptions(init_frames=("cam:31", "cam:35"))
     models, log = _begun(shop, options, {1: "cam"}, _KEYFRAMES)
     assert log["better_lenses"] == {"cam": "RADIAL"}
@@ -403,7 +410,7 @@ def test_only_a_centre_that_was_found_off_is_found_anew(
         left = 50.0 if part.camera(1).model_name == "RADIAL" else 100.0
         return left * min(0.99, crop) if centre else left
 
-    monkeypatch.setattr(lens, "_cost", cost)
+    monkeypatch.setattr(intrinsics_check, "_cost", cost)
     _, log = _begun(shop, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam"}, _KEYFRAMES)
     assert log["better_lenses"] == {"cam": "RADIAL"}
     first_map = [False, False, False, True, False]

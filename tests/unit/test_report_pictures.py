@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.capture import KeptFrames
-from bodycap_batch.context import StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.report.pictures import _LARGEST, series
 
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from bodycap_batch.cli import main
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.bvh import RigOptions, read_bvh, read_rig, write_bvh
 from bodycap_batch.formats.bvh.mapping import direction_words, joint_lines, missing_roles, warnings
-from bodycap_batch.geometry import so3_exp
-from bodycap_batch.skeleton import Motion, SkeletonModel, as_in_file, in_tpose, rest_pose
-from bodycap_batch.skeleton_presets import bone_vector, load_skeleton, nominal_mount, segment_axes
+from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.skeleton import Motion, SkeletonModel, as_in_file, in_tpose, rest_pose
+from bodycap_batch.model.skeleton_presets import bone_vector, load_skeleton, nominal_mount, segment_axes
 from tests.bodies import reaching
 
 

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bodycap_batch import rolling_shutter
-from bodycap_batch.arrays import FloatArray, IntArray
-from bodycap_batch.camera import Camera
 from bodycap_batch.config import MapOptions
-from bodycap_batch.errors import EstimationError
+from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.export.metrics import observation_errors
-from bodycap_batch.geometry import invert, make_transform, so3_exp
-from bodycap_batch.mapping.rolling import Readout, RollingModel, readouts, with_readouts
-from bodycap_batch.mapping.solve import mapper_options
-from bodycap_batch.rolling_shutter import apparent_readout, at_mid_row, image_velocity, looks_rolling
-from bodycap_batch.scene import FrameStatus, Map, Registration, Trajectory
+from bodycap_batch.mapping.intrinsics.readout_time import Readout, RollingModel, readouts, with_readouts
+from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options
+from bodycap_batch.model import rolling_shutter
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import invert, make_transform, so3_exp
+from bodycap_batch.model.rolling_shutter import apparent_readout, at_mid_row, image_velocity, looks_rolling
+from bodycap_batch.model.scene import FrameStatus, Map, Registration, Trajectory
 
 LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([400.0, 400.0, 320.0, 240.0]))
 FRAMES = 90

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from bodycap_batch.errors import (
+from bodycap_batch.core.errors import (
     BodycapError,
     Cancelled,
     CaptureError,
@@ -25,10 +25,10 @@ from bodycap_batch.errors import (
     EstimationError,
     StoreError,
 )
-from bodycap_batch.progress import Event
+from bodycap_batch.core.progress import Event
 from bodycap_batch.runner import Children, NotStored, Rules, Runner, Task
 from bodycap_batch.runner.child import _DiskWatch
-from bodycap_batch.store import ArtefactKey, Store
+from bodycap_batch.store.artefacts import ArtefactKey, Store
 
 ROOT = Path(__file__).parents[2]
 FAKE = (sys.executable, str(ROOT / "tests" / "pipeline" / "fake_child.py"))
@@ -331,7 +331,7 @@ def test_a_task_may_be_forbidden_before_it_begins(bench: Bench) -> None:
 _FULL_DISK = """
 import sys
 from pathlib import Path
-from bodycap_batch.errors import StoreError
+from bodycap_batch.core.errors import StoreError
 from tests.unit.test_runner import Bench, a_task
 bench = Bench(Path(sys.argv[1]))
 assert bench.runner.run(a_task("work"))[1]

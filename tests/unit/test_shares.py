@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bodycap_batch.shares import percent
+from bodycap_batch.core.percent import percent
 
 
 @pytest.mark.parametrize(

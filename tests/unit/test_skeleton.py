@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodycap_batch.skeleton import Motion, SkeletonModel, forward_kinematics
+from bodycap_batch.model.skeleton import Motion, SkeletonModel, forward_kinematics
 
 
 def chain() -> SkeletonModel:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bodycap_batch.errors import JobError
-from bodycap_batch.geometry import so3_exp
-from bodycap_batch.skeleton import SkeletonModel, forward_kinematics
-from bodycap_batch.skeleton_presets import (
+from bodycap_batch.core.errors import JobError
+from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.skeleton import SkeletonModel, forward_kinematics
+from bodycap_batch.model.skeleton_presets import (
     MEAN_HEIGHT_M,
     PRESETS,
     bone_vector,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodycap_batch.mapping.spanning import spanning_rows
+from bodycap_batch.mapping.matching.skeletal_set import spanning_rows
 
 
 def _likeness(places: np.ndarray, reach: float) -> np.ndarray:

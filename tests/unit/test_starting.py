@@ -13,7 +13,7 @@ from bodycap_batch.check.starting import UNKNOWN, starting_job, write_starting_j
 from bodycap_batch.cli import main
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import Job
-from bodycap_batch.errors import CaptureError, JobError
+from bodycap_batch.core.errors import CaptureError, JobError
 from tests.broken import BVH, FRAMES, LENS
 from tests.videos import write_video
 

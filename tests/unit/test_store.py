@@ -17,9 +17,15 @@ from typing import Any
 
 import pytest
 
-from bodycap_batch.digests import FileDigests, file_sha256, json_digest, remove_abandoned, temporary_beside
-from bodycap_batch.errors import CaptureError, StoreError
-from bodycap_batch.store import MANIFEST, Artefact, ArtefactKey, Store
+from bodycap_batch.core.errors import CaptureError, StoreError
+from bodycap_batch.store.artefacts import MANIFEST, Artefact, ArtefactKey, Store
+from bodycap_batch.store.digests import (
+    FileDigests,
+    file_sha256,
+    json_digest,
+    remove_abandoned,
+    temporary_beside,
+)
 
 ROOT = Path(__file__).parents[2]
 
@@ -220,7 +226,7 @@ def test_what_is_made_anew_where_nothing_lay_is_not_set_aside(
 _COMMIT = """
 import sys
 from pathlib import Path
-from bodycap_batch.store import ArtefactKey, Store
+from bodycap_batch.store.artefacts import ArtefactKey, Store
 store = Store(Path(sys.argv[1]))
 key = ArtefactKey(stage="map", algorithm="1", options={}, inputs={}, libraries={})
 with store.draft(key) as draft:
@@ -338,7 +344,7 @@ def test_a_digest_is_remembered_until_the_file_changes(tmp_path: Path) -> None:
 def test_a_remembered_digest_is_not_computed_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     video = tmp_path / "video.mp4"
     video.write_bytes(b"frames")
-    monkeypatch.setattr("bodycap_batch.digests._SETTLED_S", -1.0)
+    monkeypatch.setattr("bodycap_batch.store.digests._SETTLED_S", -1.0)
     digests = FileDigests(tmp_path / "digests")
     first, read = digests.sha256(video), []
     assert digests.sha256(video, read.append) == first
@@ -350,7 +356,7 @@ def test_a_broken_entry_of_the_digests_is_not_believed(
 ) -> None:
     video = tmp_path / "video.mp4"
     video.write_bytes(b"frames")
-    monkeypatch.setattr("bodycap_batch.digests._SETTLED_S", -1.0)
+    monkeypatch.setattr("bodycap_batch.store.digests._SETTLED_S", -1.0)
     digests = FileDigests(tmp_path / "digests")
     first = digests.sha256(video)
     for entry in (tmp_path / "digests").iterdir():

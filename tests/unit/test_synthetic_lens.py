@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bodycap_batch.camera import Camera
+from bodycap_batch.model.camera import Camera
 from bodycap_batch.synthetic.lens import ray_grid
 
 WIDTH, HEIGHT = 96, 72

@@ -1,7 +1,7 @@
 import pytest
 from pydantic import ValidationError
 
-from bodycap_batch.camera import CAMERA_MODELS
+from bodycap_batch.model.camera import CAMERA_MODELS
 from bodycap_batch.synthetic import SynthOptions
 
 

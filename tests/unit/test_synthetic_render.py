@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from bodycap_batch.camera import Camera
-from bodycap_batch.geometry import invert, make_transform, so3_exp
-from bodycap_batch.skeleton import Mount
-from bodycap_batch.skeleton_presets import load_skeleton
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import invert, make_transform, so3_exp
+from bodycap_batch.model.skeleton import Mount
+from bodycap_batch.model.skeleton_presets import load_skeleton
 from bodycap_batch.synthetic.atlas import Atlas, filter_for
 from bodycap_batch.synthetic.filming import Film, Sensor, camera_at
 from bodycap_batch.synthetic.lens import ray_grid

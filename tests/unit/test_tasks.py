@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bodycap_batch.camera import Camera
 from bodycap_batch.config.models import Job
-from bodycap_batch.digests import FileDigests
-from bodycap_batch.errors import CaptureError, DiskAway, JobError
-from bodycap_batch.pipeline.inputs import body_arguments, camera_digest
-from bodycap_batch.scene import FrameStatus, Registration, Trajectory
-from bodycap_batch.skeleton import Mount
-from bodycap_batch.skeleton_presets import (
+from bodycap_batch.core.errors import CaptureError, DiskAway, JobError
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.scene import FrameStatus, Registration, Trajectory
+from bodycap_batch.model.skeleton import Mount
+from bodycap_batch.model.skeleton_presets import (
     NOMINAL_SIGMA_RAD,
     STATED_SIGMA_M,
     STATED_SIGMA_RAD,
     load_skeleton,
     nominal_mount,
 )
+from bodycap_batch.pipeline.inputs import body_arguments, camera_digest
+from bodycap_batch.store.digests import FileDigests
 from bodycap_batch.tasks.body import mount_prior
 from bodycap_batch.tasks.registered import row_fraction
 
@@ -157,7 +157,7 @@ def test_footage_whose_disk_goes_away_while_it_is_read_is_not_to_blame(
     def fail(*_: Any) -> str:
         raise OSError(number, os.strerror(number))  # from `read`: it names no file
 
-    monkeypatch.setattr("bodycap_batch.digests.file_sha256", fail)
+    monkeypatch.setattr("bodycap_batch.store.digests.file_sha256", fail)
     job = a_job(tmp_path)
     with pytest.raises(DiskAway, match=os.strerror(number)) as caught:
         camera_digest(job.capture, job.capture.cameras[0], FileDigests(tmp_path / "digests"))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodycap_batch.tracking import (
+from bodycap_batch.model.optical_flow import (
     bearings,
     coarse_image,
     coarse_motion,

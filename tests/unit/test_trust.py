@@ -14,7 +14,7 @@ from bodycap_batch.config.job import load_job
 from bodycap_batch.config.limits import Limits, limits_from
 from bodycap_batch.config.models import Job
 from bodycap_batch.config.trust import PathPolicy
-from bodycap_batch.errors import CaptureError, JobError
+from bodycap_batch.core.errors import CaptureError, JobError
 from tests.videos import textured_frame, write_video
 
 

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.tum import TimedPoses, read_tum, seconds_text, write_tum
-from bodycap_batch.geometry import make_transform, rotation_angle_rad
+from bodycap_batch.model.geometry import make_transform, rotation_angle_rad
 
 
 def poses(count: int, seed: int, start_ns: int = 0) -> TimedPoses:

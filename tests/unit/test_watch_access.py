@@ -6,7 +6,7 @@ import socket
 
 import pytest
 
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.watch.web.access import Access, access_from
 
 TOKEN = "s3cret-s3cret-s3cret"  # noqa: S105

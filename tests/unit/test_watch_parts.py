@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from bodycap_batch.errors import JobError, StoreError
+from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.watch.changes import Changes, on_network_disk
 from bodycap_batch.watch.claim import Onlooker, first_claim, take_over
 from bodycap_batch.watch.drops import Drop, Settling, drops_in, look_at

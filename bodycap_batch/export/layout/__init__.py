@@ -6,7 +6,7 @@ from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.export.layout.names import rename
 from bodycap_batch.export.layout.rates import resample, smooth
 from bodycap_batch.export.layout.roots import floor_name, place_root, with_tpose
-from bodycap_batch.skeleton import Motion
+from bodycap_batch.model.skeleton import Motion
 
 __all__ = ["lay_out"]
 

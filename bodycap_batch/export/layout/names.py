@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.geometry import quat_xyzw_from_rotation, so3_exp
-from bodycap_batch.skeleton import Motion, SkeletonModel
-from bodycap_batch.skeleton_presets import split_side
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.geometry import quat_xyzw_from_rotation, so3_exp
+from bodycap_batch.model.skeleton import Motion, SkeletonModel
+from bodycap_batch.model.skeleton_presets import split_side
 
 
 @cache

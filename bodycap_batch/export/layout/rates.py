@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.geometry import (
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.geometry import (
     continuous_quat_xyzw,
     interpolate_pose,
     make_transform,
     rotation_from_quat_xyzw,
 )
-from bodycap_batch.skeleton import Motion
+from bodycap_batch.model.skeleton import Motion
 
 _EXACT = 1e-9
 """A new tick this near to an old one, as a share of their distance, is that one."""

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
 from bodycap_batch.config.options import RootMode
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.export.layout.names import naming
-from bodycap_batch.geometry import quat_xyzw_from_rotation, so3_exp
-from bodycap_batch.skeleton import Motion, SkeletonModel, rest_pose
+from bodycap_batch.model.geometry import quat_xyzw_from_rotation, so3_exp
+from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 
 _UPRIGHT = 0.1
 """Below this the hips are near upside down and have no heading: the one before is kept."""

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray, frozen_array
+from bodycap_batch.core.arrays import FloatArray, frozen_array
 
 Units = Literal["cm", "m"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray
 
 _GIMBAL_COSINE = 1e-7
 """Below this the first and third angle cannot be told apart: each alone would be wrong by 1e-16 over it."""

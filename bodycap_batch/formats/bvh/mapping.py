@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.formats.bvh.roles import ROLES
-from bodycap_batch.skeleton import SkeletonModel, rest_pose
+from bodycap_batch.model.skeleton import SkeletonModel, rest_pose
 
 _DIRECTIONS = {
     "left": (1, 0, 0), "right": (-1, 0, 0), "up": (0, 0, 1), "down": (0, 0, -1), "forward": (0, -1, 0),

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.formats.bvh.axes import world_from_file_points, world_from_file_rotations
 from bodycap_batch.formats.bvh.euler import rotation_from_angles
 from bodycap_batch.formats.bvh.parser import FileJoint, parse_bvh
 from bodycap_batch.formats.bvh.roles import assign_roles
-from bodycap_batch.skeleton import Motion, SkeletonModel
+from bodycap_batch.model.skeleton import Motion, SkeletonModel
 
 logger = logging.getLogger(__name__)
 

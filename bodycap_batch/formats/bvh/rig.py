@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.bvh.reader import read_bvh
 from bodycap_batch.formats.bvh.roles import ROLES
-from bodycap_batch.geometry import so3_exp
-from bodycap_batch.skeleton import Motion, SkeletonModel, rest_pose
+from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 
 NO_ROLE = "none"
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.formats.bvh.axes import file_from_world_points, file_from_world_rotations
 from bodycap_batch.formats.bvh.euler import continuous_angles
 from bodycap_batch.formats.files import replacing
-from bodycap_batch.skeleton import Motion, SkeletonModel
+from bodycap_batch.model.skeleton import Motion, SkeletonModel
 
 _POSITIONS = ("Xposition", "Yposition", "Zposition")
 

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 
 VARIABLE = "BODYCAP_BLENDER"
 _HINT = (

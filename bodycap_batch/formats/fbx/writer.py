@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.errors import StoreError
+from bodycap_batch.core.errors import StoreError
 from bodycap_batch.formats.fbx.blender import run_script
 from bodycap_batch.formats.files import replacing
 from bodycap_batch.formats.gltf import write_glb
-from bodycap_batch.geometry import so3_exp
-from bodycap_batch.skeleton import Motion
+from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.skeleton import Motion
 
 POSITION_TOLERANCE_M = 1e-4
 _SCRIPT = Path(__file__).with_name("convert.py")

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray, frozen_array
-from bodycap_batch.geometry import make_transform
+from bodycap_batch.core.arrays import FloatArray, frozen_array
+from bodycap_batch.model.geometry import make_transform
 
 FILE_FROM_WORLD: FloatArray = frozen_array(
     [[1, 0, 0], [0, 0, 1], [0, -1, 0]], name="file_from_world", shape=(3, 3)

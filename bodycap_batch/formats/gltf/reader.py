@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.gltf.axes import DTYPES, FILE_FROM_WORLD, WIDTHS, rotations_in_world_axes
-from bodycap_batch.geometry import rotation_from_quat_xyzw
-from bodycap_batch.skeleton import Motion, SkeletonModel
+from bodycap_batch.model.geometry import rotation_from_quat_xyzw
+from bodycap_batch.model.skeleton import Motion, SkeletonModel
 
 
 def read_glb(path: Path | str) -> Motion:

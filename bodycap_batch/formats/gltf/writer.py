@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.formats.figure import stick_figure
 from bodycap_batch.formats.files import replacing
 from bodycap_batch.formats.gltf.axes import (
@@ -21,8 +21,8 @@ from bodycap_batch.formats.gltf.axes import (
     VERTICES,
     poses_in_file_axes,
 )
-from bodycap_batch.geometry import continuous_quat_xyzw, invert, make_transform, quat_xyzw_from_rotation
-from bodycap_batch.skeleton import Motion, SkeletonModel, rest_pose
+from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, make_transform, quat_xyzw_from_rotation
+from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 
 _COLOR = (0.86, 0.39, 0.10, 1.0)
 

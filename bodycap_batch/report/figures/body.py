@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.body import MergeResult
-from bodycap_batch.geometry import interpolate_pose, invert
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.geometry import interpolate_pose, invert
+from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.report.figures.svg import element, picture, polyline, text
 from bodycap_batch.report.inputs import ReportInputs
 

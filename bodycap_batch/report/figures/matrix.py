@@ -10,10 +10,10 @@ import base64
 
 import numpy as np
 
-from bodycap_batch.arrays import IntArray
+from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.model.scene import Map, Registration
 from bodycap_batch.report.figures.svg import element, number, picture, text
 from bodycap_batch.report.inputs import ReportInputs
-from bodycap_batch.scene import Map, Registration
 
 _WIDTH, _LEFT, _TOP, _MAX_ROWS, _MAX_COLUMNS = 960.0, 92.0, 20.0, 720, 856
 _LEAST_BAND = 60.0

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import html
 
+from bodycap_batch.core.percent import percent
 from bodycap_batch.report.advice import shared_points
 from bodycap_batch.report.figures.svg import element, picture, text
 from bodycap_batch.report.inputs import ReportInputs
-from bodycap_batch.shares import percent
 
 _CELL, _LEFT, _TOP = 74.0, 130.0, 26.0
 _MOST = 24

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
-from bodycap_batch.geometry import rotation_angle_rad
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.geometry import rotation_angle_rad
+from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.report.figures.svg import bins, element, number, picture, polyline, text
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.losses import Loss
 from bodycap_batch.report.placing import common_times_s
-from bodycap_batch.scene import FrameStatus, Trajectory
 
 WIDTH, LEFT, RIGHT = 960.0, 92.0, 12.0
 _STATUS_HEIGHT, _ROW_HEIGHT, _GAP = 18.0, 44.0, 10.0

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from bodycap_batch.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray
 
 
 def number(value: float) -> str:

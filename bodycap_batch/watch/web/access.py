@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs
 
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 
 COOKIE = "bodycap_token"
 _SAFE = ("GET", "HEAD")

@@ -22,7 +22,7 @@ from starlette.responses import (
 )
 from starlette.routing import Route
 
-from bodycap_batch.errors import BodycapError, CaptureError, StoreError
+from bodycap_batch.core.errors import BodycapError, CaptureError, StoreError
 from bodycap_batch.watch.commands import cancel_job, retry_job
 from bodycap_batch.watch.spool import JobDir
 from bodycap_batch.watch.web.access import COOKIE, Access

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from bodycap_batch.config.limits import Limits
-from bodycap_batch.errors import JobError
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.watch.spool import Spool
 from bodycap_batch.watch.web.access import Access
 from bodycap_batch.watch.web.feed import Feed

@@ -14,8 +14,8 @@ from pathlib import Path, PurePosixPath
 
 from bodycap_batch.config.folder import JOB_FILES, VIDEO_SUFFIXES
 from bodycap_batch.config.limits import Limits
-from bodycap_batch.errors import CaptureError, JobError, StoreError
-from bodycap_batch.store import disk_errors
+from bodycap_batch.core.errors import CaptureError, JobError, StoreError
+from bodycap_batch.store.artefacts import disk_errors
 from bodycap_batch.watch.claim import is_at_work, is_of_this_machine, process_mark
 from bodycap_batch.watch.drops import READY
 from bodycap_batch.watch.spool import Spool, move, spool_name

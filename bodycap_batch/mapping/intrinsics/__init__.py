@@ -1,0 +1,1 @@
+"""Camera intrinsics and shutter readout times, checked and refined against the map."""

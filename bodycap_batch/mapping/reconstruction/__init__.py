@@ -1,0 +1,1 @@
+"""Incremental reconstruction and bundle adjustment."""

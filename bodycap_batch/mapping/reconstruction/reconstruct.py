@@ -1,0 +1,394 @@
+"""Run COLMAP's incremental mapper over a database: from nothing, or on from an existing model."""
+
+from __future__ import annotations
+
+import copy
+import shutil
+from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bodycap_batch.config import MapOptions
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.mapping.matching.database import DATABASE_NAME, matched_names
+from bodycap_batch.mapping.matching.skeletal_set import MANY
+from bodycap_batch.mapping.reconstruction.incremental_mapper import grow
+from bodycap_batch.mapping.reconstruction.initial_pair import Start
+from bodycap_batch.mapping.reconstruction.reprojection import typical_residual_px
+
+if TYPE_CHECKING:
+    import pycolmap
+
+MODELS_NAME = "sparse"
+_LADDER = (
+    {"init_min_tri_angle": 16.0, "init_min_num_inliers": 100, "init_max_forward_motion": 0.95},
+    {"init_min_tri_angle": 6.0, "init_min_num_inliers": 50, "init_max_forward_motion": 0.99},
+    {"init_min_tri_angle": 2.0, "init_min_num_inliers": 25, "init_max_forward_motion": 1.0},
+)
+"""Demands on the initial pair, relaxed step by step; the first are COLMAP's own."""
+
+_MIN_MODEL_KEYFRAMES = 3
+_SEARCH_TRIALS = 200
+"""Pairs that COLMAP's own search looks at: its default."""
+_MIN_STANDING = 0.25
+"""Share of the keyframes that a map from a chosen pair must reach; else the next pair is tried."""
+_ADJUSTMENT_TOLERANCE = 1e-5
+"""Relative change of the cost that ends a bundle adjustment: COLMAP's 0 runs every one to its last
+iteration, which on 299 violent keyframes took 3.7 times as long (206 to 55 CPU seconds) for the same map."""
+
+_SETTLED_TOLERANCE = 1e-4
+"""The same for the last adjustment, whose loss converges slowly. Half the time of 1e-5, keyframes as exact
+(walk12 0.30 and 0.30 cm, room12 0.71 and 0.73, violent arms 1.30 and 1.30); 1e-3 costs them up to 5 %."""
+
+_LONG_TRACKS = 14.0
+"""Keyframes that see an observation's point, on average over the observations. Taking the points out of the
+equations costs the square of a track, conjugate gradients on what is left only the track. The last
+adjustment of walk131 (285 keyframes, 23) takes 3.15 CPU seconds with them instead of 5.4, tum_fr1_xyz (23)
+0.50 instead of 0.59, room12 (16) 0.54 instead of 0.61, room131 (12) 0.94 instead of 0.81."""
+_STEP_ACCURACY = 1e-3
+"""Relative error at which these end. With COLMAP's 0.1 walk131's keyframes are off by 0.314 cm instead of
+0.304, with this by 0.304 (room12 0.71 cm, tum_fr1_xyz 0.74, both as with the direct solver)."""
+
+_GLOBAL_GROWTH = 1.4
+_GLOBAL_REFINEMENTS = 2
+_LOCAL_REFINEMENTS = 1
+"""The whole map is adjusted when it has grown by this factor (COLMAP: 1.1), with fewer rounds (COLMAP:
+5 and 2). Keyframes are as exact as with COLMAP's numbers (walk12 0.51 and 0.49 cm, room12 0.71 and 0.70,
+tum_fr1_xyz 0.87 and 0.87, walk131 0.66 and 0.80), in 55 to 85 % of the time. One round, a tolerance of 1e-4
+and no redundant points save another 1 to 3 seconds, but left a palm's block of room131 36 cm off."""
+
+_MIN_POINTS = 20
+"""Points of the map that place a keyframe. With COLMAP's 30, 20 and 15 on room131: 152, 167, 182 of 271
+keyframes, then 307, 311, 322 frames registered at 1.38, 1.35, 1.82 cm."""
+
+_MIN_LOSS_PX = 0.05
+"""Where all residuals vanish."""
+
+_MAX_EXTRA_PARAM = 1e3
+"""A given calibration is trusted: COLMAP's own limit of 1 drops lenses with k3 > 1 silently."""
+
+
+def mapper_options(
+    options: MapOptions, constant_cameras: Collection[int], scale: float
+) -> pycolmap.IncrementalPipelineOptions:
+    """Settings of the mapper: seeded, reproducible, given intrinsics held fixed.
+
+    Args:
+        options: The stage's options.
+        constant_cameras: Ids of calibrated cameras.
+        scale: Factor on pixel thresholds.
+
+    One thread: several add up residuals in an order that changes from run to run, and so does the map.
+    """
+    import pycolmap
+
+    settings = pycolmap.IncrementalPipelineOptions()
+    settings.random_seed = options.seed
+    settings.num_threads = 1
+    settings.ba_min_num_residuals_for_cpu_multi_threading = 2**31 - 1
+    settings.ba_local_function_tolerance = _ADJUSTMENT_TOLERANCE
+    settings.ba_global_function_tolerance = _ADJUSTMENT_TOLERANCE
+    settings.ba_global_frames_ratio = settings.ba_global_points_ratio = _GLOBAL_GROWTH
+    settings.ba_global_max_refinements = _GLOBAL_REFINEMENTS
+    settings.ba_local_max_refinements = _LOCAL_REFINEMENTS
+    settings.extract_colors = False
+    settings.min_model_size = _MIN_MODEL_KEYFRAMES
+    settings.constant_cameras = set(constant_cameras)
+    settings.ba_refine_sensor_from_rig = False
+    for part in (settings, settings.mapper, settings.triangulation):
+        part.max_extra_param = _MAX_EXTRA_PARAM
+    settings.mapper.abs_pose_min_num_inliers = _MIN_POINTS
+    settings.mapper.abs_pose_max_error *= scale
+    settings.mapper.init_max_error *= scale
+    settings.mapper.filter_max_reproj_error *= scale
+    return settings
+
+
+def reconstruct(
+    workspace: Path,
+    settings: pycolmap.IncrementalPipelineOptions,
+    context: StageContext,
+    total: int,
+    starts: Sequence[Start] = (),
+) -> tuple[list[Any], list[dict[str, object]]]:
+    """Build models from nothing, easing the demands on the initial pair until one stands.
+
+    Args:
+        workspace: Folder of the database.
+        settings: The mapper's settings; changed.
+        context: Progress and cancellation.
+        total: Keyframes there are.
+        starts: Pairs to start from, the best first; COLMAP's own search where none of them holds.
+
+    Returns:
+        Reconstructions, largest first, and what each step of the ladder gave.
+    """
+    steps: list[dict[str, object]] = []
+    for step in _LADDER:
+        for name, value in step.items():
+            setattr(settings.mapper, name, value)
+        for start in (*starts, None):
+            if start is None:
+                models = _search(workspace, settings, context, total)
+            else:
+                models = _from_start(start, workspace, settings, context, total)
+            entry = {**step, "models": [model.num_reg_images() for model in models]}
+            steps.append({**entry, **start.to_log()} if start else entry)
+            if models and models[0].num_reg_images() >= _MIN_STANDING * total:
+                return models, steps
+            if start:
+                steps[-1]["failed"] = start.doubt if not models else "few keyframes followed"
+            elif models:
+                return models, steps
+    return [], steps
+
+
+def _search(
+    workspace: Path, settings: pycolmap.IncrementalPipelineOptions, context: StageContext, total: int
+) -> list[Any]:
+    """Models from the pairs that COLMAP finds."""
+    settings.init_image_id1, settings.init_image_id2 = -1, -1
+    settings.init_num_trials, settings.multiple_models = _SEARCH_TRIALS, True
+    return _run(workspace, settings, context, total)
+
+
+def _from_start(
+    start: Start,
+    workspace: Path,
+    settings: pycolmap.IncrementalPipelineOptions,
+    context: StageContext,
+    total: int,
+) -> list[Any]:
+    """The model from a chosen pair, and those of the keyframes it does not hold.
+
+    The largest of these takes what it can of the first one's keyframes, as COLMAP's own further models do: a
+    part of the room can be reached from one side alone.
+    """
+    import pycolmap
+
+    settings.init_image_id1, settings.init_image_id2 = start.ids
+    first = pycolmap.Reconstruction()
+    if not grow(workspace, settings, first, ticker(context, total, context.check_cancelled)):
+        return []
+    models = [first]
+    if first.num_reg_images() < _MIN_STANDING * total:
+        return models
+    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+        left = sorted(matched_names(database) - _keyframes(models[0]))
+    if len(left) >= _MIN_MODEL_KEYFRAMES:
+        settings.image_names = left
+        further = _search(workspace, settings, context, total)
+        settings.image_names = []
+        if further:
+            further[0] = _grown(further[0], workspace, settings, context, total)
+            models = [model for model in models if not _keyframes(model) <= _keyframes(further[0])]
+        models += further
+    return sorted(models, key=size)
+
+
+def _keyframes(model: Any) -> set[str]:
+    """Names of a model's keyframes."""
+    return {model.image(number).name for number in model.reg_image_ids()}
+
+
+def _grown(
+    model: Any,
+    workspace: Path,
+    settings: pycolmap.IncrementalPipelineOptions,
+    context: StageContext,
+    total: int,
+) -> Any:
+    """A model with all keyframes that find a place in it."""
+    grown = copy.deepcopy(model)
+    grow(workspace, settings, grown, ticker(context, total, context.check_cancelled))
+    return min([grown, model], key=size)
+
+
+def extend(
+    workspace: Path,
+    model: Any,
+    settings: pycolmap.IncrementalPipelineOptions,
+    context: StageContext,
+    total: int,
+) -> Any:
+    """A model with the database's new images registered in it; its own poses stay where they are."""
+    settings.fix_existing_frames = True
+    grown = copy.deepcopy(model)
+    few = model.num_reg_frames() <= MANY  # all of very many are adjusted once, at the end
+    grow(workspace, settings, grown, ticker(context, total, context.check_cancelled), whole=few)
+    return grown
+
+
+def _run(
+    workspace: Path,
+    settings: pycolmap.IncrementalPipelineOptions,
+    context: StageContext,
+    total: int,
+) -> list[Any]:
+    import pycolmap
+
+    target = workspace / "mapper"
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir()
+    token = pycolmap.CancellationToken()
+    images = workspace / "images"
+    images.mkdir(exist_ok=True)
+    found = pycolmap.incremental_mapping(
+        str(workspace / DATABASE_NAME),
+        str(images),
+        str(target),
+        settings,
+        next_image_callback=ticker(context, total, token.cancel),
+        cancellation_token=token,
+    )
+    shutil.rmtree(target, ignore_errors=True)
+    context.check_cancelled()
+    return sorted(found.values(), key=size)
+
+
+def size(model: Any) -> tuple[int, int]:
+    """Sorts the largest model first."""
+    return -model.num_reg_images(), -model.num_points3D()
+
+
+def ticker(context: StageContext, total: int, stop: Callable[[], None], done: int = 0) -> Callable[[], None]:
+    """What tells of one more keyframe in the map each time it is called, and calls `stop` once it should."""
+
+    def tick() -> None:
+        nonlocal done
+        done += 1
+        context.progress(min(done, total), total, "keyframes in the map")
+        if context.cancelled():
+            stop()
+
+    return tick
+
+
+def write_models(workspace: Path, models: list[Any]) -> None:
+    """Write the models to ``sparse/<n>``, replacing what was there."""
+    folder = workspace / MODELS_NAME
+    shutil.rmtree(folder, ignore_errors=True)
+    for number, model in enumerate(models):
+        (folder / str(number)).mkdir(parents=True)
+        model.write(str(folder / str(number)))
+
+
+def refine(
+    model: Any,
+    settings: pycolmap.IncrementalPipelineOptions,
+    constant_cameras: Collection[int],
+    only: Collection[int] | None = None,
+) -> None:
+    """One bundle adjustment by squares, outliers taken out. Arguments and errors are those of `adjust`."""
+    adjust(model, settings, constant_cameras, only=only)
+    _filter(model, settings)
+
+
+def settle(
+    model: Any,
+    settings: pycolmap.IncrementalPipelineOptions,
+    constant_cameras: Collection[int],
+    only: Collection[int] | None = None,
+) -> None:
+    """The last adjustment of a model that stands: what lies off by more than is usual hardly pulls.
+
+    Keypoints are exact to a quarter of a pixel, but one in ten lies off by four times that and more, large
+    and blurred ones above all. A square lets those bend the map. The loss is Cauchy's, as wide as the median
+    residual along an axis: the width that the residuals themselves make most likely. All frames, with squares
+    and with it: walk12 0.38, 0.32 cm, room12 0.66, 0.55, tum_fr1_xyz 0.29, 0.28, a rendered brown-lens walk
+    0.67, 0.29, two with sleeves in view 0.93, 0.66 and 0.53, 0.41; with three times the width half as much is
+    won. Were all noise Gaussian, it would cost 1.4 times the error.
+
+    Raises:
+        EstimationError: The adjustment failed.
+
+    Source: Zhang, "Parameter estimation techniques: a tutorial with application to conic fitting", 1997, for
+        the loss; its width is the most likely scale of a Cauchy distribution.
+    """
+    width_px = max(_MIN_LOSS_PX, typical_residual_px(model))
+    adjust(model, settings, constant_cameras, loss_px=width_px, only=only)
+    _filter(model, settings)
+
+
+def _track_length(model: Any) -> float:
+    """How many keyframes see the point of an observation, on average over the observations."""
+    length = np.array([model.point3D(point).track.length() for point in model.point3D_ids()], dtype=float)
+    return float((length**2).sum() / max(1.0, length.sum()))
+
+
+def _filter(model: Any, settings: pycolmap.IncrementalPipelineOptions) -> None:
+    import pycolmap
+
+    pycolmap.ObservationManager(model).filter_all_points3D(
+        settings.mapper.filter_max_reproj_error, settings.mapper.filter_min_tri_angle
+    )
+    model.update_point_3d_errors()
+
+
+def part_of(model: Any, image_ids: Collection[int]) -> Any:
+    """A copy of a model with only these of its registered images."""
+    part = copy.deepcopy(model)
+    for image_id in part.reg_image_ids():
+        if image_id not in image_ids:
+            part.deregister_frame(part.image(image_id).frame_id)
+    return part
+
+
+def adjust(
+    model: Any,
+    settings: pycolmap.IncrementalPipelineOptions,
+    constant_cameras: Collection[int],
+    iterations: int | None = None,
+    loss_px: float | None = None,
+    only: Collection[int] | None = None,
+) -> None:
+    """One bundle adjustment over the whole model, every pose free; the gauge moves.
+
+    Of some keyframes alone: all other poses stay, and so do the points that others see and the lenses.
+
+    Args:
+        model: A reconstruction, changed in place.
+        settings: The mapper's settings.
+        constant_cameras: Ids of calibrated cameras.
+        iterations: At most so many; the settings' own number by default.
+        loss_px: Width of a Cauchy loss; squares by default.
+        only: Ids of the images that are adjusted; all by default.
+
+    Raises:
+        EstimationError: The adjustment failed.
+
+    Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999.
+    """
+    import pycolmap
+
+    adjustment = settings.get_global_bundle_adjustment()
+    if iterations is not None:
+        adjustment.ceres.solver_options.max_num_iterations = iterations
+    if loss_px is not None:
+        adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        adjustment.ceres.loss_function_scale = loss_px
+        adjustment.ceres.solver_options.function_tolerance = _SETTLED_TOLERANCE
+    iterative = only is not None or (loss_px is not None and _track_length(model) > _LONG_TRACKS)
+    if iterative:
+        # By the least numbers that COLMAP accepts, everything beyond which is solved that way.
+        adjustment.ceres.max_num_images_direct_dense_cpu_solver = 1
+        adjustment.ceres.max_num_images_direct_sparse_cpu_solver = 2
+        adjustment.ceres.solver_options.eta = _STEP_ACCURACY
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids() if only is None else sorted(only):
+        config.add_image(image_id)
+    for camera_id in constant_cameras if only is None else sorted(model.cameras):
+        if model.exists_camera(camera_id):
+            config.set_constant_cam_intrinsics(camera_id)
+    if not iterative:
+        # Held coordinates make blocks of unlike sizes, which cost conjugate gradients more than they save.
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    summary = pycolmap.create_default_bundle_adjuster(adjustment, config, model).solve()
+    if not summary.is_solution_usable():
+        raise EstimationError(
+            f"the map of {model.num_reg_images()} keyframes could not be refined: {summary.brief_report()}",
+            hint="set registration: {rounds: 0} to keep the map as it was first built",
+        )

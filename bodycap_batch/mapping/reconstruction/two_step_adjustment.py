@@ -1,0 +1,83 @@
+"""Adjust a map of very many keyframes: first those that see all there is, then the others to these."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.mapping.matching.database import ImageRef
+from bodycap_batch.mapping.matching.skeletal_set import spanning_rows
+from bodycap_batch.mapping.reconstruction.reconstruct import part_of, refine, settle
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_SHARED = 60
+"""Points that two keyframes share which surely show the same."""
+
+
+def refine_large(
+    model: Any, settings: pycolmap.IncrementalPipelineOptions, constant_cameras: Collection[int]
+) -> None:
+    """`refine` and `settle` for very many keyframes, in place: all at once they would take hours.
+
+    Those that see all there is are adjusted together, as a map of their own. The others follow, to points
+    that stay; a point that the first map does not hold is theirs alone.
+
+    Args:
+        model: A reconstruction; the gauge moves.
+        settings: The mapper's settings.
+        constant_cameras: Ids of calibrated cameras.
+
+    Raises:
+        EstimationError: An adjustment failed.
+    """
+    images = np.array(sorted(model.reg_image_ids()), dtype=np.int64)
+    carrying = set(
+        images[spanning_rows(_shared(model, images), _order(model, images), sure=_SHARED)].tolist()
+    )
+    part = part_of(model, carrying)
+    refine(part, settings, constant_cameras)
+    settle(part, settings, constant_cameras)
+    _take_over(model, part, carrying)
+    others = set(map(int, model.reg_image_ids())) - carrying
+    if others:
+        refine(model, settings, constant_cameras, others)
+        settle(model, settings, constant_cameras, others & set(map(int, model.reg_image_ids())))
+
+
+def _shared(model: Any, images: IntArray) -> npt.NDArray[np.int16]:
+    """(N,N) how many points two keyframes share."""
+    seen = [
+        np.array([points[index].point3D_id for index in image.get_observation_point2D_idxs()], dtype=np.int64)
+        for image in map(model.image, images.tolist())
+        for points in [image.points2D]
+    ]
+    columns = np.unique(np.concatenate(seen), return_inverse=True)[1]
+    starts = np.concatenate([[0], np.cumsum([len(mine) for mine in seen])])
+    rows = sparse.csr_array((np.ones(len(columns), np.int16), columns, starts))
+    return np.asarray((rows @ rows.T).toarray(), dtype=np.int16)
+
+
+def _order(model: Any, images: IntArray) -> IntArray:
+    """(N,) where each keyframe stands in the order of time, about: cameras may differ in their rates."""
+    return np.array([ImageRef.parse(model.image(number).name).frame for number in images.tolist()])
+
+
+def _take_over(model: Any, part: Any, carrying: Collection[int]) -> None:
+    """Poses, lenses, points and outliers of a part's adjustment, for the whole model, in place."""
+    for number, camera in part.cameras.items():
+        model.camera(number).params = camera.params
+    for number in part.point3D_ids():
+        model.point3D(number).xyz = part.point3D(number).xyz
+    for number in sorted(carrying):
+        image, mine = model.image(number), part.image(number)
+        model.frame(image.frame_id).set_cam_from_world(image.camera_id, mine.cam_from_world())
+        for feature in map(int, image.get_observation_point2D_idxs()):
+            if image.points2D[feature].has_point3D() and not mine.points2D[feature].has_point3D():
+                model.delete_observation(number, feature)

@@ -1,0 +1,154 @@
+"""Find keyframes in the wrong place or left out, match them again, place them again, or cut them out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pair, image_ids
+from bodycap_batch.mapping.matching.pair_matching import match_pairs
+from bodycap_batch.mapping.matching.skeletal_set import MANY
+from bodycap_batch.mapping.reconstruction.reconstruct import extend, part_of, refine
+from bodycap_batch.mapping.validation.epipolar_consistency import contradicted_share, doubtful, links_of
+from bodycap_batch.model.camera import Camera
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_ROUNDS = 2
+_LEAST_BUDGET = 2000
+"""Pairs that may be matched again, where fewer were matched in the first place."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Workshop:
+    """What a repair needs besides the map.
+
+    Attributes:
+        workspace: Folder of the database.
+        lenses: Lens of each camera, and whether it is known.
+        settings: Makes the mapper's settings.
+        constant: Ids of calibrated cameras.
+        context: Threads, progress, cancellation.
+        frame_numbers: `CaptureCamera.frame_numbers` of each camera.
+    """
+
+    workspace: Path
+    lenses: Mapping[str, tuple[Camera, bool]]
+    settings: Callable[[], Any]
+    constant: Collection[int]
+    context: StageContext
+    frame_numbers: Mapping[str, IntArray]
+
+
+def repair(
+    model: pycolmap.Reconstruction,
+    tried: set[Pair],
+    shop: Workshop,
+    among: Collection[ImageRef] | None = None,
+) -> tuple[Any, dict[str, object]]:
+    """Take doubtful keyframes out, match them and the unregistered ones again, place them again or cut them.
+
+    Args:
+        model: The largest model; not changed.
+        tried: Pairs that were matched; those matched here are added.
+        shop: Workspace, lenses, settings.
+        among: Keyframes that belong in it; by default all of the database.
+
+    Returns:
+        The better of the old and the new model without what is doubtful still, and an account for the log.
+    """
+    import pycolmap
+
+    log: list[dict[str, object]] = []
+    with pycolmap.Database.open(str(shop.workspace / DATABASE_NAME)) as database:
+        ids = image_ids(database)
+    if among is not None:
+        ids = {ref: ids[ref] for ref in among}
+    links = links_of(shop.workspace, model)
+    suspects = doubtful(links)
+    for _ in range(_ROUNDS):
+        placed = set(map(int, model.reg_image_ids()))
+        missing = set(ids.values()) - placed
+        if not suspects | missing:
+            break
+        fresh = _untried(ids, suspects | missing, tried)
+        if len(fresh) > max(_LEAST_BUDGET, len(tried)):
+            # Where many are missing they saw too little: matching them with all would cost the most.
+            fresh = _untried(ids, suspects, tried)
+        tried |= set(fresh)
+        held = match_pairs(shop.workspace, fresh, shop.lenses, shop.context)
+        entry: dict[str, object] = {
+            "doubtful": [ref.name for ref, number in sorted(ids.items()) if number in suspects],
+            "unregistered": len(missing),
+            "pairs": len(fresh),
+            "verified_pairs": len(held),
+        }
+        log.append(entry)
+        if not held and not suspects:
+            break
+        other = place_again(model, suspects, shop, len(ids))
+        other_links = links_of(shop.workspace, other)
+        left = doubtful(other_links)
+        sound_before = len(placed - suspects)
+        sound_after = len(set(map(int, other.reg_image_ids())) - left)
+        entry |= {"sound_before": sound_before, "sound_after": sound_after}
+        if sound_after < sound_before or (sound_after == sound_before and len(left) >= len(suspects)):
+            break
+        model, suspects, links = other, left, other_links
+    share = round(contradicted_share(links), 4)
+    model, cut = _without(model, suspects)
+    if cut:
+        _refine_few(model, shop)
+    return model, {"rounds": log, "cut": cut, "contradicted_share": share}
+
+
+def cut_doubtful(model: pycolmap.Reconstruction, shop: Workshop) -> tuple[Any, list[str]]:
+    """The model without keyframes that contradict it, adjusted then, and their names."""
+    kept, cut, _ = uncontradicted(model, shop)
+    if cut:
+        _refine_few(kept, shop)
+    return kept, cut
+
+
+def uncontradicted(model: pycolmap.Reconstruction, shop: Workshop) -> tuple[Any, list[str], float]:
+    """`cut_doubtful` with all poses left as they are, and the share of links that contradicted the model."""
+    links = links_of(shop.workspace, model)
+    return *_without(model, doubtful(links)), round(contradicted_share(links), 4)
+
+
+def _without(model: Any, suspects: set[int]) -> tuple[Any, list[str]]:
+    """Points that only suspects see go with them; tracking finds their frames' poses from what is left."""
+    cut = sorted(model.image(number).name for number in suspects)
+    return part_of(model, set(map(int, model.reg_image_ids())) - suspects) if cut else model, cut
+
+
+def _untried(ids: Mapping[ImageRef, int], images: set[int], tried: set[Pair]) -> list[Pair]:
+    refs: Sequence[ImageRef] = sorted(ids)
+    chosen = [ref for ref in refs if ids[ref] in images]
+    return sorted({(min(a, b), max(a, b)) for a in chosen for b in refs if a != b} - tried)
+
+
+def place_again(model: pycolmap.Reconstruction, suspects: Collection[int], shop: Workshop, total: int) -> Any:
+    """The model with suspects taken out, they and new keyframes registered against what is left, all refined.
+
+    Args:
+        model: A reconstruction; not changed.
+        suspects: Ids of images.
+        shop: Workspace, lenses, settings.
+        total: Keyframes there are.
+    """
+    rest = part_of(model, set(model.reg_image_ids()) - set(suspects))
+    grown = extend(shop.workspace, rest, shop.settings(), shop.context, total)
+    _refine_few(grown, shop)
+    return grown
+
+
+def _refine_few(model: pycolmap.Reconstruction, shop: Workshop) -> None:
+    """Refine a model in place; in one of very many keyframes only what is new to it is, at the end."""
+    if model.num_reg_images() <= MANY:
+        refine(model, shop.settings(), shop.constant)

@@ -1,0 +1,1 @@
+"""The kinematic chain, and first poses of its bones."""

@@ -1,0 +1,194 @@
+"""The bones that become variables of the graph, with what is known about each joint beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.skeleton import SkeletonModel
+from bodycap_batch.model.skeleton_presets import rest_positions, segment_axes, split_side
+
+JOINT_SLACK_M = 0.005
+"""How far a bone's end may leave its parent's joint: soft tissue, and room for the optimiser to move."""
+
+HINGE_ARM_M = 0.3
+"""Where the two ranges that make a hinge are anchored, either side of it along its axis."""
+
+
+@dataclass(frozen=True, slots=True)
+class _JointPrior:
+    """Rest rotation and spread of a joint, about its along, forward and flexion axes."""
+
+    relaxed_flexion_deg: float
+    sigma_deg: tuple[float, float, float]
+    psd_rotation: float
+    psd_translation: float
+
+
+# Spreads: the everyday range of each joint (half of the range of motion in D. A. Neumann, "Kinesiology of the
+# Musculoskeletal System", is about two sigmas). Power spectral densities (rad²/s³, m²/s³) were measured on
+# walking with reaching.
+_PRIORS = {
+    "Hips": _JointPrior(0.0, (30.0, 15.0, 15.0), 2.4, 1.5),
+    "Spine": _JointPrior(0.0, (8.0, 8.0, 10.0), 2.4, 1.5),
+    "Spine1": _JointPrior(0.0, (8.0, 8.0, 10.0), 2.4, 1.5),
+    "Neck": _JointPrior(0.0, (12.0, 10.0, 12.0), 3.0, 2.0),
+    "Head": _JointPrior(0.0, (25.0, 12.0, 15.0), 3.0, 2.0),
+    "Shoulder": _JointPrior(0.0, (4.0, 6.0, 6.0), 5.0, 2.0),
+    "Arm": _JointPrior(0.0, (45.0, 30.0, 40.0), 18.0, 2.4),
+    "ForeArm": _JointPrior(25.0, (40.0, 40.0, 40.0), 24.0, 6.0),
+    "Hand": _JointPrior(0.0, (10.0, 15.0, 25.0), 30.0, 12.0),
+    "UpLeg": _JointPrior(5.0, (12.0, 12.0, 30.0), 12.0, 2.4),
+    "Leg": _JointPrior(-15.0, (20.0, 20.0, 35.0), 18.0, 6.0),
+    "Foot": _JointPrior(0.0, (10.0, 10.0, 20.0), 18.0, 24.0),
+    "ToeBase": _JointPrior(0.0, (5.0, 5.0, 20.0), 18.0, 24.0),
+}
+_HINGED = {"ForeArm": "Hand", "Leg": "Foot"}
+LIMB_LINKS: dict[str, tuple[str | None, str]] = {
+    "Arm": ("ForeArm", "Hand"),
+    "ForeArm": (None, "Hand"),
+    "UpLeg": ("Leg", "Foot"),
+    "Leg": (None, "Foot"),
+}
+"""Limb bones: the bone that follows (None: the next is the end) and the limb's end."""
+_HANGING = {"Arm": 10.0, "UpLeg": 0.0}
+"""Limbs that hang at ease, with their abduction in degrees."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hinge:
+    """A hinge joint: equal distances from two points beside it keep the next joint in its plane.
+
+    Attributes:
+        upper: Index of the bone above the hinge.
+        lower: Index of the bone that starts at it.
+        following: Index of the bone that starts at the lower bone's far end.
+        anchors_m: (2,3) the two points in the upper bone's frame.
+        range_m: Their distance to the following bone's joint.
+        sigma_m: How far that distance may be off beyond a joint's slack: the lower bone's `off_hinge_m`.
+    """
+
+    upper: int
+    lower: int
+    following: int
+    anchors_m: FloatArray
+    range_m: float
+    sigma_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bone:
+    """A bone of the graph.
+
+    Attributes:
+        joint: Index of its joint in the skeleton.
+        role: Anatomical name.
+        parent: Index of its parent among the bones, −1 for the first.
+        offset_m: (3,) its joint's centre in the parent's frame.
+        mean_rotation: (3,3) parent_from_bone at ease.
+        rotation_covariance: (3,3) rad², in the bone's own axes.
+        psd: (6,) power spectral density of its acceleration, rotation first.
+        off_hinge_m: Sigma by which its far end leaves the plane of its hinge, beyond a joint's slack.
+    """
+
+    joint: int
+    role: str
+    parent: int
+    offset_m: FloatArray
+    mean_rotation: FloatArray
+    rotation_covariance: FloatArray
+    psd: FloatArray
+    off_hinge_m: float = 0.0
+
+
+def graph_bones(skeleton: SkeletonModel, mounted_roles: Iterable[str]) -> tuple[Bone, ...]:
+    """Pick the bones between the mounted ones; a parent stands before its children.
+
+    Args:
+        skeleton: The body.
+        mounted_roles: Roles that carry a camera; each is a joint of the skeleton.
+    """
+    joints = [skeleton.roles.index(role) for role in set(mounted_roles)]
+    chains = [_ancestors(skeleton, joint) for joint in joints]
+    top = max(set.intersection(*(set(chain) for chain in chains)))
+    between = {joint for chain in chains for joint in chain if joint >= top and skeleton.roles[joint]}
+    kept = sorted(between | {top})
+    order = {joint: index for index, joint in enumerate(kept)}
+    rest = rest_positions(skeleton)
+    return tuple(_make_bone(skeleton, joint, order, rest) for joint in kept)
+
+
+def _ancestors(skeleton: SkeletonModel, joint: int) -> list[int]:
+    chain = [joint]
+    while skeleton.parents[chain[-1]] >= 0:
+        chain.append(int(skeleton.parents[chain[-1]]))
+    return chain
+
+
+def _make_bone(skeleton: SkeletonModel, joint: int, order: dict[int, int], rest: FloatArray) -> Bone:
+    above = next((j for j in _ancestors(skeleton, joint)[1:] if j in order), None)
+    role = skeleton.roles[joint]
+    prior = _PRIORS[split_side(role)[1]] if role else _PRIORS["Spine"]
+    axes = proper_axes(skeleton, role)
+    spread = np.diag(np.radians(prior.sigma_deg) ** 2)
+    return Bone(
+        joint=joint,
+        role=role,
+        parent=-1 if above is None else order[above],
+        offset_m=rest[joint] - (rest[above] if above is not None else 0.0),
+        mean_rotation=_relaxed(skeleton, role, prior),
+        rotation_covariance=axes @ spread @ axes.T,
+        psd=np.repeat([prior.psd_rotation, prior.psd_translation], 3),
+    )
+
+
+def proper_axes(skeleton: SkeletonModel, role: str) -> FloatArray:
+    """Along, forward and flexion axis (along × forward) as columns: a rotation on either side."""
+    axes = segment_axes(skeleton, role)
+    return np.column_stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])])
+
+
+def _relaxed(skeleton: SkeletonModel, role: str, prior: _JointPrior) -> FloatArray:
+    """parent_from_bone of a person standing at ease."""
+    side, part = split_side(role)
+    flexion = so3_exp([0.0, 0.0, np.radians(prior.relaxed_flexion_deg)])
+    axes = proper_axes(skeleton, role)
+    if part in _HANGING:
+        tilt = np.radians(_HANGING[part])
+        outward = 1.0 if side == "Left" else -1.0
+        along = np.array([outward * np.sin(tilt), 0.0, -np.cos(tilt)])
+        forward = np.array([0.0, -1.0, 0.0])
+        hanging = np.column_stack([along, forward, np.cross(along, forward)])
+        return np.asarray(hanging @ flexion @ axes.T)
+    if part in _HINGED:
+        upper = proper_axes(skeleton, side + {"ForeArm": "Arm", "Leg": "UpLeg"}[part])
+        return np.asarray(upper @ flexion @ axes.T)
+    return np.eye(3)
+
+
+def hinges(skeleton: SkeletonModel, bones: tuple[Bone, ...]) -> tuple[Hinge, ...]:
+    """Elbows and knees whose next bone is in the graph too."""
+    index = {bone.role: position for position, bone in enumerate(bones)}
+    out = []
+    for bone in bones:
+        side, part = split_side(bone.role)
+        following = index.get(side + _HINGED[part]) if part in _HINGED else None
+        if following is None or bone.parent < 0:
+            continue
+        axis = proper_axes(skeleton, bones[bone.parent].role)[:, 2]
+        length = float(np.linalg.norm(bones[following].offset_m))
+        out.append(
+            Hinge(
+                upper=bone.parent,
+                lower=index[bone.role],
+                following=following,
+                anchors_m=bone.offset_m + HINGE_ARM_M * np.array([axis, -axis]),
+                range_m=float(np.hypot(HINGE_ARM_M, length)),
+                sigma_m=bone.off_hinge_m,
+            )
+        )
+    return tuple(out)

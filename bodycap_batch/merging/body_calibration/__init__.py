@@ -1,0 +1,1 @@
+"""What is constant about a body: mounts, bone lengths, metric scale, and their uncertainty."""

@@ -1,0 +1,1 @@
+"""The path of each camera, cleaned and checked."""

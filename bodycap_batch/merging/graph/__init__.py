@@ -1,0 +1,1 @@
+"""The factor graph of the body in motion, and the covariance of its solution."""

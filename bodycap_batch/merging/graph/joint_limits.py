@@ -1,0 +1,131 @@
+"""Soft rules: limits of joints and the reach of arms; when walking, palms hang on their own side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.merging.body.bones import HINGE_ARM_M, Bone, hinges, proper_axes
+from bodycap_batch.merging.graph.factors import bone_key
+from bodycap_batch.model.merge_data import Activity
+from bodycap_batch.model.skeleton import SkeletonModel
+from bodycap_batch.model.skeleton_presets import rest_positions, split_side
+
+_SIGMA_M = 0.05
+_LIMIT_SIGMA_M = 0.02
+_SHRUG_M = 0.05
+"""How far a shoulder's centre moves on the trunk when the clavicle turns by 15 to 20°."""
+_ANCHOR_M = 1.0
+"""Distance of the points from which height and side are judged: far enough that spheres are nearly planes."""
+_CROSSING_M = 0.1
+"""How far a walking palm may cross the body's middle before it is pulled back."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """A bone's joint keeps a distance within bounds from a point of another bone.
+
+    Attributes:
+        name: For the report.
+        base: Index of the bone that carries the point.
+        bone: Index of the bone whose joint is bounded.
+        anchor_m: (3,) the point, in the base's frame.
+        low_m: Smallest distance.
+        high_m: Largest distance.
+        sigma_m: Stiffness outside the bounds.
+    """
+
+    name: str
+    base: int
+    bone: int
+    anchor_m: FloatArray
+    low_m: float
+    high_m: float
+    sigma_m: float = _SIGMA_M
+
+    def add(self, graph: Any, tick: int) -> None:
+        """Add the soft factor of one tick: no force inside the bounds, a spring outside."""
+        middle, half = 0.5 * (self.low_m + self.high_m), 0.5 * (self.high_m - self.low_m)
+        dead_zone = gtsam.noiseModel.mEstimator.L2WithDeadZone.Create(half / self.sigma_m)
+        noise = gtsam.noiseModel.Robust.Create(dead_zone, gtsam.noiseModel.Isotropic.Sigma(1, self.sigma_m))
+        anchor = gtsam.Pose3(gtsam.Rot3(), self.anchor_m)
+        keys = bone_key(tick, self.base), bone_key(tick, self.bone)
+        graph.add(gtsam.RangeFactorWithTransformPose3(*keys, middle, noise, anchor))
+
+    def violation_m(self, world_from_bone: FloatArray) -> FloatArray:
+        """How far solved poses (T,B,4,4) press beyond the bounds (T,), 0 inside."""
+        base = world_from_bone[:, self.base]
+        anchor = np.einsum("tij,j->ti", base[:, :3, :3], self.anchor_m) + base[:, :3, 3]
+        distance = np.linalg.norm(world_from_bone[:, self.bone, :3, 3] - anchor, axis=1)
+        return np.asarray(np.maximum(np.maximum(self.low_m - distance, distance - self.high_m), 0.0))
+
+
+def soft_rules(skeleton: SkeletonModel, bones: Sequence[Bone], activity: Activity) -> tuple[Rule, ...]:
+    """All rules that apply to the bones of the graph."""
+    return (
+        *limit_rules(skeleton, bones),
+        *reach_rules(skeleton, bones),
+        *activity_rules(skeleton, bones, activity),
+    )
+
+
+def limit_rules(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[Rule, ...]:
+    """Elbows and knees do not bend backwards.
+
+    The lower bone's far end keeps to the half space of a point on the side the joint closes to; the hinge
+    keeps it in the plane.
+    """
+    rules = []
+    for hinge in hinges(skeleton, tuple(bones)):
+        side, part = split_side(bones[hinge.upper].role)
+        forward = proper_axes(skeleton, bones[hinge.upper].role)[:, 1] * (1.0 if part == "Arm" else -1.0)
+        joint = hinge.anchors_m.mean(axis=0)
+        length = float(np.linalg.norm(bones[hinge.following].offset_m))
+        name = f"{side} {'elbow' if part == 'Arm' else 'knee'} not overstretched"
+        # At right angles to the point the limb is straight; nearer is bent.
+        furthest = float(np.hypot(HINGE_ARM_M, length))
+        anchor = joint + HINGE_ARM_M * forward
+        rules.append(Rule(name, hinge.upper, hinge.following, anchor, 0.0, furthest, _LIMIT_SIGMA_M))
+    return tuple(rules)
+
+
+def reach_rules(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[Rule, ...]:
+    """Palms stay within an arm's length of the shoulder, where the chest alone says where that is."""
+    index = {bone.role: position for position, bone in enumerate(bones)}
+    chest = index.get("Spine1")
+    rest, rules = rest_positions(skeleton), []
+    for side in ("Left", "Right"):
+        hand, arm = index.get(side + "Hand"), index.get(side + "Arm")
+        if chest is None or hand is None or arm is None:
+            continue
+        shoulder = rest[bones[arm].joint] - rest[bones[chest].joint]
+        links = [bones[index[side + part]].offset_m for part in ("ForeArm", "Hand")]
+        reach = float(sum(np.linalg.norm(link) for link in links)) + _SHRUG_M
+        rules.append(Rule(f"{side} palm within reach", chest, hand, shoulder, 0.0, reach))
+    return tuple(rules)
+
+
+def activity_rules(skeleton: SkeletonModel, bones: Sequence[Bone], activity: Activity) -> tuple[Rule, ...]:
+    """The rules of an activity; ``generic`` has none beyond the limits and the reach."""
+    index = {bone.role: position for position, bone in enumerate(bones)}
+    chest = index.get("Spine1")
+    if activity != "walk" or chest is None:
+        return ()
+    rest = rest_positions(skeleton)
+    rules = []
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        hand, arm = index.get(side + "Hand"), skeleton.index_of_role(side + "Arm")
+        if hand is None or arm is None:
+            continue
+        shoulder = rest[arm] - rest[bones[chest].joint]
+        above = shoulder + np.array([0.0, 0.0, _ANCHOR_M])
+        beside = shoulder + np.array([sign * _ANCHOR_M, 0.0, 0.0])
+        across = _ANCHOR_M + abs(float(shoulder[0])) + _CROSSING_M
+        rules.append(Rule(f"{side} palm below the shoulder", chest, hand, above, _ANCHOR_M, 3.0 * _ANCHOR_M))
+        rules.append(Rule(f"{side} palm on its side", chest, hand, beside, 0.0, across))
+    return tuple(rules)

@@ -1,0 +1,1 @@
+"""Similarities between maps that share no view, found through the body."""

@@ -1,0 +1,1 @@
+"""What the stage reports of its result, and the advice it gives."""

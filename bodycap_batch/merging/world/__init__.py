@@ -1,0 +1,1 @@
+"""The vertical and the floor: the axes of the world."""

@@ -1,0 +1,281 @@
+"""Sparse optical flow between two frames, checked forward and backward. Pixels have COLMAP's origin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX
+
+GreyImage = npt.NDArray[np.uint8]
+Pixels = npt.NDArray[np.float32]
+
+REFERENCE_WIDTH_PX = 640.0
+"""Pixel thresholds are stated for images of this long side and scale with it."""
+
+_WINDOW_PX = 21
+_LEVELS = 4
+_GUIDED_LEVELS = 2
+_SURE_LEVELS = 0
+"""With a guess the coarse levels only add cost and ways to go wrong."""
+_ITERATIONS = 20
+_EPSILON_PX = 0.02
+_MAX_ROUND_TRIP_PX = 1.0
+_COARSE_WIDTH_PX = 320.0
+_COARSE_WINDOW_PX = 15
+_COARSE_LEVELS = 3
+_COARSE_POINTS = 48
+_MIN_COARSE_POINTS = 12
+_COARSE_ERROR_PX = 2.5
+_COARSE_TRIALS = 300
+_MIN_AGREED = 7
+"""Three more than a homography fits by itself."""
+_SURE_SHARE = 0.5
+_PIECE_SHARE = 0.35
+_PIECE_ROWS, _PIECE_COLUMNS = 2, 3
+_PIECES_TRIED = 2
+_MIN_CONTRAST = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """Where points went.
+
+    Attributes:
+        px: (N,2) position in the second image, COLMAP origin.
+        ok: (N,) found, inside the image and returning to where it came from.
+        round_trip_px: (N,) distance between a point and its image after going there and back.
+    """
+
+    px: Pixels
+    ok: BoolArray
+    round_trip_px: Pixels
+
+
+def pixel_scale(width_px: int, height_px: int) -> float:
+    """Factor on pixel thresholds for an image of this size."""
+    return max(width_px, height_px) / REFERENCE_WIDTH_PX
+
+
+def track_points(
+    first: GreyImage,
+    second: GreyImage,
+    px: Pixels,
+    guess_px: Pixels | None = None,
+    *,
+    careful: bool = True,
+    window_px: int = _WINDOW_PX,
+) -> Flow:
+    """Follow points from one image to the next by pyramidal Lucas–Kanade, there and back.
+
+    Args:
+        first: (H,W) uint8 image.
+        second: (H,W) uint8 image.
+        px: (N,2) float32 points in the first image.
+        guess_px: (N,2) where to start looking in the second image.
+        careful: Look far around the guess, follow the points back too and refuse those that do not return.
+            Otherwise only the guess's surroundings are searched, for a quarter of the cost.
+        window_px: Side of the square around a point that is compared.
+
+    Source: Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2000; the check is
+        Kalal, Mikolajczyk, Matas, "Forward-backward error", ICPR 2010.
+    """
+    if len(px) == 0:
+        return Flow(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0, np.float32))
+    start = np.ascontiguousarray(px - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
+    guess = None if guess_px is None else np.asarray(guess_px - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
+    levels = _LEVELS if guess is None else (_GUIDED_LEVELS if careful else _SURE_LEVELS)
+    there, alive = _lucas_kanade(first, second, start, guess, (window_px, levels))
+    height, width = second.shape
+    alive &= ((there >= 0) & (there <= (width - 1, height - 1))).all(axis=1)
+    found_px = (there + CV2_PIXEL_OFFSET_PX).astype(np.float32)
+    if not careful:
+        return Flow(found_px, alive, np.zeros(len(px), np.float32))
+    back = np.full_like(there, np.inf)
+    if alive.any():
+        # The way back starts from the guess's own shift, so that it does not know the answer.
+        back_guess = None if guess is None else there[alive] - (guess - start)[alive]
+        returned, refound = _lucas_kanade(second, first, there[alive], back_guess, (window_px, levels))
+        returned[~refound] = np.inf
+        back[alive] = returned
+    round_trip = np.linalg.norm(back - start, axis=1).astype(np.float32)
+    limit = _MAX_ROUND_TRIP_PX * pixel_scale(width, height)
+    return Flow(found_px, alive & (round_trip < limit), round_trip)
+
+
+def _lucas_kanade(
+    first: GreyImage, second: GreyImage, start: Pixels, guess: Pixels | None, size: tuple[int, int]
+) -> tuple[Pixels, BoolArray]:
+    """OpenCV's tracker, in OpenCV's pixels; `size` is the window's width and the number of coarse levels."""
+    import cv2
+
+    window, levels = size
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ITERATIONS, _EPSILON_PX)
+    flags = 0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW
+    guess = None if guess is None else guess.copy()
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        first, second, start, guess, None, None, (window, window), levels, criteria, flags
+    )
+    return there, np.asarray(found).ravel().astype(bool)
+
+
+def coarse_image(grey: GreyImage) -> GreyImage:
+    """The image reduced for `coarse_motion`, whatever its size."""
+    import cv2
+
+    scale = min(1.0, _COARSE_WIDTH_PX / max(grey.shape))
+    return np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """How the whole image moved.
+
+    Attributes:
+        homography: (3,3) second from first, full-size pixels of COLMAP's origin.
+        sure: True where most points agree with it.
+    """
+
+    homography: FloatArray
+    sure: bool
+
+    def inverse(self) -> Motion:
+        """The way back."""
+        return Motion(np.asarray(np.linalg.inv(self.homography)), self.sure)
+
+
+def coarse_motion(first: GreyImage, second: GreyImage, px: Pixels, width_px: int) -> Motion | None:
+    """Homography from one image to the next, near enough to start tracking from.
+
+    Some points are followed from where they were. Where few of them agree on a motion they are followed
+    again from where pieces of the image are found in the second one: a hand's camera turns by up to 35
+    degrees between two frames.
+
+    Args:
+        first: `coarse_image` of the first image.
+        second: The same of the second.
+        px: (N,2) points of the first image at full size; some of them are followed.
+        width_px: Width of the full-size images.
+
+    Returns:
+        It, or None where too few points agree.
+    """
+    scale = first.shape[1] / width_px
+    some = px[np.linspace(0, len(px) - 1, min(len(px), _COARSE_POINTS)).astype(int)] if len(px) else px
+    start = np.ascontiguousarray(some * scale - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
+    best, agreed = _followed(first, second, start, None)
+    if agreed < _SURE_SHARE * len(start):
+        for shift in _piece_shifts(first, second):
+            found, count = _followed(first, second, start, start + shift)
+            if count > agreed:
+                best, agreed = found, count
+    if best is None or agreed < _MIN_AGREED:
+        return None
+    # From OpenCV's pixels of the reduced images to COLMAP's of the full ones.
+    full = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, scale]])
+    return Motion(np.asarray(full @ best @ np.linalg.inv(full)), agreed >= _SURE_SHARE * len(start))
+
+
+def _followed(
+    first: GreyImage, second: GreyImage, start: Pixels, guess: Pixels | None
+) -> tuple[FloatArray | None, int]:
+    """Homography that most followed points agree on, and how many do."""
+    import cv2
+
+    if len(start) < _MIN_COARSE_POINTS:
+        return None, 0
+    levels = _COARSE_LEVELS if guess is None else _GUIDED_LEVELS
+    there, found = _lucas_kanade(first, second, start, guess, (_COARSE_WINDOW_PX, levels))
+    found &= ((there >= 0) & (there <= (second.shape[1] - 1, second.shape[0] - 1))).all(axis=1)
+    if found.sum() < _MIN_COARSE_POINTS:
+        return None, 0
+    homography, agreed = cv2.findHomography(
+        start[found], there[found], cv2.RANSAC, _COARSE_ERROR_PX, maxIters=_COARSE_TRIALS
+    )
+    return (None, 0) if homography is None else (homography, int(agreed.sum()))
+
+
+def _piece_shifts(first: GreyImage, second: GreyImage) -> list[Pixels]:
+    """Where pieces of the first image are found in the second: shifts (2,) of the best ones.
+
+    Source: Lewis, "Fast normalized cross-correlation", 1995.
+    """
+    import cv2
+
+    halves = [
+        cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in (first, second)
+    ]
+    height, width = halves[0].shape
+    side = round(_PIECE_SHARE * max(height, width))
+    found: list[tuple[float, Pixels]] = []
+    for top in np.linspace(0, height - side, _PIECE_ROWS).astype(int):
+        for left in np.linspace(0, width - side, _PIECE_COLUMNS).astype(int):
+            piece = halves[0][top : top + side, left : left + side]
+            if piece.std() < _MIN_CONTRAST:
+                continue
+            scores = cv2.matchTemplate(halves[1], piece, cv2.TM_CCOEFF_NORMED)
+            _, score, _, (column, row) = cv2.minMaxLoc(scores)
+            found.append((score, np.array([column - left, row - top], np.float32) * np.float32(2.0)))
+    found.sort(key=lambda item: -item[0])
+    return [shift for _, shift in found[:_PIECES_TRIED]]
+
+
+def moved(px: Pixels, homography: FloatArray) -> Pixels:
+    """Points (N,2) under a homography (3,3)."""
+    ahead = px @ homography[:, :2].T + homography[:, 2]
+    return np.asarray(ahead[:, :2] / ahead[:, 2:], dtype=np.float32)
+
+
+def detect_corners(grey: GreyImage, count: int, spacing_px: float, mask: BoolArray | None = None) -> Pixels:
+    """Corners (N,2) worth tracking, strongest first, at least `spacing_px` apart, where a mask is True.
+
+    Source: Shi, Tomasi, "Good features to track", CVPR 1994.
+    """
+    import cv2
+
+    allowed = None if mask is None else mask.astype(np.uint8)
+    corners = cv2.goodFeaturesToTrack(grey, count, 0.005, spacing_px, mask=allowed)
+    if corners is None:
+        return np.zeros((0, 2), np.float32)
+    return np.asarray(corners.reshape(-1, 2) + CV2_PIXEL_OFFSET_PX, dtype=np.float32)
+
+
+def sharpness(grey: GreyImage) -> float:
+    """Spread of the image's second derivative: falls with blur, comparable between neighbouring frames.
+
+    Source: Pech-Pacheco et al., "Diatom autofocusing in brightfield microscopy", ICPR 2000.
+    """
+    import cv2
+
+    small = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return float(cv2.meanStdDev(cv2.Laplacian(small, cv2.CV_16S, ksize=1))[1][0, 0])
+
+
+def bearings(rays: FloatArray) -> FloatArray:
+    """Unit directions (N,3) of rays (N,2) given at depth 1."""
+    full = np.column_stack([rays, np.ones(len(rays))])
+    return np.asarray(full / np.linalg.norm(full, axis=1, keepdims=True))
+
+
+def fit_rotation(first: FloatArray, second: FloatArray, rounds: int = 4) -> FloatArray:
+    """Rotation (3,3) that best turns unit directions (N,3) `first` into `second`, robustly.
+
+    Source: Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976, reweighted
+        with Cauchy weights at the median residual.
+    """
+    weight = np.ones(len(first))
+    rotation = np.eye(3)
+    for _ in range(rounds):
+        covariance = (second * weight[:, None]).T @ first
+        u, _, vt = np.linalg.svd(covariance)
+        if np.linalg.det(covariance) < 0.0:
+            u[:, 2] *= -1.0
+        rotation = u @ vt
+        residual = second - first @ rotation.T
+        squared = np.einsum("ni,ni->n", residual, residual)
+        middle = np.partition(squared, len(squared) // 2)[len(squared) // 2]
+        weight = 1.0 / (1.0 + squared / (middle + 1e-18))
+    return np.asarray(rotation)

@@ -1,0 +1,1 @@
+"""Poses of single frames from their observations, and the test of each pose."""

@@ -1,0 +1,52 @@
+"""Which lost frames should become keyframes, so that the map grows where tracking failed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+
+_STRIDE = 3
+_EDGE = 1
+_MIN_BUDGET = 20
+_BUDGET_SHARE = 0.5
+
+
+def lost_runs(localised: BoolArray) -> list[tuple[int, int]]:
+    """Maximal runs [start, stop) of frames without a pose."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], ~localised, [False]]).astype(int)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def wanted_keyframes(localised: BoolArray, sharpness: FloatArray, tried: IntArray) -> IntArray:
+    """Frames to offer to the map: the sharpest of every few lost ones, and the ends they hang on.
+
+    Args:
+        localised: (N,) frames with a pose.
+        sharpness: (N,) image sharpness.
+        tried: Frames that were offered before.
+
+    Returns:
+        Frame indices, increasing; at most half as many as were tried before (and 20).
+
+    Source: Algorithm 1 of Vo, Kim, Choudhary, "Motion capture using body mounted cameras in an
+        unknown environment".
+    """
+    known = np.zeros(len(localised), dtype=bool)
+    known[tried] = True
+    chosen: list[int] = []
+    for start, stop in lost_runs(localised):
+        fresh: list[int] = []
+        for begin in range(start, stop, _STRIDE):
+            window = np.arange(begin, min(begin + _STRIDE, stop))
+            if not known[window].any():
+                fresh.append(int(window[np.argmax(sharpness[window])]))
+        if not fresh:
+            continue
+        ends = [frame for frame in (start - _EDGE, stop - 1 + _EDGE) if 0 <= frame < len(localised)]
+        chosen += fresh + [frame for frame in ends if not known[frame]]
+    budget = max(_MIN_BUDGET, int(_BUDGET_SHARE * len(tried)))
+    unique = np.unique(np.array(chosen, dtype=np.int64))
+    if len(unique) > budget:
+        unique = unique[np.linspace(0, len(unique) - 1, budget).round().astype(int)]
+    return unique

@@ -1,0 +1,232 @@
+"""What cameras see of the map, a stretch of frames at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import invert
+from bodycap_batch.model.rolling_shutter import at_mid_row, image_velocity
+from bodycap_batch.model.scene import Map
+from bodycap_batch.registration.poses.batched_pnp import Views, lens_jacobian, make_views
+from bodycap_batch.registration.poses.static_points import confirmed_points
+from bodycap_batch.registration.tracking.klt import Tracks
+
+_POINT_VARIANCE = 6.0
+"""Variance that a point seen by n keyframes adds to its projections, times n, in units of a track's own.
+Without it and with 3, 6, 9: walk131 0.65, 0.59, 0.55, 0.55 cm; room131 3.1, 3.0, 2.9, 2.9; walk12 0.38 for
+all; room12 0.55, 0.55, 0.56, 0.56."""
+_UNCONFIRMED_WEIGHT = 0.01
+"""Weight of points that nothing confirms. With 1, 0.1, 0.03, 0.01: room131 1.86, 1.39, 1.38, 1.36 cm; a
+rendered capture with textured sleeves in view 1.00, 0.72, 0.61, 0.58 cm; room12 0.58, 0.60, 0.61, 0.61 cm."""
+STRETCH = 1200
+"""Frames whose views are held at a time. Solving 144 s of one camera took 792 MB with all of them held, and
+takes 484; the poses are the same."""
+_MIN_JUDGED = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Member:
+    """One of the cameras that see a frame together.
+
+    Attributes:
+        camera: Its video.
+        tracks: Observations in its frames, ordered by frame.
+        cam_from_rig: (4,4) where it sits; frames' poses are those of the rig.
+        rig_frame: (N,) frame of the rig at the instant of each of its own; -1 where there is none.
+    """
+
+    camera: CaptureCamera
+    tracks: Tracks
+    cam_from_rig: FloatArray
+    rig_frame: IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Votes:
+    """How often points were seen in frames with a pose, and how often they agreed with it.
+
+    Attributes:
+        seen: (C*P,) by camera and point.
+        agreed: (C*P,) likewise.
+    """
+
+    seen: IntArray
+    agreed: IntArray
+
+    @staticmethod
+    def none(count: int) -> Votes:
+        """No votes on so many points."""
+        return Votes(np.zeros(count, np.int64), np.zeros(count, np.int64))
+
+    def add(self, which: IntArray, posed: BoolArray, agrees: BoolArray) -> None:
+        """Count views (M,) of points `which`, those alone whose frames are posed."""
+        self.seen[:] += np.bincount(which[posed], minlength=len(self.seen))
+        self.agreed[:] += np.bincount(which[posed & agrees], minlength=len(self.seen))
+
+    def share(self, which: IntArray) -> FloatArray:
+        """Share (M,) of a point's views that agree; 1 where fewer than `_MIN_JUDGED` tell."""
+        share = self.agreed / np.maximum(self.seen, 1)
+        return np.asarray(np.where(self.seen < _MIN_JUDGED, 1.0, share)[which])
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """Cameras and the map.
+
+    Attributes:
+        members: The cameras; the first one's frames are the rig's.
+        scene_map: The map.
+        confirmed: (C,P) points that something confirms, by camera.
+        kept: The only stretch, once it is known.
+    """
+
+    members: Sequence[Member]
+    scene_map: Map
+    confirmed: BoolArray
+    kept: list[Stretch] = field(default_factory=list)
+
+    @staticmethod
+    def of(members: Sequence[Member], scene_map: Map) -> Rig:
+        """Cameras with what confirms the map's points to each."""
+        confirmed = np.array([confirmed_points(member.camera, scene_map) for member in members])
+        return Rig(members, scene_map, confirmed)
+
+    def stretches(self) -> Iterator[Stretch]:
+        """What is seen, some frames at a time; a single stretch is kept for the next time."""
+        count = len(self.members[0].camera.times_ns)
+        if count > STRETCH:
+            for first in range(0, count, STRETCH):
+                yield self._stretch(slice(first, min(first + STRETCH, count)))
+            return
+        if not self.kept:
+            self.kept.append(self._stretch(slice(0, count)))
+        yield self.kept[0]
+
+    def _stretch(self, frames: slice) -> Stretch:
+        parts = [_seen_by(member, self.scene_map, frames) for member in self.members]
+        frame, point, px = (np.concatenate(each) for each in zip(*parts, strict=True))
+        member = np.repeat(np.arange(len(self.members)), [len(part[0]) for part in parts])
+        order = np.argsort(frame, kind="stable")
+        return Stretch(self, frames, frame[order], point[order], px[order], member[order])
+
+    @property
+    def lenses(self) -> list[Camera]:
+        """Their lenses, as the map has them."""
+        return [self.scene_map.cameras[member.camera.name] for member in self.members]
+
+    @property
+    def rolling(self) -> bool:
+        """Whether pixels have to be moved to the middle row's instant."""
+        return any(self.scene_map.readout_s.get(member.camera.name, 0.0) for member in self.members)
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """What a rig sees of the map in a stretch of frames: tracked points, and keyframes' own observations.
+
+    Attributes:
+        rig: The rig.
+        frames: Which frames.
+        frame: (M,) frame index, increasing.
+        point: (M,) point index.
+        px: (M,2) where.
+        member: (M,) which camera saw it.
+        made: Its views, once they are made.
+    """
+
+    rig: Rig
+    frames: slice
+    frame: IntArray
+    point: IntArray
+    px: FloatArray
+    member: IntArray
+    made: list[Views] = field(default_factory=list)
+
+    def views(self, px: FloatArray | None, votes: Votes | None) -> Views:
+        """What is seen, at pixels (M,2) where these are not its own; `votes` tell how far points agree."""
+        if px is None:
+            if not self.made:
+                self.made.append(self._views(self.px))
+            views = self.made[0]
+        else:
+            views = self._views(px)
+        return views if votes is None else replace(views, weight=views.weight * votes.share(self.which) ** 2)
+
+    def _views(self, px: FloatArray) -> Views:
+        scene_map, lenses = self.rig.scene_map, self.rig.lenses
+        # Where a point stands is known the better the more keyframes see it.
+        count = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))[self.point]
+        weight = count / (count + _POINT_VARIANCE) * np.where(self.confirmed, 1.0, _UNCONFIRMED_WEIGHT)
+        bounds = np.searchsorted(self.frame, np.arange(self.frames.start, self.frames.stop + 1))
+        points = scene_map.points[self.point]
+        if len(lenses) == 1:
+            return make_views(lenses[0], bounds, points, px, weight)
+        rays, px_from_ray = np.empty((len(px), 2)), np.empty((len(px), 2, 2))
+        for number, lens in enumerate(lenses):
+            mine = self.member == number
+            rays[mine] = lens.unproject(px[mine])
+            px_from_ray[mine] = lens_jacobian(lens, rays[mine])
+        return Views(
+            bounds=bounds,
+            points=points,
+            rays=rays,
+            px_from_ray=px_from_ray,
+            weight=weight,
+            member=self.member,
+            cam_from_rig=np.array([member.cam_from_rig for member in self.rig.members]),
+        )
+
+    @property
+    def confirmed(self) -> BoolArray:
+        """(M,) whether something confirms the point that is seen."""
+        return np.asarray(self.rig.confirmed[self.member, self.point])
+
+    @property
+    def which(self) -> IntArray:
+        """(M,) camera and point, as votes number them."""
+        return self.member * len(self.rig.scene_map.points) + self.point
+
+    def at_mid_row(self, path: FloatArray) -> FloatArray:
+        """Pixels (M,2) at the instant of the middle row, for the rig's poses of all frames."""
+        out = self.px.copy()
+        scene_map, times_ns = self.rig.scene_map, self.rig.members[0].camera.times_ns
+        for number, (member, lens) in enumerate(zip(self.rig.members, self.rig.lenses, strict=True)):
+            readout_s = scene_map.readout_s.get(member.camera.name, 0.0)
+            if readout_s:
+                mine = self.member == number
+                own, points = path @ invert(member.cam_from_rig), scene_map.points[self.point[mine]]
+                velocity = image_velocity(lens, own, times_ns, self.frame[mine], points)
+                out[mine] = at_mid_row(lens, out[mine], velocity, readout_s)
+        return out
+
+    def counts(self, which: BoolArray) -> IntArray:
+        """How many of the rows under a mask each frame of the stretch has."""
+        return np.bincount(
+            self.frame[which] - self.frames.start, minlength=self.frames.stop - self.frames.start
+        )
+
+
+def _seen_by(member: Member, scene_map: Map, frames: slice) -> tuple[IntArray, IntArray, FloatArray]:
+    """Frames of the rig, points and pixels of what one camera sees in a stretch."""
+    name = member.camera.name
+    inside = np.flatnonzero((member.rig_frame >= frames.start) & (member.rig_frame < frames.stop))
+    first, stop = (int(inside[0]), int(inside[-1]) + 1) if len(inside) else (0, 0)
+    tracks = member.tracks.within(first, stop)
+    point = scene_map.points_of(name, tracks.keyframe, tracks.feature)
+    tracked = point >= 0
+    own_frame = scene_map.keyframe_frame[scene_map.obs_keyframe]
+    mine = np.isin(scene_map.obs_keyframe, scene_map.keyframes_of(name))
+    mine &= (own_frame >= first) & (own_frame < stop)
+    frame = member.rig_frame[np.concatenate([own_frame[mine], tracks.frame[tracked]])]
+    known = frame >= 0
+    return (
+        frame[known],
+        np.concatenate([scene_map.obs_point[mine], point[tracked]])[known],
+        np.concatenate([scene_map.obs_px[mine], tracks.px[tracked].astype(np.float64)])[known],
+    )

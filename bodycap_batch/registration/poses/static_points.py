@@ -1,0 +1,40 @@
+"""Which points of a map stand in the room: those that more than one glance of one camera saw."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.core.arrays import BoolArray
+from bodycap_batch.model.scene import Map
+
+_MOMENT_NS = 1_000_000_000
+"""The wearer's sleeve hangs before the camera for longer, but seldom in one place of it."""
+_MOSTLY = 0.5
+_ENOUGH = 12
+"""Unless so large a share of a camera's keyframes sees so many confirmed points the test tells nothing: a
+camera alone that always moves on."""
+
+
+def confirmed_points(camera: CaptureCamera, scene_map: Map) -> BoolArray:
+    """(P,) points that another camera saw too, or this one more than a moment apart.
+
+    What moves with a camera, the wearer's own arm first of all, looks like a still room to that camera for a
+    while and to no other. True for all where few of the camera's keyframes see confirmed points.
+    """
+    count = len(scene_map.points)
+    rows = scene_map.keyframes_of(camera.name)
+    mine = np.isin(scene_map.obs_keyframe, rows)
+    point = scene_map.obs_point[mine]
+    times = camera.times_ns[scene_map.keyframe_frame[scene_map.obs_keyframe[mine]]]
+    first, last = np.full(count, np.iinfo(np.int64).max), np.zeros(count, dtype=np.int64)
+    np.minimum.at(first, point, times - camera.times_ns[0])
+    np.maximum.at(last, point, times - camera.times_ns[0])
+    out = last - np.minimum(first, last) > _MOMENT_NS
+    out[scene_map.obs_point[~mine]] = True
+    seen = np.bincount(
+        scene_map.obs_keyframe[mine], weights=out[point], minlength=len(scene_map.keyframe_camera)
+    )
+    seeing = np.intersect1d(rows, scene_map.obs_keyframe)  # a refused one may be kept that sees nothing
+    tells = len(seeing) > 0 and bool((seen[seeing] >= _ENOUGH).mean() >= _MOSTLY)
+    return out if tells else np.ones(count, dtype=bool)

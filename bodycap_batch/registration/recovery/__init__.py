@@ -1,0 +1,1 @@
+"""Poses of frames that tracking lost, by guided search from their neighbours."""

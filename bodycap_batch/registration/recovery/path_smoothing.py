@@ -1,0 +1,64 @@
+"""Centres that pixels tell worse than motion does, moved to where both have them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from bodycap_batch.config.lost_frames import LEAST_POSED
+from bodycap_batch.core.arrays import BoolArray
+from bodycap_batch.model.geometry import invert
+from bodycap_batch.model.scene import Trajectory
+from bodycap_batch.registration.recovery.guided_localisation import Fix
+from bodycap_batch.registration.recovery.motion_prior import Steadiness, smooth_centres
+
+_MAX_DISAGREEMENT = 11.3
+"""Squared Mahalanobis distance from the smoothed centre beyond which a pose stays as it was measured: 99 % of
+three axes. Either is wrong then, and nobody knows which."""
+
+
+def steadied(path: Trajectory, movable: BoolArray | None = None) -> Trajectory:
+    """A camera's path on which the centres of weakly seen frames follow their neighbours.
+
+    Where a violent move leaves few points, a centre is known worse than the path's own evenness from frame to
+    frame tells it. Such centres are moved to where both have them, and the turn follows as far as the points
+    tie it to the centre. Errors of all frames before and after: walk12 0.31, 0.30 cm, room12 0.54, 0.50,
+    walk131 0.37, 0.34, room131 1.78, 1.63, a rendered one with arms thrown about 1.84, 1.61 (the worst 12.8,
+    9.9). With half and twice as much unevenness room12 has 0.49 and 0.51, walk131 0.37 and 0.35.
+
+    At an end of a lost stretch a path is told from one side only: to be steadied after lost frames were
+    looked for. (Before it, the rendered one's worst is 14.4.)
+
+    Args:
+        path: Poses of one camera, solved frame by frame.
+        movable: (N,) frames whose centres may move; all by default.
+
+    Returns:
+        The same with centres moved. The covariances stay: neighbours share the map's error, which smoothing
+        does not take out. With the smoothed ones walk12's normalised squared error rises from 1.4 to 2.2 an
+        axis; with these it stays. So do ``error_px`` and ``inliers``: they tell how well pixels fixed
+        the pose that was measured.
+
+    Source: as for `smooth_centres`.
+    """
+    posed = np.flatnonzero(path.localised)
+    if len(posed) < LEAST_POSED:
+        return path
+    times = (path.times_ns - path.times_ns[0]) / np.median(np.diff(path.times_ns))
+    steadiness = Steadiness.of(times, path.gauge_from_cam[:, :3, 3])
+    if steadiness is None:
+        return path
+    fixes = {frame: Fix.of(path, frame) for frame in posed.tolist()}
+    places = {frame: fix.place for frame, fix in fixes.items()}
+    weak = {
+        frame
+        for frame, place in places.items()
+        if np.sqrt(np.linalg.eigvalsh(place.covariance)[-1]) > steadiness.bend
+    }
+    smoothed = smooth_centres(np.arange(len(times)), times, places, places.keys() - weak, steadiness)
+    matrices = path.gauge_from_cam.copy()
+    for frame in sorted(weak):
+        if (movable is None or movable[frame]) and smoothed.disagreement[frame] < _MAX_DISAGREEMENT:
+            matrices[frame] = invert(fixes[frame].with_place(smoothed.places[frame])[0])
+    return replace(path, gauge_from_cam=matrices)

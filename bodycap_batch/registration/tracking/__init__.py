@@ -1,0 +1,1 @@
+"""Map points tracked from keyframes into the frames between them."""

@@ -1,0 +1,391 @@
+"""The artefact store: results of stages, found by what they were made from.
+
+An artefact is a folder. Its key names the stage, the stage's algorithm, its options, the content of
+its inputs and the libraries; it is written to a temporary folder of the store, synced, described by a
+manifest that comes last, and renamed into place in one step. So whatever carries a key is complete,
+and a process may be killed at any moment.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import json
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from bodycap_batch.core.errors import DiskAway, StoreError
+from bodycap_batch.store.digests import (
+    FileDigests,
+    file_sha256,
+    json_digest,
+    remove_abandoned,
+    set_digest,
+    write_atomically,
+)
+
+MANIFEST = "manifest.json"
+_AWAY = frozenset({
+    errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.ECONNRESET, errno.ECONNABORTED,
+    errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENETDOWN, errno.ENETUNREACH, errno.ENODEV, errno.ENXIO,
+})  # fmt: skip
+"""What a network disk answers while its server is away, and a disk that fails."""
+DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG}) | _AWAY
+_VOLATILE_SUFFIXES = (".db",)
+"""A database differs from run to run although what it holds is the same: no part of the content."""
+_REMEMBER_BYTES = 1 << 20
+"""When an artefact is looked up, files above this are hashed again only if their inode, size or times
+changed: a finished job of any length is found finished in a moment. What a task reads is hashed whole."""
+_Found = TypeVar("_Found")
+_LOCK = "lock"
+_SETTING_ASIDE = "setting-aside"
+_UNLOCKED = "new-"
+"""Name of a draft between its making and its locking; swept only when it is older than a minute."""
+_STALE_S = 60.0
+_KEY_LENGTH = 32
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArtefactKey:
+    """What an artefact is made from; two equal keys stand for the same result.
+
+    Attributes:
+        stage: Stage name.
+        algorithm: Version of the stage's algorithm.
+        options: The stage's own options, JSON values.
+        inputs: Digest (or small JSON value) of each input.
+        libraries: Version of each library the stage computes with.
+    """
+
+    stage: str
+    algorithm: str
+    options: Mapping[str, Any]
+    inputs: Mapping[str, Any]
+    libraries: Mapping[str, str]
+
+    def document(self) -> dict[str, Any]:
+        """All of the key as JSON values."""
+        return asdict(self)
+
+    @property
+    def name(self) -> str:
+        """Short hexadecimal name of the key."""
+        return json_digest(self.document())[:_KEY_LENGTH]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Artefact:
+    """A complete, verified artefact.
+
+    Attributes:
+        path: Its folder.
+        digest: Digest of its content; equal content, equal digest, whatever it was made from.
+        made: How it was made (seconds, peak memory, threads); no part of its content.
+        files: Relative path of each file and its SHA-256.
+    """
+
+    path: Path
+    digest: str
+    made: Mapping[str, Any]
+    files: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Draft:
+    """An artefact being made.
+
+    Attributes:
+        files: Folder whose content becomes the artefact.
+        work: Scratch folder on the same file system; vanishes with the draft.
+    """
+
+    files: Path
+    work: Path
+
+
+class Store:
+    """Artefacts below one folder.
+
+    Args:
+        root: The folder; made when absent.
+
+    Raises:
+        StoreError: The folder cannot be made or written.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root.resolve()
+        self._artefacts = self.root / "artefacts"
+        self._temporary = self.root / "tmp"
+        self._corrupt = self.root / "corrupt"
+        with disk_errors(self.root):
+            for folder in (self._artefacts, self._temporary, self._corrupt):
+                folder.mkdir(parents=True, exist_ok=True)
+            if not os.access(self._temporary, os.W_OK | os.X_OK):
+                raise PermissionError(errno.EACCES, "not writable", str(self._temporary))
+        self.digests = FileDigests(self.root / "digests")
+
+    def find(self, key: ArtefactKey) -> Artefact | None:
+        """Look an artefact up; one whose digests do not hold is set aside and counts as absent."""
+        path = self._path(key)
+        with disk_errors(self.root):
+            if not path.is_dir():
+                return None
+            artefact = self._verified(path, key)
+            return artefact or self._set_aside(path, lambda: self._verified(path, key))
+
+    def verify(self, path: Path) -> None:
+        """Hash all of an artefact that is about to be read; what does not hold is set aside.
+
+        Args:
+            path: The artefact's folder.
+
+        Raises:
+            StoreError: It is damaged, although nothing has written to it: the disk fails.
+        """
+        with disk_errors(self.root):
+            if not _is_sound(path) and not self._set_aside(path, lambda: _is_sound(path)):
+                hint = "check the disk; run the job again, what was damaged is made anew"
+                raise StoreError("a stored artefact is damaged", path=path, hint=hint)
+
+    def artefacts_in(self, value: Any) -> Iterator[Path]:
+        """Folders of artefacts that the arguments of a task name."""
+        if isinstance(value, Mapping):
+            value = list(value.values())
+        if isinstance(value, list | tuple):
+            for part in value:
+                yield from self.artefacts_in(part)
+        elif isinstance(value, str) and value.startswith(f"{self._artefacts}{os.sep}"):
+            yield Path(value)
+
+    @contextmanager
+    def draft(self, key: ArtefactKey) -> Iterator[Draft]:
+        """Temporary folder for making an artefact; locked while in use, removed afterwards."""
+        with disk_errors(self.root):
+            unlocked = Path(tempfile.mkdtemp(dir=self._temporary, prefix=_UNLOCKED))
+            # A file, opened for writing: network file systems lock nothing else across machines.
+            lock = os.open(unlocked / _LOCK, os.O_RDWR | os.O_CREAT)
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            folder = unlocked.with_name(f"{key.stage}-{unlocked.name.removeprefix(_UNLOCKED)}")
+            unlocked.rename(folder)
+            draft = Draft(files=folder / "files", work=folder / "work")
+            draft.files.mkdir()
+            draft.work.mkdir()
+        try:
+            yield draft
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+            os.close(lock)
+
+    def commit(
+        self,
+        draft: Draft,
+        key: ArtefactKey,
+        made: Mapping[str, Any],
+        *,
+        before: Callable[[], None] = lambda: None,
+        replace: bool = False,
+    ) -> Artefact:
+        """Make a draft's files the artefact of `key`, or return the one somebody else committed first.
+
+        Args:
+            draft: Its files are synced to the disk.
+            key: What they were made from.
+            made: How they were made.
+            before: Called when nothing but the last, atomic step is left; may raise to prevent it.
+            replace: The draft takes the place of an artefact that is there already.
+
+        Raises:
+            StoreError: The disk is full or fails.
+        """
+        with disk_errors(self.root):
+            files = _sync_files(draft.files)
+            body = {
+                "format": 1,
+                "key": key.document(),
+                "digest": _content_digest(files),
+                "files": files,
+                "made": dict(made),
+            }
+            manifest = {"seal": json_digest(body), **body}
+            write_atomically(draft.files / MANIFEST, json.dumps(manifest, indent=1).encode())
+            _sync_folders(draft.files)
+            before()
+            if replace:
+                with self._setting_aside(), contextlib.suppress(FileNotFoundError):
+                    os.replace(self._path(key), draft.work.with_name("replaced"))
+            return self._move_in(draft.files, key)
+
+    def sweep(self) -> int:
+        """Remove what killed processes left in the temporary folder; returns how many folders."""
+        try:
+            folders = list(self._temporary.iterdir())
+            for folder in (self.root / "digests", self.root / "references"):
+                remove_abandoned(folder)
+        except OSError:  # the next draft says what is wrong with the folder
+            return 0
+        return sum(_remove_if_abandoned(folder) for folder in folders)
+
+    def free_bytes(self) -> int:
+        """Room left on the store's disk."""
+        return shutil.disk_usage(self.root).free
+
+    def _path(self, key: ArtefactKey) -> Path:
+        return self._artefacts / key.stage / key.name
+
+    def _move_in(self, files: Path, key: ArtefactKey) -> Artefact:
+        path = self._path(key)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        while True:
+            try:
+                os.replace(files, path)
+            except OSError as error:
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                    raise
+            sync_folder(path.parent)
+            if (artefact := self.find(key)) is not None:
+                return artefact
+            if not files.is_dir():
+                raise StoreError(
+                    "an artefact does not read back as it was written",
+                    path=path,
+                    hint="check the disk; another store can be named with --store",
+                )
+
+    def _verified(self, path: Path, key: ArtefactKey) -> Artefact | None:
+        try:
+            manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
+            seal = manifest.pop("seal")
+            sound = seal == json_digest(manifest) and manifest["key"] == _as_json(key.document())
+            sound = sound and all(self._holds(path / name, want) for name, want in manifest["files"].items())
+        except (FileNotFoundError, NotADirectoryError, ValueError, KeyError, AttributeError, TypeError):
+            return None  # damaged, or just being set aside by another process
+        if not sound:
+            return None
+        return Artefact(path=path, digest=manifest["digest"], made=manifest["made"], files=manifest["files"])
+
+    def _holds(self, path: Path, want: str) -> bool:
+        if not path.is_file():
+            return False
+        large = path.stat().st_size > _REMEMBER_BYTES
+        return (self.digests.sha256(path) if large else file_sha256(path)) == want
+
+    def _set_aside(self, path: Path, look: Callable[[], _Found]) -> _Found:
+        """Move a damaged artefact away, unless a last look finds a sound one: another process was quicker.
+
+        Nobody else moves it between that look and the move, so what was made anew is never taken away. Where
+        nothing lies before the look, something made anew may lie there after it.
+        """
+        with self._setting_aside():
+            there = os.path.lexists(path)
+            if not (found := look()) and there:
+                target = self._corrupt / f"{path.parent.name}-{path.name}-{time.time_ns()}"
+                with contextlib.suppress(FileNotFoundError):
+                    os.replace(path, target)
+        return found
+
+    @contextmanager
+    def _setting_aside(self) -> Iterator[None]:
+        """Be the only process that takes artefacts from their places."""
+        handle = os.open(self.root / _SETTING_ASIDE, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(handle)
+
+
+@contextmanager
+def disk_errors(path: Path) -> Iterator[None]:
+    """Turn operating system errors on the store's disk into `StoreError` with a remedy."""
+    try:
+        yield
+    except OSError as error:
+        raise store_error(error, path) from error
+
+
+def store_error(error: OSError, path: Path) -> StoreError:
+    """Describe an operating system error with what to do about it."""
+    hints = {
+        errno.ENOSPC: "free some space, or name another disk with --store; finished stages are kept",
+        errno.EDQUOT: "your disk quota is used up; name a folder on another disk with --store",
+        errno.EROFS: "the file system is read-only; name another folder with --store or --out",
+        errno.EACCES: "no permission; name a folder you may write to with --store or --out",
+        errno.EPERM: "no permission; name a folder you may write to with --store or --out",
+        errno.ENOTDIR: "a file stands where a folder is needed; name another folder",
+    }
+    where = error.filename if isinstance(error.filename, str) else path
+    reason = os.strerror(error.errno) if error.errno else str(error)
+    hint = hints.get(error.errno or 0, "check the disk; another folder can be named with --store")
+    if error.errno in _AWAY:
+        hint = "is the disk mounted, its server reachable? Another folder can be named with --store or --out"
+        return DiskAway(reason, path=where, hint=hint)
+    return StoreError(reason, path=where, hint=hint)
+
+
+def _is_sound(path: Path) -> bool:
+    """True where every file of an artefact holds what its manifest says."""
+    try:
+        files = json.loads((path / MANIFEST).read_text(encoding="utf-8"))["files"]
+        return all(file_sha256(path / name) == want for name, want in files.items())
+    except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
+        return False
+
+
+def _as_json(value: Any) -> Any:
+    return json.loads(json.dumps(value))
+
+
+def _content_digest(files: Mapping[str, str]) -> str:
+    return set_digest({name: sha for name, sha in files.items() if not name.endswith(_VOLATILE_SUFFIXES)})
+
+
+def _sync_files(folder: Path) -> dict[str, str]:
+    """Sync every file below a folder to the disk; returns relative path -> SHA-256."""
+    digests: dict[str, str] = {}
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        with path.open("rb") as stream:
+            os.fsync(stream.fileno())
+        digests[path.relative_to(folder).as_posix()] = file_sha256(path)
+    return digests
+
+
+def _sync_folders(folder: Path) -> None:
+    for path in (*(path for path in folder.rglob("*") if path.is_dir()), folder):
+        sync_folder(path)
+
+
+def sync_folder(path: Path) -> None:
+    """Make sure that the names in a folder survive a power cut."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _remove_if_abandoned(folder: Path) -> bool:
+    """Remove a draft whose process is gone: nobody holds its lock."""
+    try:
+        if folder.name.startswith(_UNLOCKED) and time.time() - folder.stat().st_mtime < _STALE_S:
+            return False
+        lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    else:
+        shutil.rmtree(folder, ignore_errors=True)
+        return True
+    finally:
+        os.close(lock)

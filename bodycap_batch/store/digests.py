@@ -1,0 +1,124 @@
+"""Content digests of files, remembered by what the file system says about them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import re
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from bodycap_batch.core.errors import CaptureError
+
+_BLOCK_BYTES = 1 << 20
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_TEMPORARY = re.compile(r"\.([0-9a-f]{8})\.(\d+)\.\d+\.part$")
+"""Ends with the machine, the process and a moment: machines may share the folder."""
+_SETTLED_S = 1.0
+"""A file changed this recently may change again within one tick of the file system's clock."""
+
+
+def json_digest(value: Any) -> str:
+    """SHA-256 of a JSON value in its canonical form (sorted keys, no spaces)."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def set_digest(files: Mapping[str, str]) -> str:
+    """SHA-256 of a set of named files from their own digests."""
+    return json_digest(dict(sorted(files.items())))
+
+
+def file_sha256(path: Path, on_bytes: Callable[[int], None] | None = None) -> str:
+    """SHA-256 of a file's bytes; `on_bytes` is called with the size of each block read."""
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while block := stream.read(_BLOCK_BYTES):
+            digest.update(block)
+            if on_bytes is not None:
+                on_bytes(len(block))
+    return digest.hexdigest()
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file so that a reader sees the old bytes or the new ones, also after a power cut."""
+    temporary = temporary_beside(path)
+    try:
+        with temporary.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def temporary_beside(path: Path) -> Path:
+    """A name in the same folder for a file that will be renamed to `path` when it is complete."""
+    return path.with_name(f".{path.name}.{_machine()}.{os.getpid()}.{time.monotonic_ns()}.part")
+
+
+def remove_abandoned(folder: Path) -> None:
+    """Remove what killed processes of this machine left beside the files they were writing."""
+    for path in folder.glob(".*.part"):
+        named = _TEMPORARY.search(path.name)
+        if named is not None and named.group(1) == _machine() and not _is_alive(int(named.group(2))):
+            path.unlink(missing_ok=True)
+
+
+def _machine() -> str:
+    return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
+class FileDigests:
+    """Digests of large files, kept by device, inode, size, mtime and ctime.
+
+    A file whose bytes change gets another ctime, which no program can set back; so an entry that is
+    found is right, and a finished job need not read its videos again.
+
+    Args:
+        folder: Where the entries are kept, one small file each.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def sha256(self, path: Path, on_bytes: Callable[[int], None] | None = None) -> str:
+        """Digest of a file, from the cache where nothing about the file has changed.
+
+        Raises:
+            CaptureError: The file changes while it is read.
+        """
+        before = _identity(path)
+        entry = self._folder / hashlib.sha256(json.dumps(before).encode()).hexdigest()
+        known = entry.read_text() if entry.is_file() else ""
+        if _SHA256.fullmatch(known):
+            return known
+        digest = file_sha256(path, on_bytes)
+        if _identity(path) != before:
+            raise CaptureError(
+                "the file changes while it is read", path=path, hint="wait until it is copied completely"
+            )
+        if time.time() - max(before[3], before[4]) / 1e9 > _SETTLED_S:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            write_atomically(entry, digest.encode())
+        return digest
+
+
+def _identity(path: Path) -> tuple[int, int, int, int, int]:
+    stat = path.stat()
+    return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
