@@ -64,3 +64,16 @@ def set_array(
     """Check and freeze the array field `name` of a frozen dataclass in its ``__post_init__``."""
     value = frozen_array(getattr(owner, name), name=name, shape=shape, dtype=dtype, finite=finite)
     object.__setattr__(owner, name, value)
+
+
+def runs(mask: BoolArray) -> list[tuple[int, int]]:
+    """Maximal runs [start, stop) of true values in a mask (N,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def evenly_spaced(count: int, wanted: int) -> IntArray:
+    """Up to `wanted` different indices of `count` items, evenly spaced, the first and the last among them."""
+    if count <= 0:
+        return np.zeros(0, dtype=np.int64)
+    return np.unique(np.linspace(0, count - 1, min(count, wanted)).round().astype(np.int64))

@@ -22,11 +22,12 @@ from bodycap_batch.merging.body_calibration.calibrate_body import (
 )
 from bodycap_batch.merging.camera_paths import in_world, solved_with_body
 from bodycap_batch.merging.camera_selection import gather
-from bodycap_batch.merging.cameras.track import Track, adapt_psd, clean, loosened, make_track
+from bodycap_batch.merging.cameras.track import Track, clean, loosened, make_track
 from bodycap_batch.merging.graph.foot_contact import accounts, during, find_contacts, standing_joints
 from bodycap_batch.merging.graph.joint_covariance import joints_in_axes, sigma_summary
 from bodycap_batch.merging.graph.joint_limits import soft_rules
 from bodycap_batch.merging.graph.motion_graph import MotionGraph, Solution, hinge_errors, joint_gaps
+from bodycap_batch.merging.graph.motion_noise import adapt_psd
 from bodycap_batch.merging.graph.windows import MAX_ITERATIONS, longest_stretch, solve_motion
 from bodycap_batch.merging.reporting.report import build_report
 from bodycap_batch.merging.world.floor import (

@@ -91,6 +91,43 @@ def rotation_angle_rad(rotation: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.norm(so3_log(rotation), axis=-1))
 
 
+def nearest_rotation(matrix: FloatArray) -> FloatArray:
+    """The rotations nearest to matrices (...,3,3) in the Frobenius norm.
+
+    Applied to a sum of rotations this is their chordal mean.
+
+    Source: Umeyama, "Least-squares estimation of transformation parameters between two point
+        patterns", PAMI 1991; Hartley et al., "Rotation averaging", IJCV 2013.
+    """
+    u, _, vt = np.linalg.svd(matrix)
+    sign = np.ones(matrix.shape[:-1])
+    sign[..., 2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    return np.asarray((u * sign[..., None, :]) @ vt)
+
+
+def skew(vector: FloatArray) -> FloatArray:
+    """Vectors (...,3) to matrices (...,3,3) whose product with w is the cross product vector × w."""
+    x, y, z = (vector[..., axis] for axis in range(3))
+    zero = np.zeros_like(x)
+    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
+    return np.stack(rows, axis=-1).reshape(*vector.shape, 3)
+
+
+def se3_adjoint(target_from_source: FloatArray) -> FloatArray:
+    """Adjoints (...,6,6) of rigid transforms, rotation before translation.
+
+    A small motion ξ of the source frame, (rotation, translation) in its own axes, is the motion Ad ξ in the
+    axes of the target.
+
+    Source: Barfoot, "State estimation for robotics", 2017, with the order of the two halves exchanged.
+    """
+    rotation = target_from_source[..., :3, :3]
+    out = np.zeros((*rotation.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = rotation
+    out[..., 3:, :3] = skew(target_from_source[..., :3, 3]) @ rotation
+    return out
+
+
 def interpolate_pose(start: FloatArray, end: FloatArray, alpha: npt.ArrayLike) -> FloatArray:
     """Interpolate rigid transforms (...,4,4): slerp for rotation, linear for translation.
 

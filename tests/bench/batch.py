@@ -12,7 +12,7 @@ from bodycap_batch.cli import main
 from bodycap_batch.runner import Children, Executor, Making, Task
 from bodycap_batch.store.artefacts import ArtefactKey, Store
 from tests.cluster.site import REAL, Site
-from tests.unit.test_runner import FAKE
+from tests.unit.runner.test_runner import FAKE
 
 JOBS = 8
 TASKS = 100

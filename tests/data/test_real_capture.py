@@ -9,7 +9,6 @@ import numpy as np
 import pycolmap
 import pytest
 
-from bodycap_batch import mapping
 from bodycap_batch.capture import Capture, open_capture
 from bodycap_batch.config import KeyframeOptions, MapOptions, RegistrationOptions
 from bodycap_batch.config.job import load_job
@@ -17,7 +16,7 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.keyframes import select_keyframes
-from bodycap_batch.mapping import build_map, refine_map
+from bodycap_batch.mapping import build_map, refine, refine_map
 from bodycap_batch.model.geometry import align_points
 from bodycap_batch.model.rolling_shutter import looks_rolling
 from bodycap_batch.model.scene import KeyframeSelection, Map, MapResult, Registration, Trajectory
@@ -98,7 +97,7 @@ def test_the_rolling_shutter_is_found_and_taken_out(outcome: Outcome, data_root:
 def test_a_very_large_map_loses_its_rolling_shutter_too(
     outcome: Outcome, data_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mapping, "MANY", 20)
+    monkeypatch.setattr(refine, "MANY", 20)
     adjusted = list[int]()
     create = pycolmap.create_default_bundle_adjuster
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,13 +10,15 @@ import numpy as np
 import pycolmap
 import pytest
 
-from bodycap_batch import mapping
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping import build_map, extend_map
-from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options, part_of
+from bodycap_batch.mapping import build, build_map, extend, extend_map
+from bodycap_batch.mapping.reconstruction import reconstruct
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import part_of
+from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options
 from bodycap_batch.mapping.reconstruction.two_step_adjustment import refine_large
+from bodycap_batch.mapping.validation import repair
 from bodycap_batch.model.geometry import align_points
 from bodycap_batch.model.scene import KeyframeSelection, MapResult
 from tests.rooms import stroll
@@ -83,7 +84,7 @@ def test_keyframes_that_see_nothing_are_left_out(stroll_capture: Capture, tmp_pa
 def test_a_carrying_keyframe_that_was_cut_is_placed(
     stroll_capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mended, cut = mapping.repair, list[str]()
+    mended, cut = build.repair, list[str]()
 
     def cutting(*arguments: Any) -> tuple[Any, dict[str, object]]:
         model, log = mended(*arguments)
@@ -91,7 +92,7 @@ def test_a_carrying_keyframe_that_was_cut_is_placed(
         cut.append(model.image(number).name)
         return part_of(model, set(model.reg_image_ids()) - {number}), log
 
-    monkeypatch.setattr(mapping, "repair", cutting)
+    monkeypatch.setattr(build, "repair", cutting)
     found = _built(stroll_capture, MapOptions(), context(tmp_path))
     told = found.log["placed"]
     assert told["carrying"] + told["placed"] == len(found.maps[0].keyframe_camera)
@@ -160,9 +161,8 @@ def _centres_off(model: pycolmap.Reconstruction) -> float:
 def test_a_large_map_grows_without_adjusting_all_of_it_again_and_again(
     result: MapResult, stroll_capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("solve", "repair"):
-        monkeypatch.setattr(sys.modules[f"bodycap_batch.mapping.{name}"], "MANY", 40)
-    monkeypatch.setattr(mapping, "MANY", 40)
+    for module in (reconstruct, repair, extend):
+        monkeypatch.setattr(module, "MANY", 40)
     adjusted: list[int] = []
     create = pycolmap.create_default_bundle_adjuster
 

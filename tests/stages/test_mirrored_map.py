@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodycap_batch import mapping
 from bodycap_batch.capture import Capture, open_capture
 from bodycap_batch.config import KeyframeOptions, MapOptions
 from bodycap_batch.config.job import load_job
 from bodycap_batch.keyframes import select_keyframes
-from bodycap_batch.mapping import build_map
+from bodycap_batch.mapping import build, build_map
 from bodycap_batch.mapping.matching.flipped_cameras import MIRROR_IMAGES, MIRRORED
 from bodycap_batch.model.scene import KeyframeSelection
 from tests.rooms import stroll, write_capture
@@ -60,13 +59,13 @@ def test_without_the_flipped_camera_the_map_is_that_of_the_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     extracted: list[str] = []
-    add = mapping.add_keyframes
+    add = build.add_keyframes
 
     def counted(workspace: Path, wanted: Sequence[tuple[object, int, np.ndarray]], *rest: object) -> None:
         extracted.extend(f"{camera.name}:{frame}" for camera, _, frames in wanted for frame in frames)  # type: ignore[attr-defined]
         add(workspace, wanted, *rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(mapping, "add_keyframes", counted)
+    monkeypatch.setattr(build, "add_keyframes", counted)
     options = MapOptions(init_frames=("left_palm:3", "torso:20"))
     found = build_map(flipped_capture, list(selections.values()), options, context(tmp_path / "all"))
     assert found.log[MIRRORED] == ["left_palm"]

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bodycap_batch.mapping.matching.database import DATABASE_NAME
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import part_of
 from bodycap_batch.mapping.reconstruction.conversion import lens_of
-from bodycap_batch.mapping.reconstruction.reconstruct import part_of
 from bodycap_batch.model.camera import Camera
 
 if TYPE_CHECKING:

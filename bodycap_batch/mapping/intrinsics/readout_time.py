@@ -13,8 +13,8 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.mapping.matching.database import ImageRef
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust, part_of
 from bodycap_batch.mapping.reconstruction.conversion import lens_of
-from bodycap_batch.mapping.reconstruction.reconstruct import adjust, part_of
 from bodycap_batch.mapping.reconstruction.reprojection import image_residuals
 from bodycap_batch.model.rolling_shutter import at_mid_row, image_velocity
 from bodycap_batch.model.scene import Map, Trajectory

@@ -12,7 +12,7 @@ from scipy import sparse
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.matching.skeletal_set import spanning_rows
-from bodycap_batch.mapping.reconstruction.reconstruct import part_of, refine, settle
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import part_of, refine, settle
 
 if TYPE_CHECKING:
     import pycolmap

@@ -8,9 +8,11 @@ from typing import Any
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, Pair, image_ids
 from bodycap_batch.mapping.matching.pair_matching import match_pairs
 from bodycap_batch.mapping.matching.pair_selection import PairChooser
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import refine, settle
 from bodycap_batch.mapping.reconstruction.incremental_mapper import place
-from bodycap_batch.mapping.reconstruction.reconstruct import refine, settle, size, ticker
-from bodycap_batch.mapping.validation.repair import Workshop, uncontradicted
+from bodycap_batch.mapping.reconstruction.reconstruct import size, ticker
+from bodycap_batch.mapping.validation.repair import uncontradicted
+from bodycap_batch.mapping.workspace import Workshop
 
 
 def place_others(

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from bodycap_batch.core.arrays import IntArray
-from bodycap_batch.core.context import StageContext
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pair, image_ids
 from bodycap_batch.mapping.matching.pair_matching import match_pairs
 from bodycap_batch.mapping.matching.skeletal_set import MANY
-from bodycap_batch.mapping.reconstruction.reconstruct import extend, part_of, refine
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import part_of, refine
+from bodycap_batch.mapping.reconstruction.reconstruct import extend
 from bodycap_batch.mapping.validation.epipolar_consistency import contradicted_share, doubtful, links_of
-from bodycap_batch.model.camera import Camera
+from bodycap_batch.mapping.workspace import Workshop
 
 if TYPE_CHECKING:
     import pycolmap
@@ -22,27 +19,6 @@ if TYPE_CHECKING:
 _ROUNDS = 2
 _LEAST_BUDGET = 2000
 """Pairs that may be matched again, where fewer were matched in the first place."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Workshop:
-    """What a repair needs besides the map.
-
-    Attributes:
-        workspace: Folder of the database.
-        lenses: Lens of each camera, and whether it is known.
-        settings: Makes the mapper's settings.
-        constant: Ids of calibrated cameras.
-        context: Threads, progress, cancellation.
-        frame_numbers: `CaptureCamera.frame_numbers` of each camera.
-    """
-
-    workspace: Path
-    lenses: Mapping[str, tuple[Camera, bool]]
-    settings: Callable[[], Any]
-    constant: Collection[int]
-    context: StageContext
-    frame_numbers: Mapping[str, IntArray]
 
 
 def repair(

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.merging.body.bones import Bone
-from bodycap_batch.model.geometry import Similarity, interpolate_pose, so3_log
+from bodycap_batch.model.geometry import Similarity, interpolate_pose
 from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import Mount
@@ -27,8 +25,6 @@ _UNTOLD_RAD, _UNTOLD_M = 0.98 * NAMED_SIGMA_RAD, 0.98 * NOMINAL_SIGMA_M
 """A mount known less well than both was not calibrated: its name alone promises as much. (The wearer's habits
 alone turn a calibrated palm's by up to that.)"""
 
-_WILDEST = 100.0
-"""Largest factor on a motion model's density: accelerations ten times the table's."""
 
 SAMPLE_REACH_NS = 100_000_000
 """Longest hole between two frames that is interpolated for a sample."""
@@ -182,41 +178,6 @@ def _robust_quadratic(time: FloatArray, centre: FloatArray, valid: BoolArray) ->
         residual = np.linalg.norm(centre - basis @ coefficients, axis=-1)
         weight = valid / (1.0 + (residual / (0.25 * CLEAN_LIMIT_M)) ** 2)
     return np.asarray(coefficients[:, 0])
-
-
-def adapt_psd(bones: Sequence[Bone], tracks: Sequence[Track]) -> tuple[Bone, ...]:
-    """Loosen the motion model where the measured motion is wilder than its table.
-
-    The second difference of a path that follows the model has variance 2/3 q h³ besides its noise's 6 σ².
-    Bones without a camera take over the largest ratio found below them, since the limb swings as a whole.
-
-    Args:
-        bones: The graph's bones.
-        tracks: Cleaned tracks in metres.
-    """
-    ratio = np.ones((len(bones), 2))
-    for track in tracks:
-        step_s = float(np.median(np.diff(track.times_ns))) * 1e-9
-        even = np.abs(np.diff(track.times_ns) * 1e-9 - step_s) < 0.2 * step_s
-        even = even[1:] & even[:-1]
-        rotation, centre = track.map_from_cam[:, :3, :3], track.map_from_cam[:, :3, 3]
-        turn = so3_log(np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:])
-        for axis, (second, sigma) in enumerate(
-            ((np.diff(turn, axis=0), track.sigma_rad), (np.diff(centre, n=2, axis=0), track.sigma_map))
-        ):
-            if even.sum() >= 10:
-                variance = float((second[even] ** 2).mean()) - 6.0 * float(np.median(sigma)) ** 2
-                density = variance / (2.0 / 3.0 * step_s**3)
-                table = float(bones[track.bone].psd[3 * axis])
-                ratio[track.bone, axis] = max(ratio[track.bone, axis], density / table)
-    measured = {track.bone for track in tracks}
-    for index in range(len(bones) - 1, 0, -1):
-        if bones[index].parent not in measured:
-            ratio[bones[index].parent] = np.maximum(ratio[bones[index].parent], ratio[index].max())
-    ratio = np.minimum(ratio, _WILDEST)
-    return tuple(
-        replace(bone, psd=bone.psd * np.repeat(factor, 3)) for bone, factor in zip(bones, ratio, strict=True)
-    )
 
 
 def untold(mount: Mount) -> bool:

@@ -15,7 +15,8 @@ from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.cameras.track import Track
 from bodycap_batch.merging.graph.error_modes import Body, Spread, adjoint, joint_shifts
 from bodycap_batch.merging.graph.factors import bone_key
-from bodycap_batch.merging.graph.linearisation import Chain, Linear, linearise
+from bodycap_batch.merging.graph.linearisation import Linear, linearise
+from bodycap_batch.model.block_tridiagonal import Chain
 from bodycap_batch.model.geometry import invert
 
 _DIRECTIONS = 48

@@ -17,8 +17,8 @@ from bodycap_batch.merging.cameras.track import make_track
 from bodycap_batch.merging.graph.error_modes import Spread, adjoint, joined
 from bodycap_batch.merging.graph.factors import bone_key, optimise
 from bodycap_batch.merging.graph.joint_covariance import joint_covariance, sigma_summary
-from bodycap_batch.merging.graph.linearisation import Chain
 from bodycap_batch.merging.graph.motion_graph import MotionGraph, Solution
+from bodycap_batch.model.block_tridiagonal import Chain
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from tests.stages.walker import FPS, ROLES, make_inputs, make_walk, record
 

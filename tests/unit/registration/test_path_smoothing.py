@@ -10,8 +10,8 @@ import pytest
 from bodycap_batch.config.lost_frames import LEAST_LOST
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.scene import FrameStatus, Trajectory
-from bodycap_batch.registration import _finished
 from bodycap_batch.registration.recovery.path_smoothing import steadied
+from bodycap_batch.registration.stage import _finished
 
 COUNT = 90
 WEAK = np.arange(40, 50)

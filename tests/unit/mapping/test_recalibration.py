@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodycap_batch import mapping
 from bodycap_batch.capture import Capture
 from bodycap_batch.capture.cameras import CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.mapping import build
 from bodycap_batch.mapping.intrinsics.recalibration import FREED, as_mapped, freed_where_contradicted
 from bodycap_batch.model.scene import MapResult
 from tests.scenes import small_map
@@ -145,17 +145,17 @@ def test_a_map_that_cannot_be_used_is_refused_after_its_lenses_were_freed() -> N
 def test_freeing_is_tried_before_a_map_is_given_up(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     refused = EstimationError("30% of the matches contradict the map", hint="x")
 
-    def build(capture: Capture, *_: object) -> tuple[MapResult, EstimationError | None]:
+    def built(capture: Capture, *_: object) -> tuple[MapResult, EstimationError | None]:
         if capture.camera("left_palm").calibrated:
             return _mapped(0.4, {"left_palm": 1.31}), refused
         return _mapped(0.5, {}, zoom=1.33), None
 
-    monkeypatch.setattr(mapping, "_build", build)
-    found = mapping.build_map(CAPTURE, [], MapOptions(), StageContext(work_dir=tmp_path))
+    monkeypatch.setattr(build, "_build", built)
+    found = build.build_map(CAPTURE, [], MapOptions(), StageContext(work_dir=tmp_path))
     assert found.log[FREED] == ["left_palm"]
-    monkeypatch.setattr(mapping, "_build", lambda *_: (_mapped(0.4, {"left_palm": 1.31}), refused))
+    monkeypatch.setattr(build, "_build", lambda *_: (_mapped(0.4, {"left_palm": 1.31}), refused))
     with pytest.raises(EstimationError, match="30%"):
-        mapping.build_map(CAPTURE, [], MapOptions(), StageContext(work_dir=tmp_path))
+        build.build_map(CAPTURE, [], MapOptions(), StageContext(work_dir=tmp_path))
 
 
 def test_lenses_that_fit_cost_no_second_map() -> None:

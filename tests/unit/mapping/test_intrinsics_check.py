@@ -11,7 +11,8 @@ from bodycap_batch.mapping.intrinsics.intrinsics_check import (
     misfitting_lenses,
     recentred_lenses,
 )
-from bodycap_batch.mapping.reconstruction.reconstruct import adjust, mapper_options
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust
+from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options
 from bodycap_batch.model.geometry import so3_exp
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodycap_batch.core.arrays import frozen_array
+from bodycap_batch.core.arrays import evenly_spaced, frozen_array, runs
 
 
 def test_an_array_that_may_be_written_to_is_copied() -> None:
@@ -27,3 +27,16 @@ def test_a_frozen_array_is_taken_as_it_is_but_not_a_view() -> None:
     base[0] = 9.0
     assert copied[0] == 0.0
     assert frozen_array(kept, name="other", shape=(4,), dtype=np.float32) is not kept
+
+
+def test_runs_of_a_mask() -> None:
+    assert runs(np.array([True, True, False, True, False, False, True])) == [(0, 2), (3, 4), (6, 7)]
+    assert runs(np.zeros(3, dtype=bool)) == runs(np.zeros(0, dtype=bool)) == []
+    assert runs(np.ones(3, dtype=bool)) == [(0, 3)]
+
+
+def test_evenly_spaced_indices() -> None:
+    assert evenly_spaced(10, 4).tolist() == [0, 3, 6, 9]
+    assert evenly_spaced(3, 8).tolist() == [0, 1, 2]
+    assert evenly_spaced(5, 1).tolist() == [0]
+    assert evenly_spaced(0, 4).tolist() == evenly_spaced(4, 0).tolist() == []

@@ -20,7 +20,7 @@ from bodycap_batch.watch.intake import Terms, read_drop
 from bodycap_batch.watch.options import WatchOptions
 from bodycap_batch.watch.spool import JobDir, Spool, move, spool_at, spool_name
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 class Clock:

@@ -9,7 +9,8 @@ import pytest
 
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options, refine
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import refine
+from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options
 
 
 class _Failing:

@@ -12,13 +12,13 @@ import numpy as np
 import pycolmap
 import pytest
 
-from bodycap_batch import mapping
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.mapping import _begun
+from bodycap_batch.mapping import build
+from bodycap_batch.mapping.build import _begun
 from bodycap_batch.mapping.intrinsics import intrinsics_check
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
@@ -28,12 +28,14 @@ from bodycap_batch.mapping.matching.database import (
     write_image,
 )
 from bodycap_batch.mapping.matching.pair_matching import match_pairs, mutual_matches
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import refine, settle
 from bodycap_batch.mapping.reconstruction.incremental_mapper import grow
 from bodycap_batch.mapping.reconstruction.initial_pair import named_start, rank_starts
-from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options, reconstruct, refine, settle
+from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options, reconstruct
 from bodycap_batch.mapping.validation.epipolar_consistency import Link, doubtful, links_of
-from bodycap_batch.mapping.validation.repair import Workshop, cut_doubtful, place_again, repair
+from bodycap_batch.mapping.validation.repair import cut_doubtful, place_again, repair
 from bodycap_batch.mapping.validation.transient_points import drop_unconfirmed
+from bodycap_batch.mapping.workspace import Workshop
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import align_points, invert, make_transform, so3_exp
 
@@ -167,7 +169,7 @@ def test_long_tracks_are_settled_by_conjugate_gradients_to_the_same_map(
 
     monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", noted)
     for limit in (0.0, np.inf):
-        monkeypatch.setattr("bodycap_batch.mapping.reconstruction.reconstruct._LONG_TRACKS", limit)
+        monkeypatch.setattr("bodycap_batch.mapping.reconstruction.bundle_adjustment._LONG_TRACKS", limit)
         settled = copy.deepcopy(model)
         settle(settled, shop.settings(), shop.constant)
         assert _rms(settled, poses) < 0.01
@@ -427,6 +429,6 @@ def test_the_log_holds_what_both_looks_at_the_lenses_found(
         found, decentred = next(looks)
         return {name: (camera, False) for name, camera in found.items()}, decentred
 
-    monkeypatch.setattr(mapping, "change_lenses", change)
+    monkeypatch.setattr(build, "change_lenses", change)
     _, log = _begun(shop, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam", 2: "hat"}, _KEYFRAMES)
     assert log["better_lenses"] == {"cam": "RADIAL", "hat": "RADIAL"}

@@ -14,10 +14,13 @@ from bodycap_batch.model.geometry import (
     interpolate_pose,
     invert,
     make_transform,
+    nearest_rotation,
     poses_at,
     quat_xyzw_from_rotation,
     rotation_angle_rad,
     rotation_from_quat_xyzw,
+    se3_adjoint,
+    skew,
     so3_exp,
     so3_log,
     transform_points,
@@ -146,3 +149,37 @@ def test_alignment_refuses_too_little() -> None:
         align_points(np.zeros((2, 3)), np.zeros((2, 3)))
     with pytest.raises(ValueError, match="coincide"):
         align_points(np.zeros((5, 3)), np.ones((5, 3)))
+
+
+@given(SEEDS)
+def test_the_nearest_rotation_is_a_rotation_and_beats_its_neighbours(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    matrix = rng.normal(size=(5, 3, 3))
+    found = nearest_rotation(matrix)
+    assert np.allclose(found @ np.swapaxes(found, -1, -2), np.eye(3), atol=1e-12)
+    assert np.allclose(np.linalg.det(found), 1.0)
+    other = found @ so3_exp(rng.normal(scale=0.1, size=(5, 3)))
+    distance = np.linalg.norm(matrix - found, axis=(-2, -1))
+    assert (distance <= np.linalg.norm(matrix - other, axis=(-2, -1)) + 1e-12).all()
+
+
+def test_the_nearest_rotation_to_a_rotation_is_itself() -> None:
+    rotation = random_poses(4, 7)[:, :3, :3]
+    assert np.allclose(nearest_rotation(3.0 * rotation), rotation)
+
+
+@given(SEEDS)
+def test_skew_is_the_cross_product(seed: int) -> None:
+    first, second = np.random.default_rng(seed).normal(size=(2, 4, 3))
+    assert np.allclose(np.einsum("nij,nj->ni", skew(first), second), np.cross(first, second))
+
+
+def test_the_adjoint_moves_a_small_motion_to_other_axes() -> None:
+    """T exp(ξ) = exp(Ad ξ) T, to the square of a motion of 1e-6."""
+    pose = random_poses(1, 3)[0]
+    motion = np.array([1.0, -2.0, 0.5, 3.0, 1.0, -1.0]) * 1e-6
+
+    def small(step: np.ndarray) -> np.ndarray:
+        return make_transform(so3_exp(step[:3]), step[3:])
+
+    assert np.allclose(pose @ small(motion), small(se3_adjoint(pose) @ motion) @ pose, atol=1e-10)

@@ -30,7 +30,7 @@ from bodycap_batch.runner import Children, NotStored, Rules, Runner, Task
 from bodycap_batch.runner.child import _DiskWatch
 from bodycap_batch.store.artefacts import ArtefactKey, Store
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 FAKE = (sys.executable, str(ROOT / "tests" / "pipeline" / "fake_child.py"))
 
 
@@ -277,7 +277,7 @@ def test_children_do_not_outlive_a_killed_parent(tmp_path: Path) -> None:
     started = tmp_path / "started"
     script = textwrap.dedent(f"""
         from pathlib import Path
-        from tests.unit.test_runner import Bench, a_task
+        from tests.unit.runner.test_runner import Bench, a_task
         Bench(Path({str(tmp_path)!r})).runner.run(a_task("hang", started={str(started)!r}))
     """)
     parent = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT)
@@ -332,7 +332,7 @@ _FULL_DISK = """
 import sys
 from pathlib import Path
 from bodycap_batch.core.errors import StoreError
-from tests.unit.test_runner import Bench, a_task
+from tests.unit.runner.test_runner import Bench, a_task
 bench = Bench(Path(sys.argv[1]))
 assert bench.runner.run(a_task("work"))[1]
 try:

@@ -27,7 +27,7 @@ from bodycap_batch.store.digests import (
     temporary_beside,
 )
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def key(**changes: object) -> ArtefactKey:

@@ -233,7 +233,7 @@ def test_synthetic_videos_are_prepared_before_they_are_looked_for(tmp_path: Path
 
 
 def test_shipped_jobs(tmp_path: Path) -> None:
-    jobs = Path(__file__).resolve().parents[2] / "jobs"
+    jobs = Path(__file__).resolve().parents[3] / "jobs"
     with pytest.raises(JobError, match="filled in") as unfilled:
         load_job(jobs / "tum_rgbd.yaml")
     assert unfilled.value.field == "capture.cameras.0.video"
@@ -244,7 +244,7 @@ def test_shipped_jobs(tmp_path: Path) -> None:
 
 def test_the_commented_sample_holds_what_it_says(tmp_path: Path) -> None:
     """Every commented line of it, taken as it is, is a valid setting."""
-    text = (Path(__file__).resolve().parents[2] / "jobs" / "cpl_lab.yaml").read_text()
+    text = (Path(__file__).resolve().parents[3] / "jobs" / "cpl_lab.yaml").read_text()
     text = re.sub(r"  # Delete this block.*?(?=# none)", "", text, flags=re.DOTALL)
     text = text.replace("calibration: ../examples/cpl_lab/calib.json", "calibration: auto")
     text = re.sub(r"^( *)# ( *[a-z_]+:.*)$", r"\1\2", text, flags=re.MULTILINE)

@@ -19,7 +19,7 @@ from bodycap_batch.merging.body.initial_poses import (
     provisional_scale,
 )
 from bodycap_batch.merging.body_calibration.scale import ScaleSource, combine, disagreement, floor_source
-from bodycap_batch.merging.cameras.track import Track, adapt_psd, clean
+from bodycap_batch.merging.cameras.track import Track, clean
 from bodycap_batch.merging.graph.factors import (
     MountPoints,
     add_mount_prior,
@@ -29,6 +29,7 @@ from bodycap_batch.merging.graph.factors import (
     read_mount,
 )
 from bodycap_batch.merging.graph.joint_limits import activity_rules, limit_rules, reach_rules
+from bodycap_batch.merging.graph.motion_noise import adapt_psd
 from bodycap_batch.merging.world.floor import (
     feet_floor,
     find_floor,

@@ -1,0 +1,50 @@
+"""Noise of the motion prior, scaled to how fast a camera moved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from bodycap_batch.merging.body.bones import Bone
+from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.model.geometry import so3_log
+
+_WILDEST = 100.0
+"""Largest factor on a motion model's density: accelerations ten times the table's."""
+
+
+def adapt_psd(bones: Sequence[Bone], tracks: Sequence[Track]) -> tuple[Bone, ...]:
+    """Loosen the motion model where the measured motion is wilder than its table.
+
+    The second difference of a path that follows the model has variance 2/3 q h³ besides its noise's 6 σ².
+    Bones without a camera take over the largest ratio found below them, since the limb swings as a whole.
+
+    Args:
+        bones: The graph's bones.
+        tracks: Cleaned tracks in metres.
+    """
+    ratio = np.ones((len(bones), 2))
+    for track in tracks:
+        step_s = float(np.median(np.diff(track.times_ns))) * 1e-9
+        even = np.abs(np.diff(track.times_ns) * 1e-9 - step_s) < 0.2 * step_s
+        even = even[1:] & even[:-1]
+        rotation, centre = track.map_from_cam[:, :3, :3], track.map_from_cam[:, :3, 3]
+        turn = so3_log(np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:])
+        for axis, (second, sigma) in enumerate(
+            ((np.diff(turn, axis=0), track.sigma_rad), (np.diff(centre, n=2, axis=0), track.sigma_map))
+        ):
+            if even.sum() >= 10:
+                variance = float((second[even] ** 2).mean()) - 6.0 * float(np.median(sigma)) ** 2
+                density = variance / (2.0 / 3.0 * step_s**3)
+                table = float(bones[track.bone].psd[3 * axis])
+                ratio[track.bone, axis] = max(ratio[track.bone, axis], density / table)
+    measured = {track.bone for track in tracks}
+    for index in range(len(bones) - 1, 0, -1):
+        if bones[index].parent not in measured:
+            ratio[bones[index].parent] = np.maximum(ratio[bones[index].parent], ratio[index].max())
+    ratio = np.minimum(ratio, _WILDEST)
+    return tuple(
+        replace(bone, psd=bone.psd * np.repeat(factor, 3)) for bone, factor in zip(bones, ratio, strict=True)
+    )
