@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from bodycap_batch.capture.decoding import decode_frames
-from bodycap_batch.capture.images import Colours, Image, Planes, grey_of, work_image, work_planes
-from bodycap_batch.capture.kept import KeptFrames, Shot, keeps_all
-from bodycap_batch.capture.prefetch import prefetched
+from bodycap_batch.capture.images import Colours, Image, Planes, grey_from_planes, work_image, work_planes
+from bodycap_batch.capture.kept import FrameCandidate, KeptFrames, should_keep_all
+from bodycap_batch.capture.prefetch import prefetch
 from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.core.errors import CaptureError
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_MOSTLY = 0.75
+_MIN_KEPT_RATIO = 0.75
 """Share of the frames asked for that must be kept: with many others between them the video is decoded from
 end to end anyway."""
 
@@ -142,23 +142,23 @@ class CaptureCamera:
             wanted[0] < 0 or wanted[-1] >= len(self.frame_numbers) or (np.diff(wanted) <= 0).any()
         ):
             raise ValueError("indices must increase and lie inside the video")
-        return prefetched(self._decode(wanted, colour=colour))
+        return prefetch(self._decode(wanted, colour=colour))
 
-    def shots(self) -> Generator[Shot, None, None]:
+    def shots(self) -> Generator[FrameCandidate, None, None]:
         """Stream all frames as they may be kept, decoded ahead in a thread.
 
         Raises:
             CaptureError: A frame cannot be decoded.
         """
-        return prefetched(self._shots())
+        return prefetch(self._shots())
 
     @property
-    def keeps_all(self) -> bool:
+    def should_keep_all(self) -> bool:
         """True where the videos are so large that all of their frames are worth keeping at the work size."""
         size = (self.camera.width_px, self.camera.height_px)
-        return any(keeps_all(video.stored_size, size) for video in self.videos)
+        return any(should_keep_all(video.stored_size, size) for video in self.videos)
 
-    def _shots(self) -> Generator[Shot, None, None]:
+    def _shots(self) -> Generator[FrameCandidate, None, None]:
         size = (self.camera.width_px, self.camera.height_px)
         everything = self.keeps_all
         indices = np.arange(len(self.frame_numbers), dtype=np.int64)
@@ -166,16 +166,16 @@ class CaptureCamera:
             if everything:
                 # A large frame is let go of at once.
                 planes = work_planes(frame, video.orientation, size)
-                yield Shot(index, grey_of(planes, size), partial(_same, planes))
+                yield FrameCandidate(index, grey_from_planes(planes, size), partial(_same, planes))
             else:
                 grey = work_image(frame, video.orientation, size, colour=False)
-                yield Shot(index, grey, partial(work_planes, frame, video.orientation, size))
+                yield FrameCandidate(index, grey, partial(work_planes, frame, video.orientation, size))
 
     def _decode(self, indices: IntArray, *, colour: bool) -> Generator[tuple[int, Image], None, None]:
         size = (self.camera.width_px, self.camera.height_px)
         held = np.zeros(len(indices), dtype=bool) if self.kept is None else self.kept.holds(indices)
         copies: Iterator[Image] = iter(())
-        if self.kept is not None and held.sum() >= _MOSTLY * len(held):
+        if self.kept is not None and held.sum() >= _MIN_KEPT_RATIO * len(held):
             copies = self.kept.read(indices[held], size, colour=colour)
         else:
             held[:] = False

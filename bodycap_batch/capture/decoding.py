@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bodycap_batch.capture.video import COPY_AGAIN, VideoFile, open_container, reason_of, video_stream
+from bodycap_batch.capture.video import COPY_AGAIN, VideoFile, error_reason, open_container, video_stream
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import THREADS_VARIABLE
 from bodycap_batch.core.errors import CaptureError
@@ -29,21 +29,21 @@ def decode_frames(video: VideoFile, indices: IntArray) -> Iterator[tuple[int, Vi
     """
     import av
 
-    cursor = _Cursor(video, indices)
+    cursor = _ForwardDecoder(video, indices)
     try:
         for wanted in map(int, indices):
             frame = cursor.advance(wanted)
             if frame is None and not cursor.plain:
                 # Some containers seek badly (MPEG program streams): the plain way, from the start.
                 cursor.close()
-                cursor = _Cursor(video)
+                cursor = _ForwardDecoder(video)
                 frame = cursor.advance(wanted)
             if frame is None:
-                raise _lost(video, wanted)
+                raise _undecodable_frame(video, wanted)
             yield wanted, frame
     except av.error.FFmpegError as error:
         raise CaptureError(
-            f"decoding fails after frame {cursor.position} ({reason_of(error)})",
+            f"decoding fails after frame {cursor.position} ({error_reason(error)})",
             path=video.path,
             hint=COPY_AGAIN,
         ) from error
@@ -60,18 +60,18 @@ def first_frame(video: VideoFile) -> tuple[VideoFrame, bool]:
     import av
 
     with open_container(video.path) as container:
-        stream = decoder(container, video)
+        stream = open_stream(container, video)
         try:
             for frame in container.decode(stream):
                 return frame, bool(stream.codec_context.has_b_frames)
         except av.error.FFmpegError as error:
             raise CaptureError(
-                f"no frame of it can be decoded ({reason_of(error)})", path=video.path, hint=COPY_AGAIN
+                f"no frame of it can be decoded ({error_reason(error)})", path=video.path, hint=COPY_AGAIN
             ) from error
     raise CaptureError("no frame of it can be decoded", path=video.path, hint=COPY_AGAIN)
 
 
-def decoder(container: InputContainer, video: VideoFile) -> VideoStream:
+def open_stream(container: InputContainer, video: VideoFile) -> VideoStream:
     """The video's stream, decoded on as many threads as there are for it."""
     stream = video_stream(container, video.path)
     stream.thread_type = "AUTO"
@@ -82,7 +82,7 @@ def decoder(container: InputContainer, video: VideoFile) -> VideoStream:
     return stream
 
 
-class _Cursor:
+class _ForwardDecoder:
     """A decoder's place in a video, moving forwards only.
 
     Args:
@@ -95,7 +95,7 @@ class _Cursor:
         self.plain = indices is None or video.counted
         self._video = video
         self._container = open_container(video.path)
-        self._stream = decoder(self._container, video)
+        self._stream = open_stream(self._container, video)
         # The halves of an interlaced frame may come one by one; AV1's decoder loses the first frame by it.
         skips = indices is not None and not self.plain and not video.interlaced
         skips = skips and self._stream.codec_context.name == "h264"
@@ -139,7 +139,7 @@ class _Cursor:
             yield from self._stream.decode(packet)
 
 
-def _lost(video: VideoFile, index: int) -> CaptureError:
+def _undecodable_frame(video: VideoFile, index: int) -> CaptureError:
     seconds = float((int(video.pts[index]) - int(video.pts[0])) * video.time_base)
     return CaptureError(
         f"frame {index} (at {seconds:.2f} s) cannot be decoded",

@@ -15,9 +15,9 @@ from bodycap_batch.capture.decoding import first_frame
 from bodycap_batch.capture.video import (
     COPY_AGAIN,
     VideoFile,
+    error_reason,
     open_container,
-    orientation_of,
-    reason_of,
+    orientation_from_frame,
     video_stream,
 )
 from bodycap_batch.core.arrays import IntArray
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 # Later than any Unix time of a recording, and far from the end of 64-bit nanoseconds.
 _MAX_SECONDS = 4e9
 # HDV's and AVCHD's 4:3 is the usual one, television's and anamorphic lenses' lie between 1:2 and 2:1.
-_THINNEST = Fraction(2, 5)
+_MIN_PIXEL_ASPECT = Fraction(2, 5)
 # Sizes rounded to even numbers; stretching them would blur every picture for less than a pixel.
-_SQUARE = 0.004
+_SQUARE_TOLERANCE = 0.004
 
 
 def index_video(path: Path) -> VideoFile:
@@ -88,7 +88,9 @@ def _scan_packets(
                 key.append(packet.pts)
     except av.error.FFmpegError as error:
         raise CaptureError(
-            f"the video breaks off after {len(pts)} frames ({reason_of(error)})", path=path, hint=COPY_AGAIN
+            f"the video breaks off after {len(pts)} frames ({error_reason(error)})",
+            path=path,
+            hint=COPY_AGAIN,
         ) from error
     if read < listed:
         message = f"the video is cut short: {read} of the {listed} frames its index lists"
@@ -112,8 +114,8 @@ def _nominal_fps(pts: IntArray, time_base: Fraction, rate: Fraction | None) -> f
 def _pixel_aspect(stated: Fraction | None) -> Fraction:
     """Width of a stored pixel over its height; square where nothing, or what no camera makes, is stated."""
     aspect = Fraction(stated or 1)
-    usual = _THINNEST <= aspect <= 1 / _THINNEST
-    return aspect if usual and abs(aspect - 1) > _SQUARE else Fraction(1)
+    usual = _MIN_PIXEL_ASPECT <= aspect <= 1 / _MIN_PIXEL_ASPECT
+    return aspect if usual and abs(aspect - 1) > _SQUARE_TOLERANCE else Fraction(1)
 
 
 def _creation_time(metadata: dict[str, str]) -> float | None:
@@ -147,7 +149,7 @@ def _with_first_frame(video: VideoFile, container_format: str) -> VideoFile:
     video = replace(
         video,
         stored_size=(frame.width, frame.height),
-        orientation=orientation_of(frame),
+        orientation=orientation_from_frame(frame),
         interlaced=bool(frame.interlaced_frame),
     )
     if container_format == "avi" and reordered:

@@ -12,10 +12,10 @@ from bodycap_batch.core.context import THREADS_VARIABLE
 
 Item = TypeVar("Item")
 
-_AHEAD = 4
+_QUEUE_LENGTH = 4
 
 
-def prefetched(source: Generator[Item, None, None], ahead: int = _AHEAD) -> Generator[Item, None, None]:
+def prefetch(source: Generator[Item, None, None], ahead: int = _QUEUE_LENGTH) -> Generator[Item, None, None]:
     """Yield what `source` yields while the next `ahead` items are made in a thread.
 
     Decoding and resizing release the interpreter's lock, so they overlap with the consumer's work.

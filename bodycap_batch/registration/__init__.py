@@ -1,14 +1,19 @@
 """Stage 3: every frame's pose, by tracking the map's points into it."""
 
-from bodycap_batch.registration.poses.rig_members import RigCamera
-from bodycap_batch.registration.recovery.recover import recover_lost
-from bodycap_batch.registration.stage import register_frames, register_in_rig, settled, without_contradicted
+from bodycap_batch.registration.poses.rig_members import RegisteredCamera
+from bodycap_batch.registration.recovery.recover import find_lost_poses
+from bodycap_batch.registration.stage import (
+    prepare_recovery,
+    register_frames,
+    register_in_rig,
+    remove_misplaced_keyframes,
+)
 
 __all__ = [
-    "RigCamera",
-    "recover_lost",
+    "RegisteredCamera",
+    "find_lost_poses",
+    "prepare_recovery",
     "register_frames",
     "register_in_rig",
-    "settled",
-    "without_contradicted",
+    "remove_misplaced_keyframes",
 ]

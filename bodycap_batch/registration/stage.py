@@ -14,21 +14,29 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.relative_pose import RelativePose
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
-from bodycap_batch.registration.poses.keyframe_requests import wanted_keyframes
-from bodycap_batch.registration.poses.misplaced_keyframes import misplaced, without_keyframes
-from bodycap_batch.registration.poses.pnp import FramePose, PoseLimits
-from bodycap_batch.registration.poses.rig_members import RigCamera, first_poses, members_of, relative_poses
-from bodycap_batch.registration.poses.trajectory import matrices, solve_frames, solve_rig
-from bodycap_batch.registration.recovery.path_smoothing import steadied
-from bodycap_batch.registration.recovery.point_refinement import settled_points, without_weak_ends
-from bodycap_batch.registration.recovery.recover import recoverable
-from bodycap_batch.registration.tracking.frame_ranges import Known, all_tracks
-from bodycap_batch.registration.tracking.klt import Tracks, anchors_of, track_scale
+from bodycap_batch.registration.poses.keyframe_requests import request_keyframes
+from bodycap_batch.registration.poses.misplaced_keyframes import (
+    find_misplaced_keyframes,
+    map_without_keyframes,
+)
+from bodycap_batch.registration.poses.pnp import AcceptanceCriteria, FramePose
+from bodycap_batch.registration.poses.rig_members import (
+    RegisteredCamera,
+    estimate_relative_poses,
+    initial_rig_poses,
+    rig_members,
+)
+from bodycap_batch.registration.poses.trajectory import pose_array, solve_camera, solve_rig
+from bodycap_batch.registration.recovery.path_smoothing import smooth_weak_centres
+from bodycap_batch.registration.recovery.point_refinement import refine_points, remove_weak_boundary_poses
+from bodycap_batch.registration.recovery.recover import can_recover
+from bodycap_batch.registration.tracking.frame_ranges import TrackCache, track_all
+from bodycap_batch.registration.tracking.klt import Tracks, camera_pixel_scale, select_keyframe_points
 
 _MAP_NOISE_PX = 0.6
-_THRESHOLD_SIGMAS = 3.5
+_INLIER_SIGMAS = 3.5
 _BLUR_RATIO = 0.6
-_BLUR_WINDOW = 15
+_BLUR_WINDOW_FRAMES = 15
 
 
 def register_frames(
@@ -56,17 +64,19 @@ def register_frames(
     Returns:
         A pose or a reason for every frame, and the frames that should become keyframes.
     """
-    tried = _tried(selection, previous)
-    scene_map = _own_map(maps, camera.name)
+    tried = _offered_keyframes(selection, previous)
+    scene_map = _map_of_camera(maps, camera.name)
     if scene_map is None:
-        return _without_map(camera, tried)
-    limits = _limits(camera, selection, options)
-    tracks = all_tracks(camera, anchors_of(scene_map, camera.name), Known.of(previous), context)
-    scene_map, tracks, doubtful = _without_misplaced(camera, scene_map, tracks, limits, context)
-    poses = solve_frames(camera, scene_map, tracks, limits)
-    trajectory = _finished(_trajectory(camera, scene_map.gauge, poses, selection.sharpness))
+        return _registration_without_map(camera, tried)
+    limits = acceptance_criteria(camera, selection, options)
+    tracks = track_all(
+        camera, select_keyframe_points(scene_map, camera.name), TrackCache.of(previous), context
+    )
+    scene_map, tracks, doubtful = _track_without_misplaced(camera, scene_map, tracks, limits, context)
+    poses = solve_camera(camera, scene_map, tracks, limits)
+    trajectory = _smooth_if_final(build_trajectory(camera, scene_map.gauge, poses, selection.sharpness))
     asked = np.zeros(0, np.int64) if previous is None else previous.wanted_keyframes
-    lost = wanted_keyframes(trajectory.localised, selection.sharpness, tried)
+    lost = request_keyframes(trajectory.localised, selection.sharpness, tried)
     return Registration(
         trajectory=trajectory,
         obs_frame=tracks.frame,
@@ -79,8 +89,8 @@ def register_frames(
 
 
 def register_in_rig(
-    own: RigCamera,
-    others: Sequence[RigCamera],
+    own: RegisteredCamera,
+    others: Sequence[RegisteredCamera],
     maps: Sequence[Map],
     selection: KeyframeSelection,
     options: RegistrationOptions,
@@ -102,22 +112,25 @@ def register_in_rig(
 
     Source: generalised cameras, Pless, "Using many cameras as one", CVPR 2003.
     """
-    relative = relative_poses(own, others)
-    members = members_of(own, others, relative)
+    relative = estimate_relative_poses(own, others)
+    members = rig_members(own, others, relative)
     scene_map = next((each for each in maps if each.gauge == own.found.trajectory.gauge), None)
     if scene_map is None or len(members) == 1:
         return own.found, relative
-    limits = _limits(own.camera, selection, options)
+    limits = acceptance_criteria(own.camera, selection, options)
     for member in members:
-        wrong = misplaced(member.camera.name, scene_map, member.tracks, limits)
-        scene_map = without_keyframes(scene_map, wrong)
-    poses = solve_rig(members, scene_map, first_poses(own, others, members), limits)
-    trajectory = _finished(_trajectory(own.camera, scene_map.gauge, poses, selection.sharpness))
+        wrong = find_misplaced_keyframes(member.camera.name, scene_map, member.tracks, limits)
+        scene_map = map_without_keyframes(scene_map, wrong)
+    poses = solve_rig(members, scene_map, initial_rig_poses(own, others, members), limits)
+    trajectory = _smooth_if_final(build_trajectory(own.camera, scene_map.gauge, poses, selection.sharpness))
     return replace(own.found, trajectory=trajectory), relative
 
 
-def without_contradicted(
-    scene_map: Map, cameras: Iterable[RigCamera], selection: KeyframeSelection, options: RegistrationOptions
+def remove_misplaced_keyframes(
+    scene_map: Map,
+    cameras: Iterable[RegisteredCamera],
+    selection: KeyframeSelection,
+    options: RegistrationOptions,
 ) -> Map:
     """The map without keyframes that the video of one of its cameras contradicts.
 
@@ -130,13 +143,13 @@ def without_contradicted(
     wrong: list[IntArray] = []
     for each in cameras:
         if each.found.trajectory.gauge == scene_map.gauge:
-            limits = _limits(each.camera, selection, options)
-            wrong.append(misplaced(each.camera.name, scene_map, each.tracks, limits))
-    return without_keyframes(scene_map, np.concatenate([np.zeros(0, np.int64), *wrong]))
+            limits = acceptance_criteria(each.camera, selection, options)
+            wrong.append(find_misplaced_keyframes(each.camera.name, scene_map, each.tracks, limits))
+    return map_without_keyframes(scene_map, np.concatenate([np.zeros(0, np.int64), *wrong]))
 
 
-def settled(
-    own: RigCamera,
+def prepare_recovery(
+    own: RegisteredCamera,
     others: Sequence[Trajectory],
     scene_map: Map,
     selection: KeyframeSelection,
@@ -160,63 +173,65 @@ def settled(
         others.
     """
     before = [own.found.trajectory, *(path for path in others if path.gauge == scene_map.gauge)]
-    paths = [without_weak_ends(path, options.min_inliers) for path in before]
+    paths = [remove_weak_boundary_poses(path, options.min_inliers) for path in before]
     none_taken = all(path is known for path, known in zip(paths, before, strict=True))
-    if none_taken or not recoverable(paths[0]):
+    if none_taken or not can_recover(paths[0]):
         return scene_map, own.found
-    settled_map = settled_points(scene_map, paths)
-    limits = _limits(own.camera, selection, options)
-    poses = solve_frames(own.camera, settled_map, own.tracks, limits)
-    path = _trajectory(own.camera, scene_map.gauge, poses, selection.sharpness)
-    path = without_weak_ends(path, options.min_inliers)
-    if not recoverable(path):
+    settled_map = refine_points(scene_map, paths)
+    limits = acceptance_criteria(own.camera, selection, options)
+    poses = solve_camera(own.camera, settled_map, own.tracks, limits)
+    path = build_trajectory(own.camera, scene_map.gauge, poses, selection.sharpness)
+    path = remove_weak_boundary_poses(path, options.min_inliers)
+    if not can_recover(path):
         return scene_map, own.found
     return settled_map, replace(own.found, trajectory=path)
 
 
-def _without_misplaced(
-    camera: CaptureCamera, scene_map: Map, tracks: Tracks, limits: PoseLimits, context: StageContext
+def _track_without_misplaced(
+    camera: CaptureCamera, scene_map: Map, tracks: Tracks, limits: AcceptanceCriteria, context: StageContext
 ) -> tuple[Map, Tracks, IntArray]:
     """The map without keyframes that the video contradicts, the others' tracks, and the frames left out.
 
     Frames around a misplaced keyframe are tracked from the next ones that are in their place.
     """
     none = np.zeros(0, np.int64)
-    wrong = misplaced(camera.name, scene_map, tracks, limits)
+    wrong = find_misplaced_keyframes(camera.name, scene_map, tracks, limits)
     if len(wrong) == 0:
         return scene_map, tracks, none
-    known = Known(tracks, sorted(anchors_of(scene_map, camera.name)))
-    rest = without_keyframes(scene_map, wrong)
-    tracks = all_tracks(camera, anchors_of(rest, camera.name), known, context)
+    known = TrackCache(tracks, sorted(select_keyframe_points(scene_map, camera.name)))
+    rest = map_without_keyframes(scene_map, wrong)
+    tracks = track_all(camera, select_keyframe_points(rest, camera.name), known, context)
     return rest, tracks, scene_map.keyframe_frame[wrong]
 
 
-def _tried(selection: KeyframeSelection, previous: Registration | None) -> IntArray:
+def _offered_keyframes(selection: KeyframeSelection, previous: Registration | None) -> IntArray:
     if previous is None:
         return np.asarray(selection.frames)
     return np.union1d(previous.tried_keyframes, previous.wanted_keyframes)
 
 
-def _own_map(maps: Sequence[Map], camera: str) -> Map | None:
+def _map_of_camera(maps: Sequence[Map], camera: str) -> Map | None:
     """The model with most of a camera's keyframes, or None."""
     counts = [len(item.keyframes_of(camera)) for item in maps]
     return maps[int(np.argmax(counts))] if counts and max(counts) > 0 else None
 
 
-def _limits(camera: CaptureCamera, selection: KeyframeSelection, options: RegistrationOptions) -> PoseLimits:
-    noise_px = np.hypot(_MAP_NOISE_PX * track_scale(camera), 2.0 * selection.noise_px)
-    return PoseLimits(
-        max_error_px=float(_THRESHOLD_SIGMAS * noise_px),
+def acceptance_criteria(
+    camera: CaptureCamera, selection: KeyframeSelection, options: RegistrationOptions
+) -> AcceptanceCriteria:
+    noise_px = np.hypot(_MAP_NOISE_PX * camera_pixel_scale(camera), 2.0 * selection.noise_px)
+    return AcceptanceCriteria(
+        max_error_px=float(_INLIER_SIGMAS * noise_px),
         min_inliers=options.min_inliers,
         max_sigma_depth=options.max_sigma_depth,
     )
 
 
-def _without_map(camera: CaptureCamera, tried: IntArray) -> Registration:
+def _registration_without_map(camera: CaptureCamera, tried: IntArray) -> Registration:
     none = Tracks.join([])
     poses = [FramePose(status=FrameStatus.NO_MAP)] * len(camera.times_ns)
     return Registration(
-        trajectory=_trajectory(camera, "none", poses, np.zeros(len(poses))),
+        trajectory=build_trajectory(camera, "none", poses, np.zeros(len(poses))),
         obs_frame=none.frame,
         obs_keyframe=none.keyframe,
         obs_feature=none.feature,
@@ -226,7 +241,7 @@ def _without_map(camera: CaptureCamera, tried: IntArray) -> Registration:
     )
 
 
-def _trajectory(
+def build_trajectory(
     camera: CaptureCamera, gauge: str, poses: Sequence[FramePose], sharpness: FloatArray
 ) -> Trajectory:
     none6 = np.full((6, 6), np.nan)
@@ -235,28 +250,28 @@ def _trajectory(
         gauge=gauge,
         frame_numbers=camera.frame_numbers,
         times_ns=camera.times_ns,
-        gauge_from_cam=matrices(poses),
+        gauge_from_cam=pose_array(poses),
         covariance=np.array(
             [none6 if pose.covariance is None else pose.covariance for pose in poses]
         ).reshape(-1, 6, 6),
-        status=tuple(_blamed(poses, sharpness)),
+        status=tuple(_frame_statuses(poses, sharpness)),
         inliers=np.array([pose.inliers for pose in poses], dtype=np.int64),
         error_px=np.array([pose.error_px for pose in poses]),
     )
 
 
-def _finished(path: Trajectory) -> Trajectory:
+def _smooth_if_final(path: Trajectory) -> Trajectory:
     """Steadied, unless its lost frames are looked for first: that goes from poses as they were measured."""
-    return steadied(path) if (~path.localised).sum() < LEAST_LOST else path
+    return smooth_weak_centres(path) if (~path.localised).sum() < LEAST_LOST else path
 
 
-def _blamed(poses: Sequence[FramePose], sharpness: FloatArray) -> list[FrameStatus]:
+def _frame_statuses(poses: Sequence[FramePose], sharpness: FloatArray) -> list[FrameStatus]:
     """Statuses; a frame without tracks that is much less sharp than its surroundings is called blurred."""
     out = []
     for index, pose in enumerate(poses):
         status = pose.status
         if status is FrameStatus.FEW_TRACKS:
-            near = sharpness[max(0, index - _BLUR_WINDOW) : index + _BLUR_WINDOW + 1]
+            near = sharpness[max(0, index - _BLUR_WINDOW_FRAMES) : index + _BLUR_WINDOW_FRAMES + 1]
             if sharpness[index] < _BLUR_RATIO * np.median(near):
                 status = FrameStatus.BLUR
         out.append(status)

@@ -25,12 +25,12 @@ def load_capture(arguments: Json) -> Capture:
 
 
 def _kept(folder: str | None) -> KeptFrames | None:
-    from bodycap_batch.capture.kept import NAME, KeptFrames
+    from bodycap_batch.capture.kept import KEPT_NAME, KeptFrames
     from bodycap_batch.formats.bundle import read_bundle
 
-    if folder is None or not (Path(folder) / f"{NAME}.json").exists():
+    if folder is None or not (Path(folder) / f"{KEPT_NAME}.json").exists():
         return None
-    return read_bundle(KeptFrames, Path(folder), NAME)
+    return read_bundle(KeptFrames, Path(folder), KEPT_NAME)
 
 
 def load_keyframes(path: str) -> KeyframeSelection:

@@ -23,7 +23,12 @@ def _recover(options: Json, arguments: Json, context: StageContext, files: Path)
     from bodycap_batch.config import RegistrationOptions
     from bodycap_batch.formats.bundle import read_bundle, write_bundle
     from bodycap_batch.model.relative_pose import RigPoses
-    from bodycap_batch.registration import RigCamera, recover_lost, settled, without_contradicted
+    from bodycap_batch.registration import (
+        RegisteredCamera,
+        find_lost_poses,
+        prepare_recovery,
+        remove_misplaced_keyframes,
+    )
 
     context.check_cancelled()
     capture, paths = load_capture(arguments), [Path(path) for path in arguments["registrations"]]
@@ -34,19 +39,19 @@ def _recover(options: Json, arguments: Json, context: StageContext, files: Path)
     scene = next(each for each in maps if each.gauge == found.trajectory.gauge)
     trajectories: list[Trajectory] = []
 
-    def everyone() -> Iterator[RigCamera]:
+    def everyone() -> Iterator[RegisteredCamera]:
         # One at a time: what was tracked in a long video takes most of an artefact's memory.
         for camera, path in zip(capture.cameras, paths, strict=True):
-            each = RigCamera(camera=camera, found=load_registration(str(path)))
+            each = RegisteredCamera(camera=camera, found=load_registration(str(path)))
             trajectories.append(each.found.trajectory)
             yield each
 
-    scene = without_contradicted(scene, everyone(), selection, options_)
+    scene = remove_misplaced_keyframes(scene, everyone(), selection, options_)
     in_rig = (paths[0] / f"{RIG_POSES}.json").exists()
     if not in_rig:
-        own = RigCamera(camera=capture.cameras[0], found=found)
-        scene, found = settled(own, trajectories[1:], scene, selection, options_)
-    found = recover_lost(found, scene, capture, options_, context)
+        own = RegisteredCamera(camera=capture.cameras[0], found=found)
+        scene, found = prepare_recovery(own, trajectories[1:], scene, selection, options_)
+    found = find_lost_poses(found, scene, capture, options_, context)
     save_registration(found, capture.cameras[0], files, rolling=read_summary(paths[0])["rolling"])
     if in_rig:
         write_bundle(read_bundle(RigPoses, paths[0], RIG_POSES), files, RIG_POSES)

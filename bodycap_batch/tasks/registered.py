@@ -66,7 +66,7 @@ class Registered:
             segments: Names of the cameras on each segment that carries several.
         """
         from bodycap_batch.formats.bundle import read_bundle
-        from bodycap_batch.model.relative_pose import RigPoses, relative_pose
+        from bodycap_batch.model.relative_pose import RigPoses, estimate_relative_pose
 
         path_of = {each.camera: each for each in self.trajectories}
         kept = {
@@ -79,7 +79,7 @@ class Registered:
         for pair in (pair for names in segments for pair in combinations(sorted(names), 2)):
             offset_s = self.clocks[pair[1]].offset_s - self.clocks[pair[0]].offset_s
             first, second = (path_of[name] for name in pair)
-            out.append(kept.get(pair) or relative_pose(first, second, round(1e9 * offset_s)))
+            out.append(kept.get(pair) or estimate_relative_pose(first, second, round(1e9 * offset_s)))
         return tuple(out)
 
 

@@ -15,30 +15,30 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import make_transform, transform_points
 
 _RAY_STEP = 1e-4
-_CHUNK = 48
+_CHUNK_FRAMES = 48
 """Frames solved together: enough to hide numpy's overhead, few enough to stay in the cache."""
-_PART = 1 << 14
+_BATCH_ROWS = 1 << 14
 """Views that the lens is asked for at a time: what that takes is ten times what is kept of it."""
-_ROUNDS = 20
+_MAX_ITERATIONS = 20
 _CONVERGED_PX = 1e-2
 """A third of what 200 points at 0.5 px leave open; 2e-3 gives the same errors for half as much time again."""
-_MAX_TURN_RAD = 0.5
-_WIDE = 3.0
+_MAX_STEP_RAD = 0.5
+_CUTOFF_MEDIANS = 3.0
 """Medians beyond which a residual counts as wrong while the start is still bad."""
-COUNTING_WEIGHT = 0.05
+MIN_COUNTED_WEIGHT = 0.05
 """Views that weigh less decide nothing where there are others."""
-_LOSS_SHARE = 0.25
+_LOSS_SCALE = 0.25
 """The loss's width in limits. 1, 1/2, 1/4: walk12 0.42, 0.39, 0.38 cm; walk131 0.68, 0.67, 0.65 cm."""
 _DAMPING = 1e-10
 _TINY = 1e-300
-_FAR = 1e5
+_UNUSABLE = 1e5
 """Pixels and depths are cut off here where only their order counts."""
-_MIN_VIEWS = 3
-_UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
+_MIN_OBSERVATIONS = 3
+_UPPER_TRIANGLE = tuple((i, j) for i in range(6) for j in range(i, 6))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Views:
+class Observations:
     """Map points seen in frames, ordered by frame.
 
     Attributes:
@@ -63,10 +63,10 @@ class Views:
         """Rows of one frame."""
         return slice(int(self.bounds[frame]), int(self.bounds[frame + 1]))
 
-    def of_frame(self, frame: int) -> Views:
+    def of_frame(self, frame: int) -> Observations:
         """The views of one frame alone."""
         rows = self.rows(frame)
-        return Views(
+        return Observations(
             bounds=np.array([0, rows.stop - rows.start]),
             points=self.points[rows],
             rays=self.rays[rows],
@@ -84,8 +84,8 @@ class Views:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fits:
-    """What `assess_poses` finds.
+class PoseQuality:
+    """What `evaluate_poses` finds.
 
     Attributes:
         inliers: (F,) views within the limit.
@@ -104,35 +104,35 @@ class Fits:
     information: FloatArray
 
 
-def make_views(
+def make_observations(
     camera: Camera, bounds: IntArray, points: FloatArray, px: FloatArray, weight: FloatArray | None = None
-) -> Views:
+) -> Observations:
     """Undistort pixels (M,2) once, with the lens's derivative there: a pose then costs no lens model."""
     rays = np.empty((len(px), 2))
-    for start in range(0, len(px), _PART):
-        rays[start : start + _PART] = camera.unproject(px[start : start + _PART])
-    return Views(
+    for start in range(0, len(px), _BATCH_ROWS):
+        rays[start : start + _BATCH_ROWS] = camera.unproject(px[start : start + _BATCH_ROWS])
+    return Observations(
         bounds=bounds,
         points=points,
         rays=rays,
-        px_from_ray=lens_jacobian(camera, rays),
+        px_from_ray=projection_jacobian(camera, rays),
         weight=np.ones(len(px)) if weight is None else weight,
     )
 
 
-def lens_jacobian(camera: Camera, rays: FloatArray) -> FloatArray:
+def projection_jacobian(camera: Camera, rays: FloatArray) -> FloatArray:
     """Derivative (N,2,2) of the pixel by the ray (x/z, y/z), by central differences."""
     out = np.empty((len(rays), 2, 2))
-    for start in range(0, len(rays), _PART):
-        some = rays[start : start + _PART]
+    for start in range(0, len(rays), _BATCH_ROWS):
+        some = rays[start : start + _BATCH_ROWS]
         one = np.ones((len(some), 1))
         for axis, step in enumerate(np.eye(2) * _RAY_STEP):
             ahead, behind = (camera.project(np.hstack([some + sign * step, one])) for sign in (1.0, -1.0))
-            out[start : start + _PART, :, axis] = (ahead - behind) / (2.0 * _RAY_STEP)
+            out[start : start + _BATCH_ROWS, :, axis] = (ahead - behind) / (2.0 * _RAY_STEP)
     return out
 
 
-def refine_poses(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> FloatArray:
+def refine_poses(views: Observations, cam_from_gauge: FloatArray, limit_px: float) -> FloatArray:
     """Least reprojection error under a Cauchy loss cut off at `limit_px`, from starting poses (F,4,4).
 
     The loss begins as wide as the residuals are and narrows with them, so a start that is off by more
@@ -146,20 +146,20 @@ def refine_poses(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> F
     poses = cam_from_gauge.copy()
 
     def work(active: IntArray) -> None:
-        for _ in range(_ROUNDS):
-            poses[active], done = _step(views, active, poses[active], limit_px)
+        for _ in range(_MAX_ITERATIONS):
+            poses[active], done = _gauss_newton_step(views, active, poses[active], limit_px)
             active = active[~done]
             if len(active) == 0:
                 break
 
-    _side_by_side(views, work)
+    _for_each_chunk(views, work)
     return poses
 
 
-def assess_poses(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> Fits:
+def evaluate_poses(views: Observations, cam_from_gauge: FloatArray, limit_px: float) -> PoseQuality:
     """How well poses (F,4,4) explain what their frames see."""
     frames = len(cam_from_gauge)
-    fits = Fits(
+    fits = PoseQuality(
         inliers=np.zeros(frames, np.int64),
         error_px=np.full(frames, np.nan),
         evidence=np.zeros(frames),
@@ -169,7 +169,7 @@ def assess_poses(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> F
     )
 
     def work(some: IntArray) -> None:
-        rows, starts, owner = _gather(views, some)
+        rows, starts, owner = _rows_of_frames(views, some)
         residual, jacobian, depth = linearise(views, rows, cam_from_gauge[some][owner])
         size = np.hypot(residual[0], residual[1])
         inlier = size < limit_px
@@ -179,31 +179,31 @@ def assess_poses(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> F
         weight = views.weight[rows]
         total = np.maximum(np.add.reduceat(weight, starts), _TINY)
         fits.evidence[some] = np.add.reduceat(inlier * weight, starts) / total
-        counts = inlier & (weight >= COUNTING_WEIGHT)
-        spread = np.abs(np.where(counts, residual * np.sqrt(weight), _FAR)).T.ravel()
+        counts = inlier & (weight >= MIN_COUNTED_WEIGHT)
+        spread = np.abs(np.where(counts, residual * np.sqrt(weight), _UNUSABLE)).T.ravel()
         many = np.add.reduceat(counts, starts, dtype=np.int64)
-        fits.noise_px[some] = _medians(spread, np.repeat(owner, 2), 2 * starts, 2 * many)
-        fits.depth[some] = _medians(np.where(inlier, depth, np.inf), owner, starts, count)
+        fits.noise_px[some] = _segment_medians(spread, np.repeat(owner, 2), 2 * starts, 2 * many)
+        fits.depth[some] = _segment_medians(np.where(inlier, depth, np.inf), owner, starts, count)
         fits.information[some] = _normal_equations(residual, jacobian, inlier * views.weight[rows], starts)[0]
 
-    _side_by_side(views, work)
+    _for_each_chunk(views, work)
     return fits
 
 
-def inliers_of(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> BoolArray:
+def find_inliers(views: Observations, cam_from_gauge: FloatArray, limit_px: float) -> BoolArray:
     """Which views (M,) lie within a limit of what poses (F,4,4) predict; none where a pose is NaN."""
     out = np.zeros(len(views.rays), dtype=bool)
 
     def work(some: IntArray) -> None:
-        rows, _, owner = _gather(views, some)
+        rows, _, owner = _rows_of_frames(views, some)
         residual, _, _ = _residuals(views, rows, cam_from_gauge[some][owner])
         out[rows] = np.hypot(residual[0], residual[1]) < limit_px
 
-    _side_by_side(views, work)
+    _for_each_chunk(views, work)
     return out
 
 
-def _side_by_side(views: Views, work: Callable[[IntArray], None]) -> None:
+def _for_each_chunk(views: Observations, work: Callable[[IntArray], None]) -> None:
     """Do chunks of frames, on all threads of the task: frames do not influence each other."""
     chunks, threads = list(_chunks(views)), int(os.environ.get(THREADS_VARIABLE, "1"))
     if threads == 1 or len(chunks) < 2:
@@ -215,39 +215,41 @@ def _side_by_side(views: Views, work: Callable[[IntArray], None]) -> None:
             pass
 
 
-def _chunks(views: Views) -> Iterator[IntArray]:
+def _chunks(views: Observations) -> Iterator[IntArray]:
     """Frames with enough views to have a pose, some at a time."""
     counts = np.diff(views.bounds)
-    usable = np.flatnonzero(counts >= _MIN_VIEWS)
-    for start in range(0, len(usable), _CHUNK):
-        yield usable[start : start + _CHUNK]
+    usable = np.flatnonzero(counts >= _MIN_OBSERVATIONS)
+    for start in range(0, len(usable), _CHUNK_FRAMES):
+        yield usable[start : start + _CHUNK_FRAMES]
 
 
-def _step(views: Views, frames: IntArray, poses: FloatArray, limit_px: float) -> tuple[FloatArray, BoolArray]:
-    rows, starts, owner = _gather(views, frames)
+def _gauss_newton_step(
+    views: Observations, frames: IntArray, poses: FloatArray, limit_px: float
+) -> tuple[FloatArray, BoolArray]:
+    rows, starts, owner = _rows_of_frames(views, frames)
     residual, jacobian, _ = linearise(views, rows, poses[owner])
     size = np.hypot(residual[0], residual[1])
-    median = _medians(size, owner, starts, views.bounds[frames + 1] - views.bounds[frames])
-    cut = np.maximum(limit_px, _WIDE * median)[owner]
-    robust = np.where(size < cut, 1.0 / (1.0 + (size / (_LOSS_SHARE * cut)) ** 2), 0.0)
+    median = _segment_medians(size, owner, starts, views.bounds[frames + 1] - views.bounds[frames])
+    cut = np.maximum(limit_px, _CUTOFF_MEDIANS * median)[owner]
+    robust = np.where(size < cut, 1.0 / (1.0 + (size / (_LOSS_SCALE * cut)) ** 2), 0.0)
     weight = robust * views.weight[rows]
     hessian, gradient = _normal_equations(residual, jacobian, weight, starts)
     damped = hessian + np.eye(6) * (_DAMPING * np.einsum("fii->f", hessian) + _TINY)[:, None, None]
     step = -np.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
     total = np.maximum(np.add.reduceat(weight, starts), 1e-3)
     moved_px = np.sqrt(np.einsum("fi,fij,fj->f", step, hessian, step) / total)
-    return _moved(poses, step), moved_px < _CONVERGED_PX
+    return _retract(poses, step), moved_px < _CONVERGED_PX
 
 
-def _medians(value: FloatArray, owner: IntArray, starts: IntArray, counts: IntArray) -> FloatArray:
+def _segment_medians(value: FloatArray, owner: IntArray, starts: IntArray, counts: IntArray) -> FloatArray:
     """Lower median of each owner's `counts` smallest values: one sort, the owner in the leading digits."""
-    capped = np.minimum(value, _FAR)
-    base = owner * (2.0 * _FAR)
+    capped = np.minimum(value, _UNUSABLE)
+    base = owner * (2.0 * _UNUSABLE)
     middle = starts + np.maximum(counts - 1, 0) // 2
     return np.asarray(np.sort(base + capped)[middle] - base[starts])
 
 
-def _gather(views: Views, frames: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+def _rows_of_frames(views: Observations, frames: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """Rows of some frames, where each frame's begin among them, and whose each is."""
     counts = views.bounds[frames + 1] - views.bounds[frames]
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
@@ -257,7 +259,7 @@ def _gather(views: Views, frames: IntArray) -> tuple[IntArray, IntArray, IntArra
 
 
 def linearise(
-    views: Views, rows: IntArray, cam_from_gauge: FloatArray
+    views: Observations, rows: IntArray, cam_from_gauge: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Residuals (2,N) px, their derivative (2,6,N) by a left perturbation of cam_from_gauge, depths (N,).
 
@@ -279,11 +281,11 @@ def linearise(
         derivative[4] = by_b * inverse
         derivative[5] = -along * inverse
     if views.member is not None and views.cam_from_rig is not None:
-        _turn_to_rig(jacobian, views.member[rows], views.cam_from_rig)
+        _camera_to_rig_jacobian(jacobian, views.member[rows], views.cam_from_rig)
     return residual, jacobian, z
 
 
-def _turn_to_rig(jacobian: FloatArray, member: IntArray, cam_from_rig: FloatArray) -> None:
+def _camera_to_rig_jacobian(jacobian: FloatArray, member: IntArray, cam_from_rig: FloatArray) -> None:
     """Make derivatives (2,6,N) by a camera's perturbation ones by its rig's, in place.
 
     Source: the adjoint map of SE(3), as in Sola, Deray, Atchuthan, "A micro Lie theory for state estimation
@@ -299,7 +301,7 @@ def _turn_to_rig(jacobian: FloatArray, member: IntArray, cam_from_rig: FloatArra
 
 
 def _residuals(
-    views: Views, rows: IntArray, cam_from_gauge: FloatArray
+    views: Observations, rows: IntArray, cam_from_gauge: FloatArray
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]:
     """Residuals (2,N) as `linearise` has them; x/z, y/z, 1/z, z; the lens (2,2,N), 0 where unusable."""
     x, y, z = transform_points(views.in_cameras(rows, cam_from_gauge), views.points[rows]).T
@@ -311,7 +313,7 @@ def _residuals(
     residual = np.stack([by_a * off_a + by_b * off_b for by_a, by_b in lens])
     usable = front & np.isfinite(residual).all(axis=0)
     if not usable.all():
-        residual, lens = np.where(usable, residual, _FAR), np.where(usable, lens, 0.0)
+        residual, lens = np.where(usable, residual, _UNUSABLE), np.where(usable, lens, 0.0)
     return residual, (a, b, inverse, z), lens
 
 
@@ -321,7 +323,7 @@ def _normal_equations(
     frames = len(starts)
     hessian, gradient = np.empty((frames, 6, 6)), np.empty((frames, 6))
     weighted = jacobian * weight
-    for i, j in _UPPER:
+    for i, j in _UPPER_TRIANGLE:
         entry = np.add.reduceat(weighted[0, i] * jacobian[0, j] + weighted[1, i] * jacobian[1, j], starts)
         hessian[:, i, j] = hessian[:, j, i] = entry
     for i in range(6):
@@ -329,11 +331,11 @@ def _normal_equations(
     return hessian, gradient
 
 
-def _moved(cam_from_gauge: FloatArray, step: FloatArray) -> FloatArray:
+def _retract(cam_from_gauge: FloatArray, step: FloatArray) -> FloatArray:
     """Left perturbation (N,6) of poses (N,4,4), rotation first; a turn is held to what is sane."""
     turn = step[:, :3]
     angle = np.linalg.norm(turn, axis=1, keepdims=True)
-    held = np.minimum(1.0, _MAX_TURN_RAD / np.maximum(angle, 1e-12))
+    held = np.minimum(1.0, _MAX_STEP_RAD / np.maximum(angle, 1e-12))
     return make_transform(_rotation(turn * held), step[:, 3:] * held) @ cam_from_gauge
 
 

@@ -12,31 +12,31 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform
 from bodycap_batch.model.scene import FrameStatus
 from bodycap_batch.registration.poses.batched_pnp import (
-    COUNTING_WEIGHT,
-    Fits,
-    Views,
-    assess_poses,
+    MIN_COUNTED_WEIGHT,
+    Observations,
+    PoseQuality,
+    evaluate_poses,
     refine_poses,
 )
 
-_MIN_EVIDENCE = 0.3
+_MIN_INLIER_WEIGHT_RATIO = 0.3
 _MIN_NOISE_PX = 0.3
-MAP_VARIANCE_RATIO = 5.0
+MAP_COVARIANCE_SCALE = 5.0
 """Variance of a pose over what its residuals tell: the map's points around a frame are displaced together.
 
 Measured as the normalised error without it (median over what a chi-squared has): walk12 5.1, room12 4.1,
 walk131 5.2 (room131, where blocks of the map are loose, 16). The poses that a frame's two keyframes lead to
 differ by 0.8 of their own variances, so nothing in a frame alone can tell."""
-_HUGE = 1e12
-_LEAST_EVIDENCE = 1e-3
+_UNCONSTRAINED_VARIANCE = 1e12
+_WEIGHT_RATIO_FLOOR = 1e-3
 _MAX_TRIALS = 2000
-_TRUSTED_RATIO = 0.6
+TRUSTED_WEIGHT_RATIO = 0.6
 """Share of the weight with the inliers above which a start led to the right pose: sampling never found a
 better one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PoseLimits:
+class AcceptanceCriteria:
     """What makes a pose acceptable.
 
     Attributes:
@@ -76,7 +76,11 @@ class FramePose:
 
 
 def solve_poses(
-    lenses: Sequence[Camera], views: Views, px: FloatArray, start: FloatArray, limits: PoseLimits
+    lenses: Sequence[Camera],
+    views: Observations,
+    px: FloatArray,
+    start: FloatArray,
+    limits: AcceptanceCriteria,
 ) -> list[FramePose]:
     """Poses of all frames of a camera, or of a rig, from the map points seen in them.
 
@@ -92,44 +96,44 @@ def solve_poses(
     known = np.asarray(np.isfinite(start).all(axis=(1, 2)))
     poses = refine_poses(views, np.where(known[:, None, None], start, np.eye(4)), limits.max_error_px)
     count = np.diff(views.bounds)
-    found = judge_poses(views, poses, limits)
+    found = accept_poses(views, poses, limits)
     for frame in np.flatnonzero(count >= limits.min_inliers).tolist():
-        if known[frame] and found[frame].evidence >= _TRUSTED_RATIO:
+        if known[frame] and found[frame].evidence >= TRUSTED_WEIGHT_RATIO:
             continue
         alone = views.of_frame(frame)
-        some = alone.weight >= COUNTING_WEIGHT
+        some = alone.weight >= MIN_COUNTED_WEIGHT
         if some.sum() < limits.min_inliers:
             some[:] = True
-        sampled = _sampled(lenses, alone, some, px[views.rows(frame)], limits)
+        sampled = _ransac(lenses, alone, some, px[views.rows(frame)], limits)
         if sampled is not None:
             refined = refine_poses(alone, sampled[None], limits.max_error_px)
             found[frame] = max(
-                found[frame], *judge_poses(alone, refined, limits), key=lambda pose: pose.evidence
+                found[frame], *accept_poses(alone, refined, limits), key=lambda pose: pose.evidence
             )
     return found
 
 
-def _sampled(
-    lenses: Sequence[Camera], views: Views, some: BoolArray, px: FloatArray, limits: PoseLimits
+def _ransac(
+    lenses: Sequence[Camera], views: Observations, some: BoolArray, px: FloatArray, limits: AcceptanceCriteria
 ) -> FloatArray | None:
     """Pose (4,4) of one frame from some of its views; of its rig where several cameras see them."""
     seen, px = views.points[some], px[some]
     if views.member is None or views.cam_from_rig is None:
-        return sample_pose(lenses[0], seen, px, limits)
+        return ransac_pose(lenses[0], seen, px, limits)
     member = views.member[some]
     if len(np.unique(member)) > 1:
-        return _sample_rig_pose(lenses, views.cam_from_rig, member, seen, px, limits)
-    pose = sample_pose(lenses[member[0]], seen, px, limits)
+        return _ransac_rig_pose(lenses, views.cam_from_rig, member, seen, px, limits)
+    pose = ransac_pose(lenses[member[0]], seen, px, limits)
     return None if pose is None else np.asarray(invert(views.cam_from_rig[member[0]]) @ pose)
 
 
-def _sample_rig_pose(
+def _ransac_rig_pose(
     lenses: Sequence[Camera],
     cam_from_rig: FloatArray,
     member: IntArray,
     points: FloatArray,
     px: FloatArray,
-    limits: PoseLimits,
+    limits: AcceptanceCriteria,
 ) -> FloatArray | None:
     """Pose rig_from_gauge (4,4) from map points (N,3) that its cameras `member` (N,) see at pixels (N,2).
 
@@ -151,7 +155,9 @@ def _sample_rig_pose(
     return make_transform(matrix[:, :3], matrix[:, 3])
 
 
-def sample_pose(camera: Camera, points: FloatArray, px: FloatArray, limits: PoseLimits) -> FloatArray | None:
+def ransac_pose(
+    camera: Camera, points: FloatArray, px: FloatArray, limits: AcceptanceCriteria
+) -> FloatArray | None:
     """Pose cam_from_gauge (4,4) of a calibrated camera from map points (N,3) seen at pixels (N,2).
 
     Source: Lebeda, Matas, Chum, "Fixing the locally optimized RANSAC", BMVC 2012, as in COLMAP.
@@ -169,9 +175,11 @@ def sample_pose(camera: Camera, points: FloatArray, px: FloatArray, limits: Pose
     return make_transform(matrix[:, :3], matrix[:, 3])
 
 
-def judge_poses(views: Views, cam_from_gauge: FloatArray, limits: PoseLimits) -> list[FramePose]:
+def accept_poses(
+    views: Observations, cam_from_gauge: FloatArray, limits: AcceptanceCriteria
+) -> list[FramePose]:
     """Count the inliers of poses (F,4,4), estimate their covariance, and accept or refuse them."""
-    fits = assess_poses(views, cam_from_gauge, limits.max_error_px)
+    fits = evaluate_poses(views, cam_from_gauge, limits.max_error_px)
     covariance = _covariance(fits, limits.min_noise_px)
     sigma = np.sqrt(np.linalg.eigvalsh(covariance[:, 3:, 3:])[:, -1])
     constrained = sigma < limits.max_sigma_depth * fits.depth
@@ -181,7 +189,7 @@ def judge_poses(views: Views, cam_from_gauge: FloatArray, limits: PoseLimits) ->
         inliers = int(fits.inliers[frame])
         if count < limits.min_inliers:
             out.append(FramePose(status=FrameStatus.FEW_TRACKS))
-        elif inliers < limits.min_inliers or fits.evidence[frame] < _MIN_EVIDENCE:
+        elif inliers < limits.min_inliers or fits.evidence[frame] < _MIN_INLIER_WEIGHT_RATIO:
             evidence = float(fits.evidence[frame])
             out.append(FramePose(status=FrameStatus.FEW_INLIERS, inliers=inliers, evidence=evidence))
         else:
@@ -199,7 +207,7 @@ def judge_poses(views: Views, cam_from_gauge: FloatArray, limits: PoseLimits) ->
     return out
 
 
-def _covariance(fits: Fits, min_noise_px: float) -> FloatArray:
+def _covariance(fits: PoseQuality, min_noise_px: float) -> FloatArray:
     """Covariance (F,6,6) from the inliers' information and their own spread; huge where there is no inverse.
 
     Views that disagree with a pose are evidence against it: the sigmas grow as the inliers' share falls.
@@ -210,6 +218,6 @@ def _covariance(fits: Fits, min_noise_px: float) -> FloatArray:
     """
     noise_px = np.maximum(1.4826 * np.nan_to_num(fits.noise_px), min_noise_px)
     solvable = np.linalg.matrix_rank(fits.information) == 6
-    safe = np.where(solvable[:, None, None], fits.information, np.eye(6) / _HUGE)
-    sigma_px = noise_px / np.maximum(fits.evidence, _LEAST_EVIDENCE)
-    return np.asarray(np.linalg.inv(safe) * MAP_VARIANCE_RATIO * sigma_px[:, None, None] ** 2)
+    safe = np.where(solvable[:, None, None], fits.information, np.eye(6) / _UNCONSTRAINED_VARIANCE)
+    sigma_px = noise_px / np.maximum(fits.evidence, _WEIGHT_RATIO_FLOOR)
+    return np.asarray(np.linalg.inv(safe) * MAP_COVARIANCE_SCALE * sigma_px[:, None, None] ** 2)

@@ -10,13 +10,13 @@ from bodycap_batch.model.scene import Map
 
 _MOMENT_NS = 1_000_000_000
 """The wearer's sleeve hangs before the camera for longer, but seldom in one place of it."""
-_MOSTLY = 0.5
-_ENOUGH = 12
+_MIN_KEYFRAME_RATIO = 0.5
+_MIN_STATIC_POINTS = 12
 """Unless so large a share of a camera's keyframes sees so many confirmed points the test tells nothing: a
 camera alone that always moves on."""
 
 
-def confirmed_points(camera: CaptureCamera, scene_map: Map) -> BoolArray:
+def static_points(camera: CaptureCamera, scene_map: Map) -> BoolArray:
     """(P,) points that another camera saw too, or this one more than a moment apart.
 
     What moves with a camera, the wearer's own arm first of all, looks like a still room to that camera for a
@@ -36,5 +36,5 @@ def confirmed_points(camera: CaptureCamera, scene_map: Map) -> BoolArray:
         scene_map.obs_keyframe[mine], weights=out[point], minlength=len(scene_map.keyframe_camera)
     )
     seeing = np.intersect1d(rows, scene_map.obs_keyframe)  # a refused one may be kept that sees nothing
-    tells = len(seeing) > 0 and bool((seen[seeing] >= _ENOUGH).mean() >= _MOSTLY)
+    tells = len(seeing) > 0 and bool((seen[seeing] >= _MIN_STATIC_POINTS).mean() >= _MIN_KEYFRAME_RATIO)
     return out if tells else np.ones(count, dtype=bool)

@@ -11,42 +11,42 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp
 from bodycap_batch.model.scene import Trajectory
-from bodycap_batch.registration.poses.batched_pnp import Views, make_views, refine_poses
-from bodycap_batch.registration.poses.pnp import PoseLimits, judge_poses, sample_pose
-from bodycap_batch.registration.recovery.motion_prior import Place
+from bodycap_batch.registration.poses.batched_pnp import Observations, make_observations, refine_poses
+from bodycap_batch.registration.poses.pnp import AcceptanceCriteria, accept_poses, ransac_pose
+from bodycap_batch.registration.recovery.motion_prior import PositionEstimate
 from bodycap_batch.registration.recovery.patch_search import (
-    Found,
-    Gallery,
+    KeyframePatches,
+    PatchMatches,
+    PredictedView,
     Pyramid,
-    Search,
-    View,
-    choose_rows,
-    find_points,
+    SearchLevel,
+    match_patches,
+    select_patches,
 )
 
-_SEARCHES = (
-    Search(level=2, side=15, radius=14, score=0.6, limit_px=12.0),
-    Search(level=1, side=21, radius=8, score=0.7, limit_px=6.0),
-    Search(level=0, side=31, radius=8, score=0.75, limit_px=4.0),
+_LEVELS = (
+    SearchLevel(level=2, side=15, radius=14, score=0.6, limit_px=12.0),
+    SearchLevel(level=1, side=21, radius=8, score=0.7, limit_px=6.0),
+    SearchLevel(level=0, side=31, radius=8, score=0.75, limit_px=4.0),
 )
 """From far and coarse to near and fine. The last one at full size: errors of frames with known poses are a
 quarter smaller than from half size."""
 _POINT_VARIANCE = 6.0
 """As for tracks."""
-_CELL_PX = 40.0
-_PER_CELL = 2.0
+_CELL_SIDE_PX = 40.0
+_FULL_WEIGHT_PER_CELL = 2.0
 """Patches that overlap err together: so many count in a square of about a patch's side. Otherwise fifty
 patches on one grating of a ceiling pass for a pose that is 60 cm off."""
 _MIN_NOISE_PX = 1.0
 """Of patches found in blurred frames: fewer than twenty that happen to agree better tell nothing better."""
-_MIN_FOUND = 8
-_SURE_INLIERS, _SURE_EVIDENCE = 25, 0.6
+_MIN_MATCHES = 8
+_SUFFICIENT_INLIERS, _SUFFICIENT_WEIGHT_RATIO = 25, 0.6
 _TRUSTED = 0.6
 """As for tracks: beyond it sampling finds nothing better."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fix:
+class PoseEstimate:
     """A pose from points found where they were looked for.
 
     Attributes:
@@ -66,9 +66,9 @@ class Fix:
     depth: float
 
     @staticmethod
-    def of(path: Trajectory, frame: int) -> Fix:
+    def of(path: Trajectory, frame: int) -> PoseEstimate:
         """A pose that tracking found; the depth of its points is not known any more."""
-        return Fix(
+        return PoseEstimate(
             cam_from_map=invert(path.gauge_from_cam[frame]),
             covariance=path.covariance[frame],
             inliers=int(path.inliers[frame]),
@@ -78,12 +78,12 @@ class Fix:
         )
 
     @property
-    def place(self) -> Place:
+    def place(self) -> PositionEstimate:
         """Where the camera was."""
         turn = self.cam_from_map[:3, :3]
-        return Place(invert(self.cam_from_map)[:3, 3], turn.T @ self.covariance[3:, 3:] @ turn)
+        return PositionEstimate(invert(self.cam_from_map)[:3, 3], turn.T @ self.covariance[3:, 3:] @ turn)
 
-    def with_place(self, place: Place) -> tuple[FloatArray, FloatArray]:
+    def with_place(self, place: PositionEstimate) -> tuple[FloatArray, FloatArray]:
         """The pose cam_from_map (4,4) and its covariance (6,6) once the centre is known to be elsewhere.
 
         The turn follows as far as the points tie it to the centre.
@@ -102,16 +102,16 @@ class Fix:
         return make_transform(turned, -turned @ place.centre), covariance
 
 
-def together(first: Place, second: Place) -> tuple[Place, float]:
+def fuse(first: PositionEstimate, second: PositionEstimate) -> tuple[PositionEstimate, float]:
     """The place that two independent ones make, and their squared Mahalanobis distance."""
     total = np.linalg.inv(first.covariance + second.covariance)
     off = second.centre - first.centre
     centre = first.centre + first.covariance @ total @ off
-    return Place(centre, first.covariance @ total @ second.covariance), float(off @ total @ off)
+    return PositionEstimate(centre, first.covariance @ total @ second.covariance), float(off @ total @ off)
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class SearchFrame:
     """A frame as it is searched.
 
     Attributes:
@@ -124,7 +124,7 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True)
-class Beside:
+class NeighbourPose:
     """Where the camera was a frame away.
 
     Attributes:
@@ -137,7 +137,7 @@ class Beside:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finder:
+class GuidedLocaliser:
     """Finds poses of a camera's frames near where they are expected.
 
     Attributes:
@@ -150,13 +150,15 @@ class Finder:
     """
 
     lens: Camera
-    gallery: Gallery
-    limits: PoseLimits
+    gallery: KeyframePatches
+    limits: AcceptanceCriteria
     exposure: float
     readout: float = 0.0
     sees_room: Callable[[FloatArray], BoolArray]
 
-    def locate(self, seen: Seen, priors: list[FloatArray], beside: Beside, place: Place) -> Fix | None:
+    def locate(
+        self, seen: SearchFrame, priors: list[FloatArray], beside: NeighbourPose, place: PositionEstimate
+    ) -> PoseEstimate | None:
         """The pose of a frame.
 
         Args:
@@ -165,26 +167,30 @@ class Finder:
             beside: The frame before or after.
             place: Where its motion leads to.
         """
-        best: Fix | None = None
+        best: PoseEstimate | None = None
         for prior in priors:
-            fix = self._search(self._view(seen, prior, beside), _SEARCHES[0])
+            fix = self._search(self._view(seen, prior, beside), _LEVELS[0])
             if fix is not None and (best is None or fix.inliers > best.inliers):
                 best = fix
-            if best is not None and best.inliers >= _SURE_INLIERS and best.evidence >= _SURE_EVIDENCE:
+            if (
+                best is not None
+                and best.inliers >= _SUFFICIENT_INLIERS
+                and best.evidence >= _SUFFICIENT_WEIGHT_RATIO
+            ):
                 break
-        for search in _SEARCHES[1:]:
+        for search in _LEVELS[1:]:
             if best is None:
                 return None
-            pose, _ = best.with_place(together(best.place, place)[0])
+            pose, _ = best.with_place(fuse(best.place, place)[0])
             best = self._search(self._view(seen, pose, beside), search)
         return best
 
-    def look_again(self, seen: Seen, pose: FloatArray, beside: Beside) -> Fix | None:
+    def look_again(self, seen: SearchFrame, pose: FloatArray, beside: NeighbourPose) -> PoseEstimate | None:
         """The pose (4,4) of a frame that is nearly known; the rest as for `locate`."""
-        return self._search(self._view(seen, pose, beside), _SEARCHES[-1])
+        return self._search(self._view(seen, pose, beside), _LEVELS[-1])
 
-    def _view(self, seen: Seen, pose: FloatArray, beside: Beside) -> View:
-        return View(
+    def _view(self, seen: SearchFrame, pose: FloatArray, beside: NeighbourPose) -> PredictedView:
+        return PredictedView(
             lens=self.lens,
             pyramid=seen.pyramid,
             cam_from_map=pose,
@@ -194,40 +200,42 @@ class Finder:
             row=seen.row,
         )
 
-    def _search(self, view: View, search: Search) -> Fix | None:
-        rows = choose_rows(self.gallery, view)
-        if len(rows) < _MIN_FOUND:
+    def _search(self, view: PredictedView, search: SearchLevel) -> PoseEstimate | None:
+        rows = select_patches(self.gallery, view)
+        if len(rows) < _MIN_MATCHES:
             return None
-        found = find_points(self.gallery, view, rows, search)
+        found = match_patches(self.gallery, view, rows, search)
         found = found.chosen(self.sees_room(found.px))
-        return self._solve(view, found, search) if len(found.point) >= _MIN_FOUND else None
+        return self._solve(view, found, search) if len(found.point) >= _MIN_MATCHES else None
 
-    def _solve(self, view: View, found: Found, search: Search) -> Fix | None:
+    def _solve(self, view: PredictedView, found: PatchMatches, search: SearchLevel) -> PoseEstimate | None:
         scale = view.pyramid.step_px[0]
         limits = replace(
             self.limits,
             max_error_px=search.limit_px * scale,
-            min_inliers=_MIN_FOUND,
+            min_inliers=_MIN_MATCHES,
             max_sigma_depth=np.inf,
             min_noise_px=_MIN_NOISE_PX * scale,
         )
         points = self.gallery.scene_map.points[found.point]
-        weight = _weights(found.px / (_CELL_PX * scale), self.gallery.seen[found.point])
-        views = make_views(self.lens, np.array([0, len(points)]), points, found.mid_row_px, weight)
+        weight = _match_weights(found.px / (_CELL_SIDE_PX * scale), self.gallery.seen[found.point])
+        views = make_observations(self.lens, np.array([0, len(points)]), points, found.mid_row_px, weight)
         best = self._refined(views, view.cam_from_map, limits)
         if best is None or best.evidence < _TRUSTED:
-            sampled = sample_pose(self.lens, points, found.mid_row_px, limits)
+            sampled = ransac_pose(self.lens, points, found.mid_row_px, limits)
             other = None if sampled is None else self._refined(views, sampled, limits)
             if other is not None and (best is None or other.inliers > best.inliers):
                 best = other
         return best
 
-    def _refined(self, views: Views, start: FloatArray, limits: PoseLimits) -> Fix | None:
+    def _refined(
+        self, views: Observations, start: FloatArray, limits: AcceptanceCriteria
+    ) -> PoseEstimate | None:
         pose = refine_poses(views, start[None], limits.max_error_px)
-        judged = judge_poses(views, pose, limits)[0]
+        judged = accept_poses(views, pose, limits)[0]
         if judged.covariance is None:
             return None
-        return Fix(
+        return PoseEstimate(
             cam_from_map=pose[0],
             covariance=judged.covariance,
             inliers=judged.inliers,
@@ -237,7 +245,9 @@ class Finder:
         )
 
 
-def _weights(cell: FloatArray, seen: IntArray) -> FloatArray:
+def _match_weights(cell: FloatArray, seen: IntArray) -> FloatArray:
     """(N,) how much points count that are seen in cells (N,2) of the image and by so many keyframes (N,)."""
     _, group, count = np.unique(np.floor(cell).astype(int), axis=0, return_inverse=True, return_counts=True)
-    return np.asarray(seen / (seen + _POINT_VARIANCE) / np.maximum(1.0, count[np.ravel(group)] / _PER_CELL))
+    return np.asarray(
+        seen / (seen + _POINT_VARIANCE) / np.maximum(1.0, count[np.ravel(group)] / _FULL_WEIGHT_PER_CELL)
+    )

@@ -12,24 +12,24 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, transform_points
 from bodycap_batch.model.optical_flow import GreyImage, pixel_scale
-from bodycap_batch.model.rolling_shutter import at_mid_row
+from bodycap_batch.model.rolling_shutter import px_at_mid_row
 from bodycap_batch.model.scene import Map
-from bodycap_batch.registration.tracking.klt import well_spread
+from bodycap_batch.registration.tracking.klt import grid_sample
 
 _MAX_POINTS = 300
-_CELLS = 8
+_GRID_CELLS = 8
 _MARGIN_PX = 4.0
 _MIN_COSINE = 0.6
 """Of the angle between the two lines of sight: a patch is taken to face the camera."""
 _MAX_LOG_SCALE = 0.8
-_SCALE_COST, _SHARP_WORTH = 0.3, 0.1
+_SCALE_PENALTY, _SHARPNESS_REWARD = 0.3, 0.1
 """What a keyframe's distance (log of the ratio) and sharpness count beside its line of sight's cosine."""
 _MAX_BLUR_PX = 40.0
-_BLUR_SAMPLES = 5
-_BLUR_STEP = 3.0
+_MAX_BLUR_SAMPLES = 5
+_BLUR_STEP_PX = 3.0
 """Pixels of the level from sample to sample; a longer blur is sampled less densely."""
-_STEP_PX = 4.0
-_MIN_DEPTH = 0.25
+_WARP_STEP_PX = 4.0
+_MIN_DEPTH_RATIO = 0.25
 """Of the median depth: what seems to hang before the lens was triangulated wrongly and would tie the pose."""
 _MIN_CONTRAST = 3.0
 _LEVELS = 3
@@ -67,7 +67,7 @@ class Pyramid:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Gallery:
+class KeyframePatches:
     """What a map's points look like.
 
     Attributes:
@@ -86,7 +86,7 @@ class Gallery:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class View:
+class PredictedView:
     """Where a frame is thought to be.
 
     Attributes:
@@ -110,7 +110,7 @@ class View:
 
 
 @dataclass(frozen=True, slots=True)
-class Search:
+class SearchLevel:
     """How points are looked for.
 
     Attributes:
@@ -129,7 +129,7 @@ class Search:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class PatchMatches:
     """Points found.
 
     Attributes:
@@ -144,12 +144,12 @@ class Found:
     mid_row_px: FloatArray
     score: FloatArray
 
-    def chosen(self, which: BoolArray) -> Found:
+    def chosen(self, which: BoolArray) -> PatchMatches:
         """Some of them."""
-        return Found(self.point[which], self.px[which], self.mid_row_px[which], self.score[which])
+        return PatchMatches(self.point[which], self.px[which], self.mid_row_px[which], self.score[which])
 
 
-def choose_rows(gallery: Gallery, view: View) -> IntArray:
+def select_patches(gallery: KeyframePatches, view: PredictedView) -> IntArray:
     """Rows of the map's observations to take points' looks from: one for each of some well spread points."""
     scene, lens = gallery.scene_map, view.lens
     x_in_cam = transform_points(view.cam_from_map, scene.points)
@@ -157,7 +157,7 @@ def choose_rows(gallery: Gallery, view: View) -> IntArray:
     size = np.array([lens.width_px, lens.height_px])
     with np.errstate(invalid="ignore"):
         inside = ((px > _MARGIN_PX) & (px < size - _MARGIN_PX)).all(axis=1) & gallery.usable
-    inside &= x_in_cam[:, 2] > _MIN_DEPTH * np.median(x_in_cam[inside, 2]) if inside.any() else False
+    inside &= x_in_cam[:, 2] > _MIN_DEPTH_RATIO * np.median(x_in_cam[inside, 2]) if inside.any() else False
     held = np.zeros(len(scene.keyframe_camera), dtype=bool)
     held[[row for row in gallery.pictures if row != view.row]] = True
     rows = np.flatnonzero(inside[scene.obs_point] & held[scene.obs_keyframe])
@@ -168,17 +168,21 @@ def choose_rows(gallery: Gallery, view: View) -> IntArray:
     cosine = np.einsum("ni,ni->n", here, there) / np.maximum(near * far, 1e-12)
     log_scale = np.abs(np.log(np.maximum(far, 1e-12) / np.maximum(near, 1e-12)))
     alike = (cosine > _MIN_COSINE) & (log_scale < _MAX_LOG_SCALE)
-    worth = cosine - _SCALE_COST * log_scale + _SHARP_WORTH * np.minimum(gallery.sharpness[keyframe], 2.0)
+    worth = (
+        cosine - _SCALE_PENALTY * log_scale + _SHARPNESS_REWARD * np.minimum(gallery.sharpness[keyframe], 2.0)
+    )
     rows, point, worth = rows[alike], point[alike], worth[alike]
     order = np.lexsort((-worth, point))
     best = order[np.unique(point[order], return_index=True)[1]]
     rows, point = rows[best], point[best]
-    cell = np.clip((px[point] / size * _CELLS).astype(int), 0, _CELLS - 1)
-    picked = well_spread(cell[:, 1] * _CELLS + cell[:, 0], gallery.seen[point], _MAX_POINTS)
+    cell = np.clip((px[point] / size * _GRID_CELLS).astype(int), 0, _GRID_CELLS - 1)
+    picked = grid_sample(cell[:, 1] * _GRID_CELLS + cell[:, 0], gallery.seen[point], _MAX_POINTS)
     return np.asarray(np.sort(rows[picked]))
 
 
-def find_points(gallery: Gallery, view: View, rows: IntArray, search: Search) -> Found:
+def match_patches(
+    gallery: KeyframePatches, view: PredictedView, rows: IntArray, search: SearchLevel
+) -> PatchMatches:
     """Look for points around where a pose projects them, by normalised correlation.
 
     A point's look is taken from a keyframe, warped to how this camera sees it (its surroundings are taken to
@@ -188,7 +192,7 @@ def find_points(gallery: Gallery, view: View, rows: IntArray, search: Search) ->
     Args:
         gallery: The map and its keyframes' pictures.
         view: The frame and its expected pose.
-        rows: Observations of the map to take looks from, as `choose_rows` gives them.
+        rows: Observations of the map to take looks from, as `select_patches` gives them.
         search: Where and how.
 
     Returns:
@@ -203,33 +207,35 @@ def find_points(gallery: Gallery, view: View, rows: IntArray, search: Search) ->
     shown = np.isfinite(px).all(axis=1)
     rows, points, px = rows[shown], points[shown], px[shown]
     if len(rows) == 0:
-        return Found(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
-    warp = _warps(scene, lens, view.cam_from_map, rows, px)
+        return PatchMatches(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
+    warp = _patch_warps(scene, lens, view.cam_from_map, rows, px)
     step = view.pyramid.step_px[search.level]
-    crossing = _crossing(view, points, px)
-    patches, whole = _patches(gallery, rows, warp, _blur(view, crossing), search, step)
+    crossing = _image_motion(view, points, px)
+    patches, whole = _render_patches(gallery, rows, warp, _motion_blur(view, crossing), search, step)
     # Within the readout a point crosses a small part of the image: its row hardly depends on it.
-    seen_px = at_mid_row(lens, px, crossing, -view.readout)
+    seen_px = px_at_mid_row(lens, px, crossing, -view.readout)
     found_px, score = np.full((len(rows), 2), np.nan), np.zeros(len(rows))
     target = view.pyramid.levels[search.level].astype(np.float32)
     for number in np.flatnonzero(whole).tolist():
-        place = _place(target, patches[number], seen_px[number] / step - 0.5, search.radius)
+        place = _best_match(target, patches[number], seen_px[number] / step - 0.5, search.radius)
         if place is not None:
             found_px[number] = (np.array(place[:2]) + 0.5) * step
             score[number] = place[2]
     good = (score > search.score) & np.isfinite(found_px).all(axis=1)
-    mid_row_px = at_mid_row(lens, found_px, crossing, view.readout)
-    return Found(scene.obs_point[rows[good]], found_px[good], mid_row_px[good], score[good])
+    mid_row_px = px_at_mid_row(lens, found_px, crossing, view.readout)
+    return PatchMatches(scene.obs_point[rows[good]], found_px[good], mid_row_px[good], score[good])
 
 
-def _warps(scene: Map, lens: Camera, cam_from_map: FloatArray, rows: IntArray, px: FloatArray) -> FloatArray:
+def _patch_warps(
+    scene: Map, lens: Camera, cam_from_map: FloatArray, rows: IntArray, px: FloatArray
+) -> FloatArray:
     """(N,2,2) the keyframes' pixels by this camera's, around points seen at `px` (N,2)."""
     keyframe = scene.obs_keyframe[rows]
     depth = transform_points(cam_from_map, scene.points[scene.obs_point[rows]])[:, 2]
     back, ahead = invert(cam_from_map), invert(scene.map_from_cam[keyframe])
     names = np.array(scene.keyframe_camera)[keyframe]
     places = []
-    for offset in ((0.0, 0.0), (_STEP_PX, 0.0), (0.0, _STEP_PX)):
+    for offset in ((0.0, 0.0), (_WARP_STEP_PX, 0.0), (0.0, _WARP_STEP_PX)):
         rays = np.column_stack([lens.unproject(px + offset), np.ones(len(px))]) * depth[:, None]
         seen = transform_points(ahead, transform_points(back, rays))
         place = np.full((len(px), 2), np.nan)
@@ -237,15 +243,15 @@ def _warps(scene: Map, lens: Camera, cam_from_map: FloatArray, rows: IntArray, p
             mine = names == name
             place[mine] = scene.cameras[name].project(seen[mine])
         places.append(place)
-    return np.stack([places[1] - places[0], places[2] - places[0]], axis=2) / _STEP_PX
+    return np.stack([places[1] - places[0], places[2] - places[0]], axis=2) / _WARP_STEP_PX
 
 
-def _crossing(view: View, points: FloatArray, px: FloatArray) -> FloatArray:
+def _image_motion(view: PredictedView, points: FloatArray, px: FloatArray) -> FloatArray:
     """(N,2) how far points seen at `px` (N,2) moved since the frame before."""
     return np.asarray(np.nan_to_num(px - view.lens.project(transform_points(view.before, points))))
 
 
-def _blur(view: View, crossing_px: FloatArray) -> FloatArray:
+def _motion_blur(view: PredictedView, crossing_px: FloatArray) -> FloatArray:
     """(N,2) how far points cross the image while the shutter is open; held to what is sane."""
     moved = crossing_px * view.exposure
     longest = _MAX_BLUR_PX * max(1.0, view.pyramid.step_px[0])
@@ -254,8 +260,13 @@ def _blur(view: View, crossing_px: FloatArray) -> FloatArray:
     )
 
 
-def _patches(
-    gallery: Gallery, rows: IntArray, warp: FloatArray, blur_px: FloatArray, search: Search, step_px: float
+def _render_patches(
+    gallery: KeyframePatches,
+    rows: IntArray,
+    warp: FloatArray,
+    blur_px: FloatArray,
+    search: SearchLevel,
+    step_px: float,
 ) -> tuple[Patches, BoolArray]:
     """Looks (N,side,side) of points, warped and blurred, and which (N,) lie within their keyframes.
 
@@ -274,7 +285,7 @@ def _patches(
     offset = np.matmul(grid, (warp * step_px / step[:, None, None]).astype(np.float32).swapaxes(1, 2))
     shift = np.einsum("nij,nj->ni", warp, blur_px) / step[:, None]
     longest = float(np.linalg.norm(shift, axis=1).max(initial=0.0)) if np.isfinite(shift).all() else np.inf
-    samples = int(np.clip(np.ceil(longest / _BLUR_STEP) + 1, 1, _BLUR_SAMPLES))
+    samples = int(np.clip(np.ceil(longest / _BLUR_STEP_PX) + 1, 1, _MAX_BLUR_SAMPLES))
     share = np.linspace(-0.5, 0.5, samples) if samples > 1 else np.zeros(1)
     centre = scene.obs_px[rows] / step[:, None] - 0.5
     centres = centre[:, None, :] + share[None, :, None] * shift[:, None, :]
@@ -298,7 +309,7 @@ def _patches(
     return patches, whole & (patches.std(axis=(1, 2)) >= _MIN_CONTRAST)
 
 
-def _place(
+def _best_match(
     target: Patches, patch: Patches, expected: FloatArray, radius: int
 ) -> tuple[float, float, float] | None:
     """Column, row and correlation of a patch's best place near an expected one; None at the border."""
@@ -315,12 +326,12 @@ def _place(
     _, best, _, (x, y) = cv2.minMaxLoc(scores)
     if not (0 < x < scores.shape[1] - 1 and 0 < y < scores.shape[0] - 1):
         return None
-    across = _peak(scores[y, x - 1], scores[y, x], scores[y, x + 1])
-    down = _peak(scores[y - 1, x], scores[y, x], scores[y + 1, x])
+    across = _subpixel_peak(scores[y, x - 1], scores[y, x], scores[y, x + 1])
+    down = _subpixel_peak(scores[y - 1, x], scores[y, x], scores[y + 1, x])
     return left + x + half + across, top + y + half + down, float(best)
 
 
-def _peak(before: float, at: float, after: float) -> float:
+def _subpixel_peak(before: float, at: float, after: float) -> float:
     """Where a parabola through three values peaks, from the middle one."""
     bend = float(before) - 2.0 * float(at) + float(after)
     return 0.5 * (float(before) - float(after)) / bend if bend < 0.0 else 0.0

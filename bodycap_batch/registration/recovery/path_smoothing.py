@@ -10,15 +10,15 @@ from bodycap_batch.config.lost_frames import LEAST_POSED
 from bodycap_batch.core.arrays import BoolArray
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.scene import Trajectory
-from bodycap_batch.registration.recovery.guided_localisation import Fix
-from bodycap_batch.registration.recovery.motion_prior import Steadiness, smooth_centres
+from bodycap_batch.registration.recovery.guided_localisation import PoseEstimate
+from bodycap_batch.registration.recovery.motion_prior import MotionStatistics, smooth_centres
 
 _MAX_DISAGREEMENT = 11.3
 """Squared Mahalanobis distance from the smoothed centre beyond which a pose stays as it was measured: 99 % of
 three axes. Either is wrong then, and nobody knows which."""
 
 
-def steadied(path: Trajectory, movable: BoolArray | None = None) -> Trajectory:
+def smooth_weak_centres(path: Trajectory, movable: BoolArray | None = None) -> Trajectory:
     """A camera's path on which the centres of weakly seen frames follow their neighbours.
 
     Where a violent move leaves few points, a centre is known worse than the path's own evenness from frame to
@@ -46,10 +46,10 @@ def steadied(path: Trajectory, movable: BoolArray | None = None) -> Trajectory:
     if len(posed) < LEAST_POSED:
         return path
     times = (path.times_ns - path.times_ns[0]) / np.median(np.diff(path.times_ns))
-    steadiness = Steadiness.of(times, path.gauge_from_cam[:, :3, 3])
+    steadiness = MotionStatistics.of(times, path.gauge_from_cam[:, :3, 3])
     if steadiness is None:
         return path
-    fixes = {frame: Fix.of(path, frame) for frame in posed.tolist()}
+    fixes = {frame: PoseEstimate.of(path, frame) for frame in posed.tolist()}
     places = {frame: fix.place for frame, fix in fixes.items()}
     weak = {
         frame

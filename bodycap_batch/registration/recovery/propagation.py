@@ -11,31 +11,41 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import interpolate_pose, invert, make_transform
 from bodycap_batch.model.optical_flow import (
-    bearings,
-    coarse_image,
-    coarse_motion,
+    apply_homography,
     detect_corners,
+    estimate_coarse_motion,
     fit_rotation,
-    moved,
+    make_coarse_image,
+    unit_directions,
 )
-from bodycap_batch.registration.recovery.guided_localisation import Beside, Finder, Fix, Seen, together
-from bodycap_batch.registration.recovery.motion_prior import CentreFilter, Place, Steadiness
+from bodycap_batch.registration.recovery.guided_localisation import (
+    GuidedLocaliser,
+    NeighbourPose,
+    PoseEstimate,
+    SearchFrame,
+    fuse,
+)
+from bodycap_batch.registration.recovery.motion_prior import (
+    CentreKalmanFilter,
+    MotionStatistics,
+    PositionEstimate,
+)
 from bodycap_batch.registration.recovery.patch_search import Pyramid
 
-_MIN_INLIERS, _MIN_EVIDENCE = 10, 0.45
-_SEED_INLIERS, _SEED_EVIDENCE = 15, 0.5
-_GATE = 16.0
+_MIN_INLIERS, _MIN_INLIER_WEIGHT_RATIO = 10, 0.45
+_SEED_MIN_INLIERS, _SEED_MIN_INLIER_WEIGHT_RATIO = 15, 0.5
+_MAX_PREDICTION_DISTANCE = 16.0
 """Squared Mahalanobis distance from where the motion leads: 99.9 % of three axes."""
-_MISSES = 3
+_MAX_MISSES = 3
 """Frames in a row that are not found, after which a stretch is left: by then the prediction is off by more
 than is searched."""
-_SEED_SPREAD = 40.0
-_WARM_UP = 6
-_GUIDES, _GUIDE_SPACING_PX, _GRID = 48, 12.0, 4
+_SEED_SIGMA_JERKS = 40.0
+_INITIAL_FRAMES = 6
+_MAX_CORNERS, _CORNER_SPACING_PX, _GRID_SIDE = 48, 12.0, 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Stretch:
+class LostInterval:
     """A lost stretch and what is around it.
 
     Attributes:
@@ -54,29 +64,29 @@ class Stretch:
     stop: int
     times: FloatArray
     pyramids: Mapping[int, Pyramid]
-    known: Mapping[int, Fix]
+    known: Mapping[int, PoseEstimate]
     tracked: Collection[int]
     seeds: Mapping[int, FloatArray]
     rows: Mapping[int, int]
-    steadiness: Steadiness
+    steadiness: MotionStatistics
 
-    def seen(self, frame: int) -> Seen:
+    def seen(self, frame: int) -> SearchFrame:
         """A frame of which the picture is held."""
-        return Seen(self.pyramids[frame], self.rows.get(frame, -1))
+        return SearchFrame(self.pyramids[frame], self.rows.get(frame, -1))
 
 
 @dataclass(slots=True)
-class _Walk:
+class _PropagationState:
     """Where a walk has come to: the last frame, its pose and its turn from the one before."""
 
     frame: int
     pose: FloatArray
     turn: FloatArray
-    path: CentreFilter
+    path: CentreKalmanFilter
 
 
 @dataclass(slots=True)
-class March:
+class Propagation:
     """Walks through a stretch from all sides.
 
     Attributes:
@@ -85,11 +95,11 @@ class March:
         fixes: What was found, by direction and frame.
     """
 
-    finder: Finder
-    stretch: Stretch
-    fixes: dict[tuple[int, int], Fix] = field(default_factory=dict)
+    finder: GuidedLocaliser
+    stretch: LostInterval
+    fixes: dict[tuple[int, int], PoseEstimate] = field(default_factory=dict)
 
-    def run(self) -> dict[int, Fix]:
+    def run(self) -> dict[int, PoseEstimate]:
         """The best pose found for each frame, walking in from both ends and out from the seeds."""
         stretch = self.stretch
         for direction, end in ((1, stretch.start - 1), (-1, stretch.stop)):
@@ -98,23 +108,25 @@ class March:
         for frame, prior in sorted(stretch.seeds.items()):
             if (1, frame) in self.fixes or (-1, frame) in self.fixes or frame not in stretch.pyramids:
                 continue
-            spread = np.eye(3) * (_SEED_SPREAD * stretch.steadiness.jerk) ** 2
-            expected = Place(invert(prior)[:3, 3], spread)
-            fix = self.finder.locate(stretch.seen(frame), [prior], Beside(prior), expected)
-            if fix is None or fix.inliers < _SEED_INLIERS or fix.evidence < _SEED_EVIDENCE:
+            spread = np.eye(3) * (_SEED_SIGMA_JERKS * stretch.steadiness.jerk) ** 2
+            expected = PositionEstimate(invert(prior)[:3, 3], spread)
+            fix = self.finder.locate(stretch.seen(frame), [prior], NeighbourPose(prior), expected)
+            if fix is None or fix.inliers < _SEED_MIN_INLIERS or fix.evidence < _SEED_MIN_INLIER_WEIGHT_RATIO:
                 continue
             for direction in (1, -1):
                 self.fixes[direction, frame] = fix
-                path = CentreFilter(stretch.steadiness, fix.place)
-                self._walk(_Walk(frame, fix.cam_from_map, np.eye(3), path), direction)
-        best: dict[int, Fix] = {}
+                path = CentreKalmanFilter(stretch.steadiness, fix.place)
+                self._walk(_PropagationState(frame, fix.cam_from_map, np.eye(3), path), direction)
+        best: dict[int, PoseEstimate] = {}
         for (_, frame), fix in sorted(self.fixes.items()):
             other = best.get(frame)
             if other is None or fix.inliers * fix.evidence > other.inliers * other.evidence:
                 best[frame] = fix
         return best
 
-    def again(self, fixes: Mapping[int, Fix], places: Mapping[int, Place]) -> dict[int, Fix]:
+    def again(
+        self, fixes: Mapping[int, PoseEstimate], places: Mapping[int, PositionEstimate]
+    ) -> dict[int, PoseEstimate]:
         """Look once more from smoothed places, and between two frames of which one was missed.
 
         Args:
@@ -126,51 +138,53 @@ class March:
         poses |= {frame: fix.cam_from_map for frame, fix in self.stretch.known.items()}
         for frame in range(self.stretch.start, self.stretch.stop):
             before, after = poses.get(frame - 1), poses.get(frame + 1)
-            fix: Fix | None = None
+            fix: PoseEstimate | None = None
             if frame not in self.stretch.pyramids:
                 continue
             seen = self.stretch.seen(frame)
             if frame in fixes:
-                fix = self.finder.look_again(seen, poses[frame], _beside(before, after, poses[frame]))
+                fix = self.finder.look_again(seen, poses[frame], _neighbour_pose(before, after, poses[frame]))
                 fix = max(fixes[frame], fix or fixes[frame], key=lambda each: each.inliers * each.evidence)
             elif before is not None and after is not None:
                 halfway = invert(interpolate_pose(invert(before), invert(after), 0.5))
                 turn = halfway[:3, :3]
                 prior = make_transform(turn, -turn @ places[frame].centre)
-                fix = self.finder.locate(seen, [prior], Beside(before), places[frame])
-            if fix is not None and fix.inliers >= _MIN_INLIERS and fix.evidence >= _MIN_EVIDENCE:
+                fix = self.finder.locate(seen, [prior], NeighbourPose(before), places[frame])
+            if fix is not None and fix.inliers >= _MIN_INLIERS and fix.evidence >= _MIN_INLIER_WEIGHT_RATIO:
                 out[frame] = fix
         return out
 
-    def _warmed_up(self, end: int, direction: int) -> _Walk:
+    def _warmed_up(self, end: int, direction: int) -> _PropagationState:
         """A walk that has come through the frames with poses up to an end of the stretch."""
         known = self.stretch.known
-        behind = [end - direction * number for number in range(_WARM_UP)]
-        gap = next((number for number, frame in enumerate(behind) if frame not in known), _WARM_UP)
+        behind = [end - direction * number for number in range(_INITIAL_FRAMES)]
+        gap = next((number for number, frame in enumerate(behind) if frame not in known), _INITIAL_FRAMES)
         frames = behind[:gap][::-1]
-        path = CentreFilter(self.stretch.steadiness, known[frames[0]].place)
+        path = CentreKalmanFilter(self.stretch.steadiness, known[frames[0]].place)
         for last, frame in pairwise(frames):
             path.predict(abs(self.stretch.times[frame] - self.stretch.times[last]))
             path.update(known[frame].place)
         turns = [known[frame].cam_from_map[:3, :3] for frame in frames[-2:]]
         turn = turns[1] @ turns[0].T if len(turns) == 2 else np.eye(3)
-        return _Walk(end, known[end].cam_from_map, turn, path)
+        return _PropagationState(end, known[end].cam_from_map, turn, path)
 
-    def _walk(self, walk: _Walk, direction: int) -> None:
+    def _walk(self, walk: _PropagationState, direction: int) -> None:
         stretch, misses = self.stretch, 0
-        while misses <= _MISSES:
+        while misses <= _MAX_MISSES:
             frame = walk.frame + direction
             inside = stretch.start <= frame < stretch.stop and frame in stretch.pyramids
             if not inside or (direction, frame) in self.fixes:
                 return
             place = walk.path.predict(abs(stretch.times[frame] - stretch.times[walk.frame]))
             priors = [make_transform(turn, -turn @ place.centre) for turn in self._turns(walk, frame)]
-            beside = Beside(walk.pose, direction)
+            beside = NeighbourPose(walk.pose, direction)
             fix = self.finder.locate(stretch.seen(frame), priors, beside, place)
             walk.frame = frame
-            good = fix is not None and fix.inliers >= _MIN_INLIERS and fix.evidence >= _MIN_EVIDENCE
-            both, distance = (place, np.inf) if fix is None else together(fix.place, place)
-            if fix is None or not good or distance >= _GATE:
+            good = (
+                fix is not None and fix.inliers >= _MIN_INLIERS and fix.evidence >= _MIN_INLIER_WEIGHT_RATIO
+            )
+            both, distance = (place, np.inf) if fix is None else fuse(fix.place, place)
+            if fix is None or not good or distance >= _MAX_PREDICTION_DISTANCE:
                 misses += 1
                 walk.pose = priors[0]
                 continue
@@ -179,31 +193,31 @@ class March:
             pose, _ = fix.with_place(both)
             walk.turn, walk.pose, misses = pose[:3, :3] @ walk.pose[:3, :3].T, pose, 0
 
-    def _turns(self, walk: _Walk, frame: int) -> list[FloatArray]:
+    def _turns(self, walk: _PropagationState, frame: int) -> list[FloatArray]:
         """Rotations (3,3) the next frame may have: as the image turned, and as the camera turned before."""
         here, lens = walk.pose[:3, :3], self.finder.lens
         last, this = self.stretch.pyramids.get(walk.frame), self.stretch.pyramids[frame]
         steady = [walk.turn @ here]
         if last is None:
             return steady
-        first, second = coarse_image(last.levels[0]), coarse_image(this.levels[0])
+        first, second = make_coarse_image(last.levels[0]), make_coarse_image(this.levels[0])
         width = lens.width_px
-        corners = detect_corners(first, _GUIDES, _GUIDE_SPACING_PX)
-        motion = coarse_motion(first, second, corners * np.float32(width / first.shape[1]), width)
+        corners = detect_corners(first, _MAX_CORNERS, _CORNER_SPACING_PX)
+        motion = estimate_coarse_motion(first, second, corners * np.float32(width / first.shape[1]), width)
         if motion is None:
             return steady
-        shares = np.linspace(0.2, 0.8, _GRID)
+        shares = np.linspace(0.2, 0.8, _GRID_SIDE)
         grid = np.stack(np.meshgrid(shares * width, shares * lens.height_px), axis=-1).reshape(-1, 2)
-        arrived = moved(grid.astype(np.float32), motion.homography).astype(np.float64)
+        arrived = apply_homography(grid.astype(np.float32), motion.homography).astype(np.float64)
         inside = ((arrived > 0.0) & (arrived < (width, lens.height_px))).all(axis=1)
-        if inside.sum() < _GRID:
+        if inside.sum() < _GRID_SIDE:
             return steady
-        before, after = (bearings(lens.unproject(each[inside])) for each in (grid, arrived))
+        before, after = (unit_directions(lens.unproject(each[inside])) for each in (grid, arrived))
         return [fit_rotation(before, after) @ here, *steady]
 
 
-def _beside(before: FloatArray | None, after: FloatArray | None, own: FloatArray) -> Beside:
+def _neighbour_pose(before: FloatArray | None, after: FloatArray | None, own: FloatArray) -> NeighbourPose:
     """The frame before, else the one after, else one as if the camera stood."""
     if before is not None:
-        return Beside(before)
-    return Beside(own) if after is None else Beside(after, -1)
+        return NeighbourPose(before)
+    return NeighbourPose(own) if after is None else NeighbourPose(after, -1)

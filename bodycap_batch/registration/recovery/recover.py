@@ -15,43 +15,43 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.optical_flow import sharpness
 from bodycap_batch.model.scene import FrameStatus, Map, Registration, Trajectory
-from bodycap_batch.registration.poses.keyframe_requests import lost_runs
-from bodycap_batch.registration.poses.pnp import PoseLimits
-from bodycap_batch.registration.poses.pose_outliers import lone_poses
-from bodycap_batch.registration.poses.static_points import confirmed_points
-from bodycap_batch.registration.recovery.guided_localisation import Finder, Fix
-from bodycap_batch.registration.recovery.motion_prior import Smoothed, Steadiness, smooth_centres
+from bodycap_batch.registration.poses.keyframe_requests import lost_intervals
+from bodycap_batch.registration.poses.pnp import AcceptanceCriteria
+from bodycap_batch.registration.poses.pose_outliers import isolated_poses
+from bodycap_batch.registration.poses.static_points import static_points
+from bodycap_batch.registration.recovery.guided_localisation import GuidedLocaliser, PoseEstimate
+from bodycap_batch.registration.recovery.motion_prior import MotionStatistics, SmoothedCentres, smooth_centres
 from bodycap_batch.registration.recovery.patch_search import (
-    Gallery,
+    KeyframePatches,
+    PredictedView,
     Pyramid,
-    Search,
-    View,
-    choose_rows,
-    find_points,
+    SearchLevel,
+    match_patches,
+    select_patches,
 )
-from bodycap_batch.registration.recovery.path_smoothing import steadied
-from bodycap_batch.registration.recovery.propagation import March, Stretch
+from bodycap_batch.registration.recovery.path_smoothing import smooth_weak_centres
+from bodycap_batch.registration.recovery.propagation import LostInterval, Propagation
 
-_MAX_PICTURES = 600
+_MAX_KEYFRAMES = 600
 """Keyframes held in memory, half a megabyte each."""
-_AROUND = 8
-_REACH, _MAX_HELD = 90, 400
+_SMOOTHING_MARGIN = 8
+_MAX_DISTANCE_FRAMES, _MAX_FRAMES = 90, 400
 """Frames of a lost stretch from its ends or a seed that are looked at, and how many of them all in all: the
 nearest; bounds memory."""
-_EXPOSURES = (0.0, 0.3, 0.6)
+_EXPOSURE_CANDIDATES = (0.0, 0.3, 0.6)
 _EXPOSURE_FRAMES = 4
-_EXPOSURE_SEARCH = Search(level=1, side=21, radius=4, score=-1.0, limit_px=6.0)
-_MIN_EVIDENCE = 0.5
+_EXPOSURE_LEVEL = SearchLevel(level=1, side=21, radius=4, score=-1.0, limit_px=6.0)
+_MIN_INLIER_WEIGHT_RATIO = 0.5
 _MAX_DISAGREEMENT = 11.3
 """Squared Mahalanobis distance between where a frame was found and its smoothed place: 99 % of three axes."""
 _LONE_EVIDENCE = 4
-_ROUNDS = 5
+_MAX_PASSES = 5
 """A walk goes as far as motion leads it; from poses smoothed and vouched for it goes further, until nothing
 more is found. Room131's right palm has 94 of 150 frames after the first round, 104 after the second, 108
 in the end (off by 2.6 cm both), a rendered one with arms thrown about 105, 107, 108 of 120."""
 
 
-def recover_lost(
+def find_lost_poses(
     found: Registration,
     scene_map: Map,
     capture: Capture,
@@ -79,81 +79,81 @@ def recover_lost(
     """
     path = found.trajectory
     camera = capture.camera(path.camera)
-    lost, steadiness = ~path.localised, _steadiness(path)
+    lost, steadiness = ~path.localised, _motion_statistics(path)
     if steadiness is None:
         return found
-    times = _times(path)
-    finder = _finder(scene_map, capture, path, options, context)
-    search = _LostFrames(
+    times = _times_in_intervals(path)
+    finder = _make_localiser(scene_map, capture, path, options, context)
+    search = _IntervalSearch(
         camera=camera,
         scene_map=scene_map,
         finder=finder,
         times=times,
         steadiness=steadiness,
-        seeds=_seeds(scene_map, camera.name, lost),
+        seeds=_seed_keyframes(scene_map, camera.name, lost),
         tracked=frozenset(np.flatnonzero(~lost).tolist()),
     )
-    stretches, reached = lost_runs(~lost), 0
-    for _ in range(_ROUNDS):
+    stretches, reached = lost_intervals(~lost), 0
+    for _ in range(_MAX_PASSES):
         if not stretches:
             break
-        poses: dict[int, Fix] = {}
-        known = _known(path)
+        poses: dict[int, PoseEstimate] = {}
+        known = _localised_poses(path)
         for start, stop in stretches:
             context.check_cancelled()
             reached = max(reached, start)  # a further round begins in front again
             context.progress(reached, len(lost), "lost frames looked at")
             poses |= search.within(start, stop, known)
-        before, path = path.localised, _with_poses(path, poses, finder.limits)
-        stretches = _beside(path.localised, before)
-    return replace(found, trajectory=steadied(path, ~lost))
+        before, path = path.localised, _merge_into(path, poses, finder.limits)
+        stretches = _extended_intervals(path.localised, before)
+    return replace(found, trajectory=smooth_weak_centres(path, ~lost))
 
 
-def recoverable(path: Trajectory) -> bool:
+def can_recover(path: Trajectory) -> bool:
     """Whether a path has lost frames, and poses enough to look for them from."""
-    return _steadiness(path) is not None
+    return _motion_statistics(path) is not None
 
 
-def _steadiness(path: Trajectory) -> Steadiness | None:
+def _motion_statistics(path: Trajectory) -> MotionStatistics | None:
     """How evenly a camera moves; None where no frame is lost or too few have poses."""
     posed = path.localised
     if posed.all() or posed.sum() < LEAST_POSED:
         return None
-    return Steadiness.of(_times(path), path.gauge_from_cam[:, :3, 3])
+    return MotionStatistics.of(_times_in_intervals(path), path.gauge_from_cam[:, :3, 3])
 
 
-def _times(path: Trajectory) -> FloatArray:
+def _times_in_intervals(path: Trajectory) -> FloatArray:
     """(N,) in frame intervals, from the first one on."""
     times = (path.times_ns - path.times_ns[0]).astype(np.float64)
     return np.asarray(times / np.median(np.diff(times)))
 
 
-def _finder(
+def _make_localiser(
     scene_map: Map,
     capture: Capture,
     path: Trajectory,
     options: RegistrationOptions,
     context: StageContext,
-) -> Finder:
+) -> GuidedLocaliser:
     """What finds poses of a camera's frames."""
     camera = capture.camera(path.camera)
-    limits = PoseLimits(
+    limits = AcceptanceCriteria(
         max_error_px=1.0, min_inliers=options.min_inliers, max_sigma_depth=options.max_sigma_depth
     )
     interval_s = float(np.median(np.diff(path.times_ns))) * 1e-9
-    finder = Finder(
+    finder = GuidedLocaliser(
         lens=scene_map.cameras[camera.name],
-        gallery=_gallery(scene_map, capture, camera, context),
+        gallery=_keyframe_patches(scene_map, capture, camera, context),
         limits=limits,
         exposure=0.0,
         readout=scene_map.readout_s.get(camera.name, 0.0) / interval_s,
         sees_room=camera.sees_room,
     )
-    return replace(finder, exposure=_exposure(camera, finder, path))
+    return replace(finder, exposure=_estimate_exposure(camera, finder, path))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _LostFrames:
+class _IntervalSearch:
     """What looking for a camera's lost frames takes.
 
     Attributes:
@@ -168,59 +168,59 @@ class _LostFrames:
 
     camera: CaptureCamera
     scene_map: Map
-    finder: Finder
+    finder: GuidedLocaliser
     times: FloatArray
-    steadiness: Steadiness
+    steadiness: MotionStatistics
     seeds: Mapping[int, int]
     tracked: Collection[int]
 
-    def within(self, start: int, stop: int, known: Mapping[int, Fix]) -> dict[int, Fix]:
+    def within(self, start: int, stop: int, known: Mapping[int, PoseEstimate]) -> dict[int, PoseEstimate]:
         """Poses vouched for of the lost frames [start, stop) amid `known` ones."""
         inside = {frame: row for frame, row in self.seeds.items() if start <= frame < stop}
-        stretch = Stretch(
+        stretch = LostInterval(
             start=start,
             stop=stop,
             times=self.times,
-            pyramids=_pictures(self.camera, start, stop, sorted(inside)),
+            pyramids=_read_pyramids(self.camera, start, stop, sorted(inside)),
             known=known,
             tracked=self.tracked,
             seeds={frame: invert(self.scene_map.map_from_cam[row]) for frame, row in inside.items()},
             rows=inside,
             steadiness=self.steadiness,
         )
-        return _vouched(March(self.finder, stretch), self.finder.limits)
+        return _accepted_poses(Propagation(self.finder, stretch), self.finder.limits)
 
 
-def _beside(posed: BoolArray, before: BoolArray) -> list[tuple[int, int]]:
+def _extended_intervals(posed: BoolArray, before: BoolArray) -> list[tuple[int, int]]:
     """Stretches still lost at an end of which a pose was found."""
     fresh = np.concatenate([[False], posed & ~before, [False]])
-    return [(start, stop) for start, stop in lost_runs(posed) if fresh[start] or fresh[stop + 1]]
+    return [(start, stop) for start, stop in lost_intervals(posed) if fresh[start] or fresh[stop + 1]]
 
 
-def _smoothed(fixes: Mapping[int, Fix], stretch: Stretch) -> Smoothed:
+def _smooth(fixes: Mapping[int, PoseEstimate], stretch: LostInterval) -> SmoothedCentres:
     """Places of a stretch's frames and of those around it."""
-    first = max(0, stretch.start - _AROUND)
-    frames = np.arange(first, min(len(stretch.times), stretch.stop + _AROUND))
+    first = max(0, stretch.start - _SMOOTHING_MARGIN)
+    frames = np.arange(first, min(len(stretch.times), stretch.stop + _SMOOTHING_MARGIN))
     around = {frame: stretch.known[frame].place for frame in frames.tolist() if frame in stretch.known}
     found = around | {frame: fix.place for frame, fix in fixes.items()}
     trusted = around.keys() & stretch.tracked
     return smooth_centres(frames, stretch.times[frames], found, trusted, stretch.steadiness)
 
 
-def _vouched(march: March, limits: PoseLimits) -> dict[int, Fix]:
+def _accepted_poses(march: Propagation, limits: AcceptanceCriteria) -> dict[int, PoseEstimate]:
     """Smoothed poses of the frames of a stretch that enough speaks for."""
     fixes = march.run()
     if not fixes:
         return {}
-    fixes = march.again(fixes, _smoothed(fixes, march.stretch).places)
-    smoothed = _smoothed(fixes, march.stretch)
+    fixes = march.again(fixes, _smooth(fixes, march.stretch).places)
+    smoothed = _smooth(fixes, march.stretch)
     out = {}
     for frame, fix in fixes.items():
         pose, covariance = fix.with_place(smoothed.places[frame])
         sigma = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
         if (
             fix.inliers >= limits.min_inliers
-            and fix.evidence >= _MIN_EVIDENCE
+            and fix.evidence >= _MIN_INLIER_WEIGHT_RATIO
             and smoothed.disagreement[frame] < _MAX_DISAGREEMENT
             and sigma < limits.max_sigma_depth * fix.depth
         ):
@@ -228,13 +228,15 @@ def _vouched(march: March, limits: PoseLimits) -> dict[int, Fix]:
     return out
 
 
-def _with_poses(path: Trajectory, poses: Mapping[int, Fix], limits: PoseLimits) -> Trajectory:
+def _merge_into(
+    path: Trajectory, poses: Mapping[int, PoseEstimate], limits: AcceptanceCriteria
+) -> Trajectory:
     """A trajectory with more poses, without those that stand alone amid lost frames."""
     posed: BoolArray = path.localised.copy()
     inliers = path.inliers.copy()
     for frame, fix in poses.items():
         posed[frame], inliers[frame] = True, fix.inliers
-    lone = lone_poses(posed, inliers, _LONE_EVIDENCE * limits.min_inliers) | _unaccompanied(posed)
+    lone = isolated_poses(posed, inliers, _LONE_EVIDENCE * limits.min_inliers) | _single_poses(posed)
     matrices, covariance = path.gauge_from_cam.copy(), path.covariance.copy()
     status, error_px = list(path.status), path.error_px.copy()
     for frame, fix in poses.items():
@@ -253,28 +255,30 @@ def _with_poses(path: Trajectory, poses: Mapping[int, Fix], limits: PoseLimits) 
     )
 
 
-def _unaccompanied(posed: BoolArray) -> BoolArray:
+def _single_poses(posed: BoolArray) -> BoolArray:
     """(N,) frames with a pose that neither neighbour has."""
     padded = np.concatenate([[False], posed, [False]])
     return np.asarray(posed & ~padded[:-2] & ~padded[2:])
 
 
-def _known(path: Trajectory) -> dict[int, Fix]:
+def _localised_poses(path: Trajectory) -> dict[int, PoseEstimate]:
     """Poses that tracking found, by frame."""
-    return {frame: Fix.of(path, frame) for frame in np.flatnonzero(path.localised).tolist()}
+    return {frame: PoseEstimate.of(path, frame) for frame in np.flatnonzero(path.localised).tolist()}
 
 
-def _seeds(scene_map: Map, camera: str, lost: BoolArray) -> dict[int, int]:
+def _seed_keyframes(scene_map: Map, camera: str, lost: BoolArray) -> dict[int, int]:
     """Rows of the map's keyframes among a camera's lost frames, by frame."""
     rows = scene_map.keyframes_of(camera)
     frames = scene_map.keyframe_frame[rows]
     return {int(frame): int(row) for row, frame in zip(rows, frames, strict=True) if lost[frame]}
 
 
-def _gallery(scene_map: Map, capture: Capture, camera: CaptureCamera, context: StageContext) -> Gallery:
+def _keyframe_patches(
+    scene_map: Map, capture: Capture, camera: CaptureCamera, context: StageContext
+) -> KeyframePatches:
     """The map's keyframes' pictures, of all cameras; evenly thinned out where they are very many."""
     count = len(scene_map.keyframe_camera)
-    held = np.unique(np.linspace(0, count - 1, min(count, _MAX_PICTURES)).round().astype(int))
+    held = np.unique(np.linspace(0, count - 1, min(count, _MAX_KEYFRAMES)).round().astype(int))
     pictures: dict[int, Pyramid] = {}
     sharp = np.zeros(count)
     for name in sorted(set(scene_map.keyframe_camera)):
@@ -288,31 +292,31 @@ def _gallery(scene_map: Map, capture: Capture, camera: CaptureCamera, context: S
             sharp[row] = sharpness(pictures[row].levels[0])
         sharp[rows] /= max(float(np.median(sharp[rows])), 1e-9) if len(rows) else 1.0
     seen: IntArray = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))
-    usable = confirmed_points(camera, scene_map)
-    return Gallery(scene_map=scene_map, pictures=pictures, sharpness=sharp, usable=usable, seen=seen)
+    usable = static_points(camera, scene_map)
+    return KeyframePatches(scene_map=scene_map, pictures=pictures, sharpness=sharp, usable=usable, seen=seen)
 
 
-def _pictures(camera: CaptureCamera, start: int, stop: int, seeds: list[int]) -> dict[int, Pyramid]:
+def _read_pyramids(camera: CaptureCamera, start: int, stop: int, seeds: list[int]) -> dict[int, Pyramid]:
     """Frames of a lost stretch near its ends or a seed, and those on either side of it."""
     frames = np.arange(max(0, start - 1), min(len(camera.times_ns), stop + 1))
     near = np.array([start, stop - 1, *seeds])
     away = np.abs(frames[:, None] - near).min(axis=1)
-    nearest = np.argsort(away, kind="stable")[:_MAX_HELD]
-    frames = frames[np.sort(nearest[away[nearest] <= _REACH])]
+    nearest = np.argsort(away, kind="stable")[:_MAX_FRAMES]
+    frames = frames[np.sort(nearest[away[nearest] <= _MAX_DISTANCE_FRAMES])]
     return {frame: Pyramid.of(grey) for frame, grey in camera.read(frames)}
 
 
-def _exposure(camera: CaptureCamera, finder: Finder, path: Trajectory) -> float:
+def _estimate_exposure(camera: CaptureCamera, finder: GuidedLocaliser, path: Trajectory) -> float:
     """Share of the time between two frames that the shutter is open, as blurred frames with poses show it."""
     posed = path.localised
     pairs = np.flatnonzero(posed[1:] & posed[:-1]) + 1
     turned = path.gauge_from_cam[:, :3, :3]
     cosine = np.einsum("nij,nij->n", turned[pairs - 1], turned[pairs])
     fastest = np.sort(pairs[np.argsort(cosine, kind="stable")[:_EXPOSURE_FRAMES]])
-    totals = np.zeros(len(_EXPOSURES))
+    totals = np.zeros(len(_EXPOSURE_CANDIDATES))
     for frame, grey in camera.read(fastest):
         pose, before = (invert(path.gauge_from_cam[each]) for each in (frame, frame - 1))
-        view = View(
+        view = PredictedView(
             lens=finder.lens,
             pyramid=Pyramid.of(grey),
             cam_from_map=pose,
@@ -320,8 +324,8 @@ def _exposure(camera: CaptureCamera, finder: Finder, path: Trajectory) -> float:
             exposure=0.0,
             readout=finder.readout,
         )
-        rows = choose_rows(finder.gallery, view)
-        for number, share in enumerate(_EXPOSURES):
-            found = find_points(finder.gallery, replace(view, exposure=share), rows, _EXPOSURE_SEARCH)
+        rows = select_patches(finder.gallery, view)
+        for number, share in enumerate(_EXPOSURE_CANDIDATES):
+            found = match_patches(finder.gallery, replace(view, exposure=share), rows, _EXPOSURE_LEVEL)
             totals[number] += found.score[finder.sees_room(found.px)].sum()
-    return _EXPOSURES[int(np.argmax(totals))]
+    return _EXPOSURE_CANDIDATES[int(np.argmax(totals))]

@@ -13,14 +13,14 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.memory import give_back
 from bodycap_batch.model.scene import FrameStatus, Registration
-from bodycap_batch.registration.tracking.klt import Anchor, Tracks, track_stretch
+from bodycap_batch.registration.tracking.klt import KeyframePoints, Tracks, track_range
 
-_MIN_RANGE = 15
+_MIN_RANGE_FRAMES = 15
 """A shorter rest is not worth a decoder of its own."""
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class TrackCache:
     """What was tracked before.
 
     Attributes:
@@ -32,20 +32,20 @@ class Known:
     keyframes: list[int]
 
     @staticmethod
-    def of(previous: Registration | None) -> Known | None:
+    def of(previous: Registration | None) -> TrackCache | None:
         """What an earlier registration tracked."""
         if previous is None:
             return None
         status = previous.trajectory.status
         frames = [index for index, value in enumerate(status) if value is FrameStatus.KEYFRAME]
         tracks = Tracks(previous.obs_frame, previous.obs_keyframe, previous.obs_feature, previous.obs_px)
-        return Known(tracks, frames)
+        return TrackCache(tracks, frames)
 
 
-def all_tracks(
+def track_all(
     camera: CaptureCamera,
-    anchors: Mapping[int, Anchor],
-    known: Known | None,
+    anchors: Mapping[int, KeyframePoints],
+    known: TrackCache | None,
     context: StageContext,
 ) -> Tracks:
     """Track every stretch between neighbouring keyframes, or reuse what was tracked there before."""
@@ -56,17 +56,17 @@ def all_tracks(
     parts = []
     if known is not None:
         done = set(zip([None, *known.keyframes], [*known.keyframes, None], strict=True))
-        parts.append(_inside(known.tracks, [stretch for stretch in stretches if stretch in done], count))
-    todo = _joined([stretch for stretch in stretches if stretch not in done], count)
-    parts += _track(camera, anchors, _shared_out(todo, frames, context.threads), context)
+        parts.append(_reusable(known.tracks, [stretch for stretch in stretches if stretch in done], count))
+    todo = _merge_ranges([stretch for stretch in stretches if stretch not in done], count)
+    parts += _track_ranges(camera, anchors, _split_by_thread(todo, frames, context.threads), context)
     tracks = Tracks.join(parts)  # which takes them out one by one: nothing else may hold them
     give_back()  # the many small pieces: 330 MB after ten minutes of video
     return tracks
 
 
-def _track(
+def _track_ranges(
     camera: CaptureCamera,
-    anchors: Mapping[int, Anchor],
+    anchors: Mapping[int, KeyframePoints],
     ranges: list[tuple[int, int]],
     context: StageContext,
 ) -> list[Tracks]:
@@ -84,7 +84,7 @@ def _track(
 
         halting = replace(context, cancelled=lambda: stopped.is_set() or context.cancelled())
         found = []
-        for part in track_stretch(camera, anchors, *ranges[index], halting):
+        for part in track_range(camera, anchors, *ranges[index], halting):
             found.append(part)
             if part.frame[0] > reached[index]:
                 told(int(part.frame[0]))
@@ -98,7 +98,9 @@ def _track(
             stopped.set()
 
 
-def _shared_out(ranges: list[tuple[int, int]], keyframes: list[int], threads: int) -> list[tuple[int, int]]:
+def _split_by_thread(
+    ranges: list[tuple[int, int]], keyframes: list[int], threads: int
+) -> list[tuple[int, int]]:
     """Cut ranges at keyframes where they are longer than a thread's even share."""
     total = sum(stop - start for start, stop in ranges)
     share = -(-total // max(1, threads))
@@ -106,14 +108,14 @@ def _shared_out(ranges: list[tuple[int, int]], keyframes: list[int], threads: in
     for start, stop in ranges:
         begin = start
         for keyframe in keyframes:
-            if begin + share <= keyframe < stop - 1 - _MIN_RANGE:
+            if begin + share <= keyframe < stop - 1 - _MIN_RANGE_FRAMES:
                 out.append((begin, keyframe + 1))
                 begin = keyframe
         out.append((begin, stop))
     return out
 
 
-def _joined(stretches: list[tuple[int | None, int | None]], count: int) -> list[tuple[int, int]]:
+def _merge_ranges(stretches: list[tuple[int | None, int | None]], count: int) -> list[tuple[int, int]]:
     """Merge stretches that touch into ranges [start, stop) of frames, keyframes included."""
     ranges: list[tuple[int, int]] = []
     for first, last in stretches:
@@ -125,7 +127,7 @@ def _joined(stretches: list[tuple[int | None, int | None]], count: int) -> list[
     return ranges
 
 
-def _inside(tracks: Tracks, stretches: list[tuple[int | None, int | None]], count: int) -> Tracks:
+def _reusable(tracks: Tracks, stretches: list[tuple[int | None, int | None]], count: int) -> Tracks:
     """Tracks from a keyframe at an end of one of the stretches to where they lie in it.
 
     A keyframe ends two stretches: what was tracked into it across one that is tracked again is left out, or

@@ -15,29 +15,29 @@ from bodycap_batch.core.arrays import BoolArray, IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.optical_flow import (
     GreyImage,
-    Motion,
+    ImageMotion,
     Pixels,
-    coarse_image,
-    coarse_motion,
+    apply_homography,
     detect_corners,
-    moved,
+    estimate_coarse_motion,
+    make_coarse_image,
     pixel_scale,
     track_points,
 )
 from bodycap_batch.model.scene import Map
 
 _MAX_TRACKS = 250
-_CELLS = 8
-_MAX_BUFFER = 90
+_GRID_CELLS = 8
+_MAX_BUFFERED_FRAMES = 90
 """Frames held in memory for the way back from a keyframe; bounds memory where keyframes are far apart."""
 _MIN_TRACKS = 6
 _MAX_CLOSURE_PX = 2.0
-_MIN_GUIDES = 48
-_GUIDE_SPACING_PX = 12.0
+_MIN_MOTION_POINTS = 48
+_CORNER_SPACING_PX = 12.0
 
 
 @dataclass(frozen=True, slots=True)
-class Anchor:
+class KeyframePoints:
     """The map points a keyframe observes.
 
     Attributes:
@@ -50,9 +50,9 @@ class Anchor:
     point: IntArray
     px: Pixels
 
-    def select(self, mask: npt.NDArray[Any]) -> Anchor:
+    def select(self, mask: npt.NDArray[Any]) -> KeyframePoints:
         """Keep the points under a mask."""
-        return Anchor(self.feature[mask], self.point[mask], self.px[mask])
+        return KeyframePoints(self.feature[mask], self.point[mask], self.px[mask])
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +107,7 @@ class Tracks:
         return Tracks(self.frame[mask], self.keyframe[mask], self.feature[mask], self.px[mask])
 
 
-def anchors_of(scene_map: Map, camera: str) -> dict[int, Anchor]:
+def select_keyframe_points(scene_map: Map, camera: str) -> dict[int, KeyframePoints]:
     """The best spread, longest seen map points of each of a camera's keyframes, by frame index."""
     seen = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))
     lens = scene_map.cameras[camera]
@@ -117,11 +117,13 @@ def anchors_of(scene_map: Map, camera: str) -> dict[int, Anchor]:
     for keyframe in scene_map.keyframes_of(camera):
         mine = order[bounds[keyframe] : bounds[keyframe + 1]]
         px = scene_map.obs_px[mine]
-        cell = np.clip((px / (lens.width_px, lens.height_px) * _CELLS).astype(int), 0, _CELLS - 1)
-        picked = well_spread(cell[:, 1] * _CELLS + cell[:, 0], seen[scene_map.obs_point[mine]], _MAX_TRACKS)
+        cell = np.clip((px / (lens.width_px, lens.height_px) * _GRID_CELLS).astype(int), 0, _GRID_CELLS - 1)
+        picked = grid_sample(
+            cell[:, 1] * _GRID_CELLS + cell[:, 0], seen[scene_map.obs_point[mine]], _MAX_TRACKS
+        )
         rows = np.sort(mine[picked])
         frame = int(scene_map.keyframe_frame[keyframe])
-        out[frame] = Anchor(
+        out[frame] = KeyframePoints(
             scene_map.obs_feature[rows],
             scene_map.obs_point[rows],
             scene_map.obs_px[rows].astype(np.float32),
@@ -129,7 +131,7 @@ def anchors_of(scene_map: Map, camera: str) -> dict[int, Anchor]:
     return out
 
 
-def well_spread(cell: IntArray, value: IntArray, count: int) -> IntArray:
+def grid_sample(cell: IntArray, value: IntArray, count: int) -> IntArray:
     """Rows of up to `count` items, taken from the cells in turn, the most valuable first."""
     order = np.lexsort((-value, cell))
     sorted_cells = cell[order]
@@ -140,7 +142,7 @@ def well_spread(cell: IntArray, value: IntArray, count: int) -> IntArray:
 
 
 @dataclass(frozen=True, slots=True)
-class _Picture:
+class _VideoFrame:
     """A frame at full size and reduced."""
 
     camera: CaptureCamera
@@ -155,7 +157,7 @@ class _Picture:
 
 
 @dataclass(slots=True)
-class _Active:
+class _ActiveTracks:
     """Tracks alive in the newest frame.
 
     Attributes:
@@ -166,18 +168,18 @@ class _Active:
     """
 
     keyframe: int
-    anchor: Anchor
+    anchor: KeyframePoints
     slot: IntArray
     px: Pixels
 
     @staticmethod
-    def at(keyframe: int, anchor: Anchor) -> _Active:
+    def at(keyframe: int, anchor: KeyframePoints) -> _ActiveTracks:
         """Begin in a keyframe."""
-        return _Active(keyframe, anchor, np.arange(len(anchor.px)), anchor.px)
+        return _ActiveTracks(keyframe, anchor, np.arange(len(anchor.px)), anchor.px)
 
-    def step(self, first: _Picture, second: _Picture, motion: Motion | None) -> bool:
+    def step(self, first: _VideoFrame, second: _VideoFrame, motion: ImageMotion | None) -> bool:
         """Follow the tracks into a frame; False once too few are left."""
-        guess = None if motion is None else moved(self.px, motion.homography)
+        guess = None if motion is None else apply_homography(self.px, motion.homography)
         # A track that slips disagrees with the pose: the way back is followed only where many would.
         careful = motion is None or not motion.sure
         flow = track_points(first.grey, second.grey, self.px, guess, careful=careful)
@@ -187,11 +189,11 @@ class _Active:
 
     def observe(self, frame: int) -> Tracks:
         """What the tracks see in the frame they are in."""
-        return _tracks(frame, self.keyframe, self.anchor.feature[self.slot], self.px)
+        return _make_tracks(frame, self.keyframe, self.anchor.feature[self.slot], self.px)
 
 
 @dataclass(frozen=True, slots=True)
-class _Past:
+class _BufferedFrame:
     """A frame on the way to the next keyframe.
 
     Attributes:
@@ -201,27 +203,27 @@ class _Past:
         px: (N,2) where they were.
     """
 
-    picture: _Picture
-    motion: Motion | None
+    picture: _VideoFrame
+    motion: ImageMotion | None
     slot: IntArray
     px: Pixels
 
 
-def _tracks(frame: int, keyframe: int, feature: IntArray, px: Pixels) -> Tracks:
+def _make_tracks(frame: int, keyframe: int, feature: IntArray, px: Pixels) -> Tracks:
     count = len(feature)
     return Tracks(np.full(count, frame, np.int64), np.full(count, keyframe, np.int64), feature, px)
 
 
-def track_stretch(
+def track_range(
     camera: CaptureCamera,
-    anchors: Mapping[int, Anchor],
+    anchors: Mapping[int, KeyframePoints],
     start: int,
     stop: int,
     context: StageContext,
 ) -> Iterator[Tracks]:
     """Track from every keyframe in [start, stop) forward to the next one and back to the one before.
 
-    Memory is bounded by `_MAX_BUFFER` frames. Yields the observations found, in no particular order.
+    Memory is bounded by `_MAX_BUFFERED_FRAMES` frames. Yields the observations found, in no particular order.
 
     Args:
         camera: Video.
@@ -230,15 +232,15 @@ def track_stretch(
         stop: One past the last frame.
         context: Cancellation.
     """
-    forward: _Active | None = None
-    previous: _Picture | None = None
-    past: deque[_Past] = deque(maxlen=_MAX_BUFFER)
+    forward: _ActiveTracks | None = None
+    previous: _VideoFrame | None = None
+    past: deque[_BufferedFrame] = deque(maxlen=_MAX_BUFFERED_FRAMES)
     for index, grey in camera.grey_frames(start, stop):
         context.check_cancelled()
-        picture = _Picture(camera, index, grey, coarse_image(grey))
+        picture = _VideoFrame(camera, index, grey, make_coarse_image(grey))
         if previous is not None:
-            motion = _motion(previous, picture, forward)
-            past.append(_remember(previous, motion, forward))
+            motion = _estimate_motion(previous, picture, forward)
+            past.append(_buffer(previous, motion, forward))
             if forward is not None and forward.step(previous, picture, motion):
                 yield forward.observe(index)
             else:
@@ -247,22 +249,22 @@ def track_stretch(
         if anchor is not None:
             arrived = np.zeros(len(anchor.px), dtype=bool)
             if forward is not None:
-                arrived = yield from _closed(forward, index, anchor, past)
+                arrived = yield from _close_tracks(forward, index, anchor, past)
             yield from _track_back(picture, anchor.select(~arrived), past)
             past.clear()
-            forward = _Active.at(index, anchor)
+            forward = _ActiveTracks.at(index, anchor)
         previous = picture
 
 
-def _remember(picture: _Picture, motion: Motion | None, active: _Active | None) -> _Past:
+def _buffer(picture: _VideoFrame, motion: ImageMotion | None, active: _ActiveTracks | None) -> _BufferedFrame:
     back = None if motion is None else motion.inverse()
     if active is None:
-        return _Past(picture, back, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
-    return _Past(picture, back, active.slot, active.px)
+        return _BufferedFrame(picture, back, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
+    return _BufferedFrame(picture, back, active.slot, active.px)
 
 
-def _closed(
-    active: _Active, keyframe: int, anchor: Anchor, past: deque[_Past]
+def _close_tracks(
+    active: _ActiveTracks, keyframe: int, anchor: KeyframePoints, past: deque[_BufferedFrame]
 ) -> Generator[Tracks, None, BoolArray]:
     """Tracks that arrive where the next keyframe sees the same point, told from that keyframe's side.
 
@@ -280,23 +282,27 @@ def _closed(
         if len(here) == 0 or len(item.slot) == 0:
             continue
         at = np.searchsorted(item.slot, active.slot[here])
-        yield _tracks(item.picture.index, keyframe, anchor.feature[there], item.px[at] + offset)
+        yield _make_tracks(item.picture.index, keyframe, anchor.feature[there], item.px[at] + offset)
     arrived = np.zeros(len(anchor.px), dtype=bool)
     arrived[there] = True
     return arrived
 
 
-def _motion(first: _Picture, second: _Picture, active: _Active | None) -> Motion | None:
-    if active is not None and len(active.px) >= _MIN_GUIDES:
+def _estimate_motion(
+    first: _VideoFrame, second: _VideoFrame, active: _ActiveTracks | None
+) -> ImageMotion | None:
+    if active is not None and len(active.px) >= _MIN_MOTION_POINTS:
         guides = active.px
     else:
         scale = first.grey.shape[1] / first.coarse.shape[1]
-        guides = detect_corners(first.coarse, _MIN_GUIDES, _GUIDE_SPACING_PX) * np.float32(scale)
-    return coarse_motion(first.coarse, second.coarse, guides, first.grey.shape[1])
+        guides = detect_corners(first.coarse, _MIN_MOTION_POINTS, _CORNER_SPACING_PX) * np.float32(scale)
+    return estimate_coarse_motion(first.coarse, second.coarse, guides, first.grey.shape[1])
 
 
-def _track_back(picture: _Picture, anchor: Anchor, past: deque[_Past]) -> Iterator[Tracks]:
-    active = _Active.at(picture.index, anchor)
+def _track_back(
+    picture: _VideoFrame, anchor: KeyframePoints, past: deque[_BufferedFrame]
+) -> Iterator[Tracks]:
+    active = _ActiveTracks.at(picture.index, anchor)
     later = picture
     for item in reversed(past):
         if not active.step(later, item.picture, item.motion):
@@ -305,6 +311,6 @@ def _track_back(picture: _Picture, anchor: Anchor, past: deque[_Past]) -> Iterat
         later = item.picture
 
 
-def track_scale(camera: CaptureCamera) -> float:
+def camera_pixel_scale(camera: CaptureCamera) -> float:
     """Factor on pixel thresholds for this camera."""
     return pixel_scale(camera.camera.width_px, camera.camera.height_px)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bodycap_batch.capture import CaptureCamera, FrameKeeper, open_camera
-from bodycap_batch.capture.images import grey_of, work_image, work_planes
+from bodycap_batch.capture.images import grey_from_planes, work_image, work_planes
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks import STAGES
@@ -79,7 +79,7 @@ def test_luma_of_any_format_is_kept_in_the_range_that_is_told(pix_fmt: str, off:
     frame.color_range = told
     upright = ((1, 0), (0, 1))
     grey = work_image(frame, upright, (256, 16), colour=False)
-    kept = grey_of(work_planes(frame, upright, (256, 16)), (256, 16))
+    kept = grey_from_planes(work_planes(frame, upright, (256, 16)), (256, 16))
     assert np.ptp(grey) > 100
     assert np.abs(kept.astype(int) - grey).max() <= off
 
