@@ -101,7 +101,7 @@ class _Tracker:
         if usable.sum() < _MIN_TRACKS:
             return 0.0
         first, second = self.start_rays[usable], rays[usable]
-        rotation = fit_rotation(first, second, rounds=3)
+        rotation = fit_rotation(first, second, iterations=3)
         return float(np.median(np.linalg.norm(second - first @ rotation.T, axis=1))) * self.camera.focal_px
 
     def noise_px(self) -> float:
@@ -142,8 +142,8 @@ def select_keyframes(
     novelty = [0.0]
     tracker = _Tracker(camera.camera, _coarse_mask(camera))
     recent: deque[_Candidate] = deque(maxlen=options.window)
-    see, keep = (_no_keeping, _no_keeping) if keeper is None else (keeper.see, keeper.choose)
-    for shot in camera.shots():
+    see, keep = (_no_keeping, _no_keeping) if keeper is None else (keeper.add_frame, keeper.add_keyframe)
+    for shot in camera.frame_candidates():
         context.check_cancelled()
         index = shot.index
         sharp[index] = sharpness(shot.grey)

@@ -64,7 +64,7 @@ class CaptureCamera:
     offset_s: float
     rolling_shutter_s: float
     rolling_shutter_known: bool = True
-    turned: bool = False
+    may_be_sideways: bool = False
     notes: tuple[str, ...] = ()
     videos: tuple[VideoFile, ...] = field(default=(), repr=False)
     mask: BoolArray | None = field(default=None, repr=False)
@@ -81,7 +81,7 @@ class CaptureCamera:
         """(N,) frame times on the common clock."""
         return np.asarray(self.times_ns + round(self.offset_s * 1e9), dtype=np.int64)
 
-    def sees_room(self, px: npt.NDArray[Any]) -> BoolArray:
+    def is_unmasked(self, px: npt.NDArray[Any]) -> BoolArray:
         """Which pixels (N,2), COLMAP origin, lie where the mask lets the room be seen."""
         if self.mask is None:
             return np.ones(len(px), dtype=bool)
@@ -144,7 +144,7 @@ class CaptureCamera:
             raise ValueError("indices must increase and lie inside the video")
         return prefetch(self._decode(wanted, colour=colour))
 
-    def shots(self) -> Generator[FrameCandidate, None, None]:
+    def frame_candidates(self) -> Generator[FrameCandidate, None, None]:
         """Stream all frames as they may be kept, decoded ahead in a thread.
 
         Raises:
@@ -160,7 +160,7 @@ class CaptureCamera:
 
     def _shots(self) -> Generator[FrameCandidate, None, None]:
         size = (self.camera.width_px, self.camera.height_px)
-        everything = self.keeps_all
+        everything = self.should_keep_all
         indices = np.arange(len(self.frame_numbers), dtype=np.int64)
         for index, frame, video in self._frames(indices):
             if everything:

@@ -33,7 +33,7 @@ def decode_frames(video: VideoFile, indices: IntArray) -> Iterator[tuple[int, Vi
     try:
         for wanted in map(int, indices):
             frame = cursor.advance(wanted)
-            if frame is None and not cursor.plain:
+            if frame is None and not cursor.sequential:
                 # Some containers seek badly (MPEG program streams): the plain way, from the start.
                 cursor.close()
                 cursor = _ForwardDecoder(video)
@@ -92,12 +92,12 @@ class _ForwardDecoder:
 
     def __init__(self, video: VideoFile, indices: IntArray | None = None) -> None:
         self.position = -1  # index of the last decoded frame, −1 before the first
-        self.plain = indices is None or video.counted
+        self.sequential = indices is None or video.counted
         self._video = video
         self._container = open_container(video.path)
         self._stream = open_stream(self._container, video)
         # The halves of an interlaced frame may come one by one; AV1's decoder loses the first frame by it.
-        skips = indices is not None and not self.plain and not video.interlaced
+        skips = indices is not None and not self.sequential and not video.interlaced
         skips = skips and self._stream.codec_context.name == "h264"
         self._wanted = frozenset(video.pts[indices].tolist()) if skips else None
         self._frames = self._decoded()
@@ -109,7 +109,7 @@ class _ForwardDecoder:
 
     def advance(self, wanted: int) -> VideoFrame | None:
         """Decode up to a frame; None where it does not come."""
-        if not self.plain:
+        if not self.sequential:
             keys = self._key_index[: int(np.searchsorted(self._key_index, wanted, side="right"))]
             if len(keys) and keys[-1] > self.position + 1:
                 self._seek(int(keys[-1]))

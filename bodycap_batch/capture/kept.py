@@ -116,22 +116,22 @@ class FrameKeeper:
     folder: Path
     width_px: int
     height_px: int
-    everything: bool
+    keep_all: bool
     _frames: list[int] = field(default_factory=list)
     _colours: Colours = (0, 0)
     _writer: VideoWriter | None = None
 
-    def see(self, shot: FrameCandidate) -> None:
+    def add_frame(self, shot: FrameCandidate) -> None:
         """A frame comes by."""
-        if self.everything:
+        if self.keep_all:
             self._add(shot)
 
-    def choose(self, shot: FrameCandidate) -> None:
+    def add_keyframe(self, shot: FrameCandidate) -> None:
         """A frame becomes a keyframe."""
-        if not self.everything:
+        if not self.keep_all:
             self._add(shot)
 
-    def kept(self) -> KeptFrames | None:
+    def kept_frames(self) -> KeptFrames | None:
         """What was written, once the keeper is closed; None where that is nothing."""
         if not self._frames:
             return None
@@ -140,7 +140,7 @@ class FrameKeeper:
             frames=np.array(self._frames, dtype=np.int64),
             width_px=self.width_px,
             height_px=self.height_px,
-            group=_GROUP_FRAMES if self.everything else 1,
+            group=_GROUP_FRAMES if self.keep_all else 1,
         )
 
     @property
@@ -152,7 +152,7 @@ class FrameKeeper:
         if self._writer is None:
             self._colours = colours
             size = (planes.shape[1], planes.shape[0] * 2 // 3)
-            quality: Quality = "near" if self.everything else "exact"
+            quality: Quality = "near" if self.keep_all else "exact"
             self._writer = VideoWriter(self._path, _FPS, size, quality, colours)
         if colours == self._colours:  # a chapter of another kind is read where it is
             self._writer.add_planes(planes)

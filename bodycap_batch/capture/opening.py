@@ -66,7 +66,7 @@ def open_camera(spec: CaptureConfig, config: CameraConfig) -> CaptureCamera:
         rolling_shutter_s=_shown_rolling_shutter_s(config.rolling_shutter_s or 0.0, videos[0]),
         rolling_shutter_known=config.rolling_shutter_s is not None,
         # Sensors lie across: pictures taller than wide were turned, if only by who cut the video.
-        turned=_is_quarter_turned(videos[0]) or camera.height_px > camera.width_px,
+        may_be_sideways=_is_quarter_turned(videos[0]) or camera.height_px > camera.width_px,
         notes=timeline.notes,
         videos=videos,
         mask=None if config.mask is None else read_mask(config.mask, (camera.width_px, camera.height_px)),

@@ -152,7 +152,7 @@ def _relative(inputs: ExportInputs, item: RelativePose) -> dict[str, Any]:
     return {
         "cameras": list(item.cameras),
         "instants": item.instants,
-        "rigid": item.rigid,
+        "rigid": item.is_rigid,
         "turn_deg": float(np.degrees(rotation_angle_rad(pose[:3, :3]))) if item.instants else None,
         "translation": scale * pose[:3, 3],
         "spread_deg": float(np.degrees(item.spread_rad)),

@@ -58,7 +58,7 @@ class RelativePose:
         set_array(self, "first_from_second", (4, 4), finite=False)
 
     @property
-    def rigid(self) -> bool:
+    def is_rigid(self) -> bool:
         """Whether enough instants agree that the two are held together and exposed in step."""
         return self.instants >= MIN_INSTANTS and self.spread_rad < _MAX_SPREAD_RATIO * self.explained_rad
 
@@ -83,18 +83,18 @@ def estimate_relative_pose(first: Trajectory, second: Trajectory, offset_ns: int
     Source: rotations by Hartley, Aftab, Trumpf, "L1 rotation averaging using the Weiszfeld algorithm",
         CVPR 2011; translations by their median along each axis.
     """
-    names, found = (first.camera, second.camera), np.zeros((0, 4, 4))
+    names, samples = (first.camera, second.camera), np.zeros((0, 4, 4))
     if first.gauge == second.gauge and first.localised.any() and second.localised.any():
         times_ns, frame_ns = second.times_ns[second.localised], _frame_interval_ns(second.times_ns)
-        poses, known = poses_at(
+        poses, is_valid = poses_at(
             times_ns,
             second.gauge_from_cam[second.localised],
             first.times_ns[first.localised] - offset_ns,
             max_gap_ns=round(_MAX_INTERPOLATION_FRAMES * frame_ns),
             snap_ns=round(_SAME_INSTANT_RATIO * frame_ns),
         )
-        found = invert(first.gauge_from_cam[first.localised][known]) @ poses[known]
-    if len(found) == 0:
+        samples = invert(first.gauge_from_cam[first.localised][is_valid]) @ poses[is_valid]
+    if len(samples) == 0:
         return RelativePose(
             cameras=names,
             first_from_second=np.full((4, 4), np.nan),
@@ -103,15 +103,15 @@ def estimate_relative_pose(first: Trajectory, second: Trajectory, offset_ns: int
             explained_rad=np.nan,
             spread=np.nan,
         )
-    turn, shift = mean_rotation(found[:, :3, :3]), np.median(found[:, :3, 3], axis=0)
+    rotation, translation = mean_rotation(samples[:, :3, :3]), np.median(samples[:, :3, 3], axis=0)
     variance = sum(_rotation_variance(path) for path in (first, second))
     return RelativePose(
         cameras=names,
-        first_from_second=make_transform(turn, shift),
-        instants=len(found),
-        spread_rad=float(np.median(rotation_angle_rad(turn.T @ found[:, :3, :3]))),
+        first_from_second=make_transform(rotation, translation),
+        instants=len(samples),
+        spread_rad=float(np.median(rotation_angle_rad(rotation.T @ samples[:, :3, :3]))),
         explained_rad=_MEDIAN_NORM_3D * float(np.sqrt(variance)),
-        spread=float(np.median(np.linalg.norm(found[:, :3, 3] - shift, axis=1))),
+        spread=float(np.median(np.linalg.norm(samples[:, :3, 3] - translation, axis=1))),
     )
 
 
@@ -126,9 +126,9 @@ def mean_rotation(rotations: FloatArray) -> FloatArray:
     u, _, vt = np.linalg.svd(np.median(rotations, axis=0))
     mean = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     for _ in range(_MAX_ITERATIONS):
-        off = so3_log(mean.T @ rotations)
-        weight = 1.0 / np.maximum(np.linalg.norm(off, axis=1), _CONVERGED_RAD)
-        step = weight @ off / weight.sum()
+        rotvec = so3_log(mean.T @ rotations)
+        weight = 1.0 / np.maximum(np.linalg.norm(rotvec, axis=1), _CONVERGED_RAD)
+        step = weight @ rotvec / weight.sum()
         mean = mean @ so3_exp(step)
         if np.linalg.norm(step) < _CONVERGED_RAD:
             break
@@ -145,10 +145,10 @@ def match_instants(first_ns: IntArray, second_ns: IntArray) -> IntArray:
     if len(first_ns) < 2:
         return np.full(len(second_ns), -1, dtype=np.int64)
     after = np.clip(np.searchsorted(first_ns, second_ns), 1, len(first_ns) - 1)
-    nearer = second_ns - first_ns[after - 1] < first_ns[after] - second_ns
-    frame = np.where(nearer, after - 1, after)
-    close = np.abs(first_ns[frame] - second_ns) < _SAME_INSTANT_RATIO * _frame_interval_ns(first_ns)
-    return np.asarray(np.where(close, frame, -1), dtype=np.int64)
+    previous_is_nearer = second_ns - first_ns[after - 1] < first_ns[after] - second_ns
+    frame = np.where(previous_is_nearer, after - 1, after)
+    is_same = np.abs(first_ns[frame] - second_ns) < _SAME_INSTANT_RATIO * _frame_interval_ns(first_ns)
+    return np.asarray(np.where(is_same, frame, -1), dtype=np.int64)
 
 
 def _frame_interval_ns(times_ns: IntArray) -> float:
@@ -156,16 +156,16 @@ def _frame_interval_ns(times_ns: IntArray) -> float:
     return float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0.0
 
 
-def not_rigid_note(found: RelativePose) -> str:
+def not_rigid_note(relative: RelativePose) -> str:
     """Why two cameras that the job says are a rig were not taken for one."""
-    pair = " and ".join(found.cameras)
-    if found.instants < MIN_INSTANTS:
+    pair = " and ".join(relative.cameras)
+    if relative.instants < MIN_INSTANTS:
         return (
-            f"{pair}: {found.instants} common frames in one map say too little of how they sit: each is on "
+            f"{pair}: {relative.instants} common frames in one map say too little of how they sit: each is on "
             "its own"
         )
     return (
-        f"{pair}: their relative turn scatters by {np.degrees(found.spread_rad):.2f} degrees where a rig's "
-        f"would by {np.degrees(found.explained_rad):.2f}: each is on its own. Check offset_s, and that one "
+        f"{pair}: their relative turn scatters by {np.degrees(relative.spread_rad):.2f} degrees where a rig's "
+        f"would by {np.degrees(relative.explained_rad):.2f}: each is on its own. Check offset_s, and that one "
         "trigger exposes both"
     )

@@ -64,27 +64,27 @@ def register_frames(
     Returns:
         A pose or a reason for every frame, and the frames that should become keyframes.
     """
-    tried = _offered_keyframes(selection, previous)
+    offered = _offered_keyframes(selection, previous)
     scene_map = _map_of_camera(maps, camera.name)
     if scene_map is None:
-        return _registration_without_map(camera, tried)
-    limits = acceptance_criteria(camera, selection, options)
+        return _registration_without_map(camera, offered)
+    criteria = acceptance_criteria(camera, selection, options)
     tracks = track_all(
-        camera, select_keyframe_points(scene_map, camera.name), TrackCache.of(previous), context
+        camera, select_keyframe_points(scene_map, camera.name), TrackCache.from_registration(previous), context
     )
-    scene_map, tracks, doubtful = _track_without_misplaced(camera, scene_map, tracks, limits, context)
-    poses = solve_camera(camera, scene_map, tracks, limits)
+    scene_map, tracks, misplaced = _track_without_misplaced(camera, scene_map, tracks, criteria, context)
+    poses = solve_camera(camera, scene_map, tracks, criteria)
     trajectory = _smooth_if_final(build_trajectory(camera, scene_map.gauge, poses, selection.sharpness))
-    asked = np.zeros(0, np.int64) if previous is None else previous.wanted_keyframes
-    lost = request_keyframes(trajectory.localised, selection.sharpness, tried)
+    already_requested = np.zeros(0, np.int64) if previous is None else previous.wanted_keyframes
+    requested = request_keyframes(trajectory.localised, selection.sharpness, offered)
     return Registration(
         trajectory=trajectory,
         obs_frame=tracks.frame,
         obs_keyframe=tracks.keyframe,
         obs_feature=tracks.feature,
         obs_px=tracks.px,
-        wanted_keyframes=np.union1d(lost, np.setdiff1d(doubtful, asked)),
-        tried_keyframes=tried,
+        wanted_keyframes=np.union1d(requested, np.setdiff1d(misplaced, already_requested)),
+        tried_keyframes=offered,
     )
 
 
@@ -112,18 +112,18 @@ def register_in_rig(
 
     Source: generalised cameras, Pless, "Using many cameras as one", CVPR 2003.
     """
-    relative = estimate_relative_poses(own, others)
-    members = rig_members(own, others, relative)
-    scene_map = next((each for each in maps if each.gauge == own.found.trajectory.gauge), None)
+    relative_poses = estimate_relative_poses(own, others)
+    members = rig_members(own, others, relative_poses)
+    scene_map = next((scene for scene in maps if scene.gauge == own.registration.trajectory.gauge), None)
     if scene_map is None or len(members) == 1:
-        return own.found, relative
-    limits = acceptance_criteria(own.camera, selection, options)
+        return own.registration, relative_poses
+    criteria = acceptance_criteria(own.camera, selection, options)
     for member in members:
-        wrong = find_misplaced_keyframes(member.camera.name, scene_map, member.tracks, limits)
-        scene_map = map_without_keyframes(scene_map, wrong)
-    poses = solve_rig(members, scene_map, initial_rig_poses(own, others, members), limits)
+        misplaced = find_misplaced_keyframes(member.camera.name, scene_map, member.tracks, criteria)
+        scene_map = map_without_keyframes(scene_map, misplaced)
+    poses = solve_rig(members, scene_map, initial_rig_poses(own, others, members), criteria)
     trajectory = _smooth_if_final(build_trajectory(own.camera, scene_map.gauge, poses, selection.sharpness))
-    return replace(own.found, trajectory=trajectory), relative
+    return replace(own.registration, trajectory=trajectory), relative_poses
 
 
 def remove_misplaced_keyframes(
@@ -140,12 +140,12 @@ def remove_misplaced_keyframes(
         selection: Keyframes of one of them; the noise of tracks is read from it.
         options: Limits.
     """
-    wrong: list[IntArray] = []
-    for each in cameras:
-        if each.found.trajectory.gauge == scene_map.gauge:
-            limits = acceptance_criteria(each.camera, selection, options)
-            wrong.append(find_misplaced_keyframes(each.camera.name, scene_map, each.tracks, limits))
-    return map_without_keyframes(scene_map, np.concatenate([np.zeros(0, np.int64), *wrong]))
+    misplaced: list[IntArray] = []
+    for camera in cameras:
+        if camera.registration.trajectory.gauge == scene_map.gauge:
+            criteria = acceptance_criteria(camera.camera, selection, options)
+            misplaced.append(find_misplaced_keyframes(camera.camera.name, scene_map, camera.tracks, criteria))
+    return map_without_keyframes(scene_map, np.concatenate([np.zeros(0, np.int64), *misplaced]))
 
 
 def prepare_recovery(
@@ -172,36 +172,36 @@ def prepare_recovery(
         points are no better then: walk12 with covered lenses 0.34, 0.35 cm), or too few are left to look for
         others.
     """
-    before = [own.found.trajectory, *(path for path in others if path.gauge == scene_map.gauge)]
+    before = [own.registration.trajectory, *(path for path in others if path.gauge == scene_map.gauge)]
     paths = [remove_weak_boundary_poses(path, options.min_inliers) for path in before]
-    none_taken = all(path is known for path, known in zip(paths, before, strict=True))
-    if none_taken or not can_recover(paths[0]):
-        return scene_map, own.found
-    settled_map = refine_points(scene_map, paths)
-    limits = acceptance_criteria(own.camera, selection, options)
-    poses = solve_camera(own.camera, settled_map, own.tracks, limits)
+    none_removed = all(path is unchanged for path, unchanged in zip(paths, before, strict=True))
+    if none_removed or not can_recover(paths[0]):
+        return scene_map, own.registration
+    refined_map = refine_points(scene_map, paths)
+    criteria = acceptance_criteria(own.camera, selection, options)
+    poses = solve_camera(own.camera, refined_map, own.tracks, criteria)
     path = build_trajectory(own.camera, scene_map.gauge, poses, selection.sharpness)
     path = remove_weak_boundary_poses(path, options.min_inliers)
     if not can_recover(path):
-        return scene_map, own.found
-    return settled_map, replace(own.found, trajectory=path)
+        return scene_map, own.registration
+    return refined_map, replace(own.registration, trajectory=path)
 
 
 def _track_without_misplaced(
-    camera: CaptureCamera, scene_map: Map, tracks: Tracks, limits: AcceptanceCriteria, context: StageContext
+    camera: CaptureCamera, scene_map: Map, tracks: Tracks, criteria: AcceptanceCriteria, context: StageContext
 ) -> tuple[Map, Tracks, IntArray]:
     """The map without keyframes that the video contradicts, the others' tracks, and the frames left out.
 
     Frames around a misplaced keyframe are tracked from the next ones that are in their place.
     """
-    none = np.zeros(0, np.int64)
-    wrong = find_misplaced_keyframes(camera.name, scene_map, tracks, limits)
-    if len(wrong) == 0:
-        return scene_map, tracks, none
-    known = TrackCache(tracks, sorted(select_keyframe_points(scene_map, camera.name)))
-    rest = map_without_keyframes(scene_map, wrong)
-    tracks = track_all(camera, select_keyframe_points(rest, camera.name), known, context)
-    return rest, tracks, scene_map.keyframe_frame[wrong]
+    nothing = np.zeros(0, np.int64)
+    misplaced = find_misplaced_keyframes(camera.name, scene_map, tracks, criteria)
+    if len(misplaced) == 0:
+        return scene_map, tracks, nothing
+    cache = TrackCache(tracks, sorted(select_keyframe_points(scene_map, camera.name)))
+    remaining = map_without_keyframes(scene_map, misplaced)
+    tracks = track_all(camera, select_keyframe_points(remaining, camera.name), cache, context)
+    return remaining, tracks, scene_map.keyframe_frame[misplaced]
 
 
 def _offered_keyframes(selection: KeyframeSelection, previous: Registration | None) -> IntArray:
@@ -227,24 +227,24 @@ def acceptance_criteria(
     )
 
 
-def _registration_without_map(camera: CaptureCamera, tried: IntArray) -> Registration:
-    none = Tracks.join([])
+def _registration_without_map(camera: CaptureCamera, offered: IntArray) -> Registration:
+    no_tracks = Tracks.join_and_clear([])
     poses = [FramePose(status=FrameStatus.NO_MAP)] * len(camera.times_ns)
     return Registration(
         trajectory=build_trajectory(camera, "none", poses, np.zeros(len(poses))),
-        obs_frame=none.frame,
-        obs_keyframe=none.keyframe,
-        obs_feature=none.feature,
-        obs_px=none.px,
+        obs_frame=no_tracks.frame,
+        obs_keyframe=no_tracks.keyframe,
+        obs_feature=no_tracks.feature,
+        obs_px=no_tracks.px,
         wanted_keyframes=np.zeros(0, np.int64),
-        tried_keyframes=tried,
+        tried_keyframes=offered,
     )
 
 
 def build_trajectory(
     camera: CaptureCamera, gauge: str, poses: Sequence[FramePose], sharpness: FloatArray
 ) -> Trajectory:
-    none6 = np.full((6, 6), np.nan)
+    missing = np.full((6, 6), np.nan)
     return Trajectory(
         camera=camera.name,
         gauge=gauge,
@@ -252,7 +252,7 @@ def build_trajectory(
         times_ns=camera.times_ns,
         gauge_from_cam=pose_array(poses),
         covariance=np.array(
-            [none6 if pose.covariance is None else pose.covariance for pose in poses]
+            [missing if pose.covariance is None else pose.covariance for pose in poses]
         ).reshape(-1, 6, 6),
         status=tuple(_frame_statuses(poses, sharpness)),
         inliers=np.array([pose.inliers for pose in poses], dtype=np.int64),
@@ -267,12 +267,12 @@ def _smooth_if_final(path: Trajectory) -> Trajectory:
 
 def _frame_statuses(poses: Sequence[FramePose], sharpness: FloatArray) -> list[FrameStatus]:
     """Statuses; a frame without tracks that is much less sharp than its surroundings is called blurred."""
-    out = []
+    statuses = []
     for index, pose in enumerate(poses):
         status = pose.status
         if status is FrameStatus.FEW_TRACKS:
-            near = sharpness[max(0, index - _BLUR_WINDOW_FRAMES) : index + _BLUR_WINDOW_FRAMES + 1]
-            if sharpness[index] < _BLUR_RATIO * np.median(near):
+            nearby = sharpness[max(0, index - _BLUR_WINDOW_FRAMES) : index + _BLUR_WINDOW_FRAMES + 1]
+            if sharpness[index] < _BLUR_RATIO * np.median(nearby):
                 status = FrameStatus.BLUR
-        out.append(status)
-    return out
+        statuses.append(status)
+    return statuses

@@ -17,9 +17,9 @@ def _keyframes(options: Json, arguments: Json, context: StageContext, files: Pat
 
     camera = load_capture(arguments).cameras[0]
     size = camera.camera
-    with FrameKeeper(files, size.width_px, size.height_px, camera.keeps_all) as keeper:
+    with FrameKeeper(files, size.width_px, size.height_px, camera.should_keep_all) as keeper:
         selection = select_keyframes(camera, KeyframeOptions.model_validate(options), context, keeper)
-    if (kept := keeper.kept()) is not None:
+    if (kept := keeper.kept_frames()) is not None:
         write_bundle(kept, files, KEPT_NAME)
     write_bundle(selection, files, "keyframes")
     write_summary(files, frames=selection.frame_count, keyframes=len(selection.frames))

@@ -42,14 +42,14 @@ def _recover(options: Json, arguments: Json, context: StageContext, files: Path)
     def everyone() -> Iterator[RegisteredCamera]:
         # One at a time: what was tracked in a long video takes most of an artefact's memory.
         for camera, path in zip(capture.cameras, paths, strict=True):
-            each = RegisteredCamera(camera=camera, found=load_registration(str(path)))
-            trajectories.append(each.found.trajectory)
+            each = RegisteredCamera(camera=camera, registration=load_registration(str(path)))
+            trajectories.append(each.registration.trajectory)
             yield each
 
     scene = remove_misplaced_keyframes(scene, everyone(), selection, options_)
     in_rig = (paths[0] / f"{RIG_POSES}.json").exists()
     if not in_rig:
-        own = RegisteredCamera(camera=capture.cameras[0], found=found)
+        own = RegisteredCamera(camera=capture.cameras[0], registration=found)
         scene, found = prepare_recovery(own, trajectories[1:], scene, selection, options_)
     found = find_lost_poses(found, scene, capture, options_, context)
     save_registration(found, capture.cameras[0], files, rolling=read_summary(paths[0])["rolling"])

@@ -31,7 +31,7 @@ def _registration(options: Json, arguments: Json, context: StageContext, files: 
     rolling = (
         bool(camera.rolling_shutter_s)
         if known
-        else has_visible_rolling_shutter(found, maps, either_way=camera.turned)
+        else has_visible_rolling_shutter(found, maps, allow_sideways=camera.may_be_sideways)
     )
     save_registration(found, camera, files, rolling=rolling)
 

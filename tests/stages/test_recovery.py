@@ -67,7 +67,7 @@ class _Video:
     def times_ns(self) -> np.ndarray:
         return np.arange(COUNT, dtype=np.int64) * 33_333_333
 
-    def sees_room(self, px: np.ndarray) -> np.ndarray:
+    def is_unmasked(self, px: np.ndarray) -> np.ndarray:
         column, row = np.clip(px.astype(int), 0, (319, 239)).T
         return np.ones(len(px), dtype=bool) if self.mask is None else self.mask[row, column]
 
@@ -329,10 +329,10 @@ def test_what_the_mask_hides_tells_nothing_of_the_exposure(
 
     def found(_: object, view: PredictedView, *__: object) -> PatchMatches:
         px = np.array([[20.0, 100.0], [200.0, 100.0]])
-        score = np.array([0.9 - view.exposure, 0.5 + 0.1 * view.exposure])
+        score = np.array([0.9 - view.exposure_ratio, 0.5 + 0.1 * view.exposure_ratio])
         return PatchMatches(np.arange(2), px, px, score)
 
-    monkeypatch.setattr(recover, "find_points", found)
+    monkeypatch.setattr(recover, "match_patches", found)
     mask = np.ones((240, 320), dtype=bool)
     mask[:, :160] = False
     shares = []
@@ -340,15 +340,15 @@ def test_what_the_mask_hides_tells_nothing_of_the_exposure(
         camera = cast(CaptureCamera, _Video(pictures, mask=hidden))
         gallery = KeyframePatches(
             scene_map=_map(pictures),
-            pictures={},
+            pyramids={},
             sharpness=np.zeros(0),
             usable=np.zeros(0, bool),
-            seen=np.zeros(0, np.int64),
+            keyframe_count=np.zeros(0, np.int64),
         )
-        monkeypatch.setattr(recover, "choose_rows", lambda *_: np.arange(2))
+        monkeypatch.setattr(recover, "select_patches", lambda *_: np.arange(2))
         limits = AcceptanceCriteria(max_error_px=1.0, min_inliers=12, max_sigma_depth=0.1)
         finder = GuidedLocaliser(
-            lens=CAMERA, gallery=gallery, limits=limits, exposure=0.0, sees_room=camera.sees_room
+            lens=CAMERA, patches=gallery, criteria=limits, exposure_ratio=0.0, is_unmasked=camera.is_unmasked
         )
         shares.append(recover._estimate_exposure(camera, finder, _tracked().trajectory))
     assert shares == [0.0, 0.6]
@@ -376,13 +376,13 @@ def test_what_is_left_beside_found_frames_is_looked_through_again(
     asked = []
 
     def vouched(march: Propagation, limits: AcceptanceCriteria) -> dict[int, PoseEstimate]:
-        stretch = march.stretch
+        stretch = march.interval
         asked.append((stretch.start, stretch.stop))
         if len(asked) > 1:
-            assert {18, 19} <= set(stretch.known)
-            assert not {18, 19} & set(stretch.tracked)
+            assert {18, 19} <= set(stretch.poses)
+            assert not {18, 19} & set(stretch.tracked_frames)
             return {}
-        fix = replace(stretch.known[17], depth=1.0)
+        fix = replace(stretch.poses[17], depth=1.0)
         return {18: fix, 19: fix}
 
     monkeypatch.setattr(recover, "_accepted_poses", vouched)
@@ -397,9 +397,9 @@ def test_progress_grows_over_the_rounds_which_end_with_nothing_left(
 ) -> None:
     told: list[int] = []
     rounds = [[(18, 20), (23, 25)], []]
-    monkeypatch.setattr(recover, "lost_runs", lambda _: [(18, 22), (22, 26)])
+    monkeypatch.setattr(recover, "lost_intervals", lambda _: [(18, 22), (22, 26)])
     monkeypatch.setattr(recover, "_extended_intervals", lambda *_: rounds.pop(0))
-    monkeypatch.setattr(recover._IntervalSearch, "within", lambda *_: {})
+    monkeypatch.setattr(recover._IntervalSearch, "recover_interval", lambda *_: {})
 
     def progress(done: int, _: int, what: str = "") -> None:
         if what.startswith("lost"):
@@ -460,7 +460,7 @@ def test_a_wrong_end_of_a_lost_stretch_is_looked_for_again(
     path = replace(found.trajectory, gauge_from_cam=poses, inliers=inliers)
     found = replace(found, trajectory=path, obs_px=px)
     capture = cast(Capture, _Capture(_Video(pictures)))
-    own = RegisteredCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), found=found)
+    own = RegisteredCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), registration=found)
     options = RegistrationOptions()
     settled_map, left = prepare_recovery(own, [], scene, _selection(), options)
     assert not left.trajectory.localised[end]
@@ -484,7 +484,7 @@ def test_a_second_thread_changes_nothing(
     inliers = found.trajectory.inliers.copy()
     inliers[end] = 20
     found = replace(found, trajectory=replace(found.trajectory, inliers=inliers))
-    own = RegisteredCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), found=found)
+    own = RegisteredCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), registration=found)
     capture, options = cast(Capture, _Capture(_Video(pictures))), RegistrationOptions()
     before = cv2.getNumThreads()
     paths = []
@@ -505,7 +505,7 @@ def test_few_poses_are_left_as_they_are(monkeypatch: pytest.MonkeyPatch, picture
     scene = _map(pictures)
     found = _with_tracks(_tracked(), scene, -1)
     few = replace(found, trajectory=replace(found.trajectory, inliers=np.full(COUNT, 20)))
-    own = RegisteredCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), found=few)
+    own = RegisteredCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), registration=few)
     monkeypatch.setattr(recover, "LEAST_POSED", COUNT - len(LOST) - 10)
     settled_map, left = prepare_recovery(own, [], scene, _selection(), RegistrationOptions())
     assert settled_map is scene
@@ -515,7 +515,7 @@ def test_few_poses_are_left_as_they_are(monkeypatch: pytest.MonkeyPatch, picture
 def test_where_every_end_is_well_seen_all_stays(pictures: list[np.ndarray]) -> None:
     scene = _map(pictures)
     found = _with_tracks(_tracked(), scene, -1)
-    own = RegisteredCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), found=found)
+    own = RegisteredCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), registration=found)
     settled_map, left = prepare_recovery(own, [found.trajectory], scene, _selection(), RegistrationOptions())
     assert settled_map is scene
     assert left is found

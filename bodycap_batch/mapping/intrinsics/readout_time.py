@@ -277,7 +277,11 @@ def readouts(
     try:
         part = rolling.fastest()
         found = part.find(settings, constant)
-        turned = {name for name in found if cameras[name].turned and not cameras[name].rolling_shutter_known}
+        turned = {
+            name
+            for name in found
+            if cameras[name].may_be_sideways and not cameras[name].rolling_shutter_known
+        }
         across = part.read_along(stated | turned).find(settings, constant) if turned else {}
     except EstimationError as error:
         found, turned, across = rolling.undetermined(error.message), set(), {}

@@ -32,23 +32,23 @@ def request_keyframes(localised: BoolArray, sharpness: FloatArray, tried: IntArr
     Source: Algorithm 1 of Vo, Kim, Choudhary, "Motion capture using body mounted cameras in an
         unknown environment".
     """
-    known = np.zeros(len(localised), dtype=bool)
-    known[tried] = True
+    was_tried = np.zeros(len(localised), dtype=bool)
+    was_tried[tried] = True
     chosen: list[int] = []
     for start, stop in lost_intervals(localised):
-        fresh: list[int] = []
-        for begin in range(start, stop, _WINDOW_FRAMES):
-            window = np.arange(begin, min(begin + _WINDOW_FRAMES, stop))
-            if not known[window].any():
-                fresh.append(int(window[np.argmax(sharpness[window])]))
-        if not fresh:
+        untried: list[int] = []
+        for window_start in range(start, stop, _WINDOW_FRAMES):
+            window = np.arange(window_start, min(window_start + _WINDOW_FRAMES, stop))
+            if not was_tried[window].any():
+                untried.append(int(window[np.argmax(sharpness[window])]))
+        if not untried:
             continue
         ends = [
             frame
             for frame in (start - _END_OFFSET_FRAMES, stop - 1 + _END_OFFSET_FRAMES)
             if 0 <= frame < len(localised)
         ]
-        chosen += fresh + [frame for frame in ends if not known[frame]]
+        chosen += untried + [frame for frame in ends if not was_tried[frame]]
     budget = max(_MIN_BUDGET, int(_BUDGET_RATIO * len(tried)))
     unique = np.unique(np.array(chosen, dtype=np.int64))
     if len(unique) > budget:

@@ -56,23 +56,23 @@ class PointReliability:
         agreed: (C*P,) likewise.
     """
 
-    seen: IntArray
+    observed: IntArray
     agreed: IntArray
 
     @staticmethod
-    def none(count: int) -> PointReliability:
+    def zero(count: int) -> PointReliability:
         """No votes on so many points."""
         return PointReliability(np.zeros(count, np.int64), np.zeros(count, np.int64))
 
-    def add(self, which: IntArray, posed: BoolArray, agrees: BoolArray) -> None:
-        """Count views (M,) of points `which`, those alone whose frames are posed."""
-        self.seen[:] += np.bincount(which[posed], minlength=len(self.seen))
-        self.agreed[:] += np.bincount(which[posed & agrees], minlength=len(self.seen))
+    def add(self, keys: IntArray, has_pose: BoolArray, agrees: BoolArray) -> None:
+        """Count views (M,) of points `keys`, those alone whose frames are posed."""
+        self.observed[:] += np.bincount(keys[has_pose], minlength=len(self.observed))
+        self.agreed[:] += np.bincount(keys[has_pose & agrees], minlength=len(self.observed))
 
-    def share(self, which: IntArray) -> FloatArray:
+    def agreement(self, keys: IntArray) -> FloatArray:
         """Share (M,) of a point's views that agree; 1 where fewer than `_MIN_OBSERVED` tell."""
-        share = self.agreed / np.maximum(self.seen, 1)
-        return np.asarray(np.where(self.seen < _MIN_OBSERVED, 1.0, share)[which])
+        ratio = self.agreed / np.maximum(self.observed, 1)
+        return np.asarray(np.where(self.observed < _MIN_OBSERVED, 1.0, ratio)[keys])
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,27 +88,27 @@ class RigObservations:
 
     members: Sequence[RigMember]
     scene_map: Map
-    confirmed: BoolArray
+    static: BoolArray
     kept: list[FrameBlock] = field(default_factory=list)
 
     @staticmethod
-    def of(members: Sequence[RigMember], scene_map: Map) -> RigObservations:
+    def create(members: Sequence[RigMember], scene_map: Map) -> RigObservations:
         """Cameras with what confirms the map's points to each."""
-        confirmed = np.array([static_points(member.camera, scene_map) for member in members])
-        return RigObservations(members, scene_map, confirmed)
+        static = np.array([static_points(member.camera, scene_map) for member in members])
+        return RigObservations(members, scene_map, static)
 
-    def stretches(self) -> Iterator[FrameBlock]:
+    def blocks(self) -> Iterator[FrameBlock]:
         """What is seen, some frames at a time; a single stretch is kept for the next time."""
         count = len(self.members[0].camera.times_ns)
         if count > BLOCK_FRAMES:
             for first in range(0, count, BLOCK_FRAMES):
-                yield self._stretch(slice(first, min(first + BLOCK_FRAMES, count)))
+                yield self._make_block(slice(first, min(first + BLOCK_FRAMES, count)))
             return
         if not self.kept:
-            self.kept.append(self._stretch(slice(0, count)))
+            self.kept.append(self._make_block(slice(0, count)))
         yield self.kept[0]
 
-    def _stretch(self, frames: slice) -> FrameBlock:
+    def _make_block(self, frames: slice) -> FrameBlock:
         parts = [_observations_of(member, self.scene_map, frames) for member in self.members]
         frame, point, px = (np.concatenate(each) for each in zip(*parts, strict=True))
         member = np.repeat(np.arange(len(self.members)), [len(part[0]) for part in parts])
@@ -148,30 +148,36 @@ class FrameBlock:
     member: IntArray
     made: list[Observations] = field(default_factory=list)
 
-    def views(self, px: FloatArray | None, votes: PointReliability | None) -> Observations:
-        """What is seen, at pixels (M,2) where these are not its own; `votes` tell how far points agree."""
+    def observations(self, px: FloatArray | None, reliability: PointReliability | None) -> Observations:
+        """What is seen, at pixels (M,2) where these are not its own; `reliability` tell how far points agree."""
         if px is None:
             if not self.made:
-                self.made.append(self._views(self.px))
-            views = self.made[0]
+                self.made.append(self._make_observations(self.px))
+            observations = self.made[0]
         else:
-            views = self._views(px)
-        return views if votes is None else replace(views, weight=views.weight * votes.share(self.which) ** 2)
+            observations = self._make_observations(px)
+        return (
+            observations
+            if reliability is None
+            else replace(
+                observations, weight=observations.weight * reliability.agreement(self.point_keys) ** 2
+            )
+        )
 
-    def _views(self, px: FloatArray) -> Observations:
+    def _make_observations(self, px: FloatArray) -> Observations:
         scene_map, lenses = self.rig.scene_map, self.rig.lenses
         # Where a point stands is known the better the more keyframes see it.
         count = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))[self.point]
-        weight = count / (count + _POINT_VARIANCE_RATIO) * np.where(self.confirmed, 1.0, _TRANSIENT_WEIGHT)
+        weight = count / (count + _POINT_VARIANCE_RATIO) * np.where(self.static, 1.0, _TRANSIENT_WEIGHT)
         bounds = np.searchsorted(self.frame, np.arange(self.frames.start, self.frames.stop + 1))
         points = scene_map.points[self.point]
         if len(lenses) == 1:
             return make_observations(lenses[0], bounds, points, px, weight)
         rays, px_from_ray = np.empty((len(px), 2)), np.empty((len(px), 2, 2))
         for number, lens in enumerate(lenses):
-            mine = self.member == number
-            rays[mine] = lens.unproject(px[mine])
-            px_from_ray[mine] = projection_jacobian(lens, rays[mine])
+            rows = self.member == number
+            rays[rows] = lens.unproject(px[rows])
+            px_from_ray[rows] = projection_jacobian(lens, rays[rows])
         return Observations(
             bounds=bounds,
             points=points,
@@ -183,12 +189,12 @@ class FrameBlock:
         )
 
     @property
-    def confirmed(self) -> BoolArray:
+    def static(self) -> BoolArray:
         """(M,) whether something confirms the point that is seen."""
-        return np.asarray(self.rig.confirmed[self.member, self.point])
+        return np.asarray(self.rig.static[self.member, self.point])
 
     @property
-    def which(self) -> IntArray:
+    def point_keys(self) -> IntArray:
         """(M,) camera and point, as votes number them."""
         return self.member * len(self.rig.scene_map.points) + self.point
 
@@ -199,16 +205,16 @@ class FrameBlock:
         for number, (member, lens) in enumerate(zip(self.rig.members, self.rig.lenses, strict=True)):
             readout_s = scene_map.readout_s.get(member.camera.name, 0.0)
             if readout_s:
-                mine = self.member == number
-                own, points = path @ invert(member.cam_from_rig), scene_map.points[self.point[mine]]
-                velocity = image_velocity(lens, own, times_ns, self.frame[mine], points)
-                out[mine] = px_at_mid_row(lens, out[mine], velocity, readout_s)
+                rows = self.member == number
+                own_poses, points = path @ invert(member.cam_from_rig), scene_map.points[self.point[rows]]
+                velocity = image_velocity(lens, own_poses, times_ns, self.frame[rows], points)
+                out[rows] = px_at_mid_row(lens, out[rows], velocity, readout_s)
         return out
 
-    def counts(self, which: BoolArray) -> IntArray:
+    def count_by_frame(self, selected: BoolArray) -> IntArray:
         """How many of the rows under a mask each frame of the stretch has."""
         return np.bincount(
-            self.frame[which] - self.frames.start, minlength=self.frames.stop - self.frames.start
+            self.frame[selected] - self.frames.start, minlength=self.frames.stop - self.frames.start
         )
 
 
@@ -219,16 +225,16 @@ def _observations_of(
     name = member.camera.name
     inside = np.flatnonzero((member.rig_frame >= frames.start) & (member.rig_frame < frames.stop))
     first, stop = (int(inside[0]), int(inside[-1]) + 1) if len(inside) else (0, 0)
-    tracks = member.tracks.within(first, stop)
+    tracks = member.tracks.in_frames(first, stop)
     point = scene_map.points_of(name, tracks.keyframe, tracks.feature)
-    tracked = point >= 0
+    has_point = point >= 0
     own_frame = scene_map.keyframe_frame[scene_map.obs_keyframe]
-    mine = np.isin(scene_map.obs_keyframe, scene_map.keyframes_of(name))
-    mine &= (own_frame >= first) & (own_frame < stop)
-    frame = member.rig_frame[np.concatenate([own_frame[mine], tracks.frame[tracked]])]
-    known = frame >= 0
+    is_own = np.isin(scene_map.obs_keyframe, scene_map.keyframes_of(name))
+    is_own &= (own_frame >= first) & (own_frame < stop)
+    frame = member.rig_frame[np.concatenate([own_frame[is_own], tracks.frame[has_point]])]
+    in_rig = frame >= 0
     return (
-        frame[known],
-        np.concatenate([scene_map.obs_point[mine], point[tracked]])[known],
-        np.concatenate([scene_map.obs_px[mine], tracks.px[tracked].astype(np.float64)])[known],
+        frame[in_rig],
+        np.concatenate([scene_map.obs_point[is_own], point[has_point]])[in_rig],
+        np.concatenate([scene_map.obs_px[is_own], tracks.px[has_point].astype(np.float64)])[in_rig],
     )

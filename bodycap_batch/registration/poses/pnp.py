@@ -71,16 +71,16 @@ class FramePose:
     gauge_from_cam: FloatArray | None = None
     covariance: FloatArray | None = None
     inliers: int = 0
-    evidence: float = 0.0
+    inlier_weight_ratio: float = 0.0
     error_px: float = float("nan")
 
 
 def solve_poses(
     lenses: Sequence[Camera],
-    views: Observations,
+    observations: Observations,
     px: FloatArray,
     start: FloatArray,
-    limits: AcceptanceCriteria,
+    criteria: AcceptanceCriteria,
 ) -> list[FramePose]:
     """Poses of all frames of a camera, or of a rig, from the map points seen in them.
 
@@ -93,38 +93,46 @@ def solve_poses(
 
     Where a start leads to few inliers, or there is none, the frame is sampled from scratch.
     """
-    known = np.asarray(np.isfinite(start).all(axis=(1, 2)))
-    poses = refine_poses(views, np.where(known[:, None, None], start, np.eye(4)), limits.max_error_px)
-    count = np.diff(views.bounds)
-    found = accept_poses(views, poses, limits)
-    for frame in np.flatnonzero(count >= limits.min_inliers).tolist():
-        if known[frame] and found[frame].evidence >= TRUSTED_WEIGHT_RATIO:
+    has_start = np.asarray(np.isfinite(start).all(axis=(1, 2)))
+    poses = refine_poses(
+        observations, np.where(has_start[:, None, None], start, np.eye(4)), criteria.max_error_px
+    )
+    count = np.diff(observations.bounds)
+    solved = accept_poses(observations, poses, criteria)
+    for frame in np.flatnonzero(count >= criteria.min_inliers).tolist():
+        if has_start[frame] and solved[frame].inlier_weight_ratio >= TRUSTED_WEIGHT_RATIO:
             continue
-        alone = views.of_frame(frame)
-        some = alone.weight >= MIN_COUNTED_WEIGHT
-        if some.sum() < limits.min_inliers:
-            some[:] = True
-        sampled = _ransac(lenses, alone, some, px[views.rows(frame)], limits)
-        if sampled is not None:
-            refined = refine_poses(alone, sampled[None], limits.max_error_px)
-            found[frame] = max(
-                found[frame], *accept_poses(alone, refined, limits), key=lambda pose: pose.evidence
+        own = observations.select_frame(frame)
+        chosen = own.weight >= MIN_COUNTED_WEIGHT
+        if chosen.sum() < criteria.min_inliers:
+            chosen[:] = True
+        start_pose = _ransac(lenses, own, chosen, px[observations.rows(frame)], criteria)
+        if start_pose is not None:
+            refined = refine_poses(own, start_pose[None], criteria.max_error_px)
+            solved[frame] = max(
+                solved[frame],
+                *accept_poses(own, refined, criteria),
+                key=lambda pose: pose.inlier_weight_ratio,
             )
-    return found
+    return solved
 
 
 def _ransac(
-    lenses: Sequence[Camera], views: Observations, some: BoolArray, px: FloatArray, limits: AcceptanceCriteria
+    lenses: Sequence[Camera],
+    observations: Observations,
+    chosen: BoolArray,
+    px: FloatArray,
+    criteria: AcceptanceCriteria,
 ) -> FloatArray | None:
     """Pose (4,4) of one frame from some of its views; of its rig where several cameras see them."""
-    seen, px = views.points[some], px[some]
-    if views.member is None or views.cam_from_rig is None:
-        return ransac_pose(lenses[0], seen, px, limits)
-    member = views.member[some]
+    points, px = observations.points[chosen], px[chosen]
+    if observations.member is None or observations.cam_from_rig is None:
+        return ransac_pose(lenses[0], points, px, criteria)
+    member = observations.member[chosen]
     if len(np.unique(member)) > 1:
-        return _ransac_rig_pose(lenses, views.cam_from_rig, member, seen, px, limits)
-    pose = ransac_pose(lenses[member[0]], seen, px, limits)
-    return None if pose is None else np.asarray(invert(views.cam_from_rig[member[0]]) @ pose)
+        return _ransac_rig_pose(lenses, observations.cam_from_rig, member, points, px, criteria)
+    pose = ransac_pose(lenses[member[0]], points, px, criteria)
+    return None if pose is None else np.asarray(invert(observations.cam_from_rig[member[0]]) @ pose)
 
 
 def _ransac_rig_pose(
@@ -133,7 +141,7 @@ def _ransac_rig_pose(
     member: IntArray,
     points: FloatArray,
     px: FloatArray,
-    limits: AcceptanceCriteria,
+    criteria: AcceptanceCriteria,
 ) -> FloatArray | None:
     """Pose rig_from_gauge (4,4) from map points (N,3) that its cameras `member` (N,) see at pixels (N,2).
 
@@ -143,12 +151,14 @@ def _ransac_rig_pose(
     import pycolmap
 
     options = pycolmap.RANSACOptions()
-    options.max_error = limits.max_error_px
-    options.random_seed = limits.seed
+    options.max_error = criteria.max_error_px
+    options.random_seed = criteria.seed
     options.max_num_trials = _MAX_TRIALS
-    places = [pycolmap.Rigid3d(pose[:3]) for pose in cam_from_rig]
+    rig_poses = [pycolmap.Rigid3d(pose[:3]) for pose in cam_from_rig]
     cameras = [lens.to_pycolmap() for lens in lenses]
-    found = pycolmap.estimate_generalized_absolute_pose(px, points, member.tolist(), places, cameras, options)
+    found = pycolmap.estimate_generalized_absolute_pose(
+        px, points, member.tolist(), rig_poses, cameras, options
+    )
     if found is None:
         return None
     matrix = np.asarray(found["rig_from_world"].matrix())
@@ -156,7 +166,7 @@ def _ransac_rig_pose(
 
 
 def ransac_pose(
-    camera: Camera, points: FloatArray, px: FloatArray, limits: AcceptanceCriteria
+    camera: Camera, points: FloatArray, px: FloatArray, criteria: AcceptanceCriteria
 ) -> FloatArray | None:
     """Pose cam_from_gauge (4,4) of a calibrated camera from map points (N,3) seen at pixels (N,2).
 
@@ -165,8 +175,8 @@ def ransac_pose(
     import pycolmap
 
     options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac.max_error = limits.max_error_px
-    options.ransac.random_seed = limits.seed
+    options.ransac.max_error = criteria.max_error_px
+    options.ransac.random_seed = criteria.seed
     options.ransac.max_num_trials = _MAX_TRIALS
     found = pycolmap.estimate_absolute_pose(px, points, camera.to_pycolmap(), options)
     if found is None:
@@ -176,38 +186,40 @@ def ransac_pose(
 
 
 def accept_poses(
-    views: Observations, cam_from_gauge: FloatArray, limits: AcceptanceCriteria
+    observations: Observations, cam_from_gauge: FloatArray, criteria: AcceptanceCriteria
 ) -> list[FramePose]:
     """Count the inliers of poses (F,4,4), estimate their covariance, and accept or refuse them."""
-    fits = evaluate_poses(views, cam_from_gauge, limits.max_error_px)
-    covariance = _covariance(fits, limits.min_noise_px)
+    quality = evaluate_poses(observations, cam_from_gauge, criteria.max_error_px)
+    covariance = _covariance(quality, criteria.min_noise_px)
     sigma = np.sqrt(np.linalg.eigvalsh(covariance[:, 3:, 3:])[:, -1])
-    constrained = sigma < limits.max_sigma_depth * fits.depth
+    constrained = sigma < criteria.max_sigma_depth * quality.depth
     gauge_from_cam = invert(cam_from_gauge)
     out = []
-    for frame, count in enumerate(np.diff(views.bounds).tolist()):
-        inliers = int(fits.inliers[frame])
-        if count < limits.min_inliers:
+    for frame, count in enumerate(np.diff(observations.bounds).tolist()):
+        inliers = int(quality.inliers[frame])
+        if count < criteria.min_inliers:
             out.append(FramePose(status=FrameStatus.FEW_TRACKS))
-        elif inliers < limits.min_inliers or fits.evidence[frame] < _MIN_INLIER_WEIGHT_RATIO:
-            evidence = float(fits.evidence[frame])
-            out.append(FramePose(status=FrameStatus.FEW_INLIERS, inliers=inliers, evidence=evidence))
+        elif inliers < criteria.min_inliers or quality.inlier_weight_ratio[frame] < _MIN_INLIER_WEIGHT_RATIO:
+            evidence = float(quality.inlier_weight_ratio[frame])
+            out.append(
+                FramePose(status=FrameStatus.FEW_INLIERS, inliers=inliers, inlier_weight_ratio=evidence)
+            )
         else:
-            good = bool(constrained[frame])
+            is_constrained = bool(constrained[frame])
             out.append(
                 FramePose(
-                    status=FrameStatus.REGISTERED if good else FrameStatus.UNCONSTRAINED,
-                    gauge_from_cam=gauge_from_cam[frame] if good else None,
-                    covariance=covariance[frame] if good else None,
+                    status=FrameStatus.REGISTERED if is_constrained else FrameStatus.UNCONSTRAINED,
+                    gauge_from_cam=gauge_from_cam[frame] if is_constrained else None,
+                    covariance=covariance[frame] if is_constrained else None,
                     inliers=inliers,
-                    evidence=float(fits.evidence[frame]),
-                    error_px=float(fits.error_px[frame]),
+                    inlier_weight_ratio=float(quality.inlier_weight_ratio[frame]),
+                    error_px=float(quality.error_px[frame]),
                 )
             )
     return out
 
 
-def _covariance(fits: PoseQuality, min_noise_px: float) -> FloatArray:
+def _covariance(quality: PoseQuality, min_noise_px: float) -> FloatArray:
     """Covariance (F,6,6) from the inliers' information and their own spread; huge where there is no inverse.
 
     Views that disagree with a pose are evidence against it: the sigmas grow as the inliers' share falls.
@@ -216,8 +228,8 @@ def _covariance(fits: PoseQuality, min_noise_px: float) -> FloatArray:
     A left perturbation of cam_from_gauge is a right one of gauge_from_cam with the sign turned: the
     covariance is the same.
     """
-    noise_px = np.maximum(1.4826 * np.nan_to_num(fits.noise_px), min_noise_px)
-    solvable = np.linalg.matrix_rank(fits.information) == 6
-    safe = np.where(solvable[:, None, None], fits.information, np.eye(6) / _UNCONSTRAINED_VARIANCE)
-    sigma_px = noise_px / np.maximum(fits.evidence, _WEIGHT_RATIO_FLOOR)
-    return np.asarray(np.linalg.inv(safe) * MAP_COVARIANCE_SCALE * sigma_px[:, None, None] ** 2)
+    noise_px = np.maximum(1.4826 * np.nan_to_num(quality.noise_px), min_noise_px)
+    solvable = np.linalg.matrix_rank(quality.information) == 6
+    information = np.where(solvable[:, None, None], quality.information, np.eye(6) / _UNCONSTRAINED_VARIANCE)
+    sigma_px = noise_px / np.maximum(quality.inlier_weight_ratio, _WEIGHT_RATIO_FLOOR)
+    return np.asarray(np.linalg.inv(information) * MAP_COVARIANCE_SCALE * sigma_px[:, None, None] ** 2)

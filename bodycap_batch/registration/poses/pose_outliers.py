@@ -54,10 +54,10 @@ def find_outlier_poses(centres: FloatArray, sigma: FloatArray, times_ns: IntArra
     Returns:
         (N,) True where the pose is to be refused. Scaling the map changes nothing.
     """
-    bend = np.linalg.norm(_second_differences(centres, sigma)[0], axis=1)
+    size = np.linalg.norm(_second_differences(centres, sigma)[0], axis=1)
     runs = np.zeros(len(centres), dtype=bool)
     for length in _RUN_LENGTHS:
-        runs |= _outlier_runs(centres, sigma, times_ns, bend, length)
+        runs |= _outlier_runs(centres, sigma, times_ns, size, length)
     # Beside one of several wrong poses a right one would be blamed.
     centres = np.where(runs[:, None], np.nan, centres)
     backwards = _outliers_after_gaps(centres[::-1], sigma[::-1])[::-1]
@@ -68,24 +68,24 @@ def find_outlier_poses(centres: FloatArray, sigma: FloatArray, times_ns: IntArra
 def _single_outliers(centres: FloatArray, sigma: FloatArray, times_ns: IntArray) -> BoolArray:
     """Frames (N,) that leave the line between their neighbours by themselves."""
     offset, noise = _second_differences(centres, sigma)
-    bend = np.linalg.norm(offset, axis=1)
+    size = np.linalg.norm(offset, axis=1)
     out = np.zeros(len(centres), dtype=bool)
     # Without both neighbours' own bends the wrong one of the three could be blamed.
-    frames = 1 + _run_starts(np.isfinite(bend), 3)
-    highest = np.maximum(bend[frames - 1], bend[frames + 1])
-    frames = frames[(bend[frames] > _MIN_SIGMAS * noise[frames]) & (bend[frames] >= highest)]
-    answer = -np.sum((offset[frames - 1] + offset[frames + 1]) * offset[frames], axis=1)
-    slow = times_ns[frames + 1] - times_ns[frames - 1] > _SLOW_SPAN_NS
-    least = np.where(slow, _MIN_NEIGHBOUR_RESPONSE_SLOW, _MIN_NEIGHBOUR_RESPONSE)
-    for frame in frames[answer >= least * bend[frames] ** 2].tolist():
-        out[frame] = bend[frame] > _MIN_SCALE_RATIO * _local_scale(
-            bend, frame - 1, frame + 2, _SCALE_WINDOW - 1
+    frames = 1 + _run_starts(np.isfinite(size), 3)
+    highest = np.maximum(size[frames - 1], size[frames + 1])
+    frames = frames[(size[frames] > _MIN_SIGMAS * noise[frames]) & (size[frames] >= highest)]
+    response = -np.sum((offset[frames - 1] + offset[frames + 1]) * offset[frames], axis=1)
+    is_slow = times_ns[frames + 1] - times_ns[frames - 1] > _SLOW_SPAN_NS
+    min_response = np.where(is_slow, _MIN_NEIGHBOUR_RESPONSE_SLOW, _MIN_NEIGHBOUR_RESPONSE)
+    for frame in frames[response >= min_response * size[frames] ** 2].tolist():
+        out[frame] = size[frame] > _MIN_SCALE_RATIO * _local_scale(
+            size, frame - 1, frame + 2, _SCALE_WINDOW - 1
         )
     return out
 
 
 def _outlier_runs(
-    centres: FloatArray, sigma: FloatArray, times_ns: IntArray, bend: FloatArray, length: int
+    centres: FloatArray, sigma: FloatArray, times_ns: IntArray, size: FloatArray, length: int
 ) -> BoolArray:
     """Frames (N,) of runs of so many poses that all leave the way from before the run to behind it.
 
@@ -101,28 +101,28 @@ def _outlier_runs(
     first = 2 + _run_starts(np.asarray(np.isfinite(centres).all(axis=1)), length + 4)
     first = first[times_ns[first + length] - times_ns[first - 1] <= _MAX_RUN_SPAN_NS]
     before, behind, run = first - 1, first + length, first[:, None] + np.arange(length)
-    way = centres[behind] - centres[before]
-    line = np.arange(1, steps)[:, None] / steps * way[:, None]
-    away = np.linalg.norm(centres[run] - centres[before][:, None] - line, axis=2)
+    baseline = centres[behind] - centres[before]
+    line = np.arange(1, steps)[:, None] / steps * baseline[:, None]
+    distance = np.linalg.norm(centres[run] - centres[before][:, None] - line, axis=2)
     noise = np.sqrt(sigma[run] ** 2 + 0.5 * (sigma[before] ** 2 + sigma[behind] ** 2)[:, None])
     start, end = centres[before] - centres[before - 1], centres[behind + 1] - centres[behind]
     kink = 0.25 * steps * np.linalg.norm(end - start, axis=1)
-    astray = np.linalg.norm(way - 0.5 * steps * (start + end), axis=1)
-    off = away.min(axis=1)
-    enough = (away > _MIN_SIGMAS * noise).all(axis=1) & (
-        off > np.maximum(_MIN_KINK_RATIO * kink, astray / _MAX_EXTRAPOLATION_RATIO)
+    extrapolation_error = np.linalg.norm(baseline - 0.5 * steps * (start + end), axis=1)
+    smallest = distance.min(axis=1)
+    candidate = (distance > _MIN_SIGMAS * noise).all(axis=1) & (
+        smallest > np.maximum(_MIN_KINK_RATIO * kink, extrapolation_error / _MAX_EXTRAPOLATION_RATIO)
     )
-    for row in np.flatnonzero(enough).tolist():
+    for row in np.flatnonzero(candidate).tolist():
         # What a steady bend amounts to over the run.
-        usual = _local_scale(bend, before[row], behind[row] + 1, _SCALE_WINDOW) * 0.25 * steps**2
-        out[run[row]] |= off[row] > _MIN_SCALE_RATIO * usual
+        local = _local_scale(size, before[row], behind[row] + 1, _SCALE_WINDOW) * 0.25 * steps**2
+        out[run[row]] |= smallest[row] > _MIN_SCALE_RATIO * local
     return out
 
 
-def _local_scale(bend: FloatArray, start: int, stop: int, reach: int) -> float:
-    """Median bend of `reach` frames on either side of start:stop; infinite where too few are known."""
-    near = np.concatenate([bend[max(0, start - reach) : start], bend[stop : stop + reach]])
-    return float(np.nanmedian(near)) if np.isfinite(near).sum() >= _SCALE_WINDOW // 2 else np.inf
+def _local_scale(size: FloatArray, start: int, stop: int, window: int) -> float:
+    """Median bend of `window` frames on either side of start:stop; infinite where too few are known."""
+    nearby = np.concatenate([size[max(0, start - window) : start], size[stop : stop + window]])
+    return float(np.nanmedian(nearby)) if np.isfinite(nearby).sum() >= _SCALE_WINDOW // 2 else np.inf
 
 
 def _run_starts(known: BoolArray, length: int) -> IntArray:
@@ -150,22 +150,22 @@ def _outliers_after_gaps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
     The third one bends itself twice as much as the second: it has both neighbours to be judged by.
     """
     offset, noise = _second_differences(centres, sigma)
-    bend = np.linalg.norm(offset, axis=1)
+    size = np.linalg.norm(offset, axis=1)
     out = np.zeros(len(centres), dtype=bool)
     posed: BoolArray = np.asarray(np.isfinite(centres).all(axis=1), dtype=bool)
     for first in (1 + np.flatnonzero(posed[1:] & ~posed[:-1])).tolist():
         second, third = first + 1, first + 2
-        near = bend[third + 1 : third + 1 + _SCALE_WINDOW]
-        if not np.isfinite(bend[second : third + 1]).all() or np.isfinite(near).sum() < _SCALE_WINDOW // 2:
+        nearby = size[third + 1 : third + 1 + _SCALE_WINDOW]
+        if not np.isfinite(size[second : third + 1]).all() or np.isfinite(nearby).sum() < _SCALE_WINDOW // 2:
             continue
-        if bend[second] > max(_GAP_MIN_SIGMAS * noise[second], _GAP_MIN_SCALE_RATIO * np.nanmedian(near)):
-            answer = -offset[third] @ offset[second] / bend[second] ** 2
-            out[first] |= answer < _FIRST_MAX_RESPONSE
-            out[second] |= _SECOND_MIN_RESPONSE < answer <= _SECOND_MAX_RESPONSE
+        if size[second] > max(_GAP_MIN_SIGMAS * noise[second], _GAP_MIN_SCALE_RATIO * np.nanmedian(nearby)):
+            response = -offset[third] @ offset[second] / size[second] ** 2
+            out[first] |= response < _FIRST_MAX_RESPONSE
+            out[second] |= _SECOND_MIN_RESPONSE < response <= _SECOND_MAX_RESPONSE
     return out
 
 
-def isolated_poses(localised: BoolArray, inliers: IntArray, enough: int) -> BoolArray:
+def isolated_poses(localised: BoolArray, inliers: IntArray, min_inliers: int) -> BoolArray:
     """Frames of which nothing but their own few inliers speaks: no neighbouring frame confirms them.
 
     Args:
@@ -179,12 +179,12 @@ def isolated_poses(localised: BoolArray, inliers: IntArray, enough: int) -> Bool
     out = np.zeros(len(localised), dtype=bool)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], localised, [False]]).astype(int)))
     for start, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        around = np.concatenate(
+        surroundings = np.concatenate(
             [
                 localised[max(0, start - _MIN_ISOLATING_GAP) : start],
                 localised[stop : stop + _MIN_ISOLATING_GAP],
             ]
         )
-        if stop - start <= _MAX_ISOLATED_RUN and not around.any():
-            out[start:stop] = inliers[start:stop] < enough
+        if stop - start <= _MAX_ISOLATED_RUN and not surroundings.any():
+            out[start:stop] = inliers[start:stop] < min_inliers
     return out

@@ -26,13 +26,15 @@ class RegisteredCamera:
     """
 
     camera: CaptureCamera
-    found: Registration
+    registration: Registration
 
     @property
     def tracks(self) -> Tracks:
         """What was tracked in its frames."""
-        found = self.found
-        return Tracks(found.obs_frame, found.obs_keyframe, found.obs_feature, found.obs_px)
+        registration = self.registration
+        return Tracks(
+            registration.obs_frame, registration.obs_keyframe, registration.obs_feature, registration.obs_px
+        )
 
 
 def estimate_relative_poses(own: RegisteredCamera, others: Sequence[RegisteredCamera]) -> list[RelativePose]:
@@ -41,7 +43,9 @@ def estimate_relative_poses(own: RegisteredCamera, others: Sequence[RegisteredCa
     for other in others:
         first, second = sorted((own, other), key=lambda each: each.camera.name)
         offset_ns = round((second.camera.offset_s - first.camera.offset_s) * 1e9)
-        out.append(estimate_relative_pose(first.found.trajectory, second.found.trajectory, offset_ns))
+        out.append(
+            estimate_relative_pose(first.registration.trajectory, second.registration.trajectory, offset_ns)
+        )
     return out
 
 
@@ -53,11 +57,11 @@ def rig_members(
     out = [
         RigMember(camera=own.camera, tracks=own.tracks, cam_from_rig=np.eye(4), rig_frame=np.arange(count))
     ]
-    for other, each in zip(others, relative, strict=True):
-        if not each.rigid:
+    for other, pose in zip(others, relative, strict=True):
+        if not pose.is_rigid:
             continue
-        own_first = each.cameras[0] == own.camera.name
-        first_from_second = each.first_from_second
+        own_first = pose.cameras[0] == own.camera.name
+        first_from_second = pose.first_from_second
         out.append(
             RigMember(
                 camera=other.camera,
@@ -74,10 +78,10 @@ def initial_rig_poses(
 ) -> FloatArray:
     """Poses rig_from_map (F,4,4) to start from: the camera's own, else what another one's make of it."""
     out = np.full((len(own.camera.times_ns), 4, 4), np.nan)
-    by_name = {each.camera.name: each.found.trajectory for each in (own, *others)}
+    by_name = {item.camera.name: item.registration.trajectory for item in (own, *others)}
     for member in reversed(members):
         path = by_name[member.camera.name]
-        told = path.localised & (member.rig_frame >= 0)
+        has_pose = path.localised & (member.rig_frame >= 0)
         rig_from_cam = invert(member.cam_from_rig)
-        out[member.rig_frame[told]] = rig_from_cam @ invert(path.gauge_from_cam[told])
+        out[member.rig_frame[has_pose]] = rig_from_cam @ invert(path.gauge_from_cam[has_pose])
     return out

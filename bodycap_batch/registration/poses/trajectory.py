@@ -32,18 +32,18 @@ _REPEATS_ROLLING = 2
 
 
 def solve_camera(
-    camera: CaptureCamera, scene_map: Map, tracks: Tracks, limits: AcceptanceCriteria
+    camera: CaptureCamera, scene_map: Map, tracks: Tracks, criteria: AcceptanceCriteria
 ) -> list[FramePose]:
     """Solve every frame of a camera from the map points seen in it; see `solve_rig`."""
     count = len(camera.times_ns)
-    alone = RigMember(camera=camera, tracks=tracks, cam_from_rig=np.eye(4), rig_frame=np.arange(count))
+    member = RigMember(camera=camera, tracks=tracks, cam_from_rig=np.eye(4), rig_frame=np.arange(count))
     rows = scene_map.keyframes_of(camera.name)
     start = _interpolated_keyframe_poses(scene_map.keyframe_frame[rows], scene_map.map_from_cam[rows], count)
-    return solve_rig([alone], scene_map, start, limits)
+    return solve_rig([member], scene_map, start, criteria)
 
 
 def solve_rig(
-    members: Sequence[RigMember], scene_map: Map, start: FloatArray, limits: AcceptanceCriteria
+    members: Sequence[RigMember], scene_map: Map, start: FloatArray, criteria: AcceptanceCriteria
 ) -> list[FramePose]:
     """Solve every frame of a rig from the map points that its cameras see at that instant.
 
@@ -60,15 +60,15 @@ def solve_rig(
     Returns:
         Poses of the first camera; `FrameStatus.RIG` where it saw too little for one of its own.
     """
-    rig = RigObservations.of(members, scene_map)
-    solved = _solve(rig, start, limits)
+    rig = RigObservations.create(members, scene_map)
+    solution = _solve(rig, start, criteria)
     for _ in range(_REPEATS_ROLLING if rig.rolling else _REPEATS):
-        path = pose_array(solved.poses)
-        start = np.where(np.isfinite(path), invert(path), start)
-        solved = _solve(rig, start, limits, solved.votes, path if rig.rolling else None)
-    poses = _require_static_inliers(solved.poses, solved.confirmed)
+        poses = pose_array(solution.poses)
+        start = np.where(np.isfinite(poses), invert(poses), start)
+        solution = _solve(rig, start, criteria, solution.reliability, poses if rig.rolling else None)
+    accepted = _require_static_inliers(solution.poses, solution.static)
     times_ns = rig.members[0].camera.times_ns
-    return _reject_outliers(_assign_status(poses, rig, solved.own, limits), times_ns, limits)
+    return _reject_outliers(_assign_status(accepted, rig, solution.own_inliers, criteria), times_ns, criteria)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,16 +83,16 @@ class _Solution:
     """
 
     poses: list[FramePose]
-    votes: PointReliability
-    confirmed: IntArray
-    own: IntArray
+    reliability: PointReliability
+    static: IntArray
+    own_inliers: IntArray
 
 
 def _solve(
     rig: RigObservations,
     start: FloatArray,
-    limits: AcceptanceCriteria,
-    votes: PointReliability | None = None,
+    criteria: AcceptanceCriteria,
+    reliability: PointReliability | None = None,
     path: FloatArray | None = None,
 ) -> _Solution:
     """Poses of all frames, a stretch at a time: what is seen in a long video would fill the memory.
@@ -106,30 +106,30 @@ def _solve(
     """
     count = len(start)
     out = _Solution(
-        [], PointReliability.none(rig.confirmed.size), np.zeros(count, np.int64), np.zeros(count, np.int64)
+        [], PointReliability.zero(rig.static.size), np.zeros(count, np.int64), np.zeros(count, np.int64)
     )
-    for part in rig.stretches():
-        px = None if path is None else part.at_mid_row(path)
-        views, frames = part.views(px, votes), part.frames
-        poses = solve_poses(rig.lenses, views, part.px if px is None else px, start[frames], limits)
-        found = pose_array(poses)
-        agrees = find_inliers(views, invert(found), limits.max_error_px)
-        posed = np.asarray(np.isfinite(found).all(axis=(1, 2)))[part.frame - frames.start]
+    for block in rig.blocks():
+        px = None if path is None else block.px_at_mid_row(path)
+        views, frames = block.observations(px, reliability), block.frames
+        poses = solve_poses(rig.lenses, views, block.px if px is None else px, start[frames], criteria)
+        solved = pose_array(poses)
+        agrees = find_inliers(views, invert(solved), criteria.max_error_px)
+        has_pose = np.asarray(np.isfinite(solved).all(axis=(1, 2)))[block.frame - frames.start]
         out.poses.extend(poses)
-        out.votes.add(part.which, posed, agrees)
-        out.confirmed[frames] = part.counts(agrees & part.confirmed)
-        out.own[frames] = part.counts(agrees & (part.member == 0))
+        out.reliability.add(block.point_keys, has_pose, agrees)
+        out.static[frames] = block.count_by_frame(agrees & block.static)
+        out.own_inliers[frames] = block.count_by_frame(agrees & (block.member == 0))
     return out
 
 
 def _assign_status(
-    poses: list[FramePose], rig: RigObservations, own: IntArray, limits: AcceptanceCriteria
+    poses: list[FramePose], rig: RigObservations, own_inliers: IntArray, criteria: AcceptanceCriteria
 ) -> list[FramePose]:
-    """Tell keyframes, and frames that the rig's other cameras carry; `own` counts the first one's inliers."""
+    """Tell keyframes, and frames that the rig's other cameras carry; `own_inliers` counts the first one's inliers."""
     rows = rig.scene_map.keyframes_of(rig.members[0].camera.name)
     status = dict.fromkeys(rig.scene_map.keyframe_frame[rows].tolist(), FrameStatus.KEYFRAME)
     if len(rig.members) > 1:
-        status |= dict.fromkeys(np.flatnonzero(own < limits.min_inliers).tolist(), FrameStatus.RIG)
+        status |= dict.fromkeys(np.flatnonzero(own_inliers < criteria.min_inliers).tolist(), FrameStatus.RIG)
     return [
         replace(pose, status=status.get(frame, pose.status))
         if pose.status is FrameStatus.REGISTERED
@@ -140,9 +140,9 @@ def _assign_status(
 
 def pose_array(poses: Sequence[FramePose]) -> FloatArray:
     """Poses gauge_from_cam (N,4,4), NaN where there is none."""
-    none = np.full((4, 4), np.nan)
-    found = [none if pose.gauge_from_cam is None else pose.gauge_from_cam for pose in poses]
-    return np.array(found).reshape(-1, 4, 4)
+    missing = np.full((4, 4), np.nan)
+    matrices = [missing if pose.gauge_from_cam is None else pose.gauge_from_cam for pose in poses]
+    return np.array(matrices).reshape(-1, 4, 4)
 
 
 def _interpolated_keyframe_poses(keyframes: IntArray, map_from_cam: FloatArray, count: int) -> FloatArray:
@@ -156,14 +156,14 @@ def _interpolated_keyframe_poses(keyframes: IntArray, map_from_cam: FloatArray, 
     return invert(interpolate_pose(map_from_cam[before], map_from_cam[after], alpha))
 
 
-def _require_static_inliers(poses: list[FramePose], confirmed: IntArray) -> list[FramePose]:
-    """Refuse the poses that hardly any confirmed point agrees with; `confirmed` counts them by frame."""
-    posed = np.array([pose.gauge_from_cam is not None for pose in poses], dtype=bool)
-    return _reject(poses, posed & (confirmed < _MIN_STATIC_INLIERS), FrameStatus.UNCONFIRMED)
+def _require_static_inliers(poses: list[FramePose], static_inliers: IntArray) -> list[FramePose]:
+    """Refuse the poses that hardly any confirmed point agrees with; `static_inliers` counts them by frame."""
+    has_pose = np.array([pose.gauge_from_cam is not None for pose in poses], dtype=bool)
+    return _reject(poses, has_pose & (static_inliers < _MIN_STATIC_INLIERS), FrameStatus.UNCONFIRMED)
 
 
 def _reject_outliers(
-    poses: list[FramePose], times_ns: IntArray, limits: AcceptanceCriteria
+    poses: list[FramePose], times_ns: IntArray, criteria: AcceptanceCriteria
 ) -> list[FramePose]:
     """Refuse the poses that jump away from both neighbours and back, and weak ones that stand alone."""
     centres = np.full((len(poses), 3), np.nan)
@@ -173,15 +173,15 @@ def _reject_outliers(
             centres[frame] = pose.gauge_from_cam[:3, 3]
             # Neighbours share the map's error.
             sigma[frame] = np.sqrt(np.trace(pose.covariance[3:, 3:]) / MAP_COVARIANCE_SCALE)
-    out = _reject(poses, find_outlier_poses(centres, sigma, times_ns), FrameStatus.POSE_JUMP)
-    localised = np.array([pose.gauge_from_cam is not None for pose in out], dtype=bool)
-    inliers = np.array([pose.inliers for pose in out], dtype=np.int64)
-    lone = isolated_poses(localised, inliers, _LONE_EVIDENCE * limits.min_inliers)
-    return _reject(out, lone, FrameStatus.UNCONFIRMED)
+    accepted = _reject(poses, find_outlier_poses(centres, sigma, times_ns), FrameStatus.POSE_JUMP)
+    localised = np.array([pose.gauge_from_cam is not None for pose in accepted], dtype=bool)
+    inliers = np.array([pose.inliers for pose in accepted], dtype=np.int64)
+    isolated = isolated_poses(localised, inliers, _LONE_EVIDENCE * criteria.min_inliers)
+    return _reject(accepted, isolated, FrameStatus.UNCONFIRMED)
 
 
-def _reject(poses: list[FramePose], which: BoolArray, status: FrameStatus) -> list[FramePose]:
+def _reject(poses: list[FramePose], rejected: BoolArray, status: FrameStatus) -> list[FramePose]:
     return [
-        FramePose(status=status, inliers=pose.inliers, error_px=pose.error_px) if which[frame] else pose
+        FramePose(status=status, inliers=pose.inliers, error_px=pose.error_px) if rejected[frame] else pose
         for frame, pose in enumerate(poses)
     ]

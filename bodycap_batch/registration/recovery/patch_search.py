@@ -50,7 +50,7 @@ class Pyramid:
     step_px: tuple[float, ...]
 
     @staticmethod
-    def of(grey: GreyImage) -> Pyramid:
+    def build(grey: GreyImage) -> Pyramid:
         """Reduce a frame (H,W)."""
         import cv2
 
@@ -79,10 +79,10 @@ class KeyframePatches:
     """
 
     scene_map: Map
-    pictures: Mapping[int, Pyramid]
+    pyramids: Mapping[int, Pyramid]
     sharpness: FloatArray
     usable: BoolArray
-    seen: IntArray
+    keyframe_count: IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,7 +93,7 @@ class PredictedView:
         lens: Its camera.
         pyramid: Its picture.
         cam_from_map: (4,4) its pose.
-        before: (4,4) the same a frame earlier; a frame later where `readout` is negative.
+        before: (4,4) the same a frame earlier; a frame later where `readout_ratio` is negative.
         exposure: Share of the time between two frames that the shutter is open.
         readout: Share of it from the first row's exposure to the last's that the map was refined for.
         row: Of the frame itself among the map's keyframes, -1 where it is none: its own look is found in it
@@ -103,10 +103,10 @@ class PredictedView:
     lens: Camera
     pyramid: Pyramid
     cam_from_map: FloatArray
-    before: FloatArray
-    exposure: float
-    readout: float = 0.0
-    row: int = -1
+    neighbour_pose: FloatArray
+    exposure_ratio: float
+    readout_ratio: float = 0.0
+    keyframe_row: int = -1
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,9 +121,9 @@ class SearchLevel:
         limit_px: Inlier limit of the pose that is solved from what is found, at 640 pixels' width.
     """
 
-    level: int
-    side: int
-    radius: int
+    pyramid_level: int
+    patch_side: int
+    search_radius: int
     score: float
     limit_px: float
 
@@ -144,44 +144,51 @@ class PatchMatches:
     mid_row_px: FloatArray
     score: FloatArray
 
-    def chosen(self, which: BoolArray) -> PatchMatches:
+    def select(self, selected: BoolArray) -> PatchMatches:
         """Some of them."""
-        return PatchMatches(self.point[which], self.px[which], self.mid_row_px[which], self.score[which])
+        return PatchMatches(
+            self.point[selected], self.px[selected], self.mid_row_px[selected], self.score[selected]
+        )
 
 
-def select_patches(gallery: KeyframePatches, view: PredictedView) -> IntArray:
+def select_patches(patches: KeyframePatches, view: PredictedView) -> IntArray:
     """Rows of the map's observations to take points' looks from: one for each of some well spread points."""
-    scene, lens = gallery.scene_map, view.lens
+    scene, lens = patches.scene_map, view.lens
     x_in_cam = transform_points(view.cam_from_map, scene.points)
     px = lens.project(x_in_cam)
     size = np.array([lens.width_px, lens.height_px])
     with np.errstate(invalid="ignore"):
-        inside = ((px > _MARGIN_PX) & (px < size - _MARGIN_PX)).all(axis=1) & gallery.usable
+        inside = ((px > _MARGIN_PX) & (px < size - _MARGIN_PX)).all(axis=1) & patches.usable
     inside &= x_in_cam[:, 2] > _MIN_DEPTH_RATIO * np.median(x_in_cam[inside, 2]) if inside.any() else False
-    held = np.zeros(len(scene.keyframe_camera), dtype=bool)
-    held[[row for row in gallery.pictures if row != view.row]] = True
-    rows = np.flatnonzero(inside[scene.obs_point] & held[scene.obs_keyframe])
+    is_held = np.zeros(len(scene.keyframe_camera), dtype=bool)
+    is_held[[row for row in patches.pyramids if row != view.keyframe_row]] = True
+    rows = np.flatnonzero(inside[scene.obs_point] & is_held[scene.obs_keyframe])
     point, keyframe = scene.obs_point[rows], scene.obs_keyframe[rows]
-    here = scene.points[point] - invert(view.cam_from_map)[:3, 3]
-    there = scene.points[point] - scene.map_from_cam[keyframe, :3, 3]
-    near, far = np.linalg.norm(here, axis=1), np.linalg.norm(there, axis=1)
-    cosine = np.einsum("ni,ni->n", here, there) / np.maximum(near * far, 1e-12)
-    log_scale = np.abs(np.log(np.maximum(far, 1e-12) / np.maximum(near, 1e-12)))
-    alike = (cosine > _MIN_COSINE) & (log_scale < _MAX_LOG_SCALE)
-    worth = (
-        cosine - _SCALE_PENALTY * log_scale + _SHARPNESS_REWARD * np.minimum(gallery.sharpness[keyframe], 2.0)
+    x_from_camera = scene.points[point] - invert(view.cam_from_map)[:3, 3]
+    x_from_keyframe = scene.points[point] - scene.map_from_cam[keyframe, :3, 3]
+    camera_distance, keyframe_distance = (
+        np.linalg.norm(x_from_camera, axis=1),
+        np.linalg.norm(x_from_keyframe, axis=1),
     )
-    rows, point, worth = rows[alike], point[alike], worth[alike]
-    order = np.lexsort((-worth, point))
+    cosine = np.einsum("ni,ni->n", x_from_camera, x_from_keyframe) / np.maximum(
+        camera_distance * keyframe_distance, 1e-12
+    )
+    log_scale = np.abs(np.log(np.maximum(keyframe_distance, 1e-12) / np.maximum(camera_distance, 1e-12)))
+    is_similar = (cosine > _MIN_COSINE) & (log_scale < _MAX_LOG_SCALE)
+    score = (
+        cosine - _SCALE_PENALTY * log_scale + _SHARPNESS_REWARD * np.minimum(patches.sharpness[keyframe], 2.0)
+    )
+    rows, point, score = rows[is_similar], point[is_similar], score[is_similar]
+    order = np.lexsort((-score, point))
     best = order[np.unique(point[order], return_index=True)[1]]
     rows, point = rows[best], point[best]
     cell = np.clip((px[point] / size * _GRID_CELLS).astype(int), 0, _GRID_CELLS - 1)
-    picked = grid_sample(cell[:, 1] * _GRID_CELLS + cell[:, 0], gallery.seen[point], _MAX_POINTS)
-    return np.asarray(np.sort(rows[picked]))
+    chosen = grid_sample(cell[:, 1] * _GRID_CELLS + cell[:, 0], patches.keyframe_count[point], _MAX_POINTS)
+    return np.asarray(np.sort(rows[chosen]))
 
 
 def match_patches(
-    gallery: KeyframePatches, view: PredictedView, rows: IntArray, search: SearchLevel
+    patches: KeyframePatches, view: PredictedView, rows: IntArray, level: SearchLevel
 ) -> PatchMatches:
     """Look for points around where a pose projects them, by normalised correlation.
 
@@ -201,29 +208,31 @@ def match_patches(
     Source: Klein, Murray, "Improving the agility of keyframe-based SLAM", ECCV 2008, for looking in blurred
         frames for what blurs alike; the warp is Klein, Murray, "Parallel tracking and mapping", ISMAR 2007.
     """
-    scene, lens = gallery.scene_map, view.lens
+    scene, lens = patches.scene_map, view.lens
     points = scene.points[scene.obs_point[rows]]
     px = lens.project(transform_points(view.cam_from_map, points))
-    shown = np.isfinite(px).all(axis=1)
-    rows, points, px = rows[shown], points[shown], px[shown]
+    is_projected = np.isfinite(px).all(axis=1)
+    rows, points, px = rows[is_projected], points[is_projected], px[is_projected]
     if len(rows) == 0:
         return PatchMatches(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
     warp = _patch_warps(scene, lens, view.cam_from_map, rows, px)
-    step = view.pyramid.step_px[search.level]
-    crossing = _image_motion(view, points, px)
-    patches, whole = _render_patches(gallery, rows, warp, _motion_blur(view, crossing), search, step)
+    step = view.pyramid.step_px[level.pyramid_level]
+    motion = _image_motion(view, points, px)
+    images, is_inside = _render_patches(patches, rows, warp, _motion_blur(view, motion), level, step)
     # Within the readout a point crosses a small part of the image: its row hardly depends on it.
-    seen_px = px_at_mid_row(lens, px, crossing, -view.readout)
+    expected_px = px_at_mid_row(lens, px, motion, -view.readout_ratio)
     found_px, score = np.full((len(rows), 2), np.nan), np.zeros(len(rows))
-    target = view.pyramid.levels[search.level].astype(np.float32)
-    for number in np.flatnonzero(whole).tolist():
-        place = _best_match(target, patches[number], seen_px[number] / step - 0.5, search.radius)
-        if place is not None:
-            found_px[number] = (np.array(place[:2]) + 0.5) * step
-            score[number] = place[2]
-    good = (score > search.score) & np.isfinite(found_px).all(axis=1)
-    mid_row_px = px_at_mid_row(lens, found_px, crossing, view.readout)
-    return PatchMatches(scene.obs_point[rows[good]], found_px[good], mid_row_px[good], score[good])
+    target = view.pyramid.levels[level.pyramid_level].astype(np.float32)
+    for number in np.flatnonzero(is_inside).tolist():
+        match = _best_match(target, images[number], expected_px[number] / step - 0.5, level.search_radius)
+        if match is not None:
+            found_px[number] = (np.array(match[:2]) + 0.5) * step
+            score[number] = match[2]
+    accepted = (score > level.score) & np.isfinite(found_px).all(axis=1)
+    mid_row_px = px_at_mid_row(lens, found_px, motion, view.readout_ratio)
+    return PatchMatches(
+        scene.obs_point[rows[accepted]], found_px[accepted], mid_row_px[accepted], score[accepted]
+    )
 
 
 def _patch_warps(
@@ -232,40 +241,42 @@ def _patch_warps(
     """(N,2,2) the keyframes' pixels by this camera's, around points seen at `px` (N,2)."""
     keyframe = scene.obs_keyframe[rows]
     depth = transform_points(cam_from_map, scene.points[scene.obs_point[rows]])[:, 2]
-    back, ahead = invert(cam_from_map), invert(scene.map_from_cam[keyframe])
+    map_from_cam, keyframe_from_map = invert(cam_from_map), invert(scene.map_from_cam[keyframe])
     names = np.array(scene.keyframe_camera)[keyframe]
-    places = []
+    projections = []
     for offset in ((0.0, 0.0), (_WARP_STEP_PX, 0.0), (0.0, _WARP_STEP_PX)):
         rays = np.column_stack([lens.unproject(px + offset), np.ones(len(px))]) * depth[:, None]
-        seen = transform_points(ahead, transform_points(back, rays))
-        place = np.full((len(px), 2), np.nan)
+        x_in_keyframe = transform_points(keyframe_from_map, transform_points(map_from_cam, rays))
+        keyframe_px = np.full((len(px), 2), np.nan)
         for name in np.unique(names).tolist():
-            mine = names == name
-            place[mine] = scene.cameras[name].project(seen[mine])
-        places.append(place)
-    return np.stack([places[1] - places[0], places[2] - places[0]], axis=2) / _WARP_STEP_PX
+            is_own = names == name
+            keyframe_px[is_own] = scene.cameras[name].project(x_in_keyframe[is_own])
+        projections.append(keyframe_px)
+    return (
+        np.stack([projections[1] - projections[0], projections[2] - projections[0]], axis=2) / _WARP_STEP_PX
+    )
 
 
 def _image_motion(view: PredictedView, points: FloatArray, px: FloatArray) -> FloatArray:
     """(N,2) how far points seen at `px` (N,2) moved since the frame before."""
-    return np.asarray(np.nan_to_num(px - view.lens.project(transform_points(view.before, points))))
+    return np.asarray(np.nan_to_num(px - view.lens.project(transform_points(view.neighbour_pose, points))))
 
 
-def _motion_blur(view: PredictedView, crossing_px: FloatArray) -> FloatArray:
+def _motion_blur(view: PredictedView, motion_px: FloatArray) -> FloatArray:
     """(N,2) how far points cross the image while the shutter is open; held to what is sane."""
-    moved = crossing_px * view.exposure
+    blur = motion_px * view.exposure_ratio
     longest = _MAX_BLUR_PX * max(1.0, view.pyramid.step_px[0])
     return np.asarray(
-        moved * np.minimum(1.0, longest / np.maximum(np.linalg.norm(moved, axis=1), 1e-9))[:, None]
+        blur * np.minimum(1.0, longest / np.maximum(np.linalg.norm(blur, axis=1), 1e-9))[:, None]
     )
 
 
 def _render_patches(
-    gallery: KeyframePatches,
+    patches: KeyframePatches,
     rows: IntArray,
     warp: FloatArray,
     blur_px: FloatArray,
-    search: SearchLevel,
+    level: SearchLevel,
     step_px: float,
 ) -> tuple[Patches, BoolArray]:
     """Looks (N,side,side) of points, warped and blurred, and which (N,) lie within their keyframes.
@@ -274,39 +285,39 @@ def _render_patches(
     """
     import cv2
 
-    scene, side = gallery.scene_map, search.side
+    scene, side = patches.scene_map, level.patch_side
     keyframe = scene.obs_keyframe[rows]
-    held, which = np.unique(keyframe, return_inverse=True)
-    sources = [gallery.pictures[row] for row in held.tolist()]
-    step = np.array([source.step_px[search.level] for source in sources])[which]
-    limit = np.array([source.levels[search.level].shape[::-1] for source in sources])[which] - 1.0
-    along = np.arange(side) - side // 2
-    grid = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2).astype(np.float32)
+    keyframe_rows, source_index = np.unique(keyframe, return_inverse=True)
+    sources = [patches.pyramids[row] for row in keyframe_rows.tolist()]
+    step = np.array([source.step_px[level.pyramid_level] for source in sources])[source_index]
+    limit = np.array([source.levels[level.pyramid_level].shape[::-1] for source in sources])[source_index] - 1.0
+    axis = np.arange(side) - side // 2
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2).astype(np.float32)
     offset = np.matmul(grid, (warp * step_px / step[:, None, None]).astype(np.float32).swapaxes(1, 2))
     shift = np.einsum("nij,nj->ni", warp, blur_px) / step[:, None]
     longest = float(np.linalg.norm(shift, axis=1).max(initial=0.0)) if np.isfinite(shift).all() else np.inf
     samples = int(np.clip(np.ceil(longest / _BLUR_STEP_PX) + 1, 1, _MAX_BLUR_SAMPLES))
-    share = np.linspace(-0.5, 0.5, samples) if samples > 1 else np.zeros(1)
+    fraction = np.linspace(-0.5, 0.5, samples) if samples > 1 else np.zeros(1)
     centre = scene.obs_px[rows] / step[:, None] - 0.5
-    centres = centre[:, None, :] + share[None, :, None] * shift[:, None, :]
-    reach = np.abs(offset).max(axis=1)
-    low, high = centres.min(axis=1) - reach, centres.max(axis=1) + reach
-    whole = ((low >= 0.0) & (high <= limit)).all(axis=1)
-    patches = np.zeros((len(rows), side, side), np.float32)
+    centres = centre[:, None, :] + fraction[None, :, None] * shift[:, None, :]
+    extent = np.abs(offset).max(axis=1)
+    low, high = centres.min(axis=1) - extent, centres.max(axis=1) + extent
+    is_inside = ((low >= 0.0) & (high <= limit)).all(axis=1)
+    images = np.zeros((len(rows), side, side), np.float32)
     for number, source in enumerate(sources):
-        mine = np.flatnonzero((which == number) & whole)
-        if len(mine) == 0:
+        own = np.flatnonzero((source_index == number) & is_inside)
+        if len(own) == 0:
             continue
-        at = centres[mine].astype(np.float32)[:, :, None, :] + offset[mine][:, None, :, :]
-        at = at.reshape(-1, side, 2)
-        drawn = cv2.remap(
-            source.levels[search.level],
-            np.ascontiguousarray(at[..., 0]),
-            np.ascontiguousarray(at[..., 1]),
+        sample_px = centres[own].astype(np.float32)[:, :, None, :] + offset[own][:, None, :, :]
+        sample_px = sample_px.reshape(-1, side, 2)
+        rendered = cv2.remap(
+            source.levels[level.pyramid_level],
+            np.ascontiguousarray(sample_px[..., 0]),
+            np.ascontiguousarray(sample_px[..., 1]),
             cv2.INTER_LINEAR,
         )
-        patches[mine] = drawn.reshape(len(mine), samples, side, side).mean(axis=1, dtype=np.float32)
-    return patches, whole & (patches.std(axis=(1, 2)) >= _MIN_CONTRAST)
+        images[own] = rendered.reshape(len(own), samples, side, side).mean(axis=1, dtype=np.float32)
+    return images, is_inside & (images.std(axis=(1, 2)) >= _MIN_CONTRAST)
 
 
 def _best_match(
@@ -316,7 +327,7 @@ def _best_match(
     import cv2
 
     half = patch.shape[0] // 2
-    column, row = (round(float(each)) for each in expected)
+    column, row = (round(float(value)) for value in expected)
     height, width = target.shape
     left, top = max(column - half - radius, 0), max(row - half - radius, 0)
     right, bottom = min(column + half + radius + 1, width), min(row + half + radius + 1, height)
@@ -331,7 +342,7 @@ def _best_match(
     return left + x + half + across, top + y + half + down, float(best)
 
 
-def _subpixel_peak(before: float, at: float, after: float) -> float:
+def _subpixel_peak(before: float, middle: float, after: float) -> float:
     """Where a parabola through three values peaks, from the middle one."""
-    bend = float(before) - 2.0 * float(at) + float(after)
-    return 0.5 * (float(before) - float(after)) / bend if bend < 0.0 else 0.0
+    curvature = float(before) - 2.0 * float(middle) + float(after)
+    return 0.5 * (float(before) - float(after)) / curvature if curvature < 0.0 else 0.0

@@ -53,19 +53,22 @@ def remove_weak_boundary_poses(path: Trajectory, min_inliers: int) -> Trajectory
     """
     weak = path.inliers < _WELL_SUPPORTED_FACTOR * min_inliers
     weak &= np.array([status is not FrameStatus.RIG for status in path.status], dtype=bool)
-    posed = path.localised
-    for start, stop in lost_intervals(posed):
-        posed[_first_supported(weak, start - 1, -1) + 1 : start] = False
-        posed[stop : _first_supported(weak, stop, 1)] = False
-    taken = path.localised & ~posed
-    if not taken.any():
+    has_pose = path.localised
+    for start, stop in lost_intervals(has_pose):
+        has_pose[_first_supported(weak, start - 1, -1) + 1 : start] = False
+        has_pose[stop : _first_supported(weak, stop, 1)] = False
+    removed = path.localised & ~has_pose
+    if not removed.any():
         return path
-    status = [FrameStatus.UNCONFIRMED if out else each for each, out in zip(path.status, taken, strict=True)]
+    status = [
+        FrameStatus.UNCONFIRMED if is_removed else status_
+        for status_, is_removed in zip(path.status, removed, strict=True)
+    ]
     return replace(
         path,
         status=tuple(status),
-        gauge_from_cam=np.where(taken[:, None, None], np.nan, path.gauge_from_cam),
-        covariance=np.where(taken[:, None, None], np.nan, path.covariance),
+        gauge_from_cam=np.where(removed[:, None, None], np.nan, path.gauge_from_cam),
+        covariance=np.where(removed[:, None, None], np.nan, path.covariance),
     )
 
 
@@ -92,33 +95,33 @@ def refine_points(scene_map: Map, paths: Sequence[Trajectory]) -> Map:
         views that do not suit are left out, and points of which fewer than two are left are seen by nobody.
     """
     poses, covariance = scene_map.map_from_cam.copy(), np.zeros((len(scene_map.keyframe_frame), 6, 6))
-    posed = np.ones(len(poses), dtype=bool)
-    mine = [path for path in paths if path.gauge == scene_map.gauge]
-    for path in mine:
+    has_pose = np.ones(len(poses), dtype=bool)
+    own_paths = [path for path in paths if path.gauge == scene_map.gauge]
+    for path in own_paths:
         rows = scene_map.keyframes_of(path.camera)
-        posed[rows] = path.localised[scene_map.keyframe_frame[rows]]
-        rows = rows[posed[rows]]
+        has_pose[rows] = path.localised[scene_map.keyframe_frame[rows]]
+        rows = rows[has_pose[rows]]
         frames = scene_map.keyframe_frame[rows]
         poses[rows], covariance[rows] = path.gauge_from_cam[frames], path.covariance[frames]
-    moved = replace(scene_map, map_from_cam=poses)
-    px = _mid_row_px(moved, {path.camera: path for path in mine})
-    order = np.argsort(moved.obs_point, kind="stable")
-    order = order[posed[moved.obs_keyframe[order]]]
-    points, good = moved.points.copy(), np.zeros(len(px), dtype=bool)
-    for some in _split_by_point(moved.obs_point[order]):
-        rows = order[some]
-        good[rows] = _refine_points_gauss_newton(
-            moved, points, rows, px[rows], covariance / MAP_COVARIANCE_SCALE
+    posed_map = replace(scene_map, map_from_cam=poses)
+    px = _mid_row_px(posed_map, {path.camera: path for path in own_paths})
+    order = np.argsort(posed_map.obs_point, kind="stable")
+    order = order[has_pose[posed_map.obs_keyframe[order]]]
+    points, accepted = posed_map.points.copy(), np.zeros(len(px), dtype=bool)
+    for chunk in _split_by_point(posed_map.obs_point[order]):
+        rows = order[chunk]
+        accepted[rows] = _refine_points_gauss_newton(
+            posed_map, points, rows, px[rows], covariance / MAP_COVARIANCE_SCALE
         )
-    views = np.bincount(moved.obs_point[good], minlength=len(points))
-    good &= views[moved.obs_point] >= _MIN_OBSERVATIONS
+    count = np.bincount(posed_map.obs_point[accepted], minlength=len(points))
+    accepted &= count[posed_map.obs_point] >= _MIN_OBSERVATIONS
     return replace(
-        moved,
+        posed_map,
         points=points,
-        obs_keyframe=moved.obs_keyframe[good],
-        obs_point=moved.obs_point[good],
-        obs_feature=moved.obs_feature[good],
-        obs_px=moved.obs_px[good],
+        obs_keyframe=posed_map.obs_keyframe[accepted],
+        obs_point=posed_map.obs_point[accepted],
+        obs_feature=posed_map.obs_feature[accepted],
+        obs_px=posed_map.obs_px[accepted],
     )
 
 
@@ -129,11 +132,11 @@ def _mid_row_px(scene_map: Map, paths: Mapping[str, Trajectory]) -> FloatArray:
         path = paths.get(name)
         if path is None or not readout_s:
             continue
-        mine = np.isin(scene_map.obs_keyframe, scene_map.keyframes_of(name))
-        frame = scene_map.keyframe_frame[scene_map.obs_keyframe[mine]]
-        lens, points = scene_map.cameras[name], scene_map.points[scene_map.obs_point[mine]]
+        is_own = np.isin(scene_map.obs_keyframe, scene_map.keyframes_of(name))
+        frame = scene_map.keyframe_frame[scene_map.obs_keyframe[is_own]]
+        lens, points = scene_map.cameras[name], scene_map.points[scene_map.obs_point[is_own]]
         velocity = image_velocity(lens, path.gauge_from_cam, path.times_ns, frame, points)
-        out[mine] = px_at_mid_row(lens, out[mine], velocity, readout_s)
+        out[is_own] = px_at_mid_row(lens, out[is_own], velocity, readout_s)
     return out
 
 
@@ -156,30 +159,30 @@ def _refine_points_gauss_newton(
         keyframe's pose's.
     """
     keyframe = scene_map.obs_keyframe[rows]
-    which, starts, number = np.unique(scene_map.obs_point[rows], return_index=True, return_inverse=True)
+    point_index, starts, number = np.unique(scene_map.obs_point[rows], return_index=True, return_inverse=True)
     cam_from_map = invert(scene_map.map_from_cam[keyframe])
-    views, sigma = _single_observations(scene_map, keyframe, px)
-    everything = np.arange(len(rows))
-    for count in range(_ITERATIONS + 1):
-        seen = replace(views, points=points[which][number])
-        residual, by_pose, depth = linearise(seen, everything, cam_from_map)
+    observations, sigma = _single_observations(scene_map, keyframe, px)
+    all_rows = np.arange(len(rows))
+    for iteration in range(_ITERATIONS + 1):
+        current = replace(observations, points=points[point_index][number])
+        residual, by_pose, depth = linearise(current, all_rows, cam_from_map)
         by_pose = by_pose.transpose(2, 0, 1)
         noise = by_pose @ covariance[keyframe] @ by_pose.transpose(0, 2, 1)
         information = np.linalg.inv(noise + np.eye(2) * sigma[:, None, None] ** 2)
         squared = np.einsum("in,nij,jn->n", residual, information, residual)
-        if count == _ITERATIONS:
+        if iteration == _ITERATIONS:
             break
         by_point = by_pose[:, :, 3:] @ cam_from_map[:, :3, :3]
-        weighed = by_point.transpose(0, 2, 1) @ information
-        weighed /= 1.0 + squared[:, None, None] / _LOSS_SIGMAS**2
-        hessian = np.add.reduceat(weighed @ by_point, starts)
-        gradient = np.add.reduceat(np.einsum("nij,jn->ni", weighed, residual), starts)
-        damping = _COARSE_DAMPING if count < _COARSE_ITERATIONS else _FINE_DAMPING
-        own = np.einsum("nii->n", hessian)[:, None, None] * np.eye(3) / 3.0
-        hessian += damping * own + np.eye(3) * np.finfo(float).tiny
-        points[which] -= np.linalg.solve(hessian, gradient[:, :, None])[:, :, 0]
-    size = np.hypot(*residual)
-    return np.asarray((depth > 0.0) & (size < _MAX_SIGMAS * sigma))
+        weighted = by_point.transpose(0, 2, 1) @ information
+        weighted /= 1.0 + squared[:, None, None] / _LOSS_SIGMAS**2
+        hessian = np.add.reduceat(weighted @ by_point, starts)
+        gradient = np.add.reduceat(np.einsum("nij,jn->ni", weighted, residual), starts)
+        damping = _COARSE_DAMPING if iteration < _COARSE_ITERATIONS else _FINE_DAMPING
+        mean_information = np.einsum("nii->n", hessian)[:, None, None] * np.eye(3) / 3.0
+        hessian += damping * mean_information + np.eye(3) * np.finfo(float).tiny
+        points[point_index] -= np.linalg.solve(hessian, gradient[:, :, None])[:, :, 0]
+    error_px = np.hypot(*residual)
+    return np.asarray((depth > 0.0) & (error_px < _MAX_SIGMAS * sigma))
 
 
 def _single_observations(
@@ -196,8 +199,8 @@ def _single_observations(
     )
     names, sigma = np.array(scene_map.keyframe_camera)[keyframe], np.empty(count)
     for name in np.unique(names).tolist():
-        mine, lens = np.flatnonzero(names == name), scene_map.cameras[name]
-        part = make_observations(lens, np.arange(len(mine) + 1), out.points[mine], px[mine])
-        out.rays[mine], out.px_from_ray[mine] = part.rays, part.px_from_ray
-        sigma[mine] = _NOISE_PX * pixel_scale(lens.width_px, lens.height_px)
+        own, lens = np.flatnonzero(names == name), scene_map.cameras[name]
+        undistorted = make_observations(lens, np.arange(len(own) + 1), out.points[own], px[own])
+        out.rays[own], out.px_from_ray[own] = undistorted.rays, undistorted.px_from_ray
+        sigma[own] = _NOISE_PX * pixel_scale(lens.width_px, lens.height_px)
     return out, sigma

@@ -40,7 +40,7 @@ _MAX_DISTANCE_FRAMES, _MAX_FRAMES = 90, 400
 nearest; bounds memory."""
 _EXPOSURE_CANDIDATES = (0.0, 0.3, 0.6)
 _EXPOSURE_FRAMES = 4
-_EXPOSURE_LEVEL = SearchLevel(level=1, side=21, radius=4, score=-1.0, limit_px=6.0)
+_EXPOSURE_LEVEL = SearchLevel(pyramid_level=1, patch_side=21, search_radius=4, score=-1.0, limit_px=6.0)
 _MIN_INLIER_WEIGHT_RATIO = 0.5
 _MAX_DISAGREEMENT = 11.3
 """Squared Mahalanobis distance between where a frame was found and its smoothed place: 99 % of three axes."""
@@ -52,7 +52,7 @@ in the end (off by 2.6 cm both), a rendered one with arms thrown about 105, 107,
 
 
 def find_lost_poses(
-    found: Registration,
+    registration: Registration,
     scene_map: Map,
     capture: Capture,
     options: RegistrationOptions,
@@ -77,36 +77,36 @@ def find_lost_poses(
     Returns:
         The same with more poses, their observations not kept, and the path steadied.
     """
-    path = found.trajectory
+    path = registration.trajectory
     camera = capture.camera(path.camera)
-    lost, steadiness = ~path.localised, _motion_statistics(path)
-    if steadiness is None:
-        return found
+    lost, statistics = ~path.localised, _motion_statistics(path)
+    if statistics is None:
+        return registration
     times = _times_in_intervals(path)
-    finder = _make_localiser(scene_map, capture, path, options, context)
-    search = _IntervalSearch(
+    localiser = _make_localiser(scene_map, capture, path, options, context)
+    interval_search = _IntervalSearch(
         camera=camera,
         scene_map=scene_map,
-        finder=finder,
+        localiser=localiser,
         times=times,
-        steadiness=steadiness,
-        seeds=_seed_keyframes(scene_map, camera.name, lost),
-        tracked=frozenset(np.flatnonzero(~lost).tolist()),
+        statistics=statistics,
+        seed_rows=_seed_keyframes(scene_map, camera.name, lost),
+        tracked_frames=frozenset(np.flatnonzero(~lost).tolist()),
     )
-    stretches, reached = lost_intervals(~lost), 0
+    intervals, position = lost_intervals(~lost), 0
     for _ in range(_MAX_PASSES):
-        if not stretches:
+        if not intervals:
             break
         poses: dict[int, PoseEstimate] = {}
-        known = _localised_poses(path)
-        for start, stop in stretches:
+        localised = _localised_poses(path)
+        for start, stop in intervals:
             context.check_cancelled()
-            reached = max(reached, start)  # a further round begins in front again
-            context.progress(reached, len(lost), "lost frames looked at")
-            poses |= search.within(start, stop, known)
-        before, path = path.localised, _merge_into(path, poses, finder.limits)
-        stretches = _extended_intervals(path.localised, before)
-    return replace(found, trajectory=smooth_weak_centres(path, ~lost))
+            position = max(position, start)  # a further round begins in front again
+            context.progress(position, len(lost), "lost frames looked at")
+            poses |= interval_search.recover_interval(start, stop, localised)
+        before, path = path.localised, _merge_into(path, poses, localiser.criteria)
+        intervals = _extended_intervals(path.localised, before)
+    return replace(registration, trajectory=smooth_weak_centres(path, ~lost))
 
 
 def can_recover(path: Trajectory) -> bool:
@@ -116,10 +116,10 @@ def can_recover(path: Trajectory) -> bool:
 
 def _motion_statistics(path: Trajectory) -> MotionStatistics | None:
     """How evenly a camera moves; None where no frame is lost or too few have poses."""
-    posed = path.localised
-    if posed.all() or posed.sum() < LEAST_POSED:
+    has_pose = path.localised
+    if has_pose.all() or has_pose.sum() < LEAST_POSED:
         return None
-    return MotionStatistics.of(_times_in_intervals(path), path.gauge_from_cam[:, :3, 3])
+    return MotionStatistics.estimate(_times_in_intervals(path), path.gauge_from_cam[:, :3, 3])
 
 
 def _times_in_intervals(path: Trajectory) -> FloatArray:
@@ -137,19 +137,19 @@ def _make_localiser(
 ) -> GuidedLocaliser:
     """What finds poses of a camera's frames."""
     camera = capture.camera(path.camera)
-    limits = AcceptanceCriteria(
+    criteria = AcceptanceCriteria(
         max_error_px=1.0, min_inliers=options.min_inliers, max_sigma_depth=options.max_sigma_depth
     )
     interval_s = float(np.median(np.diff(path.times_ns))) * 1e-9
-    finder = GuidedLocaliser(
+    localiser = GuidedLocaliser(
         lens=scene_map.cameras[camera.name],
-        gallery=_keyframe_patches(scene_map, capture, camera, context),
-        limits=limits,
-        exposure=0.0,
-        readout=scene_map.readout_s.get(camera.name, 0.0) / interval_s,
-        sees_room=camera.sees_room,
+        patches=_keyframe_patches(scene_map, capture, camera, context),
+        criteria=criteria,
+        exposure_ratio=0.0,
+        readout_ratio=scene_map.readout_s.get(camera.name, 0.0) / interval_s,
+        is_unmasked=camera.is_unmasked,
     )
-    return replace(finder, exposure=_estimate_exposure(camera, finder, path))
+    return replace(localiser, exposure_ratio=_estimate_exposure(camera, localiser, path))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,83 +168,89 @@ class _IntervalSearch:
 
     camera: CaptureCamera
     scene_map: Map
-    finder: GuidedLocaliser
+    localiser: GuidedLocaliser
     times: FloatArray
-    steadiness: MotionStatistics
-    seeds: Mapping[int, int]
-    tracked: Collection[int]
+    statistics: MotionStatistics
+    seed_rows: Mapping[int, int]
+    tracked_frames: Collection[int]
 
-    def within(self, start: int, stop: int, known: Mapping[int, PoseEstimate]) -> dict[int, PoseEstimate]:
-        """Poses vouched for of the lost frames [start, stop) amid `known` ones."""
-        inside = {frame: row for frame, row in self.seeds.items() if start <= frame < stop}
-        stretch = LostInterval(
+    def recover_interval(
+        self, start: int, stop: int, poses: Mapping[int, PoseEstimate]
+    ) -> dict[int, PoseEstimate]:
+        """Poses vouched for of the lost frames [start, stop) amid `poses` ones."""
+        seed_rows = {frame: row for frame, row in self.seed_rows.items() if start <= frame < stop}
+        interval = LostInterval(
             start=start,
             stop=stop,
             times=self.times,
-            pyramids=_read_pyramids(self.camera, start, stop, sorted(inside)),
-            known=known,
-            tracked=self.tracked,
-            seeds={frame: invert(self.scene_map.map_from_cam[row]) for frame, row in inside.items()},
-            rows=inside,
-            steadiness=self.steadiness,
+            pyramids=_read_pyramids(self.camera, start, stop, sorted(seed_rows)),
+            poses=poses,
+            tracked_frames=self.tracked_frames,
+            seed_poses={frame: invert(self.scene_map.map_from_cam[row]) for frame, row in seed_rows.items()},
+            keyframe_rows=seed_rows,
+            statistics=self.statistics,
         )
-        return _accepted_poses(Propagation(self.finder, stretch), self.finder.limits)
+        return _accepted_poses(Propagation(self.localiser, interval), self.localiser.criteria)
 
 
-def _extended_intervals(posed: BoolArray, before: BoolArray) -> list[tuple[int, int]]:
+def _extended_intervals(has_pose: BoolArray, before: BoolArray) -> list[tuple[int, int]]:
     """Stretches still lost at an end of which a pose was found."""
-    fresh = np.concatenate([[False], posed & ~before, [False]])
-    return [(start, stop) for start, stop in lost_intervals(posed) if fresh[start] or fresh[stop + 1]]
+    is_new = np.concatenate([[False], has_pose & ~before, [False]])
+    return [(start, stop) for start, stop in lost_intervals(has_pose) if is_new[start] or is_new[stop + 1]]
 
 
-def _smooth(fixes: Mapping[int, PoseEstimate], stretch: LostInterval) -> SmoothedCentres:
+def _smooth(estimates: Mapping[int, PoseEstimate], interval: LostInterval) -> SmoothedCentres:
     """Places of a stretch's frames and of those around it."""
-    first = max(0, stretch.start - _SMOOTHING_MARGIN)
-    frames = np.arange(first, min(len(stretch.times), stretch.stop + _SMOOTHING_MARGIN))
-    around = {frame: stretch.known[frame].place for frame in frames.tolist() if frame in stretch.known}
-    found = around | {frame: fix.place for frame, fix in fixes.items()}
-    trusted = around.keys() & stretch.tracked
-    return smooth_centres(frames, stretch.times[frames], found, trusted, stretch.steadiness)
+    first = max(0, interval.start - _SMOOTHING_MARGIN)
+    frames = np.arange(first, min(len(interval.times), interval.stop + _SMOOTHING_MARGIN))
+    neighbours = {
+        frame: interval.poses[frame].position for frame in frames.tolist() if frame in interval.poses
+    }
+    positions = neighbours | {frame: estimate.position for frame, estimate in estimates.items()}
+    tracked = neighbours.keys() & interval.tracked_frames
+    return smooth_centres(frames, interval.times[frames], positions, tracked, interval.statistics)
 
 
-def _accepted_poses(march: Propagation, limits: AcceptanceCriteria) -> dict[int, PoseEstimate]:
+def _accepted_poses(propagation: Propagation, criteria: AcceptanceCriteria) -> dict[int, PoseEstimate]:
     """Smoothed poses of the frames of a stretch that enough speaks for."""
-    fixes = march.run()
-    if not fixes:
+    estimates = propagation.run()
+    if not estimates:
         return {}
-    fixes = march.again(fixes, _smooth(fixes, march.stretch).places)
-    smoothed = _smooth(fixes, march.stretch)
-    out = {}
-    for frame, fix in fixes.items():
-        pose, covariance = fix.with_place(smoothed.places[frame])
+    estimates = propagation.second_pass(estimates, _smooth(estimates, propagation.interval).positions)
+    smoothed = _smooth(estimates, propagation.interval)
+    accepted = {}
+    for frame, estimate in estimates.items():
+        pose, covariance = estimate.conditioned_on_centre(smoothed.positions[frame])
         sigma = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
         if (
-            fix.inliers >= limits.min_inliers
-            and fix.evidence >= _MIN_INLIER_WEIGHT_RATIO
+            estimate.inliers >= criteria.min_inliers
+            and estimate.inlier_weight_ratio >= _MIN_INLIER_WEIGHT_RATIO
             and smoothed.disagreement[frame] < _MAX_DISAGREEMENT
-            and sigma < limits.max_sigma_depth * fix.depth
+            and sigma < criteria.max_sigma_depth * estimate.depth
         ):
-            out[frame] = replace(fix, cam_from_map=pose, covariance=covariance)
-    return out
+            accepted[frame] = replace(estimate, cam_from_map=pose, covariance=covariance)
+    return accepted
 
 
 def _merge_into(
-    path: Trajectory, poses: Mapping[int, PoseEstimate], limits: AcceptanceCriteria
+    path: Trajectory, poses: Mapping[int, PoseEstimate], criteria: AcceptanceCriteria
 ) -> Trajectory:
     """A trajectory with more poses, without those that stand alone amid lost frames."""
-    posed: BoolArray = path.localised.copy()
+    has_pose: BoolArray = path.localised.copy()
     inliers = path.inliers.copy()
-    for frame, fix in poses.items():
-        posed[frame], inliers[frame] = True, fix.inliers
-    lone = isolated_poses(posed, inliers, _LONE_EVIDENCE * limits.min_inliers) | _single_poses(posed)
+    for frame, estimate in poses.items():
+        has_pose[frame], inliers[frame] = True, estimate.inliers
+    isolated = isolated_poses(has_pose, inliers, _LONE_EVIDENCE * criteria.min_inliers) | _single_poses(
+        has_pose
+    )
     matrices, covariance = path.gauge_from_cam.copy(), path.covariance.copy()
     status, error_px = list(path.status), path.error_px.copy()
-    for frame, fix in poses.items():
-        if lone[frame]:
+    for frame, estimate in poses.items():
+        if isolated[frame]:
             continue
-        matrices[frame], covariance[frame] = invert(fix.cam_from_map), fix.covariance
-        status[frame], error_px[frame] = FrameStatus.REGISTERED, fix.error_px
-    inliers = np.where([each.localised for each in status], inliers, path.inliers)
+        matrices[frame], covariance[frame] = invert(estimate.cam_from_map), estimate.covariance
+        status[frame], error_px[frame] = FrameStatus.REGISTERED, estimate.error_px
+    inliers = np.where([value.localised for value in status], inliers, path.inliers)
     return replace(
         path,
         gauge_from_cam=matrices,
@@ -255,15 +261,15 @@ def _merge_into(
     )
 
 
-def _single_poses(posed: BoolArray) -> BoolArray:
+def _single_poses(has_pose: BoolArray) -> BoolArray:
     """(N,) frames with a pose that neither neighbour has."""
-    padded = np.concatenate([[False], posed, [False]])
-    return np.asarray(posed & ~padded[:-2] & ~padded[2:])
+    padded = np.concatenate([[False], has_pose, [False]])
+    return np.asarray(has_pose & ~padded[:-2] & ~padded[2:])
 
 
 def _localised_poses(path: Trajectory) -> dict[int, PoseEstimate]:
     """Poses that tracking found, by frame."""
-    return {frame: PoseEstimate.of(path, frame) for frame in np.flatnonzero(path.localised).tolist()}
+    return {frame: PoseEstimate.from_trajectory(path, frame) for frame in np.flatnonzero(path.localised).tolist()}
 
 
 def _seed_keyframes(scene_map: Map, camera: str, lost: BoolArray) -> dict[int, int]:
@@ -278,54 +284,66 @@ def _keyframe_patches(
 ) -> KeyframePatches:
     """The map's keyframes' pictures, of all cameras; evenly thinned out where they are very many."""
     count = len(scene_map.keyframe_camera)
-    held = np.unique(np.linspace(0, count - 1, min(count, _MAX_KEYFRAMES)).round().astype(int))
-    pictures: dict[int, Pyramid] = {}
-    sharp = np.zeros(count)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _MAX_KEYFRAMES)).round().astype(int))
+    pyramids: dict[int, Pyramid] = {}
+    relative_sharpness = np.zeros(count)
     for name in sorted(set(scene_map.keyframe_camera)):
-        rows = np.intersect1d(scene_map.keyframes_of(name), held)
+        rows = np.intersect1d(scene_map.keyframes_of(name), chosen)
         row_of = dict(zip(scene_map.keyframe_frame[rows].tolist(), rows.tolist(), strict=True))
         for frame, grey in capture.camera(name).read(sorted(row_of)):
             context.check_cancelled()
             row = row_of[frame]
-            pictures[row] = Pyramid.of(grey)
-            context.progress(len(pictures), len(held), "keyframes of all cameras decoded")
-            sharp[row] = sharpness(pictures[row].levels[0])
-        sharp[rows] /= max(float(np.median(sharp[rows])), 1e-9) if len(rows) else 1.0
-    seen: IntArray = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))
+            pyramids[row] = Pyramid.build(grey)
+            context.progress(len(pyramids), len(chosen), "keyframes of all cameras decoded")
+            relative_sharpness[row] = sharpness(pyramids[row].levels[0])
+        relative_sharpness[rows] /= (
+            max(float(np.median(relative_sharpness[rows])), 1e-9) if len(rows) else 1.0
+        )
+    keyframe_count: IntArray = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))
     usable = static_points(camera, scene_map)
-    return KeyframePatches(scene_map=scene_map, pictures=pictures, sharpness=sharp, usable=usable, seen=seen)
+    return KeyframePatches(
+        scene_map=scene_map,
+        pyramids=pyramids,
+        sharpness=relative_sharpness,
+        usable=usable,
+        keyframe_count=keyframe_count,
+    )
 
 
-def _read_pyramids(camera: CaptureCamera, start: int, stop: int, seeds: list[int]) -> dict[int, Pyramid]:
+def _read_pyramids(
+    camera: CaptureCamera, start: int, stop: int, seed_frames: list[int]
+) -> dict[int, Pyramid]:
     """Frames of a lost stretch near its ends or a seed, and those on either side of it."""
     frames = np.arange(max(0, start - 1), min(len(camera.times_ns), stop + 1))
-    near = np.array([start, stop - 1, *seeds])
-    away = np.abs(frames[:, None] - near).min(axis=1)
-    nearest = np.argsort(away, kind="stable")[:_MAX_FRAMES]
-    frames = frames[np.sort(nearest[away[nearest] <= _MAX_DISTANCE_FRAMES])]
-    return {frame: Pyramid.of(grey) for frame, grey in camera.read(frames)}
+    reference_frames = np.array([start, stop - 1, *seed_frames])
+    distance = np.abs(frames[:, None] - reference_frames).min(axis=1)
+    nearest = np.argsort(distance, kind="stable")[:_MAX_FRAMES]
+    frames = frames[np.sort(nearest[distance[nearest] <= _MAX_DISTANCE_FRAMES])]
+    return {frame: Pyramid.build(grey) for frame, grey in camera.read(frames)}
 
 
-def _estimate_exposure(camera: CaptureCamera, finder: GuidedLocaliser, path: Trajectory) -> float:
+def _estimate_exposure(camera: CaptureCamera, localiser: GuidedLocaliser, path: Trajectory) -> float:
     """Share of the time between two frames that the shutter is open, as blurred frames with poses show it."""
-    posed = path.localised
-    pairs = np.flatnonzero(posed[1:] & posed[:-1]) + 1
-    turned = path.gauge_from_cam[:, :3, :3]
-    cosine = np.einsum("nij,nij->n", turned[pairs - 1], turned[pairs])
+    has_pose = path.localised
+    pairs = np.flatnonzero(has_pose[1:] & has_pose[:-1]) + 1
+    rotations = path.gauge_from_cam[:, :3, :3]
+    cosine = np.einsum("nij,nij->n", rotations[pairs - 1], rotations[pairs])
     fastest = np.sort(pairs[np.argsort(cosine, kind="stable")[:_EXPOSURE_FRAMES]])
     totals = np.zeros(len(_EXPOSURE_CANDIDATES))
     for frame, grey in camera.read(fastest):
-        pose, before = (invert(path.gauge_from_cam[each]) for each in (frame, frame - 1))
+        pose, neighbour_pose = (invert(path.gauge_from_cam[index]) for index in (frame, frame - 1))
         view = PredictedView(
-            lens=finder.lens,
-            pyramid=Pyramid.of(grey),
+            lens=localiser.lens,
+            pyramid=Pyramid.build(grey),
             cam_from_map=pose,
-            before=before,
-            exposure=0.0,
-            readout=finder.readout,
+            neighbour_pose=neighbour_pose,
+            exposure_ratio=0.0,
+            readout_ratio=localiser.readout_ratio,
         )
-        rows = select_patches(finder.gallery, view)
-        for number, share in enumerate(_EXPOSURE_CANDIDATES):
-            found = match_patches(finder.gallery, replace(view, exposure=share), rows, _EXPOSURE_LEVEL)
-            totals[number] += found.score[finder.sees_room(found.px)].sum()
+        rows = select_patches(localiser.patches, view)
+        for number, ratio in enumerate(_EXPOSURE_CANDIDATES):
+            matches = match_patches(
+                localiser.patches, replace(view, exposure_ratio=ratio), rows, _EXPOSURE_LEVEL
+            )
+            totals[number] += matches.score[localiser.is_unmasked(matches.px)].sum()
     return _EXPOSURE_CANDIDATES[int(np.argmax(totals))]

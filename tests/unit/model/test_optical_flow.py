@@ -83,7 +83,7 @@ def test_a_coarse_motion_starts_every_track_near_its_end() -> None:
     assert np.abs(apply_homography(corners, found.homography) - expected).max() < 2.0
     inside = ((expected > 25) & (expected < (615, 455))).all(axis=1)
     flow = track_points(
-        first, second, corners[inside], apply_homography(corners, found.homography)[inside], careful=False
+        first, second, corners[inside], apply_homography(corners, found.homography)[inside], with_check=False
     )
     error = np.linalg.norm(flow.px - expected[inside], axis=1)[flow.ok]
     # A window of 21 px does not turn with the image: 3 degrees cost about a tenth of a pixel.
@@ -113,7 +113,7 @@ def test_a_motion_between_unrelated_images_is_not_sure_and_carries_nothing() -> 
         estimate_coarse_motion(make_coarse_image(first), make_coarse_image(second), corners[:5], 640) is None
     )
     found = estimate_coarse_motion(make_coarse_image(first), make_coarse_image(second), corners, 640)
-    assert found is None or not found.sure
+    assert found is None or not found.is_reliable
     guess = None if found is None else apply_homography(corners, found.homography)
     assert track_points(first, second, corners, guess).ok.mean() < 0.1
 
@@ -132,7 +132,7 @@ def test_rotation_is_found_despite_a_third_of_moving_points(degrees: float) -> N
     second = first @ truth.T
     second[:40] += rng.normal(0, 0.15, (40, 3))
     second /= np.linalg.norm(second, axis=1, keepdims=True)
-    error = Rotation.from_matrix(fit_rotation(first, second, rounds=15).T @ truth).magnitude()
+    error = Rotation.from_matrix(fit_rotation(first, second, iterations=15).T @ truth).magnitude()
     assert np.degrees(error) < 0.1
 
 

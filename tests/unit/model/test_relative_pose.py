@@ -112,7 +112,7 @@ def _rig() -> tuple[Map, list[RegisteredCamera]]:
     rows, cameras, observed = [], [], []
     for name, path in _paths().items():
         seen = _seen(path, points, rng)
-        cameras.append(RegisteredCamera(camera=_camera(name), found=_registration(name, path, seen)))
+        cameras.append(RegisteredCamera(camera=_camera(name), registration=_registration(name, path, seen)))
         for frame in KEYFRAMES.tolist():
             rows.append((name, frame, path[frame]))
             # A keyframe knows all points by their number, so that every view is a track of it.
@@ -176,11 +176,11 @@ def test_what_the_rig_left_outlasts_the_search_for_lost_frames(
     folders = [tmp_path / each.camera.name for each in cameras]
     for folder, each in zip(folders, cameras, strict=True):
         folder.mkdir()
-        save_registration(each.found, each.camera, folder, rolling=True)
+        save_registration(each.registration, each.camera, folder, rolling=True)
     selection = KeyframeSelection(
         camera="torso", frames=KEYFRAMES, frame_count=COUNT, sharpness=np.ones(COUNT), noise_px=0.2
     )
-    relative = estimate_relative_pose(*(each.found.trajectory for each in cameras), 0)
+    relative = estimate_relative_pose(*(each.registration.trajectory for each in cameras), 0)
     write_bundle(RigPoses(relative=(relative,)), folders[0], RIG_POSES)
     capture = SimpleNamespace(cameras=tuple(each.camera for each in cameras))
     monkeypatch.setattr(recover, "load_capture", lambda _: capture)
@@ -208,16 +208,16 @@ def test_both_cameras_of_a_rig_get_poses_that_fit_together() -> None:
 def test_cameras_out_of_step_are_left_as_they_are() -> None:
     scene_map, (first, second) = _rig()
     late = replace(second, camera=replace(second.camera, offset_s=0.2))
-    assert _solved(scene_map, first, late) is first.found
+    assert _solved(scene_map, first, late) is first.registration
 
 
 def test_the_mean_place_is_robust_and_tells_its_spread() -> None:
     _, (first, second) = _rig()
-    poses = second.found.trajectory.gauge_from_cam.copy()
+    poses = second.registration.trajectory.gauge_from_cam.copy()
     poses[::4, :3, 3] += 1.0
     poses[::4, :3, :3] = poses[::4, :3, :3] @ so3_exp([0.0, 0.5, 0.0])
-    path = replace(second.found.trajectory, gauge_from_cam=poses)
-    found = estimate_relative_pose(first.found.trajectory, path, 0)
+    path = replace(second.registration.trajectory, gauge_from_cam=poses)
+    found = estimate_relative_pose(first.registration.trajectory, path, 0)
     assert found.instants == COUNT - len(BLIND)
     off = found.first_from_second[:3, :3].T @ FIRST_FROM_SECOND[:3, :3]
     assert rotation_angle_rad(off) < 2e-3
@@ -231,7 +231,9 @@ def test_the_mean_place_is_robust_and_tells_its_spread() -> None:
 
 def test_in_another_map_no_instant_tells() -> None:
     _, (first, second) = _rig()
-    found = estimate_relative_pose(first.found.trajectory, replace(second.found.trajectory, gauge="map-1"), 0)
+    found = estimate_relative_pose(
+        first.registration.trajectory, replace(second.registration.trajectory, gauge="map-1"), 0
+    )
     assert found.instants == 0
     assert np.isnan(found.spread)
 

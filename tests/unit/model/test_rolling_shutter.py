@@ -103,10 +103,10 @@ def the_map(film: Film, keyframes: range) -> Any:
     return model
 
 
-def camera_of(film: Film, *, known: bool = False, stated_s: float = 0.0, turned: bool = False) -> Any:
+def camera_of(film: Film, *, known: bool = False, stated_s: float = 0.0, may_be_sideways: bool = False) -> Any:
     return SimpleNamespace(
         camera=replace(LENS, sideways=film.sideways and known),
-        turned=turned,
+        may_be_sideways=may_be_sideways,
         rolling_shutter_known=known,
         rolling_shutter_s=stated_s,
         times_ns=film.trajectory().times_ns,
@@ -169,7 +169,7 @@ def test_a_stated_readout_time_is_not_looked_for() -> None:
 @pytest.mark.parametrize("readout_s", [0.02, -0.02, 0.0])
 def test_the_data_tell_which_way_a_turned_sensor_is_read(readout_s: float, sideways: bool) -> None:
     film = Film(readout_s, sideways)
-    model, told = readouts_of(film, camera_of(film, turned=True))
+    model, told = readouts_of(film, camera_of(film, may_be_sideways=True))
     assert told.source == ("estimated" if readout_s else "none found")
     assert abs(told.seconds - readout_s) <= 0.1 * abs(readout_s)
     assert told.sideways == (sideways and readout_s != 0.0)
@@ -180,7 +180,7 @@ def test_the_data_tell_which_way_a_turned_sensor_is_read(readout_s: float, sidew
 
 def test_a_stated_readout_runs_the_way_the_video_is_turned() -> None:
     film = Film(0.02, sideways=True)
-    _, told = readouts_of(film, camera_of(film, known=True, stated_s=0.02, turned=True))
+    _, told = readouts_of(film, camera_of(film, known=True, stated_s=0.02, may_be_sideways=True))
     assert (told.seconds, told.source, told.sideways) == (0.02, "stated", True)
 
 
@@ -192,9 +192,9 @@ def test_a_stated_readout_keeps_its_way_where_none_could_be_looked_for(
 
     monkeypatch.setattr(RollingModel, "find", fails)
     film = Film(0.02, sideways=True)
-    _, told = readouts_of(film, camera_of(film, known=True, stated_s=0.02, turned=True))
+    _, told = readouts_of(film, camera_of(film, known=True, stated_s=0.02, may_be_sideways=True))
     assert (told.seconds, told.sideways) == (0.02, True)
-    _, told = readouts_of(film, camera_of(film, turned=True))
+    _, told = readouts_of(film, camera_of(film, may_be_sideways=True))
     assert (told.seconds, told.source) == (0.0, "not determined: no convergence")
 
 
@@ -361,7 +361,7 @@ def test_a_rolling_shutter_shows_in_the_residuals(readout_s: float, shows: bool,
     ],
 )
 def test_a_turned_sensor_is_looked_at_both_ways(film: Film, either_way: bool, shows: bool) -> None:
-    assert has_visible_rolling_shutter(*tracked(film), either_way=either_way) is shows
+    assert has_visible_rolling_shutter(*tracked(film), allow_sideways=either_way) is shows
 
 
 def tracked(film: Film) -> tuple[Registration, list[Map]]:

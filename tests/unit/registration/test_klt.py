@@ -40,7 +40,7 @@ def _video(seen_to_px: float = 640.0) -> CaptureCamera:
     def sees_room(px: np.ndarray) -> np.ndarray:
         return px[:, 0] < seen_to_px
 
-    video = SimpleNamespace(times_ns=np.arange(COUNT), grey_frames=grey_frames, sees_room=sees_room)
+    video = SimpleNamespace(times_ns=np.arange(COUNT), grey_frames=grey_frames, is_unmasked=sees_room)
     return cast("CaptureCamera", video)
 
 
@@ -70,7 +70,7 @@ def _shift_from_anchor(tracks: Tracks, anchors: dict[int, KeyframePoints]) -> np
 
 def test_points_are_followed_from_both_keyframes_and_end_in_their_observations() -> None:
     anchors = _anchors([4, 20])
-    tracks = Tracks.join(list(track_range(_video(), anchors, 0, 30, CONTEXT)))
+    tracks = Tracks.join_and_clear(list(track_range(_video(), anchors, 0, 30, CONTEXT)))
     # Up to 16 steps of a few hundredths of a pixel each, and a wrapped border that enters some windows.
     assert np.median(np.linalg.norm(_shift_from_anchor(tracks, anchors), axis=1)) < 0.15
     for frame in (5, 12, 19):
@@ -86,13 +86,13 @@ def test_a_point_seen_elsewhere_by_the_next_keyframe_is_followed_on_its_own() ->
     shared = np.isin(anchors[12].point, anchors[4].point)
     other = np.roll(anchors[12].point, 1)
     wrong = KeyframePoints(anchors[12].feature, np.where(shared, other, anchors[12].point), anchors[12].px)
-    tracks = Tracks.join(list(track_range(_video(), {4: anchors[4], 12: wrong}, 4, 13, CONTEXT)))
+    tracks = Tracks.join_and_clear(list(track_range(_video(), {4: anchors[4], 12: wrong}, 4, 13, CONTEXT)))
     # Were the neighbour's path taken for it, it would be off by the grid's 40 px.
     assert np.linalg.norm(_shift_from_anchor(tracks, anchors), axis=1).max() < 5.0
 
 
 def test_tracks_end_where_the_mask_begins() -> None:
-    tracks = Tracks.join(list(track_range(_video(400.0), _anchors([4, 20]), 0, 30, CONTEXT)))
+    tracks = Tracks.join_and_clear(list(track_range(_video(400.0), _anchors([4, 20]), 0, 30, CONTEXT)))
     moved = tracks.frame != tracks.keyframe
     assert moved.sum() > 1000
     assert tracks.px[moved, 0].max() < 400.0 + STEP_PX[0] * 16
@@ -138,7 +138,7 @@ def test_tracks_of_a_long_video_are_joined_in_little_more_than_their_own_memory(
     parts = [Tracks(part.frame + 0, part.keyframe + 0, part.feature + 0, part.px) for part in parts]
     own = tracemalloc.get_traced_memory()[0]
     tracemalloc.reset_peak()
-    joined = Tracks.join(parts)
+    joined = Tracks.join_and_clear(parts)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert len(joined.frame) == 100_000
@@ -155,7 +155,7 @@ def test_what_was_tracked_before_is_held_once_while_new_tracks_join_it(
     px = rng.random((len(frame), 2)).astype(np.float32)
     known = TrackCache(Tracks(frame, np.full(len(frame), 2), np.arange(len(frame)), px), [2, COUNT - 2])
     video = _video()
-    monkeypatch.setattr(frame_ranges, "_track_ranges", lambda *_: [Tracks.join([])])
+    monkeypatch.setattr(frame_ranges, "_track_ranges", lambda *_: [Tracks.join_and_clear([])])
     tracemalloc.start()
     anchors = dict.fromkeys(
         (2, COUNT - 2, COUNT - 1), KeyframePoints(*np.zeros((2, 0), np.int64), np.zeros((0, 2)))

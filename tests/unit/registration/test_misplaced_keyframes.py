@@ -62,7 +62,7 @@ def _map(moved: IntArray, shift_m: float) -> tuple[Map, Tracks]:
         for source, to in ((first, second), (second, first)):
             frame, origin = (np.full(_POINTS, number * _STEP) for number in (to, source))
             parts.append(Tracks(frame, origin, np.arange(_POINTS), true_px[to].astype(np.float32)))
-    return scene_map, Tracks.join(parts)
+    return scene_map, Tracks.join_and_clear(parts)
 
 
 @pytest.mark.parametrize("moved", [[5], [4, 5, 6], [0, 1], [10, 11]])
@@ -98,7 +98,7 @@ def test_a_bent_but_whole_map_is_left_alone() -> None:
     # 0.03 m are 4 px, two limits.
     scene_map, tracks = _map(np.array([4, 5, 6]), 0.03)
     assert len(find_misplaced_keyframes("cam", scene_map, tracks, _LIMITS)) == 0
-    assert len(find_misplaced_keyframes("cam", scene_map, Tracks.join([]), _LIMITS)) == 0
+    assert len(find_misplaced_keyframes("cam", scene_map, Tracks.join_and_clear([]), _LIMITS)) == 0
     assert len(find_misplaced_keyframes("other", scene_map, tracks, _LIMITS)) == 0
 
 
@@ -157,7 +157,7 @@ def _registered(tracks: Tracks, gauge: str) -> RegisteredCamera:
         wanted_keyframes=none,
         tried_keyframes=none,
     )
-    return RegisteredCamera(camera=camera, found=found)
+    return RegisteredCamera(camera=camera, registration=found)
 
 
 @pytest.mark.parametrize(("gauge", "left_out"), [("g", [5]), ("another", [])])

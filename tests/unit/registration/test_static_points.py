@@ -73,7 +73,7 @@ def _capture() -> tuple[Map, Tracks]:
         seen = every[_ROOM:] if frame in _BURIED else every
         origin = np.zeros(len(seen), np.int64)
         parts.append(Tracks(origin + frame, origin, seen, view(frame)[seen].astype(np.float32)))
-    return scene_map, Tracks.join(parts)
+    return scene_map, Tracks.join_and_clear(parts)
 
 
 def _solve(scene_map: Map, tracks: Tracks) -> list[FramePose]:

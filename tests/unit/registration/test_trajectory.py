@@ -106,12 +106,12 @@ def test_a_point_counts_by_the_frames_that_agree_with_it() -> None:
     agrees = np.ones(18, dtype=bool)
     agrees[[1, 4, 7]] = False
     agrees[[2, 5, 8, 11, 14]] = False
-    votes = PointReliability.none(3)
+    votes = PointReliability.zero(3)
     votes.add(point[:9], posed[:9], agrees[:9])
     # Three views of a point are too few to condemn it.
-    np.testing.assert_array_equal(votes.share(point), np.ones(18))
+    np.testing.assert_array_equal(votes.agreement(point), np.ones(18))
     votes.add(point[9:], posed[9:], agrees[9:])
-    np.testing.assert_allclose(votes.share(point[:3]), [1.0, 0.4, 0.0])
+    np.testing.assert_allclose(votes.agreement(point[:3]), [1.0, 0.4, 0.0])
 
 
 def test_a_long_video_is_solved_in_stretches_as_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
