@@ -69,6 +69,7 @@ class CaptureCamera:
     videos: tuple[VideoFile, ...] = field(default=(), repr=False)
     mask: BoolArray | None = field(default=None, repr=False)
     kept: KeptFrames | None = field(default=None, repr=False)
+    threads: int = 0
 
     def __post_init__(self) -> None:
         count = len(self.frame_numbers)
@@ -142,7 +143,7 @@ class CaptureCamera:
             wanted[0] < 0 or wanted[-1] >= len(self.frame_numbers) or (np.diff(wanted) <= 0).any()
         ):
             raise ValueError("indices must increase and lie inside the video")
-        return prefetch(self._decode(wanted, colour=colour))
+        return prefetch(self._decode(wanted, colour=colour), self.threads)
 
     def frame_candidates(self) -> Generator[FrameCandidate, None, None]:
         """Stream all frames as they may be kept, decoded ahead in a thread.
@@ -150,7 +151,7 @@ class CaptureCamera:
         Raises:
             CaptureError: A frame cannot be decoded.
         """
-        return prefetch(self._shots())
+        return prefetch(self._shots(), self.threads)
 
     @property
     def should_keep_all(self) -> bool:
@@ -176,7 +177,7 @@ class CaptureCamera:
         held = np.zeros(len(indices), dtype=bool) if self.kept is None else self.kept.holds(indices)
         copies: Iterator[Image] = iter(())
         if self.kept is not None and held.sum() >= _MIN_KEPT_RATIO * len(held):
-            copies = self.kept.read(indices[held], size, colour=colour)
+            copies = self.kept.read(indices[held], size, colour=colour, threads=self.threads)
         else:
             held[:] = False
         others = self._frames(indices[~held])
@@ -199,7 +200,9 @@ class CaptureCamera:
             numbers = self.frame_numbers[indices] - first
             inside = (numbers >= 0) & (numbers < len(video.pts))
             mine = indices[inside]
-            for index, (_, frame) in zip(mine, decode_frames(video, numbers[inside]), strict=True):
+            for index, (_, frame) in zip(
+                mine, decode_frames(video, numbers[inside], self.threads), strict=True
+            ):
                 yield int(index), frame, video
             first += len(video.pts)
 

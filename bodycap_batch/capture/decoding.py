@@ -10,7 +10,6 @@ import numpy as np
 
 from bodycap_batch.capture.video import COPY_AGAIN, VideoFile, error_reason, open_container, video_stream
 from bodycap_batch.core.arrays import IntArray
-from bodycap_batch.core.context import THREADS_VARIABLE
 from bodycap_batch.core.errors import CaptureError
 
 if TYPE_CHECKING:
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from av.video.stream import VideoStream
 
 
-def decode_frames(video: VideoFile, indices: IntArray) -> Iterator[tuple[int, VideoFrame]]:
+def decode_frames(video: VideoFile, indices: IntArray, threads: int = 0) -> Iterator[tuple[int, VideoFrame]]:
     """Decode the frames with these increasing indices.
 
     Frames between them that no other frame is built on (most B-frames of H.264) are not decoded.
@@ -29,14 +28,14 @@ def decode_frames(video: VideoFile, indices: IntArray) -> Iterator[tuple[int, Vi
     """
     import av
 
-    cursor = _ForwardDecoder(video, indices)
+    cursor = _ForwardDecoder(video, indices, threads)
     try:
         for wanted in map(int, indices):
             frame = cursor.advance(wanted)
             if frame is None and not cursor.sequential:
                 # Some containers seek badly (MPEG program streams): the plain way, from the start.
                 cursor.close()
-                cursor = _ForwardDecoder(video)
+                cursor = _ForwardDecoder(video, None, threads)
                 frame = cursor.advance(wanted)
             if frame is None:
                 raise _undecodable_frame(video, wanted)
@@ -51,7 +50,7 @@ def decode_frames(video: VideoFile, indices: IntArray) -> Iterator[tuple[int, Vi
         cursor.close()
 
 
-def first_frame(video: VideoFile) -> tuple[VideoFrame, bool]:
+def first_frame(video: VideoFile, threads: int = 0) -> tuple[VideoFrame, bool]:
     """The first frame that decodes, and whether the codec reorders frames.
 
     Raises:
@@ -60,7 +59,7 @@ def first_frame(video: VideoFile) -> tuple[VideoFrame, bool]:
     import av
 
     with open_container(video.path) as container:
-        stream = open_stream(container, video)
+        stream = open_stream(container, video, threads)
         try:
             for frame in container.decode(stream):
                 return frame, bool(stream.codec_context.has_b_frames)
@@ -71,14 +70,13 @@ def first_frame(video: VideoFile) -> tuple[VideoFrame, bool]:
     raise CaptureError("no frame of it can be decoded", path=video.path, hint=COPY_AGAIN)
 
 
-def open_stream(container: InputContainer, video: VideoFile) -> VideoStream:
+def open_stream(container: InputContainer, video: VideoFile, threads: int = 0) -> VideoStream:
     """The video's stream, decoded on as many threads as there are for it."""
     stream = video_stream(container, video.path)
     stream.thread_type = "AUTO"
     # The task's threads, else the process's, else all processors. (In a task's process the libraries' own
     # pools are pinned to one.)
-    told = os.environ.get(THREADS_VARIABLE) or os.environ.get("OMP_NUM_THREADS") or "0"
-    stream.codec_context.thread_count = int(told)
+    stream.codec_context.thread_count = threads or int(os.environ.get("OMP_NUM_THREADS") or "0")
     return stream
 
 
@@ -90,12 +88,12 @@ class _ForwardDecoder:
         indices: The frames that will be asked for: others may be passed over. Without them all are decoded.
     """
 
-    def __init__(self, video: VideoFile, indices: IntArray | None = None) -> None:
+    def __init__(self, video: VideoFile, indices: IntArray | None, threads: int) -> None:
         self.position = -1  # index of the last decoded frame, −1 before the first
         self.sequential = indices is None or video.counted
         self._video = video
         self._container = open_container(video.path)
-        self._stream = open_stream(self._container, video)
+        self._stream = open_stream(self._container, video, threads)
         # The halves of an interlaced frame may come one by one; AV1's decoder loses the first frame by it.
         skips = indices is not None and not self.sequential and not video.interlaced
         skips = skips and self._stream.codec_context.name == "h264"

@@ -35,7 +35,7 @@ _MIN_PIXEL_ASPECT = Fraction(2, 5)
 _SQUARE_TOLERANCE = 0.004
 
 
-def index_video(path: Path) -> VideoFile:
+def index_video(path: Path, threads: int = 0) -> VideoFile:
     """List a video's frames without decoding them (one frame is decoded, for its orientation).
 
     Raises:
@@ -65,7 +65,7 @@ def index_video(path: Path) -> VideoFile:
         focal_35mm=_focal_35mm(metadata),
         pixel_aspect=pixel_aspect,
     )
-    return _with_first_frame(video, container_format)
+    return _with_first_frame(video, container_format, threads)
 
 
 def _scan_packets(
@@ -140,12 +140,12 @@ def _focal_35mm(metadata: dict[str, str]) -> float | None:
     return None
 
 
-def _with_first_frame(video: VideoFile, container_format: str) -> VideoFile:
+def _with_first_frame(video: VideoFile, container_format: str, threads: int) -> VideoFile:
     """Decode one frame: the size and display matrix a decoder delivers are the ones that count.
 
     Frames before the first that decodes (a stream cut inside a group of pictures) are left out.
     """
-    frame, reordered = first_frame(video)
+    frame, reordered = first_frame(video, threads)
     video = replace(
         video,
         stored_size=(frame.width, frame.height),

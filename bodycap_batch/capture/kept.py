@@ -54,14 +54,16 @@ class KeptFrames:
         """Which frames of a camera are here."""
         return np.isin(indices, self.frames)
 
-    def read(self, indices: IntArray, size: tuple[int, int], *, colour: bool) -> Generator[Image, None, None]:
+    def read(
+        self, indices: IntArray, size: tuple[int, int], *, colour: bool, threads: int = 0
+    ) -> Generator[Image, None, None]:
         """Grey (H,W) or RGB (H,W,3) images of kept frames, increasing, at (width, height).
 
         Raises:
             CaptureError: One cannot be decoded.
         """
         own = (self.width_px, self.height_px)
-        for _, frame in decode_frames(self._video(), np.searchsorted(self.frames, indices)):
+        for _, frame in decode_frames(self._video(), np.searchsorted(self.frames, indices), threads):
             yield work_image(frame, _IDENTITY_ORIENTATION, size, colour=colour, shown=own)
 
     def _video(self) -> VideoFile:

@@ -24,7 +24,7 @@ _FULL_FRAME_MM = 36.0
 _ASPECT_TOLERANCE = 0.004
 
 
-def open_capture(spec: CaptureConfig) -> Capture:
+def open_capture(spec: CaptureConfig, threads: int = 0) -> Capture:
     """Index every video of a resolved capture block (demuxed, not decoded).
 
     Args:
@@ -34,12 +34,12 @@ def open_capture(spec: CaptureConfig) -> Capture:
         CaptureError: A video, its timestamps or calibration cannot be used, or nothing lies between
             start_s and end_s.
     """
-    return Capture(cameras=tuple(open_camera(spec, camera) for camera in spec.cameras))
+    return Capture(cameras=tuple(open_camera(spec, camera, threads) for camera in spec.cameras))
 
 
-def open_camera(spec: CaptureConfig, config: CameraConfig) -> CaptureCamera:
+def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> CaptureCamera:
     """Index one camera's videos. Raises as `open_capture`."""
-    videos = tuple(index_video(path) for path in config.video)
+    videos = tuple(index_video(path, threads) for path in config.video)
     _check_one_format(videos)
     timeline = join_chapters(videos, config.timestamps)
     offset_s = config.offset_s or 0.0
@@ -69,6 +69,7 @@ def open_camera(spec: CaptureConfig, config: CameraConfig) -> CaptureCamera:
         may_be_sideways=_is_quarter_turned(videos[0]) or camera.height_px > camera.width_px,
         notes=timeline.notes,
         videos=videos,
+        threads=threads,
         mask=None if config.mask is None else read_mask(config.mask, (camera.width_px, camera.height_px)),
     )
 

@@ -16,6 +16,9 @@ Pixels = npt.NDArray[np.float32]
 REFERENCE_WIDTH_PX = 640.0
 """Pixel thresholds are stated for images of this long side and scale with it."""
 
+BLUR_SHARPNESS_RATIO = 0.6
+"""x"""
+
 _WINDOW_PX = 21
 _LEVELS = 4
 _GUIDED_LEVELS = 2

@@ -91,6 +91,27 @@ def row_delay(camera: Camera, px: FloatArray) -> FloatArray:
     return np.asarray(position - 0.5, dtype=np.float64)
 
 
+def mean_row_fraction(registration: Registration, camera: Camera) -> FloatArray:
+    """Return the mean image row of the observations behind each pose, over the image height.
+
+    If the sensor's rows run along the image columns, it is the mean column over the width.
+
+    Args:
+        registration: The poses and observations of one camera.
+        camera: Its camera model.
+
+    Returns:
+        (N,) one value for each frame: 0.5 for a pose without observations, NaN for a frame without a pose.
+    """
+    frame_count = len(registration.trajectory.status)
+    observed = np.bincount(registration.obs_frame, minlength=frame_count)
+    fraction = row_delay(camera, registration.obs_px.astype(np.float64)) + 0.5
+    total = np.bincount(registration.obs_frame, weights=fraction, minlength=frame_count)
+    mean = np.full(frame_count, 0.5)
+    np.divide(total, observed, out=mean, where=observed > 0)
+    return np.where(registration.trajectory.localised, mean, np.nan)
+
+
 def px_at_mid_row(camera: Camera, px: FloatArray, velocity_px_s: FloatArray, readout_s: float) -> FloatArray:
     """Where pixels (M,2) moving at `velocity_px_s` (M,2) are at the instant of the middle row."""
     return np.asarray(px - velocity_px_s * (row_delay(camera, px) * readout_s)[:, None])

@@ -15,7 +15,7 @@ def _keyframes(options: Json, arguments: Json, context: StageContext, files: Pat
     from bodycap_batch.formats.bundle import write_bundle
     from bodycap_batch.keyframes import select_keyframes
 
-    camera = load_capture(arguments).cameras[0]
+    camera = load_capture(arguments, context.threads).cameras[0]
     size = camera.camera
     with FrameKeeper(files, size.width_px, size.height_px, camera.should_keep_all) as keeper:
         selection = select_keyframes(camera, KeyframeOptions.model_validate(options), context, keeper)

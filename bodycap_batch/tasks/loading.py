@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from bodycap_batch.model.scene import KeyframeSelection, MapResult, Registration
 
 
-def load_capture(arguments: Json) -> Capture:
+def load_capture(arguments: Json, threads: int = 0) -> Capture:
     """Open the capture block of a task's arguments, with the frames that its keyframes' artefacts keep."""
     from bodycap_batch.capture import open_capture
     from bodycap_batch.config.models import CaptureConfig
 
-    capture = open_capture(CaptureConfig.model_validate(arguments["capture"]))
+    capture = open_capture(CaptureConfig.model_validate(arguments["capture"]), threads)
     folders = arguments.get("kept", {})
     cameras = (replace(each, kept=_kept(folders.get(each.name))) for each in capture.cameras)
     return replace(capture, cameras=tuple(cameras))

@@ -20,7 +20,7 @@ def _registration(options: Json, arguments: Json, context: StageContext, files: 
     from bodycap_batch.model.rolling_shutter import has_visible_rolling_shutter
     from bodycap_batch.registration import register_frames
 
-    camera = load_capture(arguments).cameras[0]
+    camera = load_capture(arguments, context.threads).cameras[0]
     selection = load_keyframes(arguments["selection"])
     previous = load_registration(arguments["previous"]) if arguments.get("previous") else None
     maps = load_map(arguments["map"]).maps

@@ -20,11 +20,14 @@ def _rig(options: Json, arguments: Json, context: StageContext, files: Path) -> 
     context.check_cancelled()
     own, *others = (
         RegisteredCamera(camera=camera, registration=load_registration(path))
-        for camera, path in zip(load_capture(arguments).cameras, arguments["registrations"], strict=True)
+        for camera, path in zip(
+            load_capture(arguments, context.threads).cameras, arguments["registrations"], strict=True
+        )
     )
     options_ = RegistrationOptions.model_validate(options)
     selection = load_keyframes(arguments["selection"])
-    found, relative = register_in_rig(own, others, load_map(arguments["map"]).maps, selection, options_)
+    maps = load_map(arguments["map"]).maps
+    found, relative = register_in_rig(own, others, maps, selection, options_, context.threads)
     notes = [not_rigid_note(each) for each in relative if not each.is_rigid]
     save_registration(found, own.camera, files, rolling=False, notes=notes)
     write_bundle(RigPoses(relative=tuple(relative)), files, RIG_POSES)

@@ -13,7 +13,7 @@ import pytest
 
 from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.config import RegistrationOptions
-from bodycap_batch.core.context import THREADS_VARIABLE, StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import (
     interpolate_pose,
@@ -25,12 +25,19 @@ from bodycap_batch.model.geometry import (
 )
 from bodycap_batch.model.optical_flow import detect_corners
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
-from bodycap_batch.registration import RegisteredCamera, find_lost_poses, prepare_recovery
+from bodycap_batch.registration import RegisteredCamera
 from bodycap_batch.registration.poses.pnp import AcceptanceCriteria
-from bodycap_batch.registration.recovery import recover
+from bodycap_batch.registration.recovery import preparation, recover, search_images
 from bodycap_batch.registration.recovery.guided_localisation import GuidedLocaliser, PoseEstimate
 from bodycap_batch.registration.recovery.patch_search import KeyframePatches, PatchMatches, PredictedView
+from bodycap_batch.registration.recovery.preparation import prepare_recovery
 from bodycap_batch.registration.recovery.propagation import Propagation
+from bodycap_batch.registration.recovery.recover import find_lost_poses
+from bodycap_batch.registration.recovery.search_images import (
+    estimate_exposure,
+    read_keyframe_patches,
+    read_pyramids,
+)
 from tests.rooms import HALF_M, LENS, Room
 
 COUNT = 44
@@ -222,10 +229,9 @@ def test_what_the_mask_hides_is_no_room(pictures: list[np.ndarray], context: Sta
     assert not path.localised[list(LOST)].any()
 
 
-def test_of_a_long_stretch_only_so_many_pictures_are_held(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recover, "_MAX_FRAMES", 12)
+def test_of_a_long_stretch_only_so_many_pictures_are_held() -> None:
     video = cast(CaptureCamera, _Video([np.zeros((240, 320), np.uint8)] * COUNT))
-    held = sorted(recover._read_pyramids(video, 4, 40, [20]))
+    held = sorted(read_pyramids(video, 4, 40, [20], max_frames=12))
     assert held == [3, 4, 5, 6, 18, 19, 20, 21, 22, 38, 39, 40]
 
 
@@ -332,7 +338,7 @@ def test_what_the_mask_hides_tells_nothing_of_the_exposure(
         score = np.array([0.9 - view.exposure_ratio, 0.5 + 0.1 * view.exposure_ratio])
         return PatchMatches(np.arange(2), px, px, score)
 
-    monkeypatch.setattr(recover, "match_patches", found)
+    monkeypatch.setattr(search_images, "match_patches", found)
     mask = np.ones((240, 320), dtype=bool)
     mask[:, :160] = False
     shares = []
@@ -345,12 +351,12 @@ def test_what_the_mask_hides_tells_nothing_of_the_exposure(
             usable=np.zeros(0, bool),
             keyframe_count=np.zeros(0, np.int64),
         )
-        monkeypatch.setattr(recover, "select_patches", lambda *_: np.arange(2))
+        monkeypatch.setattr(search_images, "select_patches", lambda *_: np.arange(2))
         limits = AcceptanceCriteria(max_error_px=1.0, min_inliers=12, max_sigma_depth=0.1)
         finder = GuidedLocaliser(
             lens=CAMERA, patches=gallery, criteria=limits, exposure_ratio=0.0, is_unmasked=camera.is_unmasked
         )
-        shares.append(recover._estimate_exposure(camera, finder, _tracked().trajectory))
+        shares.append(estimate_exposure(camera, finder, _tracked().trajectory))
     assert shares == [0.0, 0.6]
 
 
@@ -364,7 +370,7 @@ def test_decoding_the_keyframes_is_told(pictures: list[np.ndarray], tmp_path: Pa
     scene = _map(pictures)
     context = StageContext(work_dir=tmp_path, progress=progress)
     capture = cast(Capture, _Capture(_Video(pictures)))
-    recover._keyframe_patches(scene, capture, capture.camera("torso"), context)
+    read_keyframe_patches(scene, capture, capture.camera("torso"), context)
     count = len(scene.keyframe_camera)
     assert told == [(number + 1, count) for number in range(count)]
 
@@ -489,10 +495,9 @@ def test_a_second_thread_changes_nothing(
     before = cv2.getNumThreads()
     paths = []
     for threads in (1, 2):
-        monkeypatch.setenv(THREADS_VARIABLE, str(threads))
         cv2.setNumThreads(threads)
         context = StageContext(work_dir=tmp_path, threads=threads)
-        settled_map, left = prepare_recovery(own, [], scene, _selection(), options)
+        settled_map, left = prepare_recovery(own, [], scene, _selection(), options, threads)
         paths.append(find_lost_poses(left, settled_map, capture, options, context).trajectory)
     cv2.setNumThreads(before)
     assert not left.trajectory.localised[end]
@@ -506,7 +511,7 @@ def test_few_poses_are_left_as_they_are(monkeypatch: pytest.MonkeyPatch, picture
     found = _with_tracks(_tracked(), scene, -1)
     few = replace(found, trajectory=replace(found.trajectory, inliers=np.full(COUNT, 20)))
     own = RegisteredCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), registration=few)
-    monkeypatch.setattr(recover, "LEAST_POSED", COUNT - len(LOST) - 10)
+    monkeypatch.setattr(preparation, "LEAST_POSED", COUNT - len(LOST) - 10)
     settled_map, left = prepare_recovery(own, [], scene, _selection(), RegistrationOptions())
     assert settled_map is scene
     assert left is few

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -10,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.core.context import THREADS_VARIABLE
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import make_transform, transform_points
 
@@ -132,7 +130,9 @@ def projection_jacobian(camera: Camera, rays: FloatArray) -> FloatArray:
     return out
 
 
-def refine_poses(observations: Observations, cam_from_gauge: FloatArray, limit_px: float) -> FloatArray:
+def refine_poses(
+    observations: Observations, cam_from_gauge: FloatArray, limit_px: float, threads: int = 1
+) -> FloatArray:
     """Least reprojection error under a Cauchy loss cut off at `limit_px`, from starting poses (F,4,4).
 
     The loss begins as wide as the residuals are and narrows with them, so a start that is off by more
@@ -152,11 +152,13 @@ def refine_poses(observations: Observations, cam_from_gauge: FloatArray, limit_p
             if len(active) == 0:
                 break
 
-    _for_each_chunk(observations, refine_chunk)
+    _for_each_chunk(observations, refine_chunk, threads)
     return poses
 
 
-def evaluate_poses(observations: Observations, cam_from_gauge: FloatArray, limit_px: float) -> PoseQuality:
+def evaluate_poses(
+    observations: Observations, cam_from_gauge: FloatArray, limit_px: float, threads: int = 1
+) -> PoseQuality:
     """How well poses (F,4,4) explain what their frames see."""
     frame_count = len(cam_from_gauge)
     quality = PoseQuality(
@@ -190,11 +192,13 @@ def evaluate_poses(observations: Observations, cam_from_gauge: FloatArray, limit
             residual, jacobian, inlier * observations.weight[rows], starts
         )[0]
 
-    _for_each_chunk(observations, evaluate_chunk)
+    _for_each_chunk(observations, evaluate_chunk, threads)
     return quality
 
 
-def find_inliers(observations: Observations, cam_from_gauge: FloatArray, limit_px: float) -> BoolArray:
+def find_inliers(
+    observations: Observations, cam_from_gauge: FloatArray, limit_px: float, threads: int
+) -> BoolArray:
     """Which views (M,) lie within a limit of what poses (F,4,4) predict; none where a pose is NaN."""
     out = np.zeros(len(observations.rays), dtype=bool)
 
@@ -203,14 +207,14 @@ def find_inliers(observations: Observations, cam_from_gauge: FloatArray, limit_p
         residual, _, _ = _residuals(observations, rows, cam_from_gauge[chosen][owner])
         out[rows] = np.hypot(residual[0], residual[1]) < limit_px
 
-    _for_each_chunk(observations, mark_chunk)
+    _for_each_chunk(observations, mark_chunk, threads)
     return out
 
 
-def _for_each_chunk(observations: Observations, work: Callable[[IntArray], None]) -> None:
+def _for_each_chunk(observations: Observations, work: Callable[[IntArray], None], threads: int) -> None:
     """Do chunks of frames, on all threads of the task: frames do not influence each other."""
-    chunks, threads = list(_chunks(observations)), int(os.environ.get(THREADS_VARIABLE, "1"))
-    if threads == 1 or len(chunks) < 2:
+    chunks = list(_chunks(observations))
+    if threads <= 1 or len(chunks) < 2:
         for frames in chunks:
             work(frames)
         return

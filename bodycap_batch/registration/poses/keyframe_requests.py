@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, evenly_spaced, runs
 
 _WINDOW_FRAMES = 3
 _END_OFFSET_FRAMES = 1
@@ -14,8 +14,7 @@ _BUDGET_RATIO = 0.5
 
 def lost_intervals(localised: BoolArray) -> list[tuple[int, int]]:
     """Maximal runs [start, stop) of frames without a pose."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], ~localised, [False]]).astype(int)))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return runs(~localised)
 
 
 def request_keyframes(localised: BoolArray, sharpness: FloatArray, tried: IntArray) -> IntArray:
@@ -52,5 +51,5 @@ def request_keyframes(localised: BoolArray, sharpness: FloatArray, tried: IntArr
     budget = max(_MIN_BUDGET, int(_BUDGET_RATIO * len(tried)))
     unique = np.unique(np.array(chosen, dtype=np.int64))
     if len(unique) > budget:
-        unique = unique[np.linspace(0, len(unique) - 1, budget).round().astype(int)]
+        unique = unique[evenly_spaced(len(unique), budget)]
     return unique

@@ -30,6 +30,11 @@ takes 484; the poses are the same."""
 _MIN_OBSERVED = 4
 
 
+def point_weights(keyframe_count: IntArray) -> FloatArray:
+    """X"""
+    return np.asarray(keyframe_count / (keyframe_count + _POINT_VARIANCE_RATIO))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigMember:
     """One of the cameras that see a frame together.
@@ -75,7 +80,7 @@ class PointReliability:
         return np.asarray(np.where(self.observed < _MIN_OBSERVED, 1.0, ratio)[keys])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class RigObservations:
     """Cameras and the map.
 
@@ -89,7 +94,7 @@ class RigObservations:
     members: Sequence[RigMember]
     scene_map: Map
     static: BoolArray
-    kept: list[FrameBlock] = field(default_factory=list)
+    _only_block: FrameBlock | None = field(default=None, init=False, repr=False)
 
     @staticmethod
     def create(members: Sequence[RigMember], scene_map: Map) -> RigObservations:
@@ -104,9 +109,9 @@ class RigObservations:
             for first in range(0, count, BLOCK_FRAMES):
                 yield self._make_block(slice(first, min(first + BLOCK_FRAMES, count)))
             return
-        if not self.kept:
-            self.kept.append(self._make_block(slice(0, count)))
-        yield self.kept[0]
+        if self._only_block is None:
+            self._only_block = self._make_block(slice(0, count))
+        yield self._only_block
 
     def _make_block(self, frames: slice) -> FrameBlock:
         parts = [_observations_of(member, self.scene_map, frames) for member in self.members]
@@ -126,7 +131,7 @@ class RigObservations:
         return any(self.scene_map.readout_s.get(member.camera.name, 0.0) for member in self.members)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class FrameBlock:
     """What a rig sees of the map in a stretch of frames: tracked points, and keyframes' own observations.
 
@@ -146,29 +151,26 @@ class FrameBlock:
     point: IntArray
     px: FloatArray
     member: IntArray
-    made: list[Observations] = field(default_factory=list)
+    _observations: Observations | None = field(default=None, init=False, repr=False)
 
     def observations(self, px: FloatArray | None, reliability: PointReliability | None) -> Observations:
         """What is seen, at pixels (M,2) where these are not its own; `reliability` tell how far points agree."""
-        if px is None:
-            if not self.made:
-                self.made.append(self._make_observations(self.px))
-            observations = self.made[0]
-        else:
+        if px is not None:
             observations = self._make_observations(px)
-        return (
-            observations
-            if reliability is None
-            else replace(
-                observations, weight=observations.weight * reliability.agreement(self.point_keys) ** 2
-            )
-        )
+        elif self._observations is not None:
+            observations = self._observations
+        else:
+            observations = self._observations = self._make_observations(self.px)
+        if reliability is None:
+            return observations
+        weight = observations.weight * reliability.agreement(self.point_keys) ** 2
+        return replace(observations, weight=weight)
 
     def _make_observations(self, px: FloatArray) -> Observations:
         scene_map, lenses = self.rig.scene_map, self.rig.lenses
         # Where a point stands is known the better the more keyframes see it.
         count = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))[self.point]
-        weight = count / (count + _POINT_VARIANCE_RATIO) * np.where(self.static, 1.0, _TRANSIENT_WEIGHT)
+        weight = point_weights(count) * np.where(self.static, 1.0, _TRANSIENT_WEIGHT)
         bounds = np.searchsorted(self.frame, np.arange(self.frames.start, self.frames.stop + 1))
         points = scene_map.points[self.point]
         if len(lenses) == 1:

@@ -81,6 +81,7 @@ def solve_poses(
     px: FloatArray,
     start: FloatArray,
     criteria: AcceptanceCriteria,
+    threads: int = 1,
 ) -> list[FramePose]:
     """Poses of all frames of a camera, or of a rig, from the map points seen in them.
 
@@ -94,11 +95,10 @@ def solve_poses(
     Where a start leads to few inliers, or there is none, the frame is sampled from scratch.
     """
     has_start = np.asarray(np.isfinite(start).all(axis=(1, 2)))
-    poses = refine_poses(
-        observations, np.where(has_start[:, None, None], start, np.eye(4)), criteria.max_error_px
-    )
+    initial = np.where(has_start[:, None, None], start, np.eye(4))
+    poses = refine_poses(observations, initial, criteria.max_error_px, threads)
     count = np.diff(observations.bounds)
-    solved = accept_poses(observations, poses, criteria)
+    solved = accept_poses(observations, poses, criteria, threads)
     for frame in np.flatnonzero(count >= criteria.min_inliers).tolist():
         if has_start[frame] and solved[frame].inlier_weight_ratio >= TRUSTED_WEIGHT_RATIO:
             continue
@@ -186,10 +186,13 @@ def ransac_pose(
 
 
 def accept_poses(
-    observations: Observations, cam_from_gauge: FloatArray, criteria: AcceptanceCriteria
+    observations: Observations,
+    cam_from_gauge: FloatArray,
+    criteria: AcceptanceCriteria,
+    threads: int = 1,
 ) -> list[FramePose]:
     """Count the inliers of poses (F,4,4), estimate their covariance, and accept or refuse them."""
-    quality = evaluate_poses(observations, cam_from_gauge, criteria.max_error_px)
+    quality = evaluate_poses(observations, cam_from_gauge, criteria.max_error_px, threads)
     covariance = _covariance(quality, criteria.min_noise_px)
     sigma = np.sqrt(np.linalg.eigvalsh(covariance[:, 3:, 3:])[:, -1])
     constrained = sigma < criteria.max_sigma_depth * quality.depth

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, runs
 
 _MIN_SIGMAS = 8.0
 _MIN_SCALE_RATIO = 10.0
@@ -33,6 +33,8 @@ _SECOND_MIN_RESPONSE, _FIRST_MAX_RESPONSE, _SECOND_MAX_RESPONSE = 0.25, 0.45, 1.
 """Answers of the third pose's bend to the second's: between 0.25 and 0.45 either of the first two may be
 wrong, beyond 1 neither is."""
 _SCALE_WINDOW = 12
+ISOLATED_INLIER_FACTOR = 4
+"""x"""
 _MAX_ISOLATED_RUN = 2
 _MIN_ISOLATING_GAP = 3
 
@@ -177,8 +179,7 @@ def isolated_poses(localised: BoolArray, inliers: IntArray, min_inliers: int) ->
         (N,) True in runs of one or two poses amid at least three lost frames on either side.
     """
     out = np.zeros(len(localised), dtype=bool)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], localised, [False]]).astype(int)))
-    for start, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+    for start, stop in runs(localised):
         surroundings = np.concatenate(
             [
                 localised[max(0, start - _MIN_ISOLATING_GAP) : start],

@@ -7,9 +7,8 @@ import numpy as np
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.arrays import BoolArray
 from bodycap_batch.model.scene import Map
+from bodycap_batch.model.static_span import MIN_STATIC_SPAN_NS
 
-_MOMENT_NS = 1_000_000_000
-"""The wearer's sleeve hangs before the camera for longer, but seldom in one place of it."""
 _MIN_KEYFRAME_RATIO = 0.5
 _MIN_STATIC_POINTS = 12
 """Unless so large a share of a camera's keyframes sees so many confirmed points the test tells nothing: a
@@ -30,7 +29,7 @@ def static_points(camera: CaptureCamera, scene_map: Map) -> BoolArray:
     first, last = np.full(count, np.iinfo(np.int64).max), np.zeros(count, dtype=np.int64)
     np.minimum.at(first, point, times - camera.times_ns[0])
     np.maximum.at(last, point, times - camera.times_ns[0])
-    static = last - np.minimum(first, last) > _MOMENT_NS
+    static = last - np.minimum(first, last) > MIN_STATIC_SPAN_NS
     static[scene_map.obs_point[~is_own]] = True
     static_seen = np.bincount(
         scene_map.obs_keyframe[is_own], weights=static[point], minlength=len(scene_map.keyframe_camera)

@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.geometry import interpolate_pose, invert
-from bodycap_batch.model.scene import FrameStatus, Map
+from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
+from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Trajectory
 from bodycap_batch.registration.poses.batched_pnp import find_inliers
 from bodycap_batch.registration.poses.observations import PointReliability, RigMember, RigObservations
 from bodycap_batch.registration.poses.pnp import (
@@ -19,31 +21,55 @@ from bodycap_batch.registration.poses.pnp import (
     FramePose,
     solve_poses,
 )
-from bodycap_batch.registration.poses.pose_outliers import find_outlier_poses, isolated_poses
-from bodycap_batch.registration.tracking.klt import Tracks
+from bodycap_batch.registration.poses.pose_outliers import (
+    ISOLATED_INLIER_FACTOR,
+    find_outlier_poses,
+    isolated_poses,
+)
+from bodycap_batch.registration.tracking.klt import Tracks, camera_pixel_scale
 
 _MIN_STATIC_INLIERS = 6
 """Confirmed inliers without which a pose is that of the wearer's sleeve."""
-_LONE_EVIDENCE = 4
-"""A pose that no neighbouring frame confirms needs so many times the usual inliers."""
+_MAP_NOISE_PX = 0.6
+"""x"""
+_INLIER_SIGMAS = 3.5
+"""x"""
+_BLUR_WINDOW_FRAMES = 15
+"""x"""
 _REPEATS = 1
 _REPEATS_ROLLING = 2
 """The velocity that moves pixels comes from the poses that the moved pixels give."""
 
 
+def acceptance_criteria(
+    camera: CaptureCamera, selection: KeyframeSelection, options: RegistrationOptions
+) -> AcceptanceCriteria:
+    """X"""
+    noise_px = np.hypot(_MAP_NOISE_PX * camera_pixel_scale(camera), 2.0 * selection.noise_px)
+    return AcceptanceCriteria(
+        max_error_px=float(_INLIER_SIGMAS * noise_px),
+        min_inliers=options.min_inliers,
+        max_sigma_depth=options.max_sigma_depth,
+    )
+
+
 def solve_camera(
-    camera: CaptureCamera, scene_map: Map, tracks: Tracks, criteria: AcceptanceCriteria
+    camera: CaptureCamera, scene_map: Map, tracks: Tracks, criteria: AcceptanceCriteria, threads: int = 1
 ) -> list[FramePose]:
     """Solve every frame of a camera from the map points seen in it; see `solve_rig`."""
     count = len(camera.times_ns)
     member = RigMember(camera=camera, tracks=tracks, cam_from_rig=np.eye(4), rig_frame=np.arange(count))
     rows = scene_map.keyframes_of(camera.name)
     start = _interpolated_keyframe_poses(scene_map.keyframe_frame[rows], scene_map.map_from_cam[rows], count)
-    return solve_rig([member], scene_map, start, criteria)
+    return solve_rig([member], scene_map, start, criteria, threads)
 
 
 def solve_rig(
-    members: Sequence[RigMember], scene_map: Map, start: FloatArray, criteria: AcceptanceCriteria
+    members: Sequence[RigMember],
+    scene_map: Map,
+    start: FloatArray,
+    criteria: AcceptanceCriteria,
+    threads: int = 1,
 ) -> list[FramePose]:
     """Solve every frame of a rig from the map points that its cameras see at that instant.
 
@@ -61,11 +87,12 @@ def solve_rig(
         Poses of the first camera; `FrameStatus.RIG` where it saw too little for one of its own.
     """
     rig = RigObservations.create(members, scene_map)
-    solution = _solve(rig, start, criteria)
+    solution = _solve(rig, start, criteria, threads)
     for _ in range(_REPEATS_ROLLING if rig.rolling else _REPEATS):
         poses = pose_array(solution.poses)
         start = np.where(np.isfinite(poses), invert(poses), start)
-        solution = _solve(rig, start, criteria, solution.reliability, poses if rig.rolling else None)
+        path = poses if rig.rolling else None
+        solution = _solve(rig, start, criteria, threads, solution.reliability, path)
     accepted = _require_static_inliers(solution.poses, solution.static)
     times_ns = rig.members[0].camera.times_ns
     return _reject_outliers(_assign_status(accepted, rig, solution.own_inliers, criteria), times_ns, criteria)
@@ -92,6 +119,7 @@ def _solve(
     rig: RigObservations,
     start: FloatArray,
     criteria: AcceptanceCriteria,
+    threads: int,
     reliability: PointReliability | None = None,
     path: FloatArray | None = None,
 ) -> _Solution:
@@ -110,10 +138,11 @@ def _solve(
     )
     for block in rig.blocks():
         px = None if path is None else block.px_at_mid_row(path)
-        views, frames = block.observations(px, reliability), block.frames
-        poses = solve_poses(rig.lenses, views, block.px if px is None else px, start[frames], criteria)
+        observations, frames = block.observations(px, reliability), block.frames
+        observed_px = block.px if px is None else px
+        poses = solve_poses(rig.lenses, observations, observed_px, start[frames], criteria, threads)
         solved = pose_array(poses)
-        agrees = find_inliers(views, invert(solved), criteria.max_error_px)
+        agrees = find_inliers(observations, invert(solved), criteria.max_error_px, threads)
         has_pose = np.asarray(np.isfinite(solved).all(axis=(1, 2)))[block.frame - frames.start]
         out.poses.extend(poses)
         out.reliability.add(block.point_keys, has_pose, agrees)
@@ -143,6 +172,39 @@ def pose_array(poses: Sequence[FramePose]) -> FloatArray:
     missing = np.full((4, 4), np.nan)
     matrices = [missing if pose.gauge_from_cam is None else pose.gauge_from_cam for pose in poses]
     return np.array(matrices).reshape(-1, 4, 4)
+
+
+def build_trajectory(
+    camera: CaptureCamera, gauge: str, poses: Sequence[FramePose], sharpness: FloatArray
+) -> Trajectory:
+    """X"""
+    missing = np.full((6, 6), np.nan)
+    return Trajectory(
+        camera=camera.name,
+        gauge=gauge,
+        frame_numbers=camera.frame_numbers,
+        times_ns=camera.times_ns,
+        gauge_from_cam=pose_array(poses),
+        covariance=np.array(
+            [missing if pose.covariance is None else pose.covariance for pose in poses]
+        ).reshape(-1, 6, 6),
+        status=tuple(_frame_statuses(poses, sharpness)),
+        inliers=np.array([pose.inliers for pose in poses], dtype=np.int64),
+        error_px=np.array([pose.error_px for pose in poses]),
+    )
+
+
+def _frame_statuses(poses: Sequence[FramePose], sharpness: FloatArray) -> list[FrameStatus]:
+    """X"""
+    statuses = []
+    for index, pose in enumerate(poses):
+        status = pose.status
+        if status is FrameStatus.FEW_TRACKS:
+            nearby = sharpness[max(0, index - _BLUR_WINDOW_FRAMES) : index + _BLUR_WINDOW_FRAMES + 1]
+            if sharpness[index] < BLUR_SHARPNESS_RATIO * np.median(nearby):
+                status = FrameStatus.BLUR
+        statuses.append(status)
+    return statuses
 
 
 def _interpolated_keyframe_poses(keyframes: IntArray, map_from_cam: FloatArray, count: int) -> FloatArray:
@@ -176,7 +238,7 @@ def _reject_outliers(
     accepted = _reject(poses, find_outlier_poses(centres, sigma, times_ns), FrameStatus.POSE_JUMP)
     localised = np.array([pose.gauge_from_cam is not None for pose in accepted], dtype=bool)
     inliers = np.array([pose.inliers for pose in accepted], dtype=np.int64)
-    isolated = isolated_poses(localised, inliers, _LONE_EVIDENCE * criteria.min_inliers)
+    isolated = isolated_poses(localised, inliers, ISOLATED_INLIER_FACTOR * criteria.min_inliers)
     return _reject(accepted, isolated, FrameStatus.UNCONFIRMED)
 
 

@@ -12,7 +12,13 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.registration.poses.batched_pnp import Observations, make_observations, refine_poses
-from bodycap_batch.registration.poses.pnp import AcceptanceCriteria, accept_poses, ransac_pose
+from bodycap_batch.registration.poses.observations import point_weights
+from bodycap_batch.registration.poses.pnp import (
+    TRUSTED_WEIGHT_RATIO,
+    AcceptanceCriteria,
+    accept_poses,
+    ransac_pose,
+)
 from bodycap_batch.registration.recovery.motion_prior import PositionEstimate
 from bodycap_batch.registration.recovery.patch_search import (
     KeyframePatches,
@@ -31,8 +37,6 @@ _LEVELS = (
 )
 """From far and coarse to near and fine. The last one at full size: errors of frames with known poses are a
 quarter smaller than from half size."""
-_POINT_VARIANCE = 6.0
-"""As for tracks."""
 _CELL_SIDE_PX = 40.0
 _FULL_WEIGHT_PER_CELL = 2.0
 """Patches that overlap err together: so many count in a square of about a patch's side. Otherwise fifty
@@ -41,8 +45,6 @@ _MIN_NOISE_PX = 1.0
 """Of patches found in blurred frames: fewer than twenty that happen to agree better tell nothing better."""
 _MIN_MATCHES = 8
 _SUFFICIENT_INLIERS, _SUFFICIENT_WEIGHT_RATIO = 25, 0.6
-_TRUSTED = 0.6
-"""As for tracks: beyond it sampling finds nothing better."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -228,12 +230,14 @@ class GuidedLocaliser:
             min_noise_px=_MIN_NOISE_PX * scale,
         )
         points = self.patches.scene_map.points[matches.point]
-        weight = _match_weights(matches.px / (_CELL_SIDE_PX * scale), self.patches.keyframe_count[matches.point])
+        weight = _match_weights(
+            matches.px / (_CELL_SIDE_PX * scale), self.patches.keyframe_count[matches.point]
+        )
         observations = make_observations(
             self.lens, np.array([0, len(points)]), points, matches.mid_row_px, weight
         )
         best = self._refined(observations, view.cam_from_map, criteria)
-        if best is None or best.inlier_weight_ratio < _TRUSTED:
+        if best is None or best.inlier_weight_ratio < TRUSTED_WEIGHT_RATIO:
             sampled = ransac_pose(self.lens, points, matches.mid_row_px, criteria)
             other = None if sampled is None else self._refined(observations, sampled, criteria)
             if other is not None and (best is None or other.inliers > best.inliers):
@@ -257,11 +261,8 @@ class GuidedLocaliser:
         )
 
 
-def _match_weights(cell: FloatArray, search_frame: IntArray) -> FloatArray:
-    """(N,) how much points count that are seen in cells (N,2) of the image and by so many keyframes (N,)."""
+def _match_weights(cell: FloatArray, keyframe_count: IntArray) -> FloatArray:
+    """X"""
     _, group, count = np.unique(np.floor(cell).astype(int), axis=0, return_inverse=True, return_counts=True)
-    return np.asarray(
-        search_frame
-        / (search_frame + _POINT_VARIANCE)
-        / np.maximum(1.0, count[np.ravel(group)] / _FULL_WEIGHT_PER_CELL)
-    )
+    crowding = np.maximum(1.0, count[np.ravel(group)] / _FULL_WEIGHT_PER_CELL)
+    return np.asarray(point_weights(keyframe_count) / crowding)

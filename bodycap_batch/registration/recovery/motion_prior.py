@@ -17,8 +17,16 @@ _LOSS_WIDTH = 4.0
 """Squared Mahalanobis distance at which a place, or a bend of the path, counts half."""
 _VELOCITY_SIGMA_JERKS, _ACCELERATION_SIGMA_JERKS = 30.0, 4.0
 """Velocity and acceleration that nothing is known of, in the camera's usual third differences."""
+MAX_DISAGREEMENT = 11.3
+"""x"""
 _NEIGHBOURS = 4
 _PRIOR = 1e-9
+
+
+def times_in_intervals(times_ns: IntArray) -> FloatArray:
+    """Return the times (N,) of frames since the first one, in median frame intervals."""
+    times = (times_ns - times_ns[0]).astype(np.float64)
+    return np.asarray(times / np.median(np.diff(times)))
 
 
 @dataclass(frozen=True, slots=True)

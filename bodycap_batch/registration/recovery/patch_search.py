@@ -290,7 +290,9 @@ def _render_patches(
     keyframe_rows, source_index = np.unique(keyframe, return_inverse=True)
     sources = [patches.pyramids[row] for row in keyframe_rows.tolist()]
     step = np.array([source.step_px[level.pyramid_level] for source in sources])[source_index]
-    limit = np.array([source.levels[level.pyramid_level].shape[::-1] for source in sources])[source_index] - 1.0
+    limit = (
+        np.array([source.levels[level.pyramid_level].shape[::-1] for source in sources])[source_index] - 1.0
+    )
     axis = np.arange(side) - side // 2
     grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2).astype(np.float32)
     offset = np.matmul(grid, (warp * step_px / step[:, None, None]).astype(np.float32).swapaxes(1, 2))

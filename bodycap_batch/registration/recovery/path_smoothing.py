@@ -6,16 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodycap_batch.config.lost_frames import LEAST_POSED
+from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_POSED
 from bodycap_batch.core.arrays import BoolArray
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.registration.recovery.guided_localisation import PoseEstimate
-from bodycap_batch.registration.recovery.motion_prior import MotionStatistics, smooth_centres
-
-_MAX_DISAGREEMENT = 11.3
-"""Squared Mahalanobis distance from the smoothed centre beyond which a pose stays as it was measured: 99 % of
-three axes. Either is wrong then, and nobody knows which."""
+from bodycap_batch.registration.recovery.motion_prior import (
+    MAX_DISAGREEMENT,
+    MotionStatistics,
+    smooth_centres,
+    times_in_intervals,
+)
 
 
 def smooth_weak_centres(path: Trajectory, adjustable: BoolArray | None = None) -> Trajectory:
@@ -45,7 +46,7 @@ def smooth_weak_centres(path: Trajectory, adjustable: BoolArray | None = None) -
     frames_with_pose = np.flatnonzero(path.localised)
     if len(frames_with_pose) < LEAST_POSED:
         return path
-    times = (path.times_ns - path.times_ns[0]) / np.median(np.diff(path.times_ns))
+    times = times_in_intervals(path.times_ns)
     statistics = MotionStatistics.estimate(times, path.gauge_from_cam[:, :3, 3])
     if statistics is None:
         return path
@@ -59,6 +60,11 @@ def smooth_weak_centres(path: Trajectory, adjustable: BoolArray | None = None) -
     smoothed = smooth_centres(np.arange(len(times)), times, positions, positions.keys() - weak, statistics)
     matrices = path.gauge_from_cam.copy()
     for frame in sorted(weak):
-        if (adjustable is None or adjustable[frame]) and smoothed.disagreement[frame] < _MAX_DISAGREEMENT:
+        if (adjustable is None or adjustable[frame]) and smoothed.disagreement[frame] < MAX_DISAGREEMENT:
             matrices[frame] = invert(estimates[frame].conditioned_on_centre(smoothed.positions[frame])[0])
     return replace(path, gauge_from_cam=matrices)
+
+
+def smooth_if_final(path: Trajectory) -> Trajectory:
+    """Smooth the weak centres of a trajectory, unless recovery follows: recovery needs poses as measured."""
+    return smooth_weak_centres(path) if (~path.localised).sum() < LEAST_LOST else path

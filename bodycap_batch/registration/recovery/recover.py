@@ -1,54 +1,106 @@
-"""Poses of lost frames, from what the map's points look like and from how the camera moves."""
+"""Recover the poses of lost frames from the appearance of map points and from the camera's motion."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.config import RegistrationOptions
-from bodycap_batch.config.lost_frames import LEAST_POSED
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.geometry import invert
-from bodycap_batch.model.optical_flow import sharpness
-from bodycap_batch.model.scene import FrameStatus, Map, Registration, Trajectory
+from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 from bodycap_batch.registration.poses.keyframe_requests import lost_intervals
 from bodycap_batch.registration.poses.pnp import AcceptanceCriteria
-from bodycap_batch.registration.poses.pose_outliers import isolated_poses
-from bodycap_batch.registration.poses.static_points import static_points
+from bodycap_batch.registration.poses.pose_outliers import ISOLATED_INLIER_FACTOR, isolated_poses
+from bodycap_batch.registration.poses.rig_members import RegisteredCamera
 from bodycap_batch.registration.recovery.guided_localisation import GuidedLocaliser, PoseEstimate
-from bodycap_batch.registration.recovery.motion_prior import MotionStatistics, SmoothedCentres, smooth_centres
-from bodycap_batch.registration.recovery.patch_search import (
-    KeyframePatches,
-    PredictedView,
-    Pyramid,
-    SearchLevel,
-    match_patches,
-    select_patches,
+from bodycap_batch.registration.recovery.motion_prior import (
+    MAX_DISAGREEMENT,
+    MotionStatistics,
+    SmoothedCentres,
+    smooth_centres,
+    times_in_intervals,
 )
 from bodycap_batch.registration.recovery.path_smoothing import smooth_weak_centres
+from bodycap_batch.registration.recovery.preparation import (
+    motion_statistics,
+    prepare_recovery,
+    remove_misplaced_keyframes,
+)
 from bodycap_batch.registration.recovery.propagation import LostInterval, Propagation
+from bodycap_batch.registration.recovery.search_images import (
+    estimate_exposure,
+    read_keyframe_patches,
+    read_pyramids,
+)
 
-_MAX_KEYFRAMES = 600
-"""Keyframes held in memory, half a megabyte each."""
 _SMOOTHING_MARGIN = 8
-_MAX_DISTANCE_FRAMES, _MAX_FRAMES = 90, 400
-"""Frames of a lost stretch from its ends or a seed that are looked at, and how many of them all in all: the
-nearest; bounds memory."""
-_EXPOSURE_CANDIDATES = (0.0, 0.3, 0.6)
-_EXPOSURE_FRAMES = 4
-_EXPOSURE_LEVEL = SearchLevel(pyramid_level=1, patch_side=21, search_radius=4, score=-1.0, limit_px=6.0)
+"""Frames on either side of an interval that are smoothed together with it. Evidence: none."""
 _MIN_INLIER_WEIGHT_RATIO = 0.5
-_MAX_DISAGREEMENT = 11.3
-"""Squared Mahalanobis distance between where a frame was found and its smoothed place: 99 % of three axes."""
-_LONE_EVIDENCE = 4
+"""Least ratio of the inliers' weight to that of all matches for an accepted pose. Evidence: none."""
 _MAX_PASSES = 5
-"""A walk goes as far as motion leads it; from poses smoothed and vouched for it goes further, until nothing
-more is found. Room131's right palm has 94 of 150 frames after the first round, 104 after the second, 108
-in the end (off by 2.6 cm both), a rendered one with arms thrown about 105, 107, 108 of 120."""
+"""Passes over the lost intervals. Each pass starts from the poses of the pass before and reaches farther.
+Evidence: docs/decisions/registration.md."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecoveryInputs:
+    """What `recover_lost_frames` needs besides the registration of the camera.
+
+    Attributes:
+        capture: All cameras; the camera to recover is the first one.
+        registrations: Cameras with their registrations, in the same order. They may be loaded one by one:
+            only one is held at a time.
+        maps: The maps that the cameras were registered against.
+        selection: The keyframes of the camera to recover.
+        in_rig: The poses were estimated from all cameras of a rig. They are then not prepared.
+    """
+
+    capture: Capture
+    registrations: Iterable[RegisteredCamera]
+    maps: Sequence[Map]
+    selection: KeyframeSelection
+    in_rig: bool
+
+
+def recover_lost_frames(
+    registration: Registration, inputs: RecoveryInputs, options: RegistrationOptions, context: StageContext
+) -> Registration:
+    """Recover the poses of one camera's lost frames.
+
+    The steps are: remove misplaced keyframes of all cameras from the map; remove weak poses next to lost
+    intervals and refine the map points; search the lost frames.
+
+    Args:
+        registration: The frames of the camera, as tracking left them.
+        inputs: All cameras, their registrations and the maps.
+        options: Acceptance limits.
+        context: Threads, progress and cancellation.
+
+    Returns:
+        The registration with more poses and a smoothed trajectory. Observations of recovered frames are not
+        kept.
+    """
+    gauge = registration.trajectory.gauge
+    scene_map = next(scene for scene in inputs.maps if scene.gauge == gauge)
+    trajectories: list[Trajectory] = []
+
+    def cameras() -> Iterable[RegisteredCamera]:
+        for camera in inputs.registrations:
+            trajectories.append(camera.registration.trajectory)
+            yield camera
+
+    scene_map = remove_misplaced_keyframes(scene_map, cameras(), inputs.selection, options)
+    if not inputs.in_rig:
+        own = RegisteredCamera(camera=inputs.capture.cameras[0], registration=registration)
+        scene_map, registration = prepare_recovery(
+            own, trajectories[1:], scene_map, inputs.selection, options, context.threads
+        )
+    return find_lost_poses(registration, scene_map, inputs.capture, options, context)
 
 
 def find_lost_poses(
@@ -79,10 +131,10 @@ def find_lost_poses(
     """
     path = registration.trajectory
     camera = capture.camera(path.camera)
-    lost, statistics = ~path.localised, _motion_statistics(path)
+    lost, statistics = ~path.localised, motion_statistics(path)
     if statistics is None:
         return registration
-    times = _times_in_intervals(path)
+    times = times_in_intervals(path.times_ns)
     localiser = _make_localiser(scene_map, capture, path, options, context)
     interval_search = _IntervalSearch(
         camera=camera,
@@ -109,25 +161,6 @@ def find_lost_poses(
     return replace(registration, trajectory=smooth_weak_centres(path, ~lost))
 
 
-def can_recover(path: Trajectory) -> bool:
-    """Whether a path has lost frames, and poses enough to look for them from."""
-    return _motion_statistics(path) is not None
-
-
-def _motion_statistics(path: Trajectory) -> MotionStatistics | None:
-    """How evenly a camera moves; None where no frame is lost or too few have poses."""
-    has_pose = path.localised
-    if has_pose.all() or has_pose.sum() < LEAST_POSED:
-        return None
-    return MotionStatistics.estimate(_times_in_intervals(path), path.gauge_from_cam[:, :3, 3])
-
-
-def _times_in_intervals(path: Trajectory) -> FloatArray:
-    """(N,) in frame intervals, from the first one on."""
-    times = (path.times_ns - path.times_ns[0]).astype(np.float64)
-    return np.asarray(times / np.median(np.diff(times)))
-
-
 def _make_localiser(
     scene_map: Map,
     capture: Capture,
@@ -143,13 +176,13 @@ def _make_localiser(
     interval_s = float(np.median(np.diff(path.times_ns))) * 1e-9
     localiser = GuidedLocaliser(
         lens=scene_map.cameras[camera.name],
-        patches=_keyframe_patches(scene_map, capture, camera, context),
+        patches=read_keyframe_patches(scene_map, capture, camera, context),
         criteria=criteria,
         exposure_ratio=0.0,
         readout_ratio=scene_map.readout_s.get(camera.name, 0.0) / interval_s,
         is_unmasked=camera.is_unmasked,
     )
-    return replace(localiser, exposure_ratio=_estimate_exposure(camera, localiser, path))
+    return replace(localiser, exposure_ratio=estimate_exposure(camera, localiser, path))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -183,7 +216,7 @@ class _IntervalSearch:
             start=start,
             stop=stop,
             times=self.times,
-            pyramids=_read_pyramids(self.camera, start, stop, sorted(seed_rows)),
+            pyramids=read_pyramids(self.camera, start, stop, sorted(seed_rows)),
             poses=poses,
             tracked_frames=self.tracked_frames,
             seed_poses={frame: invert(self.scene_map.map_from_cam[row]) for frame, row in seed_rows.items()},
@@ -225,7 +258,7 @@ def _accepted_poses(propagation: Propagation, criteria: AcceptanceCriteria) -> d
         if (
             estimate.inliers >= criteria.min_inliers
             and estimate.inlier_weight_ratio >= _MIN_INLIER_WEIGHT_RATIO
-            and smoothed.disagreement[frame] < _MAX_DISAGREEMENT
+            and smoothed.disagreement[frame] < MAX_DISAGREEMENT
             and sigma < criteria.max_sigma_depth * estimate.depth
         ):
             accepted[frame] = replace(estimate, cam_from_map=pose, covariance=covariance)
@@ -240,9 +273,9 @@ def _merge_into(
     inliers = path.inliers.copy()
     for frame, estimate in poses.items():
         has_pose[frame], inliers[frame] = True, estimate.inliers
-    isolated = isolated_poses(has_pose, inliers, _LONE_EVIDENCE * criteria.min_inliers) | _single_poses(
-        has_pose
-    )
+    isolated = isolated_poses(
+        has_pose, inliers, ISOLATED_INLIER_FACTOR * criteria.min_inliers
+    ) | _single_poses(has_pose)
     matrices, covariance = path.gauge_from_cam.copy(), path.covariance.copy()
     status, error_px = list(path.status), path.error_px.copy()
     for frame, estimate in poses.items():
@@ -269,7 +302,9 @@ def _single_poses(has_pose: BoolArray) -> BoolArray:
 
 def _localised_poses(path: Trajectory) -> dict[int, PoseEstimate]:
     """Poses that tracking found, by frame."""
-    return {frame: PoseEstimate.from_trajectory(path, frame) for frame in np.flatnonzero(path.localised).tolist()}
+    return {
+        frame: PoseEstimate.from_trajectory(path, frame) for frame in np.flatnonzero(path.localised).tolist()
+    }
 
 
 def _seed_keyframes(scene_map: Map, camera: str, lost: BoolArray) -> dict[int, int]:
@@ -277,73 +312,3 @@ def _seed_keyframes(scene_map: Map, camera: str, lost: BoolArray) -> dict[int, i
     rows = scene_map.keyframes_of(camera)
     frames = scene_map.keyframe_frame[rows]
     return {int(frame): int(row) for row, frame in zip(rows, frames, strict=True) if lost[frame]}
-
-
-def _keyframe_patches(
-    scene_map: Map, capture: Capture, camera: CaptureCamera, context: StageContext
-) -> KeyframePatches:
-    """The map's keyframes' pictures, of all cameras; evenly thinned out where they are very many."""
-    count = len(scene_map.keyframe_camera)
-    chosen = np.unique(np.linspace(0, count - 1, min(count, _MAX_KEYFRAMES)).round().astype(int))
-    pyramids: dict[int, Pyramid] = {}
-    relative_sharpness = np.zeros(count)
-    for name in sorted(set(scene_map.keyframe_camera)):
-        rows = np.intersect1d(scene_map.keyframes_of(name), chosen)
-        row_of = dict(zip(scene_map.keyframe_frame[rows].tolist(), rows.tolist(), strict=True))
-        for frame, grey in capture.camera(name).read(sorted(row_of)):
-            context.check_cancelled()
-            row = row_of[frame]
-            pyramids[row] = Pyramid.build(grey)
-            context.progress(len(pyramids), len(chosen), "keyframes of all cameras decoded")
-            relative_sharpness[row] = sharpness(pyramids[row].levels[0])
-        relative_sharpness[rows] /= (
-            max(float(np.median(relative_sharpness[rows])), 1e-9) if len(rows) else 1.0
-        )
-    keyframe_count: IntArray = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))
-    usable = static_points(camera, scene_map)
-    return KeyframePatches(
-        scene_map=scene_map,
-        pyramids=pyramids,
-        sharpness=relative_sharpness,
-        usable=usable,
-        keyframe_count=keyframe_count,
-    )
-
-
-def _read_pyramids(
-    camera: CaptureCamera, start: int, stop: int, seed_frames: list[int]
-) -> dict[int, Pyramid]:
-    """Frames of a lost stretch near its ends or a seed, and those on either side of it."""
-    frames = np.arange(max(0, start - 1), min(len(camera.times_ns), stop + 1))
-    reference_frames = np.array([start, stop - 1, *seed_frames])
-    distance = np.abs(frames[:, None] - reference_frames).min(axis=1)
-    nearest = np.argsort(distance, kind="stable")[:_MAX_FRAMES]
-    frames = frames[np.sort(nearest[distance[nearest] <= _MAX_DISTANCE_FRAMES])]
-    return {frame: Pyramid.build(grey) for frame, grey in camera.read(frames)}
-
-
-def _estimate_exposure(camera: CaptureCamera, localiser: GuidedLocaliser, path: Trajectory) -> float:
-    """Share of the time between two frames that the shutter is open, as blurred frames with poses show it."""
-    has_pose = path.localised
-    pairs = np.flatnonzero(has_pose[1:] & has_pose[:-1]) + 1
-    rotations = path.gauge_from_cam[:, :3, :3]
-    cosine = np.einsum("nij,nij->n", rotations[pairs - 1], rotations[pairs])
-    fastest = np.sort(pairs[np.argsort(cosine, kind="stable")[:_EXPOSURE_FRAMES]])
-    totals = np.zeros(len(_EXPOSURE_CANDIDATES))
-    for frame, grey in camera.read(fastest):
-        pose, neighbour_pose = (invert(path.gauge_from_cam[index]) for index in (frame, frame - 1))
-        view = PredictedView(
-            lens=localiser.lens,
-            pyramid=Pyramid.build(grey),
-            cam_from_map=pose,
-            neighbour_pose=neighbour_pose,
-            exposure_ratio=0.0,
-            readout_ratio=localiser.readout_ratio,
-        )
-        rows = select_patches(localiser.patches, view)
-        for number, ratio in enumerate(_EXPOSURE_CANDIDATES):
-            matches = match_patches(
-                localiser.patches, replace(view, exposure_ratio=ratio), rows, _EXPOSURE_LEVEL
-            )
-            totals[number] += matches.score[localiser.is_unmasked(matches.px)].sum()
-    return _EXPOSURE_CANDIDATES[int(np.argmax(totals))]

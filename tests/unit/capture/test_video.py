@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import weakref
 from collections.abc import Generator, Iterator
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -19,7 +20,6 @@ from bodycap_batch.capture.indexing import index_video
 from bodycap_batch.capture.prefetch import prefetch
 from bodycap_batch.capture.video import open_container
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
-from bodycap_batch.core.context import THREADS_VARIABLE
 from bodycap_batch.core.errors import CaptureError
 from tests.videos import textured_frame, write_tone, write_video
 
@@ -149,11 +149,10 @@ def test_an_error_ahead_arrives_in_its_place() -> None:
         next(stream)
 
 
-def test_one_thread_decodes_what_is_asked_for_and_nothing_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_thread_decodes_what_is_asked_for_and_nothing_ahead() -> None:
     made: list[int] = []
     closed: list[str] = []
-    monkeypatch.setenv(THREADS_VARIABLE, "1")
-    stream = prefetch(counting(made, closed))
+    stream = prefetch(counting(made, closed), threads=1)
     assert [next(stream) for _ in range(5)] == made == list(range(5))
     stream.close()
     assert closed == [threading.current_thread().name]
@@ -171,13 +170,12 @@ def remuxed(source: Path, target: Path, shift: int = 0, skip: int = 0, **options
     return target
 
 
-@pytest.mark.parametrize("threads", ["1", "2"])
+@pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("codec", ["libx264", "mpeg4", "libx265"])
 def test_frames_that_nothing_is_built_on_are_passed_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, codec: str, threads: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, codec: str, threads: int
 ) -> None:
-    monkeypatch.setenv(THREADS_VARIABLE, threads)
-    camera = opened(write_video(tmp_path / "a.mp4", FRAMES, codec=codec, gop=40))
+    camera = replace(opened(write_video(tmp_path / "a.mp4", FRAMES, codec=codec, gop=40)), threads=threads)
     stream = dict(camera.grey_frames())
     decoded: list[VideoFrame] = []
     original = decoding._ForwardDecoder._decoded
@@ -333,12 +331,11 @@ def test_sound_beside_the_pictures_is_left_alone(tmp_path: Path) -> None:
     assert [shown_index(image) for _, image in camera.grey_frames()] == list(range(10))
 
 
-@pytest.mark.parametrize(("task", "process", "expected"), [("2", "1", 2), ("1", "4", 1), ("", "3", 3)])
+@pytest.mark.parametrize(("task", "process", "expected"), [(2, "1", 2), (1, "4", 1), (0, "3", 3)])
 def test_a_task_decodes_on_the_threads_it_was_given(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, task: str, process: str, expected: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, task: int, process: str, expected: int
 ) -> None:
     video = index_video(write_video(tmp_path / "a.mp4", FRAMES[:3]))
-    monkeypatch.setenv(THREADS_VARIABLE, task)
     monkeypatch.setenv("OMP_NUM_THREADS", process)
     with open_container(video.path) as container:
-        assert decoding.open_stream(container, video).codec_context.thread_count == expected
+        assert decoding.open_stream(container, video, task).codec_context.thread_count == expected

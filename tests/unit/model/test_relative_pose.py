@@ -183,10 +183,12 @@ def test_what_the_rig_left_outlasts_the_search_for_lost_frames(
     relative = estimate_relative_pose(*(each.registration.trajectory for each in cameras), 0)
     write_bundle(RigPoses(relative=(relative,)), folders[0], RIG_POSES)
     capture = SimpleNamespace(cameras=tuple(each.camera for each in cameras))
-    monkeypatch.setattr(recover, "load_capture", lambda _: capture)
+    monkeypatch.setattr(recover, "load_capture", lambda *_: capture)
     monkeypatch.setattr(recover, "load_map", lambda _: SimpleNamespace(maps=(scene_map,)))
     monkeypatch.setattr(recover, "load_keyframes", lambda _: selection)
-    monkeypatch.setattr("bodycap_batch.registration.find_lost_poses", lambda found, *_: found)
+    monkeypatch.setattr(
+        "bodycap_batch.registration.recovery.recover.find_lost_poses", lambda found, *_: found
+    )
     out = tmp_path / "out"
     out.mkdir()
     arguments = {"registrations": [str(folder) for folder in folders], "map": "", "selection": ""}

@@ -103,7 +103,9 @@ def the_map(film: Film, keyframes: range) -> Any:
     return model
 
 
-def camera_of(film: Film, *, known: bool = False, stated_s: float = 0.0, may_be_sideways: bool = False) -> Any:
+def camera_of(
+    film: Film, *, known: bool = False, stated_s: float = 0.0, may_be_sideways: bool = False
+) -> Any:
     return SimpleNamespace(
         camera=replace(LENS, sideways=film.sideways and known),
         may_be_sideways=may_be_sideways,

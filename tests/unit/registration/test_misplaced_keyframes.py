@@ -11,12 +11,13 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, transform_points
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
-from bodycap_batch.registration import RegisteredCamera, remove_misplaced_keyframes
+from bodycap_batch.registration import RegisteredCamera
 from bodycap_batch.registration.poses.misplaced_keyframes import (
     find_misplaced_keyframes,
     map_without_keyframes,
 )
 from bodycap_batch.registration.poses.pnp import AcceptanceCriteria
+from bodycap_batch.registration.recovery.preparation import remove_misplaced_keyframes
 from bodycap_batch.registration.tracking.klt import Tracks
 
 _LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([400.0, 400.0, 320.0, 240.0]))

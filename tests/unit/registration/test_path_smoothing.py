@@ -10,8 +10,7 @@ import pytest
 from bodycap_batch.config.lost_frames import LEAST_LOST
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.scene import FrameStatus, Trajectory
-from bodycap_batch.registration.recovery.path_smoothing import smooth_weak_centres
-from bodycap_batch.registration.stage import _smooth_if_final
+from bodycap_batch.registration.recovery.path_smoothing import smooth_if_final, smooth_weak_centres
 
 COUNT = 90
 WEAK = np.arange(40, 50)
@@ -130,7 +129,7 @@ def test_where_lost_frames_are_looked_for_next_the_path_is_left_to_that(lost: in
     path = replace(
         path, gauge_from_cam=path.gauge_from_cam * none, covariance=path.covariance * none, status=status
     )
-    after = _smooth_if_final(path)
+    after = smooth_if_final(path)
     assert (after.gauge_from_cam[WEAK] != path.gauge_from_cam[WEAK]).any() == moves
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bodycap_batch.core.context import THREADS_VARIABLE
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp, so3_log
 from bodycap_batch.model.scene import FrameStatus
@@ -98,12 +97,11 @@ def test_threads_of_a_task_solve_the_same_poses(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(batched_pnp, "_gauss_newton_step", noted)
     found = {}
-    for threads, name in (("1", "MainThread"), ("2", "poses")):
-        monkeypatch.setenv(THREADS_VARIABLE, threads)
+    for threads, name in ((1, "MainThread"), (2, "poses")):
         workers.clear()
-        found[threads] = batched_pnp.refine_poses(views, start, LIMITS.max_error_px)
+        found[threads] = batched_pnp.refine_poses(views, start, LIMITS.max_error_px, threads)
         assert workers == {name}
-    assert (found["1"] == found["2"]).all()
+    assert (found[1] == found[2]).all()
 
 
 def test_the_lens_is_asked_for_some_views_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
