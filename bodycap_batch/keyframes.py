@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bodycap_batch.capture import CaptureCamera, FrameKeeper, Shot
+from bodycap_batch.capture import CaptureCamera, FrameCandidate, FrameKeeper
 from bodycap_batch.config import KeyframeOptions
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
@@ -16,13 +16,13 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.optical_flow import (
     GreyImage,
     Pixels,
-    bearings,
-    coarse_image,
     detect_corners,
     fit_rotation,
+    make_coarse_image,
     pixel_scale,
     sharpness,
     track_points,
+    unit_directions,
 )
 from bodycap_batch.model.scene import KeyframeSelection
 
@@ -43,7 +43,7 @@ class _Candidate:
     image: GreyImage
     sharpness: float
     survival: float
-    shot: Shot
+    shot: FrameCandidate
 
 
 @dataclass(slots=True)
@@ -86,7 +86,7 @@ class _Tracker:
     def _rays(self) -> FloatArray:
         if self.image is None:
             return np.zeros((0, 3))
-        return bearings(self.camera.unproject(self.px.astype(np.float64) * self._enlarged(self.image)))
+        return unit_directions(self.camera.unproject(self.px.astype(np.float64) * self._enlarged(self.image)))
 
     def survival(self) -> float:
         """Share of the keyframe's corners still tracked."""
@@ -101,7 +101,7 @@ class _Tracker:
         if usable.sum() < _MIN_TRACKS:
             return 0.0
         first, second = self.start_rays[usable], rays[usable]
-        rotation = fit_rotation(first, second, rounds=3)
+        rotation = fit_rotation(first, second, iterations=3)
         return float(np.median(np.linalg.norm(second - first @ rotation.T, axis=1))) * self.camera.focal_px
 
     def noise_px(self) -> float:
@@ -142,12 +142,12 @@ def select_keyframes(
     novelty = [0.0]
     tracker = _Tracker(camera.camera, _coarse_mask(camera))
     recent: deque[_Candidate] = deque(maxlen=options.window)
-    see, keep = (_no_keeping, _no_keeping) if keeper is None else (keeper.see, keeper.choose)
-    for shot in camera.shots():
+    see, keep = (_no_keeping, _no_keeping) if keeper is None else (keeper.add_frame, keeper.add_keyframe)
+    for shot in camera.frame_candidates():
         context.check_cancelled()
         index = shot.index
         sharp[index] = sharpness(shot.grey)
-        image = coarse_image(shot.grey)
+        image = make_coarse_image(shot.grey)
         see(shot)
         if not chosen:
             chosen.append(index)
@@ -211,10 +211,10 @@ def _within_budget(chosen: list[int], novelty: list[float], most: int) -> list[i
 def _coarse_mask(camera: CaptureCamera) -> BoolArray | None:
     if camera.mask is None:
         return None
-    return np.asarray(coarse_image(np.where(camera.mask, 255, 0).astype(np.uint8)) > 127)
+    return np.asarray(make_coarse_image(np.where(camera.mask, 255, 0).astype(np.uint8)) > 127)
 
 
-def _no_keeping(_: Shot) -> None:
+def _no_keeping(_: FrameCandidate) -> None:
     """Keep nothing."""
 
 

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from bodycap_batch.capture.decoding import decode_frames
-from bodycap_batch.capture.images import Colours, Image, Planes, grey_of, work_image, work_planes
-from bodycap_batch.capture.kept import KeptFrames, Shot, keeps_all
-from bodycap_batch.capture.prefetch import prefetched
+from bodycap_batch.capture.images import Colours, Image, Planes, grey_from_planes, work_image, work_planes
+from bodycap_batch.capture.kept import FrameCandidate, KeptFrames, should_keep_all
+from bodycap_batch.capture.prefetch import prefetch
 from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.core.errors import CaptureError
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_MOSTLY = 0.75
+_MIN_KEPT_RATIO = 0.75
 """Share of the frames asked for that must be kept: with many others between them the video is decoded from
 end to end anyway."""
 
@@ -64,11 +64,12 @@ class CaptureCamera:
     offset_s: float
     rolling_shutter_s: float
     rolling_shutter_known: bool = True
-    turned: bool = False
+    may_be_sideways: bool = False
     notes: tuple[str, ...] = ()
     videos: tuple[VideoFile, ...] = field(default=(), repr=False)
     mask: BoolArray | None = field(default=None, repr=False)
     kept: KeptFrames | None = field(default=None, repr=False)
+    threads: int = 0
 
     def __post_init__(self) -> None:
         count = len(self.frame_numbers)
@@ -81,7 +82,7 @@ class CaptureCamera:
         """(N,) frame times on the common clock."""
         return np.asarray(self.times_ns + round(self.offset_s * 1e9), dtype=np.int64)
 
-    def sees_room(self, px: npt.NDArray[Any]) -> BoolArray:
+    def is_unmasked(self, px: npt.NDArray[Any]) -> BoolArray:
         """Which pixels (N,2), COLMAP origin, lie where the mask lets the room be seen."""
         if self.mask is None:
             return np.ones(len(px), dtype=bool)
@@ -142,41 +143,41 @@ class CaptureCamera:
             wanted[0] < 0 or wanted[-1] >= len(self.frame_numbers) or (np.diff(wanted) <= 0).any()
         ):
             raise ValueError("indices must increase and lie inside the video")
-        return prefetched(self._decode(wanted, colour=colour))
+        return prefetch(self._decode(wanted, colour=colour), self.threads)
 
-    def shots(self) -> Generator[Shot, None, None]:
+    def frame_candidates(self) -> Generator[FrameCandidate, None, None]:
         """Stream all frames as they may be kept, decoded ahead in a thread.
 
         Raises:
             CaptureError: A frame cannot be decoded.
         """
-        return prefetched(self._shots())
+        return prefetch(self._shots(), self.threads)
 
     @property
-    def keeps_all(self) -> bool:
+    def should_keep_all(self) -> bool:
         """True where the videos are so large that all of their frames are worth keeping at the work size."""
         size = (self.camera.width_px, self.camera.height_px)
-        return any(keeps_all(video.stored_size, size) for video in self.videos)
+        return any(should_keep_all(video.stored_size, size) for video in self.videos)
 
-    def _shots(self) -> Generator[Shot, None, None]:
+    def _shots(self) -> Generator[FrameCandidate, None, None]:
         size = (self.camera.width_px, self.camera.height_px)
-        everything = self.keeps_all
+        everything = self.should_keep_all
         indices = np.arange(len(self.frame_numbers), dtype=np.int64)
         for index, frame, video in self._frames(indices):
             if everything:
                 # A large frame is let go of at once.
                 planes = work_planes(frame, video.orientation, size)
-                yield Shot(index, grey_of(planes, size), partial(_same, planes))
+                yield FrameCandidate(index, grey_from_planes(planes, size), partial(_same, planes))
             else:
                 grey = work_image(frame, video.orientation, size, colour=False)
-                yield Shot(index, grey, partial(work_planes, frame, video.orientation, size))
+                yield FrameCandidate(index, grey, partial(work_planes, frame, video.orientation, size))
 
     def _decode(self, indices: IntArray, *, colour: bool) -> Generator[tuple[int, Image], None, None]:
         size = (self.camera.width_px, self.camera.height_px)
         held = np.zeros(len(indices), dtype=bool) if self.kept is None else self.kept.holds(indices)
         copies: Iterator[Image] = iter(())
-        if self.kept is not None and held.sum() >= _MOSTLY * len(held):
-            copies = self.kept.read(indices[held], size, colour=colour)
+        if self.kept is not None and held.sum() >= _MIN_KEPT_RATIO * len(held):
+            copies = self.kept.read(indices[held], size, colour=colour, threads=self.threads)
         else:
             held[:] = False
         others = self._frames(indices[~held])
@@ -199,7 +200,9 @@ class CaptureCamera:
             numbers = self.frame_numbers[indices] - first
             inside = (numbers >= 0) & (numbers < len(video.pts))
             mine = indices[inside]
-            for index, (_, frame) in zip(mine, decode_frames(video, numbers[inside]), strict=True):
+            for index, (_, frame) in zip(
+                mine, decode_frames(video, numbers[inside], self.threads), strict=True
+            ):
                 yield int(index), frame, video
             first += len(video.pts)
 

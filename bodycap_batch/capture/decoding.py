@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bodycap_batch.capture.video import COPY_AGAIN, VideoFile, open_container, reason_of, video_stream
+from bodycap_batch.capture.video import COPY_AGAIN, VideoFile, error_reason, open_container, video_stream
 from bodycap_batch.core.arrays import IntArray
-from bodycap_batch.core.context import THREADS_VARIABLE
 from bodycap_batch.core.errors import CaptureError
 
 if TYPE_CHECKING:
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from av.video.stream import VideoStream
 
 
-def decode_frames(video: VideoFile, indices: IntArray) -> Iterator[tuple[int, VideoFrame]]:
+def decode_frames(video: VideoFile, indices: IntArray, threads: int = 0) -> Iterator[tuple[int, VideoFrame]]:
     """Decode the frames with these increasing indices.
 
     Frames between them that no other frame is built on (most B-frames of H.264) are not decoded.
@@ -29,21 +28,21 @@ def decode_frames(video: VideoFile, indices: IntArray) -> Iterator[tuple[int, Vi
     """
     import av
 
-    cursor = _Cursor(video, indices)
+    cursor = _ForwardDecoder(video, indices, threads)
     try:
         for wanted in map(int, indices):
             frame = cursor.advance(wanted)
-            if frame is None and not cursor.plain:
+            if frame is None and not cursor.sequential:
                 # Some containers seek badly (MPEG program streams): the plain way, from the start.
                 cursor.close()
-                cursor = _Cursor(video)
+                cursor = _ForwardDecoder(video, None, threads)
                 frame = cursor.advance(wanted)
             if frame is None:
-                raise _lost(video, wanted)
+                raise _undecodable_frame(video, wanted)
             yield wanted, frame
     except av.error.FFmpegError as error:
         raise CaptureError(
-            f"decoding fails after frame {cursor.position} ({reason_of(error)})",
+            f"decoding fails after frame {cursor.position} ({error_reason(error)})",
             path=video.path,
             hint=COPY_AGAIN,
         ) from error
@@ -51,7 +50,7 @@ def decode_frames(video: VideoFile, indices: IntArray) -> Iterator[tuple[int, Vi
         cursor.close()
 
 
-def first_frame(video: VideoFile) -> tuple[VideoFrame, bool]:
+def first_frame(video: VideoFile, threads: int = 0) -> tuple[VideoFrame, bool]:
     """The first frame that decodes, and whether the codec reorders frames.
 
     Raises:
@@ -60,29 +59,28 @@ def first_frame(video: VideoFile) -> tuple[VideoFrame, bool]:
     import av
 
     with open_container(video.path) as container:
-        stream = decoder(container, video)
+        stream = open_stream(container, video, threads)
         try:
             for frame in container.decode(stream):
                 return frame, bool(stream.codec_context.has_b_frames)
         except av.error.FFmpegError as error:
             raise CaptureError(
-                f"no frame of it can be decoded ({reason_of(error)})", path=video.path, hint=COPY_AGAIN
+                f"no frame of it can be decoded ({error_reason(error)})", path=video.path, hint=COPY_AGAIN
             ) from error
     raise CaptureError("no frame of it can be decoded", path=video.path, hint=COPY_AGAIN)
 
 
-def decoder(container: InputContainer, video: VideoFile) -> VideoStream:
+def open_stream(container: InputContainer, video: VideoFile, threads: int = 0) -> VideoStream:
     """The video's stream, decoded on as many threads as there are for it."""
     stream = video_stream(container, video.path)
     stream.thread_type = "AUTO"
     # The task's threads, else the process's, else all processors. (In a task's process the libraries' own
     # pools are pinned to one.)
-    told = os.environ.get(THREADS_VARIABLE) or os.environ.get("OMP_NUM_THREADS") or "0"
-    stream.codec_context.thread_count = int(told)
+    stream.codec_context.thread_count = threads or int(os.environ.get("OMP_NUM_THREADS") or "0")
     return stream
 
 
-class _Cursor:
+class _ForwardDecoder:
     """A decoder's place in a video, moving forwards only.
 
     Args:
@@ -90,14 +88,14 @@ class _Cursor:
         indices: The frames that will be asked for: others may be passed over. Without them all are decoded.
     """
 
-    def __init__(self, video: VideoFile, indices: IntArray | None = None) -> None:
+    def __init__(self, video: VideoFile, indices: IntArray | None, threads: int) -> None:
         self.position = -1  # index of the last decoded frame, −1 before the first
-        self.plain = indices is None or video.counted
+        self.sequential = indices is None or video.counted
         self._video = video
         self._container = open_container(video.path)
-        self._stream = decoder(self._container, video)
+        self._stream = open_stream(self._container, video, threads)
         # The halves of an interlaced frame may come one by one; AV1's decoder loses the first frame by it.
-        skips = indices is not None and not self.plain and not video.interlaced
+        skips = indices is not None and not self.sequential and not video.interlaced
         skips = skips and self._stream.codec_context.name == "h264"
         self._wanted = frozenset(video.pts[indices].tolist()) if skips else None
         self._frames = self._decoded()
@@ -109,7 +107,7 @@ class _Cursor:
 
     def advance(self, wanted: int) -> VideoFrame | None:
         """Decode up to a frame; None where it does not come."""
-        if not self.plain:
+        if not self.sequential:
             keys = self._key_index[: int(np.searchsorted(self._key_index, wanted, side="right"))]
             if len(keys) and keys[-1] > self.position + 1:
                 self._seek(int(keys[-1]))
@@ -139,7 +137,7 @@ class _Cursor:
             yield from self._stream.decode(packet)
 
 
-def _lost(video: VideoFile, index: int) -> CaptureError:
+def _undecodable_frame(video: VideoFile, index: int) -> CaptureError:
     seconds = float((int(video.pts[index]) - int(video.pts[0])) * video.time_base)
     return CaptureError(
         f"frame {index} (at {seconds:.2f} s) cannot be decoded",

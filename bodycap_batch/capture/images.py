@@ -24,7 +24,7 @@ _LUMA_FORMATS = frozenset(
 ) | {"nv12", "nv21", "nv16", "gray"}
 _FULL_RANGE = 2
 # Studio range to full range (ITU-R BT.601: black 16, white 235).
-_EXPAND = np.clip(np.round((np.arange(256) - 16.0) * (255.0 / 219.0)), 0, 255).astype(np.uint8)
+_STUDIO_TO_FULL = np.clip(np.round((np.arange(256) - 16.0) * (255.0 / 219.0)), 0, 255).astype(np.uint8)
 
 
 def work_image(
@@ -47,22 +47,22 @@ def work_image(
     width, height = shown or (frame.width, frame.height)
     if colour or frame.format.name not in _LUMA_FORMATS:
         picture = np.asarray(frame.to_ndarray(format="rgb24" if colour else "gray"), dtype=np.uint8)
-        return _resized(picture[:height, :width], orientation, size)
-    image = _resized(_plane(frame, 0)[:height, :width], orientation, size)
-    return image if _is_full_range(frame) else _expanded(image)
+        return _resize_upright(picture[:height, :width], orientation, size)
+    image = _resize_upright(_plane_array(frame, 0)[:height, :width], orientation, size)
+    return image if _is_full_range(frame) else _expand_range(image)
 
 
-def grey_of(planes: tuple[Planes, Colours], size: tuple[int, int]) -> Image:
+def grey_from_planes(planes: tuple[Planes, Colours], size: tuple[int, int]) -> Image:
     """Grey (H,W), full range, of what `work_planes` made."""
     luma = np.ascontiguousarray(planes[0][: size[1], : size[0]])
-    return luma if planes[1][0] == _FULL_RANGE else _expanded(luma)
+    return luma if planes[1][0] == _FULL_RANGE else _expand_range(luma)
 
 
-def _expanded(luma: Image) -> Image:
+def _expand_range(luma: Image) -> Image:
     """Luma of studio range in full range."""
     import cv2
 
-    return np.asarray(cv2.LUT(luma, _EXPAND), dtype=np.uint8)
+    return np.asarray(cv2.LUT(luma, _STUDIO_TO_FULL), dtype=np.uint8)
 
 
 def work_planes(frame: VideoFrame, orientation: Orientation, size: tuple[int, int]) -> tuple[Planes, Colours]:
@@ -77,9 +77,11 @@ def work_planes(frame: VideoFrame, orientation: Orientation, size: tuple[int, in
         # Left to itself it makes studio range of grey and of what only its format tells to be full.
         frame = frame.reformat(format="yuv420p", dst_color_range=_FULL_RANGE if full else None)
     half = ((size[0] + 1) // 2, (size[1] + 1) // 2)
-    luma = _resized(_plane(frame, 0), orientation, size)
+    luma = _resize_upright(_plane_array(frame, 0), orientation, size)
     luma = np.pad(luma, ((0, size[1] % 2), (0, size[0] % 2)), mode="edge")
-    chroma = [_resized(_plane(frame, number), orientation, half).reshape(-1) for number in (1, 2)]
+    chroma = [
+        _resize_upright(_plane_array(frame, number), orientation, half).reshape(-1) for number in (1, 2)
+    ]
     flat = np.concatenate([luma.reshape(-1), *chroma])
     return flat.reshape(-1, luma.shape[1]), colours
 
@@ -88,14 +90,14 @@ def _is_full_range(frame: VideoFrame) -> bool:
     return frame.format.name.startswith(("yuvj", "gray")) or frame.color_range == _FULL_RANGE
 
 
-def _plane(frame: VideoFrame, number: int) -> Image:
+def _plane_array(frame: VideoFrame, number: int) -> Image:
     """A view of a plane, without the padding of its rows."""
     plane = frame.planes[number]
     rows = np.asarray(memoryview(plane), dtype=np.uint8).reshape(-1, plane.line_size)
     return rows[: plane.height, : plane.width]
 
 
-def _resized(image: Image, orientation: Orientation, size: tuple[int, int]) -> Image:
+def _resize_upright(image: Image, orientation: Orientation, size: tuple[int, int]) -> Image:
     upright = turn_upright(image, orientation)
     if (upright.shape[1], upright.shape[0]) == size:
         return np.array(upright, order="C")

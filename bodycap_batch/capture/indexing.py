@@ -15,9 +15,9 @@ from bodycap_batch.capture.decoding import first_frame
 from bodycap_batch.capture.video import (
     COPY_AGAIN,
     VideoFile,
+    error_reason,
     open_container,
-    orientation_of,
-    reason_of,
+    orientation_from_frame,
     video_stream,
 )
 from bodycap_batch.core.arrays import IntArray
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 # Later than any Unix time of a recording, and far from the end of 64-bit nanoseconds.
 _MAX_SECONDS = 4e9
 # HDV's and AVCHD's 4:3 is the usual one, television's and anamorphic lenses' lie between 1:2 and 2:1.
-_THINNEST = Fraction(2, 5)
+_MIN_PIXEL_ASPECT = Fraction(2, 5)
 # Sizes rounded to even numbers; stretching them would blur every picture for less than a pixel.
-_SQUARE = 0.004
+_SQUARE_TOLERANCE = 0.004
 
 
-def index_video(path: Path) -> VideoFile:
+def index_video(path: Path, threads: int = 0) -> VideoFile:
     """List a video's frames without decoding them (one frame is decoded, for its orientation).
 
     Raises:
@@ -65,7 +65,7 @@ def index_video(path: Path) -> VideoFile:
         focal_35mm=_focal_35mm(metadata),
         pixel_aspect=pixel_aspect,
     )
-    return _with_first_frame(video, container_format)
+    return _with_first_frame(video, container_format, threads)
 
 
 def _scan_packets(
@@ -88,7 +88,9 @@ def _scan_packets(
                 key.append(packet.pts)
     except av.error.FFmpegError as error:
         raise CaptureError(
-            f"the video breaks off after {len(pts)} frames ({reason_of(error)})", path=path, hint=COPY_AGAIN
+            f"the video breaks off after {len(pts)} frames ({error_reason(error)})",
+            path=path,
+            hint=COPY_AGAIN,
         ) from error
     if read < listed:
         message = f"the video is cut short: {read} of the {listed} frames its index lists"
@@ -112,8 +114,8 @@ def _nominal_fps(pts: IntArray, time_base: Fraction, rate: Fraction | None) -> f
 def _pixel_aspect(stated: Fraction | None) -> Fraction:
     """Width of a stored pixel over its height; square where nothing, or what no camera makes, is stated."""
     aspect = Fraction(stated or 1)
-    usual = _THINNEST <= aspect <= 1 / _THINNEST
-    return aspect if usual and abs(aspect - 1) > _SQUARE else Fraction(1)
+    usual = _MIN_PIXEL_ASPECT <= aspect <= 1 / _MIN_PIXEL_ASPECT
+    return aspect if usual and abs(aspect - 1) > _SQUARE_TOLERANCE else Fraction(1)
 
 
 def _creation_time(metadata: dict[str, str]) -> float | None:
@@ -138,16 +140,16 @@ def _focal_35mm(metadata: dict[str, str]) -> float | None:
     return None
 
 
-def _with_first_frame(video: VideoFile, container_format: str) -> VideoFile:
+def _with_first_frame(video: VideoFile, container_format: str, threads: int) -> VideoFile:
     """Decode one frame: the size and display matrix a decoder delivers are the ones that count.
 
     Frames before the first that decodes (a stream cut inside a group of pictures) are left out.
     """
-    frame, reordered = first_frame(video)
+    frame, reordered = first_frame(video, threads)
     video = replace(
         video,
         stored_size=(frame.width, frame.height),
-        orientation=orientation_of(frame),
+        orientation=orientation_from_frame(frame),
         interlaced=bool(frame.interlaced_frame),
     )
     if container_format == "avi" and reordered:

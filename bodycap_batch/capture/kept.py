@@ -17,16 +17,16 @@ from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.core.arrays import BoolArray, IntArray, set_array
 from bodycap_batch.formats.mp4 import TIME_BASE, Quality, VideoWriter
 
-NAME = "kept"
+KEPT_NAME = "kept"
 """Of the bundle in a keyframe artefact, and of the video beside it."""
 _FPS = 30
 """Nominal: frames are known by their number."""
-_STEP = TIME_BASE // _FPS
-_LARGE = 2.0
+_FRAME_TICKS = TIME_BASE // _FPS
+_LARGE_RATIO = 2.0
 """Times the pixels worked at, from which on decoding the video again costs more than writing and reading all
 of its frames at the work size (4K: 66 ms of a core a frame against 9)."""
-_GROUP = 12
-_UPRIGHT = ((1, 0), (0, 1))
+_GROUP_FRAMES = 12
+_IDENTITY_ORIENTATION = ((1, 0), (0, 1))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,18 +54,20 @@ class KeptFrames:
         """Which frames of a camera are here."""
         return np.isin(indices, self.frames)
 
-    def read(self, indices: IntArray, size: tuple[int, int], *, colour: bool) -> Generator[Image, None, None]:
+    def read(
+        self, indices: IntArray, size: tuple[int, int], *, colour: bool, threads: int = 0
+    ) -> Generator[Image, None, None]:
         """Grey (H,W) or RGB (H,W,3) images of kept frames, increasing, at (width, height).
 
         Raises:
             CaptureError: One cannot be decoded.
         """
         own = (self.width_px, self.height_px)
-        for _, frame in decode_frames(self._video(), np.searchsorted(self.frames, indices)):
-            yield work_image(frame, _UPRIGHT, size, colour=colour, shown=own)
+        for _, frame in decode_frames(self._video(), np.searchsorted(self.frames, indices), threads):
+            yield work_image(frame, _IDENTITY_ORIENTATION, size, colour=colour, shown=own)
 
     def _video(self) -> VideoFile:
-        pts = np.arange(len(self.frames), dtype=np.int64) * _STEP
+        pts = np.arange(len(self.frames), dtype=np.int64) * _FRAME_TICKS
         return VideoFile(
             path=self.path,
             pts=pts,
@@ -74,12 +76,12 @@ class KeptFrames:
             fps=float(_FPS),
             duration_ns=len(pts) * 10**9 // _FPS,
             stored_size=(self.width_px, self.height_px),
-            orientation=_UPRIGHT,
+            orientation=_IDENTITY_ORIENTATION,
         )
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
+class FrameCandidate:
     """A frame that may be kept.
 
     Attributes:
@@ -93,13 +95,13 @@ class Shot:
     planes: Callable[[], tuple[Planes, Colours]]
 
 
-def keeps_all(stored_size: tuple[int, int], work_size: tuple[int, int]) -> bool:
+def should_keep_all(stored_size: tuple[int, int], work_size: tuple[int, int]) -> bool:
     """True for videos so large that all of their frames are kept, very nearly as they are.
 
     Of others the keyframes are, without any loss where they have 8 bits and 4:2:0 chroma, else within a level
     of grey: these alone are read more than twice.
     """
-    return stored_size[0] * stored_size[1] >= _LARGE * work_size[0] * work_size[1]
+    return stored_size[0] * stored_size[1] >= _LARGE_RATIO * work_size[0] * work_size[1]
 
 
 @dataclass(slots=True)
@@ -116,22 +118,22 @@ class FrameKeeper:
     folder: Path
     width_px: int
     height_px: int
-    everything: bool
+    keep_all: bool
     _frames: list[int] = field(default_factory=list)
     _colours: Colours = (0, 0)
     _writer: VideoWriter | None = None
 
-    def see(self, shot: Shot) -> None:
+    def add_frame(self, shot: FrameCandidate) -> None:
         """A frame comes by."""
-        if self.everything:
+        if self.keep_all:
             self._add(shot)
 
-    def choose(self, shot: Shot) -> None:
+    def add_keyframe(self, shot: FrameCandidate) -> None:
         """A frame becomes a keyframe."""
-        if not self.everything:
+        if not self.keep_all:
             self._add(shot)
 
-    def kept(self) -> KeptFrames | None:
+    def kept_frames(self) -> KeptFrames | None:
         """What was written, once the keeper is closed; None where that is nothing."""
         if not self._frames:
             return None
@@ -140,19 +142,19 @@ class FrameKeeper:
             frames=np.array(self._frames, dtype=np.int64),
             width_px=self.width_px,
             height_px=self.height_px,
-            group=_GROUP if self.everything else 1,
+            group=_GROUP_FRAMES if self.keep_all else 1,
         )
 
     @property
     def _path(self) -> Path:
-        return self.folder / f"{NAME}.mp4"
+        return self.folder / f"{KEPT_NAME}.mp4"
 
-    def _add(self, shot: Shot) -> None:
+    def _add(self, shot: FrameCandidate) -> None:
         planes, colours = shot.planes()
         if self._writer is None:
             self._colours = colours
             size = (planes.shape[1], planes.shape[0] * 2 // 3)
-            quality: Quality = "near" if self.everything else "exact"
+            quality: Quality = "near" if self.keep_all else "exact"
             self._writer = VideoWriter(self._path, _FPS, size, quality, colours)
         if colours == self._colours:  # a chapter of another kind is read where it is
             self._writer.add_planes(planes)

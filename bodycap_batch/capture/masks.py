@@ -9,9 +9,9 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray
 from bodycap_batch.core.errors import CaptureError
 
-_WHITE = 128
+_WHITE_LEVEL = 128
 _ASPECT_TOLERANCE = 0.01
-_MIN_SEEN = 0.05
+_MIN_WHITE_RATIO = 0.05
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> BoolArray:
@@ -43,8 +43,8 @@ def read_mask(path: Path, size: tuple[int, int]) -> BoolArray:
             f"the mask is {width}×{height}, the picture {size[0]}×{size[1]}: another shape",
             "paint it over a frame as a player shows it",
         )
-    mask: BoolArray = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA) >= _WHITE)
-    if mask.mean() < _MIN_SEEN:
+    mask: BoolArray = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA) >= _WHITE_LEVEL)
+    if mask.mean() < _MIN_WHITE_RATIO:
         raise refused(
             f"the mask lets {100 * mask.mean():.1f} % of the picture be seen",
             "white is the room, black the wearer: is it inverted?",

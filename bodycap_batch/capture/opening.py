@@ -24,7 +24,7 @@ _FULL_FRAME_MM = 36.0
 _ASPECT_TOLERANCE = 0.004
 
 
-def open_capture(spec: CaptureConfig) -> Capture:
+def open_capture(spec: CaptureConfig, threads: int = 0) -> Capture:
     """Index every video of a resolved capture block (demuxed, not decoded).
 
     Args:
@@ -34,18 +34,18 @@ def open_capture(spec: CaptureConfig) -> Capture:
         CaptureError: A video, its timestamps or calibration cannot be used, or nothing lies between
             start_s and end_s.
     """
-    return Capture(cameras=tuple(open_camera(spec, camera) for camera in spec.cameras))
+    return Capture(cameras=tuple(open_camera(spec, camera, threads) for camera in spec.cameras))
 
 
-def open_camera(spec: CaptureConfig, config: CameraConfig) -> CaptureCamera:
+def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> CaptureCamera:
     """Index one camera's videos. Raises as `open_capture`."""
-    videos = tuple(index_video(path) for path in config.video)
+    videos = tuple(index_video(path, threads) for path in config.video)
     _check_one_format(videos)
     timeline = join_chapters(videos, config.timestamps)
     offset_s = config.offset_s or 0.0
-    used = timeline.usable & _inside(timeline.times_ns, offset_s, spec)
+    used = timeline.usable & _in_time_range(timeline.times_ns, offset_s, spec)
     if not used.any():
-        raise _nothing_left(spec, config, timeline.times_ns, offset_s)
+        raise _no_frames_error(spec, config, timeline.times_ns, offset_s)
     calibration = config.calibration if isinstance(config.calibration, Calibration) else None
     camera = (
         guessed_camera(videos[0], spec.work_px, config.fov_deg)
@@ -55,7 +55,9 @@ def open_camera(spec: CaptureConfig, config: CameraConfig) -> CaptureCamera:
     return CaptureCamera(
         name=config.name,
         chapters=config.video,
-        camera=replace(camera, sideways=_is_sideways(videos[0]) and config.rolling_shutter_s is not None),
+        camera=replace(
+            camera, sideways=_is_quarter_turned(videos[0]) and config.rolling_shutter_s is not None
+        ),
         calibrated=calibration is not None,
         frame_numbers=np.flatnonzero(used),
         times_ns=timeline.times_ns[used],
@@ -64,9 +66,10 @@ def open_camera(spec: CaptureConfig, config: CameraConfig) -> CaptureCamera:
         rolling_shutter_s=_shown_rolling_shutter_s(config.rolling_shutter_s or 0.0, videos[0]),
         rolling_shutter_known=config.rolling_shutter_s is not None,
         # Sensors lie across: pictures taller than wide were turned, if only by who cut the video.
-        turned=_is_sideways(videos[0]) or camera.height_px > camera.width_px,
+        may_be_sideways=_is_quarter_turned(videos[0]) or camera.height_px > camera.width_px,
         notes=timeline.notes,
         videos=videos,
+        threads=threads,
         mask=None if config.mask is None else read_mask(config.mask, (camera.width_px, camera.height_px)),
     )
 
@@ -134,7 +137,7 @@ def guessed_camera(video: VideoFile, work_px: int, fov_deg: float | None) -> Cam
     return Camera(model="SIMPLE_RADIAL", width_px=width, height_px=height, params=params, refine=True)
 
 
-def _is_sideways(video: VideoFile) -> bool:
+def _is_quarter_turned(video: VideoFile) -> bool:
     """Whether a player turns the video by a quarter, so that stored rows are shown as columns."""
     return not video.orientation[1][1]
 
@@ -155,7 +158,7 @@ def _check_one_format(videos: tuple[VideoFile, ...]) -> None:
             )
 
 
-def _inside(times_ns: IntArray, offset_s: float, spec: CaptureConfig) -> BoolArray:
+def _in_time_range(times_ns: IntArray, offset_s: float, spec: CaptureConfig) -> BoolArray:
     common = times_ns + round(offset_s * 1e9)
     inside = np.ones(len(common), dtype=bool)
     if spec.start_s is not None:
@@ -165,7 +168,7 @@ def _inside(times_ns: IntArray, offset_s: float, spec: CaptureConfig) -> BoolArr
     return inside
 
 
-def _nothing_left(
+def _no_frames_error(
     spec: CaptureConfig, config: CameraConfig, times_ns: IntArray, offset_s: float
 ) -> CaptureError:
     first, last = times_ns[0] / 1e9 + offset_s, times_ns[-1] / 1e9 + offset_s

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-from bodycap_batch.core.context import THREADS_VARIABLE
-
 Item = TypeVar("Item")
 
-_AHEAD = 4
+_QUEUE_LENGTH = 4
 
 
-def prefetched(source: Generator[Item, None, None], ahead: int = _AHEAD) -> Generator[Item, None, None]:
+def prefetch(
+    source: Generator[Item, None, None], threads: int = 0, ahead: int = _QUEUE_LENGTH
+) -> Generator[Item, None, None]:
     """Yield what `source` yields while the next `ahead` items are made in a thread.
 
     Decoding and resizing release the interpreter's lock, so they overlap with the consumer's work.
@@ -23,7 +22,7 @@ def prefetched(source: Generator[Item, None, None], ahead: int = _AHEAD) -> Gene
     one. An error of the source is raised where its item would have come. A task that was given one
     thread makes each item when it is asked for: its neighbours have the other cores.
     """
-    if os.environ.get(THREADS_VARIABLE) == "1":
+    if threads == 1:
         yield from source
         return
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="decode") as pool:

@@ -91,11 +91,11 @@ def join_chapters(videos: tuple[VideoFile, ...], sidecars: tuple[Path, ...]) -> 
     """
     if len(sidecars) == len(videos):
         parts = [_sidecar_times(path, len(v.pts)) for path, v in zip(sidecars, videos, strict=True)]
-        return _joined(videos, parts)
+        return _join_parts(videos, parts)
     if len(sidecars) == 1:
         times = _sidecar_times(sidecars[0], sum(len(video.pts) for video in videos))
-        return _joined(videos, np.split(times, np.cumsum([len(video.pts) for video in videos])[:-1]))
-    return _joined(videos, _container_times(videos))
+        return _join_parts(videos, np.split(times, np.cumsum([len(video.pts) for video in videos])[:-1]))
+    return _join_parts(videos, _container_times(videos))
 
 
 def _sidecar_times(path: Path, frames: int) -> IntArray:
@@ -115,12 +115,14 @@ def _container_times(videos: tuple[VideoFile, ...]) -> list[IntArray]:
     for before, video in itertools.pairwise(videos):
         own, start = video.times_ns(), int(parts[-1][0])
         runs_on = int(own[0]) > start + before.duration_ns // 2
-        shift = 0 if runs_on else start + before.duration_ns + _missing_ns(before, video) - int(own[0])
+        shift = (
+            0 if runs_on else start + before.duration_ns + _missing_between_ns(before, video) - int(own[0])
+        )
         parts.append(own + shift)
     return parts
 
 
-def _missing_ns(before: VideoFile, video: VideoFile) -> int:
+def _missing_between_ns(before: VideoFile, video: VideoFile) -> int:
     """Recording time lost between two chapters by their creation times, 0 where they cannot tell."""
     if before.created_s is None or video.created_s is None:
         return 0
@@ -128,7 +130,7 @@ def _missing_ns(before: VideoFile, video: VideoFile) -> int:
     return gap if gap > _CLOCK_RESOLUTION_NS else 0
 
 
-def _joined(videos: tuple[VideoFile, ...], parts: list[IntArray]) -> Timeline:
+def _join_parts(videos: tuple[VideoFile, ...], parts: list[IntArray]) -> Timeline:
     """Concatenate chapters; frames that do not come after all earlier ones are left out."""
     times = np.concatenate(parts)
     latest = np.maximum.accumulate(times)

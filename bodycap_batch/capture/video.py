@@ -104,7 +104,7 @@ def open_container(path: Path) -> InputContainer:
         raise CaptureError("no permission to read it", path=path, hint=MAY_READ) from error
     except (av.error.FFmpegError, OSError) as error:
         raise CaptureError(
-            f"not a readable video ({reason_of(error)}); recordings cut short have no index",
+            f"not a readable video ({error_reason(error)}); recordings cut short have no index",
             path=path,
             hint=COPY_AGAIN,
         ) from error
@@ -130,12 +130,12 @@ def video_stream(container: InputContainer, path: Path) -> VideoStream:
     raise CaptureError("no decoder knows this kind of video", path=path, hint="convert it to H.264")
 
 
-def reason_of(error: Exception) -> str:
+def error_reason(error: Exception) -> str:
     """What a library's error says, in a few words."""
     return str(getattr(error, "strerror", "") or error)
 
 
-def orientation_of(frame: VideoFrame) -> Orientation:
+def orientation_from_frame(frame: VideoFrame) -> Orientation:
     """Round the display matrix to a quarter turn or mirror: shown = matrix · stored, y down."""
     side_data: Any = frame.side_data.get("DISPLAYMATRIX")
     if side_data is None:

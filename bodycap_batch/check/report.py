@@ -7,7 +7,7 @@ import textwrap
 from dataclasses import dataclass
 from typing import Any
 
-from bodycap_batch.capture.kept import keeps_all
+from bodycap_batch.capture.kept import should_keep_all
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import BodycapError
 
@@ -56,7 +56,7 @@ class CameraFinding:
     @property
     def large_frames(self) -> int:
         """Frames of which copies at the work size are kept: all of a video that is much larger, else none."""
-        return self.used_frames if keeps_all(self.size_px, self.work_size_px) else 0
+        return self.used_frames if should_keep_all(self.size_px, self.work_size_px) else 0
 
     def lines(self) -> list[str]:
         """The finding as a person reads it."""

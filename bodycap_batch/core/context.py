@@ -8,9 +8,6 @@ from pathlib import Path
 
 from bodycap_batch.core.errors import Cancelled
 
-THREADS_VARIABLE = "BODYCAP_TASK_THREADS"
-"""Environment: the threads of the task that this process does, for what sees no `StageContext`."""
-
 
 def _no_progress(done: int, total: int, what: str = "") -> None:
     """Ignore progress."""

@@ -14,7 +14,7 @@ from bodycap_batch.export.inputs import ExportInputs
 from bodycap_batch.export.placed import WORLD, main_frame, place_maps, place_trajectories
 from bodycap_batch.model.geometry import invert, rotation_angle_rad, transform_points
 from bodycap_batch.model.relative_pose import RelativePose
-from bodycap_batch.model.rolling_shutter import at_mid_row, image_velocity
+from bodycap_batch.model.rolling_shutter import image_velocity, px_at_mid_row
 from bodycap_batch.model.scene import Map, Trajectory
 from bodycap_batch.model.skeleton import Motion
 
@@ -86,7 +86,7 @@ def observation_errors(scene: Map, trajectories: Sequence[Trajectory]) -> FloatA
         if camera in paths and camera in scene.readout_s:
             path, frame = paths[camera], np.full(len(mine), scene.keyframe_frame[keyframe])
             velocity = image_velocity(lens, path.gauge_from_cam, path.times_ns, frame, points)
-            px = at_mid_row(lens, px, velocity, scene.readout_s[camera])
+            px = px_at_mid_row(lens, px, velocity, scene.readout_s[camera])
         projected = lens.project(transform_points(invert(scene.map_from_cam[keyframe]), points))
         out[mine] = np.linalg.norm(projected - px, axis=1)
     return out
@@ -152,7 +152,7 @@ def _relative(inputs: ExportInputs, item: RelativePose) -> dict[str, Any]:
     return {
         "cameras": list(item.cameras),
         "instants": item.instants,
-        "rigid": item.rigid,
+        "rigid": item.is_rigid,
         "turn_deg": float(np.degrees(rotation_angle_rad(pose[:3, :3]))) if item.instants else None,
         "translation": scale * pose[:3, 3],
         "spread_deg": float(np.degrees(item.spread_rad)),

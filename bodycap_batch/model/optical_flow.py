@@ -16,10 +16,13 @@ Pixels = npt.NDArray[np.float32]
 REFERENCE_WIDTH_PX = 640.0
 """Pixel thresholds are stated for images of this long side and scale with it."""
 
+BLUR_SHARPNESS_RATIO = 0.6
+"""x"""
+
 _WINDOW_PX = 21
 _LEVELS = 4
 _GUIDED_LEVELS = 2
-_SURE_LEVELS = 0
+_UNCHECKED_LEVELS = 0
 """With a guess the coarse levels only add cost and ways to go wrong."""
 _ITERATIONS = 20
 _EPSILON_PX = 0.02
@@ -30,18 +33,18 @@ _COARSE_LEVELS = 3
 _COARSE_POINTS = 48
 _MIN_COARSE_POINTS = 12
 _COARSE_ERROR_PX = 2.5
-_COARSE_TRIALS = 300
-_MIN_AGREED = 7
+_COARSE_MAX_TRIALS = 300
+_MIN_INLIERS = 7
 """Three more than a homography fits by itself."""
-_SURE_SHARE = 0.5
-_PIECE_SHARE = 0.35
+_RELIABLE_RATIO = 0.5
+_PIECE_SIDE_RATIO = 0.35
 _PIECE_ROWS, _PIECE_COLUMNS = 2, 3
-_PIECES_TRIED = 2
+_MAX_PIECES = 2
 _MIN_CONTRAST = 4.0
 
 
 @dataclass(frozen=True, slots=True)
-class Flow:
+class TrackedPoints:
     """Where points went.
 
     Attributes:
@@ -66,9 +69,9 @@ def track_points(
     px: Pixels,
     guess_px: Pixels | None = None,
     *,
-    careful: bool = True,
+    with_check: bool = True,
     window_px: int = _WINDOW_PX,
-) -> Flow:
+) -> TrackedPoints:
     """Follow points from one image to the next by pyramidal Lucas–Kanade, there and back.
 
     Args:
@@ -84,26 +87,26 @@ def track_points(
         Kalal, Mikolajczyk, Matas, "Forward-backward error", ICPR 2010.
     """
     if len(px) == 0:
-        return Flow(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0, np.float32))
+        return TrackedPoints(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0, np.float32))
     start = np.ascontiguousarray(px - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
     guess = None if guess_px is None else np.asarray(guess_px - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
-    levels = _LEVELS if guess is None else (_GUIDED_LEVELS if careful else _SURE_LEVELS)
-    there, alive = _lucas_kanade(first, second, start, guess, (window_px, levels))
+    levels = _LEVELS if guess is None else (_GUIDED_LEVELS if with_check else _UNCHECKED_LEVELS)
+    tracked, is_found = _lucas_kanade(first, second, start, guess, (window_px, levels))
     height, width = second.shape
-    alive &= ((there >= 0) & (there <= (width - 1, height - 1))).all(axis=1)
-    found_px = (there + CV2_PIXEL_OFFSET_PX).astype(np.float32)
-    if not careful:
-        return Flow(found_px, alive, np.zeros(len(px), np.float32))
-    back = np.full_like(there, np.inf)
-    if alive.any():
+    is_found &= ((tracked >= 0) & (tracked <= (width - 1, height - 1))).all(axis=1)
+    found_px = (tracked + CV2_PIXEL_OFFSET_PX).astype(np.float32)
+    if not with_check:
+        return TrackedPoints(found_px, is_found, np.zeros(len(px), np.float32))
+    returned_px = np.full_like(tracked, np.inf)
+    if is_found.any():
         # The way back starts from the guess's own shift, so that it does not know the answer.
-        back_guess = None if guess is None else there[alive] - (guess - start)[alive]
-        returned, refound = _lucas_kanade(second, first, there[alive], back_guess, (window_px, levels))
+        return_guess = None if guess is None else tracked[is_found] - (guess - start)[is_found]
+        returned, refound = _lucas_kanade(second, first, tracked[is_found], return_guess, (window_px, levels))
         returned[~refound] = np.inf
-        back[alive] = returned
-    round_trip = np.linalg.norm(back - start, axis=1).astype(np.float32)
+        returned_px[is_found] = returned
+    round_trip = np.linalg.norm(returned_px - start, axis=1).astype(np.float32)
     limit = _MAX_ROUND_TRIP_PX * pixel_scale(width, height)
-    return Flow(found_px, alive & (round_trip < limit), round_trip)
+    return TrackedPoints(found_px, is_found & (round_trip < limit), round_trip)
 
 
 def _lucas_kanade(
@@ -116,14 +119,14 @@ def _lucas_kanade(
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ITERATIONS, _EPSILON_PX)
     flags = 0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW
     guess = None if guess is None else guess.copy()
-    there, found, _ = cv2.calcOpticalFlowPyrLK(
+    tracked, found, _ = cv2.calcOpticalFlowPyrLK(
         first, second, start, guess, None, None, (window, window), levels, criteria, flags
     )
-    return there, np.asarray(found).ravel().astype(bool)
+    return tracked, np.asarray(found).ravel().astype(bool)
 
 
-def coarse_image(grey: GreyImage) -> GreyImage:
-    """The image reduced for `coarse_motion`, whatever its size."""
+def make_coarse_image(grey: GreyImage) -> GreyImage:
+    """The image reduced for `estimate_coarse_motion`, whatever its size."""
     import cv2
 
     scale = min(1.0, _COARSE_WIDTH_PX / max(grey.shape))
@@ -131,7 +134,7 @@ def coarse_image(grey: GreyImage) -> GreyImage:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class ImageMotion:
     """How the whole image moved.
 
     Attributes:
@@ -140,14 +143,16 @@ class Motion:
     """
 
     homography: FloatArray
-    sure: bool
+    is_reliable: bool
 
-    def inverse(self) -> Motion:
+    def inverse(self) -> ImageMotion:
         """The way back."""
-        return Motion(np.asarray(np.linalg.inv(self.homography)), self.sure)
+        return ImageMotion(np.asarray(np.linalg.inv(self.homography)), self.is_reliable)
 
 
-def coarse_motion(first: GreyImage, second: GreyImage, px: Pixels, width_px: int) -> Motion | None:
+def estimate_coarse_motion(
+    first: GreyImage, second: GreyImage, px: Pixels, width_px: int
+) -> ImageMotion | None:
     """Homography from one image to the next, near enough to start tracking from.
 
     Some points are followed from where they were. Where few of them agree on a motion they are followed
@@ -155,7 +160,7 @@ def coarse_motion(first: GreyImage, second: GreyImage, px: Pixels, width_px: int
     degrees between two frames.
 
     Args:
-        first: `coarse_image` of the first image.
+        first: `make_coarse_image` of the first image.
         second: The same of the second.
         px: (N,2) points of the first image at full size; some of them are followed.
         width_px: Width of the full-size images.
@@ -164,22 +169,25 @@ def coarse_motion(first: GreyImage, second: GreyImage, px: Pixels, width_px: int
         It, or None where too few points agree.
     """
     scale = first.shape[1] / width_px
-    some = px[np.linspace(0, len(px) - 1, min(len(px), _COARSE_POINTS)).astype(int)] if len(px) else px
-    start = np.ascontiguousarray(some * scale - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
-    best, agreed = _followed(first, second, start, None)
-    if agreed < _SURE_SHARE * len(start):
-        for shift in _piece_shifts(first, second):
-            found, count = _followed(first, second, start, start + shift)
-            if count > agreed:
-                best, agreed = found, count
-    if best is None or agreed < _MIN_AGREED:
+    chosen = px[np.linspace(0, len(px) - 1, min(len(px), _COARSE_POINTS)).astype(int)] if len(px) else px
+    start = np.ascontiguousarray(chosen * scale - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
+    best, inliers = _fit_homography(first, second, start, None)
+    if inliers < _RELIABLE_RATIO * len(start):
+        for shift in _match_image_pieces(first, second):
+            homography, count = _fit_homography(first, second, start, start + shift)
+            if count > inliers:
+                best, inliers = homography, count
+    if best is None or inliers < _MIN_INLIERS:
         return None
     # From OpenCV's pixels of the reduced images to COLMAP's of the full ones.
-    full = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, scale]])
-    return Motion(np.asarray(full @ best @ np.linalg.inv(full)), agreed >= _SURE_SHARE * len(start))
+    full_from_coarse = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, scale]])
+    return ImageMotion(
+        np.asarray(full_from_coarse @ best @ np.linalg.inv(full_from_coarse)),
+        inliers >= _RELIABLE_RATIO * len(start),
+    )
 
 
-def _followed(
+def _fit_homography(
     first: GreyImage, second: GreyImage, start: Pixels, guess: Pixels | None
 ) -> tuple[FloatArray | None, int]:
     """Homography that most followed points agree on, and how many do."""
@@ -188,45 +196,45 @@ def _followed(
     if len(start) < _MIN_COARSE_POINTS:
         return None, 0
     levels = _COARSE_LEVELS if guess is None else _GUIDED_LEVELS
-    there, found = _lucas_kanade(first, second, start, guess, (_COARSE_WINDOW_PX, levels))
-    found &= ((there >= 0) & (there <= (second.shape[1] - 1, second.shape[0] - 1))).all(axis=1)
+    tracked, found = _lucas_kanade(first, second, start, guess, (_COARSE_WINDOW_PX, levels))
+    found &= ((tracked >= 0) & (tracked <= (second.shape[1] - 1, second.shape[0] - 1))).all(axis=1)
     if found.sum() < _MIN_COARSE_POINTS:
         return None, 0
-    homography, agreed = cv2.findHomography(
-        start[found], there[found], cv2.RANSAC, _COARSE_ERROR_PX, maxIters=_COARSE_TRIALS
+    homography, is_inlier = cv2.findHomography(
+        start[found], tracked[found], cv2.RANSAC, _COARSE_ERROR_PX, maxIters=_COARSE_MAX_TRIALS
     )
-    return (None, 0) if homography is None else (homography, int(agreed.sum()))
+    return (None, 0) if homography is None else (homography, int(is_inlier.sum()))
 
 
-def _piece_shifts(first: GreyImage, second: GreyImage) -> list[Pixels]:
+def _match_image_pieces(first: GreyImage, second: GreyImage) -> list[Pixels]:
     """Where pieces of the first image are found in the second: shifts (2,) of the best ones.
 
     Source: Lewis, "Fast normalized cross-correlation", 1995.
     """
     import cv2
 
-    halves = [
+    reduced = [
         cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in (first, second)
     ]
-    height, width = halves[0].shape
-    side = round(_PIECE_SHARE * max(height, width))
-    found: list[tuple[float, Pixels]] = []
+    height, width = reduced[0].shape
+    side = round(_PIECE_SIDE_RATIO * max(height, width))
+    matches: list[tuple[float, Pixels]] = []
     for top in np.linspace(0, height - side, _PIECE_ROWS).astype(int):
         for left in np.linspace(0, width - side, _PIECE_COLUMNS).astype(int):
-            piece = halves[0][top : top + side, left : left + side]
+            piece = reduced[0][top : top + side, left : left + side]
             if piece.std() < _MIN_CONTRAST:
                 continue
-            scores = cv2.matchTemplate(halves[1], piece, cv2.TM_CCOEFF_NORMED)
+            scores = cv2.matchTemplate(reduced[1], piece, cv2.TM_CCOEFF_NORMED)
             _, score, _, (column, row) = cv2.minMaxLoc(scores)
-            found.append((score, np.array([column - left, row - top], np.float32) * np.float32(2.0)))
-    found.sort(key=lambda item: -item[0])
-    return [shift for _, shift in found[:_PIECES_TRIED]]
+            matches.append((score, np.array([column - left, row - top], np.float32) * np.float32(2.0)))
+    matches.sort(key=lambda item: -item[0])
+    return [shift for _, shift in matches[:_MAX_PIECES]]
 
 
-def moved(px: Pixels, homography: FloatArray) -> Pixels:
+def apply_homography(px: Pixels, homography: FloatArray) -> Pixels:
     """Points (N,2) under a homography (3,3)."""
-    ahead = px @ homography[:, :2].T + homography[:, 2]
-    return np.asarray(ahead[:, :2] / ahead[:, 2:], dtype=np.float32)
+    homogeneous = px @ homography[:, :2].T + homography[:, 2]
+    return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:], dtype=np.float32)
 
 
 def detect_corners(grey: GreyImage, count: int, spacing_px: float, mask: BoolArray | None = None) -> Pixels:
@@ -254,13 +262,13 @@ def sharpness(grey: GreyImage) -> float:
     return float(cv2.meanStdDev(cv2.Laplacian(small, cv2.CV_16S, ksize=1))[1][0, 0])
 
 
-def bearings(rays: FloatArray) -> FloatArray:
+def unit_directions(rays: FloatArray) -> FloatArray:
     """Unit directions (N,3) of rays (N,2) given at depth 1."""
     full = np.column_stack([rays, np.ones(len(rays))])
     return np.asarray(full / np.linalg.norm(full, axis=1, keepdims=True))
 
 
-def fit_rotation(first: FloatArray, second: FloatArray, rounds: int = 4) -> FloatArray:
+def fit_rotation(first: FloatArray, second: FloatArray, iterations: int = 4) -> FloatArray:
     """Rotation (3,3) that best turns unit directions (N,3) `first` into `second`, robustly.
 
     Source: Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976, reweighted
@@ -268,7 +276,7 @@ def fit_rotation(first: FloatArray, second: FloatArray, rounds: int = 4) -> Floa
     """
     weight = np.ones(len(first))
     rotation = np.eye(3)
-    for _ in range(rounds):
+    for _ in range(iterations):
         covariance = (second * weight[:, None]).T @ first
         u, _, vt = np.linalg.svd(covariance)
         if np.linalg.det(covariance) < 0.0:
@@ -276,6 +284,6 @@ def fit_rotation(first: FloatArray, second: FloatArray, rounds: int = 4) -> Floa
         rotation = u @ vt
         residual = second - first @ rotation.T
         squared = np.einsum("ni,ni->n", residual, residual)
-        middle = np.partition(squared, len(squared) // 2)[len(squared) // 2]
-        weight = 1.0 / (1.0 + squared / (middle + 1e-18))
+        median = np.partition(squared, len(squared) // 2)[len(squared) // 2]
+        weight = 1.0 / (1.0 + squared / (median + 1e-18))
     return np.asarray(rotation)

@@ -17,20 +17,20 @@ from bodycap_batch.model.geometry import (
 )
 from bodycap_batch.model.scene import Trajectory
 
-_ROUNDS = 100
+_MAX_ITERATIONS = 100
 _CONVERGED_RAD = 1e-9
 MIN_INSTANTS = 30
 """A second of frames in which both cameras have a pose of their own; fewer say too little of how they sit."""
-_MAX_RATIO = 1.5
+_MAX_SPREAD_RATIO = 1.5
 """Spread of the relative turn over what the poses' own covariances explain (they hold the map's error too,
 which both share). Four rendered rigs, one with a rolling shutter, in step: 0.3 to 0.8; 2 ms out of step 0.8
 to 1.7; 5 ms, from where on solving them together does harm, 1.7 to 3.5; a frame 11 to 19."""
-_MEDIAN_OF_NORM = 1.538
+_MEDIAN_NORM_3D = 1.538
 """Median length of a vector of three standard normal variables."""
-_SAME_INSTANT = 0.25
+_SAME_INSTANT_RATIO = 0.25
 """Share of a frame's duration within which two time stamps of a synchronised rig mean one exposure: they are
 rounded, and no other exposure lies between."""
-_FRAMES_APART = 1.5
+_MAX_INTERPOLATION_FRAMES = 1.5
 """Frames so near are neighbours, between which a path is interpolated."""
 
 
@@ -58,9 +58,9 @@ class RelativePose:
         set_array(self, "first_from_second", (4, 4), finite=False)
 
     @property
-    def rigid(self) -> bool:
+    def is_rigid(self) -> bool:
         """Whether enough instants agree that the two are held together and exposed in step."""
-        return self.instants >= MIN_INSTANTS and self.spread_rad < _MAX_RATIO * self.explained_rad
+        return self.instants >= MIN_INSTANTS and self.spread_rad < _MAX_SPREAD_RATIO * self.explained_rad
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,7 +70,7 @@ class RigPoses:
     relative: tuple[RelativePose, ...]
 
 
-def relative_pose(first: Trajectory, second: Trajectory, offset_ns: int) -> RelativePose:
+def estimate_relative_pose(first: Trajectory, second: Trajectory, offset_ns: int) -> RelativePose:
     """Robust mean of the second camera's pose beside the first's over all frames where both have one.
 
     The second path is interpolated to the first one's instants.
@@ -83,18 +83,18 @@ def relative_pose(first: Trajectory, second: Trajectory, offset_ns: int) -> Rela
     Source: rotations by Hartley, Aftab, Trumpf, "L1 rotation averaging using the Weiszfeld algorithm",
         CVPR 2011; translations by their median along each axis.
     """
-    names, found = (first.camera, second.camera), np.zeros((0, 4, 4))
+    names, samples = (first.camera, second.camera), np.zeros((0, 4, 4))
     if first.gauge == second.gauge and first.localised.any() and second.localised.any():
-        times_ns, frame_ns = second.times_ns[second.localised], _frame_ns(second.times_ns)
-        poses, known = poses_at(
+        times_ns, frame_ns = second.times_ns[second.localised], _frame_interval_ns(second.times_ns)
+        poses, is_valid = poses_at(
             times_ns,
             second.gauge_from_cam[second.localised],
             first.times_ns[first.localised] - offset_ns,
-            max_gap_ns=round(_FRAMES_APART * frame_ns),
-            snap_ns=round(_SAME_INSTANT * frame_ns),
+            max_gap_ns=round(_MAX_INTERPOLATION_FRAMES * frame_ns),
+            snap_ns=round(_SAME_INSTANT_RATIO * frame_ns),
         )
-        found = invert(first.gauge_from_cam[first.localised][known]) @ poses[known]
-    if len(found) == 0:
+        samples = invert(first.gauge_from_cam[first.localised][is_valid]) @ poses[is_valid]
+    if len(samples) == 0:
         return RelativePose(
             cameras=names,
             first_from_second=np.full((4, 4), np.nan),
@@ -103,19 +103,19 @@ def relative_pose(first: Trajectory, second: Trajectory, offset_ns: int) -> Rela
             explained_rad=np.nan,
             spread=np.nan,
         )
-    turn, shift = mean_rotation(found[:, :3, :3]), np.median(found[:, :3, 3], axis=0)
-    variance = sum(_turn_variance(path) for path in (first, second))
+    rotation, translation = mean_rotation(samples[:, :3, :3]), np.median(samples[:, :3, 3], axis=0)
+    variance = sum(_rotation_variance(path) for path in (first, second))
     return RelativePose(
         cameras=names,
-        first_from_second=make_transform(turn, shift),
-        instants=len(found),
-        spread_rad=float(np.median(rotation_angle_rad(turn.T @ found[:, :3, :3]))),
-        explained_rad=_MEDIAN_OF_NORM * float(np.sqrt(variance)),
-        spread=float(np.median(np.linalg.norm(found[:, :3, 3] - shift, axis=1))),
+        first_from_second=make_transform(rotation, translation),
+        instants=len(samples),
+        spread_rad=float(np.median(rotation_angle_rad(rotation.T @ samples[:, :3, :3]))),
+        explained_rad=_MEDIAN_NORM_3D * float(np.sqrt(variance)),
+        spread=float(np.median(np.linalg.norm(samples[:, :3, 3] - translation, axis=1))),
     )
 
 
-def _turn_variance(path: Trajectory) -> float:
+def _rotation_variance(path: Trajectory) -> float:
     """Usual variance of a pose's turn about one axis, rad²."""
     covariance = path.covariance[path.localised][:, :3, :3]
     return float(np.median(np.trace(covariance, axis1=1, axis2=2))) / 3.0
@@ -125,17 +125,17 @@ def mean_rotation(rotations: FloatArray) -> FloatArray:
     """Rotation (3,3) with the least sum of angles to rotations (N,3,3): nearly half of them may be wrong."""
     u, _, vt = np.linalg.svd(np.median(rotations, axis=0))
     mean = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    for _ in range(_ROUNDS):
-        off = so3_log(mean.T @ rotations)
-        weight = 1.0 / np.maximum(np.linalg.norm(off, axis=1), _CONVERGED_RAD)
-        step = weight @ off / weight.sum()
+    for _ in range(_MAX_ITERATIONS):
+        rotvec = so3_log(mean.T @ rotations)
+        weight = 1.0 / np.maximum(np.linalg.norm(rotvec, axis=1), _CONVERGED_RAD)
+        step = weight @ rotvec / weight.sum()
         mean = mean @ so3_exp(step)
         if np.linalg.norm(step) < _CONVERGED_RAD:
             break
     return np.asarray(mean)
 
 
-def same_instants(first_ns: IntArray, second_ns: IntArray) -> IntArray:
+def match_instants(first_ns: IntArray, second_ns: IntArray) -> IntArray:
     """For each of the second's frames (N,) the first's frame at the same instant; -1 where there is none.
 
     Args:
@@ -145,27 +145,27 @@ def same_instants(first_ns: IntArray, second_ns: IntArray) -> IntArray:
     if len(first_ns) < 2:
         return np.full(len(second_ns), -1, dtype=np.int64)
     after = np.clip(np.searchsorted(first_ns, second_ns), 1, len(first_ns) - 1)
-    nearer = second_ns - first_ns[after - 1] < first_ns[after] - second_ns
-    frame = np.where(nearer, after - 1, after)
-    close = np.abs(first_ns[frame] - second_ns) < _SAME_INSTANT * _frame_ns(first_ns)
-    return np.asarray(np.where(close, frame, -1), dtype=np.int64)
+    previous_is_nearer = second_ns - first_ns[after - 1] < first_ns[after] - second_ns
+    frame = np.where(previous_is_nearer, after - 1, after)
+    is_same = np.abs(first_ns[frame] - second_ns) < _SAME_INSTANT_RATIO * _frame_interval_ns(first_ns)
+    return np.asarray(np.where(is_same, frame, -1), dtype=np.int64)
 
 
-def _frame_ns(times_ns: IntArray) -> float:
+def _frame_interval_ns(times_ns: IntArray) -> float:
     """Usual time from one frame to the next."""
     return float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0.0
 
 
-def loose_note(found: RelativePose) -> str:
+def not_rigid_note(relative: RelativePose) -> str:
     """Why two cameras that the job says are a rig were not taken for one."""
-    pair = " and ".join(found.cameras)
-    if found.instants < MIN_INSTANTS:
+    pair = " and ".join(relative.cameras)
+    if relative.instants < MIN_INSTANTS:
         return (
-            f"{pair}: {found.instants} common frames in one map say too little of how they sit: each is on "
+            f"{pair}: {relative.instants} common frames in one map say too little of how they sit: each is on "
             "its own"
         )
     return (
-        f"{pair}: their relative turn scatters by {np.degrees(found.spread_rad):.2f} degrees where a rig's "
-        f"would by {np.degrees(found.explained_rad):.2f}: each is on its own. Check offset_s, and that one "
+        f"{pair}: their relative turn scatters by {np.degrees(relative.spread_rad):.2f} degrees where a rig's "
+        f"would by {np.degrees(relative.explained_rad):.2f}: each is on its own. Check offset_s, and that one "
         "trigger exposes both"
     )

@@ -22,9 +22,9 @@ readout time of a real shutter came out as 3 ms instead of 22, and the map 0.9 c
 _MIN_POINTS = 30
 _MAX_RESIDUAL_PX = 4.0
 _LOSS_PX = 0.5
-_PART = 1 << 14
+_BATCH_ROWS = 1 << 14
 """Observations whose poses are held at a time, each in a frame of its own."""
-_SCREENED = 100_000
+_SCREENED_OBSERVATIONS = 100_000
 """About so many observations tell whether the shutter rolls, from frames spread over the video."""
 _MIN_APPARENT_S = 0.0005
 _MIN_SIGMAS = 8.0
@@ -45,52 +45,81 @@ def image_velocity(
     Returns:
         Zero where neither neighbour has a pose and is near in time, or the point is behind it.
     """
-    posed: BoolArray = np.asarray(np.isfinite(map_from_cam).all(axis=(1, 2)))
+    has_pose: BoolArray = np.asarray(np.isfinite(map_from_cam).all(axis=(1, 2)))
     cam_from_map = np.full_like(map_from_cam, np.nan)
-    cam_from_map[posed] = invert(map_from_cam[posed])
+    cam_from_map[has_pose] = invert(map_from_cam[has_pose])
     out = np.empty((len(frame), 2))
-    has_before, has_after = _beside(posed, times_ns)
-    for start in range(0, len(frame), _PART):
-        some = slice(start, start + _PART)
-        before, after = frame[some] - has_before[frame[some]], frame[some] + has_after[frame[some]]
+    has_before, has_after = _usable_neighbours(has_pose, times_ns)
+    for start in range(0, len(frame), _BATCH_ROWS):
+        batch = slice(start, start + _BATCH_ROWS)
+        before, after = frame[batch] - has_before[frame[batch]], frame[batch] + has_after[frame[batch]]
         elapsed_s = (times_ns[after] - times_ns[before]) * 1e-9
-        later, earlier = (_projected(camera, cam_from_map, at, points[some]) for at in (after, before))
+        later, earlier = (
+            _project_in_frames(camera, cam_from_map, at, points[batch]) for at in (after, before)
+        )
         velocity = (later - earlier) / np.where(elapsed_s > 0, elapsed_s, np.inf)[:, None]
-        out[some] = np.nan_to_num(velocity, posinf=0.0, neginf=0.0)
+        out[batch] = np.nan_to_num(velocity, posinf=0.0, neginf=0.0)
     return out
 
 
-def _beside(posed: BoolArray, times_ns: IntArray) -> tuple[BoolArray, BoolArray]:
+def _usable_neighbours(has_pose: BoolArray, times_ns: IntArray) -> tuple[BoolArray, BoolArray]:
     """(N,) whether the frame before, and the one after, has a pose and is near enough to tell a speed."""
-    apart_ns = np.diff(times_ns)
-    near = apart_ns <= _MAX_GAP_FRAMES * np.median(apart_ns) if len(apart_ns) else apart_ns > 0
-    none = np.zeros(1, dtype=bool)
-    return np.concatenate([none, near & posed[:-1]]), np.concatenate([near & posed[1:], none])
+    interval_ns = np.diff(times_ns)
+    is_near = interval_ns <= _MAX_GAP_FRAMES * np.median(interval_ns) if len(interval_ns) else interval_ns > 0
+    missing = np.zeros(1, dtype=bool)
+    return np.concatenate([missing, is_near & has_pose[:-1]]), np.concatenate(
+        [is_near & has_pose[1:], missing]
+    )
 
 
-def _projected(camera: Camera, cam_from_map: FloatArray, frame: IntArray, points: FloatArray) -> FloatArray:
+def _project_in_frames(
+    camera: Camera, cam_from_map: FloatArray, frame: IntArray, points: FloatArray
+) -> FloatArray:
     """Pixels (M,2) of points (M,3), each in a frame of its own; a long video is taken in parts."""
     out = np.empty((len(frame), 2))
-    for start in range(0, len(frame), _PART):
-        part = slice(start, start + _PART)
-        pose = cam_from_map[frame[part]]
-        x_in_cam = np.einsum("mij,mj->mi", pose[:, :3, :3], points[part]) + pose[:, :3, 3]
-        out[part] = camera.project(x_in_cam)
+    for start in range(0, len(frame), _BATCH_ROWS):
+        batch = slice(start, start + _BATCH_ROWS)
+        pose = cam_from_map[frame[batch]]
+        x_in_cam = np.einsum("mij,mj->mi", pose[:, :3, :3], points[batch]) + pose[:, :3, 3]
+        out[batch] = camera.project(x_in_cam)
     return out
 
 
 def row_delay(camera: Camera, px: FloatArray) -> FloatArray:
     """Exposure (M,) of pixels (M,2) relative to the frame's time, as a share of the readout time."""
-    along = px[:, 0] / camera.width_px if camera.sideways else px[:, 1] / camera.height_px
-    return np.asarray(along - 0.5, dtype=np.float64)
+    position = px[:, 0] / camera.width_px if camera.sideways else px[:, 1] / camera.height_px
+    return np.asarray(position - 0.5, dtype=np.float64)
 
 
-def at_mid_row(camera: Camera, px: FloatArray, velocity_px_s: FloatArray, readout_s: float) -> FloatArray:
+def mean_row_fraction(registration: Registration, camera: Camera) -> FloatArray:
+    """Return the mean image row of the observations behind each pose, over the image height.
+
+    If the sensor's rows run along the image columns, it is the mean column over the width.
+
+    Args:
+        registration: The poses and observations of one camera.
+        camera: Its camera model.
+
+    Returns:
+        (N,) one value for each frame: 0.5 for a pose without observations, NaN for a frame without a pose.
+    """
+    frame_count = len(registration.trajectory.status)
+    observed = np.bincount(registration.obs_frame, minlength=frame_count)
+    fraction = row_delay(camera, registration.obs_px.astype(np.float64)) + 0.5
+    total = np.bincount(registration.obs_frame, weights=fraction, minlength=frame_count)
+    mean = np.full(frame_count, 0.5)
+    np.divide(total, observed, out=mean, where=observed > 0)
+    return np.where(registration.trajectory.localised, mean, np.nan)
+
+
+def px_at_mid_row(camera: Camera, px: FloatArray, velocity_px_s: FloatArray, readout_s: float) -> FloatArray:
     """Where pixels (M,2) moving at `velocity_px_s` (M,2) are at the instant of the middle row."""
     return np.asarray(px - velocity_px_s * (row_delay(camera, px) * readout_s)[:, None])
 
 
-def looks_rolling(found: Registration, maps: Sequence[Map], *, either_way: bool = False) -> bool:
+def has_visible_rolling_shutter(
+    registration: Registration, maps: Sequence[Map], *, allow_sideways: bool = False
+) -> bool:
     """Whether a rolling shutter shows in the residuals of a camera's tracks.
 
     Global shutters show less than 0.3 ms of it, a readout time of 24 ms shows 3 ms.
@@ -100,30 +129,32 @@ def looks_rolling(found: Registration, maps: Sequence[Map], *, either_way: bool 
         maps: The maps they are in.
         either_way: The sensor's rows may run along the picture's columns, too.
     """
-    path = found.trajectory
-    scene = next((each for each in maps if each.gauge == path.gauge), None)
-    if scene is None:
+    path = registration.trajectory
+    scene_map = next((item for item in maps if item.gauge == path.gauge), None)
+    if scene_map is None:
         return False
-    stride = max(1, len(found.obs_frame) // _SCREENED)
-    some = np.flatnonzero(path.localised[found.obs_frame] & (found.obs_frame % stride == 0))
-    some = some[np.argsort(found.obs_frame[some], kind="stable")]
-    point = scene.points_of(path.camera, found.obs_keyframe[some], found.obs_feature[some])
-    used, points = some[point >= 0], scene.points[point[point >= 0]]
-    frame, px = found.obs_frame[used], found.obs_px[used].astype(float)
-    lens = scene.cameras[path.camera]
+    stride = max(1, len(registration.obs_frame) // _SCREENED_OBSERVATIONS)
+    chosen = np.flatnonzero(path.localised[registration.obs_frame] & (registration.obs_frame % stride == 0))
+    chosen = chosen[np.argsort(registration.obs_frame[chosen], kind="stable")]
+    point = scene_map.points_of(
+        path.camera, registration.obs_keyframe[chosen], registration.obs_feature[chosen]
+    )
+    has_point, points = chosen[point >= 0], scene_map.points[point[point >= 0]]
+    frame, px = registration.obs_frame[has_point], registration.obs_px[has_point].astype(float)
+    lens = scene_map.cameras[path.camera]
     pose = np.full_like(path.gauge_from_cam, np.nan)
     pose[path.localised] = invert(path.gauge_from_cam[path.localised])
-    residual = np.nan_to_num(px - _projected(lens, pose, frame, points), nan=np.inf)
+    residual = np.nan_to_num(px - _project_in_frames(lens, pose, frame, points), nan=np.inf)
     velocity = image_velocity(lens, path.gauge_from_cam, path.times_ns, frame, points)
-    for sideways in (False, True) if either_way else (lens.sideways,):
-        turned = replace(lens, sideways=sideways)
-        readout_s, sigma_s = apparent_readout(turned, frame, px, residual, velocity)
+    for sideways in (False, True) if allow_sideways else (lens.sideways,):
+        candidate = replace(lens, sideways=sideways)
+        readout_s, sigma_s = estimate_residual_readout(candidate, frame, px, residual, velocity)
         if abs(readout_s) > max(_MIN_APPARENT_S, _MIN_SIGMAS * sigma_s):
             return True
     return False
 
 
-def apparent_readout(
+def estimate_residual_readout(
     camera: Camera, frame: IntArray, px: FloatArray, residual_px: FloatArray, velocity_px_s: FloatArray
 ) -> tuple[float, float]:
     """What is left of the readout time after poses and points have absorbed most of it.
@@ -150,21 +181,21 @@ def apparent_readout(
     signals, residuals = [np.zeros(0)], [np.zeros(0)]
     for start, stop in zip(starts, [*starts[1:], len(frame)], strict=True):
         if stop - start >= _MIN_POINTS:
-            basis, _ = np.linalg.qr(_absorbed(x[start:stop]))
-            for kept, values in ((signals, signal), (residuals, residual_px)):
+            basis, _ = np.linalg.qr(_camera_motion_basis(x[start:stop]))
+            for collected, values in ((signals, signal), (residuals, residual_px)):
                 flat = values[start:stop].ravel()
-                kept.append(flat - basis @ (basis.T @ flat))
-    a, b = np.concatenate(signals), np.concatenate(residuals)
-    weight = 1.0 / (1.0 + (b / _LOSS_PX) ** 2)
-    information = float((weight * a * a).sum())
+                collected.append(flat - basis @ (basis.T @ flat))
+    signals_all, residuals_all = np.concatenate(signals), np.concatenate(residuals)
+    weight = 1.0 / (1.0 + (residuals_all / _LOSS_PX) ** 2)
+    information = float((weight * signals_all * signals_all).sum())
     if information <= 0.0:
         return 0.0, float("inf")
-    readout_s = float((weight * a * b).sum()) / information
-    spread = float((weight * (b - readout_s * a) ** 2).sum() / weight.sum())
-    return readout_s, float(np.sqrt(spread / information))
+    readout_s = float((weight * signals_all * residuals_all).sum()) / information
+    variance = float((weight * (residuals_all - readout_s * signals_all) ** 2).sum() / weight.sum())
+    return readout_s, float(np.sqrt(variance / information))
 
 
-def _absorbed(x: FloatArray) -> FloatArray:
+def _camera_motion_basis(x: FloatArray) -> FloatArray:
     """Image motions (2N,6) of a small camera motion: shift, scale, roll, and the two tilts."""
     out = np.zeros((2 * len(x), 6))
     out[0::2, 0] = out[1::2, 1] = 1.0

@@ -1,14 +1,13 @@
-"""Stage 3: every frame's pose, by tracking the map's points into it."""
+"""Stage 3: estimate the pose of every frame by tracking map points from the keyframes."""
 
-from bodycap_batch.registration.poses.rig_members import RigCamera
-from bodycap_batch.registration.recovery.recover import recover_lost
-from bodycap_batch.registration.stage import register_frames, register_in_rig, settled, without_contradicted
+from bodycap_batch.registration.poses.rig_members import RegisteredCamera
+from bodycap_batch.registration.recovery.recover import RecoveryInputs, recover_lost_frames
+from bodycap_batch.registration.stage import register_frames, register_in_rig
 
 __all__ = [
-    "RigCamera",
-    "recover_lost",
+    "RecoveryInputs",
+    "RegisteredCamera",
+    "recover_lost_frames",
     "register_frames",
     "register_in_rig",
-    "settled",
-    "without_contradicted",
 ]

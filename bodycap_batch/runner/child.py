@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from bodycap_batch.core.context import THREADS_VARIABLE, StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import (
     EXIT_BUG,
     BodycapError,
@@ -216,7 +216,6 @@ def _report_unexpected(error: Exception, root: Path, speak: _Speaker) -> int:
 
 def _pin_threads(threads: int) -> None:
     """OpenCV's pool follows the task; the other libraries' pools are off, their threads are a stage's own."""
-    os.environ[THREADS_VARIABLE] = str(threads)
     os.environ["OPENCV_FOR_THREADS_NUM"] = str(threads)
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(threads)

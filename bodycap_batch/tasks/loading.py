@@ -13,24 +13,24 @@ if TYPE_CHECKING:
     from bodycap_batch.model.scene import KeyframeSelection, MapResult, Registration
 
 
-def load_capture(arguments: Json) -> Capture:
+def load_capture(arguments: Json, threads: int = 0) -> Capture:
     """Open the capture block of a task's arguments, with the frames that its keyframes' artefacts keep."""
     from bodycap_batch.capture import open_capture
     from bodycap_batch.config.models import CaptureConfig
 
-    capture = open_capture(CaptureConfig.model_validate(arguments["capture"]))
+    capture = open_capture(CaptureConfig.model_validate(arguments["capture"]), threads)
     folders = arguments.get("kept", {})
     cameras = (replace(each, kept=_kept(folders.get(each.name))) for each in capture.cameras)
     return replace(capture, cameras=tuple(cameras))
 
 
 def _kept(folder: str | None) -> KeptFrames | None:
-    from bodycap_batch.capture.kept import NAME, KeptFrames
+    from bodycap_batch.capture.kept import KEPT_NAME, KeptFrames
     from bodycap_batch.formats.bundle import read_bundle
 
-    if folder is None or not (Path(folder) / f"{NAME}.json").exists():
+    if folder is None or not (Path(folder) / f"{KEPT_NAME}.json").exists():
         return None
-    return read_bundle(KeptFrames, Path(folder), NAME)
+    return read_bundle(KeptFrames, Path(folder), KEPT_NAME)
 
 
 def load_keyframes(path: str) -> KeyframeSelection:

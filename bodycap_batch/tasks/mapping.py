@@ -23,7 +23,7 @@ def _map(options: Json, arguments: Json, context: StageContext, files: Path) -> 
     selections = [load_keyframes(path) for path in arguments["selections"]]
     reach = {(first, second): (low, high) for first, second, low, high in arguments.get("reach", ())}
     options_ = MapOptions.model_validate(options)
-    result = build_map(load_capture(arguments), selections, options_, context, reach or None)
+    result = build_map(load_capture(arguments, context.threads), selections, options_, context, reach or None)
     _save_map(result, files)
 
 
@@ -36,7 +36,7 @@ def _extend(options: Json, arguments: Json, context: StageContext, files: Path) 
     extra = {name: np.asarray(frames, dtype=np.int64) for name, frames in arguments["extra"].items()}
     previous = load_map(arguments["previous"])
     options_ = MapOptions.model_validate(options)
-    _save_map(extend_map(load_capture(arguments), previous, extra, options_, context), files)
+    _save_map(extend_map(load_capture(arguments, context.threads), previous, extra, options_, context), files)
 
 
 def _refine(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
@@ -46,7 +46,7 @@ def _refine(options: Json, arguments: Json, context: StageContext, files: Path) 
     paths = [load_registration(path).trajectory for path in arguments["registrations"]]
     previous = load_map(arguments["previous"])
     options_ = MapOptions.model_validate(options)
-    _save_map(refine_map(load_capture(arguments), previous, paths, options_, context), files)
+    _save_map(refine_map(load_capture(arguments, context.threads), previous, paths, options_, context), files)
 
 
 def _save_map(result: MapResult, files: Path) -> None:

@@ -76,7 +76,7 @@ def _with_board(
         if keyframes.any():
             frames[path.camera] = np.flatnonzero(keyframes)
             lenses[path.camera] = maps[path.gauge].cameras[path.camera]
-    views = find_board_views(load_capture(arguments), frames, lenses, wanted, context)
+    views = find_board_views(load_capture(arguments, context.threads), frames, lenses, wanted, context)
     return dataclasses.replace(inputs, board=views)
 
 

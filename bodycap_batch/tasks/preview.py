@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 def _preview(_: Json, arguments: Json, context: StageContext, files: Path) -> None:
     from bodycap_batch.preview import render_preview
 
-    render_preview(_inputs(arguments, files / RESULTS / "preview.mp4"), context)
+    render_preview(_inputs(arguments, files / RESULTS / "preview.mp4", context.threads), context)
 
 
-def _inputs(arguments: Json, path: Path) -> PreviewInputs:
+def _inputs(arguments: Json, path: Path, threads: int) -> PreviewInputs:
     import numpy as np
 
     from bodycap_batch.export import project_motion
@@ -45,7 +45,7 @@ def _inputs(arguments: Json, path: Path) -> PreviewInputs:
     colours = [item.colors for item in scene.maps if item.gauge in shown]
     return PreviewInputs(
         path=path,
-        capture=_trunk_first(load_capture(arguments), merge),
+        capture=_trunk_first(load_capture(arguments, threads), merge),
         views=camera_views(registrations, scene.maps, found.clocks, merge),
         frame="world" if merge is not None else scene.maps[0].gauge,
         points=np.concatenate(moved),

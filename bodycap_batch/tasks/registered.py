@@ -12,10 +12,9 @@ from bodycap_batch.tasks.loading import load_registration
 
 if TYPE_CHECKING:
     from bodycap_batch.core.arrays import FloatArray
-    from bodycap_batch.model.camera import Camera
     from bodycap_batch.model.merge_data import CameraClock
     from bodycap_batch.model.relative_pose import RelativePose
-    from bodycap_batch.model.scene import Map, Registration, Trajectory
+    from bodycap_batch.model.scene import Map, Trajectory
 
 RIG_POSES = "rig"
 """Name of the bundle that says where a rig's cameras sit beside each other."""
@@ -28,7 +27,7 @@ class Registered:
     Attributes:
         trajectories: One per camera.
         clocks: By camera.
-        row_fraction: By camera whose rolling shutter is still in its poses: see `row_fraction`.
+        row_fraction: By camera whose rolling shutter is still in its poses: see `mean_row_fraction`.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -41,6 +40,7 @@ class Registered:
         from bodycap_batch.formats.bundle import read_bundle
         from bodycap_batch.model.camera import Camera
         from bodycap_batch.model.merge_data import CameraClock
+        from bodycap_batch.model.rolling_shutter import mean_row_fraction
 
         corrected = {name for each in maps for name in each.readout_s}
         trajectories: list[Trajectory] = []
@@ -53,7 +53,7 @@ class Registered:
             trajectories.append(found.trajectory)
             clocks[name] = read_bundle(CameraClock, Path(path), "clock")
             if clocks[name].rolling_shutter_s and name not in corrected:
-                rows[name] = row_fraction(found, read_bundle(Camera, Path(path), "camera"))
+                rows[name] = mean_row_fraction(found, read_bundle(Camera, Path(path), "camera"))
         return Registered(trajectories=tuple(trajectories), clocks=clocks, row_fraction=rows)
 
     def relative_poses(
@@ -66,7 +66,7 @@ class Registered:
             segments: Names of the cameras on each segment that carries several.
         """
         from bodycap_batch.formats.bundle import read_bundle
-        from bodycap_batch.model.relative_pose import RigPoses, relative_pose
+        from bodycap_batch.model.relative_pose import RigPoses, estimate_relative_pose
 
         path_of = {each.camera: each for each in self.trajectories}
         kept = {
@@ -79,23 +79,5 @@ class Registered:
         for pair in (pair for names in segments for pair in combinations(sorted(names), 2)):
             offset_s = self.clocks[pair[1]].offset_s - self.clocks[pair[0]].offset_s
             first, second = (path_of[name] for name in pair)
-            out.append(kept.get(pair) or relative_pose(first, second, round(1e9 * offset_s)))
+            out.append(kept.get(pair) or estimate_relative_pose(first, second, round(1e9 * offset_s)))
         return tuple(out)
-
-
-def row_fraction(found: Registration, camera: Camera) -> FloatArray:
-    """(N,) mean row of the observations behind each pose over the image height; NaN without a pose.
-
-    Column over width, where the sensor's rows run along columns.
-    """
-    import numpy as np
-
-    from bodycap_batch.model.rolling_shutter import row_delay
-
-    count = len(found.trajectory.status)
-    seen = np.bincount(found.obs_frame, minlength=count)
-    late = row_delay(camera, found.obs_px.astype(np.float64)) + 0.5
-    rows = np.bincount(found.obs_frame, weights=late, minlength=count)
-    mean = np.full(count, 0.5)
-    np.divide(rows, seen, out=mean, where=seen > 0)
-    return np.where(found.trajectory.localised, mean, np.nan)

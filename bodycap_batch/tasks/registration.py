@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 def _registration(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
     from bodycap_batch.config import RegistrationOptions
-    from bodycap_batch.model.rolling_shutter import looks_rolling
+    from bodycap_batch.model.rolling_shutter import has_visible_rolling_shutter
     from bodycap_batch.registration import register_frames
 
-    camera = load_capture(arguments).cameras[0]
+    camera = load_capture(arguments, context.threads).cameras[0]
     selection = load_keyframes(arguments["selection"])
     previous = load_registration(arguments["previous"]) if arguments.get("previous") else None
     maps = load_map(arguments["map"]).maps
@@ -29,7 +29,9 @@ def _registration(options: Json, arguments: Json, context: StageContext, files: 
     )
     known = camera.rolling_shutter_known
     rolling = (
-        bool(camera.rolling_shutter_s) if known else looks_rolling(found, maps, either_way=camera.turned)
+        bool(camera.rolling_shutter_s)
+        if known
+        else has_visible_rolling_shutter(found, maps, allow_sideways=camera.may_be_sideways)
     )
     save_registration(found, camera, files, rolling=rolling)
 

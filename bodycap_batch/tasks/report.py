@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 def _report(_: Json, arguments: Json, context: StageContext, files: Path) -> None:
     from bodycap_batch.report import REPORT_FILE, write_report
 
-    write_report(load_inputs(arguments), files / RESULTS / REPORT_FILE, context)
+    write_report(load_inputs(arguments, context.threads), files / RESULTS / REPORT_FILE, context)
 
 
-def load_inputs(arguments: Json) -> ReportInputs:
+def load_inputs(arguments: Json, threads: int = 0) -> ReportInputs:
     """Read what the stages before left; what a broken-off job lacks is None in the arguments."""
     from bodycap_batch.formats.bundle import read_bundle
     from bodycap_batch.model.merge_data import CameraClock
@@ -46,7 +46,7 @@ def load_inputs(arguments: Json) -> ReportInputs:
         metrics=None
         if exported is None
         else json.loads((Path(exported) / RESULTS / "metrics.json").read_text(encoding="utf-8")),
-        capture=_capture(arguments),
+        capture=_capture(arguments, threads),
         failure=arguments["failure"],
         max_gap_s=arguments["max_gap_s"],
     )
@@ -59,12 +59,12 @@ def _merge(path: str | None) -> MergeResult | None:
     return None if path is None else read_bundle(MergeResult, Path(path), "merge")
 
 
-def _capture(arguments: Json) -> Capture | None:
+def _capture(arguments: Json, threads: int) -> Capture | None:
     """The videos; None where it is they that stopped the job."""
     from bodycap_batch.core.errors import CaptureError
 
     try:
-        return load_capture(arguments)
+        return load_capture(arguments, threads)
     except CaptureError:
         if arguments["failure"] is None:
             raise

@@ -14,18 +14,21 @@ from bodycap_batch.tasks.stage import SEEING, VISION, Json, Stage
 def _rig(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
     from bodycap_batch.config import RegistrationOptions
     from bodycap_batch.formats.bundle import write_bundle
-    from bodycap_batch.model.relative_pose import RigPoses, loose_note
-    from bodycap_batch.registration import RigCamera, register_in_rig
+    from bodycap_batch.model.relative_pose import RigPoses, not_rigid_note
+    from bodycap_batch.registration import RegisteredCamera, register_in_rig
 
     context.check_cancelled()
     own, *others = (
-        RigCamera(camera=camera, found=load_registration(path))
-        for camera, path in zip(load_capture(arguments).cameras, arguments["registrations"], strict=True)
+        RegisteredCamera(camera=camera, registration=load_registration(path))
+        for camera, path in zip(
+            load_capture(arguments, context.threads).cameras, arguments["registrations"], strict=True
+        )
     )
     options_ = RegistrationOptions.model_validate(options)
     selection = load_keyframes(arguments["selection"])
-    found, relative = register_in_rig(own, others, load_map(arguments["map"]).maps, selection, options_)
-    notes = [loose_note(each) for each in relative if not each.rigid]
+    maps = load_map(arguments["map"]).maps
+    found, relative = register_in_rig(own, others, maps, selection, options_, context.threads)
+    notes = [not_rigid_note(each) for each in relative if not each.is_rigid]
     save_registration(found, own.camera, files, rolling=False, notes=notes)
     write_bundle(RigPoses(relative=tuple(relative)), files, RIG_POSES)
 

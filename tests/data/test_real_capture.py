@@ -18,7 +18,7 @@ from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build_map, refine, refine_map
 from bodycap_batch.model.geometry import align_points
-from bodycap_batch.model.rolling_shutter import looks_rolling
+from bodycap_batch.model.rolling_shutter import has_visible_rolling_shutter
 from bodycap_batch.model.scene import KeyframeSelection, Map, MapResult, Registration, Trajectory
 from bodycap_batch.registration import register_frames
 
@@ -83,7 +83,7 @@ def test_every_frame_is_registered(outcome: Outcome) -> None:
 
 def test_the_rolling_shutter_is_found_and_taken_out(outcome: Outcome, data_root: Path) -> None:
     truth = data_root / "tum_fr1_xyz" / "groundtruth.txt"
-    assert looks_rolling(outcome.before, outcome.maps[0].maps)
+    assert has_visible_rolling_shutter(outcome.before, outcome.maps[0].maps)
     readout_s = outcome.refined.maps[0].readout_s["camera"]
     # The sensor's readout is not published; it has to be positive and fit into a frame of 1/30 s.
     assert 0.01 < readout_s < 1 / 30

@@ -13,7 +13,7 @@ import pytest
 
 from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.config import RegistrationOptions
-from bodycap_batch.core.context import THREADS_VARIABLE, StageContext
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import (
     interpolate_pose,
@@ -25,12 +25,19 @@ from bodycap_batch.model.geometry import (
 )
 from bodycap_batch.model.optical_flow import detect_corners
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
-from bodycap_batch.registration import RigCamera, recover_lost, settled
-from bodycap_batch.registration.poses.pnp import PoseLimits
-from bodycap_batch.registration.recovery import recover
-from bodycap_batch.registration.recovery.guided_localisation import Finder, Fix
-from bodycap_batch.registration.recovery.patch_search import Found, Gallery, View
-from bodycap_batch.registration.recovery.propagation import March
+from bodycap_batch.registration import RegisteredCamera
+from bodycap_batch.registration.poses.pnp import AcceptanceCriteria
+from bodycap_batch.registration.recovery import preparation, recover, search_images
+from bodycap_batch.registration.recovery.guided_localisation import GuidedLocaliser, PoseEstimate
+from bodycap_batch.registration.recovery.patch_search import KeyframePatches, PatchMatches, PredictedView
+from bodycap_batch.registration.recovery.preparation import prepare_recovery
+from bodycap_batch.registration.recovery.propagation import Propagation
+from bodycap_batch.registration.recovery.recover import find_lost_poses
+from bodycap_batch.registration.recovery.search_images import (
+    estimate_exposure,
+    read_keyframe_patches,
+    read_pyramids,
+)
 from tests.rooms import HALF_M, LENS, Room
 
 COUNT = 44
@@ -67,7 +74,7 @@ class _Video:
     def times_ns(self) -> np.ndarray:
         return np.arange(COUNT, dtype=np.int64) * 33_333_333
 
-    def sees_room(self, px: np.ndarray) -> np.ndarray:
+    def is_unmasked(self, px: np.ndarray) -> np.ndarray:
         column, row = np.clip(px.astype(int), 0, (319, 239)).T
         return np.ones(len(px), dtype=bool) if self.mask is None else self.mask[row, column]
 
@@ -167,7 +174,7 @@ def _recovered(
     scene: Map, pictures: list[np.ndarray], context: StageContext, mask: np.ndarray | None = None
 ) -> Trajectory:
     capture = cast(Capture, _Capture(_Video(pictures, mask=mask)))
-    return recover_lost(_tracked(), scene, capture, RegistrationOptions(), context).trajectory
+    return find_lost_poses(_tracked(), scene, capture, RegistrationOptions(), context).trajectory
 
 
 @pytest.fixture
@@ -222,10 +229,9 @@ def test_what_the_mask_hides_is_no_room(pictures: list[np.ndarray], context: Sta
     assert not path.localised[list(LOST)].any()
 
 
-def test_of_a_long_stretch_only_so_many_pictures_are_held(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recover, "_MAX_HELD", 12)
+def test_of_a_long_stretch_only_so_many_pictures_are_held() -> None:
     video = cast(CaptureCamera, _Video([np.zeros((240, 320), np.uint8)] * COUNT))
-    held = sorted(recover._pictures(video, 4, 40, [20]))
+    held = sorted(read_pyramids(video, 4, 40, [20], max_frames=12))
     assert held == [3, 4, 5, 6, 18, 19, 20, 21, 22, 38, 39, 40]
 
 
@@ -327,28 +333,30 @@ def test_what_the_mask_hides_tells_nothing_of_the_exposure(
 ) -> None:
     """The wearer's sleeve, which is still before the camera, looks like a short exposure."""
 
-    def found(_: object, view: View, *__: object) -> Found:
+    def found(_: object, view: PredictedView, *__: object) -> PatchMatches:
         px = np.array([[20.0, 100.0], [200.0, 100.0]])
-        score = np.array([0.9 - view.exposure, 0.5 + 0.1 * view.exposure])
-        return Found(np.arange(2), px, px, score)
+        score = np.array([0.9 - view.exposure_ratio, 0.5 + 0.1 * view.exposure_ratio])
+        return PatchMatches(np.arange(2), px, px, score)
 
-    monkeypatch.setattr(recover, "find_points", found)
+    monkeypatch.setattr(search_images, "match_patches", found)
     mask = np.ones((240, 320), dtype=bool)
     mask[:, :160] = False
     shares = []
     for hidden in (None, mask):
         camera = cast(CaptureCamera, _Video(pictures, mask=hidden))
-        gallery = Gallery(
+        gallery = KeyframePatches(
             scene_map=_map(pictures),
-            pictures={},
+            pyramids={},
             sharpness=np.zeros(0),
             usable=np.zeros(0, bool),
-            seen=np.zeros(0, np.int64),
+            keyframe_count=np.zeros(0, np.int64),
         )
-        monkeypatch.setattr(recover, "choose_rows", lambda *_: np.arange(2))
-        limits = PoseLimits(max_error_px=1.0, min_inliers=12, max_sigma_depth=0.1)
-        finder = Finder(lens=CAMERA, gallery=gallery, limits=limits, exposure=0.0, sees_room=camera.sees_room)
-        shares.append(recover._exposure(camera, finder, _tracked().trajectory))
+        monkeypatch.setattr(search_images, "select_patches", lambda *_: np.arange(2))
+        limits = AcceptanceCriteria(max_error_px=1.0, min_inliers=12, max_sigma_depth=0.1)
+        finder = GuidedLocaliser(
+            lens=CAMERA, patches=gallery, criteria=limits, exposure_ratio=0.0, is_unmasked=camera.is_unmasked
+        )
+        shares.append(estimate_exposure(camera, finder, _tracked().trajectory))
     assert shares == [0.0, 0.6]
 
 
@@ -362,7 +370,7 @@ def test_decoding_the_keyframes_is_told(pictures: list[np.ndarray], tmp_path: Pa
     scene = _map(pictures)
     context = StageContext(work_dir=tmp_path, progress=progress)
     capture = cast(Capture, _Capture(_Video(pictures)))
-    recover._gallery(scene, capture, capture.camera("torso"), context)
+    read_keyframe_patches(scene, capture, capture.camera("torso"), context)
     count = len(scene.keyframe_camera)
     assert told == [(number + 1, count) for number in range(count)]
 
@@ -373,17 +381,17 @@ def test_what_is_left_beside_found_frames_is_looked_through_again(
     """From the frames found, which count as found and not as tracked; once nothing is found, no more."""
     asked = []
 
-    def vouched(march: March, limits: PoseLimits) -> dict[int, Fix]:
-        stretch = march.stretch
+    def vouched(march: Propagation, limits: AcceptanceCriteria) -> dict[int, PoseEstimate]:
+        stretch = march.interval
         asked.append((stretch.start, stretch.stop))
         if len(asked) > 1:
-            assert {18, 19} <= set(stretch.known)
-            assert not {18, 19} & set(stretch.tracked)
+            assert {18, 19} <= set(stretch.poses)
+            assert not {18, 19} & set(stretch.tracked_frames)
             return {}
-        fix = replace(stretch.known[17], depth=1.0)
+        fix = replace(stretch.poses[17], depth=1.0)
         return {18: fix, 19: fix}
 
-    monkeypatch.setattr(recover, "_vouched", vouched)
+    monkeypatch.setattr(recover, "_accepted_poses", vouched)
     path = _recovered(_map(pictures), pictures, context)
     assert asked == [(18, 26), (20, 26)]
     assert path.localised[[18, 19]].all()
@@ -395,9 +403,9 @@ def test_progress_grows_over_the_rounds_which_end_with_nothing_left(
 ) -> None:
     told: list[int] = []
     rounds = [[(18, 20), (23, 25)], []]
-    monkeypatch.setattr(recover, "lost_runs", lambda _: [(18, 22), (22, 26)])
-    monkeypatch.setattr(recover, "_beside", lambda *_: rounds.pop(0))
-    monkeypatch.setattr(recover._LostFrames, "within", lambda *_: {})
+    monkeypatch.setattr(recover, "lost_intervals", lambda _: [(18, 22), (22, 26)])
+    monkeypatch.setattr(recover, "_extended_intervals", lambda *_: rounds.pop(0))
+    monkeypatch.setattr(recover._IntervalSearch, "recover_interval", lambda *_: {})
 
     def progress(done: int, _: int, what: str = "") -> None:
         if what.startswith("lost"):
@@ -405,7 +413,7 @@ def test_progress_grows_over_the_rounds_which_end_with_nothing_left(
 
     context = StageContext(work_dir=tmp_path, progress=progress)
     capture = cast("Capture", _Capture(_Video(pictures)))
-    recover_lost(_tracked(), _map(pictures), capture, RegistrationOptions(), context)
+    find_lost_poses(_tracked(), _map(pictures), capture, RegistrationOptions(), context)
     assert told == [18, 22, 22, 23]
 
 
@@ -458,15 +466,15 @@ def test_a_wrong_end_of_a_lost_stretch_is_looked_for_again(
     path = replace(found.trajectory, gauge_from_cam=poses, inliers=inliers)
     found = replace(found, trajectory=path, obs_px=px)
     capture = cast(Capture, _Capture(_Video(pictures)))
-    own = RigCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), found=found)
+    own = RegisteredCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), registration=found)
     options = RegistrationOptions()
-    settled_map, left = settled(own, [], scene, _selection(), options)
+    settled_map, left = prepare_recovery(own, [], scene, _selection(), options)
     assert not left.trajectory.localised[end]
     off_m = [
         np.linalg.norm((each.gauge_from_cam - PATH)[:, :3, 3], axis=1)
         for each in (
-            recover_lost(found, scene, capture, options, context).trajectory,
-            recover_lost(left, settled_map, capture, options, context).trajectory,
+            find_lost_poses(found, scene, capture, options, context).trajectory,
+            find_lost_poses(left, settled_map, capture, options, context).trajectory,
         )
     ]
     assert off_m[0][end] > 0.1
@@ -482,16 +490,15 @@ def test_a_second_thread_changes_nothing(
     inliers = found.trajectory.inliers.copy()
     inliers[end] = 20
     found = replace(found, trajectory=replace(found.trajectory, inliers=inliers))
-    own = RigCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), found=found)
+    own = RegisteredCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), registration=found)
     capture, options = cast(Capture, _Capture(_Video(pictures))), RegistrationOptions()
     before = cv2.getNumThreads()
     paths = []
     for threads in (1, 2):
-        monkeypatch.setenv(THREADS_VARIABLE, str(threads))
         cv2.setNumThreads(threads)
         context = StageContext(work_dir=tmp_path, threads=threads)
-        settled_map, left = settled(own, [], scene, _selection(), options)
-        paths.append(recover_lost(left, settled_map, capture, options, context).trajectory)
+        settled_map, left = prepare_recovery(own, [], scene, _selection(), options, threads)
+        paths.append(find_lost_poses(left, settled_map, capture, options, context).trajectory)
     cv2.setNumThreads(before)
     assert not left.trajectory.localised[end]
     assert paths[0].localised[list(LOST)].any()
@@ -503,9 +510,9 @@ def test_few_poses_are_left_as_they_are(monkeypatch: pytest.MonkeyPatch, picture
     scene = _map(pictures)
     found = _with_tracks(_tracked(), scene, -1)
     few = replace(found, trajectory=replace(found.trajectory, inliers=np.full(COUNT, 20)))
-    own = RigCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), found=few)
-    monkeypatch.setattr(recover, "LEAST_POSED", COUNT - len(LOST) - 10)
-    settled_map, left = settled(own, [], scene, _selection(), RegistrationOptions())
+    own = RegisteredCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), registration=few)
+    monkeypatch.setattr(preparation, "LEAST_POSED", COUNT - len(LOST) - 10)
+    settled_map, left = prepare_recovery(own, [], scene, _selection(), RegistrationOptions())
     assert settled_map is scene
     assert left is few
 
@@ -513,7 +520,7 @@ def test_few_poses_are_left_as_they_are(monkeypatch: pytest.MonkeyPatch, picture
 def test_where_every_end_is_well_seen_all_stays(pictures: list[np.ndarray]) -> None:
     scene = _map(pictures)
     found = _with_tracks(_tracked(), scene, -1)
-    own = RigCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), found=found)
-    settled_map, left = settled(own, [found.trajectory], scene, _selection(), RegistrationOptions())
+    own = RegisteredCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), registration=found)
+    settled_map, left = prepare_recovery(own, [found.trajectory], scene, _selection(), RegistrationOptions())
     assert settled_map is scene
     assert left is found

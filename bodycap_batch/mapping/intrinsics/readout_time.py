@@ -16,7 +16,7 @@ from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust, part_of
 from bodycap_batch.mapping.reconstruction.conversion import lens_of
 from bodycap_batch.mapping.reconstruction.reprojection import image_residuals
-from bodycap_batch.model.rolling_shutter import at_mid_row, image_velocity
+from bodycap_batch.model.rolling_shutter import image_velocity, px_at_mid_row
 from bodycap_batch.model.scene import Map, Trajectory
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ class RollingModel:
     def move(self, model: pycolmap.Reconstruction, readout_s: Mapping[str, float]) -> None:
         """Move the keypoints of a copy of the model; a readout of 0 puts them back where they were found."""
         for item in self._keypoints:
-            px = at_mid_row(
+            px = px_at_mid_row(
                 self._lenses[item.camera], item.px, item.velocity, readout_s.get(item.camera, 0.0)
             )
             points = model.image(item.image_id).points2D
@@ -277,7 +277,11 @@ def readouts(
     try:
         part = rolling.fastest()
         found = part.find(settings, constant)
-        turned = {name for name in found if cameras[name].turned and not cameras[name].rolling_shutter_known}
+        turned = {
+            name
+            for name in found
+            if cameras[name].may_be_sideways and not cameras[name].rolling_shutter_known
+        }
         across = part.read_along(stated | turned).find(settings, constant) if turned else {}
     except EstimationError as error:
         found, turned, across = rolling.undetermined(error.message), set(), {}

@@ -99,7 +99,9 @@ def _detect(detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.uint8]) ->
     pixels = (np.array([each.pt for each in found]) + CV2_PIXEL_OFFSET_PX) * scale
     shape = np.array([(each.size * scale[0] / 2.0, np.radians(each.angle)) for each in found])
     keypoints = np.column_stack([pixels, shape]).astype(np.float32)
-    keep = camera.sees_room(keypoints[:, :2]) if camera.mask is not None else np.ones(len(found), dtype=bool)
+    keep = (
+        camera.is_unmasked(keypoints[:, :2]) if camera.mask is not None else np.ones(len(found), dtype=bool)
+    )
     keypoints = keypoints[keep]
     column = np.clip(keypoints[:, 0].astype(int), 0, width - 1)
     row = np.clip(keypoints[:, 1].astype(int), 0, height - 1)

@@ -13,7 +13,7 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, image_ids
 from bodycap_batch.model.camera import Camera
-from bodycap_batch.model.optical_flow import bearings, fit_rotation
+from bodycap_batch.model.optical_flow import fit_rotation, unit_directions
 
 if TYPE_CHECKING:
     import pycolmap
@@ -151,7 +151,7 @@ def _start(
         np.asarray(database.read_keypoints(number), dtype=np.float64)[matches[:, side], :2]
         for side, number in enumerate(ids)
     ]
-    rays = [bearings(lens.unproject(px)) for lens, px in zip(seen, pixels, strict=True)]
+    rays = [unit_directions(lens.unproject(px)) for lens, px in zip(seen, pixels, strict=True)]
     known = np.isfinite(rays[0]).all(axis=1) & np.isfinite(rays[1]).all(axis=1)
     first, second = rays[0][known], rays[1][known]
     parallax, spread = 0.0, 0.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -10,35 +9,34 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.core.context import THREADS_VARIABLE
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import make_transform, transform_points
 
 _RAY_STEP = 1e-4
-_CHUNK = 48
+_CHUNK_FRAMES = 48
 """Frames solved together: enough to hide numpy's overhead, few enough to stay in the cache."""
-_PART = 1 << 14
+_BATCH_ROWS = 1 << 14
 """Views that the lens is asked for at a time: what that takes is ten times what is kept of it."""
-_ROUNDS = 20
+_MAX_ITERATIONS = 20
 _CONVERGED_PX = 1e-2
 """A third of what 200 points at 0.5 px leave open; 2e-3 gives the same errors for half as much time again."""
-_MAX_TURN_RAD = 0.5
-_WIDE = 3.0
+_MAX_STEP_RAD = 0.5
+_CUTOFF_MEDIANS = 3.0
 """Medians beyond which a residual counts as wrong while the start is still bad."""
-COUNTING_WEIGHT = 0.05
+MIN_COUNTED_WEIGHT = 0.05
 """Views that weigh less decide nothing where there are others."""
-_LOSS_SHARE = 0.25
+_LOSS_SCALE = 0.25
 """The loss's width in limits. 1, 1/2, 1/4: walk12 0.42, 0.39, 0.38 cm; walk131 0.68, 0.67, 0.65 cm."""
 _DAMPING = 1e-10
 _TINY = 1e-300
-_FAR = 1e5
+_UNUSABLE = 1e5
 """Pixels and depths are cut off here where only their order counts."""
-_MIN_VIEWS = 3
-_UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
+_MIN_OBSERVATIONS = 3
+_UPPER_TRIANGLE = tuple((i, j) for i in range(6) for j in range(i, 6))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Views:
+class Observations:
     """Map points seen in frames, ordered by frame.
 
     Attributes:
@@ -63,10 +61,10 @@ class Views:
         """Rows of one frame."""
         return slice(int(self.bounds[frame]), int(self.bounds[frame + 1]))
 
-    def of_frame(self, frame: int) -> Views:
+    def select_frame(self, frame: int) -> Observations:
         """The views of one frame alone."""
         rows = self.rows(frame)
-        return Views(
+        return Observations(
             bounds=np.array([0, rows.stop - rows.start]),
             points=self.points[rows],
             rays=self.rays[rows],
@@ -76,7 +74,7 @@ class Views:
             cam_from_rig=self.cam_from_rig,
         )
 
-    def in_cameras(self, rows: IntArray, poses: FloatArray) -> FloatArray:
+    def camera_poses(self, rows: IntArray, poses: FloatArray) -> FloatArray:
         """Poses (N,4,4) of the cameras that rows (N,) were seen by, from those of their frames (N,4,4)."""
         if self.member is None or self.cam_from_rig is None:
             return poses
@@ -84,8 +82,8 @@ class Views:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fits:
-    """What `assess_poses` finds.
+class PoseQuality:
+    """What `evaluate_poses` finds.
 
     Attributes:
         inliers: (F,) views within the limit.
@@ -98,41 +96,43 @@ class Fits:
 
     inliers: IntArray
     error_px: FloatArray
-    evidence: FloatArray
+    inlier_weight_ratio: FloatArray
     noise_px: FloatArray
     depth: FloatArray
     information: FloatArray
 
 
-def make_views(
+def make_observations(
     camera: Camera, bounds: IntArray, points: FloatArray, px: FloatArray, weight: FloatArray | None = None
-) -> Views:
+) -> Observations:
     """Undistort pixels (M,2) once, with the lens's derivative there: a pose then costs no lens model."""
     rays = np.empty((len(px), 2))
-    for start in range(0, len(px), _PART):
-        rays[start : start + _PART] = camera.unproject(px[start : start + _PART])
-    return Views(
+    for start in range(0, len(px), _BATCH_ROWS):
+        rays[start : start + _BATCH_ROWS] = camera.unproject(px[start : start + _BATCH_ROWS])
+    return Observations(
         bounds=bounds,
         points=points,
         rays=rays,
-        px_from_ray=lens_jacobian(camera, rays),
+        px_from_ray=projection_jacobian(camera, rays),
         weight=np.ones(len(px)) if weight is None else weight,
     )
 
 
-def lens_jacobian(camera: Camera, rays: FloatArray) -> FloatArray:
+def projection_jacobian(camera: Camera, rays: FloatArray) -> FloatArray:
     """Derivative (N,2,2) of the pixel by the ray (x/z, y/z), by central differences."""
     out = np.empty((len(rays), 2, 2))
-    for start in range(0, len(rays), _PART):
-        some = rays[start : start + _PART]
-        one = np.ones((len(some), 1))
+    for start in range(0, len(rays), _BATCH_ROWS):
+        batch = rays[start : start + _BATCH_ROWS]
+        one = np.ones((len(batch), 1))
         for axis, step in enumerate(np.eye(2) * _RAY_STEP):
-            ahead, behind = (camera.project(np.hstack([some + sign * step, one])) for sign in (1.0, -1.0))
-            out[start : start + _PART, :, axis] = (ahead - behind) / (2.0 * _RAY_STEP)
+            ahead, behind = (camera.project(np.hstack([batch + sign * step, one])) for sign in (1.0, -1.0))
+            out[start : start + _BATCH_ROWS, :, axis] = (ahead - behind) / (2.0 * _RAY_STEP)
     return out
 
 
-def refine_poses(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> FloatArray:
+def refine_poses(
+    observations: Observations, cam_from_gauge: FloatArray, limit_px: float, threads: int = 1
+) -> FloatArray:
     """Least reprojection error under a Cauchy loss cut off at `limit_px`, from starting poses (F,4,4).
 
     The loss begins as wide as the residuals are and narrows with them, so a start that is off by more
@@ -145,119 +145,131 @@ def refine_poses(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> F
     """
     poses = cam_from_gauge.copy()
 
-    def work(active: IntArray) -> None:
-        for _ in range(_ROUNDS):
-            poses[active], done = _step(views, active, poses[active], limit_px)
+    def refine_chunk(active: IntArray) -> None:
+        for _ in range(_MAX_ITERATIONS):
+            poses[active], done = _gauss_newton_step(observations, active, poses[active], limit_px)
             active = active[~done]
             if len(active) == 0:
                 break
 
-    _side_by_side(views, work)
+    _for_each_chunk(observations, refine_chunk, threads)
     return poses
 
 
-def assess_poses(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> Fits:
+def evaluate_poses(
+    observations: Observations, cam_from_gauge: FloatArray, limit_px: float, threads: int = 1
+) -> PoseQuality:
     """How well poses (F,4,4) explain what their frames see."""
-    frames = len(cam_from_gauge)
-    fits = Fits(
-        inliers=np.zeros(frames, np.int64),
-        error_px=np.full(frames, np.nan),
-        evidence=np.zeros(frames),
-        noise_px=np.full(frames, np.nan),
-        depth=np.full(frames, np.nan),
-        information=np.zeros((frames, 6, 6)),
+    frame_count = len(cam_from_gauge)
+    quality = PoseQuality(
+        inliers=np.zeros(frame_count, np.int64),
+        error_px=np.full(frame_count, np.nan),
+        inlier_weight_ratio=np.zeros(frame_count),
+        noise_px=np.full(frame_count, np.nan),
+        depth=np.full(frame_count, np.nan),
+        information=np.zeros((frame_count, 6, 6)),
     )
 
-    def work(some: IntArray) -> None:
-        rows, starts, owner = _gather(views, some)
-        residual, jacobian, depth = linearise(views, rows, cam_from_gauge[some][owner])
-        size = np.hypot(residual[0], residual[1])
-        inlier = size < limit_px
+    def evaluate_chunk(chosen: IntArray) -> None:
+        rows, starts, owner = _rows_of_frames(observations, chosen)
+        residual, jacobian, depth = linearise(observations, rows, cam_from_gauge[chosen][owner])
+        error_px = np.hypot(residual[0], residual[1])
+        inlier = error_px < limit_px
         count = np.add.reduceat(inlier, starts, dtype=np.int64)
-        fits.inliers[some] = count
-        fits.error_px[some] = np.add.reduceat(np.where(inlier, size, 0.0), starts) / np.maximum(count, 1)
-        weight = views.weight[rows]
+        quality.inliers[chosen] = count
+        quality.error_px[chosen] = np.add.reduceat(np.where(inlier, error_px, 0.0), starts) / np.maximum(
+            count, 1
+        )
+        weight = observations.weight[rows]
         total = np.maximum(np.add.reduceat(weight, starts), _TINY)
-        fits.evidence[some] = np.add.reduceat(inlier * weight, starts) / total
-        counts = inlier & (weight >= COUNTING_WEIGHT)
-        spread = np.abs(np.where(counts, residual * np.sqrt(weight), _FAR)).T.ravel()
-        many = np.add.reduceat(counts, starts, dtype=np.int64)
-        fits.noise_px[some] = _medians(spread, np.repeat(owner, 2), 2 * starts, 2 * many)
-        fits.depth[some] = _medians(np.where(inlier, depth, np.inf), owner, starts, count)
-        fits.information[some] = _normal_equations(residual, jacobian, inlier * views.weight[rows], starts)[0]
+        quality.inlier_weight_ratio[chosen] = np.add.reduceat(inlier * weight, starts) / total
+        is_counted = inlier & (weight >= MIN_COUNTED_WEIGHT)
+        scaled_px = np.abs(np.where(is_counted, residual * np.sqrt(weight), _UNUSABLE)).T.ravel()
+        counted = np.add.reduceat(is_counted, starts, dtype=np.int64)
+        quality.noise_px[chosen] = _segment_medians(scaled_px, np.repeat(owner, 2), 2 * starts, 2 * counted)
+        quality.depth[chosen] = _segment_medians(np.where(inlier, depth, np.inf), owner, starts, count)
+        quality.information[chosen] = _normal_equations(
+            residual, jacobian, inlier * observations.weight[rows], starts
+        )[0]
 
-    _side_by_side(views, work)
-    return fits
+    _for_each_chunk(observations, evaluate_chunk, threads)
+    return quality
 
 
-def inliers_of(views: Views, cam_from_gauge: FloatArray, limit_px: float) -> BoolArray:
+def find_inliers(
+    observations: Observations, cam_from_gauge: FloatArray, limit_px: float, threads: int
+) -> BoolArray:
     """Which views (M,) lie within a limit of what poses (F,4,4) predict; none where a pose is NaN."""
-    out = np.zeros(len(views.rays), dtype=bool)
+    out = np.zeros(len(observations.rays), dtype=bool)
 
-    def work(some: IntArray) -> None:
-        rows, _, owner = _gather(views, some)
-        residual, _, _ = _residuals(views, rows, cam_from_gauge[some][owner])
+    def mark_chunk(chosen: IntArray) -> None:
+        rows, _, owner = _rows_of_frames(observations, chosen)
+        residual, _, _ = _residuals(observations, rows, cam_from_gauge[chosen][owner])
         out[rows] = np.hypot(residual[0], residual[1]) < limit_px
 
-    _side_by_side(views, work)
+    _for_each_chunk(observations, mark_chunk, threads)
     return out
 
 
-def _side_by_side(views: Views, work: Callable[[IntArray], None]) -> None:
+def _for_each_chunk(observations: Observations, work: Callable[[IntArray], None], threads: int) -> None:
     """Do chunks of frames, on all threads of the task: frames do not influence each other."""
-    chunks, threads = list(_chunks(views)), int(os.environ.get(THREADS_VARIABLE, "1"))
-    if threads == 1 or len(chunks) < 2:
-        for some in chunks:
-            work(some)
+    chunks = list(_chunks(observations))
+    if threads <= 1 or len(chunks) < 2:
+        for frames in chunks:
+            work(frames)
         return
     with ThreadPoolExecutor(threads, thread_name_prefix="poses") as pool:
         for _ in pool.map(work, chunks):
             pass
 
 
-def _chunks(views: Views) -> Iterator[IntArray]:
+def _chunks(observations: Observations) -> Iterator[IntArray]:
     """Frames with enough views to have a pose, some at a time."""
-    counts = np.diff(views.bounds)
-    usable = np.flatnonzero(counts >= _MIN_VIEWS)
-    for start in range(0, len(usable), _CHUNK):
-        yield usable[start : start + _CHUNK]
+    counts = np.diff(observations.bounds)
+    usable = np.flatnonzero(counts >= _MIN_OBSERVATIONS)
+    for start in range(0, len(usable), _CHUNK_FRAMES):
+        yield usable[start : start + _CHUNK_FRAMES]
 
 
-def _step(views: Views, frames: IntArray, poses: FloatArray, limit_px: float) -> tuple[FloatArray, BoolArray]:
-    rows, starts, owner = _gather(views, frames)
-    residual, jacobian, _ = linearise(views, rows, poses[owner])
-    size = np.hypot(residual[0], residual[1])
-    median = _medians(size, owner, starts, views.bounds[frames + 1] - views.bounds[frames])
-    cut = np.maximum(limit_px, _WIDE * median)[owner]
-    robust = np.where(size < cut, 1.0 / (1.0 + (size / (_LOSS_SHARE * cut)) ** 2), 0.0)
-    weight = robust * views.weight[rows]
+def _gauss_newton_step(
+    observations: Observations, frames: IntArray, poses: FloatArray, limit_px: float
+) -> tuple[FloatArray, BoolArray]:
+    rows, starts, owner = _rows_of_frames(observations, frames)
+    residual, jacobian, _ = linearise(observations, rows, poses[owner])
+    error_px = np.hypot(residual[0], residual[1])
+    median = _segment_medians(
+        error_px, owner, starts, observations.bounds[frames + 1] - observations.bounds[frames]
+    )
+    cutoff = np.maximum(limit_px, _CUTOFF_MEDIANS * median)[owner]
+    robust = np.where(error_px < cutoff, 1.0 / (1.0 + (error_px / (_LOSS_SCALE * cutoff)) ** 2), 0.0)
+    weight = robust * observations.weight[rows]
     hessian, gradient = _normal_equations(residual, jacobian, weight, starts)
     damped = hessian + np.eye(6) * (_DAMPING * np.einsum("fii->f", hessian) + _TINY)[:, None, None]
     step = -np.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
     total = np.maximum(np.add.reduceat(weight, starts), 1e-3)
     moved_px = np.sqrt(np.einsum("fi,fij,fj->f", step, hessian, step) / total)
-    return _moved(poses, step), moved_px < _CONVERGED_PX
+    return _retract(poses, step), moved_px < _CONVERGED_PX
 
 
-def _medians(value: FloatArray, owner: IntArray, starts: IntArray, counts: IntArray) -> FloatArray:
-    """Lower median of each owner's `counts` smallest values: one sort, the owner in the leading digits."""
-    capped = np.minimum(value, _FAR)
-    base = owner * (2.0 * _FAR)
+def _segment_medians(value: FloatArray, owner: IntArray, starts: IntArray, counts: IntArray) -> FloatArray:
+    """Lower median of each owner's `count_by_frame` smallest values: one sort, the owner in the leading digits."""
+    capped = np.minimum(value, _UNUSABLE)
+    base = owner * (2.0 * _UNUSABLE)
     middle = starts + np.maximum(counts - 1, 0) // 2
     return np.asarray(np.sort(base + capped)[middle] - base[starts])
 
 
-def _gather(views: Views, frames: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+def _rows_of_frames(observations: Observations, frames: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """Rows of some frames, where each frame's begin among them, and whose each is."""
-    counts = views.bounds[frames + 1] - views.bounds[frames]
+    counts = observations.bounds[frames + 1] - observations.bounds[frames]
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
     owner = np.repeat(np.arange(len(frames)), counts)
-    rows = np.arange(counts.sum()) + (views.bounds[frames] - starts)[owner]
+    rows = np.arange(counts.sum()) + (observations.bounds[frames] - starts)[owner]
     return rows, starts, owner
 
 
 def linearise(
-    views: Views, rows: IntArray, cam_from_gauge: FloatArray
+    observations: Observations, rows: IntArray, cam_from_gauge: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Residuals (2,N) px, their derivative (2,6,N) by a left perturbation of cam_from_gauge, depths (N,).
 
@@ -268,51 +280,51 @@ def linearise(
         rows: N of its rows.
         cam_from_gauge: (N,4,4) a pose for each row.
     """
-    residual, (a, b, inverse, z), lens = _residuals(views, rows, cam_from_gauge)
+    residual, (a, b, inverse, z), px_from_ray = _residuals(observations, rows, cam_from_gauge)
     jacobian = np.empty((2, 6, len(a)))
-    for derivative, (by_a, by_b) in zip(jacobian, lens, strict=True):
-        along = by_a * a + by_b * b
-        derivative[0] = -(b * along + by_b)
-        derivative[1] = a * along + by_a
+    for derivative, (by_a, by_b) in zip(jacobian, px_from_ray, strict=True):
+        chain = by_a * a + by_b * b
+        derivative[0] = -(b * chain + by_b)
+        derivative[1] = a * chain + by_a
         derivative[2] = by_b * a - by_a * b
         derivative[3] = by_a * inverse
         derivative[4] = by_b * inverse
-        derivative[5] = -along * inverse
-    if views.member is not None and views.cam_from_rig is not None:
-        _turn_to_rig(jacobian, views.member[rows], views.cam_from_rig)
+        derivative[5] = -chain * inverse
+    if observations.member is not None and observations.cam_from_rig is not None:
+        _camera_to_rig_jacobian(jacobian, observations.member[rows], observations.cam_from_rig)
     return residual, jacobian, z
 
 
-def _turn_to_rig(jacobian: FloatArray, member: IntArray, cam_from_rig: FloatArray) -> None:
+def _camera_to_rig_jacobian(jacobian: FloatArray, member: IntArray, cam_from_rig: FloatArray) -> None:
     """Make derivatives (2,6,N) by a camera's perturbation ones by its rig's, in place.
 
     Source: the adjoint map of SE(3), as in Sola, Deray, Atchuthan, "A micro Lie theory for state estimation
         in robotics", 2018; rotation first.
     """
     for number, pose in enumerate(cam_from_rig):
-        mine = np.flatnonzero(member == number)
-        turn, (x, y, z) = pose[:3, :3], pose[:3, 3].tolist()
+        columns = np.flatnonzero(member == number)
+        rotation, (x, y, z) = pose[:3, :3], pose[:3, 3].tolist()
         adjoint = np.zeros((6, 6))
-        adjoint[:3, :3] = adjoint[3:, 3:] = turn
-        adjoint[3:, :3] = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ turn
-        jacobian[:, :, mine] = np.einsum("dim,ik->dkm", jacobian[:, :, mine], adjoint)
+        adjoint[:3, :3] = adjoint[3:, 3:] = rotation
+        adjoint[3:, :3] = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ rotation
+        jacobian[:, :, columns] = np.einsum("dim,ik->dkm", jacobian[:, :, columns], adjoint)
 
 
 def _residuals(
-    views: Views, rows: IntArray, cam_from_gauge: FloatArray
+    observations: Observations, rows: IntArray, cam_from_gauge: FloatArray
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]:
     """Residuals (2,N) as `linearise` has them; x/z, y/z, 1/z, z; the lens (2,2,N), 0 where unusable."""
-    x, y, z = transform_points(views.in_cameras(rows, cam_from_gauge), views.points[rows]).T
-    front = z > 1e-9
-    inverse = 1.0 / np.where(front, z, 1.0)
+    x, y, z = transform_points(observations.camera_poses(rows, cam_from_gauge), observations.points[rows]).T
+    in_front = z > 1e-9
+    inverse = 1.0 / np.where(in_front, z, 1.0)
     a, b = x * inverse, y * inverse
-    lens = np.ascontiguousarray(views.px_from_ray[rows].transpose(1, 2, 0))
-    off_a, off_b = a - views.rays[rows, 0], b - views.rays[rows, 1]
-    residual = np.stack([by_a * off_a + by_b * off_b for by_a, by_b in lens])
-    usable = front & np.isfinite(residual).all(axis=0)
+    px_from_ray = np.ascontiguousarray(observations.px_from_ray[rows].transpose(1, 2, 0))
+    off_a, off_b = a - observations.rays[rows, 0], b - observations.rays[rows, 1]
+    residual = np.stack([by_a * off_a + by_b * off_b for by_a, by_b in px_from_ray])
+    usable = in_front & np.isfinite(residual).all(axis=0)
     if not usable.all():
-        residual, lens = np.where(usable, residual, _FAR), np.where(usable, lens, 0.0)
-    return residual, (a, b, inverse, z), lens
+        residual, px_from_ray = np.where(usable, residual, _UNUSABLE), np.where(usable, px_from_ray, 0.0)
+    return residual, (a, b, inverse, z), px_from_ray
 
 
 def _normal_equations(
@@ -321,7 +333,7 @@ def _normal_equations(
     frames = len(starts)
     hessian, gradient = np.empty((frames, 6, 6)), np.empty((frames, 6))
     weighted = jacobian * weight
-    for i, j in _UPPER:
+    for i, j in _UPPER_TRIANGLE:
         entry = np.add.reduceat(weighted[0, i] * jacobian[0, j] + weighted[1, i] * jacobian[1, j], starts)
         hessian[:, i, j] = hessian[:, j, i] = entry
     for i in range(6):
@@ -329,12 +341,12 @@ def _normal_equations(
     return hessian, gradient
 
 
-def _moved(cam_from_gauge: FloatArray, step: FloatArray) -> FloatArray:
+def _retract(cam_from_gauge: FloatArray, step: FloatArray) -> FloatArray:
     """Left perturbation (N,6) of poses (N,4,4), rotation first; a turn is held to what is sane."""
-    turn = step[:, :3]
-    angle = np.linalg.norm(turn, axis=1, keepdims=True)
-    held = np.minimum(1.0, _MAX_TURN_RAD / np.maximum(angle, 1e-12))
-    return make_transform(_rotation(turn * held), step[:, 3:] * held) @ cam_from_gauge
+    rotvec = step[:, :3]
+    angle = np.linalg.norm(rotvec, axis=1, keepdims=True)
+    scale = np.minimum(1.0, _MAX_STEP_RAD / np.maximum(angle, 1e-12))
+    return make_transform(_rotation(rotvec * scale), step[:, 3:] * scale) @ cam_from_gauge
 
 
 def _rotation(turn_rad: FloatArray) -> FloatArray:

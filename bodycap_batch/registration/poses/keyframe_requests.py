@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, evenly_spaced, runs
 
-_STRIDE = 3
-_EDGE = 1
+_WINDOW_FRAMES = 3
+_END_OFFSET_FRAMES = 1
 _MIN_BUDGET = 20
-_BUDGET_SHARE = 0.5
+_BUDGET_RATIO = 0.5
 
 
-def lost_runs(localised: BoolArray) -> list[tuple[int, int]]:
+def lost_intervals(localised: BoolArray) -> list[tuple[int, int]]:
     """Maximal runs [start, stop) of frames without a pose."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], ~localised, [False]]).astype(int)))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return runs(~localised)
 
 
-def wanted_keyframes(localised: BoolArray, sharpness: FloatArray, tried: IntArray) -> IntArray:
+def request_keyframes(localised: BoolArray, sharpness: FloatArray, tried: IntArray) -> IntArray:
     """Frames to offer to the map: the sharpest of every few lost ones, and the ends they hang on.
 
     Args:
@@ -32,21 +31,25 @@ def wanted_keyframes(localised: BoolArray, sharpness: FloatArray, tried: IntArra
     Source: Algorithm 1 of Vo, Kim, Choudhary, "Motion capture using body mounted cameras in an
         unknown environment".
     """
-    known = np.zeros(len(localised), dtype=bool)
-    known[tried] = True
+    was_tried = np.zeros(len(localised), dtype=bool)
+    was_tried[tried] = True
     chosen: list[int] = []
-    for start, stop in lost_runs(localised):
-        fresh: list[int] = []
-        for begin in range(start, stop, _STRIDE):
-            window = np.arange(begin, min(begin + _STRIDE, stop))
-            if not known[window].any():
-                fresh.append(int(window[np.argmax(sharpness[window])]))
-        if not fresh:
+    for start, stop in lost_intervals(localised):
+        untried: list[int] = []
+        for window_start in range(start, stop, _WINDOW_FRAMES):
+            window = np.arange(window_start, min(window_start + _WINDOW_FRAMES, stop))
+            if not was_tried[window].any():
+                untried.append(int(window[np.argmax(sharpness[window])]))
+        if not untried:
             continue
-        ends = [frame for frame in (start - _EDGE, stop - 1 + _EDGE) if 0 <= frame < len(localised)]
-        chosen += fresh + [frame for frame in ends if not known[frame]]
-    budget = max(_MIN_BUDGET, int(_BUDGET_SHARE * len(tried)))
+        ends = [
+            frame
+            for frame in (start - _END_OFFSET_FRAMES, stop - 1 + _END_OFFSET_FRAMES)
+            if 0 <= frame < len(localised)
+        ]
+        chosen += untried + [frame for frame in ends if not was_tried[frame]]
+    budget = max(_MIN_BUDGET, int(_BUDGET_RATIO * len(tried)))
     unique = np.unique(np.array(chosen, dtype=np.int64))
     if len(unique) > budget:
-        unique = unique[np.linspace(0, len(unique) - 1, budget).round().astype(int)]
+        unique = unique[evenly_spaced(len(unique), budget)]
     return unique

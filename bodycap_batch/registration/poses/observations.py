@@ -11,27 +11,32 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert
-from bodycap_batch.model.rolling_shutter import at_mid_row, image_velocity
+from bodycap_batch.model.rolling_shutter import image_velocity, px_at_mid_row
 from bodycap_batch.model.scene import Map
-from bodycap_batch.registration.poses.batched_pnp import Views, lens_jacobian, make_views
-from bodycap_batch.registration.poses.static_points import confirmed_points
+from bodycap_batch.registration.poses.batched_pnp import Observations, make_observations, projection_jacobian
+from bodycap_batch.registration.poses.static_points import static_points
 from bodycap_batch.registration.tracking.klt import Tracks
 
-_POINT_VARIANCE = 6.0
+_POINT_VARIANCE_RATIO = 6.0
 """Variance that a point seen by n keyframes adds to its projections, times n, in units of a track's own.
 Without it and with 3, 6, 9: walk131 0.65, 0.59, 0.55, 0.55 cm; room131 3.1, 3.0, 2.9, 2.9; walk12 0.38 for
 all; room12 0.55, 0.55, 0.56, 0.56."""
-_UNCONFIRMED_WEIGHT = 0.01
+_TRANSIENT_WEIGHT = 0.01
 """Weight of points that nothing confirms. With 1, 0.1, 0.03, 0.01: room131 1.86, 1.39, 1.38, 1.36 cm; a
 rendered capture with textured sleeves in view 1.00, 0.72, 0.61, 0.58 cm; room12 0.58, 0.60, 0.61, 0.61 cm."""
-STRETCH = 1200
+BLOCK_FRAMES = 1200
 """Frames whose views are held at a time. Solving 144 s of one camera took 792 MB with all of them held, and
 takes 484; the poses are the same."""
-_MIN_JUDGED = 4
+_MIN_OBSERVED = 4
+
+
+def point_weights(keyframe_count: IntArray) -> FloatArray:
+    """X"""
+    return np.asarray(keyframe_count / (keyframe_count + _POINT_VARIANCE_RATIO))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Member:
+class RigMember:
     """One of the cameras that see a frame together.
 
     Attributes:
@@ -48,7 +53,7 @@ class Member:
 
 
 @dataclass(frozen=True, slots=True)
-class Votes:
+class PointReliability:
     """How often points were seen in frames with a pose, and how often they agreed with it.
 
     Attributes:
@@ -56,27 +61,27 @@ class Votes:
         agreed: (C*P,) likewise.
     """
 
-    seen: IntArray
+    observed: IntArray
     agreed: IntArray
 
     @staticmethod
-    def none(count: int) -> Votes:
+    def zero(count: int) -> PointReliability:
         """No votes on so many points."""
-        return Votes(np.zeros(count, np.int64), np.zeros(count, np.int64))
+        return PointReliability(np.zeros(count, np.int64), np.zeros(count, np.int64))
 
-    def add(self, which: IntArray, posed: BoolArray, agrees: BoolArray) -> None:
-        """Count views (M,) of points `which`, those alone whose frames are posed."""
-        self.seen[:] += np.bincount(which[posed], minlength=len(self.seen))
-        self.agreed[:] += np.bincount(which[posed & agrees], minlength=len(self.seen))
+    def add(self, keys: IntArray, has_pose: BoolArray, agrees: BoolArray) -> None:
+        """Count views (M,) of points `keys`, those alone whose frames are posed."""
+        self.observed[:] += np.bincount(keys[has_pose], minlength=len(self.observed))
+        self.agreed[:] += np.bincount(keys[has_pose & agrees], minlength=len(self.observed))
 
-    def share(self, which: IntArray) -> FloatArray:
-        """Share (M,) of a point's views that agree; 1 where fewer than `_MIN_JUDGED` tell."""
-        share = self.agreed / np.maximum(self.seen, 1)
-        return np.asarray(np.where(self.seen < _MIN_JUDGED, 1.0, share)[which])
+    def agreement(self, keys: IntArray) -> FloatArray:
+        """Share (M,) of a point's views that agree; 1 where fewer than `_MIN_OBSERVED` tell."""
+        ratio = self.agreed / np.maximum(self.observed, 1)
+        return np.asarray(np.where(self.observed < _MIN_OBSERVED, 1.0, ratio)[keys])
 
 
-@dataclass(frozen=True, slots=True)
-class Rig:
+@dataclass(slots=True)
+class RigObservations:
     """Cameras and the map.
 
     Attributes:
@@ -86,34 +91,34 @@ class Rig:
         kept: The only stretch, once it is known.
     """
 
-    members: Sequence[Member]
+    members: Sequence[RigMember]
     scene_map: Map
-    confirmed: BoolArray
-    kept: list[Stretch] = field(default_factory=list)
+    static: BoolArray
+    _only_block: FrameBlock | None = field(default=None, init=False, repr=False)
 
     @staticmethod
-    def of(members: Sequence[Member], scene_map: Map) -> Rig:
+    def create(members: Sequence[RigMember], scene_map: Map) -> RigObservations:
         """Cameras with what confirms the map's points to each."""
-        confirmed = np.array([confirmed_points(member.camera, scene_map) for member in members])
-        return Rig(members, scene_map, confirmed)
+        static = np.array([static_points(member.camera, scene_map) for member in members])
+        return RigObservations(members, scene_map, static)
 
-    def stretches(self) -> Iterator[Stretch]:
+    def blocks(self) -> Iterator[FrameBlock]:
         """What is seen, some frames at a time; a single stretch is kept for the next time."""
         count = len(self.members[0].camera.times_ns)
-        if count > STRETCH:
-            for first in range(0, count, STRETCH):
-                yield self._stretch(slice(first, min(first + STRETCH, count)))
+        if count > BLOCK_FRAMES:
+            for first in range(0, count, BLOCK_FRAMES):
+                yield self._make_block(slice(first, min(first + BLOCK_FRAMES, count)))
             return
-        if not self.kept:
-            self.kept.append(self._stretch(slice(0, count)))
-        yield self.kept[0]
+        if self._only_block is None:
+            self._only_block = self._make_block(slice(0, count))
+        yield self._only_block
 
-    def _stretch(self, frames: slice) -> Stretch:
-        parts = [_seen_by(member, self.scene_map, frames) for member in self.members]
+    def _make_block(self, frames: slice) -> FrameBlock:
+        parts = [_observations_of(member, self.scene_map, frames) for member in self.members]
         frame, point, px = (np.concatenate(each) for each in zip(*parts, strict=True))
         member = np.repeat(np.arange(len(self.members)), [len(part[0]) for part in parts])
         order = np.argsort(frame, kind="stable")
-        return Stretch(self, frames, frame[order], point[order], px[order], member[order])
+        return FrameBlock(self, frames, frame[order], point[order], px[order], member[order])
 
     @property
     def lenses(self) -> list[Camera]:
@@ -126,8 +131,8 @@ class Rig:
         return any(self.scene_map.readout_s.get(member.camera.name, 0.0) for member in self.members)
 
 
-@dataclass(frozen=True, slots=True)
-class Stretch:
+@dataclass(slots=True)
+class FrameBlock:
     """What a rig sees of the map in a stretch of frames: tracked points, and keyframes' own observations.
 
     Attributes:
@@ -140,39 +145,42 @@ class Stretch:
         made: Its views, once they are made.
     """
 
-    rig: Rig
+    rig: RigObservations
     frames: slice
     frame: IntArray
     point: IntArray
     px: FloatArray
     member: IntArray
-    made: list[Views] = field(default_factory=list)
+    _observations: Observations | None = field(default=None, init=False, repr=False)
 
-    def views(self, px: FloatArray | None, votes: Votes | None) -> Views:
-        """What is seen, at pixels (M,2) where these are not its own; `votes` tell how far points agree."""
-        if px is None:
-            if not self.made:
-                self.made.append(self._views(self.px))
-            views = self.made[0]
+    def observations(self, px: FloatArray | None, reliability: PointReliability | None) -> Observations:
+        """What is seen, at pixels (M,2) where these are not its own; `reliability` tell how far points agree."""
+        if px is not None:
+            observations = self._make_observations(px)
+        elif self._observations is not None:
+            observations = self._observations
         else:
-            views = self._views(px)
-        return views if votes is None else replace(views, weight=views.weight * votes.share(self.which) ** 2)
+            observations = self._observations = self._make_observations(self.px)
+        if reliability is None:
+            return observations
+        weight = observations.weight * reliability.agreement(self.point_keys) ** 2
+        return replace(observations, weight=weight)
 
-    def _views(self, px: FloatArray) -> Views:
+    def _make_observations(self, px: FloatArray) -> Observations:
         scene_map, lenses = self.rig.scene_map, self.rig.lenses
         # Where a point stands is known the better the more keyframes see it.
         count = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))[self.point]
-        weight = count / (count + _POINT_VARIANCE) * np.where(self.confirmed, 1.0, _UNCONFIRMED_WEIGHT)
+        weight = point_weights(count) * np.where(self.static, 1.0, _TRANSIENT_WEIGHT)
         bounds = np.searchsorted(self.frame, np.arange(self.frames.start, self.frames.stop + 1))
         points = scene_map.points[self.point]
         if len(lenses) == 1:
-            return make_views(lenses[0], bounds, points, px, weight)
+            return make_observations(lenses[0], bounds, points, px, weight)
         rays, px_from_ray = np.empty((len(px), 2)), np.empty((len(px), 2, 2))
         for number, lens in enumerate(lenses):
-            mine = self.member == number
-            rays[mine] = lens.unproject(px[mine])
-            px_from_ray[mine] = lens_jacobian(lens, rays[mine])
-        return Views(
+            rows = self.member == number
+            rays[rows] = lens.unproject(px[rows])
+            px_from_ray[rows] = projection_jacobian(lens, rays[rows])
+        return Observations(
             bounds=bounds,
             points=points,
             rays=rays,
@@ -183,50 +191,52 @@ class Stretch:
         )
 
     @property
-    def confirmed(self) -> BoolArray:
+    def static(self) -> BoolArray:
         """(M,) whether something confirms the point that is seen."""
-        return np.asarray(self.rig.confirmed[self.member, self.point])
+        return np.asarray(self.rig.static[self.member, self.point])
 
     @property
-    def which(self) -> IntArray:
+    def point_keys(self) -> IntArray:
         """(M,) camera and point, as votes number them."""
         return self.member * len(self.rig.scene_map.points) + self.point
 
-    def at_mid_row(self, path: FloatArray) -> FloatArray:
+    def px_at_mid_row(self, path: FloatArray) -> FloatArray:
         """Pixels (M,2) at the instant of the middle row, for the rig's poses of all frames."""
         out = self.px.copy()
         scene_map, times_ns = self.rig.scene_map, self.rig.members[0].camera.times_ns
         for number, (member, lens) in enumerate(zip(self.rig.members, self.rig.lenses, strict=True)):
             readout_s = scene_map.readout_s.get(member.camera.name, 0.0)
             if readout_s:
-                mine = self.member == number
-                own, points = path @ invert(member.cam_from_rig), scene_map.points[self.point[mine]]
-                velocity = image_velocity(lens, own, times_ns, self.frame[mine], points)
-                out[mine] = at_mid_row(lens, out[mine], velocity, readout_s)
+                rows = self.member == number
+                own_poses, points = path @ invert(member.cam_from_rig), scene_map.points[self.point[rows]]
+                velocity = image_velocity(lens, own_poses, times_ns, self.frame[rows], points)
+                out[rows] = px_at_mid_row(lens, out[rows], velocity, readout_s)
         return out
 
-    def counts(self, which: BoolArray) -> IntArray:
+    def count_by_frame(self, selected: BoolArray) -> IntArray:
         """How many of the rows under a mask each frame of the stretch has."""
         return np.bincount(
-            self.frame[which] - self.frames.start, minlength=self.frames.stop - self.frames.start
+            self.frame[selected] - self.frames.start, minlength=self.frames.stop - self.frames.start
         )
 
 
-def _seen_by(member: Member, scene_map: Map, frames: slice) -> tuple[IntArray, IntArray, FloatArray]:
+def _observations_of(
+    member: RigMember, scene_map: Map, frames: slice
+) -> tuple[IntArray, IntArray, FloatArray]:
     """Frames of the rig, points and pixels of what one camera sees in a stretch."""
     name = member.camera.name
     inside = np.flatnonzero((member.rig_frame >= frames.start) & (member.rig_frame < frames.stop))
     first, stop = (int(inside[0]), int(inside[-1]) + 1) if len(inside) else (0, 0)
-    tracks = member.tracks.within(first, stop)
+    tracks = member.tracks.in_frames(first, stop)
     point = scene_map.points_of(name, tracks.keyframe, tracks.feature)
-    tracked = point >= 0
+    has_point = point >= 0
     own_frame = scene_map.keyframe_frame[scene_map.obs_keyframe]
-    mine = np.isin(scene_map.obs_keyframe, scene_map.keyframes_of(name))
-    mine &= (own_frame >= first) & (own_frame < stop)
-    frame = member.rig_frame[np.concatenate([own_frame[mine], tracks.frame[tracked]])]
-    known = frame >= 0
+    is_own = np.isin(scene_map.obs_keyframe, scene_map.keyframes_of(name))
+    is_own &= (own_frame >= first) & (own_frame < stop)
+    frame = member.rig_frame[np.concatenate([own_frame[is_own], tracks.frame[has_point]])]
+    in_rig = frame >= 0
     return (
-        frame[known],
-        np.concatenate([scene_map.obs_point[mine], point[tracked]])[known],
-        np.concatenate([scene_map.obs_px[mine], tracks.px[tracked].astype(np.float64)])[known],
+        frame[in_rig],
+        np.concatenate([scene_map.obs_point[is_own], point[has_point]])[in_rig],
+        np.concatenate([scene_map.obs_px[is_own], tracks.px[has_point].astype(np.float64)])[in_rig],
     )

@@ -12,31 +12,31 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform
 from bodycap_batch.model.scene import FrameStatus
 from bodycap_batch.registration.poses.batched_pnp import (
-    COUNTING_WEIGHT,
-    Fits,
-    Views,
-    assess_poses,
+    MIN_COUNTED_WEIGHT,
+    Observations,
+    PoseQuality,
+    evaluate_poses,
     refine_poses,
 )
 
-_MIN_EVIDENCE = 0.3
+_MIN_INLIER_WEIGHT_RATIO = 0.3
 _MIN_NOISE_PX = 0.3
-MAP_VARIANCE_RATIO = 5.0
+MAP_COVARIANCE_SCALE = 5.0
 """Variance of a pose over what its residuals tell: the map's points around a frame are displaced together.
 
 Measured as the normalised error without it (median over what a chi-squared has): walk12 5.1, room12 4.1,
 walk131 5.2 (room131, where blocks of the map are loose, 16). The poses that a frame's two keyframes lead to
 differ by 0.8 of their own variances, so nothing in a frame alone can tell."""
-_HUGE = 1e12
-_LEAST_EVIDENCE = 1e-3
+_UNCONSTRAINED_VARIANCE = 1e12
+_WEIGHT_RATIO_FLOOR = 1e-3
 _MAX_TRIALS = 2000
-_TRUSTED_RATIO = 0.6
+TRUSTED_WEIGHT_RATIO = 0.6
 """Share of the weight with the inliers above which a start led to the right pose: sampling never found a
 better one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PoseLimits:
+class AcceptanceCriteria:
     """What makes a pose acceptable.
 
     Attributes:
@@ -71,12 +71,17 @@ class FramePose:
     gauge_from_cam: FloatArray | None = None
     covariance: FloatArray | None = None
     inliers: int = 0
-    evidence: float = 0.0
+    inlier_weight_ratio: float = 0.0
     error_px: float = float("nan")
 
 
 def solve_poses(
-    lenses: Sequence[Camera], views: Views, px: FloatArray, start: FloatArray, limits: PoseLimits
+    lenses: Sequence[Camera],
+    observations: Observations,
+    px: FloatArray,
+    start: FloatArray,
+    criteria: AcceptanceCriteria,
+    threads: int = 1,
 ) -> list[FramePose]:
     """Poses of all frames of a camera, or of a rig, from the map points seen in them.
 
@@ -89,47 +94,54 @@ def solve_poses(
 
     Where a start leads to few inliers, or there is none, the frame is sampled from scratch.
     """
-    known = np.asarray(np.isfinite(start).all(axis=(1, 2)))
-    poses = refine_poses(views, np.where(known[:, None, None], start, np.eye(4)), limits.max_error_px)
-    count = np.diff(views.bounds)
-    found = judge_poses(views, poses, limits)
-    for frame in np.flatnonzero(count >= limits.min_inliers).tolist():
-        if known[frame] and found[frame].evidence >= _TRUSTED_RATIO:
+    has_start = np.asarray(np.isfinite(start).all(axis=(1, 2)))
+    initial = np.where(has_start[:, None, None], start, np.eye(4))
+    poses = refine_poses(observations, initial, criteria.max_error_px, threads)
+    count = np.diff(observations.bounds)
+    solved = accept_poses(observations, poses, criteria, threads)
+    for frame in np.flatnonzero(count >= criteria.min_inliers).tolist():
+        if has_start[frame] and solved[frame].inlier_weight_ratio >= TRUSTED_WEIGHT_RATIO:
             continue
-        alone = views.of_frame(frame)
-        some = alone.weight >= COUNTING_WEIGHT
-        if some.sum() < limits.min_inliers:
-            some[:] = True
-        sampled = _sampled(lenses, alone, some, px[views.rows(frame)], limits)
-        if sampled is not None:
-            refined = refine_poses(alone, sampled[None], limits.max_error_px)
-            found[frame] = max(
-                found[frame], *judge_poses(alone, refined, limits), key=lambda pose: pose.evidence
+        own = observations.select_frame(frame)
+        chosen = own.weight >= MIN_COUNTED_WEIGHT
+        if chosen.sum() < criteria.min_inliers:
+            chosen[:] = True
+        start_pose = _ransac(lenses, own, chosen, px[observations.rows(frame)], criteria)
+        if start_pose is not None:
+            refined = refine_poses(own, start_pose[None], criteria.max_error_px)
+            solved[frame] = max(
+                solved[frame],
+                *accept_poses(own, refined, criteria),
+                key=lambda pose: pose.inlier_weight_ratio,
             )
-    return found
+    return solved
 
 
-def _sampled(
-    lenses: Sequence[Camera], views: Views, some: BoolArray, px: FloatArray, limits: PoseLimits
+def _ransac(
+    lenses: Sequence[Camera],
+    observations: Observations,
+    chosen: BoolArray,
+    px: FloatArray,
+    criteria: AcceptanceCriteria,
 ) -> FloatArray | None:
     """Pose (4,4) of one frame from some of its views; of its rig where several cameras see them."""
-    seen, px = views.points[some], px[some]
-    if views.member is None or views.cam_from_rig is None:
-        return sample_pose(lenses[0], seen, px, limits)
-    member = views.member[some]
+    points, px = observations.points[chosen], px[chosen]
+    if observations.member is None or observations.cam_from_rig is None:
+        return ransac_pose(lenses[0], points, px, criteria)
+    member = observations.member[chosen]
     if len(np.unique(member)) > 1:
-        return _sample_rig_pose(lenses, views.cam_from_rig, member, seen, px, limits)
-    pose = sample_pose(lenses[member[0]], seen, px, limits)
-    return None if pose is None else np.asarray(invert(views.cam_from_rig[member[0]]) @ pose)
+        return _ransac_rig_pose(lenses, observations.cam_from_rig, member, points, px, criteria)
+    pose = ransac_pose(lenses[member[0]], points, px, criteria)
+    return None if pose is None else np.asarray(invert(observations.cam_from_rig[member[0]]) @ pose)
 
 
-def _sample_rig_pose(
+def _ransac_rig_pose(
     lenses: Sequence[Camera],
     cam_from_rig: FloatArray,
     member: IntArray,
     points: FloatArray,
     px: FloatArray,
-    limits: PoseLimits,
+    criteria: AcceptanceCriteria,
 ) -> FloatArray | None:
     """Pose rig_from_gauge (4,4) from map points (N,3) that its cameras `member` (N,) see at pixels (N,2).
 
@@ -139,19 +151,23 @@ def _sample_rig_pose(
     import pycolmap
 
     options = pycolmap.RANSACOptions()
-    options.max_error = limits.max_error_px
-    options.random_seed = limits.seed
+    options.max_error = criteria.max_error_px
+    options.random_seed = criteria.seed
     options.max_num_trials = _MAX_TRIALS
-    places = [pycolmap.Rigid3d(pose[:3]) for pose in cam_from_rig]
+    rig_poses = [pycolmap.Rigid3d(pose[:3]) for pose in cam_from_rig]
     cameras = [lens.to_pycolmap() for lens in lenses]
-    found = pycolmap.estimate_generalized_absolute_pose(px, points, member.tolist(), places, cameras, options)
+    found = pycolmap.estimate_generalized_absolute_pose(
+        px, points, member.tolist(), rig_poses, cameras, options
+    )
     if found is None:
         return None
     matrix = np.asarray(found["rig_from_world"].matrix())
     return make_transform(matrix[:, :3], matrix[:, 3])
 
 
-def sample_pose(camera: Camera, points: FloatArray, px: FloatArray, limits: PoseLimits) -> FloatArray | None:
+def ransac_pose(
+    camera: Camera, points: FloatArray, px: FloatArray, criteria: AcceptanceCriteria
+) -> FloatArray | None:
     """Pose cam_from_gauge (4,4) of a calibrated camera from map points (N,3) seen at pixels (N,2).
 
     Source: Lebeda, Matas, Chum, "Fixing the locally optimized RANSAC", BMVC 2012, as in COLMAP.
@@ -159,8 +175,8 @@ def sample_pose(camera: Camera, points: FloatArray, px: FloatArray, limits: Pose
     import pycolmap
 
     options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac.max_error = limits.max_error_px
-    options.ransac.random_seed = limits.seed
+    options.ransac.max_error = criteria.max_error_px
+    options.ransac.random_seed = criteria.seed
     options.ransac.max_num_trials = _MAX_TRIALS
     found = pycolmap.estimate_absolute_pose(px, points, camera.to_pycolmap(), options)
     if found is None:
@@ -169,37 +185,44 @@ def sample_pose(camera: Camera, points: FloatArray, px: FloatArray, limits: Pose
     return make_transform(matrix[:, :3], matrix[:, 3])
 
 
-def judge_poses(views: Views, cam_from_gauge: FloatArray, limits: PoseLimits) -> list[FramePose]:
+def accept_poses(
+    observations: Observations,
+    cam_from_gauge: FloatArray,
+    criteria: AcceptanceCriteria,
+    threads: int = 1,
+) -> list[FramePose]:
     """Count the inliers of poses (F,4,4), estimate their covariance, and accept or refuse them."""
-    fits = assess_poses(views, cam_from_gauge, limits.max_error_px)
-    covariance = _covariance(fits, limits.min_noise_px)
+    quality = evaluate_poses(observations, cam_from_gauge, criteria.max_error_px, threads)
+    covariance = _covariance(quality, criteria.min_noise_px)
     sigma = np.sqrt(np.linalg.eigvalsh(covariance[:, 3:, 3:])[:, -1])
-    constrained = sigma < limits.max_sigma_depth * fits.depth
+    constrained = sigma < criteria.max_sigma_depth * quality.depth
     gauge_from_cam = invert(cam_from_gauge)
     out = []
-    for frame, count in enumerate(np.diff(views.bounds).tolist()):
-        inliers = int(fits.inliers[frame])
-        if count < limits.min_inliers:
+    for frame, count in enumerate(np.diff(observations.bounds).tolist()):
+        inliers = int(quality.inliers[frame])
+        if count < criteria.min_inliers:
             out.append(FramePose(status=FrameStatus.FEW_TRACKS))
-        elif inliers < limits.min_inliers or fits.evidence[frame] < _MIN_EVIDENCE:
-            evidence = float(fits.evidence[frame])
-            out.append(FramePose(status=FrameStatus.FEW_INLIERS, inliers=inliers, evidence=evidence))
+        elif inliers < criteria.min_inliers or quality.inlier_weight_ratio[frame] < _MIN_INLIER_WEIGHT_RATIO:
+            evidence = float(quality.inlier_weight_ratio[frame])
+            out.append(
+                FramePose(status=FrameStatus.FEW_INLIERS, inliers=inliers, inlier_weight_ratio=evidence)
+            )
         else:
-            good = bool(constrained[frame])
+            is_constrained = bool(constrained[frame])
             out.append(
                 FramePose(
-                    status=FrameStatus.REGISTERED if good else FrameStatus.UNCONSTRAINED,
-                    gauge_from_cam=gauge_from_cam[frame] if good else None,
-                    covariance=covariance[frame] if good else None,
+                    status=FrameStatus.REGISTERED if is_constrained else FrameStatus.UNCONSTRAINED,
+                    gauge_from_cam=gauge_from_cam[frame] if is_constrained else None,
+                    covariance=covariance[frame] if is_constrained else None,
                     inliers=inliers,
-                    evidence=float(fits.evidence[frame]),
-                    error_px=float(fits.error_px[frame]),
+                    inlier_weight_ratio=float(quality.inlier_weight_ratio[frame]),
+                    error_px=float(quality.error_px[frame]),
                 )
             )
     return out
 
 
-def _covariance(fits: Fits, min_noise_px: float) -> FloatArray:
+def _covariance(quality: PoseQuality, min_noise_px: float) -> FloatArray:
     """Covariance (F,6,6) from the inliers' information and their own spread; huge where there is no inverse.
 
     Views that disagree with a pose are evidence against it: the sigmas grow as the inliers' share falls.
@@ -208,8 +231,8 @@ def _covariance(fits: Fits, min_noise_px: float) -> FloatArray:
     A left perturbation of cam_from_gauge is a right one of gauge_from_cam with the sign turned: the
     covariance is the same.
     """
-    noise_px = np.maximum(1.4826 * np.nan_to_num(fits.noise_px), min_noise_px)
-    solvable = np.linalg.matrix_rank(fits.information) == 6
-    safe = np.where(solvable[:, None, None], fits.information, np.eye(6) / _HUGE)
-    sigma_px = noise_px / np.maximum(fits.evidence, _LEAST_EVIDENCE)
-    return np.asarray(np.linalg.inv(safe) * MAP_VARIANCE_RATIO * sigma_px[:, None, None] ** 2)
+    noise_px = np.maximum(1.4826 * np.nan_to_num(quality.noise_px), min_noise_px)
+    solvable = np.linalg.matrix_rank(quality.information) == 6
+    information = np.where(solvable[:, None, None], quality.information, np.eye(6) / _UNCONSTRAINED_VARIANCE)
+    sigma_px = noise_px / np.maximum(quality.inlier_weight_ratio, _WEIGHT_RATIO_FLOOR)
+    return np.asarray(np.linalg.inv(information) * MAP_COVARIANCE_SCALE * sigma_px[:, None, None] ** 2)

@@ -4,40 +4,42 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, runs
 
-_SIGMAS = 8.0
-_TIMES_USUAL = 10.0
+_MIN_SIGMAS = 8.0
+_MIN_SCALE_RATIO = 10.0
 """A jump stands out of the bends of the path around it, whatever the scale and the speed."""
-_ANSWERED = 0.5
+_MIN_NEIGHBOUR_RESPONSE = 0.5
 """How much of a frame's bend its two neighbours' bends undo: all of it at a jump, nothing at a jerk."""
-_SLOW_NS, _ANSWERED_SLOW = 90_000_000, 0.8
+_SLOW_SPAN_NS, _MIN_NEIGHBOUR_RESPONSE_SLOW = 90_000_000, 0.8
 """The share where both neighbours are so far apart, as below 22 Hz: a gesture there and back bends as few
 frames there as a jump does, its neighbours less. Of 256 of them, of 12 and 20 cm within 0.2 to 0.4 s, seen at
 10 to 20 Hz, 0.5 refuses 131 frames, 0.8 refuses 34; of single wrong poses at 10 and 15 Hz it misses up to 7 %
 more."""
-_GAP_SIGMAS = 4.0
-_GAP_TIMES_USUAL = 5.0
+_GAP_MIN_SIGMAS = 4.0
+_GAP_MIN_SCALE_RATIO = 5.0
 """The same for the ends of lost stretches. On 14 results with truth six of some 150 such ends bend the path
 so much: five beside poses that are off by 6 to 16 cm, one beside a pose off by 3 cm."""
-_RUNS = (2, 3)
-_RUN_NS = 140_000_000
+_RUN_LENGTHS = (2, 3)
+_MAX_RUN_SPAN_NS = 140_000_000
 """From the frame before a run to the one behind it, three poses at 30 Hz: in longer ones a body gets there
 and back."""
-_TIMES_KINK = 2.0
+_MIN_KINK_RATIO = 2.0
 """A body that stops dead leaves the line between before and after, too: wrong poses by so many times more."""
-_ASTRAY = 0.5
+_MAX_EXTRAPOLATION_RATIO = 0.5
 """Of that offset, by which the pose behind the run may miss where the way before it leads: a path that steps
 aside for good has nothing to be judged by."""
-_SURELY_FIRST, _SURELY_SECOND, _SURELY_THIRD = 0.25, 0.45, 1.0
+_SECOND_MIN_RESPONSE, _FIRST_MAX_RESPONSE, _SECOND_MAX_RESPONSE = 0.25, 0.45, 1.0
 """Answers of the third pose's bend to the second's: between 0.25 and 0.45 either of the first two may be
 wrong, beyond 1 neither is."""
-_AROUND = 12
-_LONE_RUN = 2
-_LONE_GAP = 3
+_SCALE_WINDOW = 12
+ISOLATED_INLIER_FACTOR = 4
+"""x"""
+_MAX_ISOLATED_RUN = 2
+_MIN_ISOLATING_GAP = 3
 
 
-def pose_jumps(centres: FloatArray, sigma: FloatArray, times_ns: IntArray) -> BoolArray:
+def find_outlier_poses(centres: FloatArray, sigma: FloatArray, times_ns: IntArray) -> BoolArray:
     """Frames, up to three in a row, whose centre leaves the line between its neighbours as nothing near does.
 
     The bend of a frame is its offset from the middle of the frames before and after it. A jump bends itself
@@ -54,36 +56,38 @@ def pose_jumps(centres: FloatArray, sigma: FloatArray, times_ns: IntArray) -> Bo
     Returns:
         (N,) True where the pose is to be refused. Scaling the map changes nothing.
     """
-    bend = np.linalg.norm(_bends(centres, sigma)[0], axis=1)
+    size = np.linalg.norm(_second_differences(centres, sigma)[0], axis=1)
     runs = np.zeros(len(centres), dtype=bool)
-    for length in _RUNS:
-        runs |= _wrong_runs(centres, sigma, times_ns, bend, length)
+    for length in _RUN_LENGTHS:
+        runs |= _outlier_runs(centres, sigma, times_ns, size, length)
     # Beside one of several wrong poses a right one would be blamed.
     centres = np.where(runs[:, None], np.nan, centres)
-    backwards = _jumps_after_gaps(centres[::-1], sigma[::-1])[::-1]
-    ends = _jumps_after_gaps(centres, sigma) | backwards
-    return np.asarray(runs | _single_jumps(centres, sigma, times_ns) | ends)
+    backwards = _outliers_after_gaps(centres[::-1], sigma[::-1])[::-1]
+    ends = _outliers_after_gaps(centres, sigma) | backwards
+    return np.asarray(runs | _single_outliers(centres, sigma, times_ns) | ends)
 
 
-def _single_jumps(centres: FloatArray, sigma: FloatArray, times_ns: IntArray) -> BoolArray:
+def _single_outliers(centres: FloatArray, sigma: FloatArray, times_ns: IntArray) -> BoolArray:
     """Frames (N,) that leave the line between their neighbours by themselves."""
-    offset, noise = _bends(centres, sigma)
-    bend = np.linalg.norm(offset, axis=1)
+    offset, noise = _second_differences(centres, sigma)
+    size = np.linalg.norm(offset, axis=1)
     out = np.zeros(len(centres), dtype=bool)
     # Without both neighbours' own bends the wrong one of the three could be blamed.
-    frames = 1 + _starts(np.isfinite(bend), 3)
-    highest = np.maximum(bend[frames - 1], bend[frames + 1])
-    frames = frames[(bend[frames] > _SIGMAS * noise[frames]) & (bend[frames] >= highest)]
-    answer = -np.sum((offset[frames - 1] + offset[frames + 1]) * offset[frames], axis=1)
-    slow = times_ns[frames + 1] - times_ns[frames - 1] > _SLOW_NS
-    least = np.where(slow, _ANSWERED_SLOW, _ANSWERED)
-    for frame in frames[answer >= least * bend[frames] ** 2].tolist():
-        out[frame] = bend[frame] > _TIMES_USUAL * _usual_bend(bend, frame - 1, frame + 2, _AROUND - 1)
+    frames = 1 + _run_starts(np.isfinite(size), 3)
+    highest = np.maximum(size[frames - 1], size[frames + 1])
+    frames = frames[(size[frames] > _MIN_SIGMAS * noise[frames]) & (size[frames] >= highest)]
+    response = -np.sum((offset[frames - 1] + offset[frames + 1]) * offset[frames], axis=1)
+    is_slow = times_ns[frames + 1] - times_ns[frames - 1] > _SLOW_SPAN_NS
+    min_response = np.where(is_slow, _MIN_NEIGHBOUR_RESPONSE_SLOW, _MIN_NEIGHBOUR_RESPONSE)
+    for frame in frames[response >= min_response * size[frames] ** 2].tolist():
+        out[frame] = size[frame] > _MIN_SCALE_RATIO * _local_scale(
+            size, frame - 1, frame + 2, _SCALE_WINDOW - 1
+        )
     return out
 
 
-def _wrong_runs(
-    centres: FloatArray, sigma: FloatArray, times_ns: IntArray, bend: FloatArray, length: int
+def _outlier_runs(
+    centres: FloatArray, sigma: FloatArray, times_ns: IntArray, size: FloatArray, length: int
 ) -> BoolArray:
     """Frames (N,) of runs of so many poses that all leave the way from before the run to behind it.
 
@@ -96,32 +100,34 @@ def _wrong_runs(
     """
     out = np.zeros(len(centres), dtype=bool)
     steps = length + 1
-    first = 2 + _starts(np.asarray(np.isfinite(centres).all(axis=1)), length + 4)
-    first = first[times_ns[first + length] - times_ns[first - 1] <= _RUN_NS]
+    first = 2 + _run_starts(np.asarray(np.isfinite(centres).all(axis=1)), length + 4)
+    first = first[times_ns[first + length] - times_ns[first - 1] <= _MAX_RUN_SPAN_NS]
     before, behind, run = first - 1, first + length, first[:, None] + np.arange(length)
-    way = centres[behind] - centres[before]
-    line = np.arange(1, steps)[:, None] / steps * way[:, None]
-    away = np.linalg.norm(centres[run] - centres[before][:, None] - line, axis=2)
+    baseline = centres[behind] - centres[before]
+    line = np.arange(1, steps)[:, None] / steps * baseline[:, None]
+    distance = np.linalg.norm(centres[run] - centres[before][:, None] - line, axis=2)
     noise = np.sqrt(sigma[run] ** 2 + 0.5 * (sigma[before] ** 2 + sigma[behind] ** 2)[:, None])
     start, end = centres[before] - centres[before - 1], centres[behind + 1] - centres[behind]
     kink = 0.25 * steps * np.linalg.norm(end - start, axis=1)
-    astray = np.linalg.norm(way - 0.5 * steps * (start + end), axis=1)
-    off = away.min(axis=1)
-    enough = (away > _SIGMAS * noise).all(axis=1) & (off > np.maximum(_TIMES_KINK * kink, astray / _ASTRAY))
-    for row in np.flatnonzero(enough).tolist():
+    extrapolation_error = np.linalg.norm(baseline - 0.5 * steps * (start + end), axis=1)
+    smallest = distance.min(axis=1)
+    candidate = (distance > _MIN_SIGMAS * noise).all(axis=1) & (
+        smallest > np.maximum(_MIN_KINK_RATIO * kink, extrapolation_error / _MAX_EXTRAPOLATION_RATIO)
+    )
+    for row in np.flatnonzero(candidate).tolist():
         # What a steady bend amounts to over the run.
-        usual = _usual_bend(bend, before[row], behind[row] + 1, _AROUND) * 0.25 * steps**2
-        out[run[row]] |= off[row] > _TIMES_USUAL * usual
+        local = _local_scale(size, before[row], behind[row] + 1, _SCALE_WINDOW) * 0.25 * steps**2
+        out[run[row]] |= smallest[row] > _MIN_SCALE_RATIO * local
     return out
 
 
-def _usual_bend(bend: FloatArray, start: int, stop: int, reach: int) -> float:
-    """Median bend of `reach` frames on either side of start:stop; infinite where too few are known."""
-    near = np.concatenate([bend[max(0, start - reach) : start], bend[stop : stop + reach]])
-    return float(np.nanmedian(near)) if np.isfinite(near).sum() >= _AROUND // 2 else np.inf
+def _local_scale(size: FloatArray, start: int, stop: int, window: int) -> float:
+    """Median bend of `window` frames on either side of start:stop; infinite where too few are known."""
+    nearby = np.concatenate([size[max(0, start - window) : start], size[stop : stop + window]])
+    return float(np.nanmedian(nearby)) if np.isfinite(nearby).sum() >= _SCALE_WINDOW // 2 else np.inf
 
 
-def _starts(known: BoolArray, length: int) -> IntArray:
+def _run_starts(known: BoolArray, length: int) -> IntArray:
     """First ones of so many known frames in a row."""
     if len(known) < length:
         return np.zeros(0, dtype=np.int64)
@@ -129,7 +135,7 @@ def _starts(known: BoolArray, length: int) -> IntArray:
     return np.flatnonzero(rows.all(axis=1))
 
 
-def _bends(centres: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _second_differences(centres: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Offsets (N,3) from the middle of both neighbours, and the standard deviation (N,) of such a one."""
     offset, noise = np.full((len(centres), 3), np.nan), np.full(len(centres), np.nan)
     if len(centres) >= 3:
@@ -138,30 +144,30 @@ def _bends(centres: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArr
     return offset, noise
 
 
-def _jumps_after_gaps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
+def _outliers_after_gaps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
     """Wrong poses (N,) that come first or second after a lost stretch.
 
     The first one bends the second by half of its height and the third not at all; the second one bends itself
     by all of it and the third by half, the other way. Where that does not tell them apart both are refused.
     The third one bends itself twice as much as the second: it has both neighbours to be judged by.
     """
-    offset, noise = _bends(centres, sigma)
-    bend = np.linalg.norm(offset, axis=1)
+    offset, noise = _second_differences(centres, sigma)
+    size = np.linalg.norm(offset, axis=1)
     out = np.zeros(len(centres), dtype=bool)
     posed: BoolArray = np.asarray(np.isfinite(centres).all(axis=1), dtype=bool)
     for first in (1 + np.flatnonzero(posed[1:] & ~posed[:-1])).tolist():
         second, third = first + 1, first + 2
-        near = bend[third + 1 : third + 1 + _AROUND]
-        if not np.isfinite(bend[second : third + 1]).all() or np.isfinite(near).sum() < _AROUND // 2:
+        nearby = size[third + 1 : third + 1 + _SCALE_WINDOW]
+        if not np.isfinite(size[second : third + 1]).all() or np.isfinite(nearby).sum() < _SCALE_WINDOW // 2:
             continue
-        if bend[second] > max(_GAP_SIGMAS * noise[second], _GAP_TIMES_USUAL * np.nanmedian(near)):
-            answer = -offset[third] @ offset[second] / bend[second] ** 2
-            out[first] |= answer < _SURELY_SECOND
-            out[second] |= _SURELY_FIRST < answer <= _SURELY_THIRD
+        if size[second] > max(_GAP_MIN_SIGMAS * noise[second], _GAP_MIN_SCALE_RATIO * np.nanmedian(nearby)):
+            response = -offset[third] @ offset[second] / size[second] ** 2
+            out[first] |= response < _FIRST_MAX_RESPONSE
+            out[second] |= _SECOND_MIN_RESPONSE < response <= _SECOND_MAX_RESPONSE
     return out
 
 
-def lone_poses(localised: BoolArray, inliers: IntArray, enough: int) -> BoolArray:
+def isolated_poses(localised: BoolArray, inliers: IntArray, min_inliers: int) -> BoolArray:
     """Frames of which nothing but their own few inliers speaks: no neighbouring frame confirms them.
 
     Args:
@@ -173,11 +179,13 @@ def lone_poses(localised: BoolArray, inliers: IntArray, enough: int) -> BoolArra
         (N,) True in runs of one or two poses amid at least three lost frames on either side.
     """
     out = np.zeros(len(localised), dtype=bool)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], localised, [False]]).astype(int)))
-    for start, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        around = np.concatenate(
-            [localised[max(0, start - _LONE_GAP) : start], localised[stop : stop + _LONE_GAP]]
+    for start, stop in runs(localised):
+        surroundings = np.concatenate(
+            [
+                localised[max(0, start - _MIN_ISOLATING_GAP) : start],
+                localised[stop : stop + _MIN_ISOLATING_GAP],
+            ]
         )
-        if stop - start <= _LONE_RUN and not around.any():
-            out[start:stop] = inliers[start:stop] < enough
+        if stop - start <= _MAX_ISOLATED_RUN and not surroundings.any():
+            out[start:stop] = inliers[start:stop] < min_inliers
     return out

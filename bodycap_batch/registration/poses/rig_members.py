@@ -10,14 +10,14 @@ import numpy as np
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import invert
-from bodycap_batch.model.relative_pose import RelativePose, relative_pose, same_instants
+from bodycap_batch.model.relative_pose import RelativePose, estimate_relative_pose, match_instants
 from bodycap_batch.model.scene import Registration
-from bodycap_batch.registration.poses.observations import Member
+from bodycap_batch.registration.poses.observations import RigMember
 from bodycap_batch.registration.tracking.klt import Tracks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RigCamera:
+class RegisteredCamera:
     """A camera of a rig with what its own frames gave.
 
     Attributes:
@@ -26,52 +26,62 @@ class RigCamera:
     """
 
     camera: CaptureCamera
-    found: Registration
+    registration: Registration
 
     @property
     def tracks(self) -> Tracks:
         """What was tracked in its frames."""
-        found = self.found
-        return Tracks(found.obs_frame, found.obs_keyframe, found.obs_feature, found.obs_px)
+        registration = self.registration
+        return Tracks(
+            registration.obs_frame, registration.obs_keyframe, registration.obs_feature, registration.obs_px
+        )
 
 
-def relative_poses(own: RigCamera, others: Sequence[RigCamera]) -> list[RelativePose]:
+def estimate_relative_poses(own: RegisteredCamera, others: Sequence[RegisteredCamera]) -> list[RelativePose]:
     """Where each other camera sits beside a camera; the same, whichever of the two is asked for."""
     out = []
     for other in others:
         first, second = sorted((own, other), key=lambda each: each.camera.name)
         offset_ns = round((second.camera.offset_s - first.camera.offset_s) * 1e9)
-        out.append(relative_pose(first.found.trajectory, second.found.trajectory, offset_ns))
+        out.append(
+            estimate_relative_pose(first.registration.trajectory, second.registration.trajectory, offset_ns)
+        )
     return out
 
 
-def members_of(own: RigCamera, others: Sequence[RigCamera], relative: Sequence[RelativePose]) -> list[Member]:
+def rig_members(
+    own: RegisteredCamera, others: Sequence[RegisteredCamera], relative: Sequence[RelativePose]
+) -> list[RigMember]:
     """The camera, in the rig's origin, and those others whose place beside it is known well."""
     count = len(own.camera.times_ns)
-    out = [Member(camera=own.camera, tracks=own.tracks, cam_from_rig=np.eye(4), rig_frame=np.arange(count))]
-    for other, each in zip(others, relative, strict=True):
-        if not each.rigid:
+    out = [
+        RigMember(camera=own.camera, tracks=own.tracks, cam_from_rig=np.eye(4), rig_frame=np.arange(count))
+    ]
+    for other, pose in zip(others, relative, strict=True):
+        if not pose.is_rigid:
             continue
-        own_first = each.cameras[0] == own.camera.name
-        first_from_second = each.first_from_second
+        own_first = pose.cameras[0] == own.camera.name
+        first_from_second = pose.first_from_second
         out.append(
-            Member(
+            RigMember(
                 camera=other.camera,
                 tracks=other.tracks,
                 cam_from_rig=invert(first_from_second) if own_first else first_from_second,
-                rig_frame=same_instants(own.camera.common_times_ns(), other.camera.common_times_ns()),
+                rig_frame=match_instants(own.camera.common_times_ns(), other.camera.common_times_ns()),
             )
         )
     return out
 
 
-def first_poses(own: RigCamera, others: Sequence[RigCamera], members: Sequence[Member]) -> FloatArray:
+def initial_rig_poses(
+    own: RegisteredCamera, others: Sequence[RegisteredCamera], members: Sequence[RigMember]
+) -> FloatArray:
     """Poses rig_from_map (F,4,4) to start from: the camera's own, else what another one's make of it."""
     out = np.full((len(own.camera.times_ns), 4, 4), np.nan)
-    by_name = {each.camera.name: each.found.trajectory for each in (own, *others)}
+    by_name = {item.camera.name: item.registration.trajectory for item in (own, *others)}
     for member in reversed(members):
         path = by_name[member.camera.name]
-        told = path.localised & (member.rig_frame >= 0)
+        has_pose = path.localised & (member.rig_frame >= 0)
         rig_from_cam = invert(member.cam_from_rig)
-        out[member.rig_frame[told]] = rig_from_cam @ invert(path.gauge_from_cam[told])
+        out[member.rig_frame[has_pose]] = rig_from_cam @ invert(path.gauge_from_cam[has_pose])
     return out

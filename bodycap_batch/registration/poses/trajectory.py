@@ -8,37 +8,68 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.geometry import interpolate_pose, invert
-from bodycap_batch.model.scene import FrameStatus, Map
-from bodycap_batch.registration.poses.batched_pnp import inliers_of
-from bodycap_batch.registration.poses.observations import Member, Rig, Votes
-from bodycap_batch.registration.poses.pnp import MAP_VARIANCE_RATIO, FramePose, PoseLimits, solve_poses
-from bodycap_batch.registration.poses.pose_outliers import lone_poses, pose_jumps
-from bodycap_batch.registration.tracking.klt import Tracks
+from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
+from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Trajectory
+from bodycap_batch.registration.poses.batched_pnp import find_inliers
+from bodycap_batch.registration.poses.observations import PointReliability, RigMember, RigObservations
+from bodycap_batch.registration.poses.pnp import (
+    MAP_COVARIANCE_SCALE,
+    AcceptanceCriteria,
+    FramePose,
+    solve_poses,
+)
+from bodycap_batch.registration.poses.pose_outliers import (
+    ISOLATED_INLIER_FACTOR,
+    find_outlier_poses,
+    isolated_poses,
+)
+from bodycap_batch.registration.tracking.klt import Tracks, camera_pixel_scale
 
-_LEAST_CONFIRMED = 6
+_MIN_STATIC_INLIERS = 6
 """Confirmed inliers without which a pose is that of the wearer's sleeve."""
-_LONE_EVIDENCE = 4
-"""A pose that no neighbouring frame confirms needs so many times the usual inliers."""
-_AGAIN = 1
-_AGAIN_ROLLING = 2
+_MAP_NOISE_PX = 0.6
+"""x"""
+_INLIER_SIGMAS = 3.5
+"""x"""
+_BLUR_WINDOW_FRAMES = 15
+"""x"""
+_REPEATS = 1
+_REPEATS_ROLLING = 2
 """The velocity that moves pixels comes from the poses that the moved pixels give."""
 
 
-def solve_frames(
-    camera: CaptureCamera, scene_map: Map, tracks: Tracks, limits: PoseLimits
+def acceptance_criteria(
+    camera: CaptureCamera, selection: KeyframeSelection, options: RegistrationOptions
+) -> AcceptanceCriteria:
+    """X"""
+    noise_px = np.hypot(_MAP_NOISE_PX * camera_pixel_scale(camera), 2.0 * selection.noise_px)
+    return AcceptanceCriteria(
+        max_error_px=float(_INLIER_SIGMAS * noise_px),
+        min_inliers=options.min_inliers,
+        max_sigma_depth=options.max_sigma_depth,
+    )
+
+
+def solve_camera(
+    camera: CaptureCamera, scene_map: Map, tracks: Tracks, criteria: AcceptanceCriteria, threads: int = 1
 ) -> list[FramePose]:
     """Solve every frame of a camera from the map points seen in it; see `solve_rig`."""
     count = len(camera.times_ns)
-    alone = Member(camera=camera, tracks=tracks, cam_from_rig=np.eye(4), rig_frame=np.arange(count))
+    member = RigMember(camera=camera, tracks=tracks, cam_from_rig=np.eye(4), rig_frame=np.arange(count))
     rows = scene_map.keyframes_of(camera.name)
-    start = _between(scene_map.keyframe_frame[rows], scene_map.map_from_cam[rows], count)
-    return solve_rig([alone], scene_map, start, limits)
+    start = _interpolated_keyframe_poses(scene_map.keyframe_frame[rows], scene_map.map_from_cam[rows], count)
+    return solve_rig([member], scene_map, start, criteria, threads)
 
 
 def solve_rig(
-    members: Sequence[Member], scene_map: Map, start: FloatArray, limits: PoseLimits
+    members: Sequence[RigMember],
+    scene_map: Map,
+    start: FloatArray,
+    criteria: AcceptanceCriteria,
+    threads: int = 1,
 ) -> list[FramePose]:
     """Solve every frame of a rig from the map points that its cameras see at that instant.
 
@@ -55,19 +86,20 @@ def solve_rig(
     Returns:
         Poses of the first camera; `FrameStatus.RIG` where it saw too little for one of its own.
     """
-    rig = Rig.of(members, scene_map)
-    solved = _solve(rig, start, limits)
-    for _ in range(_AGAIN_ROLLING if rig.rolling else _AGAIN):
-        path = matrices(solved.poses)
-        start = np.where(np.isfinite(path), invert(path), start)
-        solved = _solve(rig, start, limits, solved.votes, path if rig.rolling else None)
-    poses = _with_evidence(solved.poses, solved.confirmed)
+    rig = RigObservations.create(members, scene_map)
+    solution = _solve(rig, start, criteria, threads)
+    for _ in range(_REPEATS_ROLLING if rig.rolling else _REPEATS):
+        poses = pose_array(solution.poses)
+        start = np.where(np.isfinite(poses), invert(poses), start)
+        path = poses if rig.rolling else None
+        solution = _solve(rig, start, criteria, threads, solution.reliability, path)
+    accepted = _require_static_inliers(solution.poses, solution.static)
     times_ns = rig.members[0].camera.times_ns
-    return _without_doubtful(_named(poses, rig, solved.own, limits), times_ns, limits)
+    return _reject_outliers(_assign_status(accepted, rig, solution.own_inliers, criteria), times_ns, criteria)
 
 
 @dataclass(frozen=True, slots=True)
-class _Solved:
+class _Solution:
     """Poses of all frames and what agrees with them.
 
     Attributes:
@@ -78,18 +110,19 @@ class _Solved:
     """
 
     poses: list[FramePose]
-    votes: Votes
-    confirmed: IntArray
-    own: IntArray
+    reliability: PointReliability
+    static: IntArray
+    own_inliers: IntArray
 
 
 def _solve(
-    rig: Rig,
+    rig: RigObservations,
     start: FloatArray,
-    limits: PoseLimits,
-    votes: Votes | None = None,
+    criteria: AcceptanceCriteria,
+    threads: int,
+    reliability: PointReliability | None = None,
     path: FloatArray | None = None,
-) -> _Solved:
+) -> _Solution:
     """Poses of all frames, a stretch at a time: what is seen in a long video would fill the memory.
 
     Args:
@@ -100,27 +133,32 @@ def _solve(
         path: (F,4,4) map_from_rig with which pixels of a rolling shutter are moved.
     """
     count = len(start)
-    out = _Solved([], Votes.none(rig.confirmed.size), np.zeros(count, np.int64), np.zeros(count, np.int64))
-    for part in rig.stretches():
-        px = None if path is None else part.at_mid_row(path)
-        views, frames = part.views(px, votes), part.frames
-        poses = solve_poses(rig.lenses, views, part.px if px is None else px, start[frames], limits)
-        found = matrices(poses)
-        agrees = inliers_of(views, invert(found), limits.max_error_px)
-        posed = np.asarray(np.isfinite(found).all(axis=(1, 2)))[part.frame - frames.start]
+    out = _Solution(
+        [], PointReliability.zero(rig.static.size), np.zeros(count, np.int64), np.zeros(count, np.int64)
+    )
+    for block in rig.blocks():
+        px = None if path is None else block.px_at_mid_row(path)
+        observations, frames = block.observations(px, reliability), block.frames
+        observed_px = block.px if px is None else px
+        poses = solve_poses(rig.lenses, observations, observed_px, start[frames], criteria, threads)
+        solved = pose_array(poses)
+        agrees = find_inliers(observations, invert(solved), criteria.max_error_px, threads)
+        has_pose = np.asarray(np.isfinite(solved).all(axis=(1, 2)))[block.frame - frames.start]
         out.poses.extend(poses)
-        out.votes.add(part.which, posed, agrees)
-        out.confirmed[frames] = part.counts(agrees & part.confirmed)
-        out.own[frames] = part.counts(agrees & (part.member == 0))
+        out.reliability.add(block.point_keys, has_pose, agrees)
+        out.static[frames] = block.count_by_frame(agrees & block.static)
+        out.own_inliers[frames] = block.count_by_frame(agrees & (block.member == 0))
     return out
 
 
-def _named(poses: list[FramePose], rig: Rig, own: IntArray, limits: PoseLimits) -> list[FramePose]:
-    """Tell keyframes, and frames that the rig's other cameras carry; `own` counts the first one's inliers."""
+def _assign_status(
+    poses: list[FramePose], rig: RigObservations, own_inliers: IntArray, criteria: AcceptanceCriteria
+) -> list[FramePose]:
+    """Tell keyframes, and frames that the rig's other cameras carry; `own_inliers` counts the first one's inliers."""
     rows = rig.scene_map.keyframes_of(rig.members[0].camera.name)
     status = dict.fromkeys(rig.scene_map.keyframe_frame[rows].tolist(), FrameStatus.KEYFRAME)
     if len(rig.members) > 1:
-        status |= dict.fromkeys(np.flatnonzero(own < limits.min_inliers).tolist(), FrameStatus.RIG)
+        status |= dict.fromkeys(np.flatnonzero(own_inliers < criteria.min_inliers).tolist(), FrameStatus.RIG)
     return [
         replace(pose, status=status.get(frame, pose.status))
         if pose.status is FrameStatus.REGISTERED
@@ -129,14 +167,47 @@ def _named(poses: list[FramePose], rig: Rig, own: IntArray, limits: PoseLimits) 
     ]
 
 
-def matrices(poses: Sequence[FramePose]) -> FloatArray:
+def pose_array(poses: Sequence[FramePose]) -> FloatArray:
     """Poses gauge_from_cam (N,4,4), NaN where there is none."""
-    none = np.full((4, 4), np.nan)
-    found = [none if pose.gauge_from_cam is None else pose.gauge_from_cam for pose in poses]
-    return np.array(found).reshape(-1, 4, 4)
+    missing = np.full((4, 4), np.nan)
+    matrices = [missing if pose.gauge_from_cam is None else pose.gauge_from_cam for pose in poses]
+    return np.array(matrices).reshape(-1, 4, 4)
 
 
-def _between(keyframes: IntArray, map_from_cam: FloatArray, count: int) -> FloatArray:
+def build_trajectory(
+    camera: CaptureCamera, gauge: str, poses: Sequence[FramePose], sharpness: FloatArray
+) -> Trajectory:
+    """X"""
+    missing = np.full((6, 6), np.nan)
+    return Trajectory(
+        camera=camera.name,
+        gauge=gauge,
+        frame_numbers=camera.frame_numbers,
+        times_ns=camera.times_ns,
+        gauge_from_cam=pose_array(poses),
+        covariance=np.array(
+            [missing if pose.covariance is None else pose.covariance for pose in poses]
+        ).reshape(-1, 6, 6),
+        status=tuple(_frame_statuses(poses, sharpness)),
+        inliers=np.array([pose.inliers for pose in poses], dtype=np.int64),
+        error_px=np.array([pose.error_px for pose in poses]),
+    )
+
+
+def _frame_statuses(poses: Sequence[FramePose], sharpness: FloatArray) -> list[FrameStatus]:
+    """X"""
+    statuses = []
+    for index, pose in enumerate(poses):
+        status = pose.status
+        if status is FrameStatus.FEW_TRACKS:
+            nearby = sharpness[max(0, index - _BLUR_WINDOW_FRAMES) : index + _BLUR_WINDOW_FRAMES + 1]
+            if sharpness[index] < BLUR_SHARPNESS_RATIO * np.median(nearby):
+                status = FrameStatus.BLUR
+        statuses.append(status)
+    return statuses
+
+
+def _interpolated_keyframe_poses(keyframes: IntArray, map_from_cam: FloatArray, count: int) -> FloatArray:
     """Poses cam_from_map (count,4,4) interpolated between keyframes; the nearest one's outside them."""
     frames = np.arange(count)
     after = np.clip(np.searchsorted(keyframes, frames), 1, max(1, len(keyframes) - 1))
@@ -147,13 +218,15 @@ def _between(keyframes: IntArray, map_from_cam: FloatArray, count: int) -> Float
     return invert(interpolate_pose(map_from_cam[before], map_from_cam[after], alpha))
 
 
-def _with_evidence(poses: list[FramePose], confirmed: IntArray) -> list[FramePose]:
-    """Refuse the poses that hardly any confirmed point agrees with; `confirmed` counts them by frame."""
-    posed = np.array([pose.gauge_from_cam is not None for pose in poses], dtype=bool)
-    return _refused(poses, posed & (confirmed < _LEAST_CONFIRMED), FrameStatus.UNCONFIRMED)
+def _require_static_inliers(poses: list[FramePose], static_inliers: IntArray) -> list[FramePose]:
+    """Refuse the poses that hardly any confirmed point agrees with; `static_inliers` counts them by frame."""
+    has_pose = np.array([pose.gauge_from_cam is not None for pose in poses], dtype=bool)
+    return _reject(poses, has_pose & (static_inliers < _MIN_STATIC_INLIERS), FrameStatus.UNCONFIRMED)
 
 
-def _without_doubtful(poses: list[FramePose], times_ns: IntArray, limits: PoseLimits) -> list[FramePose]:
+def _reject_outliers(
+    poses: list[FramePose], times_ns: IntArray, criteria: AcceptanceCriteria
+) -> list[FramePose]:
     """Refuse the poses that jump away from both neighbours and back, and weak ones that stand alone."""
     centres = np.full((len(poses), 3), np.nan)
     sigma = np.full(len(poses), np.nan)
@@ -161,16 +234,16 @@ def _without_doubtful(poses: list[FramePose], times_ns: IntArray, limits: PoseLi
         if pose.gauge_from_cam is not None and pose.covariance is not None:
             centres[frame] = pose.gauge_from_cam[:3, 3]
             # Neighbours share the map's error.
-            sigma[frame] = np.sqrt(np.trace(pose.covariance[3:, 3:]) / MAP_VARIANCE_RATIO)
-    out = _refused(poses, pose_jumps(centres, sigma, times_ns), FrameStatus.POSE_JUMP)
-    localised = np.array([pose.gauge_from_cam is not None for pose in out], dtype=bool)
-    inliers = np.array([pose.inliers for pose in out], dtype=np.int64)
-    lone = lone_poses(localised, inliers, _LONE_EVIDENCE * limits.min_inliers)
-    return _refused(out, lone, FrameStatus.UNCONFIRMED)
+            sigma[frame] = np.sqrt(np.trace(pose.covariance[3:, 3:]) / MAP_COVARIANCE_SCALE)
+    accepted = _reject(poses, find_outlier_poses(centres, sigma, times_ns), FrameStatus.POSE_JUMP)
+    localised = np.array([pose.gauge_from_cam is not None for pose in accepted], dtype=bool)
+    inliers = np.array([pose.inliers for pose in accepted], dtype=np.int64)
+    isolated = isolated_poses(localised, inliers, ISOLATED_INLIER_FACTOR * criteria.min_inliers)
+    return _reject(accepted, isolated, FrameStatus.UNCONFIRMED)
 
 
-def _refused(poses: list[FramePose], which: BoolArray, status: FrameStatus) -> list[FramePose]:
+def _reject(poses: list[FramePose], rejected: BoolArray, status: FrameStatus) -> list[FramePose]:
     return [
-        FramePose(status=status, inliers=pose.inliers, error_px=pose.error_px) if which[frame] else pose
+        FramePose(status=status, inliers=pose.inliers, error_px=pose.error_px) if rejected[frame] else pose
         for frame, pose in enumerate(poses)
     ]

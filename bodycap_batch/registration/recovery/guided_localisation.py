@@ -11,42 +11,44 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp
 from bodycap_batch.model.scene import Trajectory
-from bodycap_batch.registration.poses.batched_pnp import Views, make_views, refine_poses
-from bodycap_batch.registration.poses.pnp import PoseLimits, judge_poses, sample_pose
-from bodycap_batch.registration.recovery.motion_prior import Place
+from bodycap_batch.registration.poses.batched_pnp import Observations, make_observations, refine_poses
+from bodycap_batch.registration.poses.observations import point_weights
+from bodycap_batch.registration.poses.pnp import (
+    TRUSTED_WEIGHT_RATIO,
+    AcceptanceCriteria,
+    accept_poses,
+    ransac_pose,
+)
+from bodycap_batch.registration.recovery.motion_prior import PositionEstimate
 from bodycap_batch.registration.recovery.patch_search import (
-    Found,
-    Gallery,
+    KeyframePatches,
+    PatchMatches,
+    PredictedView,
     Pyramid,
-    Search,
-    View,
-    choose_rows,
-    find_points,
+    SearchLevel,
+    match_patches,
+    select_patches,
 )
 
-_SEARCHES = (
-    Search(level=2, side=15, radius=14, score=0.6, limit_px=12.0),
-    Search(level=1, side=21, radius=8, score=0.7, limit_px=6.0),
-    Search(level=0, side=31, radius=8, score=0.75, limit_px=4.0),
+_LEVELS = (
+    SearchLevel(pyramid_level=2, patch_side=15, search_radius=14, score=0.6, limit_px=12.0),
+    SearchLevel(pyramid_level=1, patch_side=21, search_radius=8, score=0.7, limit_px=6.0),
+    SearchLevel(pyramid_level=0, patch_side=31, search_radius=8, score=0.75, limit_px=4.0),
 )
 """From far and coarse to near and fine. The last one at full size: errors of frames with known poses are a
 quarter smaller than from half size."""
-_POINT_VARIANCE = 6.0
-"""As for tracks."""
-_CELL_PX = 40.0
-_PER_CELL = 2.0
+_CELL_SIDE_PX = 40.0
+_FULL_WEIGHT_PER_CELL = 2.0
 """Patches that overlap err together: so many count in a square of about a patch's side. Otherwise fifty
 patches on one grating of a ceiling pass for a pose that is 60 cm off."""
 _MIN_NOISE_PX = 1.0
 """Of patches found in blurred frames: fewer than twenty that happen to agree better tell nothing better."""
-_MIN_FOUND = 8
-_SURE_INLIERS, _SURE_EVIDENCE = 25, 0.6
-_TRUSTED = 0.6
-"""As for tracks: beyond it sampling finds nothing better."""
+_MIN_MATCHES = 8
+_SUFFICIENT_INLIERS, _SUFFICIENT_WEIGHT_RATIO = 25, 0.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fix:
+class PoseEstimate:
     """A pose from points found where they were looked for.
 
     Attributes:
@@ -61,57 +63,61 @@ class Fix:
     cam_from_map: FloatArray
     covariance: FloatArray
     inliers: int
-    evidence: float
+    inlier_weight_ratio: float
     error_px: float
     depth: float
 
     @staticmethod
-    def of(path: Trajectory, frame: int) -> Fix:
+    def from_trajectory(path: Trajectory, frame: int) -> PoseEstimate:
         """A pose that tracking found; the depth of its points is not known any more."""
-        return Fix(
+        return PoseEstimate(
             cam_from_map=invert(path.gauge_from_cam[frame]),
             covariance=path.covariance[frame],
             inliers=int(path.inliers[frame]),
-            evidence=1.0,
+            inlier_weight_ratio=1.0,
             error_px=float(path.error_px[frame]),
             depth=np.inf,
         )
 
     @property
-    def place(self) -> Place:
+    def position(self) -> PositionEstimate:
         """Where the camera was."""
-        turn = self.cam_from_map[:3, :3]
-        return Place(invert(self.cam_from_map)[:3, 3], turn.T @ self.covariance[3:, 3:] @ turn)
+        rotation = self.cam_from_map[:3, :3]
+        return PositionEstimate(
+            invert(self.cam_from_map)[:3, 3], rotation.T @ self.covariance[3:, 3:] @ rotation
+        )
 
-    def with_place(self, place: Place) -> tuple[FloatArray, FloatArray]:
+    def conditioned_on_centre(self, position: PositionEstimate) -> tuple[FloatArray, FloatArray]:
         """The pose cam_from_map (4,4) and its covariance (6,6) once the centre is known to be elsewhere.
 
         The turn follows as far as the points tie it to the centre.
         """
-        turn, centre = self.cam_from_map[:3, :3], invert(self.cam_from_map)[:3, 3]
-        follows = self.covariance[:3, 3:] @ np.linalg.inv(self.covariance[3:, 3:])
-        shift = -turn @ (place.centre - centre)
-        turned = so3_exp(follows @ shift) @ turn
-        spread = turned @ place.covariance @ turned.T
-        rest = self.covariance[:3, :3] - follows @ self.covariance[3:, :3]
+        rotation, centre = self.cam_from_map[:3, :3], invert(self.cam_from_map)[:3, 3]
+        gain = self.covariance[:3, 3:] @ np.linalg.inv(self.covariance[3:, 3:])
+        shift = -rotation @ (position.centre - centre)
+        new_rotation = so3_exp(gain @ shift) @ rotation
+        position_covariance = new_rotation @ position.covariance @ new_rotation.T
+        conditional = self.covariance[:3, :3] - gain @ self.covariance[3:, :3]
         covariance = np.empty((6, 6))
-        covariance[3:, 3:] = spread
-        covariance[:3, 3:] = follows @ spread
+        covariance[3:, 3:] = position_covariance
+        covariance[:3, 3:] = gain @ position_covariance
         covariance[3:, :3] = covariance[:3, 3:].T
-        covariance[:3, :3] = rest + follows @ spread @ follows.T
-        return make_transform(turned, -turned @ place.centre), covariance
+        covariance[:3, :3] = conditional + gain @ position_covariance @ gain.T
+        return make_transform(new_rotation, -new_rotation @ position.centre), covariance
 
 
-def together(first: Place, second: Place) -> tuple[Place, float]:
+def fuse(first: PositionEstimate, second: PositionEstimate) -> tuple[PositionEstimate, float]:
     """The place that two independent ones make, and their squared Mahalanobis distance."""
-    total = np.linalg.inv(first.covariance + second.covariance)
-    off = second.centre - first.centre
-    centre = first.centre + first.covariance @ total @ off
-    return Place(centre, first.covariance @ total @ second.covariance), float(off @ total @ off)
+    information = np.linalg.inv(first.covariance + second.covariance)
+    difference = second.centre - first.centre
+    centre = first.centre + first.covariance @ information @ difference
+    return PositionEstimate(centre, first.covariance @ information @ second.covariance), float(
+        difference @ information @ difference
+    )
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class SearchFrame:
     """A frame as it is searched.
 
     Attributes:
@@ -120,11 +126,11 @@ class Seen:
     """
 
     pyramid: Pyramid
-    row: int
+    keyframe_row: int
 
 
 @dataclass(frozen=True, slots=True)
-class Beside:
+class NeighbourPose:
     """Where the camera was a frame away.
 
     Attributes:
@@ -133,11 +139,11 @@ class Beside:
     """
 
     pose: FloatArray
-    step: int = 1
+    direction: int = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finder:
+class GuidedLocaliser:
     """Finds poses of a camera's frames near where they are expected.
 
     Attributes:
@@ -150,13 +156,19 @@ class Finder:
     """
 
     lens: Camera
-    gallery: Gallery
-    limits: PoseLimits
-    exposure: float
-    readout: float = 0.0
-    sees_room: Callable[[FloatArray], BoolArray]
+    patches: KeyframePatches
+    criteria: AcceptanceCriteria
+    exposure_ratio: float
+    readout_ratio: float = 0.0
+    is_unmasked: Callable[[FloatArray], BoolArray]
 
-    def locate(self, seen: Seen, priors: list[FloatArray], beside: Beside, place: Place) -> Fix | None:
+    def localise(
+        self,
+        search_frame: SearchFrame,
+        priors: list[FloatArray],
+        neighbour: NeighbourPose,
+        predicted: PositionEstimate,
+    ) -> PoseEstimate | None:
         """The pose of a frame.
 
         Args:
@@ -165,79 +177,92 @@ class Finder:
             beside: The frame before or after.
             place: Where its motion leads to.
         """
-        best: Fix | None = None
+        best: PoseEstimate | None = None
         for prior in priors:
-            fix = self._search(self._view(seen, prior, beside), _SEARCHES[0])
-            if fix is not None and (best is None or fix.inliers > best.inliers):
-                best = fix
-            if best is not None and best.inliers >= _SURE_INLIERS and best.evidence >= _SURE_EVIDENCE:
+            estimate = self._search(self._view(search_frame, prior, neighbour), _LEVELS[0])
+            if estimate is not None and (best is None or estimate.inliers > best.inliers):
+                best = estimate
+            if (
+                best is not None
+                and best.inliers >= _SUFFICIENT_INLIERS
+                and best.inlier_weight_ratio >= _SUFFICIENT_WEIGHT_RATIO
+            ):
                 break
-        for search in _SEARCHES[1:]:
+        for level in _LEVELS[1:]:
             if best is None:
                 return None
-            pose, _ = best.with_place(together(best.place, place)[0])
-            best = self._search(self._view(seen, pose, beside), search)
+            pose, _ = best.conditioned_on_centre(fuse(best.position, predicted)[0])
+            best = self._search(self._view(search_frame, pose, neighbour), level)
         return best
 
-    def look_again(self, seen: Seen, pose: FloatArray, beside: Beside) -> Fix | None:
-        """The pose (4,4) of a frame that is nearly known; the rest as for `locate`."""
-        return self._search(self._view(seen, pose, beside), _SEARCHES[-1])
+    def relocalise(
+        self, search_frame: SearchFrame, pose: FloatArray, neighbour: NeighbourPose
+    ) -> PoseEstimate | None:
+        """The pose (4,4) of a frame that is nearly known; the rest as for `localise`."""
+        return self._search(self._view(search_frame, pose, neighbour), _LEVELS[-1])
 
-    def _view(self, seen: Seen, pose: FloatArray, beside: Beside) -> View:
-        return View(
+    def _view(self, search_frame: SearchFrame, pose: FloatArray, neighbour: NeighbourPose) -> PredictedView:
+        return PredictedView(
             lens=self.lens,
-            pyramid=seen.pyramid,
+            pyramid=search_frame.pyramid,
             cam_from_map=pose,
-            before=beside.pose,
-            exposure=self.exposure,
-            readout=beside.step * self.readout,
-            row=seen.row,
+            neighbour_pose=neighbour.pose,
+            exposure_ratio=self.exposure_ratio,
+            readout_ratio=neighbour.direction * self.readout_ratio,
+            keyframe_row=search_frame.keyframe_row,
         )
 
-    def _search(self, view: View, search: Search) -> Fix | None:
-        rows = choose_rows(self.gallery, view)
-        if len(rows) < _MIN_FOUND:
+    def _search(self, view: PredictedView, level: SearchLevel) -> PoseEstimate | None:
+        rows = select_patches(self.patches, view)
+        if len(rows) < _MIN_MATCHES:
             return None
-        found = find_points(self.gallery, view, rows, search)
-        found = found.chosen(self.sees_room(found.px))
-        return self._solve(view, found, search) if len(found.point) >= _MIN_FOUND else None
+        matches = match_patches(self.patches, view, rows, level)
+        matches = matches.select(self.is_unmasked(matches.px))
+        return self._solve(view, matches, level) if len(matches.point) >= _MIN_MATCHES else None
 
-    def _solve(self, view: View, found: Found, search: Search) -> Fix | None:
+    def _solve(self, view: PredictedView, matches: PatchMatches, level: SearchLevel) -> PoseEstimate | None:
         scale = view.pyramid.step_px[0]
-        limits = replace(
-            self.limits,
-            max_error_px=search.limit_px * scale,
-            min_inliers=_MIN_FOUND,
+        criteria = replace(
+            self.criteria,
+            max_error_px=level.limit_px * scale,
+            min_inliers=_MIN_MATCHES,
             max_sigma_depth=np.inf,
             min_noise_px=_MIN_NOISE_PX * scale,
         )
-        points = self.gallery.scene_map.points[found.point]
-        weight = _weights(found.px / (_CELL_PX * scale), self.gallery.seen[found.point])
-        views = make_views(self.lens, np.array([0, len(points)]), points, found.mid_row_px, weight)
-        best = self._refined(views, view.cam_from_map, limits)
-        if best is None or best.evidence < _TRUSTED:
-            sampled = sample_pose(self.lens, points, found.mid_row_px, limits)
-            other = None if sampled is None else self._refined(views, sampled, limits)
+        points = self.patches.scene_map.points[matches.point]
+        weight = _match_weights(
+            matches.px / (_CELL_SIDE_PX * scale), self.patches.keyframe_count[matches.point]
+        )
+        observations = make_observations(
+            self.lens, np.array([0, len(points)]), points, matches.mid_row_px, weight
+        )
+        best = self._refined(observations, view.cam_from_map, criteria)
+        if best is None or best.inlier_weight_ratio < TRUSTED_WEIGHT_RATIO:
+            sampled = ransac_pose(self.lens, points, matches.mid_row_px, criteria)
+            other = None if sampled is None else self._refined(observations, sampled, criteria)
             if other is not None and (best is None or other.inliers > best.inliers):
                 best = other
         return best
 
-    def _refined(self, views: Views, start: FloatArray, limits: PoseLimits) -> Fix | None:
-        pose = refine_poses(views, start[None], limits.max_error_px)
-        judged = judge_poses(views, pose, limits)[0]
-        if judged.covariance is None:
+    def _refined(
+        self, observations: Observations, start: FloatArray, criteria: AcceptanceCriteria
+    ) -> PoseEstimate | None:
+        pose = refine_poses(observations, start[None], criteria.max_error_px)
+        accepted = accept_poses(observations, pose, criteria)[0]
+        if accepted.covariance is None:
             return None
-        return Fix(
+        return PoseEstimate(
             cam_from_map=pose[0],
-            covariance=judged.covariance,
-            inliers=judged.inliers,
-            evidence=judged.evidence,
-            error_px=judged.error_px,
-            depth=float(np.median(views.points @ pose[0, 2, :3] + pose[0, 2, 3])),
+            covariance=accepted.covariance,
+            inliers=accepted.inliers,
+            inlier_weight_ratio=accepted.inlier_weight_ratio,
+            error_px=accepted.error_px,
+            depth=float(np.median(observations.points @ pose[0, 2, :3] + pose[0, 2, 3])),
         )
 
 
-def _weights(cell: FloatArray, seen: IntArray) -> FloatArray:
-    """(N,) how much points count that are seen in cells (N,2) of the image and by so many keyframes (N,)."""
+def _match_weights(cell: FloatArray, keyframe_count: IntArray) -> FloatArray:
+    """X"""
     _, group, count = np.unique(np.floor(cell).astype(int), axis=0, return_inverse=True, return_counts=True)
-    return np.asarray(seen / (seen + _POINT_VARIANCE) / np.maximum(1.0, count[np.ravel(group)] / _PER_CELL))
+    crowding = np.maximum(1.0, count[np.ravel(group)] / _FULL_WEIGHT_PER_CELL)
+    return np.asarray(point_weights(keyframe_count) / crowding)

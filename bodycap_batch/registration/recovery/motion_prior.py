@@ -9,20 +9,28 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 
-_USUAL = 80.0
+_PERCENTILE = 80.0
 """Percentile of a camera's own third and fourth differences: lost stretches are among its faster ones."""
-_EVEN = 0.1
-_ROUNDS = 5
+_MAX_INTERVAL_DEVIATION = 0.1
+_ITERATIONS = 5
 _LOSS_WIDTH = 4.0
 """Squared Mahalanobis distance at which a place, or a bend of the path, counts half."""
-_FAST, _HARD = 30.0, 4.0
+_VELOCITY_SIGMA_JERKS, _ACCELERATION_SIGMA_JERKS = 30.0, 4.0
 """Velocity and acceleration that nothing is known of, in the camera's usual third differences."""
+MAX_DISAGREEMENT = 11.3
+"""x"""
 _NEIGHBOURS = 4
 _PRIOR = 1e-9
 
 
+def times_in_intervals(times_ns: IntArray) -> FloatArray:
+    """Return the times (N,) of frames since the first one, in median frame intervals."""
+    times = (times_ns - times_ns[0]).astype(np.float64)
+    return np.asarray(times / np.median(np.diff(times)))
+
+
 @dataclass(frozen=True, slots=True)
-class Place:
+class PositionEstimate:
     """Where a camera was.
 
     Attributes:
@@ -35,7 +43,7 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Steadiness:
+class MotionStatistics:
     """How evenly a camera moves, in the map's unit along an axis, for frames one interval apart.
 
     Attributes:
@@ -43,60 +51,66 @@ class Steadiness:
         bend: Distance of a centre from the cubic through the two before it and the two after it.
     """
 
-    jerk: float
-    bend: float
+    jerk_sigma: float
+    cubic_residual_sigma: float
 
     @staticmethod
-    def of(times: FloatArray, centres: FloatArray) -> Steadiness | None:
+    def estimate(times: FloatArray, centres: FloatArray) -> MotionStatistics | None:
         """From centres (N,3) at times (N,) in frame intervals, NaN where unknown; None where too few are."""
         sizes = []
         for order in (3, 4):
-            change = np.diff(centres, order, axis=0)
-            uneven = np.abs(np.diff(times) - 1.0) > _EVEN
-            broken = np.convolve(uneven, np.ones(order), "valid")[: len(change)] > 0.0
-            change = change[np.isfinite(change).all(axis=1) & ~broken]
-            if len(change) < _NEIGHBOURS:
+            differences = np.diff(centres, order, axis=0)
+            is_uneven = np.abs(np.diff(times) - 1.0) > _MAX_INTERVAL_DEVIATION
+            is_broken = np.convolve(is_uneven, np.ones(order), "valid")[: len(differences)] > 0.0
+            differences = differences[np.isfinite(differences).all(axis=1) & ~is_broken]
+            if len(differences) < _NEIGHBOURS:
                 return None
-            sizes.append(float(np.percentile(np.sqrt((change**2).mean(axis=1)), _USUAL)))
+            sizes.append(float(np.percentile(np.sqrt((differences**2).mean(axis=1)), _PERCENTILE)))
         # The fourth difference is six times the distance from the cubic.
-        return Steadiness(jerk=sizes[0], bend=sizes[1] / 6.0) if min(sizes) > 0.0 else None
+        return (
+            MotionStatistics(jerk_sigma=sizes[0], cubic_residual_sigma=sizes[1] / 6.0)
+            if min(sizes) > 0.0
+            else None
+        )
 
 
-class CentreFilter:
+class CentreKalmanFilter:
     """A camera's centre, velocity and acceleration while frames are walked through, forwards or backwards.
 
     Source: Tang, Yoon, Barfoot, "A white-noise-on-jerk motion prior for continuous-time trajectory
         estimation on SE(3)", RA-L 2019, for the prior, on the centre alone: a hand turns as it likes.
     """
 
-    def __init__(self, steadiness: Steadiness, start: Place) -> None:
-        jerk = steadiness.jerk
+    def __init__(self, statistics: MotionStatistics, start: PositionEstimate) -> None:
+        jerk = statistics.jerk_sigma
         self._jerk = jerk
         self._state = np.concatenate([start.centre, np.zeros(6)])
         self._covariance = np.zeros((9, 9))
         self._covariance[:3, :3] = start.covariance
-        self._covariance[3:6, 3:6] = np.eye(3) * (_FAST * jerk) ** 2
-        self._covariance[6:, 6:] = np.eye(3) * (_HARD * jerk) ** 2
+        self._covariance[3:6, 3:6] = np.eye(3) * (_VELOCITY_SIGMA_JERKS * jerk) ** 2
+        self._covariance[6:, 6:] = np.eye(3) * (_ACCELERATION_SIGMA_JERKS * jerk) ** 2
 
-    def predict(self, interval: float) -> Place:
+    def predict(self, interval: float) -> PositionEstimate:
         """Go on by some frame intervals (> 0); where the camera should be then."""
         powers = np.array([[1.0, interval, interval**2 / 2.0], [0.0, 1.0, interval], [0.0, 0.0, 1.0]])
-        step = np.kron(powers, np.eye(3))
-        pushed = np.array([interval**3 / 6.0, interval**2 / 2.0, interval]) * self._jerk
-        self._state = step @ self._state
-        self._covariance = step @ self._covariance @ step.T + np.kron(np.outer(pushed, pushed), np.eye(3))
-        return Place(self._state[:3].copy(), self._covariance[:3, :3].copy())
+        transition = np.kron(powers, np.eye(3))
+        noise = np.array([interval**3 / 6.0, interval**2 / 2.0, interval]) * self._jerk
+        self._state = transition @ self._state
+        self._covariance = transition @ self._covariance @ transition.T + np.kron(
+            np.outer(noise, noise), np.eye(3)
+        )
+        return PositionEstimate(self._state[:3].copy(), self._covariance[:3, :3].copy())
 
-    def update(self, seen: Place) -> None:
+    def update(self, observed: PositionEstimate) -> None:
         """Take in where the camera was found."""
-        gain = self._covariance[:, :3] @ np.linalg.inv(self._covariance[:3, :3] + seen.covariance)
-        self._state = self._state + gain @ (seen.centre - self._state[:3])
+        gain = self._covariance[:, :3] @ np.linalg.inv(self._covariance[:3, :3] + observed.covariance)
+        self._state = self._state + gain @ (observed.centre - self._state[:3])
         covariance = self._covariance - gain @ self._covariance[:3]
         self._covariance = 0.5 * (covariance + covariance.T)
 
 
 @dataclass(frozen=True, slots=True)
-class Smoothed:
+class SmoothedCentres:
     """Places of consecutive frames, each with what all of them tell.
 
     Attributes:
@@ -104,17 +118,17 @@ class Smoothed:
         disagreement: By frame that was found: squared Mahalanobis distance from its smoothed place.
     """
 
-    places: Mapping[int, Place]
+    positions: Mapping[int, PositionEstimate]
     disagreement: Mapping[int, float]
 
 
 def smooth_centres(
     frames: IntArray,
     times: FloatArray,
-    found: Mapping[int, Place],
+    observed: Mapping[int, PositionEstimate],
     trusted: Collection[int],
-    steadiness: Steadiness,
-) -> Smoothed:
+    statistics: MotionStatistics,
+) -> SmoothedCentres:
     """Centres of consecutive frames near where they were found, on a path that bends as it usually does.
 
     Both the places and the bends count under a Cauchy loss: a place may be wrong, and a hand may stop dead.
@@ -127,31 +141,33 @@ def smooth_centres(
         steadiness: The camera's.
     """
     at = {frame: index for index, frame in enumerate(frames.tolist())}
-    bends, sigma = _bends(times, steadiness.bend)
-    windows = np.arange(len(bends))[:, None] + np.arange(_NEIGHBOURS + 1)
-    worth, bend_worth = dict.fromkeys(found, 1.0), np.ones(len(bends))
+    rows, sigma = _cubic_residual_rows(times, statistics.cubic_residual_sigma)
+    windows = np.arange(len(rows))[:, None] + np.arange(_NEIGHBOURS + 1)
+    robust_weight, row_weight = dict.fromkeys(observed, 1.0), np.ones(len(rows))
     centres, covariance = np.zeros((len(frames), 3)), np.zeros((len(frames), 3, 3))
     disagreement: dict[int, float] = {}
-    for _ in range(_ROUNDS):
-        known, pull = np.zeros((len(frames), 3, 3)), np.zeros((len(frames), 3))
-        for frame, place in found.items():
-            share = worth[frame] * np.linalg.inv(place.covariance)
-            known[at[frame]] += share
-            pull[at[frame]] += share @ place.centre
-        centres, covariance = _solved(bends, bend_worth / sigma**2, known, pull)
-        for frame, place in found.items():
-            off = place.centre - centres[at[frame]]
-            disagreement[frame] = float(off @ np.linalg.solve(place.covariance, off))
+    for _ in range(_ITERATIONS):
+        information_sum, weighted_sum = np.zeros((len(frames), 3, 3)), np.zeros((len(frames), 3))
+        for frame, position in observed.items():
+            information = robust_weight[frame] * np.linalg.inv(position.covariance)
+            information_sum[at[frame]] += information
+            weighted_sum[at[frame]] += information @ position.centre
+        centres, covariance = _solve_block_tridiagonal(
+            rows, row_weight / sigma**2, information_sum, weighted_sum
+        )
+        for frame, position in observed.items():
+            difference = position.centre - centres[at[frame]]
+            disagreement[frame] = float(difference @ np.linalg.solve(position.covariance, difference))
             if frame not in trusted:
-                worth[frame] = 1.0 / (1.0 + disagreement[frame] / _LOSS_WIDTH)
-        bent = np.einsum("nj,njc->nc", bends, centres[windows])
-        bend_worth = 1.0 / (1.0 + (bent**2).mean(axis=1) / sigma**2 / _LOSS_WIDTH)
-    places = {frame: Place(centres[i], covariance[i]) for frame, i in at.items()}
-    return Smoothed(places, disagreement)
+                robust_weight[frame] = 1.0 / (1.0 + disagreement[frame] / _LOSS_WIDTH)
+        residual = np.einsum("nj,njc->nc", rows, centres[windows])
+        row_weight = 1.0 / (1.0 + (residual**2).mean(axis=1) / sigma**2 / _LOSS_WIDTH)
+    positions = {frame: PositionEstimate(centres[i], covariance[i]) for frame, i in at.items()}
+    return SmoothedCentres(positions, disagreement)
 
 
-def _solved(
-    bends: FloatArray, weight: FloatArray, known: FloatArray, pull: FloatArray
+def _solve_block_tridiagonal(
+    rows: FloatArray, weight: FloatArray, information: FloatArray, weighted: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Centres (N,3) and their covariances (N,3,3) of the least squares that bends and places make.
 
@@ -159,7 +175,7 @@ def _solved(
     memory grow with the number of frames, not with its powers.
 
     Args:
-        bends: (N−4,5) as `_bends` gives them.
+        bends: (N−4,5) as `_cubic_residual_rows` gives them.
         weight: (N−4,) their information.
         known: (N,3,3) information of the places.
         pull: (N,3) the same times the places.
@@ -167,44 +183,44 @@ def _solved(
     Source: block elimination, and its way back for the blocks of the inverse, as in Rauch, Tung, Striebel,
         "Maximum likelihood estimates of linear dynamic systems", AIAA Journal 1965.
     """
-    count, size = len(known), 3 * _NEIGHBOURS
+    count, size = len(information), 3 * _NEIGHBOURS
     groups = -(-count // _NEIGHBOURS)
-    own, ahead = _blocks(bends, weight, groups)
+    own, ahead = _information_blocks(rows, weight, groups)
     own, ahead = (np.asarray(np.kron(each, np.eye(3)), np.float64) for each in (own, ahead))
     for index in range(count):
-        group, rows = index // _NEIGHBOURS, index % _NEIGHBOURS * 3
-        own[group, rows : rows + 3, rows : rows + 3] += known[index]
+        group, block_rows = index // _NEIGHBOURS, index % _NEIGHBOURS * 3
+        own[group, block_rows : block_rows + 3, block_rows : block_rows + 3] += information[index]
     own += np.eye(size) * (_PRIOR * np.trace(own, axis1=1, axis2=2).sum() / (3 * count))
-    towards = np.zeros((groups, size))
-    towards.reshape(-1, 3)[:count] = pull
+    right = np.zeros((groups, size))
+    right.reshape(-1, 3)[:count] = weighted
     for group in range(1, groups):
-        back = np.linalg.solve(own[group - 1], ahead[group - 1]).T
-        own[group] -= back @ ahead[group - 1]
-        towards[group] -= back @ towards[group - 1]
+        elimination = np.linalg.solve(own[group - 1], ahead[group - 1]).T
+        own[group] -= elimination @ ahead[group - 1]
+        right[group] -= elimination @ right[group - 1]
     covariance = np.linalg.inv(own)
-    centres = np.einsum("gij,gj->gi", covariance, towards)
+    centres = np.einsum("gij,gj->gi", covariance, right)
     for group in range(groups - 2, -1, -1):
-        follows = covariance[group] @ ahead[group]
-        centres[group] -= follows @ centres[group + 1]
-        covariance[group] += follows @ covariance[group + 1] @ follows.T
+        gain = covariance[group] @ ahead[group]
+        centres[group] -= gain @ centres[group + 1]
+        covariance[group] += gain @ covariance[group + 1] @ gain.T
     blocks = covariance.reshape(groups, _NEIGHBOURS, 3, _NEIGHBOURS, 3)
     diagonal = np.einsum("gaiaj->gaij", blocks).reshape(-1, 3, 3)
     return centres.reshape(-1, 3)[:count], diagonal[:count]
 
 
-def _blocks(bends: FloatArray, weight: FloatArray, groups: int) -> tuple[FloatArray, FloatArray]:
+def _information_blocks(rows: FloatArray, weight: FloatArray, groups: int) -> tuple[FloatArray, FloatArray]:
     """(G,4,4) information that bends are about groups of four frames, and (G,4,4) with the group after."""
-    both = np.zeros((groups + 1, 2 * _NEIGHBOURS, 2 * _NEIGHBOURS))
-    for number, row in enumerate(bends):
+    pairs = np.zeros((groups + 1, 2 * _NEIGHBOURS, 2 * _NEIGHBOURS))
+    for number, row in enumerate(rows):
         group, first = divmod(number, _NEIGHBOURS)
-        rows = slice(first, first + _NEIGHBOURS + 1)
-        both[group, rows, rows] += weight[number] * np.outer(row, row)
-    own = both[:-1, :_NEIGHBOURS, :_NEIGHBOURS].copy()
-    own[1:] += both[: groups - 1, _NEIGHBOURS:, _NEIGHBOURS:]
-    return own, both[:-1, :_NEIGHBOURS, _NEIGHBOURS:]
+        columns = slice(first, first + _NEIGHBOURS + 1)
+        pairs[group, columns, columns] += weight[number] * np.outer(row, row)
+    own = pairs[:-1, :_NEIGHBOURS, :_NEIGHBOURS].copy()
+    own[1:] += pairs[: groups - 1, _NEIGHBOURS:, _NEIGHBOURS:]
+    return own, pairs[:-1, :_NEIGHBOURS, _NEIGHBOURS:]
 
 
-def _bends(times: FloatArray, bend: float) -> tuple[FloatArray, FloatArray]:
+def _cubic_residual_rows(times: FloatArray, bend: float) -> tuple[FloatArray, FloatArray]:
     """Rows (N−4,5) that give a centre's distance from the cubic through its neighbours, and its sigma.
 
     Row n is about frames n to n+4.

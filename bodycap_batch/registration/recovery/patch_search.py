@@ -12,24 +12,24 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, transform_points
 from bodycap_batch.model.optical_flow import GreyImage, pixel_scale
-from bodycap_batch.model.rolling_shutter import at_mid_row
+from bodycap_batch.model.rolling_shutter import px_at_mid_row
 from bodycap_batch.model.scene import Map
-from bodycap_batch.registration.tracking.klt import well_spread
+from bodycap_batch.registration.tracking.klt import grid_sample
 
 _MAX_POINTS = 300
-_CELLS = 8
+_GRID_CELLS = 8
 _MARGIN_PX = 4.0
 _MIN_COSINE = 0.6
 """Of the angle between the two lines of sight: a patch is taken to face the camera."""
 _MAX_LOG_SCALE = 0.8
-_SCALE_COST, _SHARP_WORTH = 0.3, 0.1
+_SCALE_PENALTY, _SHARPNESS_REWARD = 0.3, 0.1
 """What a keyframe's distance (log of the ratio) and sharpness count beside its line of sight's cosine."""
 _MAX_BLUR_PX = 40.0
-_BLUR_SAMPLES = 5
-_BLUR_STEP = 3.0
+_MAX_BLUR_SAMPLES = 5
+_BLUR_STEP_PX = 3.0
 """Pixels of the level from sample to sample; a longer blur is sampled less densely."""
-_STEP_PX = 4.0
-_MIN_DEPTH = 0.25
+_WARP_STEP_PX = 4.0
+_MIN_DEPTH_RATIO = 0.25
 """Of the median depth: what seems to hang before the lens was triangulated wrongly and would tie the pose."""
 _MIN_CONTRAST = 3.0
 _LEVELS = 3
@@ -50,7 +50,7 @@ class Pyramid:
     step_px: tuple[float, ...]
 
     @staticmethod
-    def of(grey: GreyImage) -> Pyramid:
+    def build(grey: GreyImage) -> Pyramid:
         """Reduce a frame (H,W)."""
         import cv2
 
@@ -67,7 +67,7 @@ class Pyramid:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Gallery:
+class KeyframePatches:
     """What a map's points look like.
 
     Attributes:
@@ -79,21 +79,21 @@ class Gallery:
     """
 
     scene_map: Map
-    pictures: Mapping[int, Pyramid]
+    pyramids: Mapping[int, Pyramid]
     sharpness: FloatArray
     usable: BoolArray
-    seen: IntArray
+    keyframe_count: IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class View:
+class PredictedView:
     """Where a frame is thought to be.
 
     Attributes:
         lens: Its camera.
         pyramid: Its picture.
         cam_from_map: (4,4) its pose.
-        before: (4,4) the same a frame earlier; a frame later where `readout` is negative.
+        before: (4,4) the same a frame earlier; a frame later where `readout_ratio` is negative.
         exposure: Share of the time between two frames that the shutter is open.
         readout: Share of it from the first row's exposure to the last's that the map was refined for.
         row: Of the frame itself among the map's keyframes, -1 where it is none: its own look is found in it
@@ -103,14 +103,14 @@ class View:
     lens: Camera
     pyramid: Pyramid
     cam_from_map: FloatArray
-    before: FloatArray
-    exposure: float
-    readout: float = 0.0
-    row: int = -1
+    neighbour_pose: FloatArray
+    exposure_ratio: float
+    readout_ratio: float = 0.0
+    keyframe_row: int = -1
 
 
 @dataclass(frozen=True, slots=True)
-class Search:
+class SearchLevel:
     """How points are looked for.
 
     Attributes:
@@ -121,15 +121,15 @@ class Search:
         limit_px: Inlier limit of the pose that is solved from what is found, at 640 pixels' width.
     """
 
-    level: int
-    side: int
-    radius: int
+    pyramid_level: int
+    patch_side: int
+    search_radius: int
     score: float
     limit_px: float
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class PatchMatches:
     """Points found.
 
     Attributes:
@@ -144,41 +144,52 @@ class Found:
     mid_row_px: FloatArray
     score: FloatArray
 
-    def chosen(self, which: BoolArray) -> Found:
+    def select(self, selected: BoolArray) -> PatchMatches:
         """Some of them."""
-        return Found(self.point[which], self.px[which], self.mid_row_px[which], self.score[which])
+        return PatchMatches(
+            self.point[selected], self.px[selected], self.mid_row_px[selected], self.score[selected]
+        )
 
 
-def choose_rows(gallery: Gallery, view: View) -> IntArray:
+def select_patches(patches: KeyframePatches, view: PredictedView) -> IntArray:
     """Rows of the map's observations to take points' looks from: one for each of some well spread points."""
-    scene, lens = gallery.scene_map, view.lens
+    scene, lens = patches.scene_map, view.lens
     x_in_cam = transform_points(view.cam_from_map, scene.points)
     px = lens.project(x_in_cam)
     size = np.array([lens.width_px, lens.height_px])
     with np.errstate(invalid="ignore"):
-        inside = ((px > _MARGIN_PX) & (px < size - _MARGIN_PX)).all(axis=1) & gallery.usable
-    inside &= x_in_cam[:, 2] > _MIN_DEPTH * np.median(x_in_cam[inside, 2]) if inside.any() else False
-    held = np.zeros(len(scene.keyframe_camera), dtype=bool)
-    held[[row for row in gallery.pictures if row != view.row]] = True
-    rows = np.flatnonzero(inside[scene.obs_point] & held[scene.obs_keyframe])
+        inside = ((px > _MARGIN_PX) & (px < size - _MARGIN_PX)).all(axis=1) & patches.usable
+    inside &= x_in_cam[:, 2] > _MIN_DEPTH_RATIO * np.median(x_in_cam[inside, 2]) if inside.any() else False
+    is_held = np.zeros(len(scene.keyframe_camera), dtype=bool)
+    is_held[[row for row in patches.pyramids if row != view.keyframe_row]] = True
+    rows = np.flatnonzero(inside[scene.obs_point] & is_held[scene.obs_keyframe])
     point, keyframe = scene.obs_point[rows], scene.obs_keyframe[rows]
-    here = scene.points[point] - invert(view.cam_from_map)[:3, 3]
-    there = scene.points[point] - scene.map_from_cam[keyframe, :3, 3]
-    near, far = np.linalg.norm(here, axis=1), np.linalg.norm(there, axis=1)
-    cosine = np.einsum("ni,ni->n", here, there) / np.maximum(near * far, 1e-12)
-    log_scale = np.abs(np.log(np.maximum(far, 1e-12) / np.maximum(near, 1e-12)))
-    alike = (cosine > _MIN_COSINE) & (log_scale < _MAX_LOG_SCALE)
-    worth = cosine - _SCALE_COST * log_scale + _SHARP_WORTH * np.minimum(gallery.sharpness[keyframe], 2.0)
-    rows, point, worth = rows[alike], point[alike], worth[alike]
-    order = np.lexsort((-worth, point))
+    x_from_camera = scene.points[point] - invert(view.cam_from_map)[:3, 3]
+    x_from_keyframe = scene.points[point] - scene.map_from_cam[keyframe, :3, 3]
+    camera_distance, keyframe_distance = (
+        np.linalg.norm(x_from_camera, axis=1),
+        np.linalg.norm(x_from_keyframe, axis=1),
+    )
+    cosine = np.einsum("ni,ni->n", x_from_camera, x_from_keyframe) / np.maximum(
+        camera_distance * keyframe_distance, 1e-12
+    )
+    log_scale = np.abs(np.log(np.maximum(keyframe_distance, 1e-12) / np.maximum(camera_distance, 1e-12)))
+    is_similar = (cosine > _MIN_COSINE) & (log_scale < _MAX_LOG_SCALE)
+    score = (
+        cosine - _SCALE_PENALTY * log_scale + _SHARPNESS_REWARD * np.minimum(patches.sharpness[keyframe], 2.0)
+    )
+    rows, point, score = rows[is_similar], point[is_similar], score[is_similar]
+    order = np.lexsort((-score, point))
     best = order[np.unique(point[order], return_index=True)[1]]
     rows, point = rows[best], point[best]
-    cell = np.clip((px[point] / size * _CELLS).astype(int), 0, _CELLS - 1)
-    picked = well_spread(cell[:, 1] * _CELLS + cell[:, 0], gallery.seen[point], _MAX_POINTS)
-    return np.asarray(np.sort(rows[picked]))
+    cell = np.clip((px[point] / size * _GRID_CELLS).astype(int), 0, _GRID_CELLS - 1)
+    chosen = grid_sample(cell[:, 1] * _GRID_CELLS + cell[:, 0], patches.keyframe_count[point], _MAX_POINTS)
+    return np.asarray(np.sort(rows[chosen]))
 
 
-def find_points(gallery: Gallery, view: View, rows: IntArray, search: Search) -> Found:
+def match_patches(
+    patches: KeyframePatches, view: PredictedView, rows: IntArray, level: SearchLevel
+) -> PatchMatches:
     """Look for points around where a pose projects them, by normalised correlation.
 
     A point's look is taken from a keyframe, warped to how this camera sees it (its surroundings are taken to
@@ -188,7 +199,7 @@ def find_points(gallery: Gallery, view: View, rows: IntArray, search: Search) ->
     Args:
         gallery: The map and its keyframes' pictures.
         view: The frame and its expected pose.
-        rows: Observations of the map to take looks from, as `choose_rows` gives them.
+        rows: Observations of the map to take looks from, as `select_patches` gives them.
         search: Where and how.
 
     Returns:
@@ -197,65 +208,76 @@ def find_points(gallery: Gallery, view: View, rows: IntArray, search: Search) ->
     Source: Klein, Murray, "Improving the agility of keyframe-based SLAM", ECCV 2008, for looking in blurred
         frames for what blurs alike; the warp is Klein, Murray, "Parallel tracking and mapping", ISMAR 2007.
     """
-    scene, lens = gallery.scene_map, view.lens
+    scene, lens = patches.scene_map, view.lens
     points = scene.points[scene.obs_point[rows]]
     px = lens.project(transform_points(view.cam_from_map, points))
-    shown = np.isfinite(px).all(axis=1)
-    rows, points, px = rows[shown], points[shown], px[shown]
+    is_projected = np.isfinite(px).all(axis=1)
+    rows, points, px = rows[is_projected], points[is_projected], px[is_projected]
     if len(rows) == 0:
-        return Found(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
-    warp = _warps(scene, lens, view.cam_from_map, rows, px)
-    step = view.pyramid.step_px[search.level]
-    crossing = _crossing(view, points, px)
-    patches, whole = _patches(gallery, rows, warp, _blur(view, crossing), search, step)
+        return PatchMatches(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
+    warp = _patch_warps(scene, lens, view.cam_from_map, rows, px)
+    step = view.pyramid.step_px[level.pyramid_level]
+    motion = _image_motion(view, points, px)
+    images, is_inside = _render_patches(patches, rows, warp, _motion_blur(view, motion), level, step)
     # Within the readout a point crosses a small part of the image: its row hardly depends on it.
-    seen_px = at_mid_row(lens, px, crossing, -view.readout)
+    expected_px = px_at_mid_row(lens, px, motion, -view.readout_ratio)
     found_px, score = np.full((len(rows), 2), np.nan), np.zeros(len(rows))
-    target = view.pyramid.levels[search.level].astype(np.float32)
-    for number in np.flatnonzero(whole).tolist():
-        place = _place(target, patches[number], seen_px[number] / step - 0.5, search.radius)
-        if place is not None:
-            found_px[number] = (np.array(place[:2]) + 0.5) * step
-            score[number] = place[2]
-    good = (score > search.score) & np.isfinite(found_px).all(axis=1)
-    mid_row_px = at_mid_row(lens, found_px, crossing, view.readout)
-    return Found(scene.obs_point[rows[good]], found_px[good], mid_row_px[good], score[good])
-
-
-def _warps(scene: Map, lens: Camera, cam_from_map: FloatArray, rows: IntArray, px: FloatArray) -> FloatArray:
-    """(N,2,2) the keyframes' pixels by this camera's, around points seen at `px` (N,2)."""
-    keyframe = scene.obs_keyframe[rows]
-    depth = transform_points(cam_from_map, scene.points[scene.obs_point[rows]])[:, 2]
-    back, ahead = invert(cam_from_map), invert(scene.map_from_cam[keyframe])
-    names = np.array(scene.keyframe_camera)[keyframe]
-    places = []
-    for offset in ((0.0, 0.0), (_STEP_PX, 0.0), (0.0, _STEP_PX)):
-        rays = np.column_stack([lens.unproject(px + offset), np.ones(len(px))]) * depth[:, None]
-        seen = transform_points(ahead, transform_points(back, rays))
-        place = np.full((len(px), 2), np.nan)
-        for name in np.unique(names).tolist():
-            mine = names == name
-            place[mine] = scene.cameras[name].project(seen[mine])
-        places.append(place)
-    return np.stack([places[1] - places[0], places[2] - places[0]], axis=2) / _STEP_PX
-
-
-def _crossing(view: View, points: FloatArray, px: FloatArray) -> FloatArray:
-    """(N,2) how far points seen at `px` (N,2) moved since the frame before."""
-    return np.asarray(np.nan_to_num(px - view.lens.project(transform_points(view.before, points))))
-
-
-def _blur(view: View, crossing_px: FloatArray) -> FloatArray:
-    """(N,2) how far points cross the image while the shutter is open; held to what is sane."""
-    moved = crossing_px * view.exposure
-    longest = _MAX_BLUR_PX * max(1.0, view.pyramid.step_px[0])
-    return np.asarray(
-        moved * np.minimum(1.0, longest / np.maximum(np.linalg.norm(moved, axis=1), 1e-9))[:, None]
+    target = view.pyramid.levels[level.pyramid_level].astype(np.float32)
+    for number in np.flatnonzero(is_inside).tolist():
+        match = _best_match(target, images[number], expected_px[number] / step - 0.5, level.search_radius)
+        if match is not None:
+            found_px[number] = (np.array(match[:2]) + 0.5) * step
+            score[number] = match[2]
+    accepted = (score > level.score) & np.isfinite(found_px).all(axis=1)
+    mid_row_px = px_at_mid_row(lens, found_px, motion, view.readout_ratio)
+    return PatchMatches(
+        scene.obs_point[rows[accepted]], found_px[accepted], mid_row_px[accepted], score[accepted]
     )
 
 
-def _patches(
-    gallery: Gallery, rows: IntArray, warp: FloatArray, blur_px: FloatArray, search: Search, step_px: float
+def _patch_warps(
+    scene: Map, lens: Camera, cam_from_map: FloatArray, rows: IntArray, px: FloatArray
+) -> FloatArray:
+    """(N,2,2) the keyframes' pixels by this camera's, around points seen at `px` (N,2)."""
+    keyframe = scene.obs_keyframe[rows]
+    depth = transform_points(cam_from_map, scene.points[scene.obs_point[rows]])[:, 2]
+    map_from_cam, keyframe_from_map = invert(cam_from_map), invert(scene.map_from_cam[keyframe])
+    names = np.array(scene.keyframe_camera)[keyframe]
+    projections = []
+    for offset in ((0.0, 0.0), (_WARP_STEP_PX, 0.0), (0.0, _WARP_STEP_PX)):
+        rays = np.column_stack([lens.unproject(px + offset), np.ones(len(px))]) * depth[:, None]
+        x_in_keyframe = transform_points(keyframe_from_map, transform_points(map_from_cam, rays))
+        keyframe_px = np.full((len(px), 2), np.nan)
+        for name in np.unique(names).tolist():
+            is_own = names == name
+            keyframe_px[is_own] = scene.cameras[name].project(x_in_keyframe[is_own])
+        projections.append(keyframe_px)
+    return (
+        np.stack([projections[1] - projections[0], projections[2] - projections[0]], axis=2) / _WARP_STEP_PX
+    )
+
+
+def _image_motion(view: PredictedView, points: FloatArray, px: FloatArray) -> FloatArray:
+    """(N,2) how far points seen at `px` (N,2) moved since the frame before."""
+    return np.asarray(np.nan_to_num(px - view.lens.project(transform_points(view.neighbour_pose, points))))
+
+
+def _motion_blur(view: PredictedView, motion_px: FloatArray) -> FloatArray:
+    """(N,2) how far points cross the image while the shutter is open; held to what is sane."""
+    blur = motion_px * view.exposure_ratio
+    longest = _MAX_BLUR_PX * max(1.0, view.pyramid.step_px[0])
+    return np.asarray(
+        blur * np.minimum(1.0, longest / np.maximum(np.linalg.norm(blur, axis=1), 1e-9))[:, None]
+    )
+
+
+def _render_patches(
+    patches: KeyframePatches,
+    rows: IntArray,
+    warp: FloatArray,
+    blur_px: FloatArray,
+    level: SearchLevel,
+    step_px: float,
 ) -> tuple[Patches, BoolArray]:
     """Looks (N,side,side) of points, warped and blurred, and which (N,) lie within their keyframes.
 
@@ -263,49 +285,51 @@ def _patches(
     """
     import cv2
 
-    scene, side = gallery.scene_map, search.side
+    scene, side = patches.scene_map, level.patch_side
     keyframe = scene.obs_keyframe[rows]
-    held, which = np.unique(keyframe, return_inverse=True)
-    sources = [gallery.pictures[row] for row in held.tolist()]
-    step = np.array([source.step_px[search.level] for source in sources])[which]
-    limit = np.array([source.levels[search.level].shape[::-1] for source in sources])[which] - 1.0
-    along = np.arange(side) - side // 2
-    grid = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2).astype(np.float32)
+    keyframe_rows, source_index = np.unique(keyframe, return_inverse=True)
+    sources = [patches.pyramids[row] for row in keyframe_rows.tolist()]
+    step = np.array([source.step_px[level.pyramid_level] for source in sources])[source_index]
+    limit = (
+        np.array([source.levels[level.pyramid_level].shape[::-1] for source in sources])[source_index] - 1.0
+    )
+    axis = np.arange(side) - side // 2
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2).astype(np.float32)
     offset = np.matmul(grid, (warp * step_px / step[:, None, None]).astype(np.float32).swapaxes(1, 2))
     shift = np.einsum("nij,nj->ni", warp, blur_px) / step[:, None]
     longest = float(np.linalg.norm(shift, axis=1).max(initial=0.0)) if np.isfinite(shift).all() else np.inf
-    samples = int(np.clip(np.ceil(longest / _BLUR_STEP) + 1, 1, _BLUR_SAMPLES))
-    share = np.linspace(-0.5, 0.5, samples) if samples > 1 else np.zeros(1)
+    samples = int(np.clip(np.ceil(longest / _BLUR_STEP_PX) + 1, 1, _MAX_BLUR_SAMPLES))
+    fraction = np.linspace(-0.5, 0.5, samples) if samples > 1 else np.zeros(1)
     centre = scene.obs_px[rows] / step[:, None] - 0.5
-    centres = centre[:, None, :] + share[None, :, None] * shift[:, None, :]
-    reach = np.abs(offset).max(axis=1)
-    low, high = centres.min(axis=1) - reach, centres.max(axis=1) + reach
-    whole = ((low >= 0.0) & (high <= limit)).all(axis=1)
-    patches = np.zeros((len(rows), side, side), np.float32)
+    centres = centre[:, None, :] + fraction[None, :, None] * shift[:, None, :]
+    extent = np.abs(offset).max(axis=1)
+    low, high = centres.min(axis=1) - extent, centres.max(axis=1) + extent
+    is_inside = ((low >= 0.0) & (high <= limit)).all(axis=1)
+    images = np.zeros((len(rows), side, side), np.float32)
     for number, source in enumerate(sources):
-        mine = np.flatnonzero((which == number) & whole)
-        if len(mine) == 0:
+        own = np.flatnonzero((source_index == number) & is_inside)
+        if len(own) == 0:
             continue
-        at = centres[mine].astype(np.float32)[:, :, None, :] + offset[mine][:, None, :, :]
-        at = at.reshape(-1, side, 2)
-        drawn = cv2.remap(
-            source.levels[search.level],
-            np.ascontiguousarray(at[..., 0]),
-            np.ascontiguousarray(at[..., 1]),
+        sample_px = centres[own].astype(np.float32)[:, :, None, :] + offset[own][:, None, :, :]
+        sample_px = sample_px.reshape(-1, side, 2)
+        rendered = cv2.remap(
+            source.levels[level.pyramid_level],
+            np.ascontiguousarray(sample_px[..., 0]),
+            np.ascontiguousarray(sample_px[..., 1]),
             cv2.INTER_LINEAR,
         )
-        patches[mine] = drawn.reshape(len(mine), samples, side, side).mean(axis=1, dtype=np.float32)
-    return patches, whole & (patches.std(axis=(1, 2)) >= _MIN_CONTRAST)
+        images[own] = rendered.reshape(len(own), samples, side, side).mean(axis=1, dtype=np.float32)
+    return images, is_inside & (images.std(axis=(1, 2)) >= _MIN_CONTRAST)
 
 
-def _place(
+def _best_match(
     target: Patches, patch: Patches, expected: FloatArray, radius: int
 ) -> tuple[float, float, float] | None:
     """Column, row and correlation of a patch's best place near an expected one; None at the border."""
     import cv2
 
     half = patch.shape[0] // 2
-    column, row = (round(float(each)) for each in expected)
+    column, row = (round(float(value)) for value in expected)
     height, width = target.shape
     left, top = max(column - half - radius, 0), max(row - half - radius, 0)
     right, bottom = min(column + half + radius + 1, width), min(row + half + radius + 1, height)
@@ -315,12 +339,12 @@ def _place(
     _, best, _, (x, y) = cv2.minMaxLoc(scores)
     if not (0 < x < scores.shape[1] - 1 and 0 < y < scores.shape[0] - 1):
         return None
-    across = _peak(scores[y, x - 1], scores[y, x], scores[y, x + 1])
-    down = _peak(scores[y - 1, x], scores[y, x], scores[y + 1, x])
+    across = _subpixel_peak(scores[y, x - 1], scores[y, x], scores[y, x + 1])
+    down = _subpixel_peak(scores[y - 1, x], scores[y, x], scores[y + 1, x])
     return left + x + half + across, top + y + half + down, float(best)
 
 
-def _peak(before: float, at: float, after: float) -> float:
+def _subpixel_peak(before: float, middle: float, after: float) -> float:
     """Where a parabola through three values peaks, from the middle one."""
-    bend = float(before) - 2.0 * float(at) + float(after)
-    return 0.5 * (float(before) - float(after)) / bend if bend < 0.0 else 0.0
+    curvature = float(before) - 2.0 * float(middle) + float(after)
+    return 0.5 * (float(before) - float(after)) / curvature if curvature < 0.0 else 0.0

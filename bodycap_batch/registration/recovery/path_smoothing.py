@@ -6,19 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodycap_batch.config.lost_frames import LEAST_POSED
+from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_POSED
 from bodycap_batch.core.arrays import BoolArray
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.scene import Trajectory
-from bodycap_batch.registration.recovery.guided_localisation import Fix
-from bodycap_batch.registration.recovery.motion_prior import Steadiness, smooth_centres
+from bodycap_batch.registration.recovery.guided_localisation import PoseEstimate
+from bodycap_batch.registration.recovery.motion_prior import (
+    MAX_DISAGREEMENT,
+    MotionStatistics,
+    smooth_centres,
+    times_in_intervals,
+)
 
-_MAX_DISAGREEMENT = 11.3
-"""Squared Mahalanobis distance from the smoothed centre beyond which a pose stays as it was measured: 99 % of
-three axes. Either is wrong then, and nobody knows which."""
 
-
-def steadied(path: Trajectory, movable: BoolArray | None = None) -> Trajectory:
+def smooth_weak_centres(path: Trajectory, adjustable: BoolArray | None = None) -> Trajectory:
     """A camera's path on which the centres of weakly seen frames follow their neighbours.
 
     Where a violent move leaves few points, a centre is known worse than the path's own evenness from frame to
@@ -42,23 +43,28 @@ def steadied(path: Trajectory, movable: BoolArray | None = None) -> Trajectory:
 
     Source: as for `smooth_centres`.
     """
-    posed = np.flatnonzero(path.localised)
-    if len(posed) < LEAST_POSED:
+    frames_with_pose = np.flatnonzero(path.localised)
+    if len(frames_with_pose) < LEAST_POSED:
         return path
-    times = (path.times_ns - path.times_ns[0]) / np.median(np.diff(path.times_ns))
-    steadiness = Steadiness.of(times, path.gauge_from_cam[:, :3, 3])
-    if steadiness is None:
+    times = times_in_intervals(path.times_ns)
+    statistics = MotionStatistics.estimate(times, path.gauge_from_cam[:, :3, 3])
+    if statistics is None:
         return path
-    fixes = {frame: Fix.of(path, frame) for frame in posed.tolist()}
-    places = {frame: fix.place for frame, fix in fixes.items()}
+    estimates = {frame: PoseEstimate.from_trajectory(path, frame) for frame in frames_with_pose.tolist()}
+    positions = {frame: fix.position for frame, fix in estimates.items()}
     weak = {
         frame
-        for frame, place in places.items()
-        if np.sqrt(np.linalg.eigvalsh(place.covariance)[-1]) > steadiness.bend
+        for frame, position in positions.items()
+        if np.sqrt(np.linalg.eigvalsh(position.covariance)[-1]) > statistics.cubic_residual_sigma
     }
-    smoothed = smooth_centres(np.arange(len(times)), times, places, places.keys() - weak, steadiness)
+    smoothed = smooth_centres(np.arange(len(times)), times, positions, positions.keys() - weak, statistics)
     matrices = path.gauge_from_cam.copy()
     for frame in sorted(weak):
-        if (movable is None or movable[frame]) and smoothed.disagreement[frame] < _MAX_DISAGREEMENT:
-            matrices[frame] = invert(fixes[frame].with_place(smoothed.places[frame])[0])
+        if (adjustable is None or adjustable[frame]) and smoothed.disagreement[frame] < MAX_DISAGREEMENT:
+            matrices[frame] = invert(estimates[frame].conditioned_on_centre(smoothed.positions[frame])[0])
     return replace(path, gauge_from_cam=matrices)
+
+
+def smooth_if_final(path: Trajectory) -> Trajectory:
+    """Smooth the weak centres of a trajectory, unless recovery follows: recovery needs poses as measured."""
+    return smooth_weak_centres(path) if (~path.localised).sum() < LEAST_LOST else path

@@ -10,29 +10,29 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.optical_flow import pixel_scale
-from bodycap_batch.model.rolling_shutter import at_mid_row, image_velocity
+from bodycap_batch.model.rolling_shutter import image_velocity, px_at_mid_row
 from bodycap_batch.model.scene import FrameStatus, Map, Trajectory
-from bodycap_batch.registration.poses.batched_pnp import Views, linearise, make_views
-from bodycap_batch.registration.poses.keyframe_requests import lost_runs
-from bodycap_batch.registration.poses.pnp import MAP_VARIANCE_RATIO
+from bodycap_batch.registration.poses.batched_pnp import Observations, linearise, make_observations
+from bodycap_batch.registration.poses.keyframe_requests import lost_intervals
+from bodycap_batch.registration.poses.pnp import MAP_COVARIANCE_SCALE
 
-_WELL_SEEN = 4
+_WELL_SUPPORTED_FACTOR = 4
 """Times the usual inliers with which an end of a lost stretch stands by itself."""
-_FARTHEST = 8
+_MAX_BOUNDARY_FRAMES = 8
 """Frames from a lost stretch that are doubted: where little is seen all the time no more than these are."""
 _NOISE_PX = 0.8
 """Of an observation, at 640 pixels' width."""
-_LOSS_WIDTH, _MOST_SIGMAS = 2.0, 5.0
+_LOSS_SIGMAS, _MAX_SIGMAS = 2.0, 5.0
 """An observation counts half at the first, and nothing in the end beyond the second, both in sigmas."""
-_ROUNDS, _COARSE_ROUNDS = 10, 4
-_COARSE, _FINE = 1e-3, 1e-6
+_ITERATIONS, _COARSE_ITERATIONS = 10, 4
+_COARSE_DAMPING, _FINE_DAMPING = 1e-3, 1e-6
 """Damping as a share of a point's own information: of the first rounds and of the others."""
-_LEAST_VIEWS = 2
-_CHUNK = 1 << 15
+_MIN_OBSERVATIONS = 2
+_CHUNK_ROWS = 1 << 15
 """Observations that are held at a time."""
 
 
-def without_weak_ends(path: Trajectory, min_inliers: int) -> Trajectory:
+def remove_weak_boundary_poses(path: Trajectory, min_inliers: int) -> Trajectory:
     """A camera's path without poses at the ends of its lost stretches that too few points support.
 
     A keyframe there hangs on points that it helped to place and on few others: they agree with it wherever it
@@ -40,7 +40,7 @@ def without_weak_ends(path: Trajectory, min_inliers: int) -> Trajectory:
     to 17 cm off and stated 1 to 2, and what was found beside them hung on them. They are looked for again as
     any lost frame is.
 
-    Without and with this and `settled_points`, on the same maps, frames with a pose, their error and the
+    Without and with this and `refine_points`, on the same maps, frames with a pose, their error and the
     worst in cm: room131 370, 1.7, 7.4 and 380, 1.8, 8.6; two rendered ones 260, 3.0, 17.2 and 260, 2.0, 10.5,
     and 250, 2.2, 12.2 and 256, 2.4, 14.9. Poses inside their 95 %: 61, 65, 59 and 67, 72, 63 of 100.
 
@@ -51,33 +51,36 @@ def without_weak_ends(path: Trajectory, min_inliers: int) -> Trajectory:
     Returns:
         The same with those poses `UNCONFIRMED`, itself where there are none; frames that a rig carries stay.
     """
-    weak = path.inliers < _WELL_SEEN * min_inliers
+    weak = path.inliers < _WELL_SUPPORTED_FACTOR * min_inliers
     weak &= np.array([status is not FrameStatus.RIG for status in path.status], dtype=bool)
-    posed = path.localised
-    for start, stop in lost_runs(posed):
-        posed[_first_kept(weak, start - 1, -1) + 1 : start] = False
-        posed[stop : _first_kept(weak, stop, 1)] = False
-    taken = path.localised & ~posed
-    if not taken.any():
+    has_pose = path.localised
+    for start, stop in lost_intervals(has_pose):
+        has_pose[_first_supported(weak, start - 1, -1) + 1 : start] = False
+        has_pose[stop : _first_supported(weak, stop, 1)] = False
+    removed = path.localised & ~has_pose
+    if not removed.any():
         return path
-    status = [FrameStatus.UNCONFIRMED if out else each for each, out in zip(path.status, taken, strict=True)]
+    status = [
+        FrameStatus.UNCONFIRMED if is_removed else status_
+        for status_, is_removed in zip(path.status, removed, strict=True)
+    ]
     return replace(
         path,
         status=tuple(status),
-        gauge_from_cam=np.where(taken[:, None, None], np.nan, path.gauge_from_cam),
-        covariance=np.where(taken[:, None, None], np.nan, path.covariance),
+        gauge_from_cam=np.where(removed[:, None, None], np.nan, path.gauge_from_cam),
+        covariance=np.where(removed[:, None, None], np.nan, path.covariance),
     )
 
 
-def _first_kept(weak: BoolArray, frame: int, step: int) -> int:
+def _first_supported(weak: BoolArray, frame: int, step: int) -> int:
     """The first frame from one on that is not weak; the last one that is doubted is followed by it."""
-    last = frame + step * _FARTHEST
+    last = frame + step * _MAX_BOUNDARY_FRAMES
     while frame != last and 0 <= frame < len(weak) and weak[frame]:
         frame += step
     return frame
 
 
-def settled_points(scene_map: Map, paths: Sequence[Trajectory]) -> Map:
+def refine_points(scene_map: Map, paths: Sequence[Trajectory]) -> Map:
     """The map as frames with poses see it: keyframes where these have them, and points moved to suit.
 
     The mapper leaves keyframes at the ends of lost stretches far from where tracking puts them (by up to 36
@@ -92,31 +95,33 @@ def settled_points(scene_map: Map, paths: Sequence[Trajectory]) -> Map:
         views that do not suit are left out, and points of which fewer than two are left are seen by nobody.
     """
     poses, covariance = scene_map.map_from_cam.copy(), np.zeros((len(scene_map.keyframe_frame), 6, 6))
-    posed = np.ones(len(poses), dtype=bool)
-    mine = [path for path in paths if path.gauge == scene_map.gauge]
-    for path in mine:
+    has_pose = np.ones(len(poses), dtype=bool)
+    own_paths = [path for path in paths if path.gauge == scene_map.gauge]
+    for path in own_paths:
         rows = scene_map.keyframes_of(path.camera)
-        posed[rows] = path.localised[scene_map.keyframe_frame[rows]]
-        rows = rows[posed[rows]]
+        has_pose[rows] = path.localised[scene_map.keyframe_frame[rows]]
+        rows = rows[has_pose[rows]]
         frames = scene_map.keyframe_frame[rows]
         poses[rows], covariance[rows] = path.gauge_from_cam[frames], path.covariance[frames]
-    moved = replace(scene_map, map_from_cam=poses)
-    px = _mid_row_px(moved, {path.camera: path for path in mine})
-    order = np.argsort(moved.obs_point, kind="stable")
-    order = order[posed[moved.obs_keyframe[order]]]
-    points, good = moved.points.copy(), np.zeros(len(px), dtype=bool)
-    for some in _by_point(moved.obs_point[order]):
-        rows = order[some]
-        good[rows] = _settle(moved, points, rows, px[rows], covariance / MAP_VARIANCE_RATIO)
-    views = np.bincount(moved.obs_point[good], minlength=len(points))
-    good &= views[moved.obs_point] >= _LEAST_VIEWS
+    posed_map = replace(scene_map, map_from_cam=poses)
+    px = _mid_row_px(posed_map, {path.camera: path for path in own_paths})
+    order = np.argsort(posed_map.obs_point, kind="stable")
+    order = order[has_pose[posed_map.obs_keyframe[order]]]
+    points, accepted = posed_map.points.copy(), np.zeros(len(px), dtype=bool)
+    for chunk in _split_by_point(posed_map.obs_point[order]):
+        rows = order[chunk]
+        accepted[rows] = _refine_points_gauss_newton(
+            posed_map, points, rows, px[rows], covariance / MAP_COVARIANCE_SCALE
+        )
+    count = np.bincount(posed_map.obs_point[accepted], minlength=len(points))
+    accepted &= count[posed_map.obs_point] >= _MIN_OBSERVATIONS
     return replace(
-        moved,
+        posed_map,
         points=points,
-        obs_keyframe=moved.obs_keyframe[good],
-        obs_point=moved.obs_point[good],
-        obs_feature=moved.obs_feature[good],
-        obs_px=moved.obs_px[good],
+        obs_keyframe=posed_map.obs_keyframe[accepted],
+        obs_point=posed_map.obs_point[accepted],
+        obs_feature=posed_map.obs_feature[accepted],
+        obs_px=posed_map.obs_px[accepted],
     )
 
 
@@ -127,25 +132,25 @@ def _mid_row_px(scene_map: Map, paths: Mapping[str, Trajectory]) -> FloatArray:
         path = paths.get(name)
         if path is None or not readout_s:
             continue
-        mine = np.isin(scene_map.obs_keyframe, scene_map.keyframes_of(name))
-        frame = scene_map.keyframe_frame[scene_map.obs_keyframe[mine]]
-        lens, points = scene_map.cameras[name], scene_map.points[scene_map.obs_point[mine]]
+        is_own = np.isin(scene_map.obs_keyframe, scene_map.keyframes_of(name))
+        frame = scene_map.keyframe_frame[scene_map.obs_keyframe[is_own]]
+        lens, points = scene_map.cameras[name], scene_map.points[scene_map.obs_point[is_own]]
         velocity = image_velocity(lens, path.gauge_from_cam, path.times_ns, frame, points)
-        out[mine] = at_mid_row(lens, out[mine], velocity, readout_s)
+        out[is_own] = px_at_mid_row(lens, out[is_own], velocity, readout_s)
     return out
 
 
-def _by_point(point: IntArray) -> list[slice]:
+def _split_by_point(point: IntArray) -> list[slice]:
     """Parts of observations (M,) in order of their points, each with all of its points' own."""
     starts = np.flatnonzero(np.diff(point, prepend=-1))
     cuts = [0]
     for start in starts.tolist():
-        if start - cuts[-1] >= _CHUNK:
+        if start - cuts[-1] >= _CHUNK_ROWS:
             cuts.append(start)
     return [slice(*ends) for ends in zip(cuts, [*cuts[1:], len(point)], strict=True)] if len(point) else []
 
 
-def _settle(
+def _refine_points_gauss_newton(
     scene_map: Map, points: FloatArray, rows: IntArray, px: FloatArray, covariance: FloatArray
 ) -> BoolArray:
     """Move the points (P,3) that observations `rows` (M,), in order of points, see; which of these suit them.
@@ -154,36 +159,38 @@ def _settle(
         keyframe's pose's.
     """
     keyframe = scene_map.obs_keyframe[rows]
-    which, starts, number = np.unique(scene_map.obs_point[rows], return_index=True, return_inverse=True)
+    point_index, starts, number = np.unique(scene_map.obs_point[rows], return_index=True, return_inverse=True)
     cam_from_map = invert(scene_map.map_from_cam[keyframe])
-    views, sigma = _views(scene_map, keyframe, px)
-    everything = np.arange(len(rows))
-    for count in range(_ROUNDS + 1):
-        seen = replace(views, points=points[which][number])
-        residual, by_pose, depth = linearise(seen, everything, cam_from_map)
+    observations, sigma = _single_observations(scene_map, keyframe, px)
+    all_rows = np.arange(len(rows))
+    for iteration in range(_ITERATIONS + 1):
+        current = replace(observations, points=points[point_index][number])
+        residual, by_pose, depth = linearise(current, all_rows, cam_from_map)
         by_pose = by_pose.transpose(2, 0, 1)
         noise = by_pose @ covariance[keyframe] @ by_pose.transpose(0, 2, 1)
         information = np.linalg.inv(noise + np.eye(2) * sigma[:, None, None] ** 2)
         squared = np.einsum("in,nij,jn->n", residual, information, residual)
-        if count == _ROUNDS:
+        if iteration == _ITERATIONS:
             break
         by_point = by_pose[:, :, 3:] @ cam_from_map[:, :3, :3]
-        weighed = by_point.transpose(0, 2, 1) @ information
-        weighed /= 1.0 + squared[:, None, None] / _LOSS_WIDTH**2
-        hessian = np.add.reduceat(weighed @ by_point, starts)
-        gradient = np.add.reduceat(np.einsum("nij,jn->ni", weighed, residual), starts)
-        damping = _COARSE if count < _COARSE_ROUNDS else _FINE
-        own = np.einsum("nii->n", hessian)[:, None, None] * np.eye(3) / 3.0
-        hessian += damping * own + np.eye(3) * np.finfo(float).tiny
-        points[which] -= np.linalg.solve(hessian, gradient[:, :, None])[:, :, 0]
-    size = np.hypot(*residual)
-    return np.asarray((depth > 0.0) & (size < _MOST_SIGMAS * sigma))
+        weighted = by_point.transpose(0, 2, 1) @ information
+        weighted /= 1.0 + squared[:, None, None] / _LOSS_SIGMAS**2
+        hessian = np.add.reduceat(weighted @ by_point, starts)
+        gradient = np.add.reduceat(np.einsum("nij,jn->ni", weighted, residual), starts)
+        damping = _COARSE_DAMPING if iteration < _COARSE_ITERATIONS else _FINE_DAMPING
+        mean_information = np.einsum("nii->n", hessian)[:, None, None] * np.eye(3) / 3.0
+        hessian += damping * mean_information + np.eye(3) * np.finfo(float).tiny
+        points[point_index] -= np.linalg.solve(hessian, gradient[:, :, None])[:, :, 0]
+    error_px = np.hypot(*residual)
+    return np.asarray((depth > 0.0) & (error_px < _MAX_SIGMAS * sigma))
 
 
-def _views(scene_map: Map, keyframe: IntArray, px: FloatArray) -> tuple[Views, FloatArray]:
+def _single_observations(
+    scene_map: Map, keyframe: IntArray, px: FloatArray
+) -> tuple[Observations, FloatArray]:
     """Pixels (M,2) of keyframes (M,) as views, each a frame of its own, and their noise (M,) in pixels."""
     count = len(px)
-    out = Views(
+    out = Observations(
         bounds=np.arange(count + 1),
         points=np.zeros((count, 3)),
         rays=np.empty((count, 2)),
@@ -192,8 +199,8 @@ def _views(scene_map: Map, keyframe: IntArray, px: FloatArray) -> tuple[Views, F
     )
     names, sigma = np.array(scene_map.keyframe_camera)[keyframe], np.empty(count)
     for name in np.unique(names).tolist():
-        mine, lens = np.flatnonzero(names == name), scene_map.cameras[name]
-        part = make_views(lens, np.arange(len(mine) + 1), out.points[mine], px[mine])
-        out.rays[mine], out.px_from_ray[mine] = part.rays, part.px_from_ray
-        sigma[mine] = _NOISE_PX * pixel_scale(lens.width_px, lens.height_px)
+        own, lens = np.flatnonzero(names == name), scene_map.cameras[name]
+        undistorted = make_observations(lens, np.arange(len(own) + 1), out.points[own], px[own])
+        out.rays[own], out.px_from_ray[own] = undistorted.rays, undistorted.px_from_ray
+        sigma[own] = _NOISE_PX * pixel_scale(lens.width_px, lens.height_px)
     return out, sigma

@@ -11,31 +11,41 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import interpolate_pose, invert, make_transform
 from bodycap_batch.model.optical_flow import (
-    bearings,
-    coarse_image,
-    coarse_motion,
+    apply_homography,
     detect_corners,
+    estimate_coarse_motion,
     fit_rotation,
-    moved,
+    make_coarse_image,
+    unit_directions,
 )
-from bodycap_batch.registration.recovery.guided_localisation import Beside, Finder, Fix, Seen, together
-from bodycap_batch.registration.recovery.motion_prior import CentreFilter, Place, Steadiness
+from bodycap_batch.registration.recovery.guided_localisation import (
+    GuidedLocaliser,
+    NeighbourPose,
+    PoseEstimate,
+    SearchFrame,
+    fuse,
+)
+from bodycap_batch.registration.recovery.motion_prior import (
+    CentreKalmanFilter,
+    MotionStatistics,
+    PositionEstimate,
+)
 from bodycap_batch.registration.recovery.patch_search import Pyramid
 
-_MIN_INLIERS, _MIN_EVIDENCE = 10, 0.45
-_SEED_INLIERS, _SEED_EVIDENCE = 15, 0.5
-_GATE = 16.0
+_MIN_INLIERS, _MIN_INLIER_WEIGHT_RATIO = 10, 0.45
+_SEED_MIN_INLIERS, _SEED_MIN_INLIER_WEIGHT_RATIO = 15, 0.5
+_MAX_PREDICTION_DISTANCE = 16.0
 """Squared Mahalanobis distance from where the motion leads: 99.9 % of three axes."""
-_MISSES = 3
+_MAX_MISSES = 3
 """Frames in a row that are not found, after which a stretch is left: by then the prediction is off by more
 than is searched."""
-_SEED_SPREAD = 40.0
-_WARM_UP = 6
-_GUIDES, _GUIDE_SPACING_PX, _GRID = 48, 12.0, 4
+_SEED_SIGMA_JERKS = 40.0
+_INITIAL_FRAMES = 6
+_MAX_CORNERS, _CORNER_SPACING_PX, _GRID_SIDE = 48, 12.0, 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Stretch:
+class LostInterval:
     """A lost stretch and what is around it.
 
     Attributes:
@@ -54,29 +64,29 @@ class Stretch:
     stop: int
     times: FloatArray
     pyramids: Mapping[int, Pyramid]
-    known: Mapping[int, Fix]
-    tracked: Collection[int]
-    seeds: Mapping[int, FloatArray]
-    rows: Mapping[int, int]
-    steadiness: Steadiness
+    poses: Mapping[int, PoseEstimate]
+    tracked_frames: Collection[int]
+    seed_poses: Mapping[int, FloatArray]
+    keyframe_rows: Mapping[int, int]
+    statistics: MotionStatistics
 
-    def seen(self, frame: int) -> Seen:
+    def search_frame(self, frame: int) -> SearchFrame:
         """A frame of which the picture is held."""
-        return Seen(self.pyramids[frame], self.rows.get(frame, -1))
+        return SearchFrame(self.pyramids[frame], self.keyframe_rows.get(frame, -1))
 
 
 @dataclass(slots=True)
-class _Walk:
+class _PropagationState:
     """Where a walk has come to: the last frame, its pose and its turn from the one before."""
 
     frame: int
     pose: FloatArray
-    turn: FloatArray
-    path: CentreFilter
+    rotation_step: FloatArray
+    motion_filter: CentreKalmanFilter
 
 
 @dataclass(slots=True)
-class March:
+class Propagation:
     """Walks through a stretch from all sides.
 
     Attributes:
@@ -85,125 +95,164 @@ class March:
         fixes: What was found, by direction and frame.
     """
 
-    finder: Finder
-    stretch: Stretch
-    fixes: dict[tuple[int, int], Fix] = field(default_factory=dict)
+    localiser: GuidedLocaliser
+    interval: LostInterval
+    estimates: dict[tuple[int, int], PoseEstimate] = field(default_factory=dict)
 
-    def run(self) -> dict[int, Fix]:
+    def run(self) -> dict[int, PoseEstimate]:
         """The best pose found for each frame, walking in from both ends and out from the seeds."""
-        stretch = self.stretch
-        for direction, end in ((1, stretch.start - 1), (-1, stretch.stop)):
-            if end in stretch.known:
-                self._walk(self._warmed_up(end, direction), direction)
-        for frame, prior in sorted(stretch.seeds.items()):
-            if (1, frame) in self.fixes or (-1, frame) in self.fixes or frame not in stretch.pyramids:
+        interval = self.interval
+        for direction, end in ((1, interval.start - 1), (-1, interval.stop)):
+            if end in interval.poses:
+                self._propagate(self._initialised(end, direction), direction)
+        for frame, prior in sorted(interval.seed_poses.items()):
+            if (
+                (1, frame) in self.estimates
+                or (-1, frame) in self.estimates
+                or frame not in interval.pyramids
+            ):
                 continue
-            spread = np.eye(3) * (_SEED_SPREAD * stretch.steadiness.jerk) ** 2
-            expected = Place(invert(prior)[:3, 3], spread)
-            fix = self.finder.locate(stretch.seen(frame), [prior], Beside(prior), expected)
-            if fix is None or fix.inliers < _SEED_INLIERS or fix.evidence < _SEED_EVIDENCE:
+            covariance = np.eye(3) * (_SEED_SIGMA_JERKS * interval.statistics.jerk_sigma) ** 2
+            expected = PositionEstimate(invert(prior)[:3, 3], covariance)
+            estimate = self.localiser.localise(
+                interval.search_frame(frame), [prior], NeighbourPose(prior), expected
+            )
+            if (
+                estimate is None
+                or estimate.inliers < _SEED_MIN_INLIERS
+                or estimate.inlier_weight_ratio < _SEED_MIN_INLIER_WEIGHT_RATIO
+            ):
                 continue
             for direction in (1, -1):
-                self.fixes[direction, frame] = fix
-                path = CentreFilter(stretch.steadiness, fix.place)
-                self._walk(_Walk(frame, fix.cam_from_map, np.eye(3), path), direction)
-        best: dict[int, Fix] = {}
-        for (_, frame), fix in sorted(self.fixes.items()):
+                self.estimates[direction, frame] = estimate
+                motion_filter = CentreKalmanFilter(interval.statistics, estimate.position)
+                self._propagate(
+                    _PropagationState(frame, estimate.cam_from_map, np.eye(3), motion_filter), direction
+                )
+        best: dict[int, PoseEstimate] = {}
+        for (_, frame), estimate in sorted(self.estimates.items()):
             other = best.get(frame)
-            if other is None or fix.inliers * fix.evidence > other.inliers * other.evidence:
-                best[frame] = fix
+            if (
+                other is None
+                or estimate.inliers * estimate.inlier_weight_ratio > other.inliers * other.inlier_weight_ratio
+            ):
+                best[frame] = estimate
         return best
 
-    def again(self, fixes: Mapping[int, Fix], places: Mapping[int, Place]) -> dict[int, Fix]:
+    def second_pass(
+        self, estimates: Mapping[int, PoseEstimate], positions: Mapping[int, PositionEstimate]
+    ) -> dict[int, PoseEstimate]:
         """Look once more from smoothed places, and between two frames of which one was missed.
 
         Args:
             fixes: What `run` found.
             places: Smoothed places of these frames and those around them.
         """
-        out = {}
-        poses = {frame: fix.with_place(places[frame])[0] for frame, fix in fixes.items()}
-        poses |= {frame: fix.cam_from_map for frame, fix in self.stretch.known.items()}
-        for frame in range(self.stretch.start, self.stretch.stop):
+        accepted = {}
+        poses = {
+            frame: estimate.conditioned_on_centre(positions[frame])[0]
+            for frame, estimate in estimates.items()
+        }
+        poses |= {frame: estimate.cam_from_map for frame, estimate in self.interval.poses.items()}
+        for frame in range(self.interval.start, self.interval.stop):
             before, after = poses.get(frame - 1), poses.get(frame + 1)
-            fix: Fix | None = None
-            if frame not in self.stretch.pyramids:
+            estimate: PoseEstimate | None = None
+            if frame not in self.interval.pyramids:
                 continue
-            seen = self.stretch.seen(frame)
-            if frame in fixes:
-                fix = self.finder.look_again(seen, poses[frame], _beside(before, after, poses[frame]))
-                fix = max(fixes[frame], fix or fixes[frame], key=lambda each: each.inliers * each.evidence)
+            search_frame = self.interval.search_frame(frame)
+            if frame in estimates:
+                estimate = self.localiser.relocalise(
+                    search_frame, poses[frame], _neighbour_pose(before, after, poses[frame])
+                )
+                estimate = max(
+                    estimates[frame],
+                    estimate or estimates[frame],
+                    key=lambda each: each.inliers * each.inlier_weight_ratio,
+                )
             elif before is not None and after is not None:
                 halfway = invert(interpolate_pose(invert(before), invert(after), 0.5))
-                turn = halfway[:3, :3]
-                prior = make_transform(turn, -turn @ places[frame].centre)
-                fix = self.finder.locate(seen, [prior], Beside(before), places[frame])
-            if fix is not None and fix.inliers >= _MIN_INLIERS and fix.evidence >= _MIN_EVIDENCE:
-                out[frame] = fix
-        return out
+                rotation = halfway[:3, :3]
+                prior = make_transform(rotation, -rotation @ positions[frame].centre)
+                estimate = self.localiser.localise(
+                    search_frame, [prior], NeighbourPose(before), positions[frame]
+                )
+            if (
+                estimate is not None
+                and estimate.inliers >= _MIN_INLIERS
+                and estimate.inlier_weight_ratio >= _MIN_INLIER_WEIGHT_RATIO
+            ):
+                accepted[frame] = estimate
+        return accepted
 
-    def _warmed_up(self, end: int, direction: int) -> _Walk:
+    def _initialised(self, end: int, direction: int) -> _PropagationState:
         """A walk that has come through the frames with poses up to an end of the stretch."""
-        known = self.stretch.known
-        behind = [end - direction * number for number in range(_WARM_UP)]
-        gap = next((number for number, frame in enumerate(behind) if frame not in known), _WARM_UP)
-        frames = behind[:gap][::-1]
-        path = CentreFilter(self.stretch.steadiness, known[frames[0]].place)
+        poses = self.interval.poses
+        candidates = [end - direction * number for number in range(_INITIAL_FRAMES)]
+        gap = next((number for number, frame in enumerate(candidates) if frame not in poses), _INITIAL_FRAMES)
+        frames = candidates[:gap][::-1]
+        motion_filter = CentreKalmanFilter(self.interval.statistics, poses[frames[0]].position)
         for last, frame in pairwise(frames):
-            path.predict(abs(self.stretch.times[frame] - self.stretch.times[last]))
-            path.update(known[frame].place)
-        turns = [known[frame].cam_from_map[:3, :3] for frame in frames[-2:]]
-        turn = turns[1] @ turns[0].T if len(turns) == 2 else np.eye(3)
-        return _Walk(end, known[end].cam_from_map, turn, path)
+            motion_filter.predict(abs(self.interval.times[frame] - self.interval.times[last]))
+            motion_filter.update(poses[frame].position)
+        rotations = [poses[frame].cam_from_map[:3, :3] for frame in frames[-2:]]
+        rotation_step = rotations[1] @ rotations[0].T if len(rotations) == 2 else np.eye(3)
+        return _PropagationState(end, poses[end].cam_from_map, rotation_step, motion_filter)
 
-    def _walk(self, walk: _Walk, direction: int) -> None:
-        stretch, misses = self.stretch, 0
-        while misses <= _MISSES:
-            frame = walk.frame + direction
-            inside = stretch.start <= frame < stretch.stop and frame in stretch.pyramids
-            if not inside or (direction, frame) in self.fixes:
+    def _propagate(self, state: _PropagationState, direction: int) -> None:
+        interval, misses = self.interval, 0
+        while misses <= _MAX_MISSES:
+            frame = state.frame + direction
+            inside = interval.start <= frame < interval.stop and frame in interval.pyramids
+            if not inside or (direction, frame) in self.estimates:
                 return
-            place = walk.path.predict(abs(stretch.times[frame] - stretch.times[walk.frame]))
-            priors = [make_transform(turn, -turn @ place.centre) for turn in self._turns(walk, frame)]
-            beside = Beside(walk.pose, direction)
-            fix = self.finder.locate(stretch.seen(frame), priors, beside, place)
-            walk.frame = frame
-            good = fix is not None and fix.inliers >= _MIN_INLIERS and fix.evidence >= _MIN_EVIDENCE
-            both, distance = (place, np.inf) if fix is None else together(fix.place, place)
-            if fix is None or not good or distance >= _GATE:
+            predicted = state.motion_filter.predict(abs(interval.times[frame] - interval.times[state.frame]))
+            priors = [
+                make_transform(rotation, -rotation @ predicted.centre)
+                for rotation in self._candidate_rotations(state, frame)
+            ]
+            neighbour = NeighbourPose(state.pose, direction)
+            estimate = self.localiser.localise(interval.search_frame(frame), priors, neighbour, predicted)
+            state.frame = frame
+            is_supported = (
+                estimate is not None
+                and estimate.inliers >= _MIN_INLIERS
+                and estimate.inlier_weight_ratio >= _MIN_INLIER_WEIGHT_RATIO
+            )
+            fused, distance = (predicted, np.inf) if estimate is None else fuse(estimate.position, predicted)
+            if estimate is None or not is_supported or distance >= _MAX_PREDICTION_DISTANCE:
                 misses += 1
-                walk.pose = priors[0]
+                state.pose = priors[0]
                 continue
-            self.fixes[direction, frame] = fix
-            walk.path.update(fix.place)
-            pose, _ = fix.with_place(both)
-            walk.turn, walk.pose, misses = pose[:3, :3] @ walk.pose[:3, :3].T, pose, 0
+            self.estimates[direction, frame] = estimate
+            state.motion_filter.update(estimate.position)
+            pose, _ = estimate.conditioned_on_centre(fused)
+            state.rotation_step, state.pose, misses = pose[:3, :3] @ state.pose[:3, :3].T, pose, 0
 
-    def _turns(self, walk: _Walk, frame: int) -> list[FloatArray]:
+    def _candidate_rotations(self, state: _PropagationState, frame: int) -> list[FloatArray]:
         """Rotations (3,3) the next frame may have: as the image turned, and as the camera turned before."""
-        here, lens = walk.pose[:3, :3], self.finder.lens
-        last, this = self.stretch.pyramids.get(walk.frame), self.stretch.pyramids[frame]
-        steady = [walk.turn @ here]
-        if last is None:
-            return steady
-        first, second = coarse_image(last.levels[0]), coarse_image(this.levels[0])
+        rotation, lens = state.pose[:3, :3], self.localiser.lens
+        previous_pyramid, pyramid = self.interval.pyramids.get(state.frame), self.interval.pyramids[frame]
+        constant_rotation = [state.rotation_step @ rotation]
+        if previous_pyramid is None:
+            return constant_rotation
+        first, second = make_coarse_image(previous_pyramid.levels[0]), make_coarse_image(pyramid.levels[0])
         width = lens.width_px
-        corners = detect_corners(first, _GUIDES, _GUIDE_SPACING_PX)
-        motion = coarse_motion(first, second, corners * np.float32(width / first.shape[1]), width)
+        corners = detect_corners(first, _MAX_CORNERS, _CORNER_SPACING_PX)
+        motion = estimate_coarse_motion(first, second, corners * np.float32(width / first.shape[1]), width)
         if motion is None:
-            return steady
-        shares = np.linspace(0.2, 0.8, _GRID)
-        grid = np.stack(np.meshgrid(shares * width, shares * lens.height_px), axis=-1).reshape(-1, 2)
-        arrived = moved(grid.astype(np.float32), motion.homography).astype(np.float64)
+            return constant_rotation
+        fractions = np.linspace(0.2, 0.8, _GRID_SIDE)
+        grid = np.stack(np.meshgrid(fractions * width, fractions * lens.height_px), axis=-1).reshape(-1, 2)
+        arrived = apply_homography(grid.astype(np.float32), motion.homography).astype(np.float64)
         inside = ((arrived > 0.0) & (arrived < (width, lens.height_px))).all(axis=1)
-        if inside.sum() < _GRID:
-            return steady
-        before, after = (bearings(lens.unproject(each[inside])) for each in (grid, arrived))
-        return [fit_rotation(before, after) @ here, *steady]
+        if inside.sum() < _GRID_SIDE:
+            return constant_rotation
+        before, after = (unit_directions(lens.unproject(px[inside])) for px in (grid, arrived))
+        return [fit_rotation(before, after) @ rotation, *constant_rotation]
 
 
-def _beside(before: FloatArray | None, after: FloatArray | None, own: FloatArray) -> Beside:
+def _neighbour_pose(before: FloatArray | None, after: FloatArray | None, pose: FloatArray) -> NeighbourPose:
     """The frame before, else the one after, else one as if the camera stood."""
     if before is not None:
-        return Beside(before)
-    return Beside(own) if after is None else Beside(after, -1)
+        return NeighbourPose(before)
+    return NeighbourPose(pose) if after is None else NeighbourPose(after, -1)

@@ -1,58 +1,110 @@
-"""Poses of lost frames, from what the map's points look like and from how the camera moves."""
+"""Recover the poses of lost frames from the appearance of map points and from the camera's motion."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.config import RegistrationOptions
-from bodycap_batch.config.lost_frames import LEAST_POSED
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.geometry import invert
-from bodycap_batch.model.optical_flow import sharpness
-from bodycap_batch.model.scene import FrameStatus, Map, Registration, Trajectory
-from bodycap_batch.registration.poses.keyframe_requests import lost_runs
-from bodycap_batch.registration.poses.pnp import PoseLimits
-from bodycap_batch.registration.poses.pose_outliers import lone_poses
-from bodycap_batch.registration.poses.static_points import confirmed_points
-from bodycap_batch.registration.recovery.guided_localisation import Finder, Fix
-from bodycap_batch.registration.recovery.motion_prior import Smoothed, Steadiness, smooth_centres
-from bodycap_batch.registration.recovery.patch_search import (
-    Gallery,
-    Pyramid,
-    Search,
-    View,
-    choose_rows,
-    find_points,
+from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
+from bodycap_batch.registration.poses.keyframe_requests import lost_intervals
+from bodycap_batch.registration.poses.pnp import AcceptanceCriteria
+from bodycap_batch.registration.poses.pose_outliers import ISOLATED_INLIER_FACTOR, isolated_poses
+from bodycap_batch.registration.poses.rig_members import RegisteredCamera
+from bodycap_batch.registration.recovery.guided_localisation import GuidedLocaliser, PoseEstimate
+from bodycap_batch.registration.recovery.motion_prior import (
+    MAX_DISAGREEMENT,
+    MotionStatistics,
+    SmoothedCentres,
+    smooth_centres,
+    times_in_intervals,
 )
-from bodycap_batch.registration.recovery.path_smoothing import steadied
-from bodycap_batch.registration.recovery.propagation import March, Stretch
+from bodycap_batch.registration.recovery.path_smoothing import smooth_weak_centres
+from bodycap_batch.registration.recovery.preparation import (
+    motion_statistics,
+    prepare_recovery,
+    remove_misplaced_keyframes,
+)
+from bodycap_batch.registration.recovery.propagation import LostInterval, Propagation
+from bodycap_batch.registration.recovery.search_images import (
+    estimate_exposure,
+    read_keyframe_patches,
+    read_pyramids,
+)
 
-_MAX_PICTURES = 600
-"""Keyframes held in memory, half a megabyte each."""
-_AROUND = 8
-_REACH, _MAX_HELD = 90, 400
-"""Frames of a lost stretch from its ends or a seed that are looked at, and how many of them all in all: the
-nearest; bounds memory."""
-_EXPOSURES = (0.0, 0.3, 0.6)
-_EXPOSURE_FRAMES = 4
-_EXPOSURE_SEARCH = Search(level=1, side=21, radius=4, score=-1.0, limit_px=6.0)
-_MIN_EVIDENCE = 0.5
-_MAX_DISAGREEMENT = 11.3
-"""Squared Mahalanobis distance between where a frame was found and its smoothed place: 99 % of three axes."""
-_LONE_EVIDENCE = 4
-_ROUNDS = 5
-"""A walk goes as far as motion leads it; from poses smoothed and vouched for it goes further, until nothing
-more is found. Room131's right palm has 94 of 150 frames after the first round, 104 after the second, 108
-in the end (off by 2.6 cm both), a rendered one with arms thrown about 105, 107, 108 of 120."""
+_SMOOTHING_MARGIN = 8
+"""Frames on either side of an interval that are smoothed together with it. Evidence: none."""
+_MIN_INLIER_WEIGHT_RATIO = 0.5
+"""Least ratio of the inliers' weight to that of all matches for an accepted pose. Evidence: none."""
+_MAX_PASSES = 5
+"""Passes over the lost intervals. Each pass starts from the poses of the pass before and reaches farther.
+Evidence: docs/decisions/registration.md."""
 
 
-def recover_lost(
-    found: Registration,
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecoveryInputs:
+    """What `recover_lost_frames` needs besides the registration of the camera.
+
+    Attributes:
+        capture: All cameras; the camera to recover is the first one.
+        registrations: Cameras with their registrations, in the same order. They may be loaded one by one:
+            only one is held at a time.
+        maps: The maps that the cameras were registered against.
+        selection: The keyframes of the camera to recover.
+        in_rig: The poses were estimated from all cameras of a rig. They are then not prepared.
+    """
+
+    capture: Capture
+    registrations: Iterable[RegisteredCamera]
+    maps: Sequence[Map]
+    selection: KeyframeSelection
+    in_rig: bool
+
+
+def recover_lost_frames(
+    registration: Registration, inputs: RecoveryInputs, options: RegistrationOptions, context: StageContext
+) -> Registration:
+    """Recover the poses of one camera's lost frames.
+
+    The steps are: remove misplaced keyframes of all cameras from the map; remove weak poses next to lost
+    intervals and refine the map points; search the lost frames.
+
+    Args:
+        registration: The frames of the camera, as tracking left them.
+        inputs: All cameras, their registrations and the maps.
+        options: Acceptance limits.
+        context: Threads, progress and cancellation.
+
+    Returns:
+        The registration with more poses and a smoothed trajectory. Observations of recovered frames are not
+        kept.
+    """
+    gauge = registration.trajectory.gauge
+    scene_map = next(scene for scene in inputs.maps if scene.gauge == gauge)
+    trajectories: list[Trajectory] = []
+
+    def cameras() -> Iterable[RegisteredCamera]:
+        for camera in inputs.registrations:
+            trajectories.append(camera.registration.trajectory)
+            yield camera
+
+    scene_map = remove_misplaced_keyframes(scene_map, cameras(), inputs.selection, options)
+    if not inputs.in_rig:
+        own = RegisteredCamera(camera=inputs.capture.cameras[0], registration=registration)
+        scene_map, registration = prepare_recovery(
+            own, trajectories[1:], scene_map, inputs.selection, options, context.threads
+        )
+    return find_lost_poses(registration, scene_map, inputs.capture, options, context)
+
+
+def find_lost_poses(
+    registration: Registration,
     scene_map: Map,
     capture: Capture,
     options: RegistrationOptions,
@@ -77,83 +129,64 @@ def recover_lost(
     Returns:
         The same with more poses, their observations not kept, and the path steadied.
     """
-    path = found.trajectory
+    path = registration.trajectory
     camera = capture.camera(path.camera)
-    lost, steadiness = ~path.localised, _steadiness(path)
-    if steadiness is None:
-        return found
-    times = _times(path)
-    finder = _finder(scene_map, capture, path, options, context)
-    search = _LostFrames(
+    lost, statistics = ~path.localised, motion_statistics(path)
+    if statistics is None:
+        return registration
+    times = times_in_intervals(path.times_ns)
+    localiser = _make_localiser(scene_map, capture, path, options, context)
+    interval_search = _IntervalSearch(
         camera=camera,
         scene_map=scene_map,
-        finder=finder,
+        localiser=localiser,
         times=times,
-        steadiness=steadiness,
-        seeds=_seeds(scene_map, camera.name, lost),
-        tracked=frozenset(np.flatnonzero(~lost).tolist()),
+        statistics=statistics,
+        seed_rows=_seed_keyframes(scene_map, camera.name, lost),
+        tracked_frames=frozenset(np.flatnonzero(~lost).tolist()),
     )
-    stretches, reached = lost_runs(~lost), 0
-    for _ in range(_ROUNDS):
-        if not stretches:
+    intervals, position = lost_intervals(~lost), 0
+    for _ in range(_MAX_PASSES):
+        if not intervals:
             break
-        poses: dict[int, Fix] = {}
-        known = _known(path)
-        for start, stop in stretches:
+        poses: dict[int, PoseEstimate] = {}
+        localised = _localised_poses(path)
+        for start, stop in intervals:
             context.check_cancelled()
-            reached = max(reached, start)  # a further round begins in front again
-            context.progress(reached, len(lost), "lost frames looked at")
-            poses |= search.within(start, stop, known)
-        before, path = path.localised, _with_poses(path, poses, finder.limits)
-        stretches = _beside(path.localised, before)
-    return replace(found, trajectory=steadied(path, ~lost))
+            position = max(position, start)  # a further round begins in front again
+            context.progress(position, len(lost), "lost frames looked at")
+            poses |= interval_search.recover_interval(start, stop, localised)
+        before, path = path.localised, _merge_into(path, poses, localiser.criteria)
+        intervals = _extended_intervals(path.localised, before)
+    return replace(registration, trajectory=smooth_weak_centres(path, ~lost))
 
 
-def recoverable(path: Trajectory) -> bool:
-    """Whether a path has lost frames, and poses enough to look for them from."""
-    return _steadiness(path) is not None
-
-
-def _steadiness(path: Trajectory) -> Steadiness | None:
-    """How evenly a camera moves; None where no frame is lost or too few have poses."""
-    posed = path.localised
-    if posed.all() or posed.sum() < LEAST_POSED:
-        return None
-    return Steadiness.of(_times(path), path.gauge_from_cam[:, :3, 3])
-
-
-def _times(path: Trajectory) -> FloatArray:
-    """(N,) in frame intervals, from the first one on."""
-    times = (path.times_ns - path.times_ns[0]).astype(np.float64)
-    return np.asarray(times / np.median(np.diff(times)))
-
-
-def _finder(
+def _make_localiser(
     scene_map: Map,
     capture: Capture,
     path: Trajectory,
     options: RegistrationOptions,
     context: StageContext,
-) -> Finder:
+) -> GuidedLocaliser:
     """What finds poses of a camera's frames."""
     camera = capture.camera(path.camera)
-    limits = PoseLimits(
+    criteria = AcceptanceCriteria(
         max_error_px=1.0, min_inliers=options.min_inliers, max_sigma_depth=options.max_sigma_depth
     )
     interval_s = float(np.median(np.diff(path.times_ns))) * 1e-9
-    finder = Finder(
+    localiser = GuidedLocaliser(
         lens=scene_map.cameras[camera.name],
-        gallery=_gallery(scene_map, capture, camera, context),
-        limits=limits,
-        exposure=0.0,
-        readout=scene_map.readout_s.get(camera.name, 0.0) / interval_s,
-        sees_room=camera.sees_room,
+        patches=read_keyframe_patches(scene_map, capture, camera, context),
+        criteria=criteria,
+        exposure_ratio=0.0,
+        readout_ratio=scene_map.readout_s.get(camera.name, 0.0) / interval_s,
+        is_unmasked=camera.is_unmasked,
     )
-    return replace(finder, exposure=_exposure(camera, finder, path))
+    return replace(localiser, exposure_ratio=estimate_exposure(camera, localiser, path))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _LostFrames:
+class _IntervalSearch:
     """What looking for a camera's lost frames takes.
 
     Attributes:
@@ -168,81 +201,89 @@ class _LostFrames:
 
     camera: CaptureCamera
     scene_map: Map
-    finder: Finder
+    localiser: GuidedLocaliser
     times: FloatArray
-    steadiness: Steadiness
-    seeds: Mapping[int, int]
-    tracked: Collection[int]
+    statistics: MotionStatistics
+    seed_rows: Mapping[int, int]
+    tracked_frames: Collection[int]
 
-    def within(self, start: int, stop: int, known: Mapping[int, Fix]) -> dict[int, Fix]:
-        """Poses vouched for of the lost frames [start, stop) amid `known` ones."""
-        inside = {frame: row for frame, row in self.seeds.items() if start <= frame < stop}
-        stretch = Stretch(
+    def recover_interval(
+        self, start: int, stop: int, poses: Mapping[int, PoseEstimate]
+    ) -> dict[int, PoseEstimate]:
+        """Poses vouched for of the lost frames [start, stop) amid `poses` ones."""
+        seed_rows = {frame: row for frame, row in self.seed_rows.items() if start <= frame < stop}
+        interval = LostInterval(
             start=start,
             stop=stop,
             times=self.times,
-            pyramids=_pictures(self.camera, start, stop, sorted(inside)),
-            known=known,
-            tracked=self.tracked,
-            seeds={frame: invert(self.scene_map.map_from_cam[row]) for frame, row in inside.items()},
-            rows=inside,
-            steadiness=self.steadiness,
+            pyramids=read_pyramids(self.camera, start, stop, sorted(seed_rows)),
+            poses=poses,
+            tracked_frames=self.tracked_frames,
+            seed_poses={frame: invert(self.scene_map.map_from_cam[row]) for frame, row in seed_rows.items()},
+            keyframe_rows=seed_rows,
+            statistics=self.statistics,
         )
-        return _vouched(March(self.finder, stretch), self.finder.limits)
+        return _accepted_poses(Propagation(self.localiser, interval), self.localiser.criteria)
 
 
-def _beside(posed: BoolArray, before: BoolArray) -> list[tuple[int, int]]:
+def _extended_intervals(has_pose: BoolArray, before: BoolArray) -> list[tuple[int, int]]:
     """Stretches still lost at an end of which a pose was found."""
-    fresh = np.concatenate([[False], posed & ~before, [False]])
-    return [(start, stop) for start, stop in lost_runs(posed) if fresh[start] or fresh[stop + 1]]
+    is_new = np.concatenate([[False], has_pose & ~before, [False]])
+    return [(start, stop) for start, stop in lost_intervals(has_pose) if is_new[start] or is_new[stop + 1]]
 
 
-def _smoothed(fixes: Mapping[int, Fix], stretch: Stretch) -> Smoothed:
+def _smooth(estimates: Mapping[int, PoseEstimate], interval: LostInterval) -> SmoothedCentres:
     """Places of a stretch's frames and of those around it."""
-    first = max(0, stretch.start - _AROUND)
-    frames = np.arange(first, min(len(stretch.times), stretch.stop + _AROUND))
-    around = {frame: stretch.known[frame].place for frame in frames.tolist() if frame in stretch.known}
-    found = around | {frame: fix.place for frame, fix in fixes.items()}
-    trusted = around.keys() & stretch.tracked
-    return smooth_centres(frames, stretch.times[frames], found, trusted, stretch.steadiness)
+    first = max(0, interval.start - _SMOOTHING_MARGIN)
+    frames = np.arange(first, min(len(interval.times), interval.stop + _SMOOTHING_MARGIN))
+    neighbours = {
+        frame: interval.poses[frame].position for frame in frames.tolist() if frame in interval.poses
+    }
+    positions = neighbours | {frame: estimate.position for frame, estimate in estimates.items()}
+    tracked = neighbours.keys() & interval.tracked_frames
+    return smooth_centres(frames, interval.times[frames], positions, tracked, interval.statistics)
 
 
-def _vouched(march: March, limits: PoseLimits) -> dict[int, Fix]:
+def _accepted_poses(propagation: Propagation, criteria: AcceptanceCriteria) -> dict[int, PoseEstimate]:
     """Smoothed poses of the frames of a stretch that enough speaks for."""
-    fixes = march.run()
-    if not fixes:
+    estimates = propagation.run()
+    if not estimates:
         return {}
-    fixes = march.again(fixes, _smoothed(fixes, march.stretch).places)
-    smoothed = _smoothed(fixes, march.stretch)
-    out = {}
-    for frame, fix in fixes.items():
-        pose, covariance = fix.with_place(smoothed.places[frame])
+    estimates = propagation.second_pass(estimates, _smooth(estimates, propagation.interval).positions)
+    smoothed = _smooth(estimates, propagation.interval)
+    accepted = {}
+    for frame, estimate in estimates.items():
+        pose, covariance = estimate.conditioned_on_centre(smoothed.positions[frame])
         sigma = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
         if (
-            fix.inliers >= limits.min_inliers
-            and fix.evidence >= _MIN_EVIDENCE
-            and smoothed.disagreement[frame] < _MAX_DISAGREEMENT
-            and sigma < limits.max_sigma_depth * fix.depth
+            estimate.inliers >= criteria.min_inliers
+            and estimate.inlier_weight_ratio >= _MIN_INLIER_WEIGHT_RATIO
+            and smoothed.disagreement[frame] < MAX_DISAGREEMENT
+            and sigma < criteria.max_sigma_depth * estimate.depth
         ):
-            out[frame] = replace(fix, cam_from_map=pose, covariance=covariance)
-    return out
+            accepted[frame] = replace(estimate, cam_from_map=pose, covariance=covariance)
+    return accepted
 
 
-def _with_poses(path: Trajectory, poses: Mapping[int, Fix], limits: PoseLimits) -> Trajectory:
+def _merge_into(
+    path: Trajectory, poses: Mapping[int, PoseEstimate], criteria: AcceptanceCriteria
+) -> Trajectory:
     """A trajectory with more poses, without those that stand alone amid lost frames."""
-    posed: BoolArray = path.localised.copy()
+    has_pose: BoolArray = path.localised.copy()
     inliers = path.inliers.copy()
-    for frame, fix in poses.items():
-        posed[frame], inliers[frame] = True, fix.inliers
-    lone = lone_poses(posed, inliers, _LONE_EVIDENCE * limits.min_inliers) | _unaccompanied(posed)
+    for frame, estimate in poses.items():
+        has_pose[frame], inliers[frame] = True, estimate.inliers
+    isolated = isolated_poses(
+        has_pose, inliers, ISOLATED_INLIER_FACTOR * criteria.min_inliers
+    ) | _single_poses(has_pose)
     matrices, covariance = path.gauge_from_cam.copy(), path.covariance.copy()
     status, error_px = list(path.status), path.error_px.copy()
-    for frame, fix in poses.items():
-        if lone[frame]:
+    for frame, estimate in poses.items():
+        if isolated[frame]:
             continue
-        matrices[frame], covariance[frame] = invert(fix.cam_from_map), fix.covariance
-        status[frame], error_px[frame] = FrameStatus.REGISTERED, fix.error_px
-    inliers = np.where([each.localised for each in status], inliers, path.inliers)
+        matrices[frame], covariance[frame] = invert(estimate.cam_from_map), estimate.covariance
+        status[frame], error_px[frame] = FrameStatus.REGISTERED, estimate.error_px
+    inliers = np.where([value.localised for value in status], inliers, path.inliers)
     return replace(
         path,
         gauge_from_cam=matrices,
@@ -253,75 +294,21 @@ def _with_poses(path: Trajectory, poses: Mapping[int, Fix], limits: PoseLimits) 
     )
 
 
-def _unaccompanied(posed: BoolArray) -> BoolArray:
+def _single_poses(has_pose: BoolArray) -> BoolArray:
     """(N,) frames with a pose that neither neighbour has."""
-    padded = np.concatenate([[False], posed, [False]])
-    return np.asarray(posed & ~padded[:-2] & ~padded[2:])
+    padded = np.concatenate([[False], has_pose, [False]])
+    return np.asarray(has_pose & ~padded[:-2] & ~padded[2:])
 
 
-def _known(path: Trajectory) -> dict[int, Fix]:
+def _localised_poses(path: Trajectory) -> dict[int, PoseEstimate]:
     """Poses that tracking found, by frame."""
-    return {frame: Fix.of(path, frame) for frame in np.flatnonzero(path.localised).tolist()}
+    return {
+        frame: PoseEstimate.from_trajectory(path, frame) for frame in np.flatnonzero(path.localised).tolist()
+    }
 
 
-def _seeds(scene_map: Map, camera: str, lost: BoolArray) -> dict[int, int]:
+def _seed_keyframes(scene_map: Map, camera: str, lost: BoolArray) -> dict[int, int]:
     """Rows of the map's keyframes among a camera's lost frames, by frame."""
     rows = scene_map.keyframes_of(camera)
     frames = scene_map.keyframe_frame[rows]
     return {int(frame): int(row) for row, frame in zip(rows, frames, strict=True) if lost[frame]}
-
-
-def _gallery(scene_map: Map, capture: Capture, camera: CaptureCamera, context: StageContext) -> Gallery:
-    """The map's keyframes' pictures, of all cameras; evenly thinned out where they are very many."""
-    count = len(scene_map.keyframe_camera)
-    held = np.unique(np.linspace(0, count - 1, min(count, _MAX_PICTURES)).round().astype(int))
-    pictures: dict[int, Pyramid] = {}
-    sharp = np.zeros(count)
-    for name in sorted(set(scene_map.keyframe_camera)):
-        rows = np.intersect1d(scene_map.keyframes_of(name), held)
-        row_of = dict(zip(scene_map.keyframe_frame[rows].tolist(), rows.tolist(), strict=True))
-        for frame, grey in capture.camera(name).read(sorted(row_of)):
-            context.check_cancelled()
-            row = row_of[frame]
-            pictures[row] = Pyramid.of(grey)
-            context.progress(len(pictures), len(held), "keyframes of all cameras decoded")
-            sharp[row] = sharpness(pictures[row].levels[0])
-        sharp[rows] /= max(float(np.median(sharp[rows])), 1e-9) if len(rows) else 1.0
-    seen: IntArray = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))
-    usable = confirmed_points(camera, scene_map)
-    return Gallery(scene_map=scene_map, pictures=pictures, sharpness=sharp, usable=usable, seen=seen)
-
-
-def _pictures(camera: CaptureCamera, start: int, stop: int, seeds: list[int]) -> dict[int, Pyramid]:
-    """Frames of a lost stretch near its ends or a seed, and those on either side of it."""
-    frames = np.arange(max(0, start - 1), min(len(camera.times_ns), stop + 1))
-    near = np.array([start, stop - 1, *seeds])
-    away = np.abs(frames[:, None] - near).min(axis=1)
-    nearest = np.argsort(away, kind="stable")[:_MAX_HELD]
-    frames = frames[np.sort(nearest[away[nearest] <= _REACH])]
-    return {frame: Pyramid.of(grey) for frame, grey in camera.read(frames)}
-
-
-def _exposure(camera: CaptureCamera, finder: Finder, path: Trajectory) -> float:
-    """Share of the time between two frames that the shutter is open, as blurred frames with poses show it."""
-    posed = path.localised
-    pairs = np.flatnonzero(posed[1:] & posed[:-1]) + 1
-    turned = path.gauge_from_cam[:, :3, :3]
-    cosine = np.einsum("nij,nij->n", turned[pairs - 1], turned[pairs])
-    fastest = np.sort(pairs[np.argsort(cosine, kind="stable")[:_EXPOSURE_FRAMES]])
-    totals = np.zeros(len(_EXPOSURES))
-    for frame, grey in camera.read(fastest):
-        pose, before = (invert(path.gauge_from_cam[each]) for each in (frame, frame - 1))
-        view = View(
-            lens=finder.lens,
-            pyramid=Pyramid.of(grey),
-            cam_from_map=pose,
-            before=before,
-            exposure=0.0,
-            readout=finder.readout,
-        )
-        rows = choose_rows(finder.gallery, view)
-        for number, share in enumerate(_EXPOSURES):
-            found = find_points(finder.gallery, replace(view, exposure=share), rows, _EXPOSURE_SEARCH)
-            totals[number] += found.score[finder.sees_room(found.px)].sum()
-    return _EXPOSURES[int(np.argmax(totals))]

@@ -13,14 +13,14 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.memory import give_back
 from bodycap_batch.model.scene import FrameStatus, Registration
-from bodycap_batch.registration.tracking.klt import Anchor, Tracks, track_stretch
+from bodycap_batch.registration.tracking.klt import KeyframePoints, Tracks, track_range
 
-_MIN_RANGE = 15
+_MIN_RANGE_FRAMES = 15
 """A shorter rest is not worth a decoder of its own."""
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class TrackCache:
     """What was tracked before.
 
     Attributes:
@@ -32,91 +32,97 @@ class Known:
     keyframes: list[int]
 
     @staticmethod
-    def of(previous: Registration | None) -> Known | None:
+    def from_registration(previous: Registration | None) -> TrackCache | None:
         """What an earlier registration tracked."""
         if previous is None:
             return None
         status = previous.trajectory.status
         frames = [index for index, value in enumerate(status) if value is FrameStatus.KEYFRAME]
         tracks = Tracks(previous.obs_frame, previous.obs_keyframe, previous.obs_feature, previous.obs_px)
-        return Known(tracks, frames)
+        return TrackCache(tracks, frames)
 
 
-def all_tracks(
+def track_all(
     camera: CaptureCamera,
-    anchors: Mapping[int, Anchor],
-    known: Known | None,
+    points_by_keyframe: Mapping[int, KeyframePoints],
+    cache: TrackCache | None,
     context: StageContext,
 ) -> Tracks:
     """Track every stretch between neighbouring keyframes, or reuse what was tracked there before."""
     count = len(camera.times_ns)
-    frames = sorted(anchors)
-    stretches = list(zip([None, *frames], [*frames, None], strict=True))
-    done: set[tuple[int | None, int | None]] = set()
+    frames = sorted(points_by_keyframe)
+    intervals = list(zip([None, *frames], [*frames, None], strict=True))
+    cached: set[tuple[int | None, int | None]] = set()
     parts = []
-    if known is not None:
-        done = set(zip([None, *known.keyframes], [*known.keyframes, None], strict=True))
-        parts.append(_inside(known.tracks, [stretch for stretch in stretches if stretch in done], count))
-    todo = _joined([stretch for stretch in stretches if stretch not in done], count)
-    parts += _track(camera, anchors, _shared_out(todo, frames, context.threads), context)
-    tracks = Tracks.join(parts)  # which takes them out one by one: nothing else may hold them
+    if cache is not None:
+        cached = set(zip([None, *cache.keyframes], [*cache.keyframes, None], strict=True))
+        parts.append(
+            _reusable(cache.tracks, [interval for interval in intervals if interval in cached], count)
+        )
+    missing = _merge_ranges([interval for interval in intervals if interval not in cached], count)
+    parts += _track_ranges(
+        camera, points_by_keyframe, _split_by_thread(missing, frames, context.threads), context
+    )
+    tracks = Tracks.join_and_clear(parts)  # which takes them out one by one: nothing else may hold them
     give_back()  # the many small pieces: 330 MB after ten minutes of video
     return tracks
 
 
-def _track(
+def _track_ranges(
     camera: CaptureCamera,
-    anchors: Mapping[int, Anchor],
+    points_by_keyframe: Mapping[int, KeyframePoints],
     ranges: list[tuple[int, int]],
     context: StageContext,
 ) -> list[Tracks]:
     """Track ranges of frames, as many at a time as there are threads; what is found is the same."""
     stopped, lock = Event(), Lock()
     total = sum(stop - start for start, stop in ranges)
-    reached = [start for start, _ in ranges]
+    position = [start for start, _ in ranges]
 
-    def work(index: int) -> list[Tracks]:
-        def told(frame: int) -> None:
+    def track_one(index: int) -> list[Tracks]:
+        def report(frame: int) -> None:
             with lock:
-                reached[index] = frame
-                done = sum(frame - start for frame, (start, _) in zip(reached, ranges, strict=True))
+                position[index] = frame
+                done = sum(frame - start for frame, (start, _) in zip(position, ranges, strict=True))
                 context.progress(done, total, "frames tracked")
 
-        halting = replace(context, cancelled=lambda: stopped.is_set() or context.cancelled())
-        found = []
-        for part in track_stretch(camera, anchors, *ranges[index], halting):
-            found.append(part)
-            if part.frame[0] > reached[index]:
-                told(int(part.frame[0]))
-        return found
+        stoppable = replace(context, cancelled=lambda: stopped.is_set() or context.cancelled())
+        parts = []
+        for part in track_range(camera, points_by_keyframe, *ranges[index], stoppable):
+            parts.append(part)
+            if part.frame[0] > position[index]:
+                report(int(part.frame[0]))
+        return parts
 
     with ThreadPoolExecutor(max_workers=max(1, context.threads), thread_name_prefix="track") as pool:
-        pending = [pool.submit(work, index) for index in range(len(ranges))]
+        pending = [pool.submit(track_one, index) for index in range(len(ranges))]
         try:
             return [part for future in pending for part in future.result()]
         finally:
             stopped.set()
 
 
-def _shared_out(ranges: list[tuple[int, int]], keyframes: list[int], threads: int) -> list[tuple[int, int]]:
+def _split_by_thread(
+    ranges: list[tuple[int, int]], keyframes: list[int], threads: int
+) -> list[tuple[int, int]]:
     """Cut ranges at keyframes where they are longer than a thread's even share."""
     total = sum(stop - start for start, stop in ranges)
-    share = -(-total // max(1, threads))
+    thread_frames = -(-total // max(1, threads))
     out = []
     for start, stop in ranges:
-        begin = start
+        range_start = start
         for keyframe in keyframes:
-            if begin + share <= keyframe < stop - 1 - _MIN_RANGE:
-                out.append((begin, keyframe + 1))
-                begin = keyframe
-        out.append((begin, stop))
+            if range_start + thread_frames <= keyframe < stop - 1 - _MIN_RANGE_FRAMES:
+                out.append((range_start, keyframe + 1))
+                range_start = keyframe
+        out.append((range_start, stop))
     return out
 
 
-def _joined(stretches: list[tuple[int | None, int | None]], count: int) -> list[tuple[int, int]]:
+def _merge_ranges(intervals: list[tuple[int | None, int | None]], count: int) -> list[tuple[int, int]]:
     """Merge stretches that touch into ranges [start, stop) of frames, keyframes included."""
     ranges: list[tuple[int, int]] = []
-    for first, last in stretches:
+    for first, last in intervals:
         start, stop = first or 0, count if last is None else last + 1
         if ranges and start < ranges[-1][1]:
             ranges[-1] = (ranges[-1][0], stop)
@@ -125,18 +131,20 @@ def _joined(stretches: list[tuple[int | None, int | None]], count: int) -> list[
     return ranges
 
 
-def _inside(tracks: Tracks, stretches: list[tuple[int | None, int | None]], count: int) -> Tracks:
+def _reusable(tracks: Tracks, intervals: list[tuple[int | None, int | None]], count: int) -> Tracks:
     """Tracks from a keyframe at an end of one of the stretches to where they lie in it.
 
     A keyframe ends two stretches: what was tracked into it across one that is tracked again is left out, or
     it would count twice.
     """
-    reach = np.zeros((count, 2), dtype=np.int64)  # how far back and ahead of a keyframe its tracks are kept
-    for first, last in stretches:
+    kept_frames = np.zeros(
+        (count, 2), dtype=np.int64
+    )  # how far back and ahead of a keyframe its tracks are kept
+    for first, last in intervals:
         if first is not None:
-            reach[first, 1] = (count if last is None else last) - first
+            kept_frames[first, 1] = (count if last is None else last) - first
         if last is not None:
-            reach[last, 0] = last - (0 if first is None else first)
-    ahead = tracks.frame - tracks.keyframe
-    back, forth = reach[tracks.keyframe].T
-    return tracks.select((-back <= ahead) & (ahead <= forth))
+            kept_frames[last, 0] = last - (0 if first is None else first)
+    offset = tracks.frame - tracks.keyframe
+    backward, forward = kept_frames[tracks.keyframe].T
+    return tracks.select((-backward <= offset) & (offset <= forward))

@@ -15,29 +15,29 @@ from bodycap_batch.core.arrays import BoolArray, IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.optical_flow import (
     GreyImage,
-    Motion,
+    ImageMotion,
     Pixels,
-    coarse_image,
-    coarse_motion,
+    apply_homography,
     detect_corners,
-    moved,
+    estimate_coarse_motion,
+    make_coarse_image,
     pixel_scale,
     track_points,
 )
 from bodycap_batch.model.scene import Map
 
 _MAX_TRACKS = 250
-_CELLS = 8
-_MAX_BUFFER = 90
+_GRID_CELLS = 8
+_MAX_BUFFERED_FRAMES = 90
 """Frames held in memory for the way back from a keyframe; bounds memory where keyframes are far apart."""
 _MIN_TRACKS = 6
 _MAX_CLOSURE_PX = 2.0
-_MIN_GUIDES = 48
-_GUIDE_SPACING_PX = 12.0
+_MIN_MOTION_POINTS = 48
+_CORNER_SPACING_PX = 12.0
 
 
 @dataclass(frozen=True, slots=True)
-class Anchor:
+class KeyframePoints:
     """The map points a keyframe observes.
 
     Attributes:
@@ -50,9 +50,9 @@ class Anchor:
     point: IntArray
     px: Pixels
 
-    def select(self, mask: npt.NDArray[Any]) -> Anchor:
+    def select(self, mask: npt.NDArray[Any]) -> KeyframePoints:
         """Keep the points under a mask."""
-        return Anchor(self.feature[mask], self.point[mask], self.px[mask])
+        return KeyframePoints(self.feature[mask], self.point[mask], self.px[mask])
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class Tracks:
     px: Pixels
 
     @staticmethod
-    def join(parts: list[Tracks]) -> Tracks:
+    def join_and_clear(parts: list[Tracks]) -> Tracks:
         """Concatenate, ordered by frame, keyframe and feature; the list is emptied.
 
         One field after the other lets go of its parts: ten minutes of video have 260 MB of observations.
@@ -97,7 +97,7 @@ class Tracks:
             field.flags.writeable = False  # so that a registration takes them as they are
         return Tracks(frame, keyframe, feature, px)
 
-    def within(self, first: int, stop: int) -> Tracks:
+    def in_frames(self, first: int, stop: int) -> Tracks:
         """Those in frames from `first` on and before `stop`, of tracks that are ordered by frame."""
         low, high = np.searchsorted(self.frame, [first, stop]).tolist()
         return self.select(slice(low, high))
@@ -107,21 +107,23 @@ class Tracks:
         return Tracks(self.frame[mask], self.keyframe[mask], self.feature[mask], self.px[mask])
 
 
-def anchors_of(scene_map: Map, camera: str) -> dict[int, Anchor]:
+def select_keyframe_points(scene_map: Map, camera: str) -> dict[int, KeyframePoints]:
     """The best spread, longest seen map points of each of a camera's keyframes, by frame index."""
-    seen = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))
+    keyframe_count = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))
     lens = scene_map.cameras[camera]
     order = np.argsort(scene_map.obs_keyframe, kind="stable")
     bounds = np.searchsorted(scene_map.obs_keyframe[order], np.arange(len(scene_map.keyframe_camera) + 1))
     out = {}
     for keyframe in scene_map.keyframes_of(camera):
-        mine = order[bounds[keyframe] : bounds[keyframe + 1]]
-        px = scene_map.obs_px[mine]
-        cell = np.clip((px / (lens.width_px, lens.height_px) * _CELLS).astype(int), 0, _CELLS - 1)
-        picked = well_spread(cell[:, 1] * _CELLS + cell[:, 0], seen[scene_map.obs_point[mine]], _MAX_TRACKS)
-        rows = np.sort(mine[picked])
+        observed = order[bounds[keyframe] : bounds[keyframe + 1]]
+        px = scene_map.obs_px[observed]
+        cell = np.clip((px / (lens.width_px, lens.height_px) * _GRID_CELLS).astype(int), 0, _GRID_CELLS - 1)
+        chosen = grid_sample(
+            cell[:, 1] * _GRID_CELLS + cell[:, 0], keyframe_count[scene_map.obs_point[observed]], _MAX_TRACKS
+        )
+        rows = np.sort(observed[chosen])
         frame = int(scene_map.keyframe_frame[keyframe])
-        out[frame] = Anchor(
+        out[frame] = KeyframePoints(
             scene_map.obs_feature[rows],
             scene_map.obs_point[rows],
             scene_map.obs_px[rows].astype(np.float32),
@@ -129,18 +131,18 @@ def anchors_of(scene_map: Map, camera: str) -> dict[int, Anchor]:
     return out
 
 
-def well_spread(cell: IntArray, value: IntArray, count: int) -> IntArray:
+def grid_sample(cell: IntArray, score: IntArray, count: int) -> IntArray:
     """Rows of up to `count` items, taken from the cells in turn, the most valuable first."""
-    order = np.lexsort((-value, cell))
+    order = np.lexsort((-score, cell))
     sorted_cells = cell[order]
-    first = np.searchsorted(sorted_cells, sorted_cells)
-    rank = np.arange(len(order)) - first
-    turn = np.lexsort((-value[order], rank))
-    return np.asarray(order[turn[:count]])
+    cell_start = np.searchsorted(sorted_cells, sorted_cells)
+    rank = np.arange(len(order)) - cell_start
+    by_rank = np.lexsort((-score[order], rank))
+    return np.asarray(order[by_rank[:count]])
 
 
 @dataclass(frozen=True, slots=True)
-class _Picture:
+class _VideoFrame:
     """A frame at full size and reduced."""
 
     camera: CaptureCamera
@@ -155,7 +157,7 @@ class _Picture:
 
 
 @dataclass(slots=True)
-class _Active:
+class _ActiveTracks:
     """Tracks alive in the newest frame.
 
     Attributes:
@@ -166,32 +168,34 @@ class _Active:
     """
 
     keyframe: int
-    anchor: Anchor
-    slot: IntArray
+    start: KeyframePoints
+    rows: IntArray
     px: Pixels
 
     @staticmethod
-    def at(keyframe: int, anchor: Anchor) -> _Active:
+    def start_at(keyframe: int, keyframe_points: KeyframePoints) -> _ActiveTracks:
         """Begin in a keyframe."""
-        return _Active(keyframe, anchor, np.arange(len(anchor.px)), anchor.px)
+        return _ActiveTracks(
+            keyframe, keyframe_points, np.arange(len(keyframe_points.px)), keyframe_points.px
+        )
 
-    def step(self, first: _Picture, second: _Picture, motion: Motion | None) -> bool:
+    def advance(self, first: _VideoFrame, second: _VideoFrame, motion: ImageMotion | None) -> bool:
         """Follow the tracks into a frame; False once too few are left."""
-        guess = None if motion is None else moved(self.px, motion.homography)
+        guess = None if motion is None else apply_homography(self.px, motion.homography)
         # A track that slips disagrees with the pose: the way back is followed only where many would.
-        careful = motion is None or not motion.sure
-        flow = track_points(first.grey, second.grey, self.px, guess, careful=careful)
-        keep = flow.ok & second.camera.sees_room(flow.px)
-        self.slot, self.px = self.slot[keep], flow.px[keep]
-        return len(self.slot) >= _MIN_TRACKS
+        with_check = motion is None or not motion.is_reliable
+        tracked = track_points(first.grey, second.grey, self.px, guess, with_check=with_check)
+        keep = tracked.ok & second.camera.is_unmasked(tracked.px)
+        self.rows, self.px = self.rows[keep], tracked.px[keep]
+        return len(self.rows) >= _MIN_TRACKS
 
     def observe(self, frame: int) -> Tracks:
         """What the tracks see in the frame they are in."""
-        return _tracks(frame, self.keyframe, self.anchor.feature[self.slot], self.px)
+        return _make_tracks(frame, self.keyframe, self.start.feature[self.rows], self.px)
 
 
 @dataclass(frozen=True, slots=True)
-class _Past:
+class _BufferedFrame:
     """A frame on the way to the next keyframe.
 
     Attributes:
@@ -201,27 +205,27 @@ class _Past:
         px: (N,2) where they were.
     """
 
-    picture: _Picture
-    motion: Motion | None
-    slot: IntArray
+    frame: _VideoFrame
+    motion: ImageMotion | None
+    rows: IntArray
     px: Pixels
 
 
-def _tracks(frame: int, keyframe: int, feature: IntArray, px: Pixels) -> Tracks:
+def _make_tracks(frame: int, keyframe: int, feature: IntArray, px: Pixels) -> Tracks:
     count = len(feature)
     return Tracks(np.full(count, frame, np.int64), np.full(count, keyframe, np.int64), feature, px)
 
 
-def track_stretch(
+def track_range(
     camera: CaptureCamera,
-    anchors: Mapping[int, Anchor],
+    points_by_keyframe: Mapping[int, KeyframePoints],
     start: int,
     stop: int,
     context: StageContext,
 ) -> Iterator[Tracks]:
     """Track from every keyframe in [start, stop) forward to the next one and back to the one before.
 
-    Memory is bounded by `_MAX_BUFFER` frames. Yields the observations found, in no particular order.
+    Memory is bounded by `_MAX_BUFFERED_FRAMES` frames. Yields the observations found, in no particular order.
 
     Args:
         camera: Video.
@@ -230,39 +234,39 @@ def track_stretch(
         stop: One past the last frame.
         context: Cancellation.
     """
-    forward: _Active | None = None
-    previous: _Picture | None = None
-    past: deque[_Past] = deque(maxlen=_MAX_BUFFER)
+    forward: _ActiveTracks | None = None
+    previous: _VideoFrame | None = None
+    buffered: deque[_BufferedFrame] = deque(maxlen=_MAX_BUFFERED_FRAMES)
     for index, grey in camera.grey_frames(start, stop):
         context.check_cancelled()
-        picture = _Picture(camera, index, grey, coarse_image(grey))
+        frame = _VideoFrame(camera, index, grey, make_coarse_image(grey))
         if previous is not None:
-            motion = _motion(previous, picture, forward)
-            past.append(_remember(previous, motion, forward))
-            if forward is not None and forward.step(previous, picture, motion):
+            motion = _estimate_motion(previous, frame, forward)
+            buffered.append(_buffer(previous, motion, forward))
+            if forward is not None and forward.advance(previous, frame, motion):
                 yield forward.observe(index)
             else:
                 forward = None
-        anchor = anchors.get(index)
-        if anchor is not None:
-            arrived = np.zeros(len(anchor.px), dtype=bool)
+        keyframe_points = points_by_keyframe.get(index)
+        if keyframe_points is not None:
+            arrived = np.zeros(len(keyframe_points.px), dtype=bool)
             if forward is not None:
-                arrived = yield from _closed(forward, index, anchor, past)
-            yield from _track_back(picture, anchor.select(~arrived), past)
-            past.clear()
-            forward = _Active.at(index, anchor)
-        previous = picture
+                arrived = yield from _close_tracks(forward, index, keyframe_points, buffered)
+            yield from _track_back(frame, keyframe_points.select(~arrived), buffered)
+            buffered.clear()
+            forward = _ActiveTracks.start_at(index, keyframe_points)
+        previous = frame
 
 
-def _remember(picture: _Picture, motion: Motion | None, active: _Active | None) -> _Past:
-    back = None if motion is None else motion.inverse()
+def _buffer(frame: _VideoFrame, motion: ImageMotion | None, active: _ActiveTracks | None) -> _BufferedFrame:
+    backward = None if motion is None else motion.inverse()
     if active is None:
-        return _Past(picture, back, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
-    return _Past(picture, back, active.slot, active.px)
+        return _BufferedFrame(frame, backward, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
+    return _BufferedFrame(frame, backward, active.rows, active.px)
 
 
-def _closed(
-    active: _Active, keyframe: int, anchor: Anchor, past: deque[_Past]
+def _close_tracks(
+    active: _ActiveTracks, keyframe: int, keyframe_points: KeyframePoints, buffered: deque[_BufferedFrame]
 ) -> Generator[Tracks, None, BoolArray]:
     """Tracks that arrive where the next keyframe sees the same point, told from that keyframe's side.
 
@@ -272,39 +276,47 @@ def _closed(
     Returns:
         (N,) which of the keyframe's points that covers.
     """
-    _, here, there = np.intersect1d(active.anchor.point[active.slot], anchor.point, return_indices=True)
-    offset = anchor.px[there] - active.px[here]
-    close = np.linalg.norm(offset, axis=1) < _MAX_CLOSURE_PX * past[-1].picture.scale
-    here, there, offset = here[close], there[close], offset[close]
-    for item in past:
-        if len(here) == 0 or len(item.slot) == 0:
+    _, active_rows, point_rows = np.intersect1d(
+        active.start.point[active.rows], keyframe_points.point, return_indices=True
+    )
+    offset = keyframe_points.px[point_rows] - active.px[active_rows]
+    is_close = np.linalg.norm(offset, axis=1) < _MAX_CLOSURE_PX * buffered[-1].frame.scale
+    active_rows, point_rows, offset = active_rows[is_close], point_rows[is_close], offset[is_close]
+    for item in buffered:
+        if len(active_rows) == 0 or len(item.rows) == 0:
             continue
-        at = np.searchsorted(item.slot, active.slot[here])
-        yield _tracks(item.picture.index, keyframe, anchor.feature[there], item.px[at] + offset)
-    arrived = np.zeros(len(anchor.px), dtype=bool)
-    arrived[there] = True
+        position = np.searchsorted(item.rows, active.rows[active_rows])
+        yield _make_tracks(
+            item.frame.index, keyframe, keyframe_points.feature[point_rows], item.px[position] + offset
+        )
+    arrived = np.zeros(len(keyframe_points.px), dtype=bool)
+    arrived[point_rows] = True
     return arrived
 
 
-def _motion(first: _Picture, second: _Picture, active: _Active | None) -> Motion | None:
-    if active is not None and len(active.px) >= _MIN_GUIDES:
-        guides = active.px
+def _estimate_motion(
+    first: _VideoFrame, second: _VideoFrame, active: _ActiveTracks | None
+) -> ImageMotion | None:
+    if active is not None and len(active.px) >= _MIN_MOTION_POINTS:
+        points = active.px
     else:
         scale = first.grey.shape[1] / first.coarse.shape[1]
-        guides = detect_corners(first.coarse, _MIN_GUIDES, _GUIDE_SPACING_PX) * np.float32(scale)
-    return coarse_motion(first.coarse, second.coarse, guides, first.grey.shape[1])
+        points = detect_corners(first.coarse, _MIN_MOTION_POINTS, _CORNER_SPACING_PX) * np.float32(scale)
+    return estimate_coarse_motion(first.coarse, second.coarse, points, first.grey.shape[1])
 
 
-def _track_back(picture: _Picture, anchor: Anchor, past: deque[_Past]) -> Iterator[Tracks]:
-    active = _Active.at(picture.index, anchor)
-    later = picture
-    for item in reversed(past):
-        if not active.step(later, item.picture, item.motion):
+def _track_back(
+    frame: _VideoFrame, keyframe_points: KeyframePoints, buffered: deque[_BufferedFrame]
+) -> Iterator[Tracks]:
+    active = _ActiveTracks.start_at(frame.index, keyframe_points)
+    later = frame
+    for item in reversed(buffered):
+        if not active.advance(later, item.frame, item.motion):
             return
-        yield active.observe(item.picture.index)
-        later = item.picture
+        yield active.observe(item.frame.index)
+        later = item.frame
 
 
-def track_scale(camera: CaptureCamera) -> float:
+def camera_pixel_scale(camera: CaptureCamera) -> float:
     """Factor on pixel thresholds for this camera."""
     return pixel_scale(camera.camera.width_px, camera.camera.height_px)

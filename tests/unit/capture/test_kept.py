@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bodycap_batch.capture import CaptureCamera, FrameKeeper, open_camera
-from bodycap_batch.capture.images import grey_of, work_image, work_planes
+from bodycap_batch.capture.images import grey_from_planes, work_image, work_planes
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks import STAGES
@@ -34,12 +34,12 @@ def opened(video: Path, work_px: int = 960) -> CaptureCamera:
 
 def with_kept(camera: CaptureCamera, folder: Path) -> CaptureCamera:
     size = camera.camera
-    with FrameKeeper(folder, size.width_px, size.height_px, camera.keeps_all) as keeper:
-        for shot in camera.shots():
-            keeper.see(shot)
+    with FrameKeeper(folder, size.width_px, size.height_px, camera.should_keep_all) as keeper:
+        for shot in camera.frame_candidates():
+            keeper.add_frame(shot)
             if shot.index in CHOSEN:
-                keeper.choose(shot)
-    return replace(camera, kept=keeper.kept())
+                keeper.add_keyframe(shot)
+    return replace(camera, kept=keeper.kept_frames())
 
 
 def both(camera: CaptureCamera, indices: list[int]) -> list[tuple[int, np.ndarray]]:
@@ -79,7 +79,7 @@ def test_luma_of_any_format_is_kept_in_the_range_that_is_told(pix_fmt: str, off:
     frame.color_range = told
     upright = ((1, 0), (0, 1))
     grey = work_image(frame, upright, (256, 16), colour=False)
-    kept = grey_of(work_planes(frame, upright, (256, 16)), (256, 16))
+    kept = grey_from_planes(work_planes(frame, upright, (256, 16)), (256, 16))
     assert np.ptp(grey) > 100
     assert np.abs(kept.astype(int) - grey).max() <= off
 
@@ -135,7 +135,7 @@ def test_large_videos_are_kept_whole_at_the_work_size(tmp_path: Path, rotation: 
 
 def test_what_is_seen_of_a_large_video_is_what_any_stage_sees(tmp_path: Path) -> None:
     camera = opened(write_video(tmp_path / "a.mp4", noisy_frames(480, 360)), work_px=161)
-    seen = [(shot.index, shot.grey) for shot in camera.shots()]
+    seen = [(shot.index, shot.grey) for shot in camera.frame_candidates()]
     assert_same(seen, list(camera.grey_frames()))
 
 

@@ -77,7 +77,7 @@ def test_a_repainted_mask_is_another_input(tmp_path: Path) -> None:
         return camera_digest(capture, capture.cameras[0], FileDigests(tmp_path / "digests"))
 
     capture = open_capture(load_job(tmp_path / "job.yaml").capture)
-    assert capture.cameras[0].sees_room(np.array([[10.0, 10.0], [63.9, 47.9]])).all()
+    assert capture.cameras[0].is_unmasked(np.array([[10.0, 10.0], [63.9, 47.9]])).all()
     first = digest("job.yaml")
     assert first != digest("plain.yaml")
     assert first == digest("job.yaml")
@@ -85,4 +85,4 @@ def test_a_repainted_mask_is_another_input(tmp_path: Path) -> None:
     _write(tmp_path / "mask.png", mask)
     assert digest("job.yaml") != first
     capture = open_capture(load_job(tmp_path / "job.yaml").capture)
-    assert capture.cameras[0].sees_room(np.array([[10.0, 10.0], [63.9, 47.9]])).tolist() == [False, True]
+    assert capture.cameras[0].is_unmasked(np.array([[10.0, 10.0], [63.9, 47.9]])).tolist() == [False, True]

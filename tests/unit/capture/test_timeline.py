@@ -46,7 +46,7 @@ def test_a_turned_sensor_is_read_the_other_way(tmp_path: Path) -> None:
     rolling = {"rolling_shutter_s": 0.02}
     upside_down = opened(write_video(tmp_path / "a.mp4", FRAMES, rotation=180), camera=rolling)
     assert upside_down.rolling_shutter_s == -0.02
-    assert (upside_down.camera.sideways, upside_down.turned) == (False, False)
+    assert (upside_down.camera.sideways, upside_down.may_be_sideways) == (False, False)
 
 
 @pytest.mark.parametrize("rotation", [90, 270])
@@ -59,10 +59,10 @@ def test_a_quarter_turn_shows_the_sensors_rows_as_columns(tmp_path: Path, rotati
     first, last = (4, 44) if shown[:, 4].mean() > shown[:, 44].mean() else (44, 4)
     times = camera.row_times_ns(3, [first, last])
     assert times[0] < camera.common_times_ns()[3] < times[1]
-    assert (camera.camera.sideways, camera.turned, camera.notes) == (True, True, ())
+    assert (camera.camera.sideways, camera.may_be_sideways, camera.notes) == (True, True, ())
     # Not stated, the data tell which way it is read.
     free = opened(path)
-    assert (free.camera.sideways, free.turned, free.rolling_shutter_known) == (False, True, False)
+    assert (free.camera.sideways, free.may_be_sideways, free.rolling_shutter_known) == (False, True, False)
 
 
 def test_the_window_is_on_the_common_clock(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import weakref
 from collections.abc import Generator, Iterator
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -16,10 +17,9 @@ from av.video.frame import VideoFrame
 from bodycap_batch.capture import CaptureCamera, decoding, open_camera
 from bodycap_batch.capture.images import turn_upright
 from bodycap_batch.capture.indexing import index_video
-from bodycap_batch.capture.prefetch import prefetched
+from bodycap_batch.capture.prefetch import prefetch
 from bodycap_batch.capture.video import open_container
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
-from bodycap_batch.core.context import THREADS_VARIABLE
 from bodycap_batch.core.errors import CaptureError
 from tests.videos import textured_frame, write_tone, write_video
 
@@ -64,13 +64,13 @@ def test_random_reads_equal_the_stream(tmp_path: Path) -> None:
 def test_a_far_read_skips_what_lies_between(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     video = index_video(write_video(tmp_path / "a.mp4", FRAMES, gop=8, bframes=False))
     sought: list[int] = []
-    original = decoding._Cursor._seek
+    original = decoding._ForwardDecoder._seek
 
-    def counted(self: decoding._Cursor, index: int) -> None:
+    def counted(self: decoding._ForwardDecoder, index: int) -> None:
         sought.append(index)
         original(self, index)
 
-    monkeypatch.setattr(decoding._Cursor, "_seek", counted)
+    monkeypatch.setattr(decoding._ForwardDecoder, "_seek", counted)
     assert [i for i, _ in decoding.decode_frames(video, np.array([1, 2, 5, 33, 39]))] == [1, 2, 5, 33, 39]
     assert sought == [32]
 
@@ -129,7 +129,7 @@ def test_decoding_ahead_is_bounded_and_ends_with_its_consumer() -> None:
     made: list[int] = []
     closed: list[str] = []
     threads = threading.active_count()
-    stream = prefetched(counting(made, closed), ahead=3)
+    stream = prefetch(counting(made, closed), ahead=3)
     assert [next(stream) for _ in range(5)] == list(range(5))
     stream.close()
     assert len(closed) == 1
@@ -143,17 +143,16 @@ def test_an_error_ahead_arrives_in_its_place() -> None:
         yield 2
         raise KeyError("third")
 
-    stream = prefetched(source())
+    stream = prefetch(source())
     assert [next(stream), next(stream)] == [1, 2]
     with pytest.raises(KeyError, match="third"):
         next(stream)
 
 
-def test_one_thread_decodes_what_is_asked_for_and_nothing_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_thread_decodes_what_is_asked_for_and_nothing_ahead() -> None:
     made: list[int] = []
     closed: list[str] = []
-    monkeypatch.setenv(THREADS_VARIABLE, "1")
-    stream = prefetched(counting(made, closed))
+    stream = prefetch(counting(made, closed), threads=1)
     assert [next(stream) for _ in range(5)] == made == list(range(5))
     stream.close()
     assert closed == [threading.current_thread().name]
@@ -171,23 +170,22 @@ def remuxed(source: Path, target: Path, shift: int = 0, skip: int = 0, **options
     return target
 
 
-@pytest.mark.parametrize("threads", ["1", "2"])
+@pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("codec", ["libx264", "mpeg4", "libx265"])
 def test_frames_that_nothing_is_built_on_are_passed_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, codec: str, threads: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, codec: str, threads: int
 ) -> None:
-    monkeypatch.setenv(THREADS_VARIABLE, threads)
-    camera = opened(write_video(tmp_path / "a.mp4", FRAMES, codec=codec, gop=40))
+    camera = replace(opened(write_video(tmp_path / "a.mp4", FRAMES, codec=codec, gop=40)), threads=threads)
     stream = dict(camera.grey_frames())
     decoded: list[VideoFrame] = []
-    original = decoding._Cursor._decoded
+    original = decoding._ForwardDecoder._decoded
 
-    def counted(self: decoding._Cursor) -> Iterator[VideoFrame]:
+    def counted(self: decoding._ForwardDecoder) -> Iterator[VideoFrame]:
         for frame in original(self):
             decoded.append(frame)
             yield frame
 
-    monkeypatch.setattr(decoding._Cursor, "_decoded", counted)
+    monkeypatch.setattr(decoding._ForwardDecoder, "_decoded", counted)
     for wanted in ([1], [2], [39], [20, 38], list(range(0, 40, 2)), list(range(1, 40, 2))):
         decoded.clear()
         got = dict(camera.read(wanted))
@@ -205,14 +203,14 @@ def test_a_sparse_read_does_not_begin_anew(
     if codec not in av.codecs_available:
         pytest.skip(f"this PyAV has no {codec}")
     camera = opened(write_video(tmp_path / "a.mp4", FRAMES, codec=codec, gop=10))
-    made: list[decoding._Cursor] = []
-    original = decoding._Cursor.__init__
+    made: list[decoding._ForwardDecoder] = []
+    original = decoding._ForwardDecoder.__init__
 
-    def noted(self: decoding._Cursor, *arguments: object) -> None:
+    def noted(self: decoding._ForwardDecoder, *arguments: object) -> None:
         made.append(self)
         original(self, *arguments)
 
-    monkeypatch.setattr(decoding._Cursor, "__init__", noted)
+    monkeypatch.setattr(decoding._ForwardDecoder, "__init__", noted)
     wanted = list(range(1, 40, 3))
     assert list(dict(camera.read(wanted))) == wanted
     assert len(made) == 1
@@ -333,12 +331,11 @@ def test_sound_beside_the_pictures_is_left_alone(tmp_path: Path) -> None:
     assert [shown_index(image) for _, image in camera.grey_frames()] == list(range(10))
 
 
-@pytest.mark.parametrize(("task", "process", "expected"), [("2", "1", 2), ("1", "4", 1), ("", "3", 3)])
+@pytest.mark.parametrize(("task", "process", "expected"), [(2, "1", 2), (1, "4", 1), (0, "3", 3)])
 def test_a_task_decodes_on_the_threads_it_was_given(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, task: str, process: str, expected: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, task: int, process: str, expected: int
 ) -> None:
     video = index_video(write_video(tmp_path / "a.mp4", FRAMES[:3]))
-    monkeypatch.setenv(THREADS_VARIABLE, task)
     monkeypatch.setenv("OMP_NUM_THREADS", process)
     with open_container(video.path) as container:
-        assert decoding.decoder(container, video).codec_context.thread_count == expected
+        assert decoding.open_stream(container, video, task).codec_context.thread_count == expected

@@ -24,7 +24,7 @@ class _Blobs:
         self.mask = object() if hidden_left_px else None
         self._hidden = hidden_left_px
 
-    def sees_room(self, px: np.ndarray) -> np.ndarray:
+    def is_unmasked(self, px: np.ndarray) -> np.ndarray:
         return px[:, 0] >= self._hidden
 
     def read(self, frames: np.ndarray, *, colour: bool) -> Iterator[tuple[int, np.ndarray]]:

@@ -8,15 +8,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bodycap_batch.model.optical_flow import (
-    bearings,
-    coarse_image,
-    coarse_motion,
+    apply_homography,
     detect_corners,
+    estimate_coarse_motion,
     fit_rotation,
-    moved,
+    make_coarse_image,
     pixel_scale,
     sharpness,
     track_points,
+    unit_directions,
 )
 
 
@@ -76,14 +76,14 @@ def test_a_coarse_motion_starts_every_track_near_its_end() -> None:
     turn[:, 2] += (35.0, -20.0)
     second = cv2.warpAffine(first, turn, (640, 480))
     corners = detect_corners(first, 200, 12.0)
-    found = coarse_motion(coarse_image(first), coarse_image(second), corners, 640)
+    found = estimate_coarse_motion(make_coarse_image(first), make_coarse_image(second), corners, 640)
     assert found is not None
     # warpAffine works in OpenCV's pixels.
     expected = (corners - 0.5) @ turn[:, :2].T + turn[:, 2] + 0.5
-    assert np.abs(moved(corners, found.homography) - expected).max() < 2.0
+    assert np.abs(apply_homography(corners, found.homography) - expected).max() < 2.0
     inside = ((expected > 25) & (expected < (615, 455))).all(axis=1)
     flow = track_points(
-        first, second, corners[inside], moved(corners, found.homography)[inside], careful=False
+        first, second, corners[inside], apply_homography(corners, found.homography)[inside], with_check=False
     )
     error = np.linalg.norm(flow.px - expected[inside], axis=1)[flow.ok]
     # A window of 21 px does not turn with the image: 3 degrees cost about a tenth of a pixel.
@@ -95,24 +95,26 @@ def test_a_third_of_the_picture_in_one_step_is_found_again() -> None:
     # The camera turns by 220 of 640 px, as a thrown hand's does between two frames.
     first, second = wide[60:540, 100:740], wide[100:580, 320:960]
     corners = detect_corners(first, 100, 12.0)
-    found = coarse_motion(coarse_image(first), coarse_image(second), corners, 640)
+    found = estimate_coarse_motion(make_coarse_image(first), make_coarse_image(second), corners, 640)
     assert found is not None
     shared = corners[(corners > (240, 60)).all(axis=1)]
     # Half a pixel of the reduced images.
-    assert np.abs(moved(shared, found.homography) - shared + (220, 40)).max() < 1.5
-    flow = track_points(first, second, shared, moved(shared, found.homography))
+    assert np.abs(apply_homography(shared, found.homography) - shared + (220, 40)).max() < 1.5
+    flow = track_points(first, second, shared, apply_homography(shared, found.homography))
     assert flow.ok.mean() > 0.8
-    back = moved(moved(shared, found.homography), found.inverse().homography)
+    back = apply_homography(apply_homography(shared, found.homography), found.inverse().homography)
     np.testing.assert_allclose(back, shared, atol=1e-2)
 
 
 def test_a_motion_between_unrelated_images_is_not_sure_and_carries_nothing() -> None:
     first, second = _texture(6, 640, 480), _texture(7, 640, 480)
     corners = detect_corners(first, 100, 12.0)
-    assert coarse_motion(coarse_image(first), coarse_image(second), corners[:5], 640) is None
-    found = coarse_motion(coarse_image(first), coarse_image(second), corners, 640)
-    assert found is None or not found.sure
-    guess = None if found is None else moved(corners, found.homography)
+    assert (
+        estimate_coarse_motion(make_coarse_image(first), make_coarse_image(second), corners[:5], 640) is None
+    )
+    found = estimate_coarse_motion(make_coarse_image(first), make_coarse_image(second), corners, 640)
+    assert found is None or not found.is_reliable
+    guess = None if found is None else apply_homography(corners, found.homography)
     assert track_points(first, second, corners, guess).ok.mean() < 0.1
 
 
@@ -125,12 +127,12 @@ def test_no_points_give_an_empty_flow() -> None:
 @pytest.mark.parametrize("degrees", [0.5, 10.0, 60.0])
 def test_rotation_is_found_despite_a_third_of_moving_points(degrees: float) -> None:
     rng = np.random.default_rng(3)
-    first = bearings(rng.uniform(-0.7, 0.7, (120, 2)))
+    first = unit_directions(rng.uniform(-0.7, 0.7, (120, 2)))
     truth = Rotation.from_rotvec(np.radians(degrees) * np.array([0.6, 0.0, 0.8])).as_matrix()
     second = first @ truth.T
     second[:40] += rng.normal(0, 0.15, (40, 3))
     second /= np.linalg.norm(second, axis=1, keepdims=True)
-    error = Rotation.from_matrix(fit_rotation(first, second, rounds=15).T @ truth).magnitude()
+    error = Rotation.from_matrix(fit_rotation(first, second, iterations=15).T @ truth).magnitude()
     assert np.degrees(error) < 0.1
 
 

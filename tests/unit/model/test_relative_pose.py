@@ -15,10 +15,10 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.bundle import read_bundle, write_bundle
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, rotation_angle_rad, so3_exp
-from bodycap_batch.model.relative_pose import RigPoses, mean_rotation, relative_pose, same_instants
+from bodycap_batch.model.relative_pose import RigPoses, estimate_relative_pose, match_instants, mean_rotation
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
-from bodycap_batch.registration import RigCamera, register_in_rig
-from bodycap_batch.registration.poses.batched_pnp import Views, linearise, make_views
+from bodycap_batch.registration import RegisteredCamera, register_in_rig
+from bodycap_batch.registration.poses.batched_pnp import Observations, linearise, make_observations
 from bodycap_batch.tasks import read_summary, recover
 from bodycap_batch.tasks.registered import RIG_POSES
 from bodycap_batch.tasks.registration import save_registration
@@ -105,14 +105,14 @@ def _registration(name: str, path: np.ndarray, seen: list[tuple[np.ndarray, np.n
     )
 
 
-def _rig() -> tuple[Map, list[RigCamera]]:
+def _rig() -> tuple[Map, list[RegisteredCamera]]:
     """Two cameras in a cloud of points; a point's feature number is its own in every keyframe."""
     rng = np.random.default_rng(0)
     points = rng.uniform((-5, -3, -5), (5, 3, 7), (1500, 3))
     rows, cameras, observed = [], [], []
     for name, path in _paths().items():
         seen = _seen(path, points, rng)
-        cameras.append(RigCamera(camera=_camera(name), found=_registration(name, path, seen)))
+        cameras.append(RegisteredCamera(camera=_camera(name), registration=_registration(name, path, seen)))
         for frame in KEYFRAMES.tolist():
             rows.append((name, frame, path[frame]))
             # A keyframe knows all points by their number, so that every view is a track of it.
@@ -135,7 +135,7 @@ def _rig() -> tuple[Map, list[RigCamera]]:
     return scene_map, cameras
 
 
-def _solved(scene_map: Map, own: RigCamera, other: RigCamera) -> Registration:
+def _solved(scene_map: Map, own: RegisteredCamera, other: RegisteredCamera) -> Registration:
     selection = KeyframeSelection(
         camera=own.camera.name, frames=KEYFRAMES, frame_count=COUNT, sharpness=np.ones(COUNT), noise_px=0.2
     )
@@ -176,17 +176,19 @@ def test_what_the_rig_left_outlasts_the_search_for_lost_frames(
     folders = [tmp_path / each.camera.name for each in cameras]
     for folder, each in zip(folders, cameras, strict=True):
         folder.mkdir()
-        save_registration(each.found, each.camera, folder, rolling=True)
+        save_registration(each.registration, each.camera, folder, rolling=True)
     selection = KeyframeSelection(
         camera="torso", frames=KEYFRAMES, frame_count=COUNT, sharpness=np.ones(COUNT), noise_px=0.2
     )
-    relative = relative_pose(*(each.found.trajectory for each in cameras), 0)
+    relative = estimate_relative_pose(*(each.registration.trajectory for each in cameras), 0)
     write_bundle(RigPoses(relative=(relative,)), folders[0], RIG_POSES)
     capture = SimpleNamespace(cameras=tuple(each.camera for each in cameras))
-    monkeypatch.setattr(recover, "load_capture", lambda _: capture)
+    monkeypatch.setattr(recover, "load_capture", lambda *_: capture)
     monkeypatch.setattr(recover, "load_map", lambda _: SimpleNamespace(maps=(scene_map,)))
     monkeypatch.setattr(recover, "load_keyframes", lambda _: selection)
-    monkeypatch.setattr("bodycap_batch.registration.recover_lost", lambda found, *_: found)
+    monkeypatch.setattr(
+        "bodycap_batch.registration.recovery.recover.find_lost_poses", lambda found, *_: found
+    )
     out = tmp_path / "out"
     out.mkdir()
     arguments = {"registrations": [str(folder) for folder in folders], "map": "", "selection": ""}
@@ -208,16 +210,16 @@ def test_both_cameras_of_a_rig_get_poses_that_fit_together() -> None:
 def test_cameras_out_of_step_are_left_as_they_are() -> None:
     scene_map, (first, second) = _rig()
     late = replace(second, camera=replace(second.camera, offset_s=0.2))
-    assert _solved(scene_map, first, late) is first.found
+    assert _solved(scene_map, first, late) is first.registration
 
 
 def test_the_mean_place_is_robust_and_tells_its_spread() -> None:
     _, (first, second) = _rig()
-    poses = second.found.trajectory.gauge_from_cam.copy()
+    poses = second.registration.trajectory.gauge_from_cam.copy()
     poses[::4, :3, 3] += 1.0
     poses[::4, :3, :3] = poses[::4, :3, :3] @ so3_exp([0.0, 0.5, 0.0])
-    path = replace(second.found.trajectory, gauge_from_cam=poses)
-    found = relative_pose(first.found.trajectory, path, 0)
+    path = replace(second.registration.trajectory, gauge_from_cam=poses)
+    found = estimate_relative_pose(first.registration.trajectory, path, 0)
     assert found.instants == COUNT - len(BLIND)
     off = found.first_from_second[:3, :3].T @ FIRST_FROM_SECOND[:3, :3]
     assert rotation_angle_rad(off) < 2e-3
@@ -231,7 +233,9 @@ def test_the_mean_place_is_robust_and_tells_its_spread() -> None:
 
 def test_in_another_map_no_instant_tells() -> None:
     _, (first, second) = _rig()
-    found = relative_pose(first.found.trajectory, replace(second.found.trajectory, gauge="map-1"), 0)
+    found = estimate_relative_pose(
+        first.registration.trajectory, replace(second.registration.trajectory, gauge="map-1"), 0
+    )
     assert found.instants == 0
     assert np.isnan(found.spread)
 
@@ -246,16 +250,16 @@ def test_the_mean_rotation_of_equal_ones_is_theirs() -> None:
 )
 def test_time_stamps_of_one_exposure_may_be_rounded(shift_ns: int, expected: int) -> None:
     times_ns = np.arange(10) * FRAME_NS
-    frame = same_instants(times_ns, times_ns[:5] + shift_ns)
+    frame = match_instants(times_ns, times_ns[:5] + shift_ns)
     assert frame.tolist() == [each + expected if expected >= 0 else -1 for each in range(5)]
 
 
 def test_the_derivative_is_that_of_the_rig_s_motion() -> None:
     rng = np.random.default_rng(5)
     points, px = rng.uniform((-1, -1, 3), (1, 1, 5), (8, 3)), rng.uniform(0, 480, (8, 2))
-    alone = make_views(LENS, np.array([0, 8]), points, px)
+    alone = make_observations(LENS, np.array([0, 8]), points, px)
     places = np.array([np.eye(4), FIRST_FROM_SECOND])
-    rig = Views(
+    rig = Observations(
         bounds=alone.bounds, points=points, rays=alone.rays, px_from_ray=alone.px_from_ray,
         weight=alone.weight, member=np.array([0, 1] * 4), cam_from_rig=places,
     )  # fmt: skip

@@ -19,7 +19,12 @@ from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options
 from bodycap_batch.model import rolling_shutter
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp
-from bodycap_batch.model.rolling_shutter import apparent_readout, at_mid_row, image_velocity, looks_rolling
+from bodycap_batch.model.rolling_shutter import (
+    estimate_residual_readout,
+    has_visible_rolling_shutter,
+    image_velocity,
+    px_at_mid_row,
+)
 from bodycap_batch.model.scene import FrameStatus, Map, Registration, Trajectory
 
 LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([400.0, 400.0, 320.0, 240.0]))
@@ -98,10 +103,12 @@ def the_map(film: Film, keyframes: range) -> Any:
     return model
 
 
-def camera_of(film: Film, *, known: bool = False, stated_s: float = 0.0, turned: bool = False) -> Any:
+def camera_of(
+    film: Film, *, known: bool = False, stated_s: float = 0.0, may_be_sideways: bool = False
+) -> Any:
     return SimpleNamespace(
         camera=replace(LENS, sideways=film.sideways and known),
-        turned=turned,
+        may_be_sideways=may_be_sideways,
         rolling_shutter_known=known,
         rolling_shutter_s=stated_s,
         times_ns=film.trajectory().times_ns,
@@ -164,7 +171,7 @@ def test_a_stated_readout_time_is_not_looked_for() -> None:
 @pytest.mark.parametrize("readout_s", [0.02, -0.02, 0.0])
 def test_the_data_tell_which_way_a_turned_sensor_is_read(readout_s: float, sideways: bool) -> None:
     film = Film(readout_s, sideways)
-    model, told = readouts_of(film, camera_of(film, turned=True))
+    model, told = readouts_of(film, camera_of(film, may_be_sideways=True))
     assert told.source == ("estimated" if readout_s else "none found")
     assert abs(told.seconds - readout_s) <= 0.1 * abs(readout_s)
     assert told.sideways == (sideways and readout_s != 0.0)
@@ -175,7 +182,7 @@ def test_the_data_tell_which_way_a_turned_sensor_is_read(readout_s: float, sidew
 
 def test_a_stated_readout_runs_the_way_the_video_is_turned() -> None:
     film = Film(0.02, sideways=True)
-    _, told = readouts_of(film, camera_of(film, known=True, stated_s=0.02, turned=True))
+    _, told = readouts_of(film, camera_of(film, known=True, stated_s=0.02, may_be_sideways=True))
     assert (told.seconds, told.source, told.sideways) == (0.02, "stated", True)
 
 
@@ -187,9 +194,9 @@ def test_a_stated_readout_keeps_its_way_where_none_could_be_looked_for(
 
     monkeypatch.setattr(RollingModel, "find", fails)
     film = Film(0.02, sideways=True)
-    _, told = readouts_of(film, camera_of(film, known=True, stated_s=0.02, turned=True))
+    _, told = readouts_of(film, camera_of(film, known=True, stated_s=0.02, may_be_sideways=True))
     assert (told.seconds, told.sideways) == (0.02, True)
-    _, told = readouts_of(film, camera_of(film, turned=True))
+    _, told = readouts_of(film, camera_of(film, may_be_sideways=True))
     assert (told.seconds, told.source) == (0.0, "not determined: no convergence")
 
 
@@ -291,7 +298,7 @@ def test_pixels_move_to_where_they_are_at_the_middle_row() -> None:
     )
     cam_from_map = invert(film.map_from_cam[frame])
     there = LENS.project(film.points[points] @ cam_from_map[:3, :3].T + cam_from_map[:3, 3])
-    moved = at_mid_row(LENS, px, velocity, 0.02)
+    moved = px_at_mid_row(LENS, px, velocity, 0.02)
     before, after = (np.sqrt(((each - there) ** 2).sum(1).mean()) for each in (px, moved))
     assert before > 2.0
     assert after < 2.0 * NOISE_PX, "little but the pixels' own noise (√2 σ) is left"
@@ -335,7 +342,7 @@ def test_a_rolling_shutter_shows_in_the_residuals(readout_s: float, shows: bool,
         seen.append(film.points[points])
     frame_of, points_of = np.concatenate(frames), np.concatenate(seen)
     velocity = image_velocity(LENS, film.map_from_cam, film.trajectory().times_ns, frame_of, points_of)
-    apparent_s, sigma_s = apparent_readout(
+    apparent_s, sigma_s = estimate_residual_readout(
         replace(LENS, sideways=sideways),
         frame_of,
         np.concatenate(pixels),
@@ -356,7 +363,7 @@ def test_a_rolling_shutter_shows_in_the_residuals(readout_s: float, shows: bool,
     ],
 )
 def test_a_turned_sensor_is_looked_at_both_ways(film: Film, either_way: bool, shows: bool) -> None:
-    assert looks_rolling(*tracked(film), either_way=either_way) is shows
+    assert has_visible_rolling_shutter(*tracked(film), allow_sideways=either_way) is shows
 
 
 def tracked(film: Film) -> tuple[Registration, list[Map]]:
@@ -401,6 +408,6 @@ def test_velocities_of_a_long_video_are_found_in_parts(monkeypatch: pytest.Monke
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     # Beside the velocities: a part's poses (128 bytes an observation) and what is made of them.
-    assert found.nbytes <= peak < found.nbytes + 4 * 128 * rolling_shutter._PART
-    monkeypatch.setattr(rolling_shutter, "_PART", count)
+    assert found.nbytes <= peak < found.nbytes + 4 * 128 * rolling_shutter._BATCH_ROWS
+    monkeypatch.setattr(rolling_shutter, "_BATCH_ROWS", count)
     assert np.array_equal(image_velocity(LENS, poses, times_ns, frame, points), found)

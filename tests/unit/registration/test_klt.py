@@ -16,8 +16,8 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.registration.tracking import frame_ranges
-from bodycap_batch.registration.tracking.frame_ranges import Known, all_tracks
-from bodycap_batch.registration.tracking.klt import Anchor, Tracks, track_stretch
+from bodycap_batch.registration.tracking.frame_ranges import TrackCache, track_all
+from bodycap_batch.registration.tracking.klt import KeyframePoints, Tracks, track_range
 
 STEP_PX = np.array([3.5, -1.25])
 COUNT = 48
@@ -40,11 +40,11 @@ def _video(seen_to_px: float = 640.0) -> CaptureCamera:
     def sees_room(px: np.ndarray) -> np.ndarray:
         return px[:, 0] < seen_to_px
 
-    video = SimpleNamespace(times_ns=np.arange(COUNT), grey_frames=grey_frames, sees_room=sees_room)
+    video = SimpleNamespace(times_ns=np.arange(COUNT), grey_frames=grey_frames, is_unmasked=sees_room)
     return cast("CaptureCamera", video)
 
 
-def _anchors(frames: list[int]) -> dict[int, Anchor]:
+def _anchors(frames: list[int]) -> dict[int, KeyframePoints]:
     """A grid of points of the plane in each keyframe; a keyframe's detector is off by up to half a pixel."""
     rng = np.random.default_rng(1)
     grid = np.stack(np.meshgrid(np.arange(-120, 640, 40), np.arange(0, 600, 40)), axis=-1).reshape(-1, 2)
@@ -53,11 +53,11 @@ def _anchors(frames: list[int]) -> dict[int, Anchor]:
         px = grid + frame * STEP_PX
         point = np.flatnonzero(((px > 25) & (px < (615, 455))).all(axis=1))
         seen = px[point] + rng.uniform(-0.5, 0.5, (len(point), 2))
-        out[frame] = Anchor(np.arange(len(point)) * 2, point, seen.astype(np.float32))
+        out[frame] = KeyframePoints(np.arange(len(point)) * 2, point, seen.astype(np.float32))
     return out
 
 
-def _shift_from_anchor(tracks: Tracks, anchors: dict[int, Anchor]) -> np.ndarray:
+def _shift_from_anchor(tracks: Tracks, anchors: dict[int, KeyframePoints]) -> np.ndarray:
     """(M,2) how much further each observation moved than the plane did."""
     began = np.array(
         [
@@ -70,7 +70,7 @@ def _shift_from_anchor(tracks: Tracks, anchors: dict[int, Anchor]) -> np.ndarray
 
 def test_points_are_followed_from_both_keyframes_and_end_in_their_observations() -> None:
     anchors = _anchors([4, 20])
-    tracks = Tracks.join(list(track_stretch(_video(), anchors, 0, 30, CONTEXT)))
+    tracks = Tracks.join_and_clear(list(track_range(_video(), anchors, 0, 30, CONTEXT)))
     # Up to 16 steps of a few hundredths of a pixel each, and a wrapped border that enters some windows.
     assert np.median(np.linalg.norm(_shift_from_anchor(tracks, anchors), axis=1)) < 0.15
     for frame in (5, 12, 19):
@@ -85,14 +85,14 @@ def test_a_point_seen_elsewhere_by_the_next_keyframe_is_followed_on_its_own() ->
     anchors = _anchors([4, 12])
     shared = np.isin(anchors[12].point, anchors[4].point)
     other = np.roll(anchors[12].point, 1)
-    wrong = Anchor(anchors[12].feature, np.where(shared, other, anchors[12].point), anchors[12].px)
-    tracks = Tracks.join(list(track_stretch(_video(), {4: anchors[4], 12: wrong}, 4, 13, CONTEXT)))
+    wrong = KeyframePoints(anchors[12].feature, np.where(shared, other, anchors[12].point), anchors[12].px)
+    tracks = Tracks.join_and_clear(list(track_range(_video(), {4: anchors[4], 12: wrong}, 4, 13, CONTEXT)))
     # Were the neighbour's path taken for it, it would be off by the grid's 40 px.
     assert np.linalg.norm(_shift_from_anchor(tracks, anchors), axis=1).max() < 5.0
 
 
 def test_tracks_end_where_the_mask_begins() -> None:
-    tracks = Tracks.join(list(track_stretch(_video(400.0), _anchors([4, 20]), 0, 30, CONTEXT)))
+    tracks = Tracks.join_and_clear(list(track_range(_video(400.0), _anchors([4, 20]), 0, 30, CONTEXT)))
     moved = tracks.frame != tracks.keyframe
     assert moved.sum() > 1000
     assert tracks.px[moved, 0].max() < 400.0 + STEP_PX[0] * 16
@@ -100,11 +100,11 @@ def test_tracks_end_where_the_mask_begins() -> None:
 
 def test_a_keyframe_taken_out_and_put_back_leaves_no_track_twice() -> None:
     video, anchors = _video(), _anchors([4, 14, 24, 40])
-    fresh = all_tracks(video, anchors, None, CONTEXT)
+    fresh = track_all(video, anchors, None, CONTEXT)
     rest = {frame: anchor for frame, anchor in anchors.items() if frame != 24}
-    without = all_tracks(video, rest, Known(fresh, sorted(anchors)), CONTEXT)
-    again = all_tracks(video, anchors, Known(without, sorted(rest)), CONTEXT)
-    for found, wanted in ((without, all_tracks(video, rest, None, CONTEXT)), (again, fresh)):
+    without = track_all(video, rest, TrackCache(fresh, sorted(anchors)), CONTEXT)
+    again = track_all(video, anchors, TrackCache(without, sorted(rest)), CONTEXT)
+    for found, wanted in ((without, track_all(video, rest, None, CONTEXT)), (again, fresh)):
         for name in ("frame", "keyframe", "feature", "px"):
             np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
 
@@ -112,11 +112,11 @@ def test_a_keyframe_taken_out_and_put_back_leaves_no_track_twice() -> None:
 def test_threads_find_the_same_tracks_and_tell_growing_progress() -> None:
     video, anchors = _video(), _anchors([2, 10, 17, 25, 33, 44])
     told: list[int] = []
-    one = all_tracks(video, anchors, None, CONTEXT)
+    one = track_all(video, anchors, None, CONTEXT)
     context = StageContext(
         work_dir=Path(), threads=3, progress=lambda done, total, what="": told.append(done)
     )
-    three = all_tracks(video, anchors, None, context)
+    three = track_all(video, anchors, None, context)
     for name in ("frame", "keyframe", "feature", "px"):
         np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
     assert told == sorted(told)
@@ -126,7 +126,7 @@ def test_threads_find_the_same_tracks_and_tell_growing_progress() -> None:
 def test_cancelling_stops_all_threads() -> None:
     context = StageContext(work_dir=Path(), threads=2, cancelled=lambda: True)
     with pytest.raises(Cancelled):
-        all_tracks(_video(), _anchors([2, 20, 40]), None, context)
+        track_all(_video(), _anchors([2, 20, 40]), None, context)
 
 
 def test_tracks_of_a_long_video_are_joined_in_little_more_than_their_own_memory() -> None:
@@ -138,7 +138,7 @@ def test_tracks_of_a_long_video_are_joined_in_little_more_than_their_own_memory(
     parts = [Tracks(part.frame + 0, part.keyframe + 0, part.feature + 0, part.px) for part in parts]
     own = tracemalloc.get_traced_memory()[0]
     tracemalloc.reset_peak()
-    joined = Tracks.join(parts)
+    joined = Tracks.join_and_clear(parts)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert len(joined.frame) == 100_000
@@ -153,12 +153,14 @@ def test_what_was_tracked_before_is_held_once_while_new_tracks_join_it(
     rng = np.random.default_rng(2)
     frame = np.sort(rng.integers(3, COUNT - 3, 200_000))
     px = rng.random((len(frame), 2)).astype(np.float32)
-    known = Known(Tracks(frame, np.full(len(frame), 2), np.arange(len(frame)), px), [2, COUNT - 2])
+    known = TrackCache(Tracks(frame, np.full(len(frame), 2), np.arange(len(frame)), px), [2, COUNT - 2])
     video = _video()
-    monkeypatch.setattr(frame_ranges, "_track", lambda *_: [Tracks.join([])])
+    monkeypatch.setattr(frame_ranges, "_track_ranges", lambda *_: [Tracks.join_and_clear([])])
     tracemalloc.start()
-    anchors = dict.fromkeys((2, COUNT - 2, COUNT - 1), Anchor(*np.zeros((2, 0), np.int64), np.zeros((0, 2))))
-    joined = all_tracks(video, anchors, known, CONTEXT)
+    anchors = dict.fromkeys(
+        (2, COUNT - 2, COUNT - 1), KeyframePoints(*np.zeros((2, 0), np.int64), np.zeros((0, 2)))
+    )
+    joined = track_all(video, anchors, known, CONTEXT)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert len(joined.frame) == len(frame)

@@ -11,16 +11,20 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, transform_points
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
-from bodycap_batch.registration import RigCamera, without_contradicted
-from bodycap_batch.registration.poses.misplaced_keyframes import misplaced, without_keyframes
-from bodycap_batch.registration.poses.pnp import PoseLimits
+from bodycap_batch.registration import RegisteredCamera
+from bodycap_batch.registration.poses.misplaced_keyframes import (
+    find_misplaced_keyframes,
+    map_without_keyframes,
+)
+from bodycap_batch.registration.poses.pnp import AcceptanceCriteria
+from bodycap_batch.registration.recovery.preparation import remove_misplaced_keyframes
 from bodycap_batch.registration.tracking.klt import Tracks
 
 _LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([400.0, 400.0, 320.0, 240.0]))
 _KEYFRAMES = 12
 _STEP = 5
 _POINTS = 120
-_LIMITS = PoseLimits(max_error_px=2.0, min_inliers=15, max_sigma_depth=0.05)
+_LIMITS = AcceptanceCriteria(max_error_px=2.0, min_inliers=15, max_sigma_depth=0.05)
 
 
 def _walk() -> FloatArray:
@@ -59,14 +63,14 @@ def _map(moved: IntArray, shift_m: float) -> tuple[Map, Tracks]:
         for source, to in ((first, second), (second, first)):
             frame, origin = (np.full(_POINTS, number * _STEP) for number in (to, source))
             parts.append(Tracks(frame, origin, np.arange(_POINTS), true_px[to].astype(np.float32)))
-    return scene_map, Tracks.join(parts)
+    return scene_map, Tracks.join_and_clear(parts)
 
 
 @pytest.mark.parametrize("moved", [[5], [4, 5, 6], [0, 1], [10, 11]])
 def test_a_block_in_the_wrong_place_is_blamed(moved: list[int]) -> None:
     # 0.2 m at 3 m and 400 px are 27 px: far beyond four limits of 2 px.
     scene_map, tracks = _map(np.array(moved), 0.2)
-    assert misplaced("cam", scene_map, tracks, _LIMITS).tolist() == moved
+    assert find_misplaced_keyframes("cam", scene_map, tracks, _LIMITS).tolist() == moved
 
 
 def test_tracks_that_slipped_condemn_no_keyframe() -> None:
@@ -76,7 +80,7 @@ def test_tracks_that_slipped_condemn_no_keyframe() -> None:
     gap |= (tracks.frame == 4 * _STEP) & (tracks.keyframe == 5 * _STEP)
     px[gap] += np.random.default_rng(1).normal(0.0, 40.0, (int(gap.sum()), 2)).astype(np.float32)
     slipped = Tracks(tracks.frame, tracks.keyframe, tracks.feature, px)
-    assert len(misplaced("cam", scene_map, slipped, _LIMITS)) == 0
+    assert len(find_misplaced_keyframes("cam", scene_map, slipped, _LIMITS)) == 0
 
 
 def test_tracks_that_lead_to_where_a_keyframe_stands_do_not_speak_against_it() -> None:
@@ -88,15 +92,15 @@ def test_tracks_that_lead_to_where_a_keyframe_stands_do_not_speak_against_it() -
     half = np.flatnonzero(gap & (tracks.feature % 2 == 0))
     px[half] += np.random.default_rng(1).uniform(40.0, 120.0, (len(half), 2)).astype(np.float32)
     slipped = Tracks(tracks.frame, tracks.keyframe, tracks.feature, px)
-    assert len(misplaced("cam", scene_map, slipped, _LIMITS)) == 0
+    assert len(find_misplaced_keyframes("cam", scene_map, slipped, _LIMITS)) == 0
 
 
 def test_a_bent_but_whole_map_is_left_alone() -> None:
     # 0.03 m are 4 px, two limits.
     scene_map, tracks = _map(np.array([4, 5, 6]), 0.03)
-    assert len(misplaced("cam", scene_map, tracks, _LIMITS)) == 0
-    assert len(misplaced("cam", scene_map, Tracks.join([]), _LIMITS)) == 0
-    assert len(misplaced("other", scene_map, tracks, _LIMITS)) == 0
+    assert len(find_misplaced_keyframes("cam", scene_map, tracks, _LIMITS)) == 0
+    assert len(find_misplaced_keyframes("cam", scene_map, Tracks.join_and_clear([]), _LIMITS)) == 0
+    assert len(find_misplaced_keyframes("other", scene_map, tracks, _LIMITS)) == 0
 
 
 def test_the_scale_of_a_map_changes_no_verdict() -> None:
@@ -106,12 +110,12 @@ def test_the_scale_of_a_map_changes_no_verdict() -> None:
         poses[:, :3, 3] *= factor
         fields = {name: getattr(scene_map, name) for name in scene_map.__dataclass_fields__}
         scaled = Map(**{**fields, "map_from_cam": poses, "points": factor * scene_map.points})
-        assert misplaced("cam", scaled, tracks, _LIMITS).tolist() == [4, 5, 6]
+        assert find_misplaced_keyframes("cam", scaled, tracks, _LIMITS).tolist() == [4, 5, 6]
 
 
 def test_the_rest_keeps_its_observations() -> None:
     scene_map, _ = _map(np.array([5]), 0.2)
-    rest = without_keyframes(scene_map, np.array([5]))
+    rest = map_without_keyframes(scene_map, np.array([5]))
     assert rest.gauge == scene_map.gauge
     assert rest.keyframe_frame.tolist() == [k * _STEP for k in range(_KEYFRAMES) if k != 5]
     assert len(rest.obs_px) == (_KEYFRAMES - 1) * _POINTS
@@ -119,7 +123,7 @@ def test_the_rest_keeps_its_observations() -> None:
     assert kept.tolist() == [7, -1]
 
 
-def _registered(tracks: Tracks, gauge: str) -> RigCamera:
+def _registered(tracks: Tracks, gauge: str) -> RegisteredCamera:
     """A camera and what registration left of it."""
     count = _KEYFRAMES * _STEP
     times_ns, none = np.arange(count) * 33_333_333, np.zeros(0, np.int64)
@@ -154,7 +158,7 @@ def _registered(tracks: Tracks, gauge: str) -> RigCamera:
         wanted_keyframes=none,
         tried_keyframes=none,
     )
-    return RigCamera(camera=camera, found=found)
+    return RegisteredCamera(camera=camera, registration=found)
 
 
 @pytest.mark.parametrize(("gauge", "left_out"), [("g", [5]), ("another", [])])
@@ -166,5 +170,7 @@ def test_what_registration_left_out_is_left_out_of_the_map(gauge: str, left_out:
     selection = KeyframeSelection(
         camera="cam", frames=np.zeros(0, np.int64), frame_count=0, sharpness=np.zeros(0), noise_px=0.2
     )
-    rest = without_contradicted(scene_map, [_registered(tracks, gauge)], selection, RegistrationOptions())
+    rest = remove_misplaced_keyframes(
+        scene_map, [_registered(tracks, gauge)], selection, RegistrationOptions()
+    )
     assert rest.keyframe_frame.tolist() == [k * _STEP for k in range(_KEYFRAMES) if k not in left_out]

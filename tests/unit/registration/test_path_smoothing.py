@@ -10,8 +10,7 @@ import pytest
 from bodycap_batch.config.lost_frames import LEAST_LOST
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.scene import FrameStatus, Trajectory
-from bodycap_batch.registration.recovery.path_smoothing import steadied
-from bodycap_batch.registration.stage import _finished
+from bodycap_batch.registration.recovery.path_smoothing import smooth_if_final, smooth_weak_centres
 
 COUNT = 90
 WEAK = np.arange(40, 50)
@@ -53,7 +52,7 @@ def _off_m(path: Trajectory) -> np.ndarray:
 
 def test_weak_centres_come_nearer_to_the_truth_and_strong_ones_stay() -> None:
     before = _measured()
-    after = steadied(before)
+    after = smooth_weak_centres(before)
     assert np.sqrt((_off_m(after)[WEAK] ** 2).mean()) < 0.7 * np.sqrt((_off_m(before)[WEAK] ** 2).mean())
     strong = np.setdiff1d(np.arange(COUNT), WEAK)
     np.testing.assert_array_equal(after.gauge_from_cam[strong], before.gauge_from_cam[strong])
@@ -61,7 +60,7 @@ def test_weak_centres_come_nearer_to_the_truth_and_strong_ones_stay() -> None:
 
 def test_covariances_and_statuses_stay() -> None:
     before = _measured()
-    after = steadied(before)
+    after = smooth_weak_centres(before)
     np.testing.assert_array_equal(after.covariance, before.covariance)
     assert after.status == before.status
 
@@ -71,7 +70,7 @@ def test_a_centre_that_motion_contradicts_stays_as_it_was_measured() -> None:
     poses = before.gauge_from_cam.copy()
     poses[45, :3, 3] += 20.0 * WEAK_M
     leaping = _with(before, poses)
-    np.testing.assert_array_equal(steadied(leaping).gauge_from_cam[45], poses[45])
+    np.testing.assert_array_equal(smooth_weak_centres(leaping).gauge_from_cam[45], poses[45])
 
 
 def test_the_turn_follows_the_centre_as_points_tie_them() -> None:
@@ -84,7 +83,7 @@ def test_the_turn_follows_the_centre_as_points_tie_them() -> None:
     covariance[:, 3:, :3] = (lever @ spread).swapaxes(1, 2)
     covariance[:, :3, :3] += lever @ spread @ lever.T
     tied = _with(before, before.gauge_from_cam, covariance)
-    after = steadied(tied)
+    after = smooth_weak_centres(tied)
     shift = (after.gauge_from_cam - before.gauge_from_cam)[WEAK, :3, 3]
     frame = int(WEAK[np.argmax(np.linalg.norm(shift, axis=1))])
     turned = after.gauge_from_cam[frame, :3, :3].T @ before.gauge_from_cam[frame, :3, :3]
@@ -97,7 +96,7 @@ def test_the_turn_follows_the_centre_as_points_tie_them() -> None:
 @pytest.mark.parametrize("count", [1, 3, 19])
 def test_a_path_too_short_to_tell_how_the_camera_moves_stays(count: int) -> None:
     before = _measured(count)
-    np.testing.assert_array_equal(steadied(before).gauge_from_cam, before.gauge_from_cam)
+    np.testing.assert_array_equal(smooth_weak_centres(before).gauge_from_cam, before.gauge_from_cam)
 
 
 @pytest.mark.parametrize("scale", [0.01, 100.0])
@@ -106,16 +105,16 @@ def test_the_unit_of_the_map_does_not_matter(scale: float) -> None:
     poses, covariance = before.gauge_from_cam.copy(), before.covariance.copy()
     poses[:, :3, 3] *= scale
     covariance[:, 3:, 3:] *= scale**2
-    after = steadied(_with(before, poses, covariance)).gauge_from_cam
+    after = smooth_weak_centres(_with(before, poses, covariance)).gauge_from_cam
     np.testing.assert_allclose(
-        after[:, :3, 3] / scale, steadied(before).gauge_from_cam[:, :3, 3], rtol=1e-5, atol=1e-6
+        after[:, :3, 3] / scale, smooth_weak_centres(before).gauge_from_cam[:, :3, 3], rtol=1e-5, atol=1e-6
     )
 
 
 def test_only_movable_centres_move() -> None:
     before, movable = _measured(), np.ones(COUNT, dtype=bool)
     movable[WEAK[:5]] = False
-    after = steadied(before, movable)
+    after = smooth_weak_centres(before, movable)
     moved = (after.gauge_from_cam != before.gauge_from_cam).any(axis=(1, 2))
     assert not moved[WEAK[:5]].any()
     assert moved[WEAK[5:]].any()
@@ -130,7 +129,7 @@ def test_where_lost_frames_are_looked_for_next_the_path_is_left_to_that(lost: in
     path = replace(
         path, gauge_from_cam=path.gauge_from_cam * none, covariance=path.covariance * none, status=status
     )
-    after = _finished(path)
+    after = smooth_if_final(path)
     assert (after.gauge_from_cam[WEAK] != path.gauge_from_cam[WEAK]).any() == moves
 
 

@@ -9,10 +9,10 @@ import pytest
 
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp, transform_points
-from bodycap_batch.model.rolling_shutter import at_mid_row, image_velocity
+from bodycap_batch.model.rolling_shutter import image_velocity, px_at_mid_row
 from bodycap_batch.model.scene import FrameStatus, Map, Trajectory
 from bodycap_batch.registration.recovery import point_refinement
-from bodycap_batch.registration.recovery.point_refinement import settled_points, without_weak_ends
+from bodycap_batch.registration.recovery.point_refinement import refine_points, remove_weak_boundary_poses
 
 COUNT, LOST = 40, range(18, 24)
 MIN_INLIERS = 15
@@ -48,7 +48,7 @@ def _path(inliers: dict[int, int] | None = None, status: dict[int, FrameStatus] 
 
 
 def _taken(path: Trajectory) -> list[int]:
-    after = without_weak_ends(path, MIN_INLIERS)
+    after = remove_weak_boundary_poses(path, MIN_INLIERS)
     taken = np.flatnonzero(path.localised & ~after.localised).tolist()
     assert all(after.status[frame] is FrameStatus.UNCONFIRMED for frame in taken)
     return list(taken)
@@ -68,7 +68,7 @@ def test_weak_poses_far_from_lost_frames_and_at_the_ends_of_a_video_stay() -> No
 
 def test_where_little_is_seen_all_the_time_a_path_is_kept() -> None:
     taken = _taken(_path(dict.fromkeys(range(COUNT), 30)))
-    reach = point_refinement._FARTHEST
+    reach = point_refinement._MAX_BOUNDARY_FRAMES
     assert taken == [*range(LOST[0] - reach, LOST[0]), *range(LOST[-1] + 1, LOST[-1] + 1 + reach)]
 
 
@@ -100,7 +100,7 @@ def _map(path: Trajectory, *, readout_s: float = 0.0) -> Map:
         )
         rows.append(np.full(len(inside), row))
         point.append(inside)
-        px.append(at_mid_row(LENS, seen_px[inside], velocity, -readout_s))
+        px.append(px_at_mid_row(LENS, seen_px[inside], velocity, -readout_s))
     keyframe_of, which = np.concatenate(rows), np.concatenate(point)
     wrong = int(np.flatnonzero(frames == 15)[0])
     poses[wrong, :3, 3] += (WRONG_M, 0.0, 0.0)
@@ -133,7 +133,7 @@ def _off_m(scene: Map) -> np.ndarray:
 def test_points_come_to_where_frames_with_poses_see_them() -> None:
     path = _path()
     before = _map(path)
-    after = settled_points(before, [path])
+    after = refine_points(before, [path])
     assert np.percentile(_off_m(before), 90) > 0.9 * WRONG_M
     # Half a pixel at 420 pixels' focal length and 3 m is 4 mm across; along the line of sight it is more.
     assert np.median(_off_m(after)) < 0.02
@@ -145,7 +145,7 @@ def test_points_come_to_where_frames_with_poses_see_them() -> None:
 def test_keyframes_without_a_pose_stay_and_see_nothing() -> None:
     path = _path()
     before = _map(path)
-    after = settled_points(before, [path])
+    after = refine_points(before, [path])
     lost = np.flatnonzero(np.isin(before.keyframe_frame, LOST))
     assert len(lost) == 2
     np.testing.assert_array_equal(after.map_from_cam[lost], before.map_from_cam[lost])
@@ -160,7 +160,7 @@ def test_views_that_suit_no_place_are_left_out() -> None:
     first = np.unique(before.obs_point, return_index=True)[1]
     often = first[np.bincount(before.obs_point)[before.obs_point[first]] > 5][:20]
     px[often] += 40.0
-    after = settled_points(replace(before, obs_px=px), [path])
+    after = refine_points(replace(before, obs_px=px), [path])
     kept = set(after.obs_feature.tolist())
     assert not kept & set(before.obs_feature[often].tolist())
     assert np.median(_off_m(after)) < 0.02
@@ -169,7 +169,7 @@ def test_views_that_suit_no_place_are_left_out() -> None:
 def test_keyframes_of_a_camera_in_another_gauge_keep_their_place_and_their_say() -> None:
     path = _path()
     before = _map(path)
-    after = settled_points(before, [replace(path, gauge="map-1")])
+    after = refine_points(before, [replace(path, gauge="map-1")])
     np.testing.assert_array_equal(after.map_from_cam, before.map_from_cam)
     assert np.isin(after.obs_keyframe, np.flatnonzero(np.isin(before.keyframe_frame, LOST))).any()
 
@@ -178,7 +178,7 @@ def test_a_rolling_shutter_is_undone() -> None:
     path = _path(status=dict.fromkeys(LOST, FrameStatus.REGISTERED))
     rolled = _map(path, readout_s=0.03)
     off = [
-        np.median(_off_m(settled_points(replace(rolled, readout_s=each), [path])))
+        np.median(_off_m(refine_points(replace(rolled, readout_s=each), [path])))
         for each in ({}, rolled.readout_s)
     ]
     assert off[1] < 0.02
@@ -187,9 +187,9 @@ def test_a_rolling_shutter_is_undone() -> None:
 
 def test_a_few_at_a_time_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     path = _path()
-    whole = settled_points(_map(path), [path])
-    monkeypatch.setattr(point_refinement, "_CHUNK", 50)
-    parts = settled_points(_map(path), [path])
+    whole = refine_points(_map(path), [path])
+    monkeypatch.setattr(point_refinement, "_CHUNK_ROWS", 50)
+    parts = refine_points(_map(path), [path])
     np.testing.assert_allclose(parts.points, whole.points, atol=1e-9)
     np.testing.assert_array_equal(parts.obs_feature, whole.obs_feature)
 
@@ -204,7 +204,7 @@ def test_a_map_that_nobody_sees_stays() -> None:
         obs_feature=scene.obs_feature[:0],
         obs_px=scene.obs_px[:0],
     )
-    np.testing.assert_array_equal(settled_points(none, [path]).points, scene.points)
+    np.testing.assert_array_equal(refine_points(none, [path]).points, scene.points)
 
 
 def test_the_scale_of_the_map_changes_nothing() -> None:
@@ -216,8 +216,8 @@ def test_the_scale_of_the_map_changes_nothing() -> None:
     covariance = path.covariance.copy()
     covariance[:, 3:] *= factor
     covariance[:, :, 3:] *= factor
-    scaled = settled_points(
+    scaled = refine_points(
         replace(small, map_from_cam=poses, points=small.points * factor),
         [replace(path, gauge_from_cam=known, covariance=covariance)],
     )
-    np.testing.assert_allclose(scaled.points / factor, settled_points(small, [path]).points, atol=1e-6)
+    np.testing.assert_allclose(scaled.points / factor, refine_points(small, [path]).points, atol=1e-6)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodycap_batch.registration.poses.pose_outliers import lone_poses, pose_jumps
+from bodycap_batch.registration.poses.pose_outliers import find_outlier_poses, isolated_poses
 
 SIGMA = np.full(60, 0.004)
 TIMES_NS = np.arange(60) * 33_333_333
@@ -21,7 +21,7 @@ def test_one_wrong_pose_is_found_at_any_scale(scale: float) -> None:
     rng = np.random.default_rng(0)
     centres = _swing(1.0) + rng.normal(0, 0.004, (60, 3))
     centres[31] += [0.0, 0.35, -0.2]
-    assert np.flatnonzero(pose_jumps(scale * centres, scale * SIGMA, TIMES_NS)).tolist() == [31]
+    assert np.flatnonzero(find_outlier_poses(scale * centres, scale * SIGMA, TIMES_NS)).tolist() == [31]
 
 
 @pytest.mark.parametrize("scale", [0.1, 10.0])
@@ -34,7 +34,7 @@ def test_wrong_poses_in_a_row_are_found_and_no_right_one(
     centres = _swing(1.0) + rng.normal(0, 0.002, (60, 3))
     off = rng.normal(size=(1 if together else length, 3))
     centres[31 : 31 + length] += 0.4 * off / np.linalg.norm(off, axis=1, keepdims=True)
-    found = np.flatnonzero(pose_jumps(scale * centres, 0.5 * scale * SIGMA, TIMES_NS))
+    found = np.flatnonzero(find_outlier_poses(scale * centres, 0.5 * scale * SIGMA, TIMES_NS))
     assert found.tolist() == list(range(31, 31 + length))
 
 
@@ -42,10 +42,10 @@ def test_a_path_that_steps_aside_or_rebounds_is_no_run_of_wrong_poses() -> None:
     rng = np.random.default_rng(7)
     aside = np.cumsum(np.full((60, 3), 0.02), axis=0) + rng.normal(0, 0.0002, (60, 3))
     aside[30:] += [0.0, 0.3, 0.0]
-    assert pose_jumps(aside, 0.0003 * np.ones(60), TIMES_NS).sum() <= 1
+    assert find_outlier_poses(aside, 0.0003 * np.ones(60), TIMES_NS).sum() <= 1
     # A hand at 3 m/s that hits a wall and comes back as fast.
     rebound = np.abs(np.arange(60) - 30.4)[:, None] * [0.1, 0.0, 0.0] + rng.normal(0, 0.0002, (60, 3))
-    assert not pose_jumps(rebound, 0.0003 * np.ones(60), TIMES_NS).any()
+    assert not find_outlier_poses(rebound, 0.0003 * np.ones(60), TIMES_NS).any()
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,9 @@ def test_a_gesture_there_and_back_is_no_jump_however_few_frames_see_it(
         done = np.clip((times - 30 / hz) / seconds + 0.5, 0, 1)
         centres = np.random.default_rng(8).normal(0, 0.0007, (60, 3))
         centres[:, 0] += height * np.sin(np.pi * done) ** 2
-        refused += pose_jumps(centres, np.full(60, 0.001), np.round(times * 1e9).astype(np.int64)).sum()
+        refused += find_outlier_poses(
+            centres, np.full(60, 0.001), np.round(times * 1e9).astype(np.int64)
+        ).sum()
     # One that a single frame sees, still before and behind it, cannot be told from a jump.
     assert refused <= 1
 
@@ -72,42 +74,42 @@ def test_a_wrong_pose_of_a_slow_video_is_found(hz: int) -> None:
     centres = np.stack([0.2 * np.sin(2 * times), 0.5 * times, 0.0 * times], axis=1)
     centres += np.random.default_rng(9).normal(0, 0.002, (60, 3))
     centres[31] += [0.0, 0.2, -0.2]
-    found = pose_jumps(centres, np.full(60, 0.002), np.round(times * 1e9).astype(np.int64))
+    found = find_outlier_poses(centres, np.full(60, 0.002), np.round(times * 1e9).astype(np.int64))
     assert np.flatnonzero(found).tolist() == [31]
 
 
 def test_a_violent_swing_is_no_jump() -> None:
     rng = np.random.default_rng(1)
     for hz in (0.5, 2.0, 4.0):
-        assert not pose_jumps(_swing(hz) + rng.normal(0, 0.004, (60, 3)), SIGMA, TIMES_NS).any()
+        assert not find_outlier_poses(_swing(hz) + rng.normal(0, 0.004, (60, 3)), SIGMA, TIMES_NS).any()
 
 
 def test_a_sudden_stop_is_no_jump() -> None:
     centres = np.cumsum(np.where(np.arange(60) < 30, 0.05, 0.0))[:, None] * np.array([1.0, 0.2, 0.0])
     noisy = centres + np.random.default_rng(2).normal(0, 0.004, (60, 3))
-    assert not pose_jumps(noisy, SIGMA, TIMES_NS).any()
+    assert not find_outlier_poses(noisy, SIGMA, TIMES_NS).any()
 
 
 def test_a_jerk_is_no_jump_however_exactly_it_is_seen() -> None:
     # 2 m/s to nothing within one frame: bent by 3 cm, 100 sigmas, where nothing else bends.
     centres = np.cumsum(np.where(np.arange(60) < 30, 0.067, 0.0))[:, None] * np.array([1.0, 0.2, 0.0])
     noisy = centres + np.random.default_rng(5).normal(0, 0.0002, (60, 3))
-    assert not pose_jumps(noisy, 0.0003 * np.ones(60), TIMES_NS).any()
+    assert not find_outlier_poses(noisy, 0.0003 * np.ones(60), TIMES_NS).any()
     noisy[12] += [0.0, 0.033, 0.0]
-    assert np.flatnonzero(pose_jumps(noisy, 0.0003 * np.ones(60), TIMES_NS)).tolist() == [12]
+    assert np.flatnonzero(find_outlier_poses(noisy, 0.0003 * np.ones(60), TIMES_NS)).tolist() == [12]
 
 
 def test_wide_covariance_and_gaps_are_no_evidence() -> None:
     rng = np.random.default_rng(3)
     centres = _swing(1.0) + rng.normal(0, 0.004, (60, 3))
     centres[31] += 0.2
-    assert not pose_jumps(centres, np.where(np.arange(60) == 31, 0.1, SIGMA), TIMES_NS).any()
+    assert not find_outlier_poses(centres, np.where(np.arange(60) == 31, 0.1, SIGMA), TIMES_NS).any()
     centres[30] = np.nan
-    assert not pose_jumps(centres, np.where(np.arange(60) == 31, 0.1, SIGMA), TIMES_NS).any()
-    assert np.flatnonzero(pose_jumps(centres, SIGMA, TIMES_NS)).tolist() == [31]
+    assert not find_outlier_poses(centres, np.where(np.arange(60) == 31, 0.1, SIGMA), TIMES_NS).any()
+    assert np.flatnonzero(find_outlier_poses(centres, SIGMA, TIMES_NS)).tolist() == [31]
     centres[33] = np.nan
-    assert not pose_jumps(centres, SIGMA, TIMES_NS).any()
-    assert pose_jumps(centres[:2], SIGMA[:2], TIMES_NS[:2]).tolist() == [False, False]
+    assert not find_outlier_poses(centres, SIGMA, TIMES_NS).any()
+    assert find_outlier_poses(centres[:2], SIGMA[:2], TIMES_NS[:2]).tolist() == [False, False]
 
 
 @pytest.mark.parametrize("backwards", [False, True])
@@ -119,10 +121,10 @@ def test_a_wrong_pose_beside_a_lost_stretch_is_told_from_its_neighbour(
     centres[20:30] = np.nan
     if backwards:
         centres = centres[::-1].copy()
-    assert not pose_jumps(centres, SIGMA, TIMES_NS).any()
+    assert not find_outlier_poses(centres, SIGMA, TIMES_NS).any()
     frame = 59 - wrong if backwards else wrong
     centres[frame] += [0.0, 0.2, -0.1]
-    assert np.flatnonzero(pose_jumps(centres, SIGMA, TIMES_NS)).tolist() == [frame]
+    assert np.flatnonzero(find_outlier_poses(centres, SIGMA, TIMES_NS)).tolist() == [frame]
 
 
 @pytest.mark.parametrize(
@@ -139,5 +141,5 @@ def test_a_wrong_pose_beside_a_lost_stretch_is_told_from_its_neighbour(
 def test_a_weak_pose_that_no_neighbour_confirms_is_doubtful(seen: str, refused: list[int]) -> None:
     localised = np.array([letter == "#" for letter in seen])
     inliers = np.where(localised, 40, 0)
-    assert np.flatnonzero(lone_poses(localised, inliers, 60)).tolist() == refused
-    assert not lone_poses(localised, inliers, 40).any(), "strong evidence stands alone"
+    assert np.flatnonzero(isolated_poses(localised, inliers, 60)).tolist() == refused
+    assert not isolated_poses(localised, inliers, 40).any(), "strong evidence stands alone"

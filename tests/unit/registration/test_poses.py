@@ -9,14 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bodycap_batch.core.context import THREADS_VARIABLE
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp, so3_log
 from bodycap_batch.model.scene import FrameStatus
 from bodycap_batch.registration.poses import batched_pnp
-from bodycap_batch.registration.poses.batched_pnp import make_views
-from bodycap_batch.registration.poses.keyframe_requests import lost_runs, wanted_keyframes
-from bodycap_batch.registration.poses.pnp import MAP_VARIANCE_RATIO, FramePose, PoseLimits, solve_poses
+from bodycap_batch.registration.poses.batched_pnp import make_observations
+from bodycap_batch.registration.poses.keyframe_requests import lost_intervals, request_keyframes
+from bodycap_batch.registration.poses.pnp import (
+    MAP_COVARIANCE_SCALE,
+    AcceptanceCriteria,
+    FramePose,
+    solve_poses,
+)
 
 CAMERA = Camera(
     model="OPENCV",
@@ -24,7 +28,7 @@ CAMERA = Camera(
     height_px=480,
     params=np.array([420.0, 430.0, 322.0, 238.0, -0.2, 0.05, 1e-3, -5e-4]),
 )
-LIMITS = PoseLimits(max_error_px=2.5, min_inliers=15, max_sigma_depth=0.05)
+LIMITS = AcceptanceCriteria(max_error_px=2.5, min_inliers=15, max_sigma_depth=0.05)
 
 
 def _scene(rng: np.random.Generator, count: int, patch_px: float | None = None) -> tuple[np.ndarray, ...]:
@@ -44,7 +48,7 @@ def _scene(rng: np.random.Generator, count: int, patch_px: float | None = None) 
 
 def _solve(points: np.ndarray, px: np.ndarray, start: np.ndarray | None = None) -> FramePose:
     """One frame alone, from a starting cam_from_gauge or from none."""
-    views = make_views(CAMERA, np.array([0, len(px)]), points, px)
+    views = make_observations(CAMERA, np.array([0, len(px)]), points, px)
     first = np.full((4, 4), np.nan) if start is None else start
     return solve_poses([CAMERA], views, px, first[None], LIMITS)[0]
 
@@ -82,23 +86,22 @@ def test_threads_of_a_task_solve_the_same_poses(monkeypatch: pytest.MonkeyPatch)
     px = np.concatenate([scene[1] + rng.normal(0, 0.5, scene[1].shape) for scene in scenes])
     start = np.stack([make_transform(np.eye(3), [0.05, 0.0, 0.0]) @ invert(scene[2]) for scene in scenes])
     points, bounds = np.concatenate([scene[0] for scene in scenes]), np.arange(13) * 90
-    views = make_views(CAMERA, bounds, points, px)
-    monkeypatch.setattr(batched_pnp, "_CHUNK", 2)
+    views = make_observations(CAMERA, bounds, points, px)
+    monkeypatch.setattr(batched_pnp, "_CHUNK_FRAMES", 2)
     workers: set[str] = set()
-    step = batched_pnp._step
+    step = batched_pnp._gauss_newton_step
 
     def noted(*arguments: Any) -> Any:
         workers.add(threading.current_thread().name.partition("_")[0])
         return step(*arguments)
 
-    monkeypatch.setattr(batched_pnp, "_step", noted)
+    monkeypatch.setattr(batched_pnp, "_gauss_newton_step", noted)
     found = {}
-    for threads, name in (("1", "MainThread"), ("2", "poses")):
-        monkeypatch.setenv(THREADS_VARIABLE, threads)
+    for threads, name in ((1, "MainThread"), (2, "poses")):
         workers.clear()
-        found[threads] = batched_pnp.refine_poses(views, start, LIMITS.max_error_px)
+        found[threads] = batched_pnp.refine_poses(views, start, LIMITS.max_error_px, threads)
         assert workers == {name}
-    assert (found["1"] == found["2"]).all()
+    assert (found[1] == found[2]).all()
 
 
 def test_the_lens_is_asked_for_some_views_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,14 +109,14 @@ def test_the_lens_is_asked_for_some_views_at_a_time(monkeypatch: pytest.MonkeyPa
     px = np.random.default_rng(0).uniform((20.0, 20.0), (620.0, 460.0), (count, 2))
     points = np.ones((count, 3))
     tracemalloc.start()
-    views = make_views(CAMERA, np.array([0, count]), points, px)
+    views = make_observations(CAMERA, np.array([0, count]), points, px)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     kept = views.rays.nbytes + views.px_from_ray.nbytes + views.weight.nbytes
     # Beside what is kept: a part's ray, pixel and point, of which several are held, 24 bytes each at most.
-    assert kept <= peak < kept + 16 * 24 * batched_pnp._PART
-    monkeypatch.setattr(batched_pnp, "_PART", count)
-    whole = make_views(CAMERA, np.array([0, count]), points, px)
+    assert kept <= peak < kept + 16 * 24 * batched_pnp._BATCH_ROWS
+    monkeypatch.setattr(batched_pnp, "_BATCH_ROWS", count)
+    whole = make_observations(CAMERA, np.array([0, count]), points, px)
     assert np.array_equal(whole.rays, views.rays)
     assert np.array_equal(whole.px_from_ray, views.px_from_ray)
 
@@ -125,7 +128,7 @@ def test_frames_solved_together_do_not_influence_each_other() -> None:
     start = np.stack([invert(scene[2]) for scene in scenes])
     bounds = np.concatenate([[0], np.cumsum([len(part) for part in px])])
     points, pixels = np.concatenate([scene[0] for scene in scenes]), np.concatenate(px)
-    together = solve_poses([CAMERA], make_views(CAMERA, bounds, points, pixels), pixels, start, LIMITS)
+    together = solve_poses([CAMERA], make_observations(CAMERA, bounds, points, pixels), pixels, start, LIMITS)
     assert [pose.status for pose in together] == [
         FrameStatus.REGISTERED if len(part) > 50 else FrameStatus.FEW_TRACKS for part in px
     ]
@@ -145,7 +148,7 @@ def test_points_that_are_known_badly_count_less() -> None:
     start = invert(truth)[None]
 
     def solve(weight: float) -> np.ndarray:
-        views = make_views(CAMERA, np.array([0, 100]), points, seen, np.where(displaced, weight, 1.0))
+        views = make_observations(CAMERA, np.array([0, 100]), points, seen, np.where(displaced, weight, 1.0))
         pose = solve_poses([CAMERA], views, seen, start, LIMITS)[0].gauge_from_cam
         assert pose is not None
         return pose
@@ -167,7 +170,7 @@ def test_normalised_error_of_the_covariance_is_near_one() -> None:
         assert found.covariance is not None
         delta = invert(truth) @ found.gauge_from_cam
         error = np.concatenate([so3_log(delta[:3, :3]), delta[:3, 3]])
-        errors.append(MAP_VARIANCE_RATIO * error @ np.linalg.solve(found.covariance, error) / 6)
+        errors.append(MAP_COVARIANCE_SCALE * error @ np.linalg.solve(found.covariance, error) / 6)
     # The map is exact here.
     # χ²(360)/360 lies in [0.86, 1.15] with 95 %; the noise is itself estimated from 80 points (± 10 %).
     assert 0.7 < np.mean(errors) < 1.4
@@ -192,8 +195,8 @@ def test_too_little_evidence_names_its_reason(count: int, status: FrameStatus) -
 
 def test_lost_runs_are_maximal() -> None:
     localised = np.array([0, 1, 1, 0, 0, 1, 0], dtype=bool)
-    assert lost_runs(localised) == [(0, 1), (3, 5), (6, 7)]
-    assert lost_runs(np.ones(4, dtype=bool)) == []
+    assert lost_intervals(localised) == [(0, 1), (3, 5), (6, 7)]
+    assert lost_intervals(np.ones(4, dtype=bool)) == []
 
 
 def test_growth_takes_the_sharpest_lost_frames_and_the_ends_they_hang_on() -> None:
@@ -201,7 +204,7 @@ def test_growth_takes_the_sharpest_lost_frames_and_the_ends_they_hang_on() -> No
     localised[10:16] = False
     sharpness = np.ones(40)
     sharpness[[11, 14]] = 2.0
-    wanted = wanted_keyframes(localised, sharpness, np.array([0, 39]))
+    wanted = request_keyframes(localised, sharpness, np.array([0, 39]))
     assert wanted.tolist() == [9, 11, 14, 16]
 
 
@@ -209,10 +212,10 @@ def test_growth_ends_once_every_lost_stretch_was_tried() -> None:
     localised = np.ones(40, dtype=bool)
     localised[10:16] = False
     tried = np.array([0, 11, 14, 39])
-    assert len(wanted_keyframes(localised, np.ones(40), tried)) == 0
+    assert len(request_keyframes(localised, np.ones(40), tried)) == 0
 
 
 def test_growth_is_bounded() -> None:
-    wanted = wanted_keyframes(np.zeros(3000, dtype=bool), np.ones(3000), np.arange(0, 3000, 50))
+    wanted = request_keyframes(np.zeros(3000, dtype=bool), np.ones(3000), np.arange(0, 3000, 50))
     assert 20 <= len(wanted) <= 30
     assert (np.diff(wanted) > 0).all()

@@ -13,13 +13,13 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp, transform_points
 from bodycap_batch.model.scene import Map
-from bodycap_batch.registration.poses.pnp import FramePose, PoseLimits
-from bodycap_batch.registration.poses.static_points import confirmed_points
-from bodycap_batch.registration.poses.trajectory import solve_frames
+from bodycap_batch.registration.poses.pnp import AcceptanceCriteria, FramePose
+from bodycap_batch.registration.poses.static_points import static_points
+from bodycap_batch.registration.poses.trajectory import solve_camera
 from bodycap_batch.registration.tracking.klt import Tracks
 
 _LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
-_LIMITS = PoseLimits(max_error_px=2.2, min_inliers=15, max_sigma_depth=0.05)
+_LIMITS = AcceptanceCriteria(max_error_px=2.2, min_inliers=15, max_sigma_depth=0.05)
 _COUNT = 25
 _ROOM, _SLEEVE = 80, 130
 _BURIED = range(10, 15)
@@ -73,11 +73,11 @@ def _capture() -> tuple[Map, Tracks]:
         seen = every[_ROOM:] if frame in _BURIED else every
         origin = np.zeros(len(seen), np.int64)
         parts.append(Tracks(origin + frame, origin, seen, view(frame)[seen].astype(np.float32)))
-    return scene_map, Tracks.join(parts)
+    return scene_map, Tracks.join_and_clear(parts)
 
 
 def _solve(scene_map: Map, tracks: Tracks) -> list[FramePose]:
-    return solve_frames(_camera(), scene_map, tracks, _LIMITS)
+    return solve_camera(_camera(), scene_map, tracks, _LIMITS)
 
 
 def test_the_sleeve_is_not_followed_although_it_has_the_majority() -> None:
@@ -99,9 +99,9 @@ def test_frames_that_see_the_sleeve_alone_are_refused() -> None:
 
 def test_another_camera_or_another_time_confirms() -> None:
     scene_map, _ = _capture()
-    assert confirmed_points(_camera(), scene_map).sum() == _ROOM
+    assert static_points(_camera(), scene_map).sum() == _ROOM
     # The same frames over two seconds: the palm itself sees all of it again.
-    assert confirmed_points(_camera(frame_ns=100_000_000), scene_map).all()
+    assert static_points(_camera(frame_ns=100_000_000), scene_map).all()
 
 
 def test_a_camera_alone_that_always_moves_on_is_trusted() -> None:
@@ -118,7 +118,7 @@ def test_a_camera_alone_that_always_moves_on_is_trusted() -> None:
             "map_from_cam": scene_map.map_from_cam[:2],
         }
     )
-    assert confirmed_points(_camera(), single).all()
+    assert static_points(_camera(), single).all()
 
 
 def test_keyframes_that_see_nothing_do_not_say_that_the_test_tells_nothing() -> None:
@@ -130,6 +130,6 @@ def test_keyframes_that_see_nothing_do_not_say_that_the_test_tells_nothing() -> 
         keyframe_frame=np.append(scene_map.keyframe_frame, np.arange(5) + 4),
         map_from_cam=np.concatenate([scene_map.map_from_cam, np.tile(np.eye(4), (5, 1, 1))]),
     )
-    before, after = (confirmed_points(_camera(), each) for each in (scene_map, unseeing))
+    before, after = (static_points(_camera(), each) for each in (scene_map, unseeing))
     assert not before.all()
     np.testing.assert_array_equal(after, before)

@@ -13,13 +13,13 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp
 from bodycap_batch.model.scene import FrameStatus, Map
 from bodycap_batch.registration.poses import observations, trajectory
-from bodycap_batch.registration.poses.observations import Votes
-from bodycap_batch.registration.poses.pnp import FramePose, PoseLimits
-from bodycap_batch.registration.poses.trajectory import solve_frames
+from bodycap_batch.registration.poses.observations import PointReliability
+from bodycap_batch.registration.poses.pnp import AcceptanceCriteria, FramePose
+from bodycap_batch.registration.poses.trajectory import solve_camera
 from bodycap_batch.registration.tracking.klt import Tracks
 
 LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
-LIMITS = PoseLimits(max_error_px=2.2, min_inliers=15, max_sigma_depth=0.05)
+LIMITS = AcceptanceCriteria(max_error_px=2.2, min_inliers=15, max_sigma_depth=0.05)
 COUNT = 31
 KEYFRAMES = [0, 30]
 
@@ -74,11 +74,11 @@ def _capture(worn: int, rng: np.random.Generator) -> tuple[Map, Tracks]:
 
 def _solve(scene_map: Map, tracks: Tracks) -> list[FramePose]:
     camera = cast("CaptureCamera", SimpleNamespace(name="torso", times_ns=np.arange(COUNT) * 33_333_333))
-    return solve_frames(camera, scene_map, tracks, LIMITS)
+    return solve_camera(camera, scene_map, tracks, LIMITS)
 
 
 def _error_m(poses: list[FramePose]) -> float:
-    found = trajectory.matrices(poses)
+    found = trajectory.pose_array(poses)
     return float(np.sqrt(((found[:, :3, 3] - _path()[:, :3, 3]) ** 2).sum(axis=1).mean()))
 
 
@@ -106,16 +106,16 @@ def test_a_point_counts_by_the_frames_that_agree_with_it() -> None:
     agrees = np.ones(18, dtype=bool)
     agrees[[1, 4, 7]] = False
     agrees[[2, 5, 8, 11, 14]] = False
-    votes = Votes.none(3)
+    votes = PointReliability.zero(3)
     votes.add(point[:9], posed[:9], agrees[:9])
     # Three views of a point are too few to condemn it.
-    np.testing.assert_array_equal(votes.share(point), np.ones(18))
+    np.testing.assert_array_equal(votes.agreement(point), np.ones(18))
     votes.add(point[9:], posed[9:], agrees[9:])
-    np.testing.assert_allclose(votes.share(point[:3]), [1.0, 0.4, 0.0])
+    np.testing.assert_allclose(votes.agreement(point[:3]), [1.0, 0.4, 0.0])
 
 
 def test_a_long_video_is_solved_in_stretches_as_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
     scene_map, tracks = _capture(30, np.random.default_rng(1))
-    whole = trajectory.matrices(_solve(scene_map, tracks))
-    monkeypatch.setattr(observations, "STRETCH", 7)
-    np.testing.assert_allclose(trajectory.matrices(_solve(scene_map, tracks)), whole, atol=1e-12)
+    whole = trajectory.pose_array(_solve(scene_map, tracks))
+    monkeypatch.setattr(observations, "BLOCK_FRAMES", 7)
+    np.testing.assert_allclose(trajectory.pose_array(_solve(scene_map, tracks)), whole, atol=1e-12)

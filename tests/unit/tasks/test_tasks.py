@@ -14,6 +14,7 @@ import pytest
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import CaptureError, DiskAway, JobError
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.rolling_shutter import mean_row_fraction
 from bodycap_batch.model.scene import FrameStatus, Registration, Trajectory
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import (
@@ -26,7 +27,6 @@ from bodycap_batch.model.skeleton_presets import (
 from bodycap_batch.pipeline.inputs import body_arguments, camera_digest
 from bodycap_batch.store.digests import FileDigests
 from bodycap_batch.tasks.body import mount_prior
-from bodycap_batch.tasks.registered import row_fraction
 
 QUARTER_TURN = {"translation_m": [0.1, 0.2, 0.3], "quat_xyzw": [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]}
 
@@ -113,9 +113,9 @@ def test_the_mean_row_follows_the_observations() -> None:
     camera = Camera(model="PINHOLE", width_px=64, height_px=48, params=np.array([50, 50, 32, 24]))
     # frame 1 has no observation of its own: the middle row; frame 2 has no pose
     expected = [15 / 48, 0.5, np.nan, 36 / 48]
-    assert np.array_equal(row_fraction(found, camera), expected, equal_nan=True)
+    assert np.array_equal(mean_row_fraction(found, camera), expected, equal_nan=True)
     across = [5 / 64, 0.5, np.nan, 5 / 64]
-    assert np.array_equal(row_fraction(found, replace(camera, sideways=True)), across, equal_nan=True)
+    assert np.array_equal(mean_row_fraction(found, replace(camera, sideways=True)), across, equal_nan=True)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,124 @@
+"""Decode the images that recovery searches in, and estimate how long the shutter was open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from bodycap_batch.capture import Capture, CaptureCamera
+from bodycap_batch.core.arrays import IntArray, evenly_spaced
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.model.geometry import invert
+from bodycap_batch.model.optical_flow import sharpness
+from bodycap_batch.model.scene import Map, Trajectory
+from bodycap_batch.registration.poses.static_points import static_points
+from bodycap_batch.registration.recovery.guided_localisation import GuidedLocaliser
+from bodycap_batch.registration.recovery.patch_search import (
+    KeyframePatches,
+    PredictedView,
+    Pyramid,
+    SearchLevel,
+    match_patches,
+    select_patches,
+)
+
+_MAX_KEYFRAMES = 600
+"""Keyframes held in memory, half a megabyte each. Origin: the memory limit of the task."""
+_MAX_DISTANCE_FRAMES = 90
+"""Frames: farthest distance of a searched frame from an end of its interval or from a seed. Evidence: none."""
+_MAX_FRAMES = 400
+"""Frames of one interval held in memory; the nearest to an end or a seed are kept. Origin: the memory limit
+of the task."""
+_EXPOSURE_CANDIDATES = (0.0, 0.3, 0.6)
+"""Exposure times tried, as a fraction of the frame interval. Evidence: none."""
+_EXPOSURE_FRAMES = 4
+"""Fastest frames with a pose that are compared for each exposure time. Evidence: none."""
+_EXPOSURE_LEVEL = SearchLevel(pyramid_level=1, patch_side=21, search_radius=4, score=-1.0, limit_px=6.0)
+"""Search for the comparison of exposure times; a score of -1 accepts every correlation. Evidence: none."""
+
+
+def read_keyframe_patches(
+    scene_map: Map, capture: Capture, camera: CaptureCamera, context: StageContext
+) -> KeyframePatches:
+    """Decode the keyframes of all cameras; at most `_MAX_KEYFRAMES` of them, evenly spaced.
+
+    Args:
+        scene_map: The map.
+        capture: All cameras.
+        camera: The camera to be searched. Its static points are used.
+        context: Progress and cancellation.
+    """
+    count = len(scene_map.keyframe_camera)
+    chosen = evenly_spaced(count, _MAX_KEYFRAMES)
+    pyramids: dict[int, Pyramid] = {}
+    relative_sharpness = np.zeros(count)
+    for name in sorted(set(scene_map.keyframe_camera)):
+        rows = np.intersect1d(scene_map.keyframes_of(name), chosen)
+        row_of = dict(zip(scene_map.keyframe_frame[rows].tolist(), rows.tolist(), strict=True))
+        for frame, grey in capture.camera(name).read(sorted(row_of)):
+            context.check_cancelled()
+            row = row_of[frame]
+            pyramids[row] = Pyramid.build(grey)
+            context.progress(len(pyramids), len(chosen), "keyframes of all cameras decoded")
+            relative_sharpness[row] = sharpness(pyramids[row].levels[0])
+        if len(rows):
+            relative_sharpness[rows] /= max(float(np.median(relative_sharpness[rows])), 1e-9)
+    keyframe_count: IntArray = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))
+    return KeyframePatches(
+        scene_map=scene_map,
+        pyramids=pyramids,
+        sharpness=relative_sharpness,
+        usable=static_points(camera, scene_map),
+        keyframe_count=keyframe_count,
+    )
+
+
+def read_pyramids(
+    camera: CaptureCamera, start: int, stop: int, seed_frames: list[int], max_frames: int = _MAX_FRAMES
+) -> dict[int, Pyramid]:
+    """Decode the frames of a lost interval that are near its ends or a seed, and one frame on either side.
+
+    Args:
+        camera: The camera.
+        start: First lost frame.
+        stop: One past the last lost frame.
+        seed_frames: Keyframes inside the interval whose poses were not accepted.
+        max_frames: Most frames to hold; the nearest ones are kept.
+
+    Returns:
+        Image pyramids by frame index.
+    """
+    frames = np.arange(max(0, start - 1), min(len(camera.times_ns), stop + 1))
+    reference_frames = np.array([start, stop - 1, *seed_frames])
+    distance = np.abs(frames[:, None] - reference_frames).min(axis=1)
+    nearest = np.argsort(distance, kind="stable")[:max_frames]
+    frames = frames[np.sort(nearest[distance[nearest] <= _MAX_DISTANCE_FRAMES])]
+    return {frame: Pyramid.build(grey) for frame, grey in camera.read(frames)}
+
+
+def estimate_exposure(camera: CaptureCamera, localiser: GuidedLocaliser, path: Trajectory) -> float:
+    """Share of the time between two frames that the shutter is open, as blurred frames with poses show it."""
+    has_pose = path.localised
+    pairs = np.flatnonzero(has_pose[1:] & has_pose[:-1]) + 1
+    rotations = path.gauge_from_cam[:, :3, :3]
+    cosine = np.einsum("nij,nij->n", rotations[pairs - 1], rotations[pairs])
+    fastest = np.sort(pairs[np.argsort(cosine, kind="stable")[:_EXPOSURE_FRAMES]])
+    totals = np.zeros(len(_EXPOSURE_CANDIDATES))
+    for frame, grey in camera.read(fastest):
+        pose, neighbour_pose = (invert(path.gauge_from_cam[index]) for index in (frame, frame - 1))
+        view = PredictedView(
+            lens=localiser.lens,
+            pyramid=Pyramid.build(grey),
+            cam_from_map=pose,
+            neighbour_pose=neighbour_pose,
+            exposure_ratio=0.0,
+            readout_ratio=localiser.readout_ratio,
+        )
+        rows = select_patches(localiser.patches, view)
+        for number, ratio in enumerate(_EXPOSURE_CANDIDATES):
+            matches = match_patches(
+                localiser.patches, replace(view, exposure_ratio=ratio), rows, _EXPOSURE_LEVEL
+            )
+            totals[number] += matches.score[localiser.is_unmasked(matches.px)].sum()
+    return _EXPOSURE_CANDIDATES[int(np.argmax(totals))]
