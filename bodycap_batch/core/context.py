@@ -16,7 +16,7 @@ def _no_progress(done: int, total: int, what: str = "") -> None:
     """Ignore progress."""
 
 
-def _never() -> bool:
+def _not_cancelled() -> bool:
     return False
 
 
@@ -34,7 +34,7 @@ class StageContext:
     work_dir: Path
     threads: int = 1
     progress: Callable[[int, int, str], None] = field(default=_no_progress)
-    cancelled: Callable[[], bool] = field(default=_never)
+    cancelled: Callable[[], bool] = field(default=_not_cancelled)
 
     def check_cancelled(self) -> None:
         """Raise `Cancelled` once the work should stop."""

@@ -91,14 +91,14 @@ class Cancelled(BodycapError):
     exit_code = EXIT_CANCELLED
 
 
-_TYPES = {
+_ERROR_TYPES = {
     cls.__name__: cls for cls in (JobError, CaptureError, EstimationError, StoreError, DiskAway, Cancelled)
 }
 
 
 def error_from_dict(data: dict[str, str | int | None]) -> BodycapError:
     """Rebuild an error that `BodycapError.to_dict` wrote."""
-    cls = _TYPES.get(str(data.get("type")), BodycapError)
+    cls = _ERROR_TYPES.get(str(data.get("type")), BodycapError)
     line = data.get("line")
     return cls(
         str(data.get("message")),

@@ -7,7 +7,7 @@ import ctypes
 import gc
 
 
-def give_back() -> None:
+def release_memory() -> None:
     """Let go of what this process freed: the C library keeps it, and so did peaks grow.
 
     A map of 54 keyframes leaves 80 MB behind. Elsewhere than with glibc nothing happens.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 
-def percent(share: float, digits: int = 0) -> str:
+def format_percent(share: float, digits: int = 0) -> str:
     """A share as a percentage, rounded, but never up to all nor down to nothing.
 
     Args:

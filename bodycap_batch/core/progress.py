@@ -37,14 +37,14 @@ class Event:
     @property
     def label(self) -> str:
         """Stage, camera and round as one reads them."""
-        return label_of(self.stage, self.camera, self.round)
+        return task_label(self.stage, self.camera, self.round)
 
     def to_dict(self) -> dict[str, Any]:
         """The event as plain JSON values."""
         return asdict(self)
 
 
-def label_of(stage: str, camera: str = "", map_round: int = 0) -> str:
+def task_label(stage: str, camera: str = "", map_round: int = 0) -> str:
     """Stage, camera and round as one reads them."""
     again = f"(round {map_round})" if map_round else ""
     return " ".join(part for part in (stage, camera, again) if part)

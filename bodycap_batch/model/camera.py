@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 CV2_PIXEL_OFFSET_PX = 0.5
 """COLMAP pixel = OpenCV pixel + this."""
 
-_FOCAL_PARAMS = {
+_FOCAL_INDICES = {
     "SIMPLE_PINHOLE": (0,),
     "PINHOLE": (0, 1),
     "SIMPLE_RADIAL": (0,),
@@ -44,7 +44,7 @@ _PARAM_COUNT = {
 CAMERA_MODELS = tuple(_PARAM_COUNT)
 
 
-def param_count(model: str) -> int:
+def parameter_count(model: str) -> int:
     """Number of parameters of a COLMAP camera model (KeyError if unknown)."""
     return _PARAM_COUNT[model]
 
@@ -80,12 +80,12 @@ class Camera:
     @property
     def focal_px(self) -> float:
         """Mean focal length."""
-        return float(np.mean([self.params[i] for i in _FOCAL_PARAMS[self.model]]))
+        return float(np.mean([self.params[i] for i in _FOCAL_INDICES[self.model]]))
 
     @property
     def principal_point_px(self) -> tuple[float, float]:
         """Principal point (cx, cy)."""
-        first = len(_FOCAL_PARAMS[self.model])
+        first = len(_FOCAL_INDICES[self.model])
         return float(self.params[first]), float(self.params[first + 1])
 
     def to_pycolmap(self) -> pycolmap.Camera:
@@ -116,7 +116,7 @@ class Camera:
         """The same lens at another image size (COLMAP's pixel origin scales exactly)."""
         scale_x, scale_y = width_px / self.width_px, height_px / self.height_px
         params = self.params.copy()
-        focal = _FOCAL_PARAMS[self.model]
+        focal = _FOCAL_INDICES[self.model]
         if len(focal) == 1:
             params[0] *= 0.5 * (scale_x + scale_y)
         else:
@@ -127,7 +127,7 @@ class Camera:
         return replace(self, width_px=width_px, height_px=height_px, params=params)
 
 
-_TWO_FOCAL_TWIN = {
+_TWO_FOCAL_MODEL = {
     "SIMPLE_PINHOLE": ("PINHOLE", 0),
     "SIMPLE_RADIAL": ("OPENCV", 1),
     "RADIAL": ("OPENCV", 2),
@@ -136,11 +136,11 @@ _TWO_FOCAL_TWIN = {
 }
 
 
-def without_single_focal(camera: Camera) -> Camera:
+def with_two_focal_lengths(camera: Camera) -> Camera:
     """The same lens with a focal length per axis, so that both axes can scale on their own."""
-    if camera.model not in _TWO_FOCAL_TWIN:
+    if camera.model not in _TWO_FOCAL_MODEL:
         return camera
-    model, radial = _TWO_FOCAL_TWIN[camera.model]
+    model, radial = _TWO_FOCAL_MODEL[camera.model]
     focal, cx, cy, *distortion = camera.params
     params = np.zeros(_PARAM_COUNT[model])
     params[:4] = focal, focal, cx, cy

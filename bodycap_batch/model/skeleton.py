@@ -29,7 +29,7 @@ class SkeletonModel:
         bvh_channels: (J,) channel names as a file gave them, or () for the default order.
         tpose_rotation: (J,3,3) parent_from_joint rotations of the T-pose, where the zero pose is another one.
         file_rotation: (J,3,3) how each joint of the file stands in this zero pose, where it is the file's
-            T-pose and not its zero pose (`in_tpose`).
+            T-pose and not its zero pose (`with_tpose_as_zero_pose`).
     """
 
     name: str
@@ -136,7 +136,7 @@ class Motion:
     def world_from_joint(self) -> FloatArray:
         """(T,J,4,4) joint poses."""
         local = make_transform(self.local_rotation, self.local_position_m())
-        return _chained(self.skeleton, local)
+        return _chain_poses(self.skeleton, local)
 
 
 def forward_kinematics(
@@ -145,7 +145,7 @@ def forward_kinematics(
     """Joint poses (T,J,4,4) from root positions (T,3) and local rotations (T,J,3,3)."""
     local = make_transform(local_rotation, skeleton.offsets_m)
     local[:, 0, :3, 3] = root_in_world_m
-    return _chained(skeleton, local)
+    return _chain_poses(skeleton, local)
 
 
 def rest_pose(skeleton: SkeletonModel) -> FloatArray:
@@ -168,8 +168,8 @@ def rest_pose(skeleton: SkeletonModel) -> FloatArray:
     return pose
 
 
-def in_tpose(skeleton: SkeletonModel) -> SkeletonModel:
-    """The same body with its T-pose as zero pose; `as_in_file` leads a motion of it back."""
+def with_tpose_as_zero_pose(skeleton: SkeletonModel) -> SkeletonModel:
+    """The same body with its T-pose as zero pose; `with_file_zero_pose` leads a motion of it back."""
     if skeleton.tpose_rotation is None:
         return skeleton
     world: FloatArray = rest_pose(skeleton)[:, :3, :3]
@@ -183,7 +183,7 @@ def in_tpose(skeleton: SkeletonModel) -> SkeletonModel:
     )
 
 
-def as_in_file(motion: Motion) -> Motion:
+def with_file_zero_pose(motion: Motion) -> Motion:
     """The same motion on the rig as its file has it, where that has another zero pose."""
     skeleton = motion.skeleton
     world = skeleton.file_rotation
@@ -201,7 +201,7 @@ def as_in_file(motion: Motion) -> Motion:
     return replace(motion, skeleton=rig, local_rotation=back @ motion.local_rotation @ world)
 
 
-def _chained(skeleton: SkeletonModel, parent_from_joint: FloatArray) -> FloatArray:
+def _chain_poses(skeleton: SkeletonModel, parent_from_joint: FloatArray) -> FloatArray:
     """Joint poses (T,J,4,4) from poses in the parents (T,J,4,4), the root's in the world."""
     out: FloatArray = parent_from_joint.copy()
     for joint in range(1, len(skeleton.joints)):

@@ -27,10 +27,10 @@ NCD Risk Factor Collaboration, "A century of trends in adult human height", eLif
 NOMINAL_SIGMA_RAD = float(np.radians(15.0))
 NOMINAL_SIGMA_M = 0.029
 """Per axis, of a mount known by its name only: straps turn, and bodies differ; 5 cm in all. The 15° are how
-lightly it is weighed against postures. Mounts are off by 15° in all, which `NAMED_SIGMA_RAD` has per axis;
+lightly it is weighed against postures. Mounts are off by 15° in all, which `NOMINAL_ERROR_RAD` has per axis;
 weighed with that, joints of simulated walks come out 2 mm worse (4.3 cm without a T-pose)."""
 
-NAMED_SIGMA_RAD = float(np.radians(15.0 / np.sqrt(3.0)))
+NOMINAL_ERROR_RAD = float(np.radians(15.0 / np.sqrt(3.0)))
 """What it is believed to be off by, per axis."""
 
 STATED_SIGMA_RAD = float(np.radians(5.0))
@@ -48,7 +48,7 @@ _NEXT_ROLE = {
 
 
 @cache
-def _data(name: str) -> dict[str, Any]:
+def _load_preset_data(name: str) -> dict[str, Any]:
     text = resources.files("bodycap_batch.presets").joinpath(name).read_text(encoding="utf-8")
     return dict(yaml.safe_load(text))
 
@@ -70,7 +70,7 @@ def load_skeleton(preset: str, height_m: float | None = None) -> SkeletonModel:
     height = MEAN_HEIGHT_M if height_m is None else height_m
     if not 0.5 <= height <= 2.8:
         raise JobError(f"a stature of {height} m is no person's", field="height_m", hint="give it in metres")
-    joints: dict[str, Any] = _data("humanoid.yaml")["joints"]
+    joints: dict[str, Any] = _load_preset_data("humanoid.yaml")["joints"]
     names = tuple(joints)
     at = {name: height * np.array(entry["at"], dtype=np.float64) for name, entry in joints.items()}
     origin = {
@@ -120,13 +120,13 @@ def bone_vector(skeleton: SkeletonModel, role: str) -> FloatArray | None:
     if following is not None:
         vector = rest[following] - rest[joint]
         return np.asarray(vector) if np.linalg.norm(vector) > 1e-6 else None
-    below = [index for index in range(len(rest)) if _descends(skeleton, index, joint)]
+    below = [index for index in range(len(rest)) if _is_descendant(skeleton, index, joint)]
     tips = np.array([rest[i] + np.nan_to_num(skeleton.end_offsets_m[i]) - rest[joint] for i in below])
     farthest = tips[np.argmax(np.linalg.norm(tips, axis=1))]
     return np.asarray(farthest) if np.linalg.norm(farthest) > 1e-6 else None
 
 
-def _descends(skeleton: SkeletonModel, joint: int, ancestor: int) -> bool:
+def _is_descendant(skeleton: SkeletonModel, joint: int, ancestor: int) -> bool:
     while joint > ancestor:
         joint = int(skeleton.parents[joint])
     return joint == ancestor
@@ -173,7 +173,7 @@ def nominal_mount(camera: str, role: str, skeleton: SkeletonModel) -> Mount:
             field="capture.cameras",
             hint=f"it has {', '.join(name for name in skeleton.roles if name)}",
         )
-    entry = _data("mounts.yaml")[split_side(role)[1]]
+    entry = _load_preset_data("mounts.yaml")[split_side(role)[1]]
     axes = segment_axes(skeleton, role)
     bone = bone_vector(skeleton, role)
     length = 0.0 if bone is None else float(np.linalg.norm(bone))
@@ -198,9 +198,9 @@ def _faces_back(camera: str, role: str) -> bool:
 
 
 _ARTICULATED = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase", "Neck", "Head")
-_REACH_SHARE = 0.15
-_REACH_M = 0.05
-_CLOSEST_M = 0.08
+_REACH_MARGIN_RATIO = 0.15
+_REACH_MARGIN_M = 0.05
+_MIN_DISTANCE_M = 0.08
 """Two cameras on different bones cannot come nearer: each stands off its own bone."""
 
 
@@ -220,26 +220,31 @@ def camera_reach(skeleton: SkeletonModel, mounts: Sequence[Mount]) -> list[tuple
     rest = rest_positions(skeleton)
     rows = []
     for first, second in combinations(sorted(mounts, key=lambda mount: mount.camera), 2):
-        ways = [_to_root(skeleton, mount) for mount in (first, second)]
+        ways = [_joints_to_root(skeleton, mount) for mount in (first, second)]
         shared = set(ways[0]) & set(ways[1])
         ends = [
             rest[way[0]] + mount.joint_from_cam[:3, 3]
             for way, mount in zip(ways, (first, second), strict=True)
         ]
         limbs = [
-            [rest[joint] for joint in way if joint not in shared and _bends(skeleton, joint)] for way in ways
+            [rest[joint] for joint in way if joint not in shared and _is_articulated(skeleton, joint)]
+            for way in ways
         ]
         chain = np.array([ends[0], *limbs[0], *limbs[1][::-1], ends[1]])
         links = np.linalg.norm(np.diff(chain, axis=0), axis=1)
         most = float(links.sum())
         least = max(0.0, 2.0 * float(links.max()) - most)
-        low = max(_CLOSEST_M, (1 - _REACH_SHARE) * least - _REACH_M) if len(chain) > 2 else 0.5 * least
-        high = (1 + _REACH_SHARE) * most + _REACH_M
+        low = (
+            max(_MIN_DISTANCE_M, (1 - _REACH_MARGIN_RATIO) * least - _REACH_MARGIN_M)
+            if len(chain) > 2
+            else 0.5 * least
+        )
+        high = (1 + _REACH_MARGIN_RATIO) * most + _REACH_MARGIN_M
         rows.append((first.camera, second.camera, round(low, 2), round(high, 2)))
     return rows
 
 
-def _to_root(skeleton: SkeletonModel, mount: Mount) -> list[int]:
+def _joints_to_root(skeleton: SkeletonModel, mount: Mount) -> list[int]:
     joint = skeleton.index_of_role(mount.role)
     if joint is None:
         raise JobError(f"no joint plays {mount.role}", field="capture.cameras")
@@ -249,5 +254,5 @@ def _to_root(skeleton: SkeletonModel, mount: Mount) -> list[int]:
     return way
 
 
-def _bends(skeleton: SkeletonModel, joint: int) -> bool:
+def _is_articulated(skeleton: SkeletonModel, joint: int) -> bool:
     return split_side(skeleton.roles[joint])[1] in _ARTICULATED
