@@ -183,9 +183,7 @@ def other_lens(factor: float) -> str:
     """What fits over what was given; a wrong centre alone can leave the focal length as it was."""
     percent = round(100 * abs(factor - 1.0))
     return (
-        f"a focal length {percent} % {'longer' if factor > 1.0 else 'shorter'}"
-        if percent
-        else "another lens"
+        f"a focal length {percent} % {'longer' if factor > 1.0 else 'shorter'}" if percent else "another lens"
     )
 
 
