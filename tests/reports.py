@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.export.inputs import ExportInputs
+from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.export.metrics import collect_metrics
 from bodycap_batch.export.projection import project_motion
 from bodycap_batch.model.camera import Camera

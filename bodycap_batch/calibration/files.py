@@ -11,7 +11,7 @@ import numpy as np
 
 from bodycap_batch.calibration.clip import CalibrationResult
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.formats.files import replacing, write_text
+from bodycap_batch.formats.atomic_files import atomic_replacement, write_text
 
 
 def write_calibration(result: CalibrationResult, path: Path, camera: str | None) -> None:
@@ -91,6 +91,6 @@ def write_preview(result: CalibrationResult, path: Path) -> None:
             matrix, fit.distortion, np.eye(3), straight, (width, height), cv2.CV_32FC1
         )
     flat = cv2.remap(result.preview, maps[0], maps[1], cv2.INTER_LINEAR)
-    with replacing(path) as temporary:
+    with atomic_replacement(path) as temporary:
         _, encoded = cv2.imencode(".png", np.hstack([result.preview, flat]))
         temporary.write_bytes(encoded.tobytes())

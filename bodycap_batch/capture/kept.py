@@ -15,13 +15,13 @@ from bodycap_batch.capture.decoding import decode_frames
 from bodycap_batch.capture.images import Colours, Image, Planes, work_image
 from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.core.arrays import BoolArray, IntArray, set_array
-from bodycap_batch.formats.mp4 import TIME_BASE, Quality, VideoWriter
+from bodycap_batch.formats.mp4 import TIME_BASE_HZ, Quality, VideoWriter
 
 KEPT_NAME = "kept"
 """Of the bundle in a keyframe artefact, and of the video beside it."""
 _FPS = 30
 """Nominal: frames are known by their number."""
-_FRAME_TICKS = TIME_BASE // _FPS
+_FRAME_TICKS = TIME_BASE_HZ // _FPS
 _LARGE_RATIO = 2.0
 """Times the pixels worked at, from which on decoding the video again costs more than writing and reading all
 of its frames at the work size (4K: 66 ms of a core a frame against 9)."""
@@ -72,7 +72,7 @@ class KeptFrames:
             path=self.path,
             pts=pts,
             key_pts=pts[:: self.group],
-            time_base=Fraction(1, TIME_BASE),
+            time_base=Fraction(1, TIME_BASE_HZ),
             fps=float(_FPS),
             duration_ns=len(pts) * 10**9 // _FPS,
             stored_size=(self.width_px, self.height_px),

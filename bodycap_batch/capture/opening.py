@@ -15,7 +15,7 @@ from bodycap_batch.config.calibration import Calibration
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.arrays import BoolArray, IntArray
 from bodycap_batch.core.errors import CaptureError
-from bodycap_batch.model.camera import Camera, without_single_focal
+from bodycap_batch.model.camera import Camera, with_two_focal_lengths
 
 # Widest lens in common use as webcam or phone camera; mapping refines it.
 _GUESSED_FOV_DEG = 70.0
@@ -115,7 +115,7 @@ def work_camera(calibration: Calibration, video: VideoFile, work_px: int) -> Cam
     camera = calibration.camera()
     size = work_size((width, height), work_px, video.turned_size)
     if size[0] * camera.height_px != size[1] * camera.width_px:
-        camera = without_single_focal(camera)
+        camera = with_two_focal_lengths(camera)
     return camera.scaled(*size)
 
 

@@ -23,7 +23,7 @@ from bodycap_batch.config.rules import named_frames
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.errors import BodycapError, CaptureError, JobError
 from bodycap_batch.formats.bvh import RigOptions, read_rig
-from bodycap_batch.formats.needs import require_libraries
+from bodycap_batch.formats.optional_libraries import require_libraries
 from bodycap_batch.store.disk_space import require_room
 
 # Frames whose distance differs by more than this share from the usual one make a variable rate.

@@ -18,7 +18,7 @@ from bodycap_batch.config.folder import recordings_in
 from bodycap_batch.config.models import Job
 from bodycap_batch.config.mounts import MOUNT_NAMES, mount_of
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.formats.files import write_text
+from bodycap_batch.formats.atomic_files import write_text
 
 FILE = "job.yaml"
 UNKNOWN = "<where on the body?>"

@@ -9,7 +9,7 @@ import time
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol, Self
 
-from bodycap_batch.core.percent import percent
+from bodycap_batch.core.percent import format_percent
 from bodycap_batch.core.progress import Event
 
 if TYPE_CHECKING:
@@ -106,7 +106,9 @@ class _Pace:
         seconds, done = now - self._first[0], event.done - self._first[1]
         rate = done / seconds if seconds > 0 and done > 0 else None
         text = f"{event.label}: {event.done}"
-        text += f" of {event.total} {event.what} ({percent(share)})" if event.total else f" {event.what}"
+        text += (
+            f" of {event.total} {event.what} ({format_percent(share)})" if event.total else f" {event.what}"
+        )
         if rate is not None:
             text += f", {rate:.3g}/s"
             if event.done < event.total:

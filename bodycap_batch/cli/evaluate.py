@@ -14,7 +14,7 @@ import typer
 
 from bodycap_batch.cli.base import app
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.core.percent import percent
+from bodycap_batch.core.percent import format_percent
 
 TUM_SUFFIXES = (".tum", ".txt")
 _MOTION = "motion.bvh"
@@ -165,7 +165,7 @@ _RELATIVE_ROWS = (("vector_m", "vector, cm"), ("in_reference_m", "in its frame, 
 
 def _camera_line(name: str, score: dict[str, Any]) -> str:
     frames = "?" if score["frames"] is None else str(score["frames"])
-    share = "?" if score["coverage"] is None else percent(score["coverage"], 1)
+    share = "?" if score["coverage"] is None else format_percent(score["coverage"], 1)
     line = f"{name:14}{frames:>8}{score['registered']:>8}{share:>8}"
     if score["ate_m"] is None:
         return f"{line}  no truth"

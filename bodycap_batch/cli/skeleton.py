@@ -46,12 +46,12 @@ def skeleton(
       bodycap run my_walk/ --skeleton hero.bvh
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.formats.bvh import RigOptions, read_rig
-    from bodycap_batch.formats.bvh.mapping import joint_lines, missing_roles
+    from bodycap_batch.formats.bvh.skeleton_description import describe_joints, missing_roles
 
     options = RigOptions(roles=_pairs(roles or []), tpose_frame=tpose_frame)
     rig, motion = read_rig(file, options)
     if as_json:
-        joints = [dataclasses.asdict(line) for line in joint_lines(rig)]
+        joints = [dataclasses.asdict(line) for line in describe_joints(rig)]
         typer.echo(
             json.dumps({"joints": joints, "missing": missing_roles(rig)}, indent=1, ensure_ascii=False)
         )
@@ -76,7 +76,7 @@ def _pairs(words: list[str]) -> dict[str, str]:
 def _heading(file: Path, rig: SkeletonModel, motion: Motion | None, frame: int | None) -> list[str]:
     import numpy as np
 
-    from bodycap_batch.formats.bvh.mapping import pose_words
+    from bodycap_batch.formats.bvh.skeleton_description import describe_arm_pose
     from bodycap_batch.model.skeleton import rest_pose
 
     rest = rest_pose(rig)
@@ -87,16 +87,16 @@ def _heading(file: Path, rig: SkeletonModel, motion: Motion | None, frame: int |
     pose = "zero pose" if frame is None else f"frame {frame}"
     return [
         f"{file.name}: {len(rig.joints)} joints, {frames}",
-        f"{pose}: {pose_words(rig)}; {max(heights) - min(heights):.2f} m from top to bottom",
+        f"{pose}: {describe_arm_pose(rig)}; {max(heights) - min(heights):.2f} m from top to bottom",
     ]
 
 
 def _table(rig: SkeletonModel) -> list[str]:
-    from bodycap_batch.formats.bvh.mapping import joint_lines
+    from bodycap_batch.formats.bvh.skeleton_description import describe_joints
 
     rows = [("joint", "role", "bone", "points", "")]
     depth: dict[str, int] = {"": -1}
-    for line in joint_lines(rig):
+    for line in describe_joints(rig):
         depth[line.name] = depth[line.parent] + 1
         name = "  " * min(depth[line.name], 12) + line.name
         bone = f"{100.0 * line.bone_m:5.1f} cm" if line.points else ""
@@ -109,11 +109,11 @@ def _table(rig: SkeletonModel) -> list[str]:
 
 
 def _ending(rig: SkeletonModel, options: RigOptions) -> list[str]:
-    from bodycap_batch.formats.bvh.mapping import missing_roles, warnings
+    from bodycap_batch.formats.bvh.skeleton_description import missing_roles, skeleton_warnings
 
     missing = missing_roles(rig)
     lines = [f"missing: {', '.join(missing)}" if missing else "missing: nothing"]
-    lines += [f"warning: {text}" for text in warnings(rig)]
+    lines += [f"warning: {text}" for text in skeleton_warnings(rig)]
     if options.roles:
         pairs = ", ".join(f"{json.dumps(name)}: {role}" for name, role in options.roles.items())
         lines.append(f"in the job: skeleton_map: {{{pairs}}}")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bodycap_batch.cli.base import app
-from bodycap_batch.core.percent import percent
+from bodycap_batch.core.percent import format_percent
 
 if TYPE_CHECKING:
     from bodycap_batch.watch import JobRow, Spool
@@ -104,7 +104,7 @@ def _table(rows: list[JobRow]) -> list[str]:
         return ["no jobs"]
     cells = [("JOB", "STATE", "STAGE", "PROGRESS", "AGE", "")]
     for row in rows:
-        share = "" if row.progress is None else percent(row.progress)
+        share = "" if row.progress is None else format_percent(row.progress)
         cause = " ".join(row.cause.split())
         cause = cause if len(cause) <= _CAUSE_CHARACTERS else f"{cause[: _CAUSE_CHARACTERS - 1]}…"
         cells.append((row.name, row.state, row.stage, share, _age(row.age_s), cause))

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from bodycap_batch.core.errors import CaptureError
-from bodycap_batch.model.camera import CAMERA_MODELS, CV2_PIXEL_OFFSET_PX, Camera, param_count
+from bodycap_batch.model.camera import CAMERA_MODELS, CV2_PIXEL_OFFSET_PX, Camera, parameter_count
 
 _MAX_BYTES = 1 << 20
 _MAX_SECONDS = 1e10
@@ -55,7 +55,7 @@ class Calibration(BaseModel):
 
     @model_validator(mode="after")
     def _fits_model(self) -> Calibration:
-        want = param_count(self.model)
+        want = parameter_count(self.model)
         if len(self.params) != want:
             raise ValueError(f"{self.model} takes {want} params, got {len(self.params)}")
         if self.params[0] <= 0 or (self.model not in _FIRST_CENTRE and self.params[1] <= 0):

@@ -1,1 +1,1 @@
-"""Ground of every package: errors, checked arrays, progress, what a stage may use besides its inputs."""
+"""What every package builds on: errors, checked arrays, progress events and the context of a stage."""

@@ -20,23 +20,23 @@ def frozen_array(
     dtype: npt.DTypeLike = np.float64,
     finite: bool = True,
 ) -> npt.NDArray[Any]:
-    """Copy `value` into a read-only array of the given dtype and shape.
+    """Return `value` as a read-only array of the given dtype and shape.
 
-    One that is such already is taken as it is.
+    The data are copied, unless `value` is already a read-only array that owns its data.
 
     Args:
-        value: Anything numpy accepts.
-        name: The field's name, for the message.
-        shape: Expected shape; None matches any length.
+        value: Anything that numpy converts to an array.
+        name: Name of the field, for the error message.
+        shape: Expected shape; None accepts any length.
         dtype: Target dtype.
-        finite: Refuse NaN and infinity.
+        finite: Whether NaN and infinity are refused.
 
     Raises:
-        ValueError: The shape differs or a value is not finite.
+        ValueError: The shape differs, or a value is not finite.
     """
     array = value if _is_frozen(value, dtype) else np.array(value, dtype=dtype, copy=True)
     matches = array.ndim == len(shape) and all(
-        want is None or want == got for want, got in zip(shape, array.shape, strict=True)
+        expected is None or expected == actual for expected, actual in zip(shape, array.shape, strict=True)
     )
     if not matches:
         raise ValueError(f"{name}: shape {array.shape}, expected {shape}")
@@ -47,7 +47,10 @@ def frozen_array(
 
 
 def _is_frozen(value: npt.ArrayLike, dtype: npt.DTypeLike) -> TypeGuard[npt.NDArray[Any]]:
-    """True for an array that nobody writes to: copies of long recordings take hundreds of megabytes."""
+    """Return whether `value` can be shared: read-only, contiguous and no view of another array.
+
+    Sharing matters because the arrays of a long recording take hundreds of megabytes.
+    """
     if not isinstance(value, np.ndarray) or value.dtype != dtype:
         return False
     return bool(value.flags.owndata and not value.flags.writeable and value.flags.c_contiguous)
@@ -61,19 +64,25 @@ def set_array(
     *,
     finite: bool = True,
 ) -> None:
-    """Check and freeze the array field `name` of a frozen dataclass in its ``__post_init__``."""
+    """Check the array field `name` of a frozen dataclass and make it read-only.
+
+    Call this in ``__post_init__``. Arguments and errors are those of `frozen_array`.
+    """
     value = frozen_array(getattr(owner, name), name=name, shape=shape, dtype=dtype, finite=finite)
     object.__setattr__(owner, name, value)
 
 
 def runs(mask: BoolArray) -> list[tuple[int, int]]:
-    """Maximal runs [start, stop) of true values in a mask (N,)."""
+    """Return the maximal runs [start, stop) of true values in a mask (N,), in order."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def evenly_spaced(count: int, wanted: int) -> IntArray:
-    """Up to `wanted` different indices of `count` items, evenly spaced, the first and the last among them."""
+def evenly_spaced(count: int, limit: int) -> IntArray:
+    """Return up to `limit` different, evenly spaced indices of `count` items.
+
+    The first and the last item are included; with a limit of one, only the first.
+    """
     if count <= 0:
         return np.zeros(0, dtype=np.int64)
-    return np.unique(np.linspace(0, count - 1, min(count, wanted)).round().astype(np.int64))
+    return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(np.int64))

@@ -1,4 +1,7 @@
-"""What a stage may use besides its inputs; no part of any result's identity."""
+"""What a stage may use besides its inputs and options.
+
+The context never affects a result, so it is no part of the key of a stored artefact.
+"""
 
 from __future__ import annotations
 
@@ -10,30 +13,30 @@ from bodycap_batch.core.errors import Cancelled
 
 
 def _no_progress(done: int, total: int, what: str = "") -> None:
-    """Ignore progress."""
+    """Ignore a progress report."""
 
 
-def _never() -> bool:
+def _not_cancelled() -> bool:
     return False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageContext:
-    """Surroundings of one stage.
+    """Resources and callbacks of one run of a stage.
 
     Attributes:
-        work_dir: Scratch folder of this stage alone.
-        threads: Threads the stage may keep busy.
-        progress: Called as ``progress(done, total, what)``.
-        cancelled: True once the work should stop.
+        work_dir: Folder for temporary files, used by this run only.
+        threads: Number of threads that the stage may use.
+        progress: Callback ``progress(done, total, what)``; `what` is the unit, for example ``frames``.
+        cancelled: Callback that returns True as soon as the stage should stop.
     """
 
     work_dir: Path
     threads: int = 1
     progress: Callable[[int, int, str], None] = field(default=_no_progress)
-    cancelled: Callable[[], bool] = field(default=_never)
+    cancelled: Callable[[], bool] = field(default=_not_cancelled)
 
     def check_cancelled(self) -> None:
-        """Raise `Cancelled` once the work should stop."""
+        """Raise `Cancelled` if the stage should stop. Long loops call this at every step."""
         if self.cancelled():
             raise Cancelled("stopped on request")

@@ -1,4 +1,7 @@
-"""The exceptions a user can meet, each with an exit code and a remedy."""
+"""The errors that are reported to users, each with an exit code and a hint.
+
+Only these errors are expected. Any other exception is a bug and ends the program with `EXIT_BUG`.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +9,21 @@ from pathlib import Path
 
 EXIT_OK = 0
 EXIT_BUG = 70
+"""Exit code of an unexpected exception. Source: EX_SOFTWARE of sysexits.h."""
+
 EXIT_CANCELLED = 130
+"""Exit code after a stop on request. Source: shells report 128 + SIGINT (2)."""
 
 
 class BodycapError(Exception):
-    """Something a user can understand and act upon.
+    """Base class of the errors that a user can understand and correct.
 
     Args:
         message: What is wrong, in one sentence.
-        path: The file it concerns.
-        line: 1-based line in that file.
-        field: The job's field, dotted (``capture.cameras.0.video``).
-        hint: What to do about it.
+        path: File that the error concerns.
+        line: Line in that file, counted from 1.
+        field: Field of the job file, with dots (``capture.cameras.0.video``).
+        hint: What the user can do.
     """
 
     exit_code = EXIT_BUG
@@ -45,7 +51,7 @@ class BodycapError(Exception):
         return f"{text}\n  hint: {self.hint}" if self.hint else text
 
     def to_dict(self) -> dict[str, str | int | None]:
-        """Return the error as plain JSON values (crosses the process boundary)."""
+        """Return the error as plain JSON values; `error_from_dict` restores it in another process."""
         return {
             "type": type(self).__name__,
             "message": self.message,
@@ -58,7 +64,7 @@ class BodycapError(Exception):
 
 
 class JobError(BodycapError):
-    """The job file or the command line is wrong."""
+    """The job file, the command line or a file named there is wrong."""
 
     exit_code = 2
 
@@ -70,19 +76,19 @@ class CaptureError(BodycapError):
 
 
 class EstimationError(BodycapError):
-    """The data did not support an answer."""
+    """The data do not determine the result."""
 
     exit_code = 4
 
 
 class StoreError(BodycapError):
-    """The disk or a stored artefact failed."""
+    """A file cannot be written, or a stored artefact is damaged."""
 
     exit_code = 5
 
 
 class DiskAway(StoreError):
-    """The disk does not answer (a network disk that is away, a failing one); trying again later may help."""
+    """The disk does not answer, for example an unreachable network disk. A later attempt may succeed."""
 
 
 class Cancelled(BodycapError):
@@ -91,14 +97,14 @@ class Cancelled(BodycapError):
     exit_code = EXIT_CANCELLED
 
 
-_TYPES = {
+_ERROR_TYPES = {
     cls.__name__: cls for cls in (JobError, CaptureError, EstimationError, StoreError, DiskAway, Cancelled)
 }
 
 
 def error_from_dict(data: dict[str, str | int | None]) -> BodycapError:
-    """Rebuild an error that `BodycapError.to_dict` wrote."""
-    cls = _TYPES.get(str(data.get("type")), BodycapError)
+    """Restore an error from the values of `BodycapError.to_dict`; an unknown type gives a `BodycapError`."""
+    cls = _ERROR_TYPES.get(str(data.get("type")), BodycapError)
     line = data.get("line")
     return cls(
         str(data.get("message")),

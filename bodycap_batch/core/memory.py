@@ -1,4 +1,4 @@
-"""Memory that was freed goes back to the system."""
+"""Return freed memory to the operating system."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import ctypes
 import gc
 
 
-def give_back() -> None:
-    """Let go of what this process freed: the C library keeps it, and so did peaks grow.
+def release_memory() -> None:
+    """Return the memory that this process has freed to the operating system.
 
-    A map of 54 keyframes leaves 80 MB behind. Elsewhere than with glibc nothing happens.
+    glibc keeps freed memory, which raises the peak of the next step. Other C libraries have no
+    ``malloc_trim``; there only Python's garbage collector runs. Evidence: docs/decisions/export.md.
     """
     gc.collect()
     with contextlib.suppress(OSError, AttributeError):

@@ -1,4 +1,4 @@
-"""What a running job tells those who watch it."""
+"""The progress events of a running job."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ Kind = Literal["started", "progress", "finished", "reused", "failed", "stopped",
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Event:
-    """One step of a job.
+    """One progress event of a job.
 
     Attributes:
-        kind: What happened: a stage started, moved on, finished, was answered by the store, failed or
-            was stopped; or a note for the reader.
+        kind: What happened. A task started, progressed, finished, was reused from the store, failed or was
+            stopped; or the event is a note for the user.
         stage: Stage name.
-        camera: Camera name; "" when the stage concerns all cameras.
-        done: Units done, of `total`.
-        total: Units in all; 0 when not known.
-        what: The unit (``frames``, ``pairs`` …) or, in a note, the text.
-        seconds: How long it took, for a finished stage.
-        round: Which round of growing the map, from 0.
+        camera: Camera name; "" if the stage concerns all cameras.
+        done: Number of finished units.
+        total: Number of units; 0 if unknown.
+        what: Name of the unit (``frames``, ``pairs`` …) or the text of a note.
+        seconds: Duration of a finished task.
+        round: Number of the round in which the map is extended, counted from 0.
     """
 
     kind: Kind
@@ -36,18 +36,19 @@ class Event:
 
     @property
     def label(self) -> str:
-        """Stage, camera and round as one reads them."""
-        return label_of(self.stage, self.camera, self.round)
+        """Stage, camera and round in one text."""
+        return task_label(self.stage, self.camera, self.round)
 
     def to_dict(self) -> dict[str, Any]:
-        """The event as plain JSON values."""
+        """Return the event as plain JSON values."""
         return asdict(self)
 
 
-def label_of(stage: str, camera: str = "", map_round: int = 0) -> str:
-    """Stage, camera and round as one reads them."""
-    again = f"(round {map_round})" if map_round else ""
-    return " ".join(part for part in (stage, camera, again) if part)
+def task_label(stage: str, camera: str = "", map_round: int = 0) -> str:
+    """Return stage, camera and round in one text; the first round is not mentioned."""
+    round_text = f"(round {map_round})" if map_round else ""
+    return " ".join(part for part in (stage, camera, round_text) if part)
 
 
 Listener = Callable[[Event], None]
+"""A function that is called with every event."""

@@ -1,7 +1,11 @@
 """Scores against a truth: trajectories, relative cameras, motions, covariances."""
 
 from bodycap_batch.evaluate.motion import MotionOptions, MotionReport, evaluate_motion, score_motion
-from bodycap_batch.evaluate.relative import RelativeCameraError, normalised_errors, relative_camera_error
+from bodycap_batch.evaluate.relative_cameras import (
+    RelativeCameraError,
+    normalised_errors,
+    relative_camera_error,
+)
 from bodycap_batch.evaluate.trajectories import (
     CameraScore,
     ErrorSummary,

@@ -18,7 +18,7 @@ from bodycap_batch.formats.tum import TimedPoses
 from bodycap_batch.model.geometry import Similarity, align_points, rotation_angle_rad
 from bodycap_batch.model.skeleton import Motion
 
-_ROLE_OF_TRUTH = {
+_ROLE_BY_TRUTH_NAME = {
     "root": "Hips",
     "torso": "Spine1",
     "head": "Head",
@@ -89,7 +89,7 @@ class MotionReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Joints:
+class _JointPoses:
     """Timed joint positions (T,J,3) and orientations (T,J,3,3), the latter identity if not `oriented`."""
 
     times_ns: IntArray
@@ -112,40 +112,42 @@ def evaluate_motion(estimate: Path, truth: Path, options: MotionOptions | None =
     _, motion = read_bvh(estimate)
     if motion is None:
         raise JobError("no frames in the file", path=estimate, hint="give the motion.bvh of a result")
-    return _score(_from_motion(motion), found, options or MotionOptions())
+    return _compare_joints(_joints_from_motion(motion), found, options or MotionOptions())
 
 
 def score_motion(estimate: Motion, truth: Motion, options: MotionOptions | None = None) -> MotionReport:
     """Compare two motions on one clock; see `evaluate_motion`."""
-    return _score(_from_motion(estimate), _from_motion(truth), options or MotionOptions())
+    return _compare_joints(
+        _joints_from_motion(estimate), _joints_from_motion(truth), options or MotionOptions()
+    )
 
 
-def _read_truth(path: Path) -> _Joints:
+def _read_truth(path: Path) -> _JointPoses:
     if path.suffix.lower() != ".npz":
         _, motion = read_bvh(path)
         if motion is None:
             raise JobError("no frames in the file", path=path, hint="give a BVH file with its motion")
-        return _from_motion(motion)
+        return _joints_from_motion(motion)
     try:
         with np.load(path, allow_pickle=False) as content:
             names, seconds, world = (np.asarray(content[key]) for key in ("names", "t", "world"))
     except (OSError, KeyError, ValueError) as error:
         raise JobError(f"not a joints file: {error}", path=path, hint="needs names, t, world") from error
-    kept = [index for index, name in enumerate(names.tolist()) if name in _ROLE_OF_TRUTH]
-    return _Joints(
+    kept = [index for index, name in enumerate(names.tolist()) if name in _ROLE_BY_TRUTH_NAME]
+    return _JointPoses(
         times_ns=np.round(seconds * 1e9).astype(np.int64),
-        roles=tuple(_ROLE_OF_TRUTH[str(names[index])] for index in kept),
+        roles=tuple(_ROLE_BY_TRUTH_NAME[str(names[index])] for index in kept),
         positions=world[:, kept].astype(np.float64),
         rotations=np.broadcast_to(np.eye(3), (len(seconds), len(kept), 3, 3)),
         oriented=False,
     )
 
 
-def _from_motion(motion: Motion) -> _Joints:
+def _joints_from_motion(motion: Motion) -> _JointPoses:
     roles = motion.skeleton.roles
     kept = [index for index, role in enumerate(roles) if role]
     poses = motion.world_from_joint()[:, kept]
-    return _Joints(
+    return _JointPoses(
         times_ns=motion.times_ns(),
         roles=tuple(roles[index] for index in kept),
         positions=poses[..., :3, 3],
@@ -154,13 +156,13 @@ def _from_motion(motion: Motion) -> _Joints:
     )
 
 
-def _score(estimate: _Joints, truth: _Joints, options: MotionOptions) -> MotionReport:
+def _compare_joints(estimate: _JointPoses, truth: _JointPoses, options: MotionOptions) -> MotionReport:
     wanted = {*options.roles, options.root} if options.roles else set(truth.roles)
     roles = tuple(role for role in estimate.roles if role in truth.roles and role in wanted)
     if options.root not in roles or len(roles) < 3:
         message = f"the two share {len(roles)} joints ({', '.join(roles)}); needs {options.root} and two more"
         raise JobError(message, hint="joints are matched by name: HumanIK, Mixamo, Biped, CMU ... names")
-    mine, theirs, rotations, true_rotations = _matched(estimate, truth, roles, options)
+    mine, theirs, rotations, true_rotations = _match_joints(estimate, truth, roles, options)
     if len(mine) == 0:
         raise JobError("the two motions share no time", hint="check offset_s and the frame times")
     alignment = Similarity(1.0, np.eye(3), np.zeros(3))
@@ -175,14 +177,14 @@ def _score(estimate: _Joints, truth: _Joints, options: MotionOptions) -> MotionR
     if truth.oriented:
         turned = alignment.rotation @ rotations
         angles = np.rad2deg(rotation_angle_rad(np.swapaxes(turned, -1, -2) @ true_rotations))
-        offset_free = _without_constant_offset(turned, true_rotations)
+        offset_free = _angles_without_offset(turned, true_rotations)
     others = [index for index in range(len(roles)) if index != root]
     return MotionReport(
         frames=len(mine),
         joints=roles,
         mpjpe_m=_summary(np.linalg.norm(aligned - theirs, axis=-1)),
         root_relative_m=_summary(relative[:, others]),
-        procrustes_m=_summary(_procrustes(mine, theirs)),
+        procrustes_m=_summary(_procrustes_distances(mine, theirs)),
         angle_deg=None if angles is None else _summary(angles),
         angle_offset_free_deg=None if offset_free is None else _summary(offset_free),
         per_joint_m={roles[index]: float(relative[:, index].mean()) for index in others},
@@ -192,8 +194,8 @@ def _score(estimate: _Joints, truth: _Joints, options: MotionOptions) -> MotionR
     )
 
 
-def _matched(
-    estimate: _Joints, truth: _Joints, roles: tuple[str, ...], options: MotionOptions
+def _match_joints(
+    estimate: _JointPoses, truth: _JointPoses, roles: tuple[str, ...], options: MotionOptions
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Positions of both and rotations of both, where both have a time."""
     times = estimate.times_ns + round(options.offset_s * 1e9)
@@ -217,7 +219,7 @@ def _matched(
     )
 
 
-def _without_constant_offset(rotation: FloatArray, true_rotation: FloatArray) -> FloatArray:
+def _angles_without_offset(rotation: FloatArray, true_rotation: FloatArray) -> FloatArray:
     """Angles (T,J) left after the one right-hand offset per joint that explains most (chordal mean)."""
     offset = np.swapaxes(rotation, -1, -2) @ true_rotation
     u, _, vt = np.linalg.svd(offset.sum(axis=0))
@@ -225,7 +227,7 @@ def _without_constant_offset(rotation: FloatArray, true_rotation: FloatArray) ->
     return np.asarray(np.rad2deg(rotation_angle_rad(np.swapaxes(offset, -1, -2) @ (u @ vt))))
 
 
-def _procrustes(mine: FloatArray, theirs: FloatArray) -> FloatArray:
+def _procrustes_distances(mine: FloatArray, theirs: FloatArray) -> FloatArray:
     """Distances (T,J) after a similarity for each frame."""
     out = np.empty(mine.shape[:2])
     for frame, (source, target) in enumerate(zip(mine, theirs, strict=True)):

@@ -138,7 +138,7 @@ def evaluate_trajectories(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Pairs:
+class _MatchedPoses:
     """One camera's estimates with their truths."""
 
     times_ns: IntArray
@@ -169,10 +169,10 @@ def score_trajectories(
             f"the truth of camera {', '.join(empty)} holds no poses",
             hint="a TUM file: time tx ty tz qx qy qz qw",
         )
-    pairs = {name: _pair(estimates[name], truths[name], options) for name in sorted(estimates)}
-    alignment = _align(pairs, options.align)
+    pairs = {name: _match_poses(estimates[name], truths[name], options) for name in sorted(estimates)}
+    alignment = _truth_from_estimate(pairs, options.align)
     counts = frames or {}
-    errors = {name: _errors(pair, alignment, options.rpe_delta_s) for name, pair in pairs.items()}
+    errors = {name: _pose_errors(pair, alignment, options.rpe_delta_s) for name, pair in pairs.items()}
     cameras = {
         name: _score(counts.get(name), pairs[name].registered, len(pairs[name].times_ns), errors[name])
         for name in pairs
@@ -202,9 +202,9 @@ def truth_at(
     return interpolate_truth(truth, times_ns, options.max_gap_s)
 
 
-def _pair(estimate: TimedPoses, truth: TimedPoses, options: TrajectoryOptions) -> _Pairs:
+def _match_poses(estimate: TimedPoses, truth: TimedPoses, options: TrajectoryOptions) -> _MatchedPoses:
     poses, found = truth_at(truth, estimate.times_ns, options)
-    return _Pairs(
+    return _MatchedPoses(
         times_ns=estimate.times_ns[found],
         estimate=estimate.world_from_cam[found],
         truth=poses[found],
@@ -212,7 +212,7 @@ def _pair(estimate: TimedPoses, truth: TimedPoses, options: TrajectoryOptions) -
     )
 
 
-def _align(pairs: Mapping[str, _Pairs], align: Alignment) -> Similarity:
+def _truth_from_estimate(pairs: Mapping[str, _MatchedPoses], align: Alignment) -> Similarity:
     """truth_from_estimate over the centres of all cameras."""
     if align == "none":
         return Similarity(1.0, np.eye(3), np.zeros(3))
@@ -227,13 +227,13 @@ def _align(pairs: Mapping[str, _Pairs], align: Alignment) -> Similarity:
         ) from error
 
 
-def _errors(pair: _Pairs, alignment: Similarity, delta_s: float) -> tuple[FloatArray, ...]:
+def _pose_errors(pair: _MatchedPoses, alignment: Similarity, delta_s: float) -> tuple[FloatArray, ...]:
     """Errors of centres, orientations, and of relative motion (m, deg)."""
     aligned = alignment.apply_to_poses(pair.estimate)
     centres = np.linalg.norm(aligned[:, :3, 3] - pair.truth[:, :3, 3], axis=1)
     difference = invert(pair.truth) @ aligned
     angles = np.rad2deg(rotation_angle_rad(difference[:, :3, :3])) if len(aligned) else np.zeros(0)
-    first, second = _pairs_apart(pair.times_ns, delta_s)
+    first, second = _pairs_at_interval(pair.times_ns, delta_s)
     moved = invert(aligned[first]) @ aligned[second]
     should = invert(pair.truth[first]) @ pair.truth[second]
     relative = invert(should) @ moved
@@ -241,7 +241,7 @@ def _errors(pair: _Pairs, alignment: Similarity, delta_s: float) -> tuple[FloatA
     return centres, angles, np.linalg.norm(relative[:, :3, 3], axis=1), turns
 
 
-def _pairs_apart(times_ns: IntArray, delta_s: float) -> tuple[IntArray, IntArray]:
+def _pairs_at_interval(times_ns: IntArray, delta_s: float) -> tuple[IntArray, IntArray]:
     """Index pairs whose times differ by delta, to half a frame."""
     if len(times_ns) < 2:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.formats.bundle import write_npz
-from bodycap_batch.formats.files import replacing, write_text
+from bodycap_batch.formats.atomic_files import atomic_replacement, write_text
+from bodycap_batch.formats.dataclass_files import write_npz
 from bodycap_batch.formats.tum import seconds_text
 from bodycap_batch.model.geometry import continuous_quat_xyzw
 from bodycap_batch.model.skeleton import Motion
@@ -37,7 +37,7 @@ def write_joint_table(path: Path, motion: Motion, sigma_m: FloatArray | None = N
     local = continuous_quat_xyzw(motion.local_rotation)
     numbers = np.concatenate([poses[..., :3, 3], world, local], axis=-1).round(6) + 0.0
     line = "%s,%s," + "%.6f," * numbers.shape[-1] + "%d,%s\n"
-    names = [_field(name) for name in motion.skeleton.joints]
+    names = [_csv_field(name) for name in motion.skeleton.joints]
     text = io.StringIO()
     text.write(COLUMNS + "\n")
     for tick, time_ns in enumerate(motion.times_ns().tolist()):
@@ -50,7 +50,7 @@ def write_joint_table(path: Path, motion: Motion, sigma_m: FloatArray | None = N
     return path
 
 
-def _field(name: str) -> str:
+def _csv_field(name: str) -> str:
     """A joint's name as CSV takes it."""
     doubled = name.replace('"', '""')
     return f'"{doubled}"' if set(name) & set(',"\n') else name
@@ -80,6 +80,6 @@ def write_joint_arrays(path: Path, motion: Motion, sigma_m: FloatArray | None = 
         "observed": motion.observed,
         "sigma_m": np.full(motion.observed.shape, np.nan) if sigma_m is None else sigma_m,
     }
-    with replacing(path) as temporary:
+    with atomic_replacement(path) as temporary:
         write_npz(temporary, arrays)
     return path

@@ -10,8 +10,13 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.export.inputs import ExportInputs
-from bodycap_batch.export.placed import WORLD, main_frame, place_maps, place_trajectories
+from bodycap_batch.export.export_inputs import ExportInputs
+from bodycap_batch.export.target_frames import (
+    WORLD,
+    main_target_name,
+    maps_in_target_frames,
+    trajectories_in_target_frames,
+)
 from bodycap_batch.model.geometry import invert, rotation_angle_rad, transform_points
 from bodycap_batch.model.relative_pose import RelativePose
 from bodycap_batch.model.rolling_shutter import image_velocity, px_at_mid_row
@@ -28,39 +33,39 @@ def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[st
         gap: How far it is from the graph and the cameras.
     """
     errors = [observation_errors(scene, inputs.trajectories) for scene in inputs.maps]
-    trajectories = place_trajectories(inputs)
-    cameras = {item.camera: _camera(inputs, item, errors) for item in trajectories}
+    trajectories = trajectories_in_target_frames(inputs)
+    cameras = {item.camera: _camera_metrics(inputs, item, errors) for item in trajectories}
     out: dict[str, Any] = {
-        "frame": main_frame(inputs),
-        "metric": main_frame(inputs) == WORLD,
+        "frame": main_target_name(inputs),
+        "metric": main_target_name(inputs) == WORLD,
         "partial": inputs.partial_reason is not None,
         "partial_reason": inputs.partial_reason,
         "cameras": cameras,
-        "total": _total(inputs, cameras, errors),
+        "total": _total_metrics(inputs, cameras, errors),
         "models": [
             {
                 "frame": placed.frame,
                 "scale": None if placed.target_from_map is None else placed.target_from_map.scale,
                 "keyframes": dict(sorted(Counter(placed.scene.keyframe_camera).items())),
-                **_table(placed.scene, errors[_index(inputs.maps, placed.scene)]),
+                **_map_counts(placed.scene, errors[_map_index(inputs.maps, placed.scene)]),
             }
-            for placed in place_maps(inputs)
+            for placed in maps_in_target_frames(inputs)
         ],
         "mapping": dict(inputs.log),
     }
     if inputs.relative_poses:
-        out["relative_poses"] = [_relative(inputs, item) for item in inputs.relative_poses]
+        out["relative_poses"] = [_relative_pose_metrics(inputs, item) for item in inputs.relative_poses]
     if inputs.merge is not None:
         out["merge"] = {
             **inputs.merge.report,
             "unused_cameras": dict(inputs.merge.unused_cameras),
         }
     if motion is not None:
-        out["motion"] = _motion(motion, gap)
-    return dict(_plain(out))
+        out["motion"] = _motion_metrics(motion, gap)
+    return dict(_json_value(out))
 
 
-def _index(maps: Sequence[Map], scene: Map) -> int:
+def _map_index(maps: Sequence[Map], scene: Map) -> int:
     return next(index for index, item in enumerate(maps) if item is scene)
 
 
@@ -92,16 +97,18 @@ def observation_errors(scene: Map, trajectories: Sequence[Trajectory]) -> FloatA
     return out
 
 
-def _table(scene: Map, errors: FloatArray) -> dict[str, Any]:
+def _map_counts(scene: Map, errors: FloatArray) -> dict[str, Any]:
     """Points, measurements and their mean error of one map."""
     return {
         "points": len(scene.points),
         "measurements": len(scene.obs_px),
-        "mean_reprojection_error_px": _mean(errors),
+        "mean_reprojection_error_px": _finite_mean(errors),
     }
 
 
-def _camera(inputs: ExportInputs, trajectory: Trajectory, errors: Sequence[FloatArray]) -> dict[str, Any]:
+def _camera_metrics(
+    inputs: ExportInputs, trajectory: Trajectory, errors: Sequence[FloatArray]
+) -> dict[str, Any]:
     """One camera's line of the tables."""
     name = trajectory.camera
     kept = trajectory.localised
@@ -124,12 +131,12 @@ def _camera(inputs: ExportInputs, trajectory: Trajectory, errors: Sequence[Float
         "keyframes": sum(scene.keyframe_camera.count(name) for scene in inputs.maps),
         "points": sum(len(np.unique(scene.obs_point[seen])) for seen, scene in mine),
         "measurements": sum(int(seen.sum()) for seen, _ in mine),
-        "mean_reprojection_error_px": _mean(mapped[0]),
-        "registration": _registration(trajectory),
+        "mean_reprojection_error_px": _finite_mean(mapped[0]),
+        "registration": _registration_metrics(trajectory),
     }
 
 
-def _registration(trajectory: Trajectory) -> dict[str, Any]:
+def _registration_metrics(trajectory: Trajectory) -> dict[str, Any]:
     """Measurements behind the frames' poses."""
     kept = trajectory.localised & np.isfinite(trajectory.error_px)
     weights = trajectory.inliers[kept]
@@ -142,10 +149,10 @@ def _registration(trajectory: Trajectory) -> dict[str, Any]:
     }
 
 
-def _relative(inputs: ExportInputs, item: RelativePose) -> dict[str, Any]:
+def _relative_pose_metrics(inputs: ExportInputs, item: RelativePose) -> dict[str, Any]:
     """Where one camera of a segment sits beside another: metres in the world, else the map's unit."""
     gauge = {path.camera: path.gauge for path in inputs.trajectories}.get(item.cameras[0])
-    placed = next((each for each in place_maps(inputs) if each.scene.gauge == gauge), None)
+    placed = next((each for each in maps_in_target_frames(inputs) if each.scene.gauge == gauge), None)
     target_from_map = None if placed is None else placed.target_from_map
     scale = 1.0 if target_from_map is None else target_from_map.scale
     pose = item.first_from_second
@@ -161,7 +168,7 @@ def _relative(inputs: ExportInputs, item: RelativePose) -> dict[str, Any]:
     }
 
 
-def _total(
+def _total_metrics(
     inputs: ExportInputs, cameras: Mapping[str, Mapping[str, Any]], errors: Sequence[FloatArray]
 ) -> dict[str, Any]:
     """All cameras together."""
@@ -180,11 +187,11 @@ def _total(
         "keyframes": added("keyframes"),
         "points": sum(len(scene.points) for scene in inputs.maps),
         "measurements": added("measurements"),
-        "mean_reprojection_error_px": _mean(np.concatenate([np.zeros(0), *errors])),
+        "mean_reprojection_error_px": _finite_mean(np.concatenate([np.zeros(0), *errors])),
     }
 
 
-def _motion(motion: Motion, gap: Mapping[str, Any]) -> dict[str, Any]:
+def _motion_metrics(motion: Motion, gap: Mapping[str, Any]) -> dict[str, Any]:
     """The exported motion: rate, length, what was measured, and the gap."""
     share = motion.observed.mean(axis=0) if len(motion.observed) else np.zeros(len(motion.skeleton.joints))
     return {
@@ -204,19 +211,19 @@ def _motion(motion: Motion, gap: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _mean(values: FloatArray) -> float | None:
+def _finite_mean(values: FloatArray) -> float | None:
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else None
 
 
-def _plain(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
     """JSON values: numpy scalars and arrays unwrapped, NaN and infinity as null."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): _json_value(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [_json_value(item) for item in value]
     if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
+        return _json_value(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

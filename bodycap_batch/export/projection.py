@@ -14,12 +14,18 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray
-from bodycap_batch.export.corrections import Correction, Planted, Problem, Tracked, solve_correction
+from bodycap_batch.export.projection_solver import (
+    CameraTarget,
+    ProjectionProblem,
+    RigidMotion,
+    StandingJoint,
+    solve_rigid_motion,
+)
 from bodycap_batch.model.geometry import invert, poses_at, rotation_angle_rad
 from bodycap_batch.model.merge_data import CameraClock, MergeResult, standing_sigma_m
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, forward_kinematics
 
-_MAX_GAP_FRAMES = 1.6
+_MAX_GAP_INTERVALS = 1.6
 """A measured pose is interpolated between neighbouring frames, never across a lost one."""
 
 
@@ -52,18 +58,18 @@ def project_motion(
     Returns:
         The motion on the merge's timeline. Joints the graph did not solve keep their local rotations.
     """
-    cameras = _tracked(merge, clocks, row_fraction or {})
+    cameras = _camera_targets(merge, clocks, row_fraction or {})
     solved = np.flatnonzero(merge.solved)
-    start = _start(merge.skeleton, merge.world_from_joint, merge.solved)
-    problem = Problem(
+    start = _initial_motion(merge.skeleton, merge.world_from_joint, merge.solved)
+    problem = ProjectionProblem(
         fps=merge.fps,
         skeleton=merge.skeleton,
         solved=solved,
         world_from_joint=merge.world_from_joint,
         cameras=cameras,
-        planted=_planted(merge),
+        planted=_standing_joints(merge),
     )
-    result = solve_correction(problem, start)
+    result = solve_rigid_motion(problem, start)
     motion = Motion(
         skeleton=merge.skeleton,
         fps=merge.fps,
@@ -75,19 +81,19 @@ def project_motion(
     return Projection(motion=motion, gap=_gap(merge, motion, cameras))
 
 
-def _planted(merge: MergeResult) -> tuple[Planted, ...]:
+def _standing_joints(merge: MergeResult) -> tuple[StandingJoint, ...]:
     """The ankles whose feet stand now and then."""
     if merge.standing is None:
         return ()
     held = merge.standing[1:] & merge.standing[:-1]
     sigma_m = standing_sigma_m(merge.fps)
     return tuple(
-        Planted(joint=int(joint), held=held[:, joint], sigma_m=sigma_m)
+        StandingJoint(joint=int(joint), held=held[:, joint], sigma_m=sigma_m)
         for joint in np.flatnonzero(held.any(axis=0))
     )
 
 
-def _start(skeleton: SkeletonModel, world_from_joint: FloatArray, solved: BoolArray) -> Correction:
+def _initial_motion(skeleton: SkeletonModel, world_from_joint: FloatArray, solved: BoolArray) -> RigidMotion:
     """The graph's rotations, and the root where the solved joints fit best."""
     rotation = world_from_joint[..., :3, :3]
     local = rotation.copy()
@@ -96,12 +102,12 @@ def _start(skeleton: SkeletonModel, world_from_joint: FloatArray, solved: BoolAr
     placed = forward_kinematics(skeleton, np.zeros((len(local), 3)), local)[..., :3, 3]
     trusted = solved if solved.any() else np.ones(len(solved), dtype=bool)
     root = (world_from_joint[:, trusted][..., :3, 3] - placed[:, trusted]).mean(axis=1)
-    return Correction(root=root, local=local)
+    return RigidMotion(root=root, local=local)
 
 
-def _tracked(
+def _camera_targets(
     merge: MergeResult, clocks: Mapping[str, CameraClock], row_fraction: Mapping[str, FloatArray]
-) -> tuple[Tracked, ...]:
+) -> tuple[CameraTarget, ...]:
     """Each camera's measured poses at the ticks of the motion."""
     out = []
     mounts = {mount.camera: mount for mount in merge.mounts}
@@ -121,11 +127,11 @@ def _tracked(
             times[order],
             trajectory.gauge_from_cam[kept[order]],
             merge.times_ns(),
-            max_gap_ns=round(_MAX_GAP_FRAMES * float(interval)),
+            max_gap_ns=round(_MAX_GAP_INTERVALS * float(interval)),
             snap_ns=1_000_000,
         )
         out.append(
-            Tracked(
+            CameraTarget(
                 camera=trajectory.camera,
                 joint=joint,
                 joint_from_cam=mount.joint_from_cam,
@@ -136,15 +142,15 @@ def _tracked(
     return tuple(out)
 
 
-def _gap(merge: MergeResult, motion: Motion, cameras: tuple[Tracked, ...]) -> dict[str, Any]:
+def _gap(merge: MergeResult, motion: Motion, cameras: tuple[CameraTarget, ...]) -> dict[str, Any]:
     """How far the exported motion is from the graph and from the cameras."""
     exported = motion.world_from_joint()
     out: dict[str, Any] = {}
     if merge.solved.any():
         graph, rigid = merge.world_from_joint[:, merge.solved], exported[:, merge.solved]
-        out["joints"] = _difference(graph, rigid)
+        out["joints"] = _pose_difference(graph, rigid)
     out["cameras"] = {
-        tracked.camera: _difference(
+        tracked.camera: _pose_difference(
             tracked.world_from_cam[tracked.found],
             exported[tracked.found, tracked.joint] @ tracked.joint_from_cam,
         )
@@ -153,21 +159,21 @@ def _gap(merge: MergeResult, motion: Motion, cameras: tuple[Tracked, ...]) -> di
     }
     if merge.standing is not None:
         out["feet"] = {
-            merge.skeleton.joints[planted.joint]: _slide(
+            merge.skeleton.joints[planted.joint]: _slide_speed(
                 exported[:, planted.joint, :3, 3], planted, merge.fps
             )
-            for planted in _planted(merge)
+            for planted in _standing_joints(merge)
         }
     return out
 
 
-def _slide(centre: FloatArray, planted: Planted, fps: float) -> dict[str, float]:
+def _slide_speed(centre: FloatArray, planted: StandingJoint, fps: float) -> dict[str, float]:
     """How fast an ankle (T,3) slides while its foot stands."""
     speed = fps * np.linalg.norm(np.diff(centre, axis=0), axis=1)[planted.held]
     return {f"slide_p{q}_m_per_s": float(np.percentile(speed, q)) for q in (50, 95)}
 
 
-def _difference(first: FloatArray, second: FloatArray) -> dict[str, float]:
+def _pose_difference(first: FloatArray, second: FloatArray) -> dict[str, float]:
     """Median and 95th percentile of distance and angle between poses (...,4,4)."""
     difference = invert(first) @ second
     distance = np.linalg.norm(difference[..., :3, 3], axis=-1)

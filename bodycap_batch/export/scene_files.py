@@ -7,16 +7,22 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.export.inputs import ExportInputs
-from bodycap_batch.export.placed import WORLD, PlacedMap, main_frame, place_maps, place_trajectories
+from bodycap_batch.export.export_inputs import ExportInputs
+from bodycap_batch.export.target_frames import (
+    WORLD,
+    ExportedMap,
+    main_target_name,
+    maps_in_target_frames,
+    trajectories_in_target_frames,
+)
 from bodycap_batch.formats.colmap import write_colmap_model
 from bodycap_batch.formats.palette import camera_colours
-from bodycap_batch.formats.ply import PointCloud, with_paths, write_ply
+from bodycap_batch.formats.ply import PointCloud, add_camera_paths, write_ply
 from bodycap_batch.formats.tum import TimedPoses, write_tum
 from bodycap_batch.model.scene import Trajectory
 
 PATH_SPACING_M = 0.01
-_PATH_SPACING_SHARE = 1e-3
+_PATH_SPACING_RATIO = 1e-3
 """In a map's own gauge: this share of its points' extent (a room of 10 m: 1 cm)."""
 
 
@@ -26,21 +32,25 @@ def write_maps(inputs: ExportInputs) -> list[Path]:
     Raises:
         StoreError: A file cannot be written.
     """
-    frame = main_frame(inputs)
+    frame = main_target_name(inputs)
     written = []
     colours = camera_colours(item.camera for item in inputs.trajectories)
-    groups: dict[str, list[PlacedMap]] = {}
-    for placed in place_maps(inputs):
+    groups: dict[str, list[ExportedMap]] = {}
+    for placed in maps_in_target_frames(inputs):
         groups.setdefault(placed.frame, []).append(placed)
     for number, (name, members) in enumerate(groups.items()):
-        points = [_moved_points(member) for member in members]
+        points = [_points_in_target(member) for member in members]
         cloud = PointCloud(
             points=np.concatenate(points), colors=np.concatenate([member.scene.colors for member in members])
         )
-        paths = {item.camera: _centres(item) for item in place_trajectories(inputs) if item.gauge == name}
-        spacing = PATH_SPACING_M if name == WORLD else _PATH_SPACING_SHARE * _extent(cloud.points)
+        paths = {
+            item.camera: _camera_centres(item)
+            for item in trajectories_in_target_frames(inputs)
+            if item.gauge == name
+        }
+        spacing = PATH_SPACING_M if name == WORLD else _PATH_SPACING_RATIO * _extent(cloud.points)
         file = inputs.out_dir / ("map.ply" if name == frame else f"map_{number}.ply")
-        write_ply(file, with_paths(cloud, paths, spacing, colours) if paths else cloud)
+        write_ply(file, add_camera_paths(cloud, paths, spacing, colours) if paths else cloud)
         written.append(file)
     return written
 
@@ -54,20 +64,20 @@ def write_trajectories(inputs: ExportInputs) -> list[Path]:
     Raises:
         StoreError: A file cannot be written.
     """
-    frame = main_frame(inputs)
+    frame = main_target_name(inputs)
     written = []
-    for trajectory in place_trajectories(inputs):
+    for trajectory in trajectories_in_target_frames(inputs):
         kept = trajectory.localised
         folder = inputs.out_dir / "trajectories"
         folder = folder if trajectory.gauge == frame or not kept.any() else folder / "unplaced"
         file = folder / f"{trajectory.camera}.tum"
         poses = TimedPoses(times_ns=trajectory.times_ns[kept], world_from_cam=trajectory.gauge_from_cam[kept])
-        write_tum(file, poses, _heading(trajectory))
+        write_tum(file, poses, _header_comments(trajectory))
         written.append(file)
     return written
 
 
-def _heading(trajectory: Trajectory) -> list[str]:
+def _header_comments(trajectory: Trajectory) -> list[str]:
     frame = "world_from_camera: metres, Z up, floor at z = 0"
     if trajectory.gauge != WORLD:
         frame = f"map_from_camera: gauge {trajectory.gauge}, its scale and axes are arbitrary"
@@ -82,18 +92,18 @@ def write_colmap(inputs: ExportInputs) -> list[Path]:
     """
     numbers = {item.camera: item.frame_numbers for item in inputs.trajectories}
     written: list[Path] = []
-    for index, placed in enumerate(place_maps(inputs)):
+    for index, placed in enumerate(maps_in_target_frames(inputs)):
         folder = inputs.out_dir / "colmap" / str(index)
         written += write_colmap_model(folder, placed.scene, placed.target_from_map, numbers)
     return written
 
 
-def _moved_points(placed: PlacedMap) -> FloatArray:
+def _points_in_target(placed: ExportedMap) -> FloatArray:
     points = placed.scene.points
     return points if placed.target_from_map is None else placed.target_from_map.apply(points)
 
 
-def _centres(trajectory: Trajectory) -> FloatArray:
+def _camera_centres(trajectory: Trajectory) -> FloatArray:
     """(N,3) camera centres, NaN where not localised."""
     return np.asarray(trajectory.gauge_from_cam[:, :3, 3])
 

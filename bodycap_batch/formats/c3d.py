@@ -9,7 +9,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, set_array
 from bodycap_batch.core.errors import JobError, StoreError
-from bodycap_batch.formats.files import replacing
+from bodycap_batch.formats.atomic_files import atomic_replacement
 
 _MM_PER_M = 1000.0
 _TOLERANCE_M = 1e-5
@@ -17,7 +17,7 @@ _TOLERANCE_M = 1e-5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Points:
+class LabelledPoints:
     """Named points over time, in the world.
 
     Attributes:
@@ -34,7 +34,7 @@ class Points:
         set_array(self, "x_in_world_m", (None, len(self.names), 3))
 
 
-def write_c3d(path: Path, points: Points) -> Path:
+def write_c3d(path: Path, points: LabelledPoints) -> Path:
     """Write points as C3D and verify them by reading them back.
 
     Returns:
@@ -56,7 +56,7 @@ def write_c3d(path: Path, points: Points) -> Path:
     data = np.ones((4, count, frames))
     data[:3] = _MM_PER_M * points.x_in_world_m.transpose(2, 1, 0)
     content["data"]["points"] = data
-    with replacing(path) as temporary:
+    with atomic_replacement(path) as temporary:
         content.write(str(temporary))
         back = read_c3d(temporary)
         same = back.names == points.names and back.x_in_world_m.shape == points.x_in_world_m.shape
@@ -69,7 +69,7 @@ def write_c3d(path: Path, points: Points) -> Path:
     return path
 
 
-def read_c3d(path: Path) -> Points:
+def read_c3d(path: Path) -> LabelledPoints:
     """Read the points of a C3D file in millimetres.
 
     Raises:
@@ -84,7 +84,7 @@ def read_c3d(path: Path) -> Points:
             f"cannot be read as C3D: {error}", path=path, hint="run the job again; it writes the file anew"
         ) from error
     group = content["parameters"]["POINT"]
-    return Points(
+    return LabelledPoints(
         names=tuple(group["LABELS"]["value"]),
         fps=float(group["RATE"]["value"][0]),
         x_in_world_m=content["data"]["points"][:3].transpose(2, 1, 0) / _MM_PER_M,

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
-from bodycap_batch.formats.files import replacing
+from bodycap_batch.formats.atomic_files import atomic_replacement
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import Similarity, invert, quat_xyzw_from_rotation
 from bodycap_batch.model.scene import Map
 
-_MODEL_IDS = {
+_COLMAP_MODEL_IDS = {
     "SIMPLE_PINHOLE": 0,
     "PINHOLE": 1,
     "SIMPLE_RADIAL": 2,
@@ -82,32 +82,34 @@ def write_colmap_model(
     starts = np.searchsorted(images, np.arange(1, len(order) + 2))
     cam_from_target = invert(move.apply_to_poses(scene.map_from_cam[order]))
     blobs = (
-        _cameras([(index, scene.cameras[name]) for index, name in enumerate(names, start=1)]),
-        _images(
+        _encode_cameras([(index, scene.cameras[name]) for index, name in enumerate(names, start=1)]),
+        _encode_images(
             cam_from_target,
             [names.index(scene.keyframe_camera[keyframe]) + 1 for keyframe in order],
             titles,
-            _observations(scene, by_image, starts),
+            _encode_observations(scene, by_image, starts),
         ),
-        _points(scene, move.apply(scene.points), by_image, images, starts),
+        _encode_points(scene, move.apply(scene.points), by_image, images, starts),
     )
     written = []
     for file, blob in zip(MODEL_FILES, blobs, strict=True):
         written.append(folder / file)
-        with replacing(written[-1]) as temporary:
+        with atomic_replacement(written[-1]) as temporary:
             temporary.write_bytes(blob)
     return tuple(written)
 
 
-def _cameras(cameras: list[tuple[int, Camera]]) -> bytes:
+def _encode_cameras(cameras: list[tuple[int, Camera]]) -> bytes:
     parts = [struct.pack("<Q", len(cameras))]
     for index, camera in cameras:
-        parts.append(struct.pack("<iiQQ", index, _MODEL_IDS[camera.model], camera.width_px, camera.height_px))
+        parts.append(
+            struct.pack("<iiQQ", index, _COLMAP_MODEL_IDS[camera.model], camera.width_px, camera.height_px)
+        )
         parts.append(np.asarray(camera.params, dtype="<f8").tobytes())
     return b"".join(parts)
 
 
-def _observations(scene: Map, by_image: IntArray, starts: IntArray) -> list[bytes]:
+def _encode_observations(scene: Map, by_image: IntArray, starts: IntArray) -> list[bytes]:
     """Each image's 2D points."""
     table = np.empty(len(by_image), dtype=_POINT2D)
     table["x"], table["y"] = scene.obs_px[by_image].T
@@ -115,7 +117,7 @@ def _observations(scene: Map, by_image: IntArray, starts: IntArray) -> list[byte
     return [table[start:end].tobytes() for start, end in pairwise(starts)]
 
 
-def _images(
+def _encode_images(
     cam_from_target: FloatArray, camera_ids: list[int], titles: list[str], points2d: list[bytes]
 ) -> bytes:
     quats = np.roll(quat_xyzw_from_rotation(cam_from_target[:, :3, :3]), 1, axis=-1)
@@ -128,7 +130,7 @@ def _images(
     return b"".join(parts)
 
 
-def _points(
+def _encode_points(
     scene: Map, positions: FloatArray, by_image: IntArray, images: IntArray, starts: IntArray
 ) -> bytes:
     track = np.empty(len(by_image), dtype=_TRACK)

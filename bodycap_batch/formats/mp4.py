@@ -11,27 +11,27 @@ import numpy as np
 import numpy.typing as npt
 
 from bodycap_batch.core.errors import StoreError
-from bodycap_batch.formats.files import store_error
+from bodycap_batch.formats.atomic_files import store_error_from_os_error
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
-TIME_BASE = 15360
-_PLAIN = "bframes=0:rc-lookahead=0:weightp=0:8x8dct=0"
+TIME_BASE_HZ = 15360
+_FAST_X264_PARAMS = "bframes=0:rc-lookahead=0:weightp=0:8x8dct=0"
 """Without looking ahead a picture takes 16 ms instead of 22, and a file a tenth more; without weights and
 large transforms a tenth less time, and it is no larger and no worse."""
-_OPTIONS = {
+_ENCODER_OPTIONS = {
     "high": {"crf": "16", "preset": "superfast"},
     "lossless": {"crf": "0", "preset": "ultrafast"},
     # Every frame decodes alone.
     "exact": {"qp": "0", "preset": "ultrafast", "g": "1"},
     "near": {"crf": "12", "preset": "ultrafast", "g": "12"},
-    "small": {"crf": "27", "preset": "superfast", "x264-params": _PLAIN},
+    "small": {"crf": "27", "preset": "superfast", "x264-params": _FAST_X264_PARAMS},
 }
-_FILE_OPTIONS = {"small": {"movflags": "+faststart"}}
+_CONTAINER_OPTIONS = {"small": {"movflags": "+faststart"}}
 """The index first, so that a page plays the file while it is still loading."""
 Quality = Literal["high", "lossless", "exact", "near", "small"]
-_STUDIO = np.round((np.arange(256) - 128.0) * (224.0 / 255.0) + 128.0).astype(np.uint8)
+_STUDIO_RANGE_CHROMA = np.round((np.arange(256) - 128.0) * (224.0 / 255.0) + 128.0).astype(np.uint8)
 """Chroma of full range in studio range (ITU-R BT.601)."""
 
 
@@ -65,13 +65,13 @@ class VideoWriter:
         self._quality = quality
         rate = Fraction(fps).limit_denominator(100_000)
         try:
-            self._container = av.open(str(path), "w", options=_FILE_OPTIONS.get(quality, {}))
+            self._container = av.open(str(path), "w", options=_CONTAINER_OPTIONS.get(quality, {}))
             self._stream = self._container.add_stream("libx264", rate=rate)
         except (OSError, av.error.FFmpegError) as error:
             raise self._failure(error) from error
         self._stream.width, self._stream.height = size
         self._stream.pix_fmt = "yuv420p"
-        self._stream.options = _OPTIONS[quality]
+        self._stream.options = _ENCODER_OPTIONS[quality]
         self._stream.codec_context.thread_count = 1
         if colours is not None:
             self._stream.codec_context.color_range, self._stream.codec_context.colorspace = colours
@@ -81,7 +81,7 @@ class VideoWriter:
     def add(self, image: npt.NDArray[np.uint8]) -> None:
         """Append an RGB image (H,W,3)."""
         if self._quality == "small":
-            self.add_planes(planes_of(image))
+            self.add_planes(yuv420_from_rgb(image))
         else:
             self._add(self._av.VideoFrame.from_ndarray(image, format="rgb24"))
 
@@ -90,8 +90,8 @@ class VideoWriter:
         self._add(self._av.VideoFrame.from_ndarray(planes, format="yuv420p"))
 
     def _add(self, frame: VideoFrame) -> None:
-        frame.pts = round(self._count * self._frame_duration * TIME_BASE)
-        frame.time_base = Fraction(1, TIME_BASE)
+        frame.pts = round(self._count * self._frame_duration * TIME_BASE_HZ)
+        frame.time_base = Fraction(1, TIME_BASE_HZ)
         self._count += 1
         self._send(frame)
 
@@ -104,7 +104,7 @@ class VideoWriter:
 
     def _failure(self, error: Exception) -> StoreError:
         if isinstance(error, OSError):
-            return store_error(error, self._path)
+            return store_error_from_os_error(error, self._path)
         return StoreError(f"cannot write the video: {error}", path=self._path, hint="check the disk")
 
     def __enter__(self) -> Self:
@@ -122,7 +122,7 @@ class VideoWriter:
                 raise self._failure(problem) from problem
 
 
-def planes_of(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+def yuv420_from_rgb(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     """Luma and halved chroma (1.5·H,W) of an RGB image (H,W,3) whose sides are even, in studio range.
 
     FFmpeg's conversion takes 3.5 ms for 1280×720, this 1.0, and a picture's encoding 8.
@@ -137,5 +137,5 @@ def planes_of(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     # OpenCV takes the chroma of one pixel in four, where thin coloured lines flicker: the mean of them.
     _, red, blue = cv2.split(cv2.cvtColor(half, cv2.COLOR_RGB2YCrCb))
     for plane, chroma in zip(planes[height:].reshape(2, -1), (blue, red), strict=True):
-        plane[:] = cv2.LUT(chroma, _STUDIO).ravel()
+        plane[:] = cv2.LUT(chroma, _STUDIO_RANGE_CHROMA).ravel()
     return np.asarray(planes)

@@ -22,6 +22,6 @@ def camera_colours(cameras: Iterable[str]) -> dict[str, Colour]:
     return {name: CAMERA_COLOURS[number % len(CAMERA_COLOURS)] for number, name in enumerate(names)}
 
 
-def as_hex(colour: Colour) -> str:
+def hex_from_colour(colour: Colour) -> str:
     """``#rrggbb``."""
     return "#{:02x}{:02x}{:02x}".format(*colour)

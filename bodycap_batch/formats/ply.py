@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from bodycap_batch.core.arrays import FloatArray, set_array
 from bodycap_batch.core.errors import StoreError
-from bodycap_batch.formats.files import replacing
-from bodycap_batch.formats.open3d_library import load_open3d
+from bodycap_batch.formats.atomic_files import atomic_replacement
+from bodycap_batch.formats.open3d_loader import load_open3d
 from bodycap_batch.formats.palette import Colour, camera_colours
 
 Colors = npt.NDArray[np.uint8]
@@ -40,7 +40,7 @@ class PointCloud:
         set_array(self, "colors", (len(self.points), 3), np.uint8)
 
 
-def with_paths(
+def add_camera_paths(
     cloud: PointCloud,
     paths: Mapping[str, FloatArray],
     spacing: float,
@@ -57,13 +57,13 @@ def with_paths(
     points, colors = [cloud.points], [cloud.colors]
     colours = colours or camera_colours(paths)
     for name in sorted(paths):
-        samples = _sampled(np.asarray(paths[name], dtype=np.float64).reshape(-1, 3), spacing)
+        samples = _sample_polyline(np.asarray(paths[name], dtype=np.float64).reshape(-1, 3), spacing)
         points.append(samples)
         colors.append(np.broadcast_to(np.array(colours[name], dtype=np.uint8), samples.shape))
     return PointCloud(points=np.concatenate(points), colors=np.concatenate(colors))
 
 
-def _sampled(path: FloatArray, spacing: float) -> FloatArray:
+def _sample_polyline(path: FloatArray, spacing: float) -> FloatArray:
     """Points along a polyline at most `spacing` apart, every vertex kept, gaps left open."""
     out = []
     for start, end in pairwise(path):
@@ -86,7 +86,7 @@ def write_ply(path: Path, cloud: PointCloud) -> None:
     content = open3d.geometry.PointCloud()
     content.points = open3d.utility.Vector3dVector(cloud.points.copy())
     content.colors = open3d.utility.Vector3dVector(cloud.colors / 255.0)
-    with replacing(path) as temporary:
+    with atomic_replacement(path) as temporary:
         # Open3D gives no reason, and tells of a full disk by a flood of lines: ask the system first.
         temporary.write_bytes(bytes(_HEADER_BYTES + _VERTEX_BYTES * len(cloud.points)))
         if not open3d.io.write_point_cloud(temporary, content, write_ascii=False):

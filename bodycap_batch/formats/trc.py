@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, frozen_array
-from bodycap_batch.formats.c3d import Points
-from bodycap_batch.formats.files import write_text
+from bodycap_batch.formats.atomic_files import write_text
+from bodycap_batch.formats.c3d import LabelledPoints
 
 _FILE_FROM_WORLD: FloatArray = frozen_array(
     [[0, -1, 0], [0, 0, 1], [-1, 0, 0]], name="file_from_world", shape=(3, 3)
@@ -16,7 +16,7 @@ _FILE_FROM_WORLD: FloatArray = frozen_array(
 _MM_PER_M = 1000.0
 
 
-def write_trc(path: Path, points: Points) -> Path:
+def write_trc(path: Path, points: LabelledPoints) -> Path:
     """Write points; a frame's time counts from 0, a micrometre is its last digit.
 
     Returns:

@@ -11,13 +11,13 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray, set_array
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.formats.files import write_text
+from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.model.geometry import make_transform, quat_xyzw_from_rotation, rotation_from_quat_xyzw
 
 _NS_PER_S = 1_000_000_000
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
-_COMMENTS = ("#", "%", "//", ";")
-_HEADINGS = ("timestamp", "time", "t")
+_COMMENT_PREFIXES = ("#", "%", "//", ";")
+_HEADER_WORDS = ("timestamp", "time", "t")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,10 +58,10 @@ def read_tum(path: Path | str) -> TimedPoses:
                 words = line.replace(",", " ").split()
                 if not words:
                     continue
-                if words[0].startswith(_COMMENTS) or (not rows and words[0].lower() in _HEADINGS):
+                if words[0].startswith(_COMMENT_PREFIXES) or (not rows and words[0].lower() in _HEADER_WORDS):
                     headed = True
                     continue
-                time_ns, row = _parse(path, number, words)
+                time_ns, row = _parse_line(path, number, words)
                 times.append(time_ns)
                 rows.append(row)
     except OSError as error:
@@ -74,7 +74,7 @@ def read_tum(path: Path | str) -> TimedPoses:
     return TimedPoses(times_ns=times_ns, world_from_cam=poses)
 
 
-def _parse(path: Path, number: int, words: list[str]) -> tuple[int, list[float]]:
+def _parse_line(path: Path, number: int, words: list[str]) -> tuple[int, list[float]]:
     """Time and the seven numbers of one line."""
     if len(words) != 8:
         message = f"{len(words)} columns, expected 8"

@@ -9,14 +9,14 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError, StoreError
-from bodycap_batch.formats.figure import Figure, stick_figure
-from bodycap_batch.formats.files import replacing
+from bodycap_batch.formats.atomic_files import atomic_replacement
+from bodycap_batch.formats.stick_figure import StickFigure, make_stick_figure
 from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, rotation_from_quat_xyzw
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 
-_BODY, _SKELETON, _FIGURE = "/Body", "/Body/Skeleton", "/Body/Figure"
-_MOTION = "/Body/Skeleton/Motion"
-_COLOR = (0.86, 0.39, 0.10)
+_BODY_PATH, _SKELETON_PATH, _FIGURE_PATH = "/Body", "/Body/Skeleton", "/Body/Figure"
+_MOTION_PATH = "/Body/Skeleton/Motion"
+_FIGURE_COLOR_RGB = (0.86, 0.39, 0.10)
 
 
 def write_usd(path: Path, motion: Motion) -> Path:
@@ -45,17 +45,17 @@ def write_usd(path: Path, motion: Motion) -> Path:
     stage.SetFramesPerSecond(motion.fps)
     stage.SetStartTimeCode(0.0)
     stage.SetEndTimeCode(float(frames - 1))
-    body = UsdSkel.Root.Define(stage, _BODY)
+    body = UsdSkel.Root.Define(stage, _BODY_PATH)
     stage.SetDefaultPrim(body.GetPrim())
     centres = motion.world_from_joint()[..., :3, 3].reshape(-1, 3)
-    corners = [centres.min(axis=0) - _MARGIN_M, centres.max(axis=0) + _MARGIN_M]
+    corners = [centres.min(axis=0) - _EXTENT_MARGIN_M, centres.max(axis=0) + _EXTENT_MARGIN_M]
     body.CreateExtentAttr(Vt.Vec3fArray([Gf.Vec3f(*corner.tolist()) for corner in corners]))
-    tokens = _tokens(motion.skeleton)
-    skeleton = _skeleton(stage, motion.skeleton, tokens)
-    animation = _animation(stage, motion, tokens)
+    tokens = _joint_tokens(motion.skeleton)
+    skeleton = _define_skeleton(stage, motion.skeleton, tokens)
+    animation = _define_animation(stage, motion, tokens)
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
-    _figure(stage, stick_figure(motion.skeleton), skeleton)
-    with replacing(path) as temporary:
+    _define_figure(stage, make_stick_figure(motion.skeleton), skeleton)
+    with atomic_replacement(path) as temporary:
         if not stage.GetRootLayer().Export(str(temporary)):
             raise StoreError(
                 "USD could not write the stage", path=path, hint="check that the disk is not full"
@@ -63,11 +63,11 @@ def write_usd(path: Path, motion: Motion) -> Path:
     return path
 
 
-_MARGIN_M = 0.3
+_EXTENT_MARGIN_M = 0.3
 """The figure's bones reach beyond the joints' centres: head, hands, feet."""
 
 
-def _tokens(skeleton: SkeletonModel) -> list[str]:
+def _joint_tokens(skeleton: SkeletonModel) -> list[str]:
     """Each joint's path, of names that USD allows; siblings never share one."""
     from pxr import Tf
 
@@ -82,30 +82,30 @@ def _tokens(skeleton: SkeletonModel) -> list[str]:
     return out
 
 
-def _matrices(poses: FloatArray) -> Any:
+def _usd_matrices(poses: FloatArray) -> Any:
     """Poses (J,4,4) as USD keeps matrices: row vectors."""
     from pxr import Gf, Vt
 
     return Vt.Matrix4dArray([Gf.Matrix4d(*pose.T.reshape(-1).tolist()) for pose in poses])
 
 
-def _skeleton(stage: Any, model: SkeletonModel, tokens: list[str]) -> Any:
+def _define_skeleton(stage: Any, model: SkeletonModel, tokens: list[str]) -> Any:
     from pxr import UsdSkel
 
     rest = rest_pose(model)
     local = [rest[j] if p < 0 else invert(rest[p]) @ rest[j] for j, p in enumerate(model.parents.tolist())]
-    skeleton = UsdSkel.Skeleton.Define(stage, _SKELETON)
+    skeleton = UsdSkel.Skeleton.Define(stage, _SKELETON_PATH)
     skeleton.CreateJointsAttr(tokens)
     skeleton.CreateJointNamesAttr(list(model.joints))
-    skeleton.CreateBindTransformsAttr(_matrices(rest))
-    skeleton.CreateRestTransformsAttr(_matrices(np.array(local)))
+    skeleton.CreateBindTransformsAttr(_usd_matrices(rest))
+    skeleton.CreateRestTransformsAttr(_usd_matrices(np.array(local)))
     return skeleton
 
 
-def _animation(stage: Any, motion: Motion, tokens: list[str]) -> Any:
+def _define_animation(stage: Any, motion: Motion, tokens: list[str]) -> Any:
     from pxr import Gf, UsdSkel, Vt
 
-    animation = UsdSkel.Animation.Define(stage, _MOTION)
+    animation = UsdSkel.Animation.Define(stage, _MOTION_PATH)
     animation.CreateJointsAttr(tokens)
     attributes = (
         animation.CreateTranslationsAttr(),
@@ -124,11 +124,11 @@ def _animation(stage: Any, motion: Motion, tokens: list[str]) -> Any:
     return animation
 
 
-def _figure(stage: Any, figure: Figure, skeleton: Any) -> None:
+def _define_figure(stage: Any, figure: StickFigure, skeleton: Any) -> None:
     """The mesh, every vertex bound to one joint with weight 1."""
     from pxr import Gf, UsdGeom, UsdSkel, Vt
 
-    mesh = UsdGeom.Mesh.Define(stage, _FIGURE)
+    mesh = UsdGeom.Mesh.Define(stage, _FIGURE_PATH)
     vertices = figure.vertices_m.astype(np.float32)
     mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(vertices))
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(figure.faces), 3, dtype=np.int32)))
@@ -138,7 +138,7 @@ def _figure(stage: Any, figure: Figure, skeleton: Any) -> None:
     mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(figure.normals.astype(np.float32)))
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    mesh.CreateDisplayColorAttr([Gf.Vec3f(*_COLOR)])
+    mesh.CreateDisplayColorAttr([Gf.Vec3f(*_FIGURE_COLOR_RGB)])
     low, high = vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()
     mesh.CreateExtentAttr([Gf.Vec3f(*low), Gf.Vec3f(*high)])
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
@@ -162,7 +162,10 @@ def read_usd(path: Path) -> Motion:
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
         raise JobError("cannot be read as USD", path=path, hint="give the motion.usd of a result") from error
-    skeleton, animation = UsdSkel.Skeleton.Get(stage, _SKELETON), UsdSkel.Animation.Get(stage, _MOTION)
+    skeleton, animation = (
+        UsdSkel.Skeleton.Get(stage, _SKELETON_PATH),
+        UsdSkel.Animation.Get(stage, _MOTION_PATH),
+    )
     if not skeleton or not animation:
         raise JobError("holds no skeleton with its motion", path=path, hint="give the motion.usd of a result")
     frames = [float(frame) for frame in range(round(stage.GetEndTimeCode()) + 1)]

@@ -1,1 +1,1 @@
-"""What all stages share: poses, cameras, maps, skeletons, motions, and the geometry on them."""
+"""The data types that all stages share (cameras, maps, trajectories, skeletons, motions) and their geometry."""

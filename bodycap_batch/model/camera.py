@@ -1,4 +1,7 @@
-"""A calibrated camera. Pixels follow COLMAP: the centre of the first pixel is (0.5, 0.5)."""
+"""The intrinsics of a camera: projection and its inverse.
+
+Pixels follow COLMAP: the centre of the first pixel is (0.5, 0.5).
+"""
 
 from __future__ import annotations
 
@@ -13,9 +16,9 @@ if TYPE_CHECKING:
     import pycolmap
 
 CV2_PIXEL_OFFSET_PX = 0.5
-"""COLMAP pixel = OpenCV pixel + this."""
+"""Pixels: COLMAP's coordinates are OpenCV's plus this. OpenCV puts (0, 0) at the centre of the first pixel."""
 
-_FOCAL_PARAMS = {
+_FOCAL_INDICES = {
     "SIMPLE_PINHOLE": (0,),
     "PINHOLE": (0, 1),
     "SIMPLE_RADIAL": (0,),
@@ -28,6 +31,8 @@ _FOCAL_PARAMS = {
     "THIN_PRISM_FISHEYE": (0, 1),
     "FOV": (0, 1),
 }
+"""Index of each focal length in the parameters of a COLMAP camera model. Source: COLMAP, sensor/models.h."""
+
 _PARAM_COUNT = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -41,26 +46,35 @@ _PARAM_COUNT = {
     "THIN_PRISM_FISHEYE": 12,
     "FOV": 5,
 }
+"""Number of parameters of each COLMAP camera model. Source: COLMAP, sensor/models.h."""
+
+_MIN_DEPTH = 1e-9
+"""Unit of the points. Points at a smaller depth have no projection. Derivation: avoids a division by zero."""
+
 CAMERA_MODELS = tuple(_PARAM_COUNT)
 
 
-def param_count(model: str) -> int:
-    """Number of parameters of a COLMAP camera model (KeyError if unknown)."""
+def parameter_count(model: str) -> int:
+    """Return the number of parameters of a COLMAP camera model.
+
+    Raises:
+        KeyError: The model is unknown.
+    """
     return _PARAM_COUNT[model]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Camera:
-    """Intrinsics of one lens at one image size.
+    """Intrinsics of one camera at one image size.
 
     Attributes:
-        model: COLMAP camera model name.
+        model: Name of the COLMAP camera model.
         width_px: Image width.
         height_px: Image height.
-        params: The model's parameters in COLMAP's order, pixels and COLMAP's pixel origin.
-        refine: True where the parameters are a guess that mapping may refine.
-        sideways: True where the sensor's rows run along the picture's columns, as where a phone was held
-            upright; a rolling shutter alone asks.
+        params: Parameters of the model in COLMAP's order, in pixels with COLMAP's origin.
+        refine: Whether the parameters are only an initial guess that mapping may refine.
+        sideways: Whether the sensor's rows are the image's columns, as for a phone that was held upright. Only
+            the rolling-shutter correction uses it.
     """
 
     model: str
@@ -79,17 +93,17 @@ class Camera:
 
     @property
     def focal_px(self) -> float:
-        """Mean focal length."""
-        return float(np.mean([self.params[i] for i in _FOCAL_PARAMS[self.model]]))
+        """Focal length in pixels, the mean of both axes."""
+        return float(np.mean([self.params[i] for i in _FOCAL_INDICES[self.model]]))
 
     @property
     def principal_point_px(self) -> tuple[float, float]:
-        """Principal point (cx, cy)."""
-        first = len(_FOCAL_PARAMS[self.model])
+        """Principal point (cx, cy) in pixels."""
+        first = len(_FOCAL_INDICES[self.model])
         return float(self.params[first]), float(self.params[first + 1])
 
     def to_pycolmap(self) -> pycolmap.Camera:
-        """Build the same camera for pycolmap."""
+        """Return the same intrinsics as a pycolmap camera."""
         import pycolmap
 
         return pycolmap.Camera(
@@ -97,26 +111,32 @@ class Camera:
         )
 
     def project(self, x_in_cam: FloatArray) -> FloatArray:
-        """Project points (N,3) in the camera frame to pixels (N,2); NaN behind the camera."""
+        """Project points (N,3) in the camera frame to pixels (N,2); points behind the camera give NaN."""
         points = np.asarray(x_in_cam, dtype=np.float64).reshape(-1, 3)
         out = np.full((len(points), 2), np.nan)
-        front = points[:, 2] > 1e-9
+        front = points[:, 2] > _MIN_DEPTH
         if front.any():
             out[front] = self.to_pycolmap().img_from_cam(points[front])
         return out
 
     def unproject(self, px: FloatArray) -> FloatArray:
-        """Undistort pixels (N,2) to rays (N,2) at depth 1; NaN where the model has no inverse."""
+        """Return the rays (N,2) of pixels (N,2) as undistorted image coordinates at depth 1.
+
+        A pixel for which the camera model has no inverse gives NaN.
+        """
         pixels = np.ascontiguousarray(px, dtype=np.float64).reshape(-1, 2)
         if len(pixels) == 0:
             return np.zeros((0, 2))
         return np.asarray(self.to_pycolmap().cam_from_img(pixels))
 
     def scaled(self, width_px: int, height_px: int) -> Camera:
-        """The same lens at another image size (COLMAP's pixel origin scales exactly)."""
+        """Return the intrinsics of the same camera at another image size.
+
+        The result is exact because COLMAP's pixel coordinates start at the corner of the image.
+        """
         scale_x, scale_y = width_px / self.width_px, height_px / self.height_px
         params = self.params.copy()
-        focal = _FOCAL_PARAMS[self.model]
+        focal = _FOCAL_INDICES[self.model]
         if len(focal) == 1:
             params[0] *= 0.5 * (scale_x + scale_y)
         else:
@@ -127,22 +147,26 @@ class Camera:
         return replace(self, width_px=width_px, height_px=height_px, params=params)
 
 
-_TWO_FOCAL_TWIN = {
+_TWO_FOCAL_MODEL = {
     "SIMPLE_PINHOLE": ("PINHOLE", 0),
     "SIMPLE_RADIAL": ("OPENCV", 1),
     "RADIAL": ("OPENCV", 2),
     "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", 1),
     "RADIAL_FISHEYE": ("OPENCV_FISHEYE", 2),
 }
+"""For each model with one focal length: a model with two, and the number of distortion parameters to copy."""
 
 
-def without_single_focal(camera: Camera) -> Camera:
-    """The same lens with a focal length per axis, so that both axes can scale on their own."""
-    if camera.model not in _TWO_FOCAL_TWIN:
+def with_two_focal_lengths(camera: Camera) -> Camera:
+    """Return the same intrinsics with one focal length per axis.
+
+    Only such a camera can be scaled by different factors in width and height.
+    """
+    if camera.model not in _TWO_FOCAL_MODEL:
         return camera
-    model, radial = _TWO_FOCAL_TWIN[camera.model]
+    model, distortion_count = _TWO_FOCAL_MODEL[camera.model]
     focal, cx, cy, *distortion = camera.params
     params = np.zeros(_PARAM_COUNT[model])
     params[:4] = focal, focal, cx, cy
-    params[4 : 4 + radial] = distortion[:radial]
+    params[4 : 4 + distortion_count] = distortion[:distortion_count]
     return replace(camera, model=model, params=params)

@@ -1,7 +1,8 @@
-"""Rigid and similarity transforms on arrays of 4×4 matrices.
+"""Rotations, rigid transforms and similarities on arrays.
 
-Transforms are ``target_from_source``, float64, column vectors. Quaternions are xyzw. scipy takes a second
-to import and is imported where it is needed: ``bodycap --help`` and finished jobs do without it.
+A transform is named ``target_from_source``. It is a 4×4 float64 matrix that multiplies column vectors.
+Quaternions are in the order x, y, z, w. scipy is imported inside the functions because its import takes a
+second, which ``bodycap --help`` and finished jobs do not need.
 """
 
 from __future__ import annotations
@@ -15,7 +16,10 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 
 
 def make_transform(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> FloatArray:
-    """Stack (...,3,3) rotations and (...,3) translations into (...,4,4)."""
+    """Combine rotations (...,3,3) and translations (...,3) to rigid transforms (...,4,4).
+
+    The leading axes are broadcast against each other.
+    """
     rotation = np.asarray(rotation, dtype=np.float64)
     translation = np.asarray(translation, dtype=np.float64)
     lead = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
@@ -27,20 +31,25 @@ def make_transform(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Float
 
 
 def invert(target_from_source: FloatArray) -> FloatArray:
-    """Invert rigid transforms (...,4,4)."""
+    """Return the inverses source_from_target of rigid transforms (...,4,4)."""
     rotation_t = np.swapaxes(target_from_source[..., :3, :3], -1, -2)
     translation = -np.einsum("...ij,...j->...i", rotation_t, target_from_source[..., :3, 3])
     return make_transform(rotation_t, translation)
 
 
 def transform_points(target_from_source: FloatArray, x_in_source: FloatArray) -> FloatArray:
-    """Apply one (4,4) transform to points (...,3), or (N,4,4) to (N,3)."""
+    """Return points in the target frame.
+
+    Args:
+        target_from_source: One transform (4,4) for all points, or one per point (N,4,4).
+        x_in_source: Points (...,3) for one transform, else (N,3).
+    """
     rotated = np.einsum("...ij,...j->...i", target_from_source[..., :3, :3], x_in_source)
     return np.asarray(rotated + target_from_source[..., :3, 3])
 
 
 def quat_xyzw_from_rotation(rotation: FloatArray) -> FloatArray:
-    """Convert (...,3,3) rotations to unit quaternions (...,4), w ≥ 0."""
+    """Convert rotations (...,3,3) to unit quaternions (...,4) with w ≥ 0."""
     from scipy.spatial.transform import Rotation
 
     flat = rotation.reshape(-1, 3, 3)
@@ -51,7 +60,10 @@ def quat_xyzw_from_rotation(rotation: FloatArray) -> FloatArray:
 
 
 def continuous_quat_xyzw(rotation: FloatArray) -> FloatArray:
-    """Convert rotations over time (T,...,3,3) to quaternions (T,...,4) whose sign never jumps."""
+    """Convert rotations over time (T,...,3,3) to unit quaternions (T,...,4) with continuous signs.
+
+    The sign of each quaternion is chosen such that its dot product with the previous one is not negative.
+    """
     quat = quat_xyzw_from_rotation(rotation)
     flips = np.where((quat[1:] * quat[:-1]).sum(axis=-1) < 0.0, -1.0, 1.0)
     quat[1:] *= np.cumprod(flips, axis=0)[..., None]
@@ -59,7 +71,7 @@ def continuous_quat_xyzw(rotation: FloatArray) -> FloatArray:
 
 
 def rotation_from_quat_xyzw(quat_xyzw: npt.ArrayLike) -> FloatArray:
-    """Convert quaternions (...,4) (any norm but zero) to (...,3,3) rotations."""
+    """Convert quaternions (...,4) of any norm but zero to rotations (...,3,3)."""
     from scipy.spatial.transform import Rotation
 
     quat = np.asarray(quat_xyzw, dtype=np.float64)
@@ -70,7 +82,7 @@ def rotation_from_quat_xyzw(quat_xyzw: npt.ArrayLike) -> FloatArray:
 
 
 def so3_exp(rotvec_rad: npt.ArrayLike) -> FloatArray:
-    """Rotation vectors (...,3) to rotations (...,3,3)."""
+    """Convert rotation vectors (...,3), radians, to rotations (...,3,3)."""
     from scipy.spatial.transform import Rotation
 
     vec = np.asarray(rotvec_rad, dtype=np.float64)
@@ -79,7 +91,7 @@ def so3_exp(rotvec_rad: npt.ArrayLike) -> FloatArray:
 
 
 def so3_log(rotation: FloatArray) -> FloatArray:
-    """Rotations (...,3,3) to rotation vectors (...,3), angle ≤ π."""
+    """Convert rotations (...,3,3) to rotation vectors (...,3), radians, with angles up to π."""
     from scipy.spatial.transform import Rotation
 
     vec = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
@@ -87,14 +99,14 @@ def so3_log(rotation: FloatArray) -> FloatArray:
 
 
 def rotation_angle_rad(rotation: FloatArray) -> FloatArray:
-    """Geodesic angle (...) of rotations (...,3,3)."""
+    """Return the angles (...), radians, of rotations (...,3,3)."""
     return np.asarray(np.linalg.norm(so3_log(rotation), axis=-1))
 
 
 def nearest_rotation(matrix: FloatArray) -> FloatArray:
-    """The rotations nearest to matrices (...,3,3) in the Frobenius norm.
+    """Return the rotations that are nearest to matrices (...,3,3) in the Frobenius norm.
 
-    Applied to a sum of rotations this is their chordal mean.
+    The nearest rotation to a sum of rotations is their chordal mean.
 
     Source: Umeyama, "Least-squares estimation of transformation parameters between two point
         patterns", PAMI 1991; Hartley et al., "Rotation averaging", IJCV 2013.
@@ -106,7 +118,7 @@ def nearest_rotation(matrix: FloatArray) -> FloatArray:
 
 
 def skew(vector: FloatArray) -> FloatArray:
-    """Vectors (...,3) to matrices (...,3,3) whose product with w is the cross product vector × w."""
+    """Return the matrices (...,3,3) for which ``skew(v) @ w`` is the cross product v × w."""
     x, y, z = (vector[..., axis] for axis in range(3))
     zero = np.zeros_like(x)
     rows = [zero, -z, y, z, zero, -x, -y, x, zero]
@@ -114,12 +126,12 @@ def skew(vector: FloatArray) -> FloatArray:
 
 
 def se3_adjoint(target_from_source: FloatArray) -> FloatArray:
-    """Adjoints (...,6,6) of rigid transforms, rotation before translation.
+    """Return the adjoints (...,6,6) of rigid transforms, with rotation before translation.
 
-    A small motion ξ of the source frame, (rotation, translation) in its own axes, is the motion Ad ξ in the
-    axes of the target.
+    A small motion ξ = (rotation, translation) of the source frame in its own axes equals the motion Ad ξ in
+    the axes of the target frame.
 
-    Source: Barfoot, "State estimation for robotics", 2017, with the order of the two halves exchanged.
+    Source: T. Barfoot, "State estimation for robotics", 2017, which puts translation before rotation.
     """
     rotation = target_from_source[..., :3, :3]
     out = np.zeros((*rotation.shape[:-2], 6, 6))
@@ -129,12 +141,12 @@ def se3_adjoint(target_from_source: FloatArray) -> FloatArray:
 
 
 def interpolate_pose(start: FloatArray, end: FloatArray, alpha: npt.ArrayLike) -> FloatArray:
-    """Interpolate rigid transforms (...,4,4): slerp for rotation, linear for translation.
+    """Interpolate between rigid transforms (...,4,4): rotations by slerp, translations linearly.
 
     Args:
-        start: target_from_source at alpha 0.
-        end: target_from_source at alpha 1.
-        alpha: Fraction(s), broadcast against the leading axes.
+        start: target_from_source for alpha 0.
+        end: target_from_source for alpha 1.
+        alpha: Fraction of the way from start to end, broadcast against the leading axes.
     """
     weight = np.asarray(alpha, dtype=np.float64)[..., None]
     delta = so3_log(np.swapaxes(start[..., :3, :3], -1, -2) @ end[..., :3, :3])
@@ -146,17 +158,18 @@ def interpolate_pose(start: FloatArray, end: FloatArray, alpha: npt.ArrayLike) -
 def poses_at(
     times_ns: IntArray, poses: FloatArray, at_ns: IntArray, *, max_gap_ns: int, snap_ns: int = 0
 ) -> tuple[FloatArray, BoolArray]:
-    """Interpolate timed poses between their two neighbours.
+    """Interpolate timed poses at given times, each between its two neighbours in time.
 
     Args:
-        times_ns: (N,) increasing.
-        poses: (N,4,4).
-        at_ns: (M,) wanted times.
-        max_gap_ns: Where the neighbours are further apart than this, there is no pose.
-        snap_ns: A pose this near in time is taken as it is, even outside the range or in a gap.
+        times_ns: (N,) times of the poses, increasing.
+        poses: (N,4,4) poses.
+        at_ns: (M,) times to interpolate at.
+        max_gap_ns: Largest time between two neighbours. In a longer gap no pose is found.
+        snap_ns: If the nearest pose is at most this far away in time, it is found in any case, even in a gap
+            and outside the range of `times_ns`.
 
     Returns:
-        (M,4,4) poses, identity where there is none, and (M,) where there is one.
+        (M,4,4) interpolated poses, the identity if none is found, and a mask (M,) of the poses found.
     """
     out = np.tile(np.eye(4), (len(at_ns), 1, 1))
     if len(times_ns) == 0:
@@ -178,40 +191,51 @@ def poses_at(
 
 @dataclass(frozen=True, slots=True)
 class Similarity:
-    """target_from_source as scale · rotation · x + translation."""
+    """A similarity transform: x_in_target = scale · rotation · x_in_source + translation.
+
+    Attributes:
+        scale: Scale factor, target unit per source unit.
+        rotation: (3,3) rotation.
+        translation: (3,) translation, target unit.
+    """
 
     scale: float
     rotation: FloatArray
     translation: FloatArray
 
     def apply(self, x_in_source: FloatArray) -> FloatArray:
-        """Map points (...,3)."""
+        """Return points (...,3) in the target frame."""
         return np.asarray(self.scale * x_in_source @ self.rotation.T + self.translation)
 
     def apply_to_poses(self, source_from_body: FloatArray) -> FloatArray:
-        """Map poses (...,4,4): rotation turned, position scaled, turned and moved."""
+        """Return target_from_body (...,4,4): rotations are rotated, positions are transformed as points."""
         return make_transform(
             self.rotation @ source_from_body[..., :3, :3],
             self.apply(source_from_body[..., :3, 3]),
         )
 
     def after(self, first: Similarity) -> Similarity:
-        """Return this transform applied to what `first` gives."""
+        """Return the composition that applies `first` and then this transform."""
         return Similarity(
             self.scale * first.scale, self.rotation @ first.rotation, self.apply(first.translation)
         )
 
     def inverse(self) -> Similarity:
-        """Return source_from_target."""
+        """Return the inverse transform, source_from_target."""
         rotation = self.rotation.T
         return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
 
 def align_points(x_in_source: FloatArray, x_in_target: FloatArray, *, with_scale: bool = True) -> Similarity:
-    """Least-squares similarity (or rigid) transform between matched points (N,3).
+    """Estimate target_from_source by least squares from corresponding points (N,3).
+
+    Args:
+        x_in_source: (N,3) points in the source frame, N ≥ 3.
+        x_in_target: (N,3) the same points in the target frame.
+        with_scale: Whether the scale is estimated; if not, it is 1 and the transform is rigid.
 
     Raises:
-        ValueError: Fewer than three points, or all in one place.
+        ValueError: There are fewer than three points, the shapes differ, or all source points coincide.
 
     Source: Umeyama, "Least-squares estimation of transformation parameters between two point
         patterns", PAMI 1991.

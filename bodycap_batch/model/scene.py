@@ -1,4 +1,8 @@
-"""What mapping and registration produce: keyframe selections, maps and trajectories."""
+"""The results of keyframe selection, mapping and registration: maps, trajectories and their observations.
+
+A map has its own gauge: a frame of reference with arbitrary origin, axes and scale. Each `Map` and
+`Trajectory` names its gauge. Poses of different gauges must not be mixed.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +18,24 @@ from bodycap_batch.core.arrays import FloatArray, IntArray, set_array
 from bodycap_batch.model.camera import Camera
 
 _FEATURE_STRIDE = 1 << 24
+"""Number of feature indices per frame in a combined (frame, feature) key. Derivation: above any SIFT count,
+and 2^39 frames still fit into 64 bits."""
 
 
 class FrameStatus(StrEnum):
     """Whether a frame was localised, and if not, why.
 
-    RIG: through the cameras that a hardware-synchronised rig holds beside it; it saw too little itself.
+    KEYFRAME: The frame is a keyframe of the map.
+    REGISTERED: The pose was estimated from the frame's own observations.
+    RIG: The pose follows from other cameras of a hardware-synchronised rig, because the frame itself has too
+        few observations.
+    BLUR: Lost; too few tracks reach the frame, and its image is blurred.
+    FEW_TRACKS: Lost; too few tracks reach the frame, although its image is sharp.
+    FEW_INLIERS: Lost; too few observations agree with any pose.
+    UNCONSTRAINED: Lost; the observations do not determine the pose well enough.
+    POSE_JUMP: Lost; the estimated pose was rejected as an outlier of the trajectory.
+    UNCONFIRMED: Lost; few observations support the estimated pose, and no neighbouring frame confirms it.
+    NO_MAP: Lost; no map contains this camera.
     """
 
     KEYFRAME = "KEYFRAME"
@@ -35,20 +51,20 @@ class FrameStatus(StrEnum):
 
     @property
     def localised(self) -> bool:
-        """True where the frame has a measured pose."""
+        """Whether the frame has a measured pose."""
         return self in (FrameStatus.KEYFRAME, FrameStatus.REGISTERED, FrameStatus.RIG)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeyframeSelection:
-    """Keyframes of one camera.
+    """The keyframes that were selected from one camera's video.
 
     Attributes:
         camera: Camera name.
-        frames: (K,) indices into the camera's frames, increasing.
-        frame_count: Frames the camera has.
-        sharpness: (N,) image sharpness per frame (larger is sharper, arbitrary unit).
-        noise_px: Track noise measured by the forward-backward check, one standard deviation.
+        frames: (K,) frame indices of the keyframes, increasing.
+        frame_count: Number N of frames of the video.
+        sharpness: (N,) sharpness of each frame in an arbitrary unit; larger is sharper.
+        noise_px: Standard deviation of the tracked positions, measured by tracking forwards and backwards.
     """
 
     camera: str
@@ -68,23 +84,26 @@ class KeyframeSelection:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Map:
-    """One sparse reconstruction in its own gauge (arbitrary scale, frame ``map``).
+    """A sparse reconstruction: keyframe poses, points and observations in one gauge.
+
+    K keyframes, P points, M observations. The frame of reference is called ``map``.
 
     Attributes:
-        gauge: Identifies the coordinate frame; a refinement makes a new one.
+        gauge: Identifier of the gauge. Each adjustment of the map creates a new gauge.
         cameras: Intrinsics after mapping, by camera name.
         keyframe_camera: (K,) camera name of each keyframe.
-        keyframe_frame: (K,) frame index in that camera.
-        map_from_cam: (K,4,4) keyframe poses.
-        points: (P,3) points in the map frame.
-        colors: (P,3) uint8 RGB.
-        point_error_px: (P,) mean reprojection error.
+        keyframe_frame: (K,) frame index of each keyframe in the video of its camera.
+        map_from_cam: (K,4,4) keyframe poses. With a rolling shutter: the poses at the exposure of the middle
+            row.
+        points: (P,3) points in the map frame, in the unit of the gauge.
+        colors: (P,3) colours of the points, uint8 RGB.
+        point_error_px: (P,) mean reprojection error of each point.
         obs_keyframe: (M,) keyframe index of each observation.
         obs_point: (M,) point index of each observation.
-        obs_feature: (M,) feature index of each observation in its keyframe.
-        obs_px: (M,2) observed pixel, COLMAP origin, work size.
-        readout_s: Time from the first row's exposure to the last's that the map was refined for, by
-            camera; its poses are those of the middle row's instant, `obs_px` is where the pixels were seen.
+        obs_feature: (M,) index of the observed feature in its keyframe.
+        obs_px: (M,2) observed pixels at the work size, COLMAP's origin, not corrected for a rolling shutter.
+        readout_s: Readout time that the map was adjusted with, by camera name. A camera without an entry was
+            adjusted as if it had a global shutter.
     """
 
     gauge: str
@@ -114,41 +133,52 @@ class Map:
         set_array(self, "obs_px", (observations, 2))
 
     def keyframes_of(self, camera: str) -> IntArray:
-        """Indices (into this map's keyframes) of one camera's keyframes, by frame."""
-        mine = np.flatnonzero(np.array([name == camera for name in self.keyframe_camera], dtype=bool))
-        return np.asarray(mine[np.argsort(self.keyframe_frame[mine], kind="stable")], dtype=np.int64)
+        """Return the indices of one camera's keyframes in this map, ordered by frame."""
+        keyframes = np.flatnonzero(np.array([name == camera for name in self.keyframe_camera], dtype=bool))
+        order = np.argsort(self.keyframe_frame[keyframes], kind="stable")
+        return np.asarray(keyframes[order], dtype=np.int64)
 
     def points_of(self, camera: str, frame: IntArray, feature: IntArray) -> IntArray:
-        """Index of the point behind each (keyframe's frame, feature) of a camera; −1 where there is none."""
-        mine = np.isin(self.obs_keyframe, self.keyframes_of(camera))
-        known = self.keyframe_frame[self.obs_keyframe[mine]] * _FEATURE_STRIDE + self.obs_feature[mine]
-        if len(known) == 0:
+        """Return the index of the map point behind each feature of a camera's keyframes.
+
+        Args:
+            camera: Camera name.
+            frame: (N,) frame index of the keyframe of each feature.
+            feature: (N,) feature index in that keyframe.
+
+        Returns:
+            (N,) point indices, −1 if the map has no such observation.
+        """
+        observed = np.isin(self.obs_keyframe, self.keyframes_of(camera))
+        keys = self.keyframe_frame[self.obs_keyframe[observed]] * _FEATURE_STRIDE + self.obs_feature[observed]
+        if len(keys) == 0:
             return np.full(len(frame), -1, np.int64)
-        order = np.argsort(known, kind="stable")
-        wanted = frame * _FEATURE_STRIDE + feature
-        at = order[np.minimum(np.searchsorted(known, wanted, sorter=order), len(known) - 1)]
-        return np.asarray(np.where(known[at] == wanted, self.obs_point[mine][at], -1))
+        order = np.argsort(keys, kind="stable")
+        queries = frame * _FEATURE_STRIDE + feature
+        found = order[np.minimum(np.searchsorted(keys, queries, sorter=order), len(keys) - 1)]
+        return np.asarray(np.where(keys[found] == queries, self.obs_point[observed][found], -1))
 
     def mean_error_px(self) -> float:
-        """Mean reprojection error over observations' points."""
+        """Return the mean over all observations of their point's reprojection error; NaN without any."""
         return float(self.point_error_px[self.obs_point].mean()) if len(self.obs_point) else float("nan")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trajectory:
-    """Timed poses of one camera, one entry for every frame of its video.
+    """The pose and status of each of the N frames of one camera.
 
     Attributes:
         camera: Camera name.
-        gauge: Gauge id of the map it was solved in, or "world" after merging (metres, Z up).
-        frame_numbers: (N,) number of each frame in the video, from 0.
+        gauge: Identifier of the gauge of the map that the poses refer to, or "world" after merging (metres,
+            Z up).
+        frame_numbers: (N,) number of each frame in the video, counted from 0.
         times_ns: (N,) the camera's own timestamps.
-        gauge_from_cam: (N,4,4) poses; NaN where the frame was not localised.
-        covariance: (N,6,6) of the pose, rotation (rad) first, then translation (gauge unit), in the
-            camera's frame (right perturbation, as GTSAM's Pose3); NaN where not localised.
-        status: (N,) a `FrameStatus` per frame.
-        inliers: (N,) PnP inliers.
-        error_px: (N,) mean reprojection error of the inliers; NaN where there are none.
+        gauge_from_cam: (N,4,4) poses; NaN for lost frames.
+        covariance: (N,6,6) covariance of each pose in the camera's axes: rotation (rad) first, then
+            translation (unit of the gauge), as a right perturbation like GTSAM's Pose3. NaN for lost frames.
+        status: (N,) status of each frame.
+        inliers: (N,) number of PnP inliers.
+        error_px: (N,) mean reprojection error of the inliers; NaN for a frame without inliers.
     """
 
     camera: str
@@ -176,18 +206,19 @@ class Trajectory:
 
     @property
     def localised(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-        """(N,) True where the frame has a measured pose."""
+        """(N,) True for the frames that have a measured pose."""
         return np.array([status.localised for status in self.status], dtype=bool)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapResult:
-    """All that mapping leaves behind.
+    """The result of mapping.
 
     Attributes:
-        maps: The models, largest first; each in its own gauge.
-        workspace: Folder with ``database.db`` and ``sparse/<n>``, needed to extend the map.
-        log: JSON-able account: initial pairs tried, models, pairs matched, keyframes left out.
+        maps: The maps, largest first, each in its own gauge.
+        workspace: Folder with ``database.db`` and ``sparse/<n>``, which an extension of the map needs.
+        log: Diagnostics as plain JSON values: the initial pairs tried, the models, the pairs matched, the
+            keyframes without a pose.
     """
 
     maps: tuple[Map, ...]
@@ -197,17 +228,18 @@ class MapResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Registration:
-    """One camera's frames solved against the maps, with the observations behind each pose.
+    """One camera's trajectory against the map, with the observations behind each pose.
 
     Attributes:
-        trajectory: A pose and a status for every frame.
+        trajectory: Pose and status of each frame.
         obs_frame: (M,) frame index of each tracked observation.
-        obs_keyframe: (M,) frame index of the keyframe whose observation was tracked.
-        obs_feature: (M,) feature index in that keyframe (identifies the track after the map changed).
-        obs_px: (M,2) float32 tracked pixel, COLMAP origin.
-        wanted_keyframes: (W,) frames that should become keyframes where tracking failed, and
-            keyframes that the video contradicts, to be placed again.
-        tried_keyframes: (V,) frames of this camera that were offered to the map so far.
+        obs_keyframe: (M,) frame index of the keyframe in which the track starts.
+        obs_feature: (M,) feature index of the track in that keyframe. Frame and feature identify the track
+            even after the map has changed.
+        obs_px: (M,2) tracked pixels, float32, COLMAP's origin.
+        wanted_keyframes: (W,) frame indices that the map should add as keyframes: frames where tracking
+            failed, and misregistered keyframes whose pose should be estimated again.
+        tried_keyframes: (V,) frame indices of this camera that mapping has tried as keyframes so far.
     """
 
     trajectory: Trajectory

@@ -1,7 +1,7 @@
-"""The body: joints, rest pose, mounts, motion and forward kinematics.
+"""The body: skeleton, camera mounts, motion and forward kinematics.
 
-Rest pose and motion are in ``world`` axes: Z up, the body faces −Y, its left is +X, metres. Every
-joint's frame is aligned with the world in the zero pose.
+All coordinates are in metres and in the axes of the world: Z is up, the body faces −Y, its left is +X. In the
+zero pose, in which all joint rotations are the identity, the axes of every joint are those of the world.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from bodycap_batch.model.geometry import make_transform
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SkeletonModel:
-    """A tree of joints in its zero pose.
+    """A tree of J joints in its zero pose.
 
     Attributes:
-        name: Preset or file name.
-        joints: (J,) joint names; a parent stands before its children, the root first.
-        parents: (J,) index of the parent, −1 for the root.
-        offsets_m: (J,3) joint centre in the parent's frame at zero pose (the root's own is its
-            standing position).
-        end_offsets_m: (J,3) the bone's far end in the joint's frame; NaN where it has children.
-        roles: (J,) the anatomical (HumanIK) name of each joint, "" where it has none.
-        bvh_channels: (J,) channel names as a file gave them, or () for the default order.
-        tpose_rotation: (J,3,3) parent_from_joint rotations of the T-pose, where the zero pose is another one.
-        file_rotation: (J,3,3) how each joint of the file stands in this zero pose, where it is the file's
-            T-pose and not its zero pose (`in_tpose`).
+        name: Name of the preset or the file.
+        joints: (J,) joint names, the root first and every parent before its children.
+        parents: (J,) index of each parent, −1 for the root.
+        offsets_m: (J,3) joint centre in the frame of the parent; for the root, its position in the world when
+            the body stands.
+        end_offsets_m: (J,3) far end of the bone in the frame of its joint; NaN for joints with children.
+        roles: (J,) anatomical (HumanIK) name of each joint, "" for joints without one.
+        bvh_channels: (J,) channel names from a BVH file, or () for the default order.
+        tpose_rotation: (J,3,3) parent_from_joint rotations of the T-pose; None if the T-pose is the zero pose.
+        file_rotation: (J,3,3) world_from_joint rotations of the T-pose in the original file, if this skeleton
+            was made by `with_tpose_as_zero_pose`; else None.
     """
 
     name: str
@@ -58,21 +58,21 @@ class SkeletonModel:
             raise ValueError("one root, and every joint name once")
 
     def index_of_role(self, role: str) -> int | None:
-        """Index of the joint that plays an anatomical role, or None."""
+        """Return the index of the joint with an anatomical role, or None if no joint has it."""
         return self.roles.index(role) if role in self.roles else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mount:
-    """How a camera sits on the body.
+    """The pose of a camera in the frame of its bone.
 
     Attributes:
         camera: Camera name.
-        role: Anatomical name of the joint whose bone carries it (``Spine1``, ``LeftHand`` …).
-        joint_from_cam: (4,4) nominal or solved pose of the camera in the joint's frame.
-        sigma_rad: Uncertainty of the rotation, per axis.
-        sigma_m: Uncertainty of the position, per axis.
-        by_name: Whether how it is turned, and how well that is known, rests on the camera's name alone.
+        role: Anatomical name of the joint at which the bone starts (``Spine1``, ``LeftHand`` …).
+        joint_from_cam: (4,4) nominal or estimated pose of the camera in the frame of that joint.
+        sigma_rad: Standard deviation of the rotation, per axis.
+        sigma_m: Standard deviation of the position, per axis.
+        by_name: Whether the rotation and its standard deviation are assumed from the camera's name alone.
     """
 
     camera: str
@@ -88,18 +88,18 @@ class Mount:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
-    """A skeleton moving on a constant-rate timeline, in the world.
+    """The pose of a skeleton in the world at T ticks of constant rate.
 
     Attributes:
-        skeleton: The skeleton that moves.
-        fps: Frames per second.
+        skeleton: The skeleton, with J joints.
+        fps: Ticks per second.
         start_ns: Common time of tick 0.
         root_in_world_m: (T,3) root position.
-        local_rotation: (T,J,3,3) parent_from_joint rotations (zero pose = identity; the root's is
-            world_from_root).
-        observed: (T,J) True where cameras measured the joint rather than a prior.
-        hips_in_root_m: (T,3) position of the root's first child in the root's frame where it travels on its
-            own (a root on the floor that carries the hips); None where every bone keeps its length.
+        local_rotation: (T,J,3,3) parent_from_joint rotations; for the root, world_from_root. The zero pose has
+            identities.
+        observed: (T,J) True if cameras measured the joint; False if its pose follows from priors only.
+        hips_in_root_m: (T,3) position of the root's first child in the frame of the root, for a root on the
+            floor from which the hips move freely. None if every bone has a constant length.
     """
 
     skeleton: SkeletonModel
@@ -121,7 +121,7 @@ class Motion:
                 raise ValueError("hips_in_root_m: the root has no child")
 
     def local_position_m(self) -> FloatArray:
-        """(T,J,3) joint centres in their parent's frame; the root's in the world."""
+        """Return the joint centres (T,J,3) in the frames of their parents; the root's in the world."""
         out = np.tile(self.skeleton.offsets_m, (len(self.root_in_world_m), 1, 1))
         out[:, 0] = self.root_in_world_m
         if self.hips_in_root_m is not None:
@@ -129,30 +129,36 @@ class Motion:
         return out
 
     def times_ns(self) -> IntArray:
-        """(T,) common time of each tick."""
+        """Return the common time (T,) of each tick."""
         ticks = np.arange(len(self.root_in_world_m))
         return np.asarray(self.start_ns + np.round(ticks * (1e9 / self.fps)), dtype=np.int64)
 
     def world_from_joint(self) -> FloatArray:
-        """(T,J,4,4) joint poses."""
+        """Return the joint poses (T,J,4,4) in the world."""
         local = make_transform(self.local_rotation, self.local_position_m())
-        return _chained(self.skeleton, local)
+        return _chain_poses(self.skeleton, local)
 
 
 def forward_kinematics(
     skeleton: SkeletonModel, root_in_world_m: FloatArray, local_rotation: FloatArray
 ) -> FloatArray:
-    """Joint poses (T,J,4,4) from root positions (T,3) and local rotations (T,J,3,3)."""
+    """Return the joint poses (T,J,4,4) in the world for bones of constant length.
+
+    Args:
+        skeleton: The skeleton, with J joints.
+        root_in_world_m: (T,3) root positions.
+        local_rotation: (T,J,3,3) parent_from_joint rotations; for the root, world_from_root.
+    """
     local = make_transform(local_rotation, skeleton.offsets_m)
     local[:, 0, :3, 3] = root_in_world_m
-    return _chained(skeleton, local)
+    return _chain_poses(skeleton, local)
 
 
 def rest_pose(skeleton: SkeletonModel) -> FloatArray:
-    """Joint poses (J,4,4) of the skeleton standing at the origin in its T-pose (without one, its zero pose).
+    """Return the joint poses (J,4,4) of the skeleton that stands at the origin in its T-pose.
 
-    Its root stands as high as the skeleton says; where that says nothing, so that the lowest point of the
-    body touches the floor.
+    A skeleton without a separate T-pose stands in its zero pose. The height of the root is taken from its
+    offset. If that is not positive, the root is raised until the lowest point of the body touches the floor.
     """
     count = len(skeleton.joints)
     local = skeleton.tpose_rotation
@@ -168,41 +174,47 @@ def rest_pose(skeleton: SkeletonModel) -> FloatArray:
     return pose
 
 
-def in_tpose(skeleton: SkeletonModel) -> SkeletonModel:
-    """The same body with its T-pose as zero pose; `as_in_file` leads a motion of it back."""
+def with_tpose_as_zero_pose(skeleton: SkeletonModel) -> SkeletonModel:
+    """Return the same body with its T-pose as zero pose.
+
+    `with_file_zero_pose` converts a motion of this skeleton back to the zero pose of the file.
+    """
     if skeleton.tpose_rotation is None:
         return skeleton
     world: FloatArray = rest_pose(skeleton)[:, :3, :3]
-    above = np.concatenate([np.eye(3)[None], world[skeleton.parents[1:]]])
+    parent = np.concatenate([np.eye(3)[None], world[skeleton.parents[1:]]])
     return replace(
         skeleton,
-        offsets_m=np.einsum("jab,jb->ja", above, skeleton.offsets_m),
+        offsets_m=np.einsum("jab,jb->ja", parent, skeleton.offsets_m),
         end_offsets_m=np.einsum("jab,jb->ja", world, skeleton.end_offsets_m),
         tpose_rotation=None,
         file_rotation=world,
     )
 
 
-def as_in_file(motion: Motion) -> Motion:
-    """The same motion on the rig as its file has it, where that has another zero pose."""
+def with_file_zero_pose(motion: Motion) -> Motion:
+    """Return the same motion of the skeleton with the zero pose of its file.
+
+    This is the inverse of `with_tpose_as_zero_pose`. A motion of any other skeleton is returned unchanged.
+    """
     skeleton = motion.skeleton
     world = skeleton.file_rotation
     if world is None:
         return motion
-    above = np.concatenate([np.eye(3)[None], world[skeleton.parents[1:]]])
-    back = np.swapaxes(above, -1, -2)
-    rig = replace(
+    parent = np.concatenate([np.eye(3)[None], world[skeleton.parents[1:]]])
+    inverse = np.swapaxes(parent, -1, -2)
+    file_skeleton = replace(
         skeleton,
-        offsets_m=np.einsum("jab,jb->ja", back, skeleton.offsets_m),
+        offsets_m=np.einsum("jab,jb->ja", inverse, skeleton.offsets_m),
         end_offsets_m=np.einsum("jba,jb->ja", world, skeleton.end_offsets_m),
-        tpose_rotation=back @ world,
+        tpose_rotation=inverse @ world,
         file_rotation=None,
     )
-    return replace(motion, skeleton=rig, local_rotation=back @ motion.local_rotation @ world)
+    return replace(motion, skeleton=file_skeleton, local_rotation=inverse @ motion.local_rotation @ world)
 
 
-def _chained(skeleton: SkeletonModel, parent_from_joint: FloatArray) -> FloatArray:
-    """Joint poses (T,J,4,4) from poses in the parents (T,J,4,4), the root's in the world."""
+def _chain_poses(skeleton: SkeletonModel, parent_from_joint: FloatArray) -> FloatArray:
+    """Return the joint poses (T,J,4,4) in the world from parent_from_joint (T,J,4,4)."""
     out: FloatArray = parent_from_joint.copy()
     for joint in range(1, len(skeleton.joints)):
         out[:, joint] = out[:, skeleton.parents[joint]] @ parent_from_joint[:, joint]

@@ -1,4 +1,4 @@
-"""The standard body by stature, the axes of its segments, and where cameras usually sit on it."""
+"""The skeleton of a person by stature, the anatomical axes of its segments, and the nominal camera mounts."""
 
 from __future__ import annotations
 
@@ -18,24 +18,35 @@ from bodycap_batch.model.geometry import make_transform
 from bodycap_batch.model.skeleton import Mount, SkeletonModel, rest_pose
 
 PRESETS = ("upper_body", "full_body")
-"""Both are the whole humanoid: what is solved follows the cameras, not the preset."""
+"""Both names give the whole skeleton. The cameras, not the preset, determine which joints are estimated."""
 
 MEAN_HEIGHT_M = 1.70
-"""Stature taken when none is given: between the means of adult women and men in Europe (1.64 and 1.78 m;
-NCD Risk Factor Collaboration, "A century of trends in adult human height", eLife 2016)."""
+"""Metres. The stature if none is given: between the means of adult women and men in Europe, 1.64 m and 1.78 m.
+Source: NCD Risk Factor Collaboration, "A century of trends in adult human height", eLife 2016."""
+
+_STATURE_RANGE_M = (0.5, 2.8)
+"""Metres. Statures outside are refused. Derivation: small children to the tallest people, with a margin; a
+value in centimetres or feet lies outside."""
 
 NOMINAL_SIGMA_RAD = float(np.radians(15.0))
-NOMINAL_SIGMA_M = 0.029
-"""Per axis, of a mount known by its name only: straps turn, and bodies differ; 5 cm in all. The 15° are how
-lightly it is weighed against postures. Mounts are off by 15° in all, which `NAMED_SIGMA_RAD` has per axis;
-weighed with that, joints of simulated walks come out 2 mm worse (4.3 cm without a T-pose)."""
+"""Radians per axis. Weight of the rotation of a mount that is known by its name only. It is larger than the
+expected error `NOMINAL_ERROR_RAD`, so that postures count more. Evidence: docs/decisions/export.md."""
 
-NAMED_SIGMA_RAD = float(np.radians(15.0 / np.sqrt(3.0)))
-"""What it is believed to be off by, per axis."""
+NOMINAL_SIGMA_M = 0.029
+"""Metres per axis, for the position of a mount that is known by its name only. Derivation: 5 cm in all three
+axes together, because straps move and bodies differ."""
+
+NOMINAL_ERROR_RAD = float(np.radians(15.0 / np.sqrt(3.0)))
+"""Radians per axis. Expected rotation error of a mount that is known by its name only. Derivation: 15° in all
+three axes together."""
 
 STATED_SIGMA_RAD = float(np.radians(5.0))
+"""Radians per axis, for a mount whose pose the job states without an accuracy. Derivation: 15° are three
+sigmas."""
+
 STATED_SIGMA_M = 0.015
-"""Per axis, of a mount whose pose the job states without saying how well: 15° and 4.5 cm are three sigma."""
+"""Metres per axis, for a mount whose pose the job states without an accuracy. Derivation: 4.5 cm are three
+sigmas."""
 
 _UP, _FORWARD, _LEFT = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])
 _NEXT_ROLE = {
@@ -45,32 +56,40 @@ _NEXT_ROLE = {
     "UpLeg": "Leg",
     "Leg": "Foot",
 }
+"""The part of a limb at the far end of each bone. Hands and feet point to the end of their own bone."""
+
+_MIN_BONE_M = 1e-6
+"""Metres. A shorter bone has no direction. Derivation: far below any real bone, above rounding errors."""
 
 
 @cache
-def _data(name: str) -> dict[str, Any]:
+def _load_preset_data(name: str) -> dict[str, Any]:
+    """Return the content of a data file of ``bodycap_batch/presets``."""
     text = resources.files("bodycap_batch.presets").joinpath(name).read_text(encoding="utf-8")
     return dict(yaml.safe_load(text))
 
 
 def load_skeleton(preset: str, height_m: float | None = None) -> SkeletonModel:
-    """Build a preset's skeleton for a person of the given stature.
+    """Return the skeleton of a person of the given stature.
 
     Args:
         preset: One of `PRESETS`.
-        height_m: Stature; `MEAN_HEIGHT_M` when None.
+        height_m: Stature; None stands for `MEAN_HEIGHT_M`.
 
     Raises:
-        JobError: The preset does not exist or the stature is not a person's.
+        JobError: The preset does not exist, or no person has this stature.
     """
     if preset not in PRESETS:
         raise JobError(
             f"no skeleton preset {preset!r}", field="skeleton", hint=f"one of {', '.join(PRESETS)}"
         )
     height = MEAN_HEIGHT_M if height_m is None else height_m
-    if not 0.5 <= height <= 2.8:
-        raise JobError(f"a stature of {height} m is no person's", field="height_m", hint="give it in metres")
-    joints: dict[str, Any] = _data("humanoid.yaml")["joints"]
+    low, high = _STATURE_RANGE_M
+    if not low <= height <= high:
+        raise JobError(
+            f"a stature of {height} m is not plausible", field="height_m", hint="give it in metres"
+        )
+    joints: dict[str, Any] = _load_preset_data("humanoid.yaml")["joints"]
     names = tuple(joints)
     at = {name: height * np.array(entry["at"], dtype=np.float64) for name, entry in joints.items()}
     origin = {
@@ -94,7 +113,7 @@ def load_skeleton(preset: str, height_m: float | None = None) -> SkeletonModel:
 
 
 def split_side(role: str) -> tuple[str, str]:
-    """Split ``LeftForeArm`` into ("Left", "ForeArm"); the side is "" for trunk and head."""
+    """Split a role such as ``LeftForeArm`` into side and part; the side of trunk and head is ""."""
     for side in ("Left", "Right"):
         if role.startswith(side):
             return side, role.removeprefix(side)
@@ -102,7 +121,7 @@ def split_side(role: str) -> tuple[str, str]:
 
 
 def rest_positions(skeleton: SkeletonModel) -> FloatArray:
-    """Joint centres (J,3) of the zero pose."""
+    """Return the joint centres (J,3) in the zero pose."""
     out = np.array(skeleton.offsets_m)
     for joint in range(1, len(out)):
         out[joint] += out[skeleton.parents[joint]]
@@ -110,7 +129,14 @@ def rest_positions(skeleton: SkeletonModel) -> FloatArray:
 
 
 def bone_vector(skeleton: SkeletonModel, role: str) -> FloatArray | None:
-    """From a role's joint to the far end of its bone at zero pose (3,), or None where it has none."""
+    """Return the vector (3,) from the joint of a role to the far end of its bone in the zero pose.
+
+    The far end is the next joint of the limb. A bone without a next joint, such as the hand, ends at the
+    farthest point of its descendants.
+
+    Returns:
+        The vector in metres, or None if no joint has the role or the bone has no length.
+    """
     side, part = split_side(role)
     joint = skeleton.index_of_role(role)
     if joint is None:
@@ -119,28 +145,31 @@ def bone_vector(skeleton: SkeletonModel, role: str) -> FloatArray | None:
     rest = rest_positions(skeleton)
     if following is not None:
         vector = rest[following] - rest[joint]
-        return np.asarray(vector) if np.linalg.norm(vector) > 1e-6 else None
-    below = [index for index in range(len(rest)) if _descends(skeleton, index, joint)]
-    tips = np.array([rest[i] + np.nan_to_num(skeleton.end_offsets_m[i]) - rest[joint] for i in below])
+        return np.asarray(vector) if np.linalg.norm(vector) > _MIN_BONE_M else None
+    subtree = [index for index in range(len(rest)) if _is_descendant(skeleton, index, joint)]
+    tips = np.array([rest[i] + np.nan_to_num(skeleton.end_offsets_m[i]) - rest[joint] for i in subtree])
     farthest = tips[np.argmax(np.linalg.norm(tips, axis=1))]
-    return np.asarray(farthest) if np.linalg.norm(farthest) > 1e-6 else None
+    return np.asarray(farthest) if np.linalg.norm(farthest) > _MIN_BONE_M else None
 
 
-def _descends(skeleton: SkeletonModel, joint: int, ancestor: int) -> bool:
+def _is_descendant(skeleton: SkeletonModel, joint: int, ancestor: int) -> bool:
+    """Return whether a joint is `ancestor` itself or below it."""
     while joint > ancestor:
         joint = int(skeleton.parents[joint])
     return joint == ancestor
 
 
 def segment_axes(skeleton: SkeletonModel, role: str) -> FloatArray:
-    """Anatomical axes of a segment as columns (3,3) in its joint's frame: along, forward, outward.
+    """Return the anatomical axes (3,3) of a segment as columns in the frame of its joint.
 
-    They are read off the rig's T-pose, its zero pose where it names none, so that arms may rest stretched out
-    or hanging. Along points to
-    the bone's far end (up for trunk and head, down for feet); forward is where the standing body faces (the
-    side the elbow closes to, the thumb's side of the hand); outward is away from the body for a hanging
-    limb (the back of the hand), left for trunk and head. Left-hand segments make a left-handed triad,
-    so that mirrored segments have mirrored axes.
+    The columns are:
+
+    1. along: to the far end of the bone; up for trunk and head, down for the feet;
+    2. forward: where the standing body faces; the side to which the elbow bends; the thumb's side of the hand;
+    3. outward: away from the body for a hanging limb; left for trunk and head; the back of the hand.
+
+    The axes are taken from the T-pose, so they do not depend on how the arms are held in the zero pose. The
+    axes of left limbs are left-handed, so mirrored segments have mirrored axes.
     """
     side, part = split_side(role)
     joint = skeleton.index_of_role(role)
@@ -151,7 +180,7 @@ def segment_axes(skeleton: SkeletonModel, role: str) -> FloatArray:
     if vector is None and part == "Hand":
         vector = bone_vector(skeleton, side + "ForeArm")
     along = -_UP if vector is None else turn @ vector / np.linalg.norm(vector)
-    # A limb that rests pointing forward closes upwards instead.
+    # For a limb that points forward, the forward axis is undefined; up takes its place.
     reference = _FORWARD if abs(along @ _FORWARD) < 0.9 else _UP
     forward = reference - (reference @ along) * along
     forward /= np.linalg.norm(forward)
@@ -160,20 +189,20 @@ def segment_axes(skeleton: SkeletonModel, role: str) -> FloatArray:
 
 
 def nominal_mount(camera: str, role: str, skeleton: SkeletonModel) -> Mount:
-    """Where a camera on the bone of `role` usually sits.
+    """Return the nominal mount of a camera on the bone of an anatomical role.
 
-    A trunk's or head's camera whose name holds the word "back" (``torso_back``) sits and looks backwards.
+    A camera on trunk or head is mounted on the back if its name contains the word "back" (``torso_back``).
 
     Raises:
-        JobError: The skeleton has no joint of that role.
+        JobError: The skeleton has no joint with that role.
     """
     if skeleton.index_of_role(role) is None:
         raise JobError(
-            f"camera {camera!r} sits on {role}, which the skeleton {skeleton.name!r} does not have",
+            f"camera {camera!r} is mounted on {role}, which the skeleton {skeleton.name!r} does not have",
             field="capture.cameras",
             hint=f"it has {', '.join(name for name in skeleton.roles if name)}",
         )
-    entry = _data("mounts.yaml")[split_side(role)[1]]
+    entry = _load_preset_data("mounts.yaml")[split_side(role)[1]]
     axes = segment_axes(skeleton, role)
     bone = bone_vector(skeleton, role)
     length = 0.0 if bone is None else float(np.linalg.norm(bone))
@@ -194,60 +223,76 @@ def nominal_mount(camera: str, role: str, skeleton: SkeletonModel) -> Mount:
 
 
 def _faces_back(camera: str, role: str) -> bool:
+    """Return whether a camera on trunk or head is mounted on the back, according to its name."""
     return not split_side(role)[0] and "back" in re.split(r"[_\-. ]", camera.lower())
 
 
 _ARTICULATED = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase", "Neck", "Head")
-_REACH_SHARE = 0.15
-_REACH_M = 0.05
-_CLOSEST_M = 0.08
-"""Two cameras on different bones cannot come nearer: each stands off its own bone."""
+"""Parts of the body that move against their parent. The spine is treated as rigid."""
+
+_REACH_MARGIN_RATIO = 0.15
+"""Ratio. Widens the reach on both sides, because bodies differ from the skeleton. Evidence: none."""
+
+_REACH_MARGIN_M = 0.05
+"""Metres. Widens the reach on both sides, because straps slip. Evidence: none."""
+
+_MIN_DISTANCE_M = 0.08
+"""Metres. Smallest distance of two cameras on different bones. Derivation: each camera stands off its own bone
+by 4 to 5 cm (mounts.yaml)."""
 
 
 def camera_reach(skeleton: SkeletonModel, mounts: Sequence[Mount]) -> list[tuple[str, str, float, float]]:
-    """How near and how far two cameras on one body can be, whatever the pose.
+    """Return the reach of each pair of cameras: the smallest and largest distance that any pose permits.
 
     Args:
-        skeleton: The body.
-        mounts: Where each camera sits.
+        skeleton: The skeleton.
+        mounts: The mount of each camera.
 
     Returns:
-        Rows (camera, camera, least, most), metres, to the centimetre. Bodies differ and straps slip: 15 % and
-        5 cm are allowed for.
+        Rows (first camera, second camera, smallest, largest distance) in metres, rounded to centimetres. The
+        margins `_REACH_MARGIN_RATIO` and `_REACH_MARGIN_M` are included.
 
-    Source: the reach of a chain of ball joints: all links in one line, or the longest against the others.
+    Source: extremes of a chain of ball joints. The largest distance has all links in one line, the smallest has
+        the longest link against all others.
     """
     rest = rest_positions(skeleton)
     rows = []
     for first, second in combinations(sorted(mounts, key=lambda mount: mount.camera), 2):
-        ways = [_to_root(skeleton, mount) for mount in (first, second)]
-        shared = set(ways[0]) & set(ways[1])
+        paths = [_joints_to_root(skeleton, mount) for mount in (first, second)]
+        shared = set(paths[0]) & set(paths[1])
         ends = [
-            rest[way[0]] + mount.joint_from_cam[:3, 3]
-            for way, mount in zip(ways, (first, second), strict=True)
+            rest[path[0]] + mount.joint_from_cam[:3, 3]
+            for path, mount in zip(paths, (first, second), strict=True)
         ]
         limbs = [
-            [rest[joint] for joint in way if joint not in shared and _bends(skeleton, joint)] for way in ways
+            [rest[joint] for joint in path if joint not in shared and _is_articulated(skeleton, joint)]
+            for path in paths
         ]
         chain = np.array([ends[0], *limbs[0], *limbs[1][::-1], ends[1]])
         links = np.linalg.norm(np.diff(chain, axis=0), axis=1)
         most = float(links.sum())
         least = max(0.0, 2.0 * float(links.max()) - most)
-        low = max(_CLOSEST_M, (1 - _REACH_SHARE) * least - _REACH_M) if len(chain) > 2 else 0.5 * least
-        high = (1 + _REACH_SHARE) * most + _REACH_M
+        low = (
+            max(_MIN_DISTANCE_M, (1 - _REACH_MARGIN_RATIO) * least - _REACH_MARGIN_M)
+            if len(chain) > 2
+            else 0.5 * least
+        )
+        high = (1 + _REACH_MARGIN_RATIO) * most + _REACH_MARGIN_M
         rows.append((first.camera, second.camera, round(low, 2), round(high, 2)))
     return rows
 
 
-def _to_root(skeleton: SkeletonModel, mount: Mount) -> list[int]:
+def _joints_to_root(skeleton: SkeletonModel, mount: Mount) -> list[int]:
+    """Return the joint of a mount and all its ancestors up to the root."""
     joint = skeleton.index_of_role(mount.role)
     if joint is None:
-        raise JobError(f"no joint plays {mount.role}", field="capture.cameras")
-    way = [joint]
-    while skeleton.parents[way[-1]] >= 0:
-        way.append(int(skeleton.parents[way[-1]]))
-    return way
+        raise JobError(f"no joint has the role {mount.role}", field="capture.cameras")
+    path = [joint]
+    while skeleton.parents[path[-1]] >= 0:
+        path.append(int(skeleton.parents[path[-1]]))
+    return path
 
 
-def _bends(skeleton: SkeletonModel, joint: int) -> bool:
+def _is_articulated(skeleton: SkeletonModel, joint: int) -> bool:
+    """Return whether a joint moves against its parent; the spine is treated as rigid."""
     return split_side(skeleton.roles[joint])[1] in _ARTICULATED

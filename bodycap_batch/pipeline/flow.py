@@ -13,7 +13,7 @@ from typing import Any
 from bodycap_batch.config.models import CameraConfig, Job
 from bodycap_batch.core.errors import BodycapError, Cancelled, CaptureError, EstimationError, JobError
 from bodycap_batch.core.progress import Event
-from bodycap_batch.formats.needs import require_libraries
+from bodycap_batch.formats.optional_libraries import require_libraries
 from bodycap_batch.pipeline.inputs import (
     all_cameras,
     body_arguments,

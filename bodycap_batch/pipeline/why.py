@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.config.models import Job
-from bodycap_batch.core.progress import label_of
+from bodycap_batch.core.progress import task_label
 from bodycap_batch.pipeline.flow import Flow
 from bodycap_batch.pipeline.inputs import has_body
 from bodycap_batch.pipeline.made import Made
@@ -68,7 +68,7 @@ def explain_job(job: Job, *, out_dir: Path, settings: Settings) -> list[Step]:
             missing = (*error.tasks, *beside)
         records = tuple(flow.records)
     steps = [
-        Step(stage=label_of(item.stage, item.camera, item.round), stored=True)
+        Step(stage=task_label(item.stage, item.camera, item.round), stored=True)
         for item in sorted(records, key=lambda item: (item.round, _place(item.stage)))
     ]
     steps += [Step(stage=task.label, stored=False, reason=_reason(task, settings.store)) for task in missing]

@@ -1,1 +1,1 @@
-"""Data files of the skeleton presets."""
+"""Data files of the skeleton presets: bones, camera mounts and joint names."""

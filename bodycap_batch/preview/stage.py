@@ -13,7 +13,7 @@ import numpy as np
 from bodycap_batch.capture import Capture
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.formats.files import replacing
+from bodycap_batch.formats.atomic_files import atomic_replacement
 from bodycap_batch.formats.mp4 import VideoWriter
 from bodycap_batch.formats.palette import camera_colours
 from bodycap_batch.overlay import Body, CameraView
@@ -75,7 +75,7 @@ def render_preview(inputs: PreviewInputs, context: StageContext) -> Path:
     empty = room.blank((WIDTH, HEIGHT))
     with ExitStack() as opened:
         streams = [opened.enter_context(closing(tile.images())) for tile in tiles]
-        temporary = opened.enter_context(replacing(inputs.path))
+        temporary = opened.enter_context(atomic_replacement(inputs.path))
         video = opened.enter_context(VideoWriter(temporary, float(timeline.fps), (WIDTH, HEIGHT), "small"))
         add = opened.enter_context(_encoder(video, context.threads))
         for index, now in enumerate(timeline.times_ns.tolist()):

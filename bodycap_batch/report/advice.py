@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.core.arrays import IntArray
-from bodycap_batch.core.percent import percent
+from bodycap_batch.core.percent import format_percent
 from bodycap_batch.model.scene import Map
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.losses import Cause
@@ -205,7 +205,7 @@ def _of_motion(inputs: ReportInputs) -> Iterator[Advice]:
     if straight or (narrow is not None and narrow < _NARROW_DEG):
         angle = "" if narrow is None else f"half of the map's points are seen under less than {narrow:.1f}°"
         along = (
-            f"every camera moved along its own line of sight {percent(min(forward))} of the way"
+            f"every camera moved along its own line of sight {format_percent(min(forward))} of the way"
             if straight
             else ""
         )

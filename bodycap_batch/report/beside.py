@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
-from bodycap_batch.core.percent import percent
+from bodycap_batch.core.percent import format_percent
 from bodycap_batch.model.relative_pose import MIN_INSTANTS
 from bodycap_batch.model.skeleton_presets import split_side
 from bodycap_batch.report.grades import Criterion, Grade, graded
@@ -38,7 +38,7 @@ def of_reach(reach: Mapping[str, Any] | None, unused: Collection[str]) -> Iterat
         about="cameras",
         name="Cameras within the body's reach",
         grade=grade,
-        says=f"{percent(share, 1)} of {reach['distances']:,} distances between cameras{doubt}",
+        says=f"{format_percent(share, 1)} of {reach['distances']:,} distances between cameras{doubt}",
         why="Cameras on one body cannot be further apart than it reaches: a map folded over two places "
         "that look alike shows here although its error in pixels is small.",
         metric="mapping.reach.within_reach",

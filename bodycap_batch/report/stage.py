@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.formats.files import write_text
-from bodycap_batch.formats.palette import as_hex, camera_colours
+from bodycap_batch.formats.atomic_files import write_text
+from bodycap_batch.formats.palette import camera_colours, hex_from_colour
 from bodycap_batch.report.content import page_content
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.lost import lost_frames
@@ -39,7 +39,7 @@ def write_report(inputs: ReportInputs, path: Path, context: StageContext) -> Non
         StoreError: The file cannot be written.
     """
     placed = place(inputs)
-    tones = {name: as_hex(colour) for name, colour in camera_colours(inputs.cameras).items()}
+    tones = {name: hex_from_colour(colour) for name, colour in camera_colours(inputs.cameras).items()}
     context.progress(0, 3, "pictures")
     lost = lost_frames(inputs, context)
     pictures = _pictures(inputs, context) if placed.drawn else []

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.core.percent import percent
+from bodycap_batch.core.percent import format_percent
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.solid import joint_sigma_m
 
@@ -89,7 +89,7 @@ def figure(
 
 
 def _share(value: float) -> str:
-    return percent(value, 1)
+    return format_percent(value, 1)
 
 
 def _frames(metrics: Mapping[str, Any]) -> Table:

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from bodycap_batch.core.percent import percent
+from bodycap_batch.core.percent import format_percent
 from bodycap_batch.report.beside import of_reach, of_shared_segments
 from bodycap_batch.report.grades import Criterion, Grade, graded
 
@@ -95,7 +95,7 @@ def _of_frames(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
         about="cameras",
         name="Frames registered",
         grade=graded(share, 0.98, 0.85, more_is_better=True) if share > 0.0 else Grade.NONE,
-        says=f"{total['frames_registered']:,} of {total['frames']:,} frames ({percent(share, 1)})",
+        says=f"{total['frames_registered']:,} of {total['frames']:,} frames ({format_percent(share, 1)})",
         why="From 98 % on only moments are missing, and the body's smoothness carries over them; below 85 % "
         "more than one frame in seven rests on nothing that was seen.",
         metric="total.coverage",
@@ -109,7 +109,7 @@ def _of_frames(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
             name="The worst camera",
             grade=graded(share, 0.95, 0.75, more_is_better=True),
             says=f"{name}: {worst['frames_registered']:,} of {worst['frames']:,} frames "
-            f"({percent(share, 1)})",
+            f"({format_percent(share, 1)})",
             why="An average hides one bad camera, and a limb is as good as the camera on it.",
             metric=f"cameras.{name}.coverage",
             value=share,
@@ -300,7 +300,7 @@ def _of_measured(joints: Mapping[str, Any]) -> Iterator[Criterion]:
             about="body",
             name="Time measured",
             grade=graded(share, 0.95, 0.8, more_is_better=True),
-            says=f"{percent(share, 1)} of the motion at the joint that was measured least ({name})",
+            says=f"{format_percent(share, 1)} of the motion at the joint that was measured least ({name})",
             why="A camera that starts late, ends early or is lost for long leaves its limb inferred, "
             "and an average over all joints would hide it.",
             metric="" if "." in name else f"motion.joints.{name}.observed_share",

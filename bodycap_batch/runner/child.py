@@ -29,7 +29,7 @@ from bodycap_batch.core.errors import (
     JobError,
     StoreError,
 )
-from bodycap_batch.core.memory import give_back
+from bodycap_batch.core.memory import release_memory
 from bodycap_batch.runner.task import Task, TaskFunction, task_from_json
 from bodycap_batch.store.artefacts import DISK_ERRORS, Store, store_error
 
@@ -118,7 +118,7 @@ def _send_prints_to(log: Path) -> None:
 def _run(task: Task, store: Store, function: TaskFunction, link: _Link) -> None:
     started, cpu_before = time.monotonic(), time.process_time()
     _pin_threads(task.threads)
-    give_back()
+    release_memory()
     _forget_peak_memory()
     for artefact in dict.fromkeys(store.artefacts_in(task.arguments)):
         store.verify(artefact)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.core.progress import label_of
+from bodycap_batch.core.progress import task_label
 from bodycap_batch.store.artefacts import ArtefactKey
 
 TaskFunction = Callable[[Mapping[str, Any], Mapping[str, Any], StageContext, Path], None]
@@ -44,7 +44,7 @@ class Task:
     @property
     def label(self) -> str:
         """Stage, camera and round as one reads them."""
-        return label_of(self.key.stage, self.camera, self.round)
+        return task_label(self.key.stage, self.camera, self.round)
 
     @property
     def file_stem(self) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import JobError, StoreError
-from bodycap_batch.formats.files import store_error
+from bodycap_batch.formats.atomic_files import store_error_from_os_error
 from bodycap_batch.formats.mp4 import VideoWriter
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
@@ -284,7 +284,7 @@ def _appearing(out_dir: Path) -> Iterator[Path]:
             out_dir.rename(old)
         folder.rename(out_dir)
     except OSError as error:
-        raise store_error(error, out_dir) from error
+        raise store_error_from_os_error(error, out_dir) from error
     except StoreError as error:
         # Speak of the folder that was asked for, not of the one that is gone by now.
         path = Path(error.path or out_dir)

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from bodycap_batch.config.mounts import mount_of
 from bodycap_batch.config.options import Options
-from bodycap_batch.model.camera import CAMERA_MODELS, Camera, param_count
+from bodycap_batch.model.camera import CAMERA_MODELS, Camera, parameter_count
 
 _EARLIEST_S = 3.0
 """The walk begins a little before the common clock's zero."""
@@ -93,8 +93,8 @@ class SynthOptions(Options):
             raise ValueError("cameras: every name once")
         if self.lens not in CAMERA_MODELS:
             raise ValueError(f"lens: unknown model {self.lens!r}; known: {', '.join(CAMERA_MODELS)}")
-        if self.lens_params is not None and len(self.lens_params) != param_count(self.lens):
-            raise ValueError(f"lens_params: {self.lens} takes {param_count(self.lens)} parameters")
+        if self.lens_params is not None and len(self.lens_params) != parameter_count(self.lens):
+            raise ValueError(f"lens_params: {self.lens} takes {parameter_count(self.lens)} parameters")
         self._check_cameras_named()
         if min(self.offsets_s.values(), default=0.0) < -_EARLIEST_S:
             raise ValueError(f"offsets_s: no earlier than -{_EARLIEST_S:g} s")
@@ -155,7 +155,7 @@ def _plain_lens(model: str, width: int, height: int) -> tuple[float, ...]:
     single = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
     head = [focal] if single else [focal, focal]
     head += [width / 2.0, height / 2.0]
-    rest = [0.0] * (param_count(model) - len(head))
+    rest = [0.0] * (parameter_count(model) - len(head))
     if model == "FOV":
         rest = [0.8]
     return tuple(head + rest)

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.formats.open3d_library import load_open3d
+from bodycap_batch.formats.open3d_loader import load_open3d
 
 NOTHING = -1
 """Index for a ray that meets no triangle."""

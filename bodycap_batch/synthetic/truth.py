@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.formats.atomic_files import atomic_replacement, write_text
 from bodycap_batch.formats.bvh import write_bvh
-from bodycap_batch.formats.files import replacing, write_text
 from bodycap_batch.formats.tum import TimedPoses, seconds_text, write_tum
 from bodycap_batch.model.geometry import quat_xyzw_from_rotation
 from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
@@ -134,7 +134,7 @@ def _write_joints(path: Path, motion: Moving, ticks_ns: IntArray) -> None:
     indices = {name: motion.skeleton.index_of_role(role) for name, role in JOINT_ROLES.items()}
     present = {name: index for name, index in indices.items() if index is not None}
     world = joints_at(motion, in_seconds(ticks_ns))[:, list(present.values())][..., :3, 3]
-    with replacing(path) as temporary:
+    with atomic_replacement(path) as temporary:
         np.savez(temporary, names=np.array(list(present)), t=in_seconds(ticks_ns), world=world)
 
 

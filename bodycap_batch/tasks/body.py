@@ -52,10 +52,10 @@ def mount_prior(block: Json, skeleton: SkeletonModel) -> Mount:
 def _skeleton(arguments: Json) -> SkeletonModel:
     if arguments["skeleton_file"] is not None:
         from bodycap_batch.formats.bvh import RigOptions, read_rig
-        from bodycap_batch.model.skeleton import in_tpose
+        from bodycap_batch.model.skeleton import with_tpose_as_zero_pose
 
         rig = RigOptions(roles=arguments["skeleton_map"], tpose_frame=arguments["tpose_frame"])
-        return in_tpose(read_rig(Path(arguments["skeleton_file"]), rig)[0])
+        return with_tpose_as_zero_pose(read_rig(Path(arguments["skeleton_file"]), rig)[0])
     from bodycap_batch.model.skeleton_presets import load_skeleton
 
     return load_skeleton(arguments["skeleton"], arguments["height_m"])

@@ -13,7 +13,7 @@ from bodycap_batch.tasks.stage import RESULTS, Json, Stage
 def _export(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
     from bodycap_batch.config import ExportOptions
     from bodycap_batch.export import ExportInputs, export_results
-    from bodycap_batch.formats.bundle import read_bundle
+    from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.merge_data import MergeResult
 
     scene = load_map(arguments["map"])
@@ -25,7 +25,7 @@ def _export(options: Json, arguments: Json, context: StageContext, files: Path) 
         trajectories=found.trajectories,
         clocks=found.clocks,
         selections=tuple(load_keyframes(path) for path in arguments["keyframes"]),
-        merge=None if merged is None else read_bundle(MergeResult, Path(merged), "merge"),
+        merge=None if merged is None else read_dataclass(MergeResult, Path(merged), "merge"),
         partial_reason=arguments["failure"],
         row_fraction=found.row_fraction,
         relative_poses=found.relative_poses(arguments["registrations"], arguments["segments"]),
@@ -39,7 +39,7 @@ EXPORT = Stage(
     libraries=("numpy", "scipy", "open3d-cpu|open3d", "pygltflib", "usd-core", "ezc3d"),
     modules=(
         "bodycap_batch.export",
-        "bodycap_batch.formats.open3d_loaded",
+        "bodycap_batch.formats.open3d_preload",
         "pycolmap",
         "pygltflib",
         "scipy.spatial.transform",

@@ -26,32 +26,32 @@ def load_capture(arguments: Json, threads: int = 0) -> Capture:
 
 def _kept(folder: str | None) -> KeptFrames | None:
     from bodycap_batch.capture.kept import KEPT_NAME, KeptFrames
-    from bodycap_batch.formats.bundle import read_bundle
+    from bodycap_batch.formats.dataclass_files import read_dataclass
 
     if folder is None or not (Path(folder) / f"{KEPT_NAME}.json").exists():
         return None
-    return read_bundle(KeptFrames, Path(folder), KEPT_NAME)
+    return read_dataclass(KeptFrames, Path(folder), KEPT_NAME)
 
 
 def load_keyframes(path: str) -> KeyframeSelection:
     """Read a camera's keyframes."""
-    from bodycap_batch.formats.bundle import read_bundle
+    from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.scene import KeyframeSelection
 
-    return read_bundle(KeyframeSelection, Path(path), "keyframes")
+    return read_dataclass(KeyframeSelection, Path(path), "keyframes")
 
 
 def load_map(path: str) -> MapResult:
     """Read a map with its workspace."""
-    from bodycap_batch.formats.bundle import read_bundle
+    from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.scene import MapResult
 
-    return read_bundle(MapResult, Path(path), "map")
+    return read_dataclass(MapResult, Path(path), "map")
 
 
 def load_registration(path: str) -> Registration:
     """Read a camera's poses."""
-    from bodycap_batch.formats.bundle import read_bundle
+    from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.scene import Registration
 
-    return read_bundle(Registration, Path(path), "registration")
+    return read_dataclass(Registration, Path(path), "registration")

@@ -51,14 +51,14 @@ def _refine(options: Json, arguments: Json, context: StageContext, files: Path) 
 
 def _save_map(result: MapResult, files: Path) -> None:
     """Keep a map together with the workspace that is needed to extend it."""
-    from bodycap_batch.formats.bundle import write_bundle
+    from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.mapping.intrinsics.intrinsics_check import misfit_note
     from bodycap_batch.mapping.intrinsics.recalibration import FREED
     from bodycap_batch.mapping.matching.flipped_cameras import mirror_notes
 
     workspace = files / "workspace"
     os.rename(result.workspace, workspace)
-    write_bundle(dataclasses.replace(result, workspace=workspace), files, "map")
+    write_dataclass(dataclasses.replace(result, workspace=workspace), files, "map")
     largest = result.maps[0]
     wrong: Mapping[str, float] = result.log.get("misfitting_lenses", {})
     write_summary(

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def _merge(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
     from bodycap_batch.config import MergeOptions
-    from bodycap_batch.formats.bundle import write_bundle
+    from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.merging import merge_trajectories
 
     inputs, options_ = _merge_inputs(arguments), MergeOptions.model_validate(options)
@@ -32,7 +32,7 @@ def _merge(options: Json, arguments: Json, context: StageContext, files: Path) -
 
         explained(error, load_map(arguments["map"]).log)
         raise
-    write_bundle(result, files, "merge")
+    write_dataclass(result, files, "merge")
     doubts = [*result.report.get("doubted_clocks", {}).values(), result.report.get("exchanged_sides", {})]
     notes = [f"camera {name} is no part of the body: {why}" for name, why in result.unused_cameras.items()]
     notes += [str(doubt["says"]) for doubt in doubts if doubt]

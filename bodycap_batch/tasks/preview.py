@@ -30,7 +30,7 @@ def _inputs(arguments: Json, path: Path, threads: int) -> PreviewInputs:
     import numpy as np
 
     from bodycap_batch.export import project_motion
-    from bodycap_batch.formats.bundle import read_bundle
+    from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.merge_data import MergeResult
     from bodycap_batch.overlay import body_of, camera_views
     from bodycap_batch.preview import PreviewInputs
@@ -38,7 +38,7 @@ def _inputs(arguments: Json, path: Path, threads: int) -> PreviewInputs:
     scene = load_map(arguments["map"])
     found = Registered.load(arguments["registrations"], scene.maps)
     merged = arguments["merge"]
-    merge = None if merged is None else read_bundle(MergeResult, Path(merged), "merge")
+    merge = None if merged is None else read_dataclass(MergeResult, Path(merged), "merge")
     registrations = [load_registration(path) for path in arguments["registrations"]]
     shown = _shown(scene.maps, merge)
     moved = [shown[item.gauge].apply(item.points) for item in scene.maps if item.gauge in shown]

@@ -16,7 +16,7 @@ _MEMORY_MB = 900
 
 def _recover(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
     from bodycap_batch.config import RegistrationOptions
-    from bodycap_batch.formats.bundle import read_bundle, write_bundle
+    from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
     from bodycap_batch.model.relative_pose import RigPoses
     from bodycap_batch.registration import RecoveryInputs, RegisteredCamera, recover_lost_frames
 
@@ -40,7 +40,7 @@ def _recover(options: Json, arguments: Json, context: StageContext, files: Path)
     )
     save_registration(registration, capture.cameras[0], files, rolling=read_summary(paths[0])["rolling"])
     if in_rig:
-        write_bundle(read_bundle(RigPoses, paths[0], RIG_POSES), files, RIG_POSES)
+        write_dataclass(read_dataclass(RigPoses, paths[0], RIG_POSES), files, RIG_POSES)
 
 
 RECOVER = Stage(

@@ -37,7 +37,7 @@ class Registered:
     @staticmethod
     def load(paths: Sequence[str], maps: Sequence[Map]) -> Registered:
         """Read one artefact per camera; rows matter where a rolling shutter is still in the poses."""
-        from bodycap_batch.formats.bundle import read_bundle
+        from bodycap_batch.formats.dataclass_files import read_dataclass
         from bodycap_batch.model.camera import Camera
         from bodycap_batch.model.merge_data import CameraClock
         from bodycap_batch.model.rolling_shutter import mean_row_fraction
@@ -51,9 +51,9 @@ class Registered:
             found = load_registration(path)
             name = found.trajectory.camera
             trajectories.append(found.trajectory)
-            clocks[name] = read_bundle(CameraClock, Path(path), "clock")
+            clocks[name] = read_dataclass(CameraClock, Path(path), "clock")
             if clocks[name].rolling_shutter_s and name not in corrected:
-                rows[name] = mean_row_fraction(found, read_bundle(Camera, Path(path), "camera"))
+                rows[name] = mean_row_fraction(found, read_dataclass(Camera, Path(path), "camera"))
         return Registered(trajectories=tuple(trajectories), clocks=clocks, row_fraction=rows)
 
     def relative_poses(
@@ -65,7 +65,7 @@ class Registered:
             paths: The artefacts; those of a rig kept how its cameras' own poses lay.
             segments: Names of the cameras on each segment that carries several.
         """
-        from bodycap_batch.formats.bundle import read_bundle
+        from bodycap_batch.formats.dataclass_files import read_dataclass
         from bodycap_batch.model.relative_pose import RigPoses, estimate_relative_pose
 
         path_of = {each.camera: each for each in self.trajectories}
@@ -73,7 +73,7 @@ class Registered:
             each.cameras: each
             for path in map(Path, paths)
             if (path / f"{RIG_POSES}.json").exists()
-            for each in read_bundle(RigPoses, path, RIG_POSES).relative
+            for each in read_dataclass(RigPoses, path, RIG_POSES).relative
         }
         out = []
         for pair in (pair for names in segments for pair in combinations(sorted(names), 2)):

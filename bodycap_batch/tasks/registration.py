@@ -45,17 +45,17 @@ def save_registration(
     notes: Sequence[str] = (),
 ) -> None:
     """Keep a camera's poses with what the stages after it need to know of the camera."""
-    from bodycap_batch.formats.bundle import write_bundle
+    from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.model.merge_data import CameraClock
 
-    write_bundle(found, files, "registration")
+    write_dataclass(found, files, "registration")
     clock = CameraClock(
         nominal_fps=camera.nominal_fps,
         offset_s=camera.offset_s,
         rolling_shutter_s=camera.rolling_shutter_s,
     )
-    write_bundle(clock, files, "clock")
-    write_bundle(camera.camera, files, "camera")
+    write_dataclass(clock, files, "clock")
+    write_dataclass(camera.camera, files, "camera")
     write_summary(
         files,
         frames=len(found.trajectory.status),

@@ -25,7 +25,7 @@ def _report(_: Json, arguments: Json, context: StageContext, files: Path) -> Non
 
 def load_inputs(arguments: Json, threads: int = 0) -> ReportInputs:
     """Read what the stages before left; what a broken-off job lacks is None in the arguments."""
-    from bodycap_batch.formats.bundle import read_bundle
+    from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.merge_data import CameraClock
     from bodycap_batch.report import ReportInputs
 
@@ -37,7 +37,7 @@ def load_inputs(arguments: Json, threads: int = 0) -> ReportInputs:
         maps=() if arguments["map"] is None else load_map(arguments["map"]).maps,
         registrations=tuple(registrations),
         clocks={
-            found.trajectory.camera: read_bundle(CameraClock, Path(path), "clock")
+            found.trajectory.camera: read_dataclass(CameraClock, Path(path), "clock")
             for path, found in zip(arguments["registrations"], registrations, strict=True)
         },
         selections=tuple(load_keyframes(path) for path in arguments["keyframes"]),
@@ -53,10 +53,10 @@ def load_inputs(arguments: Json, threads: int = 0) -> ReportInputs:
 
 
 def _merge(path: str | None) -> MergeResult | None:
-    from bodycap_batch.formats.bundle import read_bundle
+    from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.merge_data import MergeResult
 
-    return None if path is None else read_bundle(MergeResult, Path(path), "merge")
+    return None if path is None else read_dataclass(MergeResult, Path(path), "merge")
 
 
 def _capture(arguments: Json, threads: int) -> Capture | None:

@@ -13,7 +13,7 @@ from bodycap_batch.tasks.stage import SEEING, VISION, Json, Stage
 
 def _rig(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
     from bodycap_batch.config import RegistrationOptions
-    from bodycap_batch.formats.bundle import write_bundle
+    from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.model.relative_pose import RigPoses, not_rigid_note
     from bodycap_batch.registration import RegisteredCamera, register_in_rig
 
@@ -30,7 +30,7 @@ def _rig(options: Json, arguments: Json, context: StageContext, files: Path) -> 
     found, relative = register_in_rig(own, others, maps, selection, options_, context.threads)
     notes = [not_rigid_note(each) for each in relative if not each.is_rigid]
     save_registration(found, own.camera, files, rolling=False, notes=notes)
-    write_bundle(RigPoses(relative=tuple(relative)), files, RIG_POSES)
+    write_dataclass(RigPoses(relative=tuple(relative)), files, RIG_POSES)
 
 
 RIG = Stage(function=_rig, libraries=(*VISION, "pycolmap"), modules=(*SEEING, "pycolmap"))

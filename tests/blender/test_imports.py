@@ -18,7 +18,7 @@ from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.export import ExportInputs, export_results
-from bodycap_batch.export.layout import lay_out
+from bodycap_batch.export.layout import apply_layout
 from bodycap_batch.export.projection import project_motion
 from bodycap_batch.formats.fbx import find_blender, write_fbx
 from bodycap_batch.formats.palette import CAMERA_COLOURS
@@ -219,7 +219,7 @@ def test_other_layouts_arrive(case: Case, blender: Path, tmp_path: Path, names: 
         {"names": names, "root": root, "fps": 60, "tpose": True, "formats": FORMATS}
     )
     export_results(replace(case.inputs, out_dir=tmp_path), options, StageContext(work_dir=tmp_path))
-    motion = lay_out(case.motion, options)
+    motion = apply_layout(case.motion, options)
     for name in FORMATS:
         seen = look(blender, tmp_path, 60.0, tmp_path / f"motion.{name}")
         found = seen.world[:, seen.order(motion)]

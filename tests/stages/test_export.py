@@ -15,7 +15,7 @@ from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import Cancelled, JobError, StoreError
 from bodycap_batch.export import ExportInputs, export_results
-from bodycap_batch.export.motion import motion_difference, only_solved
+from bodycap_batch.export.motion_files import motion_difference, without_unsolved_branches
 from bodycap_batch.export.projection import project_motion
 from bodycap_batch.formats.bvh import read_bvh, write_bvh
 from bodycap_batch.formats.c3d import read_c3d
@@ -263,7 +263,7 @@ def test_a_missing_library_is_told_before_anything_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inputs = inputs_of(tmp_path)
-    monkeypatch.setattr("bodycap_batch.formats.needs.find_spec", lambda name: None)
+    monkeypatch.setattr("bodycap_batch.formats.optional_libraries.find_spec", lambda name: None)
     with pytest.raises(JobError, match="C3D"):
         run(inputs, formats=("bvh", "c3d"))
     assert not inputs.out_dir.exists()
@@ -279,7 +279,7 @@ def test_solved_hierarchy_drops_what_hangs_off(tmp_path: Path) -> None:
     assert {"Hips", "Spine", "LeftShoulder"} <= set(model.joints)
     assert inputs.merge is not None
     whole = project_motion(inputs.merge, inputs.clocks).motion
-    part = only_solved(whole, inputs.merge.solved)
+    part = without_unsolved_branches(whole, inputs.merge.solved)
     hand, same = whole.skeleton.index_of_role("LeftHand"), part.skeleton.index_of_role("LeftHand")
     np.testing.assert_allclose(
         part.world_from_joint()[:, same], whole.world_from_joint()[:, hand], atol=1e-12
@@ -289,7 +289,7 @@ def test_solved_hierarchy_drops_what_hangs_off(tmp_path: Path) -> None:
 def test_a_joint_that_loses_its_children_ends_where_they_were() -> None:
     motion = reaching(3)
     solved = np.array([role == "Spine1" for role in motion.skeleton.roles])
-    part = only_solved(motion, solved).skeleton
+    part = without_unsolved_branches(motion, solved).skeleton
     assert part.joints == ("Hips", "Spine", "Spine1")
     neck = motion.skeleton.index_of_role("Neck")
     np.testing.assert_array_equal(part.end_offsets_m[2], motion.skeleton.offsets_m[neck])
@@ -348,7 +348,7 @@ def test_a_full_disk_leaves_no_half_file(tmp_path: Path, monkeypatch: pytest.Mon
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("bodycap_batch.formats.files.os.fsync", full)
+    monkeypatch.setattr("bodycap_batch.formats.atomic_files.os.fsync", full)
     with pytest.raises(StoreError, match="No space left") as caught:
         export_results(inputs, ExportOptions(), StageContext(work_dir=tmp_path))
     assert "free some space" in str(caught.value.hint)
@@ -366,7 +366,7 @@ def test_a_motion_that_reads_back_differently_is_refused(
         local[10, 3] = local[10, 3] @ so3_exp([np.deg2rad(0.02), 0.0, 0.0])
         write_bvh(path, replace(motion, local_rotation=local), **options)
 
-    monkeypatch.setattr("bodycap_batch.export.motion.write_bvh", wrong)
+    monkeypatch.setattr("bodycap_batch.export.motion_files.write_bvh", wrong)
     with pytest.raises(StoreError, match="read back differs"):
         export_results(inputs, ExportOptions(formats=("bvh",)), StageContext(work_dir=tmp_path))
     assert not (inputs.out_dir / "motion.bvh").exists()

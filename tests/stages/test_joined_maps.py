@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from bodycap_batch.config.options import ExportOptions, MergeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.export import ExportInputs, export_results
-from bodycap_batch.formats.bundle import read_bundle, write_bundle
+from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
 from bodycap_batch.formats.ply import read_ply
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.merging import merge_trajectories
@@ -74,8 +74,8 @@ def test_trajectories_and_maps_move_alike(capture, result):
 
 
 def test_every_map_is_written_into_the_world(capture, result, tmp_path):
-    write_bundle(result, tmp_path, "merge")
-    kept = read_bundle(MergeResult, tmp_path, "merge")
+    write_dataclass(result, tmp_path, "merge")
+    kept = read_dataclass(MergeResult, tmp_path, "merge")
     assert_allclose(kept.joint_covariance_m2, result.joint_covariance_m2)
     maps = tuple(small_map(gauge, seed=index) for index, gauge in enumerate("abc"))
     inputs = ExportInputs(

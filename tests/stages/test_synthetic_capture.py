@@ -12,8 +12,8 @@ from bodycap_batch.capture import open_capture
 from bodycap_batch.config.job import load_job
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import Cancelled, JobError, StoreError
+from bodycap_batch.formats.atomic_files import store_error_from_os_error
 from bodycap_batch.formats.bvh import read_bvh
-from bodycap_batch.formats.files import store_error
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.model.geometry import interpolate_pose, invert, rotation_angle_rad
 from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount, rest_positions
@@ -277,7 +277,7 @@ def test_a_disk_that_fills_up_is_named_and_nothing_stays(tmp_path, monkeypatch):
             return None
 
         def add(self, image):
-            raise store_error(OSError(errno.ENOSPC, "No space left on device"), self.path)
+            raise store_error_from_os_error(OSError(errno.ENOSPC, "No space left on device"), self.path)
 
     monkeypatch.setattr("bodycap_batch.synthetic.making.VideoWriter", Full)
     with pytest.raises(StoreError, match="No space left") as caught:

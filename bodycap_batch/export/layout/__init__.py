@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.export.layout.names import rename
-from bodycap_batch.export.layout.rates import resample, smooth
-from bodycap_batch.export.layout.roots import floor_name, place_root, with_tpose
+from bodycap_batch.export.layout.joint_names import rename_joints
+from bodycap_batch.export.layout.resampling import resample, smooth
+from bodycap_batch.export.layout.root_motion import apply_root_mode, floor_root_name, prepend_tpose
 from bodycap_batch.model.skeleton import Motion
 
-__all__ = ["lay_out"]
+__all__ = ["apply_layout"]
 
 
-def lay_out(motion: Motion, options: ExportOptions) -> Motion:
+def apply_layout(motion: Motion, options: ExportOptions) -> Motion:
     """The motion as the files for animation hold it (BVH, GLB, FBX, USD).
 
     Names and spine count leave the joints where they are; a user's own skeleton keeps both.
@@ -26,7 +26,9 @@ def lay_out(motion: Motion, options: ExportOptions) -> Motion:
         motion = resample(motion, options.fps)
     own = any(motion.skeleton.bvh_channels)
     if not own:
-        motion = rename(motion, options.names)
+        motion = rename_joints(motion, options.names)
     if options.tpose:
-        motion = with_tpose(motion)
-    return place_root(motion, options.root, floor_name("hik" if own else options.names, options.root))
+        motion = prepend_tpose(motion)
+    return apply_root_mode(
+        motion, options.root, floor_root_name("hik" if own else options.names, options.root)
+    )

@@ -1,8 +1,8 @@
 """BVH: Y up, degrees, Euler angles in a chosen order, centimetres; converted here and nowhere else."""
 
 from bodycap_batch.formats.bvh.reader import read_bvh
-from bodycap_batch.formats.bvh.rig import RigOptions, read_rig
 from bodycap_batch.formats.bvh.roles import ROLES, assign_roles
+from bodycap_batch.formats.bvh.user_skeleton import RigOptions, read_rig
 from bodycap_batch.formats.bvh.writer import write_bvh
 
 __all__ = ["ROLES", "RigOptions", "assign_roles", "read_bvh", "read_rig", "write_bvh"]

@@ -6,10 +6,10 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 
-_GIMBAL_COSINE = 1e-7
+_GIMBAL_LOCK_COSINE = 1e-7
 """Below this the first and third angle cannot be told apart: each alone would be wrong by 1e-16 over it."""
 
-_TURN = 2.0 * np.pi
+_FULL_TURN_RAD = 2.0 * np.pi
 
 
 def rotation_from_angles(axes: str, angles_rad: FloatArray) -> FloatArray:
@@ -24,11 +24,11 @@ def rotation_from_angles(axes: str, angles_rad: FloatArray) -> FloatArray:
     """
     out = np.broadcast_to(np.eye(3), (len(angles_rad), 3, 3)).copy()
     for column, axis in enumerate(axes):
-        out = out @ _elementary("XYZ".index(axis), angles_rad[:, column])
+        out = out @ _elementary_rotation("XYZ".index(axis), angles_rad[:, column])
     return out
 
 
-def _elementary(axis: int, angle_rad: FloatArray) -> FloatArray:
+def _elementary_rotation(axis: int, angle_rad: FloatArray) -> FloatArray:
     """Rotations (T,3,3) about one axis."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     first, second = (axis + 1) % 3, (axis + 2) % 3
@@ -62,7 +62,7 @@ def continuous_angles(orders: tuple[str, ...], rotation: FloatArray) -> FloatArr
     out = np.zeros_like(principal)
     previous = np.zeros(principal.shape[1:])
     for tick in range(len(out)):
-        previous = _nearest(principal[tick], locked[tick], previous)
+        previous = _nearest_equivalent(principal[tick], locked[tick], previous)
         out[tick] = previous
     return out * parity[:, None]
 
@@ -77,30 +77,30 @@ def _principal_angles(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
     b = np.arctan2(rotation[..., 0, 2], cos_b)
     a = np.arctan2(-rotation[..., 1, 2], rotation[..., 2, 2])
     c = np.arctan2(-rotation[..., 0, 1], rotation[..., 0, 0])
-    locked = cos_b < _GIMBAL_COSINE
+    locked = cos_b < _GIMBAL_LOCK_COSINE
     a = np.where(locked, np.arctan2(rotation[..., 1, 0], rotation[..., 1, 1]), a)
     sign = np.where(locked, np.sign(b), 0.0)
     return np.stack([a, b, np.where(locked, 0.0, c)], axis=-1), sign
 
 
-def _nearest(principal: FloatArray, locked: FloatArray, previous: FloatArray) -> FloatArray:
+def _nearest_equivalent(principal: FloatArray, locked: FloatArray, previous: FloatArray) -> FloatArray:
     """The equivalent angles (J,3) nearest to the previous ones."""
-    direct = _whole_turns(principal, previous)
-    other = _whole_turns(principal * [1, -1, 1] + np.pi, previous)
+    direct = _add_full_turns(principal, previous)
+    other = _add_full_turns(principal * [1, -1, 1] + np.pi, previous)
     if locked.any():
-        direct = np.where(locked[:, None] != 0, _share_lock(direct, locked, previous), direct)
-        other = np.where(locked[:, None] != 0, _share_lock(other, locked, previous), other)
+        direct = np.where(locked[:, None] != 0, _split_locked_sum(direct, locked, previous), direct)
+        other = np.where(locked[:, None] != 0, _split_locked_sum(other, locked, previous), other)
     step_direct = ((direct - previous) ** 2).sum(axis=1)
     step_other = ((other - previous) ** 2).sum(axis=1)
     return np.where((step_other < step_direct)[:, None], other, direct)
 
 
-def _whole_turns(angles: FloatArray, previous: FloatArray) -> FloatArray:
+def _add_full_turns(angles: FloatArray, previous: FloatArray) -> FloatArray:
     """Add the whole turns that bring each angle within half a turn of the previous one."""
-    return np.asarray(angles + _TURN * np.round((previous - angles) / _TURN))
+    return np.asarray(angles + _FULL_TURN_RAD * np.round((previous - angles) / _FULL_TURN_RAD))
 
 
-def _share_lock(angles: FloatArray, locked: FloatArray, previous: FloatArray) -> FloatArray:
+def _split_locked_sum(angles: FloatArray, locked: FloatArray, previous: FloatArray) -> FloatArray:
     """In gimbal lock, split the one known sum c + sign · a so that a and c move equally little.
 
     `angles` is either triple of the lock: both have the same middle axis pose, and the sum is a plus
@@ -109,5 +109,5 @@ def _share_lock(angles: FloatArray, locked: FloatArray, previous: FloatArray) ->
     total = angles[:, 0] + locked * angles[:, 2]
     before = previous[:, 2] + locked * previous[:, 0]
     change = total - before
-    half = 0.5 * (change - _TURN * np.round(change / _TURN))
+    half = 0.5 * (change - _FULL_TURN_RAD * np.round(change / _FULL_TURN_RAD))
     return np.stack([previous[:, 0] + locked * half, angles[:, 1], previous[:, 2] + half], axis=-1)

@@ -31,7 +31,7 @@ class FileJoint:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BvhText:
+class BvhFile:
     """A parsed file.
 
     Attributes:
@@ -45,7 +45,7 @@ class BvhText:
     frame_time: str
 
 
-def parse_bvh(path: Path) -> BvhText:
+def parse_bvh(path: Path) -> BvhFile:
     """Parse a file.
 
     Raises:
@@ -53,17 +53,17 @@ def parse_bvh(path: Path) -> BvhText:
     """
     try:
         with open(path, "rb") as handle:
-            lines = _Lines(path, iter(handle))
+            lines = _LineReader(path, iter(handle))
             joints, at_motion = _read_hierarchy(lines)
             size_bytes = path.stat().st_size
             values, frame_time = _read_motion(lines, joints, size_bytes) if at_motion else (None, "")
     except OSError as error:
         raise JobError(f"cannot read: {error.strerror or error}", path=path, hint="check the path") from error
-    return BvhText(joints=joints, values=values, frame_time=frame_time)
+    return BvhFile(joints=joints, values=values, frame_time=frame_time)
 
 
 @dataclass
-class _Lines:
+class _LineReader:
     """The file's non-empty lines with their numbers, read one at a time."""
 
     path: Path
@@ -99,7 +99,7 @@ def _decode(raw: bytes) -> str:
         return raw.decode("latin-1")
 
 
-def _read_hierarchy(lines: _Lines) -> tuple[list[FileJoint], bool]:
+def _read_hierarchy(lines: _LineReader) -> tuple[list[FileJoint], bool]:
     """Parse up to MOTION (True) or the end of the file (False)."""
     if (lines.next() or "").upper() != "HIERARCHY":
         raise lines.error("a BVH file begins with HIERARCHY", line=max(lines.number, 1))
@@ -131,7 +131,7 @@ def _read_hierarchy(lines: _Lines) -> tuple[list[FileJoint], bool]:
 
 
 def _read_statement(
-    lines: _Lines, text: str, joints: list[FileJoint], stack: list[int | None], opening: list[int | None]
+    lines: _LineReader, text: str, joints: list[FileJoint], stack: list[int | None], opening: list[int | None]
 ) -> None:
     """Parse one ROOT, JOINT, End Site, OFFSET or CHANNELS line."""
     keyword, _, rest = text.partition(" ")
@@ -145,7 +145,7 @@ def _read_statement(
         if len(joints) >= _MAX_JOINTS:
             raise lines.error(f"more than {_MAX_JOINTS} joints")
         parent = -1 if inside is None else inside
-        joints.append(FileJoint(_free_name(rest or f"joint{len(joints)}", joints), parent, lines.number))
+        joints.append(FileJoint(_unique_name(rest or f"joint{len(joints)}", joints), parent, lines.number))
         if parent >= 0:
             joints[parent].children += 1
         opening.append(len(joints) - 1)
@@ -165,8 +165,8 @@ def _read_statement(
         joints[stack[-1]].channels = _read_channels(lines, rest)
 
 
-def _read_offset(lines: _Lines, rest: str, joints: list[FileJoint], stack: list[int | None]) -> None:
-    numbers = [_number(lines, token) for token in rest.split()]
+def _read_offset(lines: _LineReader, rest: str, joints: list[FileJoint], stack: list[int | None]) -> None:
+    numbers = [_parse_number(lines, token) for token in rest.split()]
     if len(numbers) != 3:
         raise lines.error(f"OFFSET needs 3 numbers, found {len(numbers)}")
     inside = stack[-1]
@@ -177,7 +177,7 @@ def _read_offset(lines: _Lines, rest: str, joints: list[FileJoint], stack: list[
         joints[inside].offset = np.array(numbers)
 
 
-def _read_channels(lines: _Lines, rest: str) -> tuple[str, ...]:
+def _read_channels(lines: _LineReader, rest: str) -> tuple[str, ...]:
     count, *names = rest.split() or [""]
     if not count.isdigit() or int(count) != len(names):
         raise lines.error(f"CHANNELS {count or '?'} is followed by {len(names)} names")
@@ -191,7 +191,7 @@ def _read_channels(lines: _Lines, rest: str) -> tuple[str, ...]:
     return channels
 
 
-def _free_name(name: str, joints: list[FileJoint]) -> str:
+def _unique_name(name: str, joints: list[FileJoint]) -> str:
     """The name, with a number added when an earlier joint has it."""
     taken = {joint.name for joint in joints}
     free, number = name, 2
@@ -200,7 +200,7 @@ def _free_name(name: str, joints: list[FileJoint]) -> str:
     return free
 
 
-def _check_joints(lines: _Lines, joints: list[FileJoint]) -> None:
+def _check_joints(lines: _LineReader, joints: list[FileJoint]) -> None:
     if not joints:
         raise lines.error("no ROOT in the hierarchy")
     for joint in joints:
@@ -208,7 +208,7 @@ def _check_joints(lines: _Lines, joints: list[FileJoint]) -> None:
             raise lines.error(f"joint {joint.name!r} has no OFFSET", line=joint.line)
 
 
-def _number(lines: _Lines, token: str) -> float:
+def _parse_number(lines: _LineReader, token: str) -> float:
     """A finite number; a decimal comma is understood."""
     try:
         value = float(token.replace(",", "."))
@@ -219,20 +219,22 @@ def _number(lines: _Lines, token: str) -> float:
     return value
 
 
-def _read_motion(lines: _Lines, joints: list[FileJoint], size_bytes: int) -> tuple[FloatArray | None, str]:
+def _read_motion(
+    lines: _LineReader, joints: list[FileJoint], size_bytes: int
+) -> tuple[FloatArray | None, str]:
     """Frames (T, channels) and the Frame Time as written; None when there are no frames."""
-    frames = _header(lines, "FRAMES")
+    frames = _read_header(lines, "FRAMES")
     if frames is None:
         return None, ""
-    count = _number(lines, frames)
+    count = _parse_number(lines, frames)
     if count < 0 or count != int(count):
         raise lines.error(f"Frames: {frames} is not a count")
     if count == 0:
         return None, ""
-    frame_time = _header(lines, "FRAME TIME")
+    frame_time = _read_header(lines, "FRAME TIME")
     if frame_time is None:
         raise lines.error("no Frame Time")
-    if _number(lines, frame_time) < 0 or (_number(lines, frame_time) == 0 and count > 1):
+    if _parse_number(lines, frame_time) < 0 or (_parse_number(lines, frame_time) == 0 and count > 1):
         raise lines.error(f"Frame Time {frame_time} is not a positive duration")
     width = sum(len(joint.channels) for joint in joints)
     wanted = int(count) * width
@@ -244,7 +246,7 @@ def _read_motion(lines: _Lines, joints: list[FileJoint], size_bytes: int) -> tup
     values = np.empty(wanted)
     done = 0
     while done < wanted and (text := lines.next()) is not None:
-        row = _row(lines, text)[: wanted - done]
+        row = _parse_row(lines, text)[: wanted - done]
         values[done : done + len(row)] = row
         done += len(row)
     if done < wanted:
@@ -255,7 +257,7 @@ def _read_motion(lines: _Lines, joints: list[FileJoint], size_bytes: int) -> tup
     return values.reshape(int(count), width), frame_time
 
 
-def _header(lines: _Lines, label: str) -> str | None:
+def _read_header(lines: _LineReader, label: str) -> str | None:
     """The value of ``label: value``; None at the end of the file."""
     text = lines.next()
     if text is None:
@@ -267,12 +269,12 @@ def _header(lines: _Lines, label: str) -> str | None:
     return value
 
 
-def _row(lines: _Lines, text: str) -> list[float]:
+def _parse_row(lines: _LineReader, text: str) -> list[float]:
     tokens = text.split()
     try:
         row = [float(token) for token in tokens]
     except ValueError:
-        return [_number(lines, token) for token in tokens]
+        return [_parse_number(lines, token) for token in tokens]
     if not all(map(math.isfinite, row)):
         raise lines.error("NaN or infinity in the motion")
     return row

@@ -16,13 +16,13 @@ from bodycap_batch.model.skeleton import Motion, SkeletonModel
 
 logger = logging.getLogger(__name__)
 
-_METRES_BELOW = 10.0
+_MAX_METRE_EXTENT = 10.0
 """A body's zero pose spans 100-200 cm or 1-2 m: a file below this many units is in metres."""
 
-_MOVES = 1e-3
+_MOTION_THRESHOLD = 1e-3
 """Joint translation, in file units, below which a joint holds still."""
 
-_STRETCH_WARNING = 1.0
+_WARNING_THRESHOLD = 1.0
 """Joint translation, in file units, that is worth a warning."""
 
 
@@ -49,15 +49,15 @@ def read_bvh(path: Path | str, *, units: str = "auto") -> tuple[SkeletonModel, M
     joints, values = text.joints, text.values
     offsets = np.array([joint.offset for joint in joints])
     if values is not None:
-        offsets = _held_offsets(path, joints, offsets, values)
-    units = _resolve_units(joints, offsets) if units == "auto" else units
+        offsets = _offsets_from_channels(path, joints, offsets, values)
+    units = _detect_units(joints, offsets) if units == "auto" else units
     skeleton = _skeleton(path.stem, joints, offsets, units)
     if values is None:
         return skeleton, None
-    columns = _columns(joints)
+    columns = _channel_slices(joints)
     root = world_from_file_points(_positions(joints[0], values[:, columns[0]], offsets[0]), units)
     hips = None
-    if _hips_travel(joints, values):
+    if _have_hips_own_translation(joints, values):
         hips = world_from_file_points(_positions(joints[1], values[:, columns[1]], offsets[1]), units)
     return skeleton, Motion(
         skeleton=skeleton,
@@ -89,34 +89,42 @@ def rate_from_frame_time(frame_time: str) -> float:
     return 1.0 / seconds
 
 
-def _columns(joints: list[FileJoint]) -> list[slice]:
+def _channel_slices(joints: list[FileJoint]) -> list[slice]:
     """Where each joint's channels stand in a frame."""
     ends = np.cumsum([len(joint.channels) for joint in joints]).tolist()
     return [slice(end - len(joint.channels), end) for end, joint in zip(ends, joints, strict=True)]
 
 
-def _hips_travel(joints: list[FileJoint], values: FloatArray) -> bool:
+def _have_hips_own_translation(joints: list[FileJoint], values: FloatArray) -> bool:
     """True where the root carries hips with a moving position of their own."""
     parents = [joint.parent for joint in joints]
     if len(joints) < 2 or assign_roles([joint.name for joint in joints], parents)[:2] != ("", "Hips"):
         return False
     moving = [name.endswith("position") for name in joints[1].channels]
-    return any(moving) and bool(np.ptp(values[:, _columns(joints)[1]][:, moving], axis=0).max() > _MOVES)
+    return any(moving) and bool(
+        np.ptp(values[:, _channel_slices(joints)[1]][:, moving], axis=0).max() > _MOTION_THRESHOLD
+    )
 
 
-def _held_offsets(path: Path, joints: list[FileJoint], offsets: FloatArray, values: FloatArray) -> FloatArray:
+def _offsets_from_channels(
+    path: Path, joints: list[FileJoint], offsets: FloatArray, values: FloatArray
+) -> FloatArray:
     """Bones (J,3), taken from position channels that hold one value other than zero."""
     out = offsets.copy()
-    for index, (joint, columns) in enumerate(zip(joints, _columns(joints), strict=True)):
+    for index, (joint, columns) in enumerate(zip(joints, _channel_slices(joints), strict=True)):
         if index == 0 or not any(name.endswith("position") for name in joint.channels):
             continue
-        if index == 1 and _hips_travel(joints, values):
+        if index == 1 and _have_hips_own_translation(joints, values):
             continue
         positions = _positions(joint, values[:, columns], offsets[index])
         spread = float(np.ptp(positions, axis=0).max())
-        if spread > _STRETCH_WARNING:
+        if spread > _WARNING_THRESHOLD:
             logger.warning("%s: joint %s stretches by %.3g; its OFFSET is kept", path, joint.name, spread)
-        if spread < _MOVES and positions.any() and not np.allclose(positions[0], offsets[index], atol=1e-3):
+        if (
+            spread < _MOTION_THRESHOLD
+            and positions.any()
+            and not np.allclose(positions[0], offsets[index], atol=1e-3)
+        ):
             out[index] = positions[0]
     return out
 
@@ -133,20 +141,20 @@ def _positions(joint: FileJoint, values: FloatArray, offset: FloatArray) -> Floa
 def _rotations(joints: list[FileJoint], values: FloatArray) -> FloatArray:
     """Local rotations (T,J,3,3) in file axes."""
     out = np.empty((len(values), len(joints), 3, 3))
-    for index, (joint, columns) in enumerate(zip(joints, _columns(joints), strict=True)):
+    for index, (joint, columns) in enumerate(zip(joints, _channel_slices(joints), strict=True)):
         turning = [i for i, name in enumerate(joint.channels) if name.endswith("rotation")]
         axes = "".join(joint.channels[i][0] for i in turning)
         out[:, index] = rotation_from_angles(axes, np.deg2rad(values[:, columns][:, turning]))
     return out
 
 
-def _resolve_units(joints: list[FileJoint], offsets: FloatArray) -> str:
+def _detect_units(joints: list[FileJoint], offsets: FloatArray) -> str:
     """Tell metres from centimetres by the size of the zero pose."""
     placed = np.zeros_like(offsets)
     for index, joint in enumerate(joints[1:], start=1):
         placed[index] = placed[joint.parent] + offsets[index]
     extent = float(np.ptp(placed, axis=0).max())
-    return "m" if 0.0 < extent < _METRES_BELOW else "cm"
+    return "m" if 0.0 < extent < _MAX_METRE_EXTENT else "cm"
 
 
 def _skeleton(name: str, joints: list[FileJoint], offsets: FloatArray, units: str) -> SkeletonModel:

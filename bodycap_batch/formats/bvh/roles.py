@@ -37,23 +37,33 @@ _LEG_WORDS = {
     (2, 3): "foot",
     (3,): "toe toes toebase ball",
 }
-_HIPS = {"hips", "hip", "pelvis", "waist", "root"}
-_SPINE = {"spine", "chest", "upperchest", "lowerback", "upperback", "abdomen", "torso", "thorax", "back"}
-_NECK = {"neck", "lowerneck", "upperneck"}
-_HEAD = {"head", "skull"}
+_HIPS_WORDS = {"hips", "hip", "pelvis", "waist", "root"}
+_SPINE_WORDS = {
+    "spine",
+    "chest",
+    "upperchest",
+    "lowerback",
+    "upperback",
+    "abdomen",
+    "torso",
+    "thorax",
+    "back",
+}
+_NECK_WORDS = {"neck", "lowerneck", "upperneck"}
+_HEAD_WORDS = {"head", "skull"}
 
-_CORE_SLOTS = (9.0, 10.0, 10.0, 10.0)
-_LEG_SLOTS = (10.0, 10.0, 10.0, 9.0)
+_ARM_SCORES = (9.0, 10.0, 10.0, 10.0)
+_LEG_SCORES = (10.0, 10.0, 10.0, 9.0)
 """What finding each joint of a limb is worth: collar bone and toes are the ones a rig may lack."""
 
-_SPLIT = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
+_WORD_PATTERN = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 
 
-def _slots(words: dict[tuple[int, ...], str]) -> dict[str, tuple[int, ...]]:
+def _slots_by_word(words: dict[tuple[int, ...], str]) -> dict[str, tuple[int, ...]]:
     return {word: slots for slots, text in words.items() for word in text.split()}
 
 
-_ARM_SLOTS_OF, _LEG_SLOTS_OF = _slots(_ARM_WORDS), _slots(_LEG_WORDS)
+_ARM_SLOTS, _LEG_SLOTS = _slots_by_word(_ARM_WORDS), _slots_by_word(_LEG_WORDS)
 
 
 def assign_roles(
@@ -71,11 +81,11 @@ def assign_roles(
         (J,) HumanIK names (Hips, Spine, Spine1 = the joint that carries the arms, Neck, Head,
         LeftShoulder = collar bone, LeftArm ...), "" where a joint has none; each role at most once.
     """
-    names = [_words(name) for name in _without_prefix(joints)]
+    names = [_split_name(name) for name in _strip_common_prefix(joints)]
     chains = [_ancestors(joint, parents) for joint in range(len(joints))]
     found: dict[str, int] = {}
     for side, title in (("l", "Left"), ("r", "Right")):
-        for table, slots, worth in ((_ARM_SLOTS_OF, _ARM, _CORE_SLOTS), (_LEG_SLOTS_OF, _LEG, _LEG_SLOTS)):
+        for table, slots, worth in ((_ARM_SLOTS, _ARM, _ARM_SCORES), (_LEG_SLOTS, _LEG, _LEG_SCORES)):
             allowed = [table.get(base, ()) if mine == side else () for mine, base in names]
             for slot, joint in _best_chain(allowed, chains, worth).items():
                 found[title + slots[slot]] = joint
@@ -88,7 +98,7 @@ def assign_roles(
     return tuple(role_of.get(joint, "") for joint in range(len(joints)))
 
 
-def _without_prefix(joints: Sequence[str]) -> list[str]:
+def _strip_common_prefix(joints: Sequence[str]) -> list[str]:
     """Drop a namespace ("mixamorig:") and what all names begin with ("Bip01 ", "Character1_")."""
     names = [name.rsplit(":", 1)[-1].rsplit("|", 1)[-1] for name in joints]
     if len(names) < 3:
@@ -101,9 +111,9 @@ def _without_prefix(joints: Sequence[str]) -> list[str]:
     return [name[whole.end() :] for name in names] if whole else names
 
 
-def _words(name: str) -> tuple[str, str]:
+def _split_name(name: str) -> tuple[str, str]:
     """Split a joint name into its side ("l", "r" or "") and the rest in lower case, digits dropped."""
-    tokens = [token.lower() for token in _SPLIT.findall(name)]
+    tokens = [token.lower() for token in _WORD_PATTERN.findall(name)]
     while tokens and tokens[-1].isdigit():
         tokens.pop()
     side = ""
@@ -114,10 +124,10 @@ def _words(name: str) -> tuple[str, str]:
     while tokens and tokens[-1].isdigit():
         tokens.pop()
     base = "".join(tokens)
-    known = base in _ARM_SLOTS_OF or base in _LEG_SLOTS_OF
+    known = base in _ARM_SLOTS or base in _LEG_SLOTS
     for prefix in ("left", "right", "l", "r"):
         rest = base.removeprefix(prefix)
-        if not side and not known and rest != base and (rest in _ARM_SLOTS_OF or rest in _LEG_SLOTS_OF):
+        if not side and not known and rest != base and (rest in _ARM_SLOTS or rest in _LEG_SLOTS):
             return prefix[0], rest
     return side, base
 
@@ -171,26 +181,30 @@ def _assign_trunk(
             taken.add(joint)
 
     everything = range(len(bases))
-    hips = _meeting_point([found.get("LeftUpLeg"), found.get("RightUpLeg")], chains)
-    named = first(_HIPS - {"root"}, everything)
-    claim("Hips", named if named is not None else hips if hips is not None else first(_HIPS, everything))
-    claim("Head", first(_HEAD, everything))
+    hips = _lowest_common_ancestor([found.get("LeftUpLeg"), found.get("RightUpLeg")], chains)
+    named = first(_HIPS_WORDS - {"root"}, everything)
+    claim(
+        "Hips", named if named is not None else hips if hips is not None else first(_HIPS_WORDS, everything)
+    )
+    claim("Head", first(_HEAD_WORDS, everything))
     arms = [found.get(f"{side}Shoulder", found.get(f"{side}Arm")) for side in ("Left", "Right")]
-    chest = _meeting_point(arms, chains)
-    while chest is not None and bases[chest] in _NECK and chains[chest]:
+    chest = _lowest_common_ancestor(arms, chains)
+    while chest is not None and bases[chest] in _NECK_WORDS and chains[chest]:
         chest = chains[chest][0]
     if chest is None or chest in taken:
-        spine = [joint for joint in everything if bases[joint] in _SPINE and joint not in taken]
+        spine = [joint for joint in everything if bases[joint] in _SPINE_WORDS and joint not in taken]
         chest = spine[-1] if spine else None
     claim("Spine1", chest)
-    between = _between(found.get("Hips"), found.get("Spine1"), chains)
-    claim("Spine", _preferred("spine", between, bases, has_bone))
-    necks = _between(found.get("Spine1", found.get("Hips")), found.get("Head"), chains)
-    necks = [joint for joint in necks if bases[joint] in _NECK] or (necks[:1] if "Spine1" in found else [])
-    claim("Neck", _preferred("neck", necks, bases, has_bone))
+    between = _joints_between(found.get("Hips"), found.get("Spine1"), chains)
+    claim("Spine", _choose_joint("spine", between, bases, has_bone))
+    necks = _joints_between(found.get("Spine1", found.get("Hips")), found.get("Head"), chains)
+    necks = [joint for joint in necks if bases[joint] in _NECK_WORDS] or (
+        necks[:1] if "Spine1" in found else []
+    )
+    claim("Neck", _choose_joint("neck", necks, bases, has_bone))
 
 
-def _meeting_point(joints: Sequence[int | None], chains: Sequence[list[int]]) -> int | None:
+def _lowest_common_ancestor(joints: Sequence[int | None], chains: Sequence[list[int]]) -> int | None:
     """The lowest joint that stands above all the given ones; None when one is missing."""
     given = [joint for joint in joints if joint is not None]
     if len(given) < len(joints):
@@ -198,7 +212,7 @@ def _meeting_point(joints: Sequence[int | None], chains: Sequence[list[int]]) ->
     return next((joint for joint in chains[given[0]] if all(joint in chains[other] for other in given)), None)
 
 
-def _between(upper: int | None, lower: int | None, chains: Sequence[list[int]]) -> list[int]:
+def _joints_between(upper: int | None, lower: int | None, chains: Sequence[list[int]]) -> list[int]:
     """Joints strictly between two joints of one path, from the upper one down."""
     if upper is None or lower is None or upper not in chains[lower]:
         return []
@@ -206,7 +220,9 @@ def _between(upper: int | None, lower: int | None, chains: Sequence[list[int]]) 
     return path[: path.index(upper)][::-1]
 
 
-def _preferred(word: str, among: Sequence[int], bases: Sequence[str], has_bone: Sequence[bool]) -> int | None:
+def _choose_joint(
+    word: str, among: Sequence[int], bases: Sequence[str], has_bone: Sequence[bool]
+) -> int | None:
     """Of several joints the one named exactly so, else the first with a bone, else the first."""
     order = sorted(
         among, key=lambda joint: (not (bases[joint] == word and has_bone[joint]), not has_bone[joint])

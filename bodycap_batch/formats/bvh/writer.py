@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.formats.atomic_files import atomic_replacement
 from bodycap_batch.formats.bvh.axes import file_from_world_points, file_from_world_rotations
 from bodycap_batch.formats.bvh.euler import continuous_angles
-from bodycap_batch.formats.files import replacing
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
 
-_POSITIONS = ("Xposition", "Yposition", "Zposition")
+_POSITION_CHANNELS = ("Xposition", "Yposition", "Zposition")
 
 
 def write_bvh(path: Path | str, motion: Motion, *, units: str = "cm", euler_order: str = "ZXY") -> None:
@@ -32,18 +32,21 @@ def write_bvh(path: Path | str, motion: Motion, *, units: str = "cm", euler_orde
         StoreError: The file cannot be written.
     """
     skeleton = motion.skeleton
-    channels = _all_channels(skeleton, euler_order, 1 if motion.hips_in_root_m is None else 2)
-    order = _depth_first(skeleton)
-    values = _values(motion, channels, order, units)
+    channels = _joint_channels(skeleton, euler_order, 1 if motion.hips_in_root_m is None else 2)
+    order = _depth_first_order(skeleton)
+    values = _frame_values(motion, channels, order, units)
     row = " ".join(["%.6f" if units == "cm" else "%.8f"] * values.shape[1]) + "\n"
-    with replacing(Path(path)) as temporary, open(temporary, "w", encoding="utf-8", newline="\n") as handle:
+    with (
+        atomic_replacement(Path(path)) as temporary,
+        open(temporary, "w", encoding="utf-8", newline="\n") as handle,
+    ):
         handle.write("HIERARCHY\n")
-        handle.writelines(_hierarchy(motion, channels, order, units))
+        handle.writelines(_hierarchy_lines(motion, channels, order, units))
         handle.write(f"MOTION\nFrames: {len(values)}\nFrame Time: {1.0 / motion.fps:.10f}\n")
         handle.writelines(row % tuple(frame) for frame in values)
 
 
-def _depth_first(skeleton: SkeletonModel) -> list[int]:
+def _depth_first_order(skeleton: SkeletonModel) -> list[int]:
     """Joints in the order of the file: each followed by its whole subtree."""
     children: list[list[int]] = [[] for _ in skeleton.joints]
     for joint, parent in enumerate(skeleton.parents.tolist()[1:], start=1):
@@ -55,7 +58,7 @@ def _depth_first(skeleton: SkeletonModel) -> list[int]:
     return order
 
 
-def _all_channels(skeleton: SkeletonModel, euler_order: str, travelling: int) -> list[tuple[str, ...]]:
+def _joint_channels(skeleton: SkeletonModel, euler_order: str, travelling: int) -> list[tuple[str, ...]]:
     """Channel names of each joint; the first `travelling` joints have a position."""
     out = []
     for index, given in enumerate(skeleton.bvh_channels):
@@ -67,12 +70,14 @@ def _all_channels(skeleton: SkeletonModel, euler_order: str, travelling: int) ->
             rotations = unique + tuple(f"{axis}rotation" for axis in "ZXY" if f"{axis}rotation" not in unique)
             names = positions + rotations
         if index < travelling and len(positions) != 3:
-            names = _POSITIONS + rotations
+            names = _POSITION_CHANNELS + rotations
         out.append(names)
     return out
 
 
-def _values(motion: Motion, channels: list[tuple[str, ...]], order: list[int], units: str) -> FloatArray:
+def _frame_values(
+    motion: Motion, channels: list[tuple[str, ...]], order: list[int], units: str
+) -> FloatArray:
     """Frames (T, channels) in file axes and units, degrees."""
     orders = tuple("".join(name[0] for name in names if name.endswith("rotation")) for names in channels)
     angles = np.rad2deg(continuous_angles(orders, file_from_world_rotations(motion.local_rotation)))
@@ -87,7 +92,9 @@ def _values(motion: Motion, channels: list[tuple[str, ...]], order: list[int], u
     return np.stack(columns, axis=1) + 0.0
 
 
-def _hierarchy(motion: Motion, channels: list[tuple[str, ...]], order: list[int], units: str) -> list[str]:
+def _hierarchy_lines(
+    motion: Motion, channels: list[tuple[str, ...]], order: list[int], units: str
+) -> list[str]:
     """The text of the HIERARCHY block."""
     skeleton = motion.skeleton
     offsets = file_from_world_points(skeleton.offsets_m, units)
@@ -109,24 +116,24 @@ def _hierarchy(motion: Motion, channels: list[tuple[str, ...]], order: list[int]
             close()
         tabs = "\t" * len(open_joints)
         lines.append(f"{tabs}{'JOINT' if open_joints else 'ROOT'} {skeleton.joints[joint]}\n{tabs}{{\n")
-        lines.append(f"{tabs}\tOFFSET {_offset(offsets[joint])}\n")
+        lines.append(f"{tabs}\tOFFSET {_format_vector(offsets[joint])}\n")
         lines.append(f"{tabs}\tCHANNELS {len(channels[joint])} {' '.join(channels[joint])}\n")
         open_joints.append(joint)
         if joint not in has_child:
             lines.append(
-                f"{tabs}\tEnd Site\n{tabs}\t{{\n{tabs}\t\tOFFSET {_offset(ends[joint])}\n{tabs}\t}}\n"
+                f"{tabs}\tEnd Site\n{tabs}\t{{\n{tabs}\t\tOFFSET {_format_vector(ends[joint])}\n{tabs}\t}}\n"
             )
     while open_joints:
         close()
     return lines
 
 
-def _offset(vector: FloatArray) -> str:
+def _format_vector(vector: FloatArray) -> str:
     """Three lengths: every digit the file had, six decimals or more, no negative zero."""
-    return " ".join(_length(float(value)) for value in vector)
+    return " ".join(_format_length(float(value)) for value in vector)
 
 
-def _length(value: float) -> str:
+def _format_length(value: float) -> str:
     text = f"{round(value, 12) + 0.0:.12f}".rstrip("0")
     whole, _, decimals = text.partition(".")
     return f"{whole}.{decimals:0<6}"

@@ -11,13 +11,13 @@ from pathlib import Path
 
 from bodycap_batch.core.errors import JobError
 
-VARIABLE = "BODYCAP_BLENDER"
+BLENDER_VARIABLE = "BODYCAP_BLENDER"
 _HINT = (
-    f"`make blender` installs it as a Python module (Python 3.11); or set {VARIABLE} to a Python that "
+    f"`make blender` installs it as a Python module (Python 3.11); or set {BLENDER_VARIABLE} to a Python that "
     "has bpy, or to a blender executable"
 )
 _TIMEOUT_S = 3600.0
-_TRIAL = "import bpy"
+_START_TEST = "import bpy"
 
 
 def find_blender() -> Path:
@@ -29,10 +29,10 @@ def find_blender() -> Path:
     Raises:
         JobError: There is none, or the one that is named does not exist.
     """
-    named = os.environ.get(VARIABLE)
+    named = os.environ.get(BLENDER_VARIABLE)
     if named:
         if not os.access(named, os.X_OK) or Path(named).is_dir():
-            raise JobError(f"{VARIABLE} names no program", path=named, hint=_HINT)
+            raise JobError(f"{BLENDER_VARIABLE} names no program", path=named, hint=_HINT)
         return Path(named)
     if importlib.util.find_spec("bpy") is not None:
         return Path(sys.executable)
@@ -51,7 +51,7 @@ def require_blender() -> None:
         JobError: It is not there or does not start.
     """
     blender = find_blender()
-    script = ["--python-expr", _TRIAL] if is_application(blender) else ["-c", _TRIAL]
+    script = ["--python-expr", _START_TEST] if is_blender_executable(blender) else ["-c", _START_TEST]
     done = _run([str(blender), *_flags(blender), *script])
     if done.returncode != 0:
         last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
@@ -61,18 +61,18 @@ def require_blender() -> None:
 def run_script(script: Path, arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
     """Run a Python file in Blender; names hash the same in every run, so that files come out the same."""
     blender = find_blender()
-    if is_application(blender):
+    if is_blender_executable(blender):
         return _run([str(blender), *_flags(blender), "--python", str(script), "--", *arguments])
     return _run([str(blender), *_flags(blender), str(script), *arguments])
 
 
-def is_application(blender: Path) -> bool:
+def is_blender_executable(blender: Path) -> bool:
     """True for Blender itself, False for a Python with its module."""
     return blender.name.lower().startswith("blender")
 
 
 def _flags(blender: Path) -> list[str]:
-    if is_application(blender):
+    if is_blender_executable(blender):
         return ["--background", "--factory-startup", "--python-exit-code", "1"]
     return ["-P"]
 

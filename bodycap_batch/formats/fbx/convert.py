@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-_SAMPLES = 20
+_COMPARED_FRAMES = 20
 
 
 def convert(source: str, target: str, fps: float, frames: int) -> None:
@@ -61,7 +61,9 @@ def read_back(target: str, fps: float) -> dict[str, Any]:
     bpy.ops.import_scene.fbx(filepath=target)
     (body,) = [item for item in bpy.data.objects if item.type == "ARMATURE"]
     first, last = (round(frame) for frame in body.animation_data.action.frame_range)
-    sampled = sorted({first + round(k * (last - first) / (_SAMPLES - 1)) for k in range(_SAMPLES)})
+    sampled = sorted(
+        {first + round(k * (last - first) / (_COMPARED_FRAMES - 1)) for k in range(_COMPARED_FRAMES)}
+    )
     joints: dict[str, list[list[float]]] = {bone.name: [] for bone in body.pose.bones}
     for frame in sampled:
         scene.frame_set(frame)

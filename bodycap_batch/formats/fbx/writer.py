@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.core.errors import StoreError
+from bodycap_batch.formats.atomic_files import atomic_replacement
 from bodycap_batch.formats.fbx.blender import run_script
-from bodycap_batch.formats.files import replacing
 from bodycap_batch.formats.gltf import write_glb
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import Motion
 
 POSITION_TOLERANCE_M = 1e-4
-_SCRIPT = Path(__file__).with_name("convert.py")
+_CONVERT_SCRIPT = Path(__file__).with_name("convert.py")
 # Blender turns a GLB by a quarter about X on its way in; turned back before, the joints keep our axes.
-_AS_IT_STANDS = so3_exp([-np.pi / 2, 0.0, 0.0])
+_BEFORE_BLENDER_IMPORT = so3_exp([-np.pi / 2, 0.0, 0.0])
 
 
 def write_fbx(path: Path, motion: Motion) -> Path:
@@ -38,22 +38,24 @@ def write_fbx(path: Path, motion: Motion) -> Path:
         JobError: Blender is not there.
         StoreError: Blender failed, or the file differs from the motion by more than 0.1 mm.
     """
-    with tempfile.TemporaryDirectory() as folder, replacing(path) as temporary:
+    with tempfile.TemporaryDirectory() as folder, atomic_replacement(path) as temporary:
         figure, report = Path(folder) / "figure.glb", Path(folder) / "report.json"
-        write_glb(figure, motion, file_from_up=_AS_IT_STANDS)
+        write_glb(figure, motion, file_from_up=_BEFORE_BLENDER_IMPORT)
         frames = len(motion.root_in_world_m)
-        done = run_script(_SCRIPT, [str(figure), str(temporary), str(report), repr(motion.fps), str(frames)])
+        done = run_script(
+            _CONVERT_SCRIPT, [str(figure), str(temporary), str(report), repr(motion.fps), str(frames)]
+        )
         if done.returncode != 0 or not report.is_file():
             last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
             raise StoreError(f"Blender could not write it: {last}", path=path, hint="check the disk")
-        off_m = _difference_m(json.loads(report.read_text(encoding="utf-8")), motion)
+        off_m = _max_joint_difference_m(json.loads(report.read_text(encoding="utf-8")), motion)
         if not off_m <= POSITION_TOLERANCE_M:
             hint = "check the disk; if it is sound, this is a bug worth reporting"
             raise StoreError(f"joints read back differ by {off_m * 1000:.3g} mm", path=path, hint=hint)
     return path
 
 
-def _difference_m(report: dict[str, Any], motion: Motion) -> float:
+def _max_joint_difference_m(report: dict[str, Any], motion: Motion) -> float:
     """Largest distance between the joints Blender read and the motion's; infinite where they cannot match."""
     joints, frames = report["joints"], report["frames"]
     count = len(motion.root_in_world_m)

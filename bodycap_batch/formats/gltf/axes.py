@@ -15,9 +15,13 @@ FILE_FROM_WORLD: FloatArray = frozen_array(
 """File (Y up, facing +Z) from world (Z up, facing −Y) axes."""
 
 FLOAT, UINT16, UINT32 = 5126, 5123, 5125
-DTYPES: dict[int, np.dtype[Any]] = {FLOAT: np.dtype("<f4"), UINT16: np.dtype("<u2"), UINT32: np.dtype("<u4")}
-WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-ELEMENTS, VERTICES = 34963, 34962
+COMPONENT_DTYPES: dict[int, np.dtype[Any]] = {
+    FLOAT: np.dtype("<f4"),
+    UINT16: np.dtype("<u2"),
+    UINT32: np.dtype("<u4"),
+}
+ELEMENT_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+ELEMENT_ARRAY_BUFFER, ARRAY_BUFFER = 34963, 34962
 
 
 def poses_in_file_axes(world_from_joint: FloatArray) -> FloatArray:

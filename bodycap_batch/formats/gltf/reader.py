@@ -10,7 +10,12 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.formats.gltf.axes import DTYPES, FILE_FROM_WORLD, WIDTHS, rotations_in_world_axes
+from bodycap_batch.formats.gltf.axes import (
+    COMPONENT_DTYPES,
+    ELEMENT_WIDTHS,
+    FILE_FROM_WORLD,
+    rotations_in_world_axes,
+)
 from bodycap_batch.model.geometry import rotation_from_quat_xyzw
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
 
@@ -34,23 +39,23 @@ def read_glb(path: Path | str) -> Motion:
                 path=path,
                 hint="give the motion.glb of a result",
             )
-        return _motion(document, Path(path).stem)
+        return _read_motion(document, Path(path).stem)
     except (OSError, struct.error, ValueError, LookupError, TypeError, AttributeError) as error:
         raise JobError(
             f"cannot be read as GLB: {error}", path=path, hint="give the motion.glb of a result"
         ) from error
 
 
-def _motion(document: Any, name: str) -> Motion:
+def _read_motion(document: Any, name: str) -> Motion:
     skin, animation = document.skins[0], document.animations[0]
     place = {node: joint for joint, node in enumerate(skin.joints)}
-    skeleton = _skeleton(document, name, place)
-    times = _array(document, animation.samplers[0].input)[:, 0]
+    skeleton = _read_skeleton(document, name, place)
+    times = _read_accessor(document, animation.samplers[0].input)[:, 0]
     shape = (len(times), len(place))
     local = np.tile(np.eye(3), (*shape, 1, 1))
     position: dict[int, FloatArray] = {}
     for channel in animation.channels:
-        values = _array(document, animation.samplers[channel.sampler].output)
+        values = _read_accessor(document, animation.samplers[channel.sampler].output)
         joint = place[channel.target.node]
         if channel.target.path == "rotation":
             local[:, joint] = rotations_in_world_axes(rotation_from_quat_xyzw(values))
@@ -67,7 +72,7 @@ def _motion(document: Any, name: str) -> Motion:
     )
 
 
-def _skeleton(document: Any, name: str, place: dict[int, int]) -> SkeletonModel:
+def _read_skeleton(document: Any, name: str, place: dict[int, int]) -> SkeletonModel:
     nodes = [document.nodes[node] for node in place]
     parents = np.full(len(nodes), -1)
     for joint, node in enumerate(nodes):
@@ -87,14 +92,14 @@ def _skeleton(document: Any, name: str, place: dict[int, int]) -> SkeletonModel:
     )
 
 
-def _array(document: Any, accessor: int) -> FloatArray:
+def _read_accessor(document: Any, accessor: int) -> FloatArray:
     """The values (N, width) of an accessor."""
     wanted = document.accessors[accessor]
     view = document.bufferViews[wanted.bufferView]
     values = np.frombuffer(
         document.binary_blob(),
-        dtype=DTYPES[wanted.componentType],
-        count=wanted.count * WIDTHS[wanted.type],
+        dtype=COMPONENT_DTYPES[wanted.componentType],
+        count=wanted.count * ELEMENT_WIDTHS[wanted.type],
         offset=view.byteOffset + wanted.byteOffset,
     )
-    return np.asarray(values.reshape(wanted.count, WIDTHS[wanted.type]), dtype=np.float64)
+    return np.asarray(values.reshape(wanted.count, ELEMENT_WIDTHS[wanted.type]), dtype=np.float64)

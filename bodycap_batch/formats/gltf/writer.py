@@ -9,22 +9,22 @@ import numpy as np
 import numpy.typing as npt
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.formats.figure import stick_figure
-from bodycap_batch.formats.files import replacing
+from bodycap_batch.formats.atomic_files import atomic_replacement
 from bodycap_batch.formats.gltf.axes import (
-    DTYPES,
-    ELEMENTS,
+    ARRAY_BUFFER,
+    COMPONENT_DTYPES,
+    ELEMENT_ARRAY_BUFFER,
     FILE_FROM_WORLD,
     FLOAT,
     UINT16,
     UINT32,
-    VERTICES,
     poses_in_file_axes,
 )
+from bodycap_batch.formats.stick_figure import make_stick_figure
 from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, make_transform, quat_xyzw_from_rotation
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 
-_COLOR = (0.86, 0.39, 0.10, 1.0)
+_FIGURE_COLOR_RGBA = (0.86, 0.39, 0.10, 1.0)
 
 
 def write_glb(
@@ -48,10 +48,10 @@ def write_glb(
     """
     import pygltflib as gl
 
-    buffer = _Buffer()
+    buffer = _BinaryBuffer()
     turn = make_transform(np.eye(3) if file_from_up is None else file_from_up, np.zeros(3))
-    figure = _figure(motion.skeleton, turn, buffer)
-    animation = _animation(motion, turn, buffer)
+    figure = _figure_primitive(motion.skeleton, turn, buffer)
+    animation = _motion_animation(motion, turn, buffer)
     rest = turn @ poses_in_file_axes(rest_pose(motion.skeleton))
     binds = buffer.add(np.swapaxes(invert(rest), -1, -2).reshape(-1, 16), "MAT4")
     joints = len(motion.skeleton.joints)
@@ -77,7 +77,7 @@ def write_glb(
             gl.Material(
                 name="Figure",
                 pbrMetallicRoughness=gl.PbrMetallicRoughness(
-                    baseColorFactor=list(_COLOR), metallicFactor=0.0, roughnessFactor=0.7
+                    baseColorFactor=list(_FIGURE_COLOR_RGBA), metallicFactor=0.0, roughnessFactor=0.7
                 ),
             )
         ],
@@ -88,11 +88,11 @@ def write_glb(
         extras={"fps": motion.fps, "start_s": motion.start_ns / 1e9},
     )
     document.set_binary_blob(bytes(buffer.data))
-    with replacing(Path(path)) as temporary:
+    with atomic_replacement(Path(path)) as temporary:
         document.save_binary(str(temporary))
 
 
-class _Buffer:
+class _BinaryBuffer:
     """The binary part: arrays one after the other, each with its view and accessor."""
 
     def __init__(self) -> None:
@@ -106,7 +106,7 @@ class _Buffer:
         """Append an array (N, …) and return its accessor's index."""
         import pygltflib as gl
 
-        values = np.ascontiguousarray(array, dtype=DTYPES[component])
+        values = np.ascontiguousarray(array, dtype=COMPONENT_DTYPES[component])
         self.data += bytes(-len(self.data) % 4)
         view = gl.BufferView(buffer=0, byteOffset=len(self.data), byteLength=values.nbytes, target=target)
         self.views.append(view)
@@ -145,11 +145,11 @@ def _joint_nodes(skeleton: SkeletonModel, rest: FloatArray) -> list[Any]:
     ]
 
 
-def _figure(skeleton: SkeletonModel, turn: FloatArray, buffer: _Buffer) -> Any:
+def _figure_primitive(skeleton: SkeletonModel, turn: FloatArray, buffer: _BinaryBuffer) -> Any:
     """The stick figure as a primitive: every vertex follows one joint with weight 1."""
     import pygltflib as gl
 
-    figure = stick_figure(skeleton)
+    figure = make_stick_figure(skeleton)
     axes = (turn[:3, :3] @ FILE_FROM_WORLD).T
     count = len(figure.vertices_m)
     joints = np.zeros((count, 4))
@@ -157,16 +157,16 @@ def _figure(skeleton: SkeletonModel, turn: FloatArray, buffer: _Buffer) -> Any:
     weights = np.zeros((count, 4))
     weights[:, 0] = 1.0
     attributes = gl.Attributes(
-        POSITION=buffer.add(figure.vertices_m @ axes, "VEC3", target=VERTICES),
-        NORMAL=buffer.add(figure.normals @ axes, "VEC3", target=VERTICES),
-        JOINTS_0=buffer.add(joints, "VEC4", target=VERTICES, component=UINT16),
-        WEIGHTS_0=buffer.add(weights, "VEC4", target=VERTICES),
+        POSITION=buffer.add(figure.vertices_m @ axes, "VEC3", target=ARRAY_BUFFER),
+        NORMAL=buffer.add(figure.normals @ axes, "VEC3", target=ARRAY_BUFFER),
+        JOINTS_0=buffer.add(joints, "VEC4", target=ARRAY_BUFFER, component=UINT16),
+        WEIGHTS_0=buffer.add(weights, "VEC4", target=ARRAY_BUFFER),
     )
-    faces = buffer.add(figure.faces.reshape(-1), "SCALAR", target=ELEMENTS, component=UINT32)
+    faces = buffer.add(figure.faces.reshape(-1), "SCALAR", target=ELEMENT_ARRAY_BUFFER, component=UINT32)
     return gl.Primitive(attributes=attributes, indices=faces, material=0)
 
 
-def _animation(motion: Motion, turn: FloatArray, buffer: _Buffer) -> Any:
+def _motion_animation(motion: Motion, turn: FloatArray, buffer: _BinaryBuffer) -> Any:
     """Rotations of all joints, translations of those that travel."""
     import pygltflib as gl
 

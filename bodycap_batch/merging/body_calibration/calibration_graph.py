@@ -50,7 +50,7 @@ from bodycap_batch.merging.graph.linearisation import Linear, linearise
 from bodycap_batch.merging.graph.posture import PostureFactors, per_gesture, widened
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
-from bodycap_batch.model.skeleton_presets import NAMED_SIGMA_RAD, NOMINAL_SIGMA_RAD
+from bodycap_batch.model.skeleton_presets import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_RAD
 
 PRIOR_SCALE = 4.0
 """The pose prior counts once per tick here; its sigmas are widened, or it would outvote the cameras."""
@@ -223,7 +223,7 @@ class Calibration:
         joined = repeats * mounts.variance(solved, JOINED, 1.0 / repeats)
         # Rotations are weighed at the pose prior's widened sigmas; what comes and goes differs by sample.
         posed = (_FLEETING / PRIOR_SCALE) ** 2
-        return np.array([1.0, measured, joined, posed, (NAMED_SIGMA_RAD / NOMINAL_SIGMA_RAD) ** 2])
+        return np.array([1.0, measured, joined, posed, (NOMINAL_ERROR_RAD / NOMINAL_SIGMA_RAD) ** 2])
 
     def measurement_shifts(self, linear: Linear, directions: FloatArray) -> FloatArray:
         """How the residuals change as the measured cameras move: rows (R,P).

@@ -11,7 +11,7 @@ from bodycap_batch.model.geometry import Similarity, interpolate_pose
 from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import Mount
-from bodycap_batch.model.skeleton_presets import NAMED_SIGMA_RAD, NOMINAL_SIGMA_M
+from bodycap_batch.model.skeleton_presets import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_M
 
 CLEAN_HALF_WINDOW = 6
 CLEAN_LIMIT_M = 0.12
@@ -21,7 +21,7 @@ MIN_SIGMA_M = 0.004
 MIN_SIGMA_RAD = float(np.radians(0.4))
 """Floors of a pose's sigma: PnP's covariance knows image noise, not the map's error or a strap's give."""
 
-_UNTOLD_RAD, _UNTOLD_M = 0.98 * NAMED_SIGMA_RAD, 0.98 * NOMINAL_SIGMA_M
+_UNTOLD_RAD, _UNTOLD_M = 0.98 * NOMINAL_ERROR_RAD, 0.98 * NOMINAL_SIGMA_M
 """A mount known less well than both was not calibrated: its name alone promises as much. (The wearer's habits
 alone turn a calibrated palm's by up to that.)"""
 

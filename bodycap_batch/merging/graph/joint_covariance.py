@@ -10,7 +10,7 @@ import numpy as np
 from scipy import sparse
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.core.memory import give_back
+from bodycap_batch.core.memory import release_memory
 from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.cameras.track import Track
 from bodycap_batch.merging.graph.error_modes import Body, Spread, adjoint, joint_shifts
@@ -64,14 +64,14 @@ def joint_covariance(solved: SolvedGraph, world_from_bone: FloatArray, spread: S
         NaN throughout where the graph's equations are singular.
     """
     linear = linearise(solved.graph, solved.values)
-    give_back()  # GTSAM's own derivatives
+    release_memory()  # GTSAM's own derivatives
     order, bounds = _blocks(solved, linear)
     try:
         chain = Chain((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
     except np.linalg.LinAlgError:
         # A state that nothing holds: the solution stands, how well it is known cannot be told.
         return np.full((*world_from_bone.shape[:2], 3, 3), np.nan)
-    give_back()
+    release_memory()
     shifts = _measurement_shifts(solved, linear, spread)
     shifts = shifts + joint_shifts(linear, solved.body, solved.first_joint, world_from_bone, spread)
     shifts = shifts.tocsc()
@@ -95,7 +95,7 @@ def joint_covariance(solved: SolvedGraph, world_from_bone: FloatArray, spread: S
         out[tick, 1:] += reader @ covariance @ reader.swapaxes(1, 2)
 
     chain.covariances(read)
-    give_back()
+    release_memory()
     for first in range(0, shifts.shape[1], _DIRECTIONS):
         # A few directions at a time: all of eleven cameras' at once take gigabytes.
         right = (linear.matrix.T @ shifts[:, first : first + _DIRECTIONS]).toarray()

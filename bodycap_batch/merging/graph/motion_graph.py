@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
-from bodycap_batch.core.memory import give_back
+from bodycap_batch.core.memory import release_memory
 from bodycap_batch.merging.body.bones import Bone, hinges
 from bodycap_batch.merging.body.initial_poses import fill_gaps, pose_bones
 from bodycap_batch.merging.cameras.track import MIN_SIGMA_M, MIN_SIGMA_RAD, Track
@@ -124,7 +124,7 @@ class MotionGraph:
         if spread is None:
             return solution
         # The optimiser's factors, 0.2 MB a tick, are of a size that nothing of what follows would take again.
-        give_back()
+        release_memory()
         return replace(solution, joint_covariance=joint_covariance(self._solved(values), poses, spread))
 
     def _solved(self, values: Any) -> SolvedGraph:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 
-from bodycap_batch.core.percent import percent
+from bodycap_batch.core.percent import format_percent
 from bodycap_batch.report.advice import shared_points
 from bodycap_batch.report.figures.svg import element, picture, text
 from bodycap_batch.report.inputs import ReportInputs
@@ -33,7 +33,7 @@ def shared(inputs: ReportInputs) -> str:
             says = (
                 f"{name} sees {counts[row, row]:,} points"
                 if row == column
-                else f"{name} and {other} share {counts[row, column]:,} points, {percent(share)} of {name}'s"
+                else f"{name} and {other} share {counts[row, column]:,} points, {format_percent(share)} of {name}'s"
             )
             x = _LEFT + column * _CELL
             parts.append(
@@ -57,7 +57,7 @@ def shared(inputs: ReportInputs) -> str:
                     text(
                         middle,
                         y + 0.3 * _CELL + 13.0,
-                        f"{percent(share)}",
+                        f"{format_percent(share)}",
                         class_=f"{tone} small",
                         text_anchor="middle",
                     )

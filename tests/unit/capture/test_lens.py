@@ -17,7 +17,7 @@ from bodycap_batch.config.calibration import Calibration, read_calibration
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.errors import CaptureError
-from bodycap_batch.model.camera import Camera, without_single_focal
+from bodycap_batch.model.camera import Camera, with_two_focal_lengths
 from tests.videos import textured_frame, write_video
 
 
@@ -122,7 +122,7 @@ def test_another_aspect_is_refused(wide: Path, size: tuple[int, int], hint: str)
 )
 def test_one_focal_length_becomes_two_without_a_change(model: str, params: tuple[float, ...]) -> None:
     lens = Camera(model=model, width_px=640, height_px=360, params=params)  # type: ignore[arg-type]
-    twin = without_single_focal(lens)
+    twin = with_two_focal_lengths(lens)
     points = np.random.default_rng(1).uniform((-1, -1, 2), (1, 1, 5), (20, 3))
     assert np.allclose(twin.project(points), lens.project(points), atol=1e-9)
 

@@ -15,7 +15,7 @@ from bodycap_batch.check.pictures import sample_indices
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.errors import Cancelled, JobError, StoreError
-from bodycap_batch.formats import needs
+from bodycap_batch.formats import optional_libraries
 from bodycap_batch.formats.bvh import write_bvh
 from bodycap_batch.store.disk_space import require_room
 from tests.bodies import reaching
@@ -154,7 +154,7 @@ def test_formats_that_cannot_be_written_are_refused_beforehand(
         return [str(error) for error in found if isinstance(error, JobError)]
 
     assert errors() == []
-    monkeypatch.setattr(needs, "find_spec", lambda name: None)
+    monkeypatch.setattr(optional_libraries, "find_spec", lambda name: None)
     (text,) = errors(formats=("bvh", "usd"))
     assert text.startswith("export.formats: USD files take a library")
     monkeypatch.setenv("BODYCAP_BLENDER", str(tmp_path / "nothing"))

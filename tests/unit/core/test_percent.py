@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bodycap_batch.core.percent import percent
+from bodycap_batch.core.percent import format_percent
 
 
 @pytest.mark.parametrize(
@@ -22,4 +22,4 @@ from bodycap_batch.core.percent import percent
     ],
 )
 def test_rounding_never_says_all_or_nothing_where_it_is_not(share: float, digits: int, says: str) -> None:
-    assert percent(share, digits) == says
+    assert format_percent(share, digits) == says

@@ -13,10 +13,10 @@ import pytest
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.export.joint_tables import write_joint_arrays, write_joint_table
-from bodycap_batch.export.layout import lay_out
-from bodycap_batch.export.motion import joint_centres, motion_difference
-from bodycap_batch.formats import needs, usd
-from bodycap_batch.formats.c3d import Points, read_c3d, write_c3d
+from bodycap_batch.export.layout import apply_layout
+from bodycap_batch.export.motion_files import motion_difference, points_from_motion
+from bodycap_batch.formats import optional_libraries, usd
+from bodycap_batch.formats.c3d import LabelledPoints, read_c3d, write_c3d
 from bodycap_batch.formats.fbx import blender
 from bodycap_batch.formats.trc import write_trc
 from bodycap_batch.model.geometry import rotation_from_quat_xyzw
@@ -27,7 +27,7 @@ from tests.bodies import reaching
 def test_usd_comes_back_and_complies(tmp_path: Path, options: dict[str, Any]) -> None:
     from pxr import Usd, UsdGeom, UsdSkel, UsdValidation
 
-    motion = lay_out(reaching(12), ExportOptions.model_validate(options))
+    motion = apply_layout(reaching(12), ExportOptions.model_validate(options))
     usd.write_usd(tmp_path / "a.usd", motion)
     usd.write_usd(tmp_path / "b.usd", motion)
     assert (tmp_path / "a.usd").read_bytes() == (tmp_path / "b.usd").read_bytes()
@@ -79,7 +79,7 @@ def test_c3d_is_in_millimetres_z_up(tmp_path: Path) -> None:
     import ezc3d
 
     motion = reaching(25)
-    write_c3d(tmp_path / "a.c3d", joint_centres(motion))
+    write_c3d(tmp_path / "a.c3d", points_from_motion(motion))
     raw = ezc3d.c3d(str(tmp_path / "a.c3d"))
     head = raw["parameters"]["POINT"]["LABELS"]["value"].index("Head")
     assert raw["parameters"]["POINT"]["UNITS"]["value"] == ["mm"]
@@ -91,7 +91,7 @@ def test_c3d_is_in_millimetres_z_up(tmp_path: Path) -> None:
 
 
 def test_c3d_refuses_what_does_not_come_back(tmp_path: Path) -> None:
-    far = Points(names=("a",), fps=30.0, x_in_world_m=np.full((3, 1, 3), 123456.789))
+    far = LabelledPoints(names=("a",), fps=30.0, x_in_world_m=np.full((3, 1, 3), 123456.789))
     with pytest.raises(StoreError, match="read back"):
         write_c3d(tmp_path / "a.c3d", far)
     assert not (tmp_path / "a.c3d").exists()
@@ -99,7 +99,7 @@ def test_c3d_refuses_what_does_not_come_back(tmp_path: Path) -> None:
 
 def test_trc_is_in_millimetres_x_forward_y_up(tmp_path: Path) -> None:
     motion = reaching(20)
-    write_trc(tmp_path / "a.trc", joint_centres(motion))
+    write_trc(tmp_path / "a.trc", points_from_motion(motion))
     rows = [line.split("\t") for line in (tmp_path / "a.trc").read_text().splitlines()]
     assert rows[2][:5] == ["30", "30", "20", "21", "mm"]
     names = [name for name in rows[3][2:] if name]
@@ -138,11 +138,11 @@ def test_tables_hold_everything(tmp_path: Path) -> None:
 
 
 def test_a_missing_library_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    needs.require_libraries(("bvh", "glb", "trc", "fbx"))
-    monkeypatch.setattr(needs, "find_spec", lambda name: None)
+    optional_libraries.require_libraries(("bvh", "glb", "trc", "fbx"))
+    monkeypatch.setattr(optional_libraries, "find_spec", lambda name: None)
     for name in ("usd", "c3d"):
         with pytest.raises(JobError, match=name.upper()) as caught:
-            needs.require_libraries(("bvh", name))
+            optional_libraries.require_libraries(("bvh", name))
         assert "bodycap_batch[formats]" in str(caught.value.hint)
         assert caught.value.field == "export.formats"
 

@@ -11,10 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.export.layout import lay_out
-from bodycap_batch.export.layout.rates import resample, smooth
-from bodycap_batch.export.layout.roots import heading_rad
-from bodycap_batch.export.motion import motion_difference
+from bodycap_batch.export.layout import apply_layout
+from bodycap_batch.export.layout.resampling import resample, smooth
+from bodycap_batch.export.layout.root_motion import heading_rad
+from bodycap_batch.export.motion_files import motion_difference
 from bodycap_batch.formats.bvh import assign_roles, read_bvh, write_bvh
 from bodycap_batch.model.geometry import rotation_angle_rad, so3_exp
 from bodycap_batch.model.skeleton import Motion
@@ -25,7 +25,7 @@ ROOTS = ("hips", "ground", "in_place")
 
 
 def laid_out(motion: Motion, **options: Any) -> Motion:
-    return lay_out(motion, ExportOptions.model_validate(options))
+    return apply_layout(motion, ExportOptions.model_validate(options))
 
 
 def poses(motion: Motion, roles: tuple[str, ...]) -> np.ndarray:

@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.export import corrections
-from bodycap_batch.export.corrections import (
-    Correction,
-    Planted,
-    Problem,
-    _cost,
-    _moved,
-    _normal_equations,
-    solve_correction,
-)
+from bodycap_batch.export import projection_solver
 from bodycap_batch.export.projection import project_motion
+from bodycap_batch.export.projection_solver import (
+    ProjectionProblem,
+    RigidMotion,
+    StandingJoint,
+    _cost,
+    _normal_equations,
+    _retract,
+    solve_rigid_motion,
+)
 from bodycap_batch.model.geometry import rotation_angle_rad
 from tests.bodies import merged, reaching
 
@@ -132,30 +132,30 @@ def test_gradient_and_optimum(sigma_m: float | None) -> None:
         hand = truth.skeleton.index_of_role("LeftHand")
         assert hand is not None
         held = np.array([True, True, False, False, True])
-        problem = replace(problem, planted=(Planted(joint=hand, held=held, sigma_m=sigma_m),))
+        problem = replace(problem, planted=(StandingJoint(joint=hand, held=held, sigma_m=sigma_m),))
     rotation = result.world_from_joint[..., :3, :3]
     local = rotation.copy()
     for joint in range(1, len(truth.skeleton.joints)):
         local[:, joint] = np.swapaxes(rotation[:, truth.skeleton.parents[joint]], -1, -2) @ rotation[:, joint]
-    start = Correction(root=truth.root_in_world_m.copy(), local=local)
+    start = RigidMotion(root=truth.root_in_world_m.copy(), local=local)
     rng = np.random.default_rng(1)
     # away from the graph, so that the change of the correction over time takes part
     away = 3e-3 * rng.normal(size=(6, 3 + 3 * len(problem.solved)))
-    start = _moved(problem, start, away)
+    start = _retract(problem, start, away)
     _, _, gradient = _normal_equations(problem, start, problem.reach())
     for _ in range(5):
         step = rng.normal(size=gradient.shape)
-        change = _cost(problem, _moved(problem, start, 1e-6 * step)) - _cost(
-            problem, _moved(problem, start, -1e-6 * step)
+        change = _cost(problem, _retract(problem, start, 1e-6 * step)) - _cost(
+            problem, _retract(problem, start, -1e-6 * step)
         )
         # logarithms' own derivative is taken as the identity: errors here are up to 0.03 rad
         assert change / 2e-6 == pytest.approx(2.0 * float((gradient * step).sum()), rel=0.03)
-    found = solve_correction(problem, start)
+    found = solve_rigid_motion(problem, start)
     best = _cost(problem, found)
     assert best < _cost(problem, start)
     for _ in range(20):
         step = 1e-3 * rng.normal(size=gradient.shape)
-        assert _cost(problem, _moved(problem, found, step)) > best
+        assert _cost(problem, _retract(problem, found, step)) > best
 
 
 @pytest.mark.parametrize("standing", [False, True])
@@ -222,30 +222,30 @@ def test_a_long_motion_is_corrected_in_stretches_as_of_one_piece(monkeypatch: py
     result = replace(result, standing=standing)
     whole = project_motion(result, clocks).motion.world_from_joint()
     solved: list[int] = []
-    equations = corrections._normal_equations
+    equations = projection_solver._normal_equations
 
     def counted(problem, now, reach):  # type: ignore[no-untyped-def]
         solved.append(len(now.root))
         return equations(problem, now, reach)
 
-    monkeypatch.setattr(corrections, "_normal_equations", counted)
-    monkeypatch.setattr(corrections, "_STRETCH_TICKS", 40)
-    monkeypatch.setattr(corrections, "_OVERLAP_S", 25 / 30)
+    monkeypatch.setattr(projection_solver, "_normal_equations", counted)
+    monkeypatch.setattr(projection_solver, "_WINDOW_TICKS", 40)
+    monkeypatch.setattr(projection_solver, "_OVERLAP_S", 25 / 30)
     pieces = project_motion(result, clocks).motion.world_from_joint()
     # A correction is forgotten at a tenth a tick and faster where cameras measure.
     assert np.abs(pieces - whole)[..., :3, 3].max() < 1e-4
     assert set(solved) == {65, 90}
 
 
-def problem_of(result, clocks) -> Problem:  # type: ignore[no-untyped-def]
-    from bodycap_batch.export.projection import _tracked
+def problem_of(result, clocks) -> ProjectionProblem:  # type: ignore[no-untyped-def]
+    from bodycap_batch.export.projection import _camera_targets
 
-    return Problem(
+    return ProjectionProblem(
         fps=result.fps,
         skeleton=result.skeleton,
         solved=np.flatnonzero(result.solved),
         world_from_joint=result.world_from_joint,
-        cameras=_tracked(result, clocks, {}),
+        cameras=_camera_targets(result, clocks, {}),
     )
 
 

@@ -368,7 +368,7 @@ def test_a_full_disk_is_a_store_error_and_keeps_the_earlier_file(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("bodycap_batch.formats.files.os.fsync", full)
+    monkeypatch.setattr("bodycap_batch.formats.atomic_files.os.fsync", full)
     with pytest.raises(StoreError, match=r"No space left") as caught:
         write_bvh(tmp_path / "a.bvh", moving)
     assert "free some space" in str(caught.value.hint)

@@ -61,12 +61,12 @@ def test_observations_still_reproject(tmp_path: Path) -> None:
 def test_every_lens_model_has_colmaps_number(tmp_path: Path) -> None:
     import pycolmap
 
-    from bodycap_batch.formats.colmap import _MODEL_IDS
-    from bodycap_batch.model.camera import CAMERA_MODELS, param_count
+    from bodycap_batch.formats.colmap import _COLMAP_MODEL_IDS
+    from bodycap_batch.model.camera import CAMERA_MODELS, parameter_count
 
-    assert set(_MODEL_IDS) == set(CAMERA_MODELS)
+    assert set(_COLMAP_MODEL_IDS) == set(CAMERA_MODELS)
     for model in CAMERA_MODELS:
-        params = [100.0] * param_count(model)
+        params = [100.0] * parameter_count(model)
         camera = Camera(model=model, width_px=200, height_px=200, params=np.array(params))
-        assert int(camera.to_pycolmap().model) == _MODEL_IDS[model]
-        assert pycolmap.CameraModelId(_MODEL_IDS[model]).name == model
+        assert int(camera.to_pycolmap().model) == _COLMAP_MODEL_IDS[model]
+        assert pycolmap.CameraModelId(_COLMAP_MODEL_IDS[model]).name == model

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.export.layout import lay_out
-from bodycap_batch.export.motion import joint_centres
+from bodycap_batch.export.layout import apply_layout
+from bodycap_batch.export.motion_files import points_from_motion
 from bodycap_batch.formats.bvh import write_bvh
 from bodycap_batch.formats.c3d import write_c3d
 from bodycap_batch.formats.trc import write_trc
@@ -30,7 +30,7 @@ def file_axes_cm(motion: Motion) -> np.ndarray:
 def test_pybvh_places_the_joints_where_we_do(tmp_path: Path, names: str) -> None:
     import pybvh
 
-    motion = lay_out(reaching(30), ExportOptions.model_validate({"names": names, "tpose": True}))
+    motion = apply_layout(reaching(30), ExportOptions.model_validate({"names": names, "tpose": True}))
     write_bvh(tmp_path / "a.bvh", motion)
     other = pybvh.read_bvh_file(str(tmp_path / "a.bvh"))
     assert (other.frame_count, other.fps) == (31, pytest.approx(30.0))
@@ -43,7 +43,7 @@ def test_pybvh_places_the_joints_where_we_do(tmp_path: Path, names: str) -> None
 def test_bvhio_places_the_joints_where_we_do(tmp_path: Path, names: str, root: str) -> None:
     import bvhio
 
-    motion = lay_out(reaching(20), ExportOptions.model_validate({"names": names, "root": root}))
+    motion = apply_layout(reaching(20), ExportOptions.model_validate({"names": names, "root": root}))
     write_bvh(tmp_path / "a.bvh", motion)
     assert bvhio.readAsBvh(str(tmp_path / "a.bvh")).FrameCount == 20
     tree = bvhio.readAsHierarchy(str(tmp_path / "a.bvh"))
@@ -60,7 +60,7 @@ def test_c3d_reads_our_points(tmp_path: Path) -> None:
     import c3d
 
     motion = reaching(25)
-    write_c3d(tmp_path / "a.c3d", joint_centres(motion))
+    write_c3d(tmp_path / "a.c3d", points_from_motion(motion))
     with open(tmp_path / "a.c3d", "rb") as handle:
         reader = c3d.Reader(handle)
         assert [label.strip() for label in reader.point_labels] == list(motion.skeleton.joints)
@@ -73,7 +73,7 @@ def test_trc_reader_reads_our_points(tmp_path: Path) -> None:
     from trc import TRCData
 
     motion = reaching(25)
-    write_trc(tmp_path / "a.trc", joint_centres(motion))
+    write_trc(tmp_path / "a.trc", points_from_motion(motion))
     other = TRCData()
     other.load(str(tmp_path / "a.trc"))
     assert (other["NumFrames"], other["Units"], other["DataRate"]) == (25, "mm", 30.0)

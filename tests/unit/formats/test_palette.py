@@ -13,8 +13,8 @@ import pytest
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config.job import load_job
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.formats.palette import CAMERA_COLOURS, as_hex, camera_colours
-from bodycap_batch.formats.ply import PointCloud, with_paths
+from bodycap_batch.formats.palette import CAMERA_COLOURS, camera_colours, hex_from_colour
+from bodycap_batch.formats.ply import PointCloud, add_camera_paths
 from bodycap_batch.preview import PreviewInputs
 from bodycap_batch.preview.room import BACKGROUND
 from bodycap_batch.preview.stage import film_tiles
@@ -65,7 +65,7 @@ def test_each_is_seen_on_white_paper_and_on_the_dark_ground(colour: tuple[int, i
     for ground in ((255, 255, 255), (28, 32, 36), tuple(BACKGROUND.tolist())):
         light, dark = sorted((_luminance(colour), _luminance(ground)), reverse=True)
         assert (light + 0.05) / (dark + 0.05) >= 3.0
-    assert re.fullmatch("#[0-9a-f]{6}", as_hex(colour))
+    assert re.fullmatch("#[0-9a-f]{6}", hex_from_colour(colour))
 
 
 def test_a_camera_has_its_colour_whatever_the_order_and_keeps_it_where_others_are_not_drawn() -> None:
@@ -73,7 +73,7 @@ def test_a_camera_has_its_colour_whatever_the_order_and_keeps_it_where_others_ar
     assert every == camera_colours(["right_palm", "torso", "left_palm"])
     assert len(set(camera_colours(f"camera {number}" for number in range(8)).values())) == 8
     nothing = PointCloud(points=np.zeros((0, 3)), colors=np.zeros((0, 3), np.uint8))
-    cloud = with_paths(nothing, {"torso": np.zeros((1, 3))}, 0.1, every)
+    cloud = add_camera_paths(nothing, {"torso": np.zeros((1, 3))}, 0.1, every)
     assert tuple(cloud.colors[0].tolist()) == every["torso"]
 
 
@@ -82,7 +82,7 @@ def test_page_and_film_have_it_from_there(tmp_path: Path) -> None:
     own = camera_colours(inputs.cameras)
     told = re.search(r'"tones": ?(\{[^}]*\})', written(inputs, tmp_path))
     assert told is not None
-    assert json.loads(told.group(1)) == {name: as_hex(colour) for name, colour in own.items()}
+    assert json.loads(told.group(1)) == {name: hex_from_colour(colour) for name, colour in own.items()}
     for name in ("left_palm", "torso"):
         write_video(tmp_path / "videos" / f"{name}.mp4", [textured_frame(index) for index in range(9)])
     capture = open_capture(load_job(tmp_path / "videos").capture)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from bodycap_batch.core.errors import StoreError
-from bodycap_batch.formats.open3d_library import load_open3d
+from bodycap_batch.formats.open3d_loader import load_open3d
 from bodycap_batch.formats.palette import camera_colours
-from bodycap_batch.formats.ply import PointCloud, read_ply, with_paths, write_ply
+from bodycap_batch.formats.ply import PointCloud, add_camera_paths, read_ply, write_ply
 
 
 def cloud(count: int) -> PointCloud:
@@ -39,7 +39,7 @@ def test_round_trip_and_an_independent_reading(tmp_path: Path) -> None:
 
 def test_paths_keep_every_vertex_and_leave_gaps_open() -> None:
     path = np.array([[0, 0, 0], [1, 0, 0], [np.nan] * 3, [5, 0, 0], [5, 0.05, 0]])
-    both = with_paths(cloud(10), {"b": path, "a": np.full((2, 3), np.nan)}, spacing=0.25)
+    both = add_camera_paths(cloud(10), {"b": path, "a": np.full((2, 3), np.nan)}, spacing=0.25)
     mine = both.points[10:]
     np.testing.assert_allclose(mine[:, 0], [0, 0.25, 0.5, 0.75, 1, 5, 5])
     assert (both.colors[10:] == camera_colours("ab")["b"]).all()
@@ -69,7 +69,7 @@ def test_a_failing_writer_keeps_the_earlier_file(tmp_path: Path, monkeypatch: py
 def test_open3d_loads_without_its_web_pages_which_come_when_they_are_asked_for() -> None:
     code = """
 import sys
-from bodycap_batch.formats.open3d_library import load_open3d
+from bodycap_batch.formats.open3d_loader import load_open3d
 open3d = load_open3d()
 assert "dash" not in sys.modules
 cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector([[1.0, 2.0, 3.0]]))

@@ -10,7 +10,7 @@ import pytest
 
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.export.projection import _planted
+from bodycap_batch.export.projection import _standing_joints
 from bodycap_batch.merging import merge_trajectories
 from bodycap_batch.merging.body.bones import graph_bones
 from bodycap_batch.merging.cameras.track import Track
@@ -101,7 +101,7 @@ def test_a_foot_is_held_as_firmly_over_a_second_at_every_rate(shin, fps):
     result, _ = merged(reaching(10))
     standing = np.zeros(result.observed.shape, dtype=bool)
     standing[:, skeleton.index_of_role("LeftLeg")] = True
-    (planted,) = _planted(replace(result, fps=fps, standing=standing))
+    (planted,) = _standing_joints(replace(result, fps=fps, standing=standing))
     # What sliding by 2 cm in a second costs; at 30 ticks a second each is held to 0.05 m/s.
     costs = [fps * (0.02 / fps / sigma_m) ** 2 for sigma_m in (found.sigma_m, planted.sigma_m)]
     assert costs == pytest.approx([30.0 * (0.02 / 0.05) ** 2] * 2, rel=1e-3)

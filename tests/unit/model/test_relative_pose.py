@@ -12,7 +12,7 @@ import pytest
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.formats.bundle import read_bundle, write_bundle
+from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, rotation_angle_rad, so3_exp
 from bodycap_batch.model.relative_pose import RigPoses, estimate_relative_pose, match_instants, mean_rotation
@@ -181,7 +181,7 @@ def test_what_the_rig_left_outlasts_the_search_for_lost_frames(
         camera="torso", frames=KEYFRAMES, frame_count=COUNT, sharpness=np.ones(COUNT), noise_px=0.2
     )
     relative = estimate_relative_pose(*(each.registration.trajectory for each in cameras), 0)
-    write_bundle(RigPoses(relative=(relative,)), folders[0], RIG_POSES)
+    write_dataclass(RigPoses(relative=(relative,)), folders[0], RIG_POSES)
     capture = SimpleNamespace(cameras=tuple(each.camera for each in cameras))
     monkeypatch.setattr(recover, "load_capture", lambda *_: capture)
     monkeypatch.setattr(recover, "load_map", lambda _: SimpleNamespace(maps=(scene_map,)))
@@ -193,7 +193,7 @@ def test_what_the_rig_left_outlasts_the_search_for_lost_frames(
     out.mkdir()
     arguments = {"registrations": [str(folder) for folder in folders], "map": "", "selection": ""}
     recover.RECOVER.function({}, arguments, StageContext(work_dir=tmp_path, threads=1), out)
-    (kept,) = read_bundle(RigPoses, out, RIG_POSES).relative
+    (kept,) = read_dataclass(RigPoses, out, RIG_POSES).relative
     assert kept.cameras == relative.cameras
     assert read_summary(out) == read_summary(folders[0])
 

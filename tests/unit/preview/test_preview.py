@@ -10,7 +10,7 @@ import pytest
 
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
-from bodycap_batch.formats.mp4 import planes_of
+from bodycap_batch.formats.mp4 import yuv420_from_rgb
 from bodycap_batch.model.scene import FrameStatus
 from bodycap_batch.overlay import SeenPoints
 from bodycap_batch.preview import room
@@ -193,7 +193,7 @@ def test_pictures_get_the_colours_that_ffmpeg_would_give_them() -> None:
     rng = np.random.default_rng(0)
     colours = rng.integers(0, 256, (6, 8, 3), dtype=np.uint8)
     image = np.ascontiguousarray(colours.repeat(16, axis=0).repeat(16, axis=1))
-    planes = planes_of(image)
+    planes = yuv420_from_rgb(image)
     frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format="yuv420p")
     off = np.abs(planes.astype(int) - frame.to_ndarray())
     assert off[:96].max() <= 1  # rounding

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from bodycap_batch.core.memory import give_back
+from bodycap_batch.core.memory import release_memory
 
 _BLOCK, _COUNT = 64 * 1024, 1600
 
@@ -33,6 +33,6 @@ def test_what_earlier_tasks_freed_goes_back() -> None:
     for block in blocks[:-1]:
         libc.free(block)
     held = _resident_mb()
-    give_back()
+    release_memory()
     assert held - _resident_mb() > 80
     libc.free(blocks[-1])

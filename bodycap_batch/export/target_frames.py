@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bodycap_batch.export.inputs import ExportInputs
+from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.scene import Map, Trajectory
 
@@ -12,7 +12,7 @@ WORLD = "world"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PlacedMap:
+class ExportedMap:
     """A map and the frame it is written in.
 
     Attributes:
@@ -26,11 +26,11 @@ class PlacedMap:
     target_from_map: Similarity | None
 
 
-def place_maps(inputs: ExportInputs) -> tuple[PlacedMap, ...]:
+def maps_in_target_frames(inputs: ExportInputs) -> tuple[ExportedMap, ...]:
     """All maps, the world's first; each group largest first."""
     placements = {} if inputs.merge is None else inputs.merge.world_from_map
     placed = [
-        PlacedMap(
+        ExportedMap(
             scene=scene,
             frame=WORLD if scene.gauge in placements else scene.gauge,
             target_from_map=placements.get(scene.gauge),
@@ -40,13 +40,13 @@ def place_maps(inputs: ExportInputs) -> tuple[PlacedMap, ...]:
     return tuple(sorted(placed, key=lambda item: item.frame != WORLD))
 
 
-def place_trajectories(inputs: ExportInputs) -> tuple[Trajectory, ...]:
+def trajectories_in_target_frames(inputs: ExportInputs) -> tuple[Trajectory, ...]:
     """Every camera's trajectory: merging's in the world where there is one, else in its map's gauge."""
     merged = {} if inputs.merge is None else {item.camera: item for item in inputs.merge.trajectories}
     return tuple(merged.get(item.camera, item) for item in inputs.trajectories)
 
 
-def main_frame(inputs: ExportInputs) -> str:
+def main_target_name(inputs: ExportInputs) -> str:
     """The frame of the results: the world, else the largest map's gauge."""
-    placed = place_maps(inputs)
+    placed = maps_in_target_frames(inputs)
     return placed[0].frame if placed else WORLD

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 
 from bodycap_batch.core.errors import JobError
 
-_MODULES = {"usd": "pxr", "c3d": "ezc3d"}
+_LIBRARY_MODULES = {"usd": "pxr", "c3d": "ezc3d"}
 
 
 def require_libraries(formats: Iterable[str]) -> None:
@@ -20,9 +20,9 @@ def require_libraries(formats: Iterable[str]) -> None:
         JobError: Names the format and the extra that brings it.
     """
     for name in formats:
-        if name in _MODULES and find_spec(_MODULES[name]) is None:
+        if name in _LIBRARY_MODULES and find_spec(_LIBRARY_MODULES[name]) is None:
             raise JobError(
-                f"{name.upper()} files take a library that is not installed ({_MODULES[name]})",
+                f"{name.upper()} files take a library that is not installed ({_LIBRARY_MODULES[name]})",
                 field="export.formats",
                 hint="`make extras`, or `pip install 'bodycap_batch[formats]'`; or leave the format out",
             )

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.export.inputs import ExportInputs
-from bodycap_batch.export.placed import place_trajectories
-from bodycap_batch.formats.files import write_text
+from bodycap_batch.export.export_inputs import ExportInputs
+from bodycap_batch.export.target_frames import trajectories_in_target_frames
+from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.formats.tum import seconds_text
 from bodycap_batch.model.scene import FrameStatus
 
@@ -18,7 +18,7 @@ COLUMNS = ("camera", "frame", "time", "common_time", "status", "reason", "inlier
 LOST = "LOST"
 
 
-def write_frames(path: Path, inputs: ExportInputs) -> Path:
+def write_frame_table(path: Path, inputs: ExportInputs) -> Path:
     """Write the table (times in seconds, error in pixels at the work size) and return its path.
 
     `status` is KEYFRAME, REGISTERED, RIG (carried by the other cameras of a rig) or LOST; `reason` says why
@@ -30,7 +30,7 @@ def write_frames(path: Path, inputs: ExportInputs) -> Path:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
-    for trajectory in place_trajectories(inputs):
+    for trajectory in trajectories_in_target_frames(inputs):
         common = inputs.clocks[trajectory.camera].common_times_ns(trajectory.times_ns)
         for index, status in enumerate(trajectory.status):
             error = trajectory.error_px[index]
@@ -40,7 +40,7 @@ def write_frames(path: Path, inputs: ExportInputs) -> Path:
                     int(trajectory.frame_numbers[index]),
                     seconds_text(int(trajectory.times_ns[index])),
                     seconds_text(int(common[index])),
-                    *_status(status),
+                    *_status_and_reason(status),
                     int(trajectory.inliers[index]),
                     f"{error:.3f}" if np.isfinite(error) else "",
                 )
@@ -49,5 +49,5 @@ def write_frames(path: Path, inputs: ExportInputs) -> Path:
     return path
 
 
-def _status(status: FrameStatus) -> tuple[str, str]:
+def _status_and_reason(status: FrameStatus) -> tuple[str, str]:
     return (status.value, "") if status.localised else (LOST, status.value)

@@ -10,16 +10,16 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.model.skeleton import SkeletonModel, rest_pose
 
-_WAIST = 0.15
+_WAIST_RATIO = 0.15
 """Where along the bone its spindle is widest."""
-_SHORTEST_M = 1e-4
+_MIN_BONE_M = 1e-4
 _WIDTH_SHARE, _WIDTH_M = 0.08, (0.008, 0.03)
 """Half width: this share of the length, within these bounds."""
 _FACES = np.array([[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4], [5, 1, 2], [5, 2, 3], [5, 3, 4], [5, 4, 1]])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Figure:
+class StickFigure:
     """A triangle mesh in world axes, bound to a skeleton in its rest pose.
 
     Attributes:
@@ -35,7 +35,7 @@ class Figure:
     joints: IntArray
 
 
-def stick_figure(skeleton: SkeletonModel) -> Figure:
+def make_stick_figure(skeleton: SkeletonModel) -> StickFigure:
     """One spindle from each joint to each of its children and to its end; bones of zero length have none.
 
     Raises:
@@ -43,8 +43,8 @@ def stick_figure(skeleton: SkeletonModel) -> Figure:
     """
     rest = rest_pose(skeleton)
     corners, joints = [], []
-    for joint, end in _bone_ends(skeleton, rest):
-        corners.append(_spindle(rest[joint, :3, 3], end)[_FACES].reshape(-1, 3))
+    for joint, end in _iterate_bones(skeleton, rest):
+        corners.append(_spindle_corners(rest[joint, :3, 3], end)[_FACES].reshape(-1, 3))
         joints.append(np.full(3 * len(_FACES), joint))
     if not corners:
         raise ValueError("no bone has a length")
@@ -52,7 +52,7 @@ def stick_figure(skeleton: SkeletonModel) -> Figure:
     triangles = vertices.reshape(-1, 3, 3)
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return Figure(
+    return StickFigure(
         vertices_m=vertices,
         normals=np.repeat(normals, 3, axis=0),
         faces=np.arange(len(vertices)).reshape(-1, 3),
@@ -60,7 +60,7 @@ def stick_figure(skeleton: SkeletonModel) -> Figure:
     )
 
 
-def _bone_ends(skeleton: SkeletonModel, rest: FloatArray) -> Iterator[tuple[int, FloatArray]]:
+def _iterate_bones(skeleton: SkeletonModel, rest: FloatArray) -> Iterator[tuple[int, FloatArray]]:
     """Each joint with the far end (3,) of each of its bones; a root on the floor has none."""
     on_floor = len(skeleton.joints) > 1 and skeleton.roles[:2] == ("", "Hips")
     for joint, parent in enumerate(skeleton.parents.tolist()):
@@ -69,11 +69,11 @@ def _bone_ends(skeleton: SkeletonModel, rest: FloatArray) -> Iterator[tuple[int,
         if np.isfinite(end).all():
             bones.append((joint, rest[joint, :3, 3] + rest[joint, :3, :3] @ end))
         for owner, tip in bones:
-            if np.linalg.norm(tip - rest[owner, :3, 3]) > _SHORTEST_M:
+            if np.linalg.norm(tip - rest[owner, :3, 3]) > _MIN_BONE_M:
                 yield owner, tip
 
 
-def _spindle(start: FloatArray, end: FloatArray) -> FloatArray:
+def _spindle_corners(start: FloatArray, end: FloatArray) -> FloatArray:
     """The six corners (6,3) of a slim octahedron: start, four around the waist, end."""
     along = end - start
     length = float(np.linalg.norm(along))
@@ -82,6 +82,6 @@ def _spindle(start: FloatArray, end: FloatArray) -> FloatArray:
     side /= np.linalg.norm(side)
     other = np.cross(along, side)
     half = float(np.clip(_WIDTH_SHARE * length, *_WIDTH_M))
-    waist = start + _WAIST * length * along
+    waist = start + _WAIST_RATIO * length * along
     around = [waist + half * offset for offset in (side, other, -side, -other)]
     return np.array([start, *around, end])

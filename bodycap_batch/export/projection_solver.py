@@ -30,22 +30,22 @@ _CHANGE_SIGMA = np.repeat([0.002, np.deg2rad(0.3)], 3)
 """Change of the correction over a thirtieth of a second, root shift and rotations: below what a viewer sees
 as jitter. It grows with the square root of the time: 1.1 cm and 1.6° over a second."""
 
-_USUAL_HZ = 30.0
+_INDEPENDENT_HZ = 30.0
 """So many errors a second count as independent: at other rates a tick counts for the time it stands for."""
 
-_SLIPS = 2.0
+_SLIP_HUBER_SIGMAS = 2.0
 """Sigmas beyond which a standing foot slips after all (Huber), as in the graph."""
 
-_OUTLIER_SCALE = 100.0
+_GEMAN_MCCLURE_SQUARED = 100.0
 """Geman-McClure's c² on the squared error in sigmas: 3 to 4 sigmas on each of six numbers."""
 
 _MAX_STEPS = 12
-_ENOUGH = 1e-6
+_STEP_TOLERANCE = 1e-6
 """Largest step (m, rad) below which the solve is done: a thousandth of what the file resolves."""
 
-_CHUNK_TICKS = 1000
+_JACOBIAN_CHUNK_TICKS = 1000
 
-_STRETCH_TICKS = 2000
+_WINDOW_TICKS = 2000
 """Solved at once, besides the overlaps: with 15 joints, four blocks of 18 kB a tick, that takes 180 MB at 30
 ticks a second, 350 at 240."""
 _OVERLAP_S = 4.0
@@ -53,7 +53,7 @@ _OVERLAP_S = 4.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Tracked:
+class CameraTarget:
     """A camera on a bone, measured at the ticks (T,); `world_from_cam` counts where `found`."""
 
     camera: str
@@ -64,7 +64,7 @@ class Tracked:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Planted:
+class StandingJoint:
     """A joint that should stay where it is from one tick to the next, to `sigma_m`, where `held` (T-1,)."""
 
     joint: int
@@ -73,7 +73,7 @@ class Planted:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Problem:
+class ProjectionProblem:
     """What the corrected motion should meet: graph poses (T,J,4,4) of the solved joints, cameras, ground.
 
     Its ticks follow each other at `fps` a second.
@@ -83,8 +83,8 @@ class Problem:
     skeleton: SkeletonModel
     solved: IntArray
     world_from_joint: FloatArray
-    cameras: tuple[Tracked, ...]
-    planted: tuple[Planted, ...] = ()
+    cameras: tuple[CameraTarget, ...]
+    planted: tuple[StandingJoint, ...] = ()
 
     def reach(self) -> FloatArray:
         """(J,S) one where a solved joint turns a joint: itself and its ancestors."""
@@ -99,9 +99,9 @@ class Problem:
     @property
     def tick_share(self) -> float:
         """How much a tick's errors count for: as many ticks as stand for the same time count alike."""
-        return _USUAL_HZ / self.fps
+        return _INDEPENDENT_HZ / self.fps
 
-    def between(self, low: int, high: int) -> Problem:
+    def between(self, low: int, high: int) -> ProjectionProblem:
         """The same of ticks `low` to before `high` alone."""
         ticks = slice(low, high)
         cameras = (
@@ -118,28 +118,28 @@ class Problem:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Correction:
+class RigidMotion:
     """A rigid motion: root (T,3) and local rotations (T,J,3,3)."""
 
     root: FloatArray
     local: FloatArray
 
 
-def solve_correction(problem: Problem, start: Correction) -> Correction:
+def solve_rigid_motion(problem: ProjectionProblem, start: RigidMotion) -> RigidMotion:
     """Fit the rigid motion, a long one stretch by stretch."""
     count, overlap = len(start.root), round(_OVERLAP_S * problem.fps)
     root, local = np.empty_like(start.root), np.empty_like(start.local)
-    cuts = np.linspace(0, count, max(1, -(-count // _STRETCH_TICKS)) + 1).round().astype(int).tolist()
+    cuts = np.linspace(0, count, max(1, -(-count // _WINDOW_TICKS)) + 1).round().astype(int).tolist()
     for first, last in pairwise(cuts):
         low, high = max(first - overlap, 0), min(last + overlap, count)
-        part = Correction(root=start.root[low:high], local=start.local[low:high])
-        found = _solve_stretch(problem.between(low, high), part)
+        part = RigidMotion(root=start.root[low:high], local=start.local[low:high])
+        found = _solve_window(problem.between(low, high), part)
         own = slice(first - low, last - low)
         root[first:last], local[first:last] = found.root[own], found.local[own]
-    return Correction(root=root, local=local)
+    return RigidMotion(root=root, local=local)
 
 
-def _solve_stretch(problem: Problem, start: Correction) -> Correction:
+def _solve_window(problem: ProjectionProblem, start: RigidMotion) -> RigidMotion:
     """Levenberg-Marquardt: a step that does not help is shortened."""
     reach = problem.reach()
     now, damping = start, 1e-6
@@ -147,18 +147,18 @@ def _solve_stretch(problem: Problem, start: Correction) -> Correction:
     for _ in range(_MAX_STEPS):
         blocks, coupling, gradient = _normal_equations(problem, now, reach)
         step = _solve_tridiagonal(blocks, coupling, -gradient, damping)
-        trial = _moved(problem, now, step)
+        trial = _retract(problem, now, step)
         trial_cost = _cost(problem, trial)
         if trial_cost <= cost:
             now, cost, damping = trial, trial_cost, max(damping * 0.1, 1e-9)
         else:
             damping *= 100.0
-        if np.abs(step).max(initial=0.0) < _ENOUGH:
+        if np.abs(step).max(initial=0.0) < _STEP_TOLERANCE:
             break
     return now
 
 
-def _moved(problem: Problem, now: Correction, step: FloatArray) -> Correction:
+def _retract(problem: ProjectionProblem, now: RigidMotion, step: FloatArray) -> RigidMotion:
     """Apply a step (T, 3+3S): shift the root, turn solved joints by rotation vectors in world axes."""
     rotation = forward_kinematics(problem.skeleton, now.root, now.local)[..., :3, :3]
     local = now.local.copy()
@@ -168,10 +168,10 @@ def _moved(problem: Problem, now: Correction, step: FloatArray) -> Correction:
             parent = rotation[:, problem.skeleton.parents[joint]]
             turn = np.einsum("tji,tj->ti", parent, turn)
         local[:, joint] = so3_exp(turn) @ local[:, joint]
-    return Correction(root=now.root + step[:, :3], local=local)
+    return RigidMotion(root=now.root + step[:, :3], local=local)
 
 
-def _camera_error(tracked: Tracked, world: FloatArray, ticks: slice) -> tuple[FloatArray, FloatArray]:
+def _camera_error(tracked: CameraTarget, world: FloatArray, ticks: slice) -> tuple[FloatArray, FloatArray]:
     """Errors (T,6) in sigmas, zero where not measured, and the exported centres (T,3)."""
     exported = world[:, tracked.joint] @ tracked.joint_from_cam
     measured = tracked.world_from_cam[ticks]
@@ -180,61 +180,65 @@ def _camera_error(tracked: Tracked, world: FloatArray, ticks: slice) -> tuple[Fl
     return np.where(tracked.found[ticks, None], error, 0.0), exported[:, :3, 3]
 
 
-def _graph_error(problem: Problem, world: FloatArray, ticks: slice) -> FloatArray:
+def _graph_error(problem: ProjectionProblem, world: FloatArray, ticks: slice) -> FloatArray:
     """Errors (T,S,6) of the solved joints against the graph, rotation first, in rad and m."""
     graph, rigid = problem.world_from_joint[ticks][:, problem.solved], world[:, problem.solved]
     turn = so3_log(rigid[..., :3, :3] @ np.swapaxes(graph[..., :3, :3], -1, -2))
     return np.concatenate([turn, rigid[..., :3, 3] - graph[..., :3, 3]], axis=-1)
 
 
-def _change(problem: Problem, now: Correction, graph: FloatArray) -> FloatArray:
+def _scaled_correction(problem: ProjectionProblem, now: RigidMotion, graph: FloatArray) -> FloatArray:
     """What may change only slowly (T, 3+3S): the root's shift and the joints' turns off the graph."""
     shift = now.root - problem.world_from_joint[:, 0, :3, 3]
     return np.concatenate([shift, graph[..., :3].reshape(len(shift), -1)], axis=1) / _change_sigma(problem)
 
 
-def _change_sigma(problem: Problem) -> FloatArray:
+def _change_sigma(problem: ProjectionProblem) -> FloatArray:
     """(3+3S,) of the change from one tick to the next."""
     sigma = _CHANGE_SIGMA * np.sqrt(problem.tick_share)
     return np.concatenate([sigma[:3], np.tile(sigma[3:], len(problem.solved))])
 
 
-def _cost(problem: Problem, now: Correction) -> float:
+def _cost(problem: ProjectionProblem, now: RigidMotion) -> float:
     everything = slice(None)
     world = forward_kinematics(problem.skeleton, now.root, now.local)
     graph = _graph_error(problem, world, everything)
     cost = float(((graph / _GRAPH_SIGMA) ** 2).sum())
     for tracked in problem.cameras:
         squared = (_camera_error(tracked, world, everything)[0] ** 2).sum(axis=1)
-        cost += float((_OUTLIER_SCALE * squared / (_OUTLIER_SCALE + squared)).sum())
+        cost += float((_GEMAN_MCCLURE_SQUARED * squared / (_GEMAN_MCCLURE_SQUARED + squared)).sum())
     cost *= problem.tick_share
-    cost += float((np.diff(_change(problem, now, graph), axis=0) ** 2).sum())
+    cost += float((np.diff(_scaled_correction(problem, now, graph), axis=0) ** 2).sum())
     for planted in problem.planted:
         size = np.linalg.norm(_slip(planted, world), axis=1)
-        cost += float(np.where(size < _SLIPS, size**2, _SLIPS * (2.0 * size - _SLIPS)).sum())
+        cost += float(
+            np.where(
+                size < _SLIP_HUBER_SIGMAS, size**2, _SLIP_HUBER_SIGMAS * (2.0 * size - _SLIP_HUBER_SIGMAS)
+            ).sum()
+        )
     return cost
 
 
-def _slip(planted: Planted, world: FloatArray) -> FloatArray:
+def _slip(planted: StandingJoint, world: FloatArray) -> FloatArray:
     """How far (T-1,3) a joint moves from tick to tick while it should not, in sigmas."""
     moved = np.diff(world[:, planted.joint, :3, 3], axis=0)
     return np.asarray(np.where(planted.held[:, None], moved / planted.sigma_m, 0.0))
 
 
 def _normal_equations(
-    problem: Problem, now: Correction, reach: FloatArray
+    problem: ProjectionProblem, now: RigidMotion, reach: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Diagonal blocks (T,n,n), the blocks (T-1,n,n) that tie neighbours, and the gradient (T,n)."""
     world = forward_kinematics(problem.skeleton, now.root, now.local)
     ticks, size = len(world), 3 + 3 * len(problem.solved)
     blocks, gradient = np.zeros((ticks, size, size)), np.zeros((ticks, size))
-    for first in range(0, ticks, _CHUNK_TICKS):
-        chunk = slice(first, min(first + _CHUNK_TICKS, ticks))
-        for jacobian, error in _rows(problem, world[chunk], reach, chunk):
+    for first in range(0, ticks, _JACOBIAN_CHUNK_TICKS):
+        chunk = slice(first, min(first + _JACOBIAN_CHUNK_TICKS, ticks))
+        for jacobian, error in _residual_blocks(problem, world[chunk], reach, chunk):
             transposed = problem.tick_share * np.swapaxes(jacobian, -1, -2)
             blocks[chunk] += transposed @ jacobian
             gradient[chunk] += (transposed @ error[..., None])[..., 0]
-    change = _change(problem, now, _graph_error(problem, world, slice(None)))
+    change = _scaled_correction(problem, now, _graph_error(problem, world, slice(None)))
     turns = np.zeros((size, size))
     turns[:3, :3] = np.eye(3)
     turns[3:, 3:] = np.kron(reach[problem.solved], np.eye(3))
@@ -250,19 +254,24 @@ def _normal_equations(
     ties = np.broadcast_to(-coupling, (ticks - 1, size, size))
     if problem.planted:
         ties = ties.copy()
-        _plant(problem, world, reach, (blocks, ties, gradient))
+        _add_standing_joints(problem, world, reach, (blocks, ties, gradient))
     return blocks, ties, gradient
 
 
-def _plant(
-    problem: Problem, world: FloatArray, reach: FloatArray, system: tuple[FloatArray, FloatArray, FloatArray]
+def _add_standing_joints(
+    problem: ProjectionProblem,
+    world: FloatArray,
+    reach: FloatArray,
+    system: tuple[FloatArray, FloatArray, FloatArray],
 ) -> None:
     """Add the standing feet to the normal equations."""
     blocks, ties, gradient = system
     for planted in problem.planted:
         (held,) = np.nonzero(planted.held)
         slip = _slip(planted, world)[held]
-        root_weight = np.sqrt(_SLIPS / np.maximum(np.linalg.norm(slip, axis=1), _SLIPS))
+        root_weight = np.sqrt(
+            _SLIP_HUBER_SIGMAS / np.maximum(np.linalg.norm(slip, axis=1), _SLIP_HUBER_SIGMAS)
+        )
         rows = []
         for ticks in (held, held + 1):
             centres = world[ticks][:, problem.solved][..., :3, 3]
@@ -277,8 +286,8 @@ def _plant(
         gradient[held + 1] += (np.swapaxes(after, 1, 2) @ error)[..., 0]
 
 
-def _rows(
-    problem: Problem, world: FloatArray, reach: FloatArray, ticks: slice
+def _residual_blocks(
+    problem: ProjectionProblem, world: FloatArray, reach: FloatArray, ticks: slice
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Jacobians (T,6,n) and errors (T,6) in sigmas of every joint and camera."""
     centres = world[:, problem.solved][..., :3, 3]
@@ -289,7 +298,9 @@ def _rows(
         out.append((jacobian / _GRAPH_SIGMA[:, None], graph[:, column] / _GRAPH_SIGMA))
     for tracked in problem.cameras:
         error, centre = _camera_error(tracked, world, ticks)
-        root_weight = _OUTLIER_SCALE / (_OUTLIER_SCALE + (error**2).sum(axis=1)) * tracked.found[ticks]
+        root_weight = (
+            _GEMAN_MCCLURE_SQUARED / (_GEMAN_MCCLURE_SQUARED + (error**2).sum(axis=1)) * tracked.found[ticks]
+        )
         jacobian = _jacobian(centres, centre, reach[tracked.joint]) / _CAMERA_SIGMA[:, None]
         out.append((jacobian * root_weight[:, None, None], error * root_weight[:, None]))
     return out

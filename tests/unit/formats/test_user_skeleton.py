@@ -12,9 +12,20 @@ import pytest
 from bodycap_batch.cli import main
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.bvh import RigOptions, read_bvh, read_rig, write_bvh
-from bodycap_batch.formats.bvh.mapping import direction_words, joint_lines, missing_roles, warnings
+from bodycap_batch.formats.bvh.skeleton_description import (
+    describe_direction,
+    describe_joints,
+    missing_roles,
+    skeleton_warnings,
+)
 from bodycap_batch.model.geometry import so3_exp
-from bodycap_batch.model.skeleton import Motion, SkeletonModel, as_in_file, in_tpose, rest_pose
+from bodycap_batch.model.skeleton import (
+    Motion,
+    SkeletonModel,
+    rest_pose,
+    with_file_zero_pose,
+    with_tpose_as_zero_pose,
+)
 from bodycap_batch.model.skeleton_presets import bone_vector, load_skeleton, nominal_mount, segment_axes
 from tests.bodies import reaching
 
@@ -48,8 +59,8 @@ def test_the_t_pose_comes_from_a_frame_and_faces_the_front(tmp_path: Path) -> No
     order = [rig.roles.index(role) for role in plain.roles]
     off = found[order, :3, 3] - expected[:, :3, 3]
     np.testing.assert_allclose(off, np.broadcast_to(off[0], off.shape), atol=1e-6)
-    assert not list(warnings(rig))
-    assert list(warnings(read_rig(tmp_path / "rig.bvh")[0]))
+    assert not list(skeleton_warnings(rig))
+    assert list(skeleton_warnings(read_rig(tmp_path / "rig.bvh")[0]))
 
 
 @pytest.mark.parametrize("role", ["LeftForeArm", "RightHand", "LeftLeg", "RightFoot", "Spine1", "Head"])
@@ -98,11 +109,11 @@ def test_what_does_not_exist_is_named(tmp_path: Path, options: RigOptions, says:
 
 def test_the_mapping_in_words() -> None:
     body: SkeletonModel = load_skeleton("full_body", 1.75)
-    lines = {line.role: line for line in joint_lines(body)}
+    lines = {line.role: line for line in describe_joints(body)}
     assert (lines["LeftForeArm"].points, lines["RightLeg"].points) == ("left", "down")
     assert lines["LeftForeArm"].bone_m == pytest.approx(1.75 * 0.146)
     assert lines["LeftFoot"].points.startswith("forward, ")
-    assert direction_words(np.array([0.0, -1.0, -1.0])) in ("forward, 45° down", "down, 45° forward")
+    assert describe_direction(np.array([0.0, -1.0, -1.0])) in ("forward, 45° down", "down, 45° forward")
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -137,12 +148,12 @@ def test_a_motion_solved_in_the_t_pose_goes_back_into_the_file(tmp_path: Path) -
     """Solved on a body whose zero pose is the T-pose, written on the rig as the file has it."""
     write_bvh(tmp_path / "rig.bvh", folded())
     rig, _ = read_rig(tmp_path / "rig.bvh", RigOptions(tpose_frame=1))
-    body = in_tpose(rig)
+    body = with_tpose_as_zero_pose(rig)
     plain = load_skeleton("upper_body", 1.75)
     np.testing.assert_allclose(body.offsets_m[1:], plain.offsets_m[1:], atol=1e-6)
     np.testing.assert_allclose(rest_pose(body)[:, :3, :3], np.broadcast_to(np.eye(3), (21, 3, 3)))
     solved = replace(reaching(20), skeleton=body)
-    back = as_in_file(solved)
+    back = with_file_zero_pose(solved)
     np.testing.assert_allclose(back.skeleton.offsets_m, rig.offsets_m, atol=1e-12)
     assert back.skeleton.file_rotation is None
     ours, theirs = solved.world_from_joint(), back.world_from_joint()

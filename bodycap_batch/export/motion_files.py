@@ -12,7 +12,7 @@ from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.arrays import BoolArray
 from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.bvh import read_bvh, write_bvh
-from bodycap_batch.formats.c3d import Points
+from bodycap_batch.formats.c3d import LabelledPoints
 from bodycap_batch.formats.gltf import read_glb, write_glb
 from bodycap_batch.formats.usd import read_usd, write_usd
 from bodycap_batch.model.geometry import rotation_angle_rad
@@ -22,7 +22,7 @@ POSITION_TOLERANCE_M = 1e-4
 ANGLE_TOLERANCE_DEG = 0.01
 
 
-def write_motion(path: Path, motion: Motion, options: ExportOptions) -> Path:
+def write_verified_bvh(path: Path, motion: Motion, options: ExportOptions) -> Path:
     """Write a BVH, verify that it holds the motion, return its path.
 
     Raises:
@@ -33,23 +33,23 @@ def write_motion(path: Path, motion: Motion, options: ExportOptions) -> Path:
     return path
 
 
-def write_figure(path: Path, motion: Motion) -> Path:
-    """Write a GLB, verify that it holds the motion, return its path. Raises as `write_motion`."""
+def write_verified_glb(path: Path, motion: Motion) -> Path:
+    """Write a GLB, verify that it holds the motion, return its path. Raises as `write_verified_bvh`."""
     write_glb(path, motion)
     _verify(path, motion, read_glb)
     return path
 
 
-def write_stage(path: Path, motion: Motion) -> Path:
-    """Write a USD stage, verify that it holds the motion, return its path. Raises as `write_motion`."""
+def write_verified_usd(path: Path, motion: Motion) -> Path:
+    """Write a USD stage, verify that it holds the motion, return its path. Raises as `write_verified_bvh`."""
     write_usd(path, motion)
     _verify(path, motion, read_usd)
     return path
 
 
-def joint_centres(motion: Motion) -> Points:
+def points_from_motion(motion: Motion) -> LabelledPoints:
     """The joint centres as named points."""
-    return Points(
+    return LabelledPoints(
         names=motion.skeleton.joints, fps=motion.fps, x_in_world_m=motion.world_from_joint()[..., :3, 3]
     )
 
@@ -84,7 +84,7 @@ def motion_difference(back: Motion | None, motion: Motion) -> tuple[float, float
     return float(position.max()), float(np.rad2deg(rotation_angle_rad(turned).max()))
 
 
-def only_solved(motion: Motion, solved: BoolArray) -> Motion:
+def without_unsolved_branches(motion: Motion, solved: BoolArray) -> Motion:
     """Drop what hangs off the solved joints without being solved; ancestors of solved joints stay.
 
     Args:
@@ -100,13 +100,13 @@ def only_solved(motion: Motion, solved: BoolArray) -> Motion:
     chosen = np.flatnonzero(kept)
     return replace(
         motion,
-        skeleton=_subset(skeleton, kept),
+        skeleton=_sub_skeleton(skeleton, kept),
         local_rotation=motion.local_rotation[:, chosen],
         observed=motion.observed[:, chosen],
     )
 
 
-def _subset(skeleton: SkeletonModel, kept: BoolArray) -> SkeletonModel:
+def _sub_skeleton(skeleton: SkeletonModel, kept: BoolArray) -> SkeletonModel:
     """The kept joints; a joint that lost its children ends where the first of them was."""
     chosen = np.flatnonzero(kept)
     place = {int(joint): index for index, joint in enumerate(chosen)}

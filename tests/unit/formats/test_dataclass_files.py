@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from bodycap_batch.core.errors import StoreError
-from bodycap_batch.formats.bundle import read_bundle, read_npz, write_bundle, write_npz
+from bodycap_batch.formats.dataclass_files import read_dataclass, read_npz, write_dataclass, write_npz
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import CameraClock, MergeResult
@@ -138,8 +138,8 @@ MAKERS = [a_trajectory, a_map, a_merge, a_registration, a_selection]
 @pytest.mark.parametrize("make", MAKERS, ids=lambda make: make.__name__)
 def test_what_is_written_is_read_back_exactly(tmp_path: Path, make: Any) -> None:
     value = make(np.random.default_rng(1))
-    write_bundle(value, tmp_path, "value")
-    assert same(read_bundle(type(value), tmp_path, "value"), value)
+    write_dataclass(value, tmp_path, "value")
+    assert same(read_dataclass(type(value), tmp_path, "value"), value)
 
 
 @pytest.mark.parametrize("make", MAKERS, ids=lambda make: make.__name__)
@@ -148,7 +148,7 @@ def test_equal_values_give_equal_bytes_at_any_time(
 ) -> None:
     for folder in ("first", "second"):
         (tmp_path / folder).mkdir()
-        write_bundle(make(np.random.default_rng(1)), tmp_path / folder, "value")
+        write_dataclass(make(np.random.default_rng(1)), tmp_path / folder, "value")
         now = time.time() + 1e7
         monkeypatch.setattr(time, "time", lambda now=now: now)
     names = sorted(path.name for path in (tmp_path / "first").iterdir())
@@ -159,7 +159,7 @@ def test_equal_values_give_equal_bytes_at_any_time(
 
 def test_numpy_itself_reads_the_arrays(tmp_path: Path) -> None:
     selection = a_selection(np.random.default_rng(1))
-    write_bundle(selection, tmp_path, "value")
+    write_dataclass(selection, tmp_path, "value")
     with np.load(tmp_path / "value.npz") as archive:
         assert np.array_equal(archive["sharpness"], selection.sharpness)
 
@@ -168,23 +168,23 @@ def test_a_path_is_kept_relative_so_that_the_artefact_can_move(tmp_path: Path) -
     old, new = tmp_path / "old", tmp_path / "new"
     (old / "workspace").mkdir(parents=True)
     result = MapResult(maps=(a_map(np.random.default_rng(1)),), workspace=old / "workspace", log={"n": 1})
-    write_bundle(result, old, "map")
+    write_dataclass(result, old, "map")
     old.rename(new)
-    assert read_bundle(MapResult, new, "map").workspace == new / "workspace"
+    assert read_dataclass(MapResult, new, "map").workspace == new / "workspace"
 
 
 def test_a_path_outside_the_artefact_is_refused(tmp_path: Path) -> None:
     (tmp_path / "artefact").mkdir()
     result = MapResult(maps=(), workspace=tmp_path, log={})
     with pytest.raises(ValueError, match="subpath"):
-        write_bundle(result, tmp_path / "artefact", "map")
+        write_dataclass(result, tmp_path / "artefact", "map")
 
 
 def test_a_value_without_arrays_needs_no_npz(tmp_path: Path) -> None:
     clock = CameraClock(nominal_fps=30.0, offset_s=-0.12)
-    write_bundle(clock, tmp_path, "clock")
+    write_dataclass(clock, tmp_path, "clock")
     assert [path.name for path in tmp_path.iterdir()] == ["clock.json"]
-    assert read_bundle(CameraClock, tmp_path, "clock") == clock
+    assert read_dataclass(CameraClock, tmp_path, "clock") == clock
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -198,8 +198,8 @@ class Loose:
 
 def test_numbers_that_json_lacks_survive_where_their_type_is_known(tmp_path: Path) -> None:
     value = Loose(number=float("-inf"), anything={"nan": float("nan"), "np": np.float64(0.5), "t": (1, 2)})
-    write_bundle(value, tmp_path, "value")
-    read = read_bundle(Loose, tmp_path, "value")
+    write_dataclass(value, tmp_path, "value")
+    read = read_dataclass(Loose, tmp_path, "value")
     assert read.number == float("-inf")
     assert read.anything == {"nan": None, "np": 0.5, "t": [1, 2]}
     assert read.maybe is None
@@ -207,19 +207,19 @@ def test_numbers_that_json_lacks_survive_where_their_type_is_known(tmp_path: Pat
 
 def test_what_is_no_plain_value_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TypeError, match="object"):
-        write_bundle(Loose(number=1.0, anything={"x": object()}), tmp_path, "value")
+        write_dataclass(Loose(number=1.0, anything={"x": object()}), tmp_path, "value")
 
 
 def test_another_type_is_refused(tmp_path: Path) -> None:
-    write_bundle(CameraClock(nominal_fps=30.0), tmp_path, "value")
+    write_dataclass(CameraClock(nominal_fps=30.0), tmp_path, "value")
     with pytest.raises(StoreError, match="CameraClock"):
-        read_bundle(Camera, tmp_path, "value")
+        read_dataclass(Camera, tmp_path, "value")
 
 
 @pytest.mark.parametrize("victim", ["value.json", "value.npz"])
 @pytest.mark.parametrize("damage", ["missing", "cut", "empty"])
 def test_damage_is_a_typed_error(tmp_path: Path, victim: str, damage: str) -> None:
-    write_bundle(a_selection(np.random.default_rng(1)), tmp_path, "value")
+    write_dataclass(a_selection(np.random.default_rng(1)), tmp_path, "value")
     path = tmp_path / victim
     if damage == "missing":
         path.unlink()
@@ -227,7 +227,7 @@ def test_damage_is_a_typed_error(tmp_path: Path, victim: str, damage: str) -> No
         data = path.read_bytes()
         path.write_bytes(data[: len(data) // 2] if damage == "cut" else b"")
     with pytest.raises(StoreError):
-        read_bundle(KeyframeSelection, tmp_path, "value")
+        read_dataclass(KeyframeSelection, tmp_path, "value")
 
 
 def test_pickled_arrays_are_refused(tmp_path: Path) -> None:

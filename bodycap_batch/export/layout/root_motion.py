@@ -8,25 +8,25 @@ import numpy as np
 
 from bodycap_batch.config.options import RootMode
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.export.layout.names import naming
+from bodycap_batch.export.layout.joint_names import naming_preset
 from bodycap_batch.model.geometry import quat_xyzw_from_rotation, so3_exp
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 
-_UPRIGHT = 0.1
+_MIN_HEADING_NORM = 0.1
 """Below this the hips are near upside down and have no heading: the one before is kept."""
 
-_ASIDE_M = 1e-3
+_HIPS_OFFSET_M = 1e-3
 """At rest the hips stand this little before the root: right above it, at the tip of its bone, Blender's FBX
 importer takes them for fixed to it and ignores their motion."""
 
 
-def floor_name(names: str, mode: RootMode) -> str | None:
+def floor_root_name(names: str, mode: RootMode) -> str | None:
     """Name of the root on the floor where the preset or the mode asks for one."""
-    chosen = naming(names)
+    chosen = naming_preset(names)
     return str(chosen["floor"]) if mode == "ground" or chosen.get("always") else None
 
 
-def with_tpose(motion: Motion) -> Motion:
+def prepend_tpose(motion: Motion) -> Motion:
     """Put the T-pose before the first frame: standing where the motion begins, facing the front (−Y)."""
     skeleton = motion.skeleton
     tpose = skeleton.tpose_rotation
@@ -41,7 +41,7 @@ def with_tpose(motion: Motion) -> Motion:
     )
 
 
-def place_root(motion: Motion, mode: RootMode, floor: str | None) -> Motion:
+def apply_root_mode(motion: Motion, mode: RootMode, floor: str | None) -> Motion:
     """Put the travel where the mode wants it.
 
     ``hips``: all of it on the hips. ``ground``: the root on the floor below the hips has their path and
@@ -68,7 +68,7 @@ def place_root(motion: Motion, mode: RootMode, floor: str | None) -> Motion:
     hips = np.einsum("tji,tj->ti", world_from_floor, motion.root_in_world_m - path)
     return replace(
         motion,
-        skeleton=_on_floor(motion.skeleton, floor),
+        skeleton=_skeleton_with_floor_root(motion.skeleton, floor),
         root_in_world_m=path,
         local_rotation=np.concatenate([world_from_floor[:, None], local], axis=1),
         observed=np.concatenate([motion.observed[:, :1], motion.observed], axis=1),
@@ -79,7 +79,7 @@ def place_root(motion: Motion, mode: RootMode, floor: str | None) -> Motion:
 def heading_rad(world_from_hips: FloatArray) -> FloatArray:
     """Turn (T,) about the vertical: the twist of each rotation (T,3,3) about Z, continuous."""
     quat = quat_xyzw_from_rotation(world_from_hips)
-    known = np.hypot(quat[:, 2], quat[:, 3]) > _UPRIGHT
+    known = np.hypot(quat[:, 2], quat[:, 3]) > _MIN_HEADING_NORM
     turn = 2.0 * np.arctan2(quat[:, 2], quat[:, 3])
     if not known.any():
         return np.zeros_like(turn)
@@ -87,13 +87,13 @@ def heading_rad(world_from_hips: FloatArray) -> FloatArray:
     return np.asarray(np.unwrap(turn[latest]))
 
 
-def _on_floor(skeleton: SkeletonModel, name: str) -> SkeletonModel:
+def _skeleton_with_floor_root(skeleton: SkeletonModel, name: str) -> SkeletonModel:
     """The skeleton with a root on the floor, below its first root."""
     free, number = name, 2
     while free in skeleton.joints:
         free, number = f"{name}{number}", number + 1
     offsets = np.concatenate([np.zeros((1, 3)), skeleton.offsets_m])
-    offsets[1] = [0.0, -_ASIDE_M, rest_pose(skeleton)[0, 2, 3]]
+    offsets[1] = [0.0, -_HIPS_OFFSET_M, rest_pose(skeleton)[0, 2, 3]]
     tpose = skeleton.tpose_rotation
     return SkeletonModel(
         name=skeleton.name,

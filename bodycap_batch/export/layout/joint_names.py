@@ -17,39 +17,39 @@ from bodycap_batch.model.skeleton_presets import split_side
 
 
 @cache
-def naming(preset: str) -> dict[str, Any]:
+def naming_preset(preset: str) -> dict[str, Any]:
     """The entry of a preset in ``names.yaml``."""
     text = resources.files("bodycap_batch.presets").joinpath("names.yaml").read_text(encoding="utf-8")
     return dict(yaml.safe_load(text)[preset])
 
 
-def rename(motion: Motion, preset: str) -> Motion:
+def rename_joints(motion: Motion, preset: str) -> Motion:
     """Give joints a preset's names, spine and neck its number of joints.
 
     Joints that are added lie on the bone they divide and turn about it only, each by an equal share of the
     twist of the joint above: so no other joint moves or turns in the world.
     """
-    chosen = naming(preset)
+    chosen = naming_preset(preset)
     prefix, spine, neck = chosen.get("prefix", ""), chosen["spine"], chosen["neck"]
     titles = {"Spine": spine[0], "Spine1": spine[-1], "Neck": neck[0]}
     skeleton = motion.skeleton
     joints = tuple(
-        prefix + (titles.get(role) or _title(role, chosen) if role else name)
+        prefix + (titles.get(role) or _joint_name(role, chosen) if role else name)
         for name, role in zip(skeleton.joints, skeleton.roles, strict=True)
     )
     motion = replace(motion, skeleton=replace(skeleton, joints=joints))
-    motion = _divide(motion, "Spine", "Spine1", [prefix + name for name in spine[1:-1]])
-    return _divide(motion, "Neck", "Head", [prefix + name for name in neck[1:]])
+    motion = _insert_joints(motion, "Spine", "Spine1", [prefix + name for name in spine[1:-1]])
+    return _insert_joints(motion, "Neck", "Head", [prefix + name for name in neck[1:]])
 
 
-def _title(role: str, chosen: dict[str, Any]) -> str:
+def _joint_name(role: str, chosen: dict[str, Any]) -> str:
     """A role's name in the preset."""
     side, part = split_side(role)
     name = chosen.get("names", {}).get(part, part)
     return f"{name}{chosen['sides'][side]}" if side and "sides" in chosen else f"{side}{name}"
 
 
-def _divide(motion: Motion, lower: str, upper: str, names: list[str]) -> Motion:
+def _insert_joints(motion: Motion, lower: str, upper: str, names: list[str]) -> Motion:
     """Put joints of these names between two joints that follow each other."""
     skeleton = motion.skeleton
     start, end = skeleton.index_of_role(lower), skeleton.index_of_role(upper)
@@ -57,7 +57,7 @@ def _divide(motion: Motion, lower: str, upper: str, names: list[str]) -> Motion:
         return motion
     parts = len(names) + 1
     bone = skeleton.offsets_m[end]
-    share = so3_exp(_twist_rad(motion.local_rotation[:, end], bone)[:, None] / parts * _unit(bone))
+    share = so3_exp(_twist_rad(motion.local_rotation[:, end], bone)[:, None] / parts * _unit_vector(bone))
     back = np.linalg.matrix_power(np.swapaxes(share, -1, -2), parts - 1)
     local = motion.local_rotation.copy()
     local[:, end] = back @ local[:, end]
@@ -65,13 +65,13 @@ def _divide(motion: Motion, lower: str, upper: str, names: list[str]) -> Motion:
     observed = np.repeat(motion.observed[:, end, None], len(names), axis=1)
     return replace(
         motion,
-        skeleton=_divided(skeleton, end, names),
+        skeleton=_skeleton_with_joints(skeleton, end, names),
         local_rotation=np.concatenate([local[:, :end], added, local[:, end:]], axis=1),
         observed=np.concatenate([motion.observed[:, :end], observed, motion.observed[:, end:]], axis=1),
     )
 
 
-def _divided(skeleton: SkeletonModel, end: int, names: list[str]) -> SkeletonModel:
+def _skeleton_with_joints(skeleton: SkeletonModel, end: int, names: list[str]) -> SkeletonModel:
     """The zero pose with joints of these names before the joint `end`, evenly along its bone."""
     count = len(names)
     moved = np.where(skeleton.parents >= end, skeleton.parents + count, skeleton.parents)
@@ -96,10 +96,10 @@ def _divided(skeleton: SkeletonModel, end: int, names: list[str]) -> SkeletonMod
 def _twist_rad(rotation: FloatArray, axis: FloatArray) -> FloatArray:
     """Angle (T,) of the turn about an axis that comes last in each rotation (T,3,3); continuous."""
     quat = quat_xyzw_from_rotation(rotation)
-    half = np.arctan2(quat[:, :3] @ _unit(axis), quat[:, 3])
+    half = np.arctan2(quat[:, :3] @ _unit_vector(axis), quat[:, 3])
     return np.asarray(np.unwrap(2.0 * half))
 
 
-def _unit(vector: FloatArray) -> FloatArray:
+def _unit_vector(vector: FloatArray) -> FloatArray:
     """The direction; zero for a bone without length."""
     return np.asarray(vector / (np.linalg.norm(vector) or 1.0))

@@ -15,7 +15,7 @@ from bodycap_batch.model.geometry import (
 )
 from bodycap_batch.model.skeleton import Motion
 
-_EXACT = 1e-9
+_TICK_TOLERANCE = 1e-9
 """A new tick this near to an old one, as a share of their distance, is that one."""
 
 
@@ -35,7 +35,9 @@ def resample(motion: Motion, fps: float) -> Motion:
     poses = make_transform(motion.local_rotation, np.zeros(3))
     poses[:, 0, :3, 3] = motion.root_in_world_m
     poses = interpolate_pose(poses[before], poses[after], alpha[:, None])
-    first, second = (motion.observed[np.where(alpha > s, after, before)] for s in (1.0 - _EXACT, _EXACT))
+    first, second = (
+        motion.observed[np.where(alpha > s, after, before)] for s in (1.0 - _TICK_TOLERANCE, _TICK_TOLERANCE)
+    )
     return replace(
         motion,
         fps=fps,
@@ -54,7 +56,7 @@ def smooth(motion: Motion, cutoff_hz: float) -> Motion:
         second-order Butterworth low-pass, forwards and backwards, its cut-off corrected for the two passes;
         here on positions and on the components of sign-continuous quaternions.
     """
-    if 2.0 * cutoff_hz / _TWO_PASSES >= motion.fps or len(motion.root_in_world_m) < _FEWEST_TICKS:
+    if 2.0 * cutoff_hz / _TWO_PASS_CUTOFF_RATIO >= motion.fps or len(motion.root_in_world_m) < _MIN_TICKS:
         return motion
     quats = _low_pass(continuous_quat_xyzw(motion.local_rotation), cutoff_hz, motion.fps)
     return replace(
@@ -64,14 +66,14 @@ def smooth(motion: Motion, cutoff_hz: float) -> Motion:
     )
 
 
-_TWO_PASSES = float((2**0.5 - 1) ** 0.25)
-_FEWEST_TICKS = 4
+_TWO_PASS_CUTOFF_RATIO = float((2**0.5 - 1) ** 0.25)
+_MIN_TICKS = 4
 
 
 def _low_pass(values: FloatArray, cutoff_hz: float, fps: float) -> FloatArray:
     """Filter along time (T,...)."""
     from scipy.signal import butter, sosfiltfilt
 
-    sections = butter(2, cutoff_hz / _TWO_PASSES, fs=fps, output="sos")
+    sections = butter(2, cutoff_hz / _TWO_PASS_CUTOFF_RATIO, fs=fps, output="sos")
     reach = min(len(values) - 1, round(3.0 * fps / cutoff_hz))
     return np.asarray(sosfiltfilt(sections, values, axis=0, padlen=reach))

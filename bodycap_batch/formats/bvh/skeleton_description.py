@@ -15,8 +15,8 @@ _DIRECTIONS = {
     "left": (1, 0, 0), "right": (-1, 0, 0), "up": (0, 0, 1), "down": (0, 0, -1), "forward": (0, -1, 0),
     "back": (0, 1, 0),
 }  # fmt: skip
-_NO_LENGTH_M = 1e-6
-_NEXT = {
+_MIN_BONE_M = 1e-6
+_NEXT_PART = {
     "Shoulder": "Arm",
     "Arm": "ForeArm",
     "ForeArm": "Hand",
@@ -24,11 +24,11 @@ _NEXT = {
     "Leg": "Foot",
     "Foot": "ToeBase",
 }
-_OPTIONAL = ("Shoulder", "ToeBase")
+_OPTIONAL_PARTS = ("Shoulder", "ToeBase")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class JointLine:
+class JointDescription:
     """One joint as it is understood.
 
     Attributes:
@@ -48,36 +48,36 @@ class JointLine:
     note: str
 
 
-def joint_lines(skeleton: SkeletonModel) -> tuple[JointLine, ...]:
+def describe_joints(skeleton: SkeletonModel) -> tuple[JointDescription, ...]:
     """Every joint of a rig, in its order."""
     rest = rest_pose(skeleton)
     out = []
     for joint, name in enumerate(skeleton.joints):
         parent = int(skeleton.parents[joint])
-        bone = _bone(skeleton, rest, joint)
+        bone = _bone_vector(skeleton, rest, joint)
         length = float(np.linalg.norm(bone))
         role = skeleton.roles[joint]
-        helper = parent >= 0 and float(np.linalg.norm(skeleton.offsets_m[joint])) < _NO_LENGTH_M
+        helper = parent >= 0 and float(np.linalg.norm(skeleton.offsets_m[joint])) < _MIN_BONE_M
         note = "stays at zero" if not role else ""
         if helper:
             note = f"{note}, " * bool(note) + "sits on its parent"
         out.append(
-            JointLine(
+            JointDescription(
                 name=name,
                 role=role,
                 parent=skeleton.joints[parent] if parent >= 0 else "",
                 bone_m=length,
-                points=direction_words(bone) if length > _NO_LENGTH_M else "",
+                points=describe_direction(bone) if length > _MIN_BONE_M else "",
                 note=note,
             )
         )
     return tuple(out)
 
 
-def _bone(skeleton: SkeletonModel, rest: FloatArray, joint: int) -> FloatArray:
+def _bone_vector(skeleton: SkeletonModel, rest: FloatArray, joint: int) -> FloatArray:
     """The bone (3,) that starts at a joint, in the world; zero where the rig branches."""
     side = next((word for word in ("Left", "Right") if skeleton.roles[joint].startswith(word)), "")
-    following = _NEXT.get(skeleton.roles[joint].removeprefix(side)) if side else None
+    following = _NEXT_PART.get(skeleton.roles[joint].removeprefix(side)) if side else None
     after = None if following is None else skeleton.index_of_role(side + following)
     children = np.flatnonzero(skeleton.parents == joint)
     if after is None and len(children) == 1:
@@ -87,7 +87,7 @@ def _bone(skeleton: SkeletonModel, rest: FloatArray, joint: int) -> FloatArray:
     return np.asarray(rest[joint, :3, :3] @ np.nan_to_num(skeleton.end_offsets_m[joint]))
 
 
-def direction_words(vector: FloatArray) -> str:
+def describe_direction(vector: FloatArray) -> str:
     """A direction in the body's words: the nearest of six, and how far it leans to the next."""
     unit = vector / np.linalg.norm(vector)
     ranked = sorted(_DIRECTIONS, key=lambda word: -float(unit @ np.array(_DIRECTIONS[word])))
@@ -96,13 +96,13 @@ def direction_words(vector: FloatArray) -> str:
     return ranked[0] if lean < 10.0 else f"{ranked[0]}, {lean:.0f}° {ranked[1]}"
 
 
-def pose_words(skeleton: SkeletonModel) -> str:
+def describe_arm_pose(skeleton: SkeletonModel) -> str:
     """How the rig stands in the pose its limb axes are read from."""
     rest, arms = rest_pose(skeleton), []
     for side in ("Left", "Right"):
         joint = skeleton.index_of_role(f"{side}Arm")
         if joint is not None:
-            arms.append((side.lower(), direction_words_or_none(_bone(skeleton, rest, joint))))
+            arms.append((side.lower(), _describe_direction_or_empty(_bone_vector(skeleton, rest, joint))))
     if not arms:
         return "no arms recognised"
     if all(word.split(",")[0] == side for side, word in arms):
@@ -112,9 +112,9 @@ def pose_words(skeleton: SkeletonModel) -> str:
     return "; ".join(f"{side} arm {word or 'without length'}" for side, word in arms)
 
 
-def direction_words_or_none(vector: FloatArray) -> str:
+def _describe_direction_or_empty(vector: FloatArray) -> str:
     """The same, "" for a vector of no length."""
-    return direction_words(vector) if np.linalg.norm(vector) > _NO_LENGTH_M else ""
+    return describe_direction(vector) if np.linalg.norm(vector) > _MIN_BONE_M else ""
 
 
 def missing_roles(skeleton: SkeletonModel) -> tuple[str, ...]:
@@ -122,9 +122,9 @@ def missing_roles(skeleton: SkeletonModel) -> tuple[str, ...]:
     return tuple(role for role in ROLES if role not in skeleton.roles)
 
 
-def warnings(skeleton: SkeletonModel) -> Iterator[str]:
+def skeleton_warnings(skeleton: SkeletonModel) -> Iterator[str]:
     """What will hurt: missing joints, and a pose that is none of a standing body."""
-    missing = [role for role in missing_roles(skeleton) if not role.endswith(_OPTIONAL)]
+    missing = [role for role in missing_roles(skeleton) if not role.endswith(_OPTIONAL_PARTS)]
     if missing:
         yield f"no joint plays {', '.join(missing)}: name one with --map JOINT=ROLE; no camera can ride there"
     rest = rest_pose(skeleton)

@@ -48,21 +48,23 @@ def read_rig(path: Path | str, options: RigOptions | None = None) -> tuple[Skele
     path, options = Path(path), options or RigOptions()
     skeleton, motion = read_bvh(path)
     if options.roles:
-        skeleton = replace(skeleton, roles=_overridden(path, skeleton, options.roles))
+        skeleton = replace(skeleton, roles=_override_roles(path, skeleton, options.roles))
     if options.tpose_frame is not None:
-        skeleton = replace(skeleton, tpose_rotation=_tpose(path, skeleton, motion, options.tpose_frame))
+        skeleton = replace(
+            skeleton, tpose_rotation=_tpose_rotations(path, skeleton, motion, options.tpose_frame)
+        )
     return skeleton, None if motion is None else replace(motion, skeleton=skeleton)
 
 
-def _overridden(path: Path, skeleton: SkeletonModel, wanted: Mapping[str, str]) -> tuple[str, ...]:
+def _override_roles(path: Path, skeleton: SkeletonModel, wanted: Mapping[str, str]) -> tuple[str, ...]:
     """The roles with the user's in their place; one the user gives is taken from the joint that had it."""
     roles = list(skeleton.roles)
     for name, role in wanted.items():
         if name not in skeleton.joints:
-            hint = _nearest(name, skeleton.joints)
+            hint = _suggest_name(name, skeleton.joints)
             raise JobError(f"it has no joint {name!r}", path=path, field="skeleton_map", hint=hint)
         if role not in (*ROLES, NO_ROLE):
-            hint = _nearest(role, (*ROLES, NO_ROLE))
+            hint = _suggest_name(role, (*ROLES, NO_ROLE))
             raise JobError(f"there is no role {role!r}", path=path, field="skeleton_map", hint=hint)
     given = [role for role in wanted.values() if role != NO_ROLE]
     twice = next((role for role in given if given.count(role) > 1), None)
@@ -77,12 +79,12 @@ def _overridden(path: Path, skeleton: SkeletonModel, wanted: Mapping[str, str]) 
     return tuple(roles)
 
 
-def _nearest(word: str, known: tuple[str, ...]) -> str:
+def _suggest_name(word: str, known: tuple[str, ...]) -> str:
     near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
     return f"did you mean {near[0]!r}?" if near else f"one of {', '.join(known[:40])}"
 
 
-def _tpose(path: Path, skeleton: SkeletonModel, motion: Motion | None, frame: int) -> FloatArray:
+def _tpose_rotations(path: Path, skeleton: SkeletonModel, motion: Motion | None, frame: int) -> FloatArray:
     """Local rotations (J,3,3) of a frame, turned about the vertical until the body faces the front (−Y)."""
     count = 0 if motion is None else len(motion.root_in_world_m)
     if motion is None or not 0 <= frame < count:

@@ -9,10 +9,10 @@ from types import ModuleType
 from typing import Any
 
 # `import open3d` loads dash and plotly for these functions: three quarters of the time, nothing we use.
-_DRAWING = "open3d.visualization.draw_plotly"
+_PLOTLY_MODULE = "open3d.visualization.draw_plotly"
 
 
-class _LoadedWhenCalled(ModuleType):
+class _LazyModule(ModuleType):
     """Stands for a module; a function taken from it loads the module at its first call."""
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
@@ -20,7 +20,7 @@ class _LoadedWhenCalled(ModuleType):
             raise AttributeError(name)
 
         def call(*arguments: Any, **named: Any) -> Any:
-            if isinstance(sys.modules.get(self.__name__), _LoadedWhenCalled):
+            if isinstance(sys.modules.get(self.__name__), _LazyModule):
                 del sys.modules[self.__name__]
             return getattr(import_module(self.__name__), name)(*arguments, **named)
 
@@ -30,5 +30,5 @@ class _LoadedWhenCalled(ModuleType):
 def load_open3d() -> Any:
     """Import Open3D; its `draw_plotly` functions load what they need when they are called."""
     if "open3d" not in sys.modules:
-        sys.modules[_DRAWING] = _LoadedWhenCalled(_DRAWING)
+        sys.modules[_PLOTLY_MODULE] = _LazyModule(_PLOTLY_MODULE)
     return import_module("open3d")

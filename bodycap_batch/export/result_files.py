@@ -10,21 +10,27 @@ from typing import Any
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.export.inputs import ExportInputs
+from bodycap_batch.export.export_inputs import ExportInputs
+from bodycap_batch.export.frame_table import write_frame_table
 from bodycap_batch.export.joint_tables import write_joint_arrays, write_joint_table
-from bodycap_batch.export.layout import lay_out
+from bodycap_batch.export.layout import apply_layout
 from bodycap_batch.export.metrics import collect_metrics
-from bodycap_batch.export.motion import joint_centres, only_solved, write_figure, write_motion, write_stage
+from bodycap_batch.export.motion_files import (
+    points_from_motion,
+    without_unsolved_branches,
+    write_verified_bvh,
+    write_verified_glb,
+    write_verified_usd,
+)
 from bodycap_batch.export.projection import project_motion
 from bodycap_batch.export.scene_files import write_colmap, write_maps, write_trajectories
-from bodycap_batch.export.tables import write_frames
+from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.formats.c3d import write_c3d
 from bodycap_batch.formats.fbx import write_fbx
-from bodycap_batch.formats.files import write_text
-from bodycap_batch.formats.needs import require_libraries
+from bodycap_batch.formats.optional_libraries import require_libraries
 from bodycap_batch.formats.trc import write_trc
 from bodycap_batch.model.merge_data import MergeResult
-from bodycap_batch.model.skeleton import Motion, as_in_file
+from bodycap_batch.model.skeleton import Motion, with_file_zero_pose
 
 
 def export_results(inputs: ExportInputs, options: ExportOptions, context: StageContext) -> tuple[Path, ...]:
@@ -47,16 +53,16 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
         StoreError: A file cannot be written, or read back it differs from what was meant.
     """
     require_libraries(options.formats)
-    motion, gap = _project(inputs, options)
-    sigma_m = None if inputs.merge is None or motion is None else _sigma_m(inputs.merge, motion)
+    motion, gap = _exported_motion(inputs, options)
+    sigma_m = None if inputs.merge is None or motion is None else _exported_sigma_m(inputs.merge, motion)
     steps: dict[str, Callable[[], list[Path]]] = {"tum": lambda: write_trajectories(inputs)}
     if inputs.maps:
         steps |= {"ply": lambda: write_maps(inputs), "colmap": lambda: write_colmap(inputs)}
-    steps["csv"] = lambda: [write_frames(inputs.out_dir / "frames.csv", inputs)]
+    steps["csv"] = lambda: [write_frame_table(inputs.out_dir / "frames.csv", inputs)]
     if motion is not None:
-        steps |= _motion_steps(inputs.out_dir, motion, options, sigma_m)
+        steps |= _motion_writers(inputs.out_dir, motion, options, sigma_m)
         steps["csv"] = lambda: [
-            write_frames(inputs.out_dir / "frames.csv", inputs),
+            write_frame_table(inputs.out_dir / "frames.csv", inputs),
             write_joint_table(inputs.out_dir / "joints.csv", motion, sigma_m),
         ]
     steps = {name: write for name, write in steps.items() if name in options.formats}
@@ -70,23 +76,23 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
     return tuple(path.relative_to(inputs.out_dir) for path in written)
 
 
-def _motion_steps(
+def _motion_writers(
     folder: Path, motion: Motion, options: ExportOptions, sigma_m: FloatArray | None
 ) -> dict[str, Callable[[], list[Path]]]:
     """The files of the motion: for animation as it is laid out, for measuring as it was solved."""
-    animated, centres = lay_out(motion, options), joint_centres(motion)
+    animated, centres = apply_layout(motion, options), points_from_motion(motion)
     return {
-        "bvh": lambda: [write_motion(folder / "motion.bvh", animated, options)],
-        "glb": lambda: [write_figure(folder / "motion.glb", animated)],
+        "bvh": lambda: [write_verified_bvh(folder / "motion.bvh", animated, options)],
+        "glb": lambda: [write_verified_glb(folder / "motion.glb", animated)],
         "fbx": lambda: [write_fbx(folder / "motion.fbx", animated)],
-        "usd": lambda: [write_stage(folder / "motion.usd", animated)],
+        "usd": lambda: [write_verified_usd(folder / "motion.usd", animated)],
         "c3d": lambda: [write_c3d(folder / "joints.c3d", centres)],
         "trc": lambda: [write_trc(folder / "joints.trc", centres)],
         "npz": lambda: [write_joint_arrays(folder / "joints.npz", motion, sigma_m)],
     }
 
 
-def _sigma_m(merge: MergeResult, motion: Motion) -> FloatArray:
+def _exported_sigma_m(merge: MergeResult, motion: Motion) -> FloatArray:
     """(T,J) how well each exported joint's centre is known, NaN where nothing measured it."""
     kept = [merge.skeleton.joints.index(name) for name in motion.skeleton.joints]
     return merge.joint_sigma_m()[:, kept]
@@ -99,12 +105,12 @@ def _write_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[str
     return path
 
 
-def _project(inputs: ExportInputs, options: ExportOptions) -> tuple[Motion | None, dict[str, Any]]:
+def _exported_motion(inputs: ExportInputs, options: ExportOptions) -> tuple[Motion | None, dict[str, Any]]:
     """The motion to export and its distance from the graph; None without a body."""
     if inputs.merge is None:
         return None, {}
     projection = project_motion(inputs.merge, inputs.clocks, inputs.row_fraction)
-    motion = as_in_file(projection.motion)
+    motion = with_file_zero_pose(projection.motion)
     if options.hierarchy == "solved":
-        motion = only_solved(motion, inputs.merge.solved)
+        motion = without_unsolved_branches(motion, inputs.merge.solved)
     return motion, dict(projection.gap)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from bodycap_batch.core.errors import StoreError
 
-_REMEDIES = {
+_HINTS = {
     errno.ENOSPC: "the disk is full: free some space, or write elsewhere with --out",
     errno.EDQUOT: "the disk quota is used up: free some space, or write elsewhere with --out",
     errno.EACCES: "no permission to write there: choose another folder with --out",
@@ -19,17 +19,17 @@ _REMEDIES = {
 }
 
 
-def store_error(error: OSError, path: Path) -> StoreError:
+def store_error_from_os_error(error: OSError, path: Path) -> StoreError:
     """Turn a failed write to `path` into the typed error, with its remedy."""
     return StoreError(
         f"cannot write: {error.strerror or error}",
         path=path,
-        hint=_REMEDIES.get(error.errno or 0, "check the folder and the disk"),
+        hint=_HINTS.get(error.errno or 0, "check the folder and the disk"),
     )
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def atomic_replacement(path: Path) -> Iterator[Path]:
     """Yield a temporary sibling of `path`; rename it over `path` when the block ends well.
 
     The sibling keeps the suffix (libraries choose the format by it) and is deleted on any failure, so
@@ -47,7 +47,7 @@ def replacing(path: Path) -> Iterator[Path]:
             os.fsync(handle.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        raise store_error(error, path) from error
+        raise store_error_from_os_error(error, path) from error
     finally:
         with suppress(OSError):  # gone after the rename; nothing to do where the folder itself is bad
             temporary.unlink()
@@ -59,5 +59,8 @@ def write_text(path: Path, text: str) -> None:
     Raises:
         StoreError: The file cannot be written.
     """
-    with replacing(path) as temporary, open(temporary, "w", encoding="utf-8", newline="\n") as handle:
+    with (
+        atomic_replacement(path) as temporary,
+        open(temporary, "w", encoding="utf-8", newline="\n") as handle,
+    ):
         handle.write(text)

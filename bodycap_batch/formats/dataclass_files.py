@@ -25,11 +25,11 @@ from bodycap_batch.core.errors import StoreError
 T = TypeVar("T")
 Arrays = dict[str, np.ndarray[Any, Any]]
 
-_EPOCH = (1980, 1, 1, 0, 0, 0)
+_ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 """The earliest time a zip entry can carry; a constant, so that the bytes do not tell the clock."""
 
 
-def write_bundle(value: Any, folder: Path, name: str) -> None:
+def write_dataclass(value: Any, folder: Path, name: str) -> None:
     """Write a dataclass instance as ``<name>.json`` and, if it holds arrays, ``<name>.npz``.
 
     Args:
@@ -38,7 +38,7 @@ def write_bundle(value: Any, folder: Path, name: str) -> None:
         name: File stem.
     """
     arrays: Arrays = {}
-    body = _encode(value, type(value), _Place(folder, arrays))
+    body = _encode(value, type(value), _Location(folder, arrays))
     document = {"type": type(value).__name__, "value": body}
     text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
     (folder / f"{name}.json").write_text(text + "\n", encoding="utf-8")
@@ -46,8 +46,8 @@ def write_bundle(value: Any, folder: Path, name: str) -> None:
         write_npz(folder / f"{name}.npz", arrays)
 
 
-def read_bundle(cls: type[T], folder: Path, name: str) -> T:
-    """Read what `write_bundle` wrote.
+def read_dataclass(cls: type[T], folder: Path, name: str) -> T:
+    """Read what `write_dataclass` wrote.
 
     Raises:
         StoreError: A file is missing, broken, or holds another type.
@@ -59,7 +59,7 @@ def read_bundle(cls: type[T], folder: Path, name: str) -> T:
             raise StoreError(f"holds a {document['type']}, not a {cls.__name__}", path=path)
         archive = folder / f"{name}.npz"
         arrays = read_npz(archive) if archive.exists() else {}
-        return typing.cast(T, _decode(document["value"], cls, _Place(folder, arrays)))
+        return typing.cast(T, _decode(document["value"], cls, _Location(folder, arrays)))
     except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
         hint = "remove the folder; it is made again by the next run"
         raise StoreError(f"cannot be read: {error}", path=path, hint=hint) from error
@@ -71,7 +71,7 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
         for name, array in arrays.items():
             buffer = io.BytesIO()
             np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy", _EPOCH), buffer.getbuffer())
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy", _ZIP_DATE), buffer.getbuffer())
 
 
 def read_npz(path: Path) -> Arrays:
@@ -81,19 +81,19 @@ def read_npz(path: Path) -> Arrays:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class _Place:
+class _Location:
     """Where a value stands: its folder, all arrays, and the name of the value itself."""
 
     folder: Path
     arrays: Arrays
     name: str = ""
 
-    def inner(self, part: object) -> _Place:
+    def inner(self, part: object) -> _Location:
         name = f"{self.name}.{part}" if self.name else str(part)
         return dataclasses.replace(self, name=name)
 
 
-def _encode(value: Any, hint: Any, place: _Place) -> Any:  # noqa: PLR0911 - one case a kind of type
+def _encode(value: Any, hint: Any, place: _Location) -> Any:  # noqa: PLR0911 - one case a kind of type
     hint = _strip_none(hint)
     origin = typing.get_origin(hint) or hint
     if value is None:
@@ -106,7 +106,7 @@ def _encode(value: Any, hint: Any, place: _Place) -> Any:  # noqa: PLR0911 - one
         names = [field.name for field in dataclasses.fields(hint)]
         return {name: _encode(getattr(value, name), hints[name], place.inner(name)) for name in names}
     if origin is tuple:
-        inner = _item_hints(hint, len(value))
+        inner = _element_hints(hint, len(value))
         return [_encode(value[i], inner[i], place.inner(i)) for i in range(len(value))]
     if isinstance(origin, type) and issubclass(origin, Mapping):
         inner_hint = (*typing.get_args(hint), Any, Any)[1]
@@ -117,10 +117,10 @@ def _encode(value: Any, hint: Any, place: _Place) -> Any:  # noqa: PLR0911 - one
         return Path(value).resolve().relative_to(place.folder.resolve()).as_posix()
     if origin is float:
         return float(value) if math.isfinite(value) else str(float(value))
-    return _plain(value)
+    return _json_value(value)
 
 
-def _decode(value: Any, hint: Any, place: _Place) -> Any:
+def _decode(value: Any, hint: Any, place: _Location) -> Any:
     hint = _strip_none(hint)
     origin = typing.get_origin(hint) or hint
     if value is None:
@@ -132,7 +132,7 @@ def _decode(value: Any, hint: Any, place: _Place) -> Any:
         parts = {name: _decode(part, hints[name], place.inner(name)) for name, part in value.items()}
         return typing.cast(type, hint)(**parts)
     if origin is tuple:
-        inner = _item_hints(hint, len(value))
+        inner = _element_hints(hint, len(value))
         return tuple(_decode(value[i], inner[i], place.inner(i)) for i in range(len(value)))
     if isinstance(origin, type) and issubclass(origin, Mapping):
         inner_hint = (*typing.get_args(hint), Any, Any)[1]
@@ -152,19 +152,19 @@ def _strip_none(hint: Any) -> Any:
     return hint
 
 
-def _item_hints(hint: Any, count: int) -> tuple[Any, ...]:
+def _element_hints(hint: Any, count: int) -> tuple[Any, ...]:
     hints = typing.get_args(hint)
     return (hints[0],) * count if len(hints) == 2 and hints[1] is Ellipsis else hints
 
 
-def _plain(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
     """A value of no declared type as JSON; what is not a finite number becomes null."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(part) for key, part in value.items()}
+        return {str(key): _json_value(part) for key, part in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(part) for part in value]
+        return [_json_value(part) for part in value]
     if isinstance(value, (np.generic, np.ndarray)):
-        return _plain(value.tolist())
+        return _json_value(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if value is None or isinstance(value, (bool, int, float, str)):
