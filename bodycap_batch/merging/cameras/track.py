@@ -13,25 +13,25 @@ from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import NAMED_SIGMA_RAD, NOMINAL_SIGMA_M
 
-CLEAN_HALF_WINDOW = 6
-CLEAN_LIMIT_M = 0.12
+OUTLIER_HALF_WINDOW = 6
+OUTLIER_LIMIT_M = 0.12
 """A quadratic over ±6 frames at 30 fps follows a swinging hand to a few cm; wrong poses are off by more."""
 
 MIN_SIGMA_M = 0.004
 MIN_SIGMA_RAD = float(np.radians(0.4))
 """Floors of a pose's sigma: PnP's covariance knows image noise, not the map's error or a strap's give."""
 
-_UNTOLD_RAD, _UNTOLD_M = 0.98 * NAMED_SIGMA_RAD, 0.98 * NOMINAL_SIGMA_M
+_UNCALIBRATED_SIGMA_RAD, _UNCALIBRATED_SIGMA_M = 0.98 * NAMED_SIGMA_RAD, 0.98 * NOMINAL_SIGMA_M
 """A mount known less well than both was not calibrated: its name alone promises as much. (The wearer's habits
 alone turn a calibrated palm's by up to that.)"""
 
 
-SAMPLE_REACH_NS = 100_000_000
+MAX_SAMPLE_GAP_NS = 100_000_000
 """Longest hole between two frames that is interpolated for a sample."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Track:
+class CameraTrack:
     """The localised frames of one camera.
 
     Attributes:
@@ -52,7 +52,7 @@ class Track:
     sigma_rad: FloatArray
     sigma_map: FloatArray
 
-    def keep(self, mask: BoolArray) -> Track:
+    def keep(self, mask: BoolArray) -> CameraTrack:
         """Keep the frames where `mask` (N,) is True."""
         return replace(
             self,
@@ -63,18 +63,18 @@ class Track:
             sigma_map=self.sigma_map[mask],
         )
 
-    def scaled(self, scale: float) -> Track:
+    def scaled(self, scale: float) -> CameraTrack:
         """The same path with that many units in each of its own."""
         poses = self.map_from_cam.copy()
         poses[:, :3, 3] *= scale
         return replace(self, map_from_cam=poses, sigma_map=scale * self.sigma_map)
 
-    def at(self, times_ns: IntArray, *, reach_ns: int) -> tuple[FloatArray, BoolArray]:
+    def poses_at(self, times_ns: IntArray, *, max_gap_ns: int) -> tuple[FloatArray, BoolArray]:
         """Interpolate between neighbouring frames.
 
         Args:
             times_ns: (T,) wanted times.
-            reach_ns: Largest time between the two frames around a wanted time.
+            max_gap_ns: Largest time between the two frames around a wanted time.
 
         Returns:
             Poses (T,4,4), nearest-frame ones where there is nothing to interpolate, and (T,) whether it was.
@@ -86,10 +86,10 @@ class Track:
         alpha = np.clip((times_ns - self.times_ns[before]) / span, 0.0, 1.0)
         poses = interpolate_pose(self.map_from_cam[before], self.map_from_cam[after], alpha)
         inside = (times_ns >= self.times_ns[0]) & (times_ns <= self.times_ns[-1])
-        return poses, inside & (self.times_ns[after] - self.times_ns[before] <= reach_ns)
+        return poses, inside & (self.times_ns[after] - self.times_ns[before] <= max_gap_ns)
 
 
-def make_track(inputs: MergeInputs, trajectory: Trajectory, bone: int) -> Track:
+def make_track(inputs: MergeInputs, trajectory: Trajectory, bone: int) -> CameraTrack:
     """Take the localised frames of a trajectory onto the common clock."""
     frames = np.flatnonzero(trajectory.localised)
     rows = inputs.row_fraction.get(trajectory.camera)
@@ -98,7 +98,7 @@ def make_track(inputs: MergeInputs, trajectory: Trajectory, bone: int) -> Track:
     )
     order = np.argsort(times_ns, kind="stable")
     variances = np.diagonal(trajectory.covariance[frames], axis1=1, axis2=2)[order]
-    return Track(
+    return CameraTrack(
         camera=trajectory.camera,
         bone=bone,
         frames=frames[order].astype(np.int64),
@@ -109,7 +109,7 @@ def make_track(inputs: MergeInputs, trajectory: Trajectory, bone: int) -> Track:
     )
 
 
-def moved(track: Track, target_from_map: Similarity) -> Track:
+def transform_track(track: CameraTrack, target_from_map: Similarity) -> CameraTrack:
     """The track in another map's gauge, or in metres."""
     return replace(
         track,
@@ -118,7 +118,7 @@ def moved(track: Track, target_from_map: Similarity) -> Track:
     )
 
 
-def in_gauge(trajectory: Trajectory, target_from_map: Similarity, gauge: str) -> Trajectory:
+def transform_trajectory(trajectory: Trajectory, target_from_map: Similarity, gauge: str) -> Trajectory:
     """The trajectory in another frame of that name."""
     unit = np.repeat([1.0, target_from_map.scale], 3)
     return replace(
@@ -129,7 +129,7 @@ def in_gauge(trajectory: Trajectory, target_from_map: Similarity, gauge: str) ->
     )
 
 
-def clean(track: Track, scale: float, fps: float) -> tuple[Track, int]:
+def remove_outliers(track: CameraTrack, scale: float, fps: float) -> tuple[CameraTrack, int]:
     """Drop frames whose centre jumps off a robust quadratic through its neighbours.
 
     Args:
@@ -141,25 +141,25 @@ def clean(track: Track, scale: float, fps: float) -> tuple[Track, int]:
         The cleaned track and how many frames were dropped.
     """
     count = len(track.times_ns)
-    steps = np.array([step for step in range(-CLEAN_HALF_WINDOW, CLEAN_HALF_WINDOW + 1) if step])
+    steps = np.array([step for step in range(-OUTLIER_HALF_WINDOW, OUTLIER_HALF_WINDOW + 1) if step])
     index = np.arange(count)[:, None] + steps
     valid = (index >= 0) & (index < count)
     index = np.clip(index, 0, count - 1)
     time = (track.times_ns[index] - track.times_ns[:, None]) * (1e-9 * fps)
-    valid &= np.abs(time) <= CLEAN_HALF_WINDOW + 0.5
+    valid &= np.abs(time) <= OUTLIER_HALF_WINDOW + 0.5
     centre = scale * (track.map_from_cam[index, :3, 3] - track.map_from_cam[:, None, :3, 3])
-    predicted = _robust_quadratic(time / CLEAN_HALF_WINDOW, centre, valid)
+    predicted = _robust_quadratic(time / OUTLIER_HALF_WINDOW, centre, valid)
     # Extrapolation at the end of a stretch cannot tell a turn of the path from an error.
     inner = ((time < 0) & valid).sum(axis=1).clip(max=2) + ((time > 0) & valid).sum(axis=1).clip(max=2) == 4
-    bad = (np.linalg.norm(predicted, axis=1) > CLEAN_LIMIT_M) & inner & (valid.sum(axis=1) >= 6)
-    bad = _jumping(bad, scale * track.map_from_cam[:, :3, 3])
+    bad = (np.linalg.norm(predicted, axis=1) > OUTLIER_LIMIT_M) & inner & (valid.sum(axis=1) >= 6)
+    bad = _runs_with_jumps(bad, scale * track.map_from_cam[:, :3, 3])
     return track.keep(~bad), int(bad.sum())
 
 
-def _jumping(bad: BoolArray, centre_m: FloatArray) -> BoolArray:
+def _runs_with_jumps(bad: BoolArray, centre_m: FloatArray) -> BoolArray:
     """Those stretches of bad frames (N,) that jump: a thrown arm leaves any quadratic, but smoothly."""
     jump = np.zeros(len(bad), dtype=bool)
-    jump[1:-1] = np.linalg.norm(np.diff(centre_m, n=2, axis=0), axis=1) > CLEAN_LIMIT_M
+    jump[1:-1] = np.linalg.norm(np.diff(centre_m, n=2, axis=0), axis=1) > OUTLIER_LIMIT_M
     edges = np.flatnonzero(np.diff(np.concatenate([[0], bad.astype(np.int8), [0]])))
     out = np.zeros(len(bad), dtype=bool)
     for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
@@ -176,22 +176,22 @@ def _robust_quadratic(time: FloatArray, centre: FloatArray, valid: BoolArray) ->
         normal = np.einsum("nwi,nwj->nij", weighted, basis) + 1e-9 * np.eye(3)
         coefficients = np.linalg.solve(normal, np.einsum("nwi,nwk->nik", weighted, centre))
         residual = np.linalg.norm(centre - basis @ coefficients, axis=-1)
-        weight = valid / (1.0 + (residual / (0.25 * CLEAN_LIMIT_M)) ** 2)
+        weight = valid / (1.0 + (residual / (0.25 * OUTLIER_LIMIT_M)) ** 2)
     return np.asarray(coefficients[:, 0])
 
 
-def untold(mount: Mount) -> bool:
+def is_uncalibrated(mount: Mount) -> bool:
     """Whether a solved mount is known no better than its name promises."""
-    return mount.sigma_rad >= _UNTOLD_RAD and mount.sigma_m >= _UNTOLD_M
+    return mount.sigma_rad >= _UNCALIBRATED_SIGMA_RAD and mount.sigma_m >= _UNCALIBRATED_SIGMA_M
 
 
-def loosened(track: Track, mount: Mount) -> Track:
+def inflate_sigmas(track: CameraTrack, mount: Mount) -> CameraTrack:
     """The track (metres) at the uncertainty of its mount, where the motion told next to nothing of it.
 
     A camera never seen together with others keeps the mount its name promises: 9° and 2.9 cm an axis.
     At its poses' own millimetres it would bend the body to that guess.
     """
-    if not untold(mount):
+    if not is_uncalibrated(mount):
         return track
     return replace(
         track,
@@ -200,7 +200,7 @@ def loosened(track: Track, mount: Mount) -> Track:
     )
 
 
-def evenly(pool: IntArray, count: int) -> IntArray:
+def pick_evenly(pool: IntArray, count: int) -> IntArray:
     """Up to `count` of the pool, evenly; none of an empty one."""
     if not len(pool):
         return pool
