@@ -166,7 +166,7 @@ def _clean_tracks(
     provisional = provisional_scale(bones, tracks, mounts)
     cleaned, dropped = [], {}
     for track in tracks:
-        kept, _ = remove_outliers(track, provisional, inputs.clocks[track.camera].nominal_fps)
+        kept = remove_outliers(track, provisional, inputs.clocks[track.camera].nominal_fps)
         dropped[track.camera] = np.setdiff1d(track.frames, kept.frames)
         cleaned.append(kept)
     return cleaned, provisional_scale(bones, cleaned, mounts), dropped

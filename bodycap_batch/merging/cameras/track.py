@@ -1,4 +1,4 @@
-"""Measured camera paths on the common clock, cleaned of gross errors."""
+"""The camera paths that merging works on: localised frames on the common clock, without gross errors."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, evenly_spaced, runs
 from bodycap_batch.model.geometry import Similarity, interpolate_pose
 from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.scene import Trajectory
@@ -14,20 +14,28 @@ from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import NAMED_SIGMA_RAD, NOMINAL_SIGMA_M
 
 OUTLIER_HALF_WINDOW = 6
+"""Frames on either side that a frame is compared with, 0.2 s at 30 fps. A quadratic follows a swinging hand to
+a few centimetres over that time. Evidence: none."""
 OUTLIER_LIMIT_M = 0.12
-"""A quadratic over ±6 frames at 30 fps follows a swinging hand to a few cm; wrong poses are off by more."""
+"""Distance from the quadratic, in metres, above which a pose is wrong: several times a swing's deviation from
+it. Evidence: none."""
 
 MIN_SIGMA_M = 0.004
 MIN_SIGMA_RAD = float(np.radians(0.4))
-"""Floors of a pose's sigma: PnP's covariance knows image noise, not the map's error or a strap's give."""
+"""Smallest sigmas of a measured pose per axis, metres and radians. The covariance of PnP contains the image
+noise, but neither the error of the map nor the movement of the strap. Evidence: none."""
 
 _UNCALIBRATED_SIGMA_RAD, _UNCALIBRATED_SIGMA_M = 0.98 * NAMED_SIGMA_RAD, 0.98 * NOMINAL_SIGMA_M
-"""A mount known less well than both was not calibrated: its name alone promises as much. (The wearer's habits
-alone turn a calibrated palm's by up to that.)"""
+"""A mount with both sigmas (radians, metres per axis) above these was not calibrated: its prior has hardly
+larger ones. One sigma alone says nothing: the posture's systematic bias alone gives a calibrated palm such a
+rotation sigma."""
 
 
 MAX_SAMPLE_GAP_NS = 100_000_000
-"""Longest hole between two frames that is interpolated for a sample."""
+"""Longest time between two frames, in nanoseconds, over which a pose is interpolated for the calibration and
+the checks: three frames at 30 fps."""
+MAX_COARSE_GAP_NS = 200_000_000
+"""The same for initial values and for the search for a T-pose, where centimetres of error do no harm."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,12 +44,12 @@ class CameraTrack:
 
     Attributes:
         camera: Camera name.
-        bone: Index of the bone that carries it.
+        bone: Index of the bone that carries the camera.
         frames: (N,) indices into the trajectory.
-        times_ns: (N,) common clock, increasing.
+        times_ns: (N,) common time, increasing.
         map_from_cam: (N,4,4) poses in the map's gauge.
         sigma_rad: (N,) rotation sigma per axis.
-        sigma_map: (N,) centre sigma per axis, map units.
+        sigma_map: (N,) sigma of the centre per axis, map units.
     """
 
     camera: str
@@ -53,7 +61,7 @@ class CameraTrack:
     sigma_map: FloatArray
 
     def keep(self, mask: BoolArray) -> CameraTrack:
-        """Keep the frames where `mask` (N,) is True."""
+        """Return the track with the frames where `mask` (N,) is True."""
         return replace(
             self,
             frames=self.frames[mask],
@@ -64,20 +72,28 @@ class CameraTrack:
         )
 
     def scaled(self, scale: float) -> CameraTrack:
-        """The same path with that many units in each of its own."""
+        """Return the track in another unit of length.
+
+        Args:
+            scale: New units per present unit.
+        """
         poses = self.map_from_cam.copy()
         poses[:, :3, 3] *= scale
         return replace(self, map_from_cam=poses, sigma_map=scale * self.sigma_map)
 
     def poses_at(self, times_ns: IntArray, *, max_gap_ns: int) -> tuple[FloatArray, BoolArray]:
-        """Interpolate between neighbouring frames.
+        """Interpolate the poses between neighbouring frames.
+
+        `bodycap_batch.model.geometry.poses_at` returns the identity where there is no pose; here a pose is
+        needed there too, and a time at which there is a frame gets exactly the pose of that frame.
 
         Args:
-            times_ns: (T,) wanted times.
-            max_gap_ns: Largest time between the two frames around a wanted time.
+            times_ns: (T,) common times.
+            max_gap_ns: Longest time between the two frames around a requested time.
 
         Returns:
-            Poses (T,4,4), nearest-frame ones where there is nothing to interpolate, and (T,) whether it was.
+            Poses (T,4,4), and (T,) whether each is valid: inside the track and not in a longer gap. A pose
+            in a gap is interpolated over it; one outside the track is that of the first or last frame.
         """
         last = len(self.times_ns) - 1
         after = np.clip(np.searchsorted(self.times_ns, times_ns, side="left"), 0, last)
@@ -90,7 +106,13 @@ class CameraTrack:
 
 
 def make_track(inputs: MergeInputs, trajectory: Trajectory, bone: int) -> CameraTrack:
-    """Take the localised frames of a trajectory onto the common clock."""
+    """Return the localised frames of a trajectory on the common clock.
+
+    Args:
+        inputs: The clocks, and the image rows that the poses belong to.
+        trajectory: Of one camera.
+        bone: Index of the bone that carries the camera.
+    """
     frames = np.flatnonzero(trajectory.localised)
     rows = inputs.row_fraction.get(trajectory.camera)
     times_ns = inputs.clocks[trajectory.camera].common_times_ns(
@@ -110,7 +132,7 @@ def make_track(inputs: MergeInputs, trajectory: Trajectory, bone: int) -> Camera
 
 
 def transform_track(track: CameraTrack, target_from_map: Similarity) -> CameraTrack:
-    """The track in another map's gauge, or in metres."""
+    """Return the track in another frame of reference, such as another map's gauge."""
     return replace(
         track,
         map_from_cam=target_from_map.apply_to_poses(track.map_from_cam),
@@ -119,7 +141,13 @@ def transform_track(track: CameraTrack, target_from_map: Similarity) -> CameraTr
 
 
 def transform_trajectory(trajectory: Trajectory, target_from_map: Similarity, gauge: str) -> Trajectory:
-    """The trajectory in another frame of that name."""
+    """Return the trajectory in another frame of reference.
+
+    Args:
+        trajectory: Poses and covariances in their own gauge.
+        target_from_map: From that gauge.
+        gauge: Name of the new frame of reference.
+    """
     unit = np.repeat([1.0, target_from_map.scale], 3)
     return replace(
         trajectory,
@@ -129,16 +157,13 @@ def transform_trajectory(trajectory: Trajectory, target_from_map: Similarity, ga
     )
 
 
-def remove_outliers(track: CameraTrack, scale: float, fps: float) -> tuple[CameraTrack, int]:
-    """Drop frames whose centre jumps off a robust quadratic through its neighbours.
+def remove_outliers(track: CameraTrack, scale: float, fps: float) -> CameraTrack:
+    """Remove frames whose centre jumps off a robust quadratic through the neighbouring frames.
 
     Args:
         track: The measured path.
-        scale: Metres per map unit (a provisional one will do).
+        scale: Metres per map unit; a provisional value is accurate enough.
         fps: Nominal rate of the camera.
-
-    Returns:
-        The cleaned track and how many frames were dropped.
     """
     count = len(track.times_ns)
     steps = np.array([step for step in range(-OUTLIER_HALF_WINDOW, OUTLIER_HALF_WINDOW + 1) if step])
@@ -149,26 +174,27 @@ def remove_outliers(track: CameraTrack, scale: float, fps: float) -> tuple[Camer
     valid &= np.abs(time) <= OUTLIER_HALF_WINDOW + 0.5
     centre = scale * (track.map_from_cam[index, :3, 3] - track.map_from_cam[:, None, :3, 3])
     predicted = _robust_quadratic(time / OUTLIER_HALF_WINDOW, centre, valid)
-    # Extrapolation at the end of a stretch cannot tell a turn of the path from an error.
+    # At the end of an interval the quadratic extrapolates: a turn of the path looks like an error there.
     inner = ((time < 0) & valid).sum(axis=1).clip(max=2) + ((time > 0) & valid).sum(axis=1).clip(max=2) == 4
     bad = (np.linalg.norm(predicted, axis=1) > OUTLIER_LIMIT_M) & inner & (valid.sum(axis=1) >= 6)
-    bad = _runs_with_jumps(bad, scale * track.map_from_cam[:, :3, 3])
-    return track.keep(~bad), int(bad.sum())
+    return track.keep(~_runs_with_jumps(bad, scale * track.map_from_cam[:, :3, 3]))
 
 
 def _runs_with_jumps(bad: BoolArray, centre_m: FloatArray) -> BoolArray:
-    """Those stretches of bad frames (N,) that jump: a thrown arm leaves any quadratic, but smoothly."""
+    """Select the runs of bad frames (N,) in which the path jumps.
+
+    The path of a thrown arm leaves any quadratic, but it has no jump.
+    """
     jump = np.zeros(len(bad), dtype=bool)
     jump[1:-1] = np.linalg.norm(np.diff(centre_m, n=2, axis=0), axis=1) > OUTLIER_LIMIT_M
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], bad.astype(np.int8), [0]])))
     out = np.zeros(len(bad), dtype=bool)
-    for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        out[first:end] = jump[max(first - 1, 0) : end + 1].any()
+    for start, stop in runs(bad):
+        out[start:stop] = jump[max(start - 1, 0) : stop + 1].any()
     return out
 
 
 def _robust_quadratic(time: FloatArray, centre: FloatArray, valid: BoolArray) -> FloatArray:
-    """Value at time 0 (N,3) of quadratics through (N,W) times and (N,W,3) centres, Cauchy-weighted."""
+    """Fit quadratics with Cauchy weights to centres (N,W,3) at times (N,W); return their values (N,3) at 0."""
     basis = np.stack([np.ones_like(time), time, time**2], axis=-1)
     weight = valid.astype(np.float64)
     for _ in range(8):
@@ -181,15 +207,19 @@ def _robust_quadratic(time: FloatArray, centre: FloatArray, valid: BoolArray) ->
 
 
 def is_uncalibrated(mount: Mount) -> bool:
-    """Whether a solved mount is known no better than its name promises."""
+    """Return whether the calibration left a mount as uncertain as the prior by its name."""
     return mount.sigma_rad >= _UNCALIBRATED_SIGMA_RAD and mount.sigma_m >= _UNCALIBRATED_SIGMA_M
 
 
 def inflate_sigmas(track: CameraTrack, mount: Mount) -> CameraTrack:
-    """The track (metres) at the uncertainty of its mount, where the motion told next to nothing of it.
+    """Add the uncertainty of an uncalibrated mount to the sigmas of its track.
 
-    A camera never seen together with others keeps the mount its name promises: 9° and 2.9 cm an axis.
-    At its poses' own millimetres it would bend the body to that guess.
+    A camera that is never localised together with others keeps the mount that its name implies, known to 9°
+    and 2.9 cm per axis. With the millimetres of its own poses, it would bend the body to that guess.
+
+    Args:
+        track: Poses in metres.
+        mount: The solved mount.
     """
     if not is_uncalibrated(mount):
         return track
@@ -201,7 +231,5 @@ def inflate_sigmas(track: CameraTrack, mount: Mount) -> CameraTrack:
 
 
 def pick_evenly(pool: IntArray, count: int) -> IntArray:
-    """Up to `count` of the pool, evenly; none of an empty one."""
-    if not len(pool):
-        return pool
-    return np.asarray(pool[np.unique(np.linspace(0, len(pool) - 1, count).round().astype(np.int64))])
+    """Return up to `count` items of a pool (N,), evenly spaced."""
+    return np.asarray(pool[evenly_spaced(len(pool), count)])

@@ -223,7 +223,7 @@ def _require_one_scale(strain: float, reach_sigma: float) -> None:
 
 
 def _without_outliers(inputs: MergeInputs, tracks: Sequence[CameraTrack], scale: float) -> list[CameraTrack]:
-    return [remove_outliers(each, scale, inputs.clocks[each.camera].nominal_fps)[0] for each in tracks]
+    return [remove_outliers(each, scale, inputs.clocks[each.camera].nominal_fps) for each in tracks]
 
 
 def align_maps(

@@ -232,7 +232,7 @@ def test_hands_alone_make_no_body_and_the_error_says_what_is_missing(capture):
 
 def test_a_limbs_camera_tells_no_vertical(capture):
     inputs = capture.inputs
-    bones = camera_selection.graph_bones(inputs.skeleton, {mount.role for mount in inputs.mounts})
+    bones = camera_selection.kinematic_chain(inputs.skeleton, {mount.role for mount in inputs.mounts})
     arm = next(mount for mount in inputs.mounts if mount.camera == "left_upper_arm")
     place = [bone.role for bone in bones].index(arm.role)
     trajectory = next(each for each in inputs.trajectories if each.camera == arm.camera)
@@ -316,7 +316,7 @@ def test_cameras_at_one_place_know_it_together_no_better_than_one(capture):
 
 
 def test_a_map_that_bends_two_cameras_of_a_bone_alike_counts_once(capture):
-    bones = camera_selection.graph_bones(
+    bones = camera_selection.kinematic_chain(
         capture.inputs.skeleton, {mount.role for mount in capture.inputs.mounts}
     )
     index = {bone.role: place for place, bone in enumerate(bones)}

@@ -75,8 +75,8 @@ def test_right_clocks_straight_walks_and_short_clips_are_not_doubted() -> None:
     trunk_turns, arm_swings = _straight_walk_of_turns_and_swings()
     found = best_time_shift(trunk_turns, arm_swings)
     assert found is not None
-    assert found[0] > 0.25
-    assert found[1] < 0.7
+    assert found.shift_s > 0.25
+    assert found.scatter_ratio < 0.7
     assert suspicious_clocks([trunk_turns, arm_swings]) == {}
     assert best_time_shift(trunk, palm.keep(palm.times_ns < 1_000_000_000)) is None
     assert best_time_shift(trunk, _late(palm, 9.0)) is None
