@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
 from bodycap_batch.merging.body_calibration.samples import Samples, take_samples
 from bodycap_batch.merging.cameras.track import make_track
@@ -14,7 +14,7 @@ def calibration_of(options: SynthOptions) -> tuple[Samples, Calibration, float]:
     """Sixty samples of a walk in one map, their calibration, not yet solved, and metres per map unit."""
     capture = posed(options)
     inputs, roles = capture.inputs, {mount.camera: mount.role for mount in capture.mounts}
-    bones = graph_bones(inputs.skeleton, set(roles.values()))
+    bones = kinematic_chain(inputs.skeleton, set(roles.values()))
     index = {bone.role: place for place, bone in enumerate(bones)}
     tracks = [make_track(inputs, each, index[roles[each.camera]]) for each in inputs.trajectories]
     metric = 1.0 / capture.gauges[GAUGE].scale

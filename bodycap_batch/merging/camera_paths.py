@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
-from bodycap_batch.merging.cameras.track import Track, in_gauge, untold
-from bodycap_batch.merging.graph.motion_graph import Solution
+from bodycap_batch.merging.cameras.track import CameraTrack, is_uncalibrated, transform_trajectory
+from bodycap_batch.merging.graph.motion_graph import MotionSolution
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.model.skeleton import Mount
@@ -16,7 +16,7 @@ from bodycap_batch.model.skeleton import Mount
 
 def in_world(trajectory: Trajectory, world_from_map: Similarity, dropped: IntArray) -> Trajectory:
     """The trajectory in the world, without the poses that proved to be gross errors."""
-    placed = in_gauge(trajectory, world_from_map, "world")
+    placed = transform_trajectory(trajectory, world_from_map, "world")
     poses, covariance = np.array(placed.gauge_from_cam), np.array(placed.covariance)
     status = list(trajectory.status)
     poses[dropped], covariance[dropped] = np.nan, np.nan
@@ -26,7 +26,11 @@ def in_world(trajectory: Trajectory, world_from_map: Similarity, dropped: IntArr
 
 
 def solved_with_body(
-    trajectory: Trajectory, track: Track, mount: Mount, solution: Solution, world_from_solved: Similarity
+    trajectory: Trajectory,
+    track: CameraTrack,
+    mount: Mount,
+    solution: MotionSolution,
+    world_from_solved: Similarity,
 ) -> Trajectory:
     """The trajectory with each localised frame where the body's joint solution has its camera.
 
@@ -47,7 +51,7 @@ def solved_with_body(
         solution: The solved motion.
         world_from_solved: From the solution's axes.
     """
-    if untold(mount):
+    if is_uncalibrated(mount):
         return trajectory
     solved = world_from_solved.apply_to_poses(solution.world_from_cam[track.camera])
     poses = np.array(trajectory.gauge_from_cam)

@@ -9,11 +9,11 @@ import numpy as np
 
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body.bones import graph_bones
-from bodycap_batch.merging.body.initial_poses import anchor_and_reach
+from bodycap_batch.merging.body.bones import kinematic_chain
+from bodycap_batch.merging.body.initial_poses import reach_constraint
 from bodycap_batch.merging.body_calibration.camera_roll import is_open
-from bodycap_batch.merging.cameras.stationary import unworn
-from bodycap_batch.merging.map_alignment.align import Together, use_together
+from bodycap_batch.merging.cameras.stationary import stationary_cameras
+from bodycap_batch.merging.map_alignment.align import UsableCameras, align_cameras
 from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import Mount
@@ -28,7 +28,7 @@ _SHORT = 0.25
 
 def gather(
     inputs: MergeInputs, step: Callable[[], None], options: MergeOptions
-) -> tuple[MergeInputs, Together]:
+) -> tuple[MergeInputs, UsableCameras]:
     """The inputs with priors that cameras at one place share, and the cameras that make the body.
 
     Args:
@@ -49,7 +49,7 @@ def bring_together(
     step: Callable[[], None],
     options: MergeOptions | None = None,
     useless: Mapping[str, str] | None = None,
-) -> Together:
+) -> UsableCameras:
     """Gather the cameras that can be used together, from the first main map that makes a body.
 
     Args:
@@ -64,7 +64,7 @@ def bring_together(
     useless = of_no_use(inputs) if useless is None else useless
     left_out: dict[str, str] = {}
     for main, further in choices(inputs, useless):
-        together = use_together(inputs, main, further, step, options)
+        together = align_cameras(inputs, main, further, step, options)
         if _make_a_body(inputs, together.trajectories):
             return replace(together, unused={**useless, **together.unused})
         left_out = left_out or dict(together.unused)
@@ -109,7 +109,7 @@ def _same(first: Mount, second: Mount) -> bool:
 def of_no_use(inputs: MergeInputs) -> dict[str, str]:
     """By camera that tells nothing of the body's motion, why."""
     seldom = seldom_localised(inputs)
-    still = unworn(inputs, [each for each in inputs.trajectories if each.camera not in seldom])
+    still = stationary_cameras(inputs, [each for each in inputs.trajectories if each.camera not in seldom])
     why = "it stands still while the others move: nobody wears it, or it is frozen"
     return {**seldom, **dict.fromkeys(still, why)}
 
@@ -153,10 +153,10 @@ def _make_a_body(inputs: MergeInputs, used: Sequence[Trajectory]) -> bool:
     roles = [inputs.mount_of(each.camera).role for each in used]
     if len(roles) < 2:
         return False
-    bones = graph_bones(inputs.skeleton, set(roles))
+    bones = kinematic_chain(inputs.skeleton, set(roles))
     place = {bone.role: index for index, bone in enumerate(bones)}
     return any(
-        anchor_and_reach(bones, place[one], place[other]) is not None
+        reach_constraint(bones, place[one], place[other]) is not None
         for number, one in enumerate(roles)
         for index, other in enumerate(roles)
         if number != index

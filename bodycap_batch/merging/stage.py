@@ -11,8 +11,8 @@ import numpy as np
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.merging.body.bones import Bone, graph_bones
-from bodycap_batch.merging.body.completion import complete_body, observed_joints
+from bodycap_batch.merging.body.bones import Bone, kinematic_chain
+from bodycap_batch.merging.body.completion import complete_skeleton, observed_joints
 from bodycap_batch.merging.body.initial_poses import provisional_scale
 from bodycap_batch.merging.body_calibration.calibrate_body import (
     Calibrated,
@@ -22,24 +22,29 @@ from bodycap_batch.merging.body_calibration.calibrate_body import (
 )
 from bodycap_batch.merging.camera_paths import in_world, solved_with_body
 from bodycap_batch.merging.camera_selection import gather
-from bodycap_batch.merging.cameras.track import Track, clean, loosened, make_track
-from bodycap_batch.merging.graph.foot_contact import accounts, during, find_contacts, standing_joints
-from bodycap_batch.merging.graph.joint_covariance import joints_in_axes, sigma_summary
-from bodycap_batch.merging.graph.joint_limits import soft_rules
-from bodycap_batch.merging.graph.motion_graph import MotionGraph, Solution, hinge_errors, joint_gaps
-from bodycap_batch.merging.graph.motion_noise import adapt_psd
-from bodycap_batch.merging.graph.windows import MAX_ITERATIONS, longest_stretch, solve_motion
+from bodycap_batch.merging.cameras.track import CameraTrack, inflate_sigmas, make_track, remove_outliers
+from bodycap_batch.merging.graph.foot_contact import (
+    contact_statistics,
+    contacts_in_window,
+    find_contacts,
+    standing_joints,
+)
+from bodycap_batch.merging.graph.joint_covariance import sigma_percentiles, skeleton_covariance
+from bodycap_batch.merging.graph.joint_limits import soft_limits
+from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution, hinge_deviations, joint_gaps
+from bodycap_batch.merging.graph.motion_noise import scale_motion_noise
+from bodycap_batch.merging.graph.windows import MAX_ITERATIONS, max_window_ticks, solve_windows
 from bodycap_batch.merging.reporting.report import build_report
 from bodycap_batch.merging.world.floor import (
-    WALKING_HEIGHT,
+    WALKING_HEIGHT_RATIO,
     Floor,
-    feet_floor,
-    find_floor,
-    heading,
+    floor_beside_path,
+    floor_from_feet,
+    floor_from_points,
+    initial_heading,
     place,
+    rotation_to_z_up,
     standing_height,
-    upright,
-    walked_floor,
 )
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs, MergeResult
@@ -69,28 +74,33 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
     step = _Progress(context)
     inputs, together = gather(inputs, step, options)
     used = together.trajectories
-    bones = graph_bones(inputs.skeleton, {inputs.mount_of(each.camera).role for each in used})
+    bones = kinematic_chain(inputs.skeleton, {inputs.mount_of(each.camera).role for each in used})
     fps = options.fps or inputs.clocks[used[0].camera].nominal_fps
     tick_times = timeline(inputs, used, fps)
     tracks, provisional, dropped = _clean_tracks(inputs, used, bones)
-    cleaned = Cleaned(tracks, provisional, together.sigmas, together.places)
+    cleaned = Cleaned(tracks, provisional, together.sigmas, together.main_from_gauge)
     calibrated = calibrate_body(inputs, options, bones, cleaned, step)
     step.what = "solving"
     metric = [track.scaled(calibrated.scale) for track in tracks]
-    rules = soft_rules(inputs.skeleton, bones, inputs.activity)
+    rules = soft_limits(inputs.skeleton, bones, inputs.activity)
     loose = tuple(replace(bone, off_hinge_m=calibrated.off_hinge_m.get(bone.role, 0.0)) for bone in bones)
-    psd_bones = adapt_psd(loose, metric)
+    psd_bones = scale_motion_noise(loose, metric)
     mounts = {mount.camera: mount.joint_from_cam for mount in calibrated.mounts}
     asked = metric if options.foot_contact else ()
     contacts = find_contacts(inputs.skeleton, bones, asked, mounts, calibrated.up.up, tick_times)
-    solution = solve_motion(
+    solution = solve_windows(
         lambda ticks, seen: MotionGraph(
-            inputs.skeleton, psd_bones, ticks, seen, mounts, (*rules, *during(contacts, tick_times, ticks))
+            inputs.skeleton,
+            psd_bones,
+            ticks,
+            seen,
+            mounts,
+            (*rules, *contacts_in_window(contacts, tick_times, ticks)),
         ),
         tick_times,
-        [loosened(track, mount) for track, mount in zip(metric, calibrated.mounts, strict=True)],
+        [inflate_sigmas(track, mount) for track, mount in zip(metric, calibrated.mounts, strict=True)],
         step,
-        chunk_ticks=longest_stretch(len(bones), tracks, tick_times),
+        window_ticks=max_window_ticks(len(bones), tracks, tick_times),
         spread=calibrated.spread,
     )
     world_from_solved, joints, solved, floor = _place(inputs, bones, solution, calibrated, fps)
@@ -99,7 +109,9 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
     if options.camera_paths == "joint":
         paths = _with_body(paths, metric, calibrated, solution, world_from_solved)
     observed = observed_joints(inputs.skeleton, bones, tracks, tick_times, options.max_gap_s)
-    covariance = joints_in_axes(world_from_solved.rotation, bones, solution.joint_covariance, len(solved))
+    covariance = skeleton_covariance(
+        world_from_solved.rotation, bones, solution.joint_covariance, len(solved)
+    )
     step.finish()
     return MergeResult(
         skeleton=inputs.skeleton,
@@ -108,7 +120,7 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         world_from_joint=joints,
         solved=solved,
         observed=observed,
-        world_from_map={gauge: place.after(here) for gauge, here in together.places.items()},
+        world_from_map={gauge: place.after(here) for gauge, here in together.main_from_gauge.items()},
         trajectories=paths,
         mounts=calibrated.mounts,
         unused_cameras=together.unused,
@@ -124,10 +136,10 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
                 "floor": floor,
                 "unused": together.unused,
                 "joined": together.report(),
-                "uncertainty": sigma_summary(inputs.skeleton.roles, covariance, observed),
+                "uncertainty": sigma_percentiles(inputs.skeleton.roles, covariance, observed),
                 "joint_gap_m": joint_gaps(bones, solution.world_from_bone),
-                "hinge_m": hinge_errors(inputs.skeleton, bones, solution.world_from_bone),
-                "contacts": accounts(contacts, solution.world_from_bone, fps),
+                "hinge_m": hinge_deviations(inputs.skeleton, bones, solution.world_from_bone),
+                "contacts": contact_statistics(contacts, solution.world_from_bone, fps),
                 "rules": {rule.name: rule.violation_m(solution.world_from_bone) for rule in rules},
             },
         ),
@@ -146,7 +158,7 @@ def timeline(inputs: MergeInputs, used: Sequence[Trajectory], fps: float) -> Int
 
 def _clean_tracks(
     inputs: MergeInputs, used: Sequence[Trajectory], bones: Sequence[Bone]
-) -> tuple[list[Track], float, dict[str, IntArray]]:
+) -> tuple[list[CameraTrack], float, dict[str, IntArray]]:
     """Tracks without gross errors, a provisional scale, and the frames that were dropped."""
     index = {bone.role: position for position, bone in enumerate(bones)}
     mounts = {mount.camera: mount for mount in inputs.mounts}
@@ -154,7 +166,7 @@ def _clean_tracks(
     provisional = provisional_scale(bones, tracks, mounts)
     cleaned, dropped = [], {}
     for track in tracks:
-        kept, _ = clean(track, provisional, inputs.clocks[track.camera].nominal_fps)
+        kept = remove_outliers(track, provisional, inputs.clocks[track.camera].nominal_fps)
         dropped[track.camera] = np.setdiff1d(track.frames, kept.frames)
         cleaned.append(kept)
     return cleaned, provisional_scale(bones, cleaned, mounts), dropped
@@ -165,34 +177,34 @@ def _turned(rotation: FloatArray, poses: FloatArray) -> FloatArray:
 
 
 def _place(
-    inputs: MergeInputs, bones: Sequence[Bone], solution: Solution, calibrated: Calibrated, fps: float
+    inputs: MergeInputs, bones: Sequence[Bone], solution: MotionSolution, calibrated: Calibrated, fps: float
 ) -> tuple[Similarity, FloatArray, Any, Floor]:
     """Find the world and put the whole body into it."""
-    rotation = upright(calibrated.up.up)
+    rotation = rotation_to_z_up(calibrated.up.up)
     turned = _turned(rotation, solution.world_from_bone)
-    joints, solved = complete_body(inputs.skeleton, bones, turned)
+    joints, solved = complete_skeleton(inputs.skeleton, bones, turned)
     hips = joints[:, 0, :3, 3]
     standing = standing_height(inputs.skeleton, 0)
     # The first mount is the trunk camera's: in a long capture the first stretch may lack it.
     points = points_around(inputs, calibrated.mounts[0].camera)
     points_m, path_m = calibrated.scale * points, solution.world_from_bone[:, 0, :3, 3]
-    expected = float(np.median(hips[:, 2])) - WALKING_HEIGHT * standing
-    floor = walked_floor(points_m, path_m, calibrated.up, expected, standing) or find_floor(
+    expected = float(np.median(hips[:, 2])) - WALKING_HEIGHT_RATIO * standing
+    floor = floor_beside_path(points_m, path_m, calibrated.up, expected, standing) or floor_from_points(
         points_m @ rotation[2], calibrated.up, expected, standing
     )
     if floor.source != "map":
-        floor = feet_floor(inputs.skeleton, joints, solved) or floor
+        floor = floor_from_feet(inputs.skeleton, joints, solved) or floor
     forward = -joints[:, 0, :3, 1]
-    placed = place(rotation, hips[0], floor.height_m, heading(forward, hips, fps))
+    placed = place(rotation, hips[0], floor.height_m, initial_heading(forward, hips, fps))
     to_world = Similarity(1.0, placed.rotation @ rotation.T, placed.translation)
     return placed, to_world.apply_to_poses(joints), solved, floor
 
 
 def _with_body(
     paths: Sequence[Trajectory],
-    tracks: Sequence[Track],
+    tracks: Sequence[CameraTrack],
     calibrated: Calibrated,
-    solution: Solution,
+    solution: MotionSolution,
     world_from_solved: Similarity,
 ) -> tuple[Trajectory, ...]:
     """All paths as solved together with the body."""

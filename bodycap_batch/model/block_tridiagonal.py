@@ -30,7 +30,7 @@ def _solve(lower: FloatArray, right: FloatArray, *, transposed: bool = False) ->
     return np.asarray(found)
 
 
-class Chain:
+class BlockTridiagonal:
     """Normal equations whose unknowns are linked within a block and with the next block only.
 
     Of a long chain factors are held for a stretch of blocks at a time, and made again when they are needed:
@@ -80,7 +80,7 @@ class Chain:
             out.append(_solve(lower, known, transposed=True))
         return out[::-1]
 
-    def covariances(self, read: Callable[[int, FloatArray], None]) -> None:
+    def marginals(self, read: Callable[[int, FloatArray], None]) -> None:
         """Hand out each block's marginal covariance (n,n), the last block's first."""
         later: FloatArray | None = None
         block = len(self._bounds) - 1

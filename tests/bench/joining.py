@@ -45,17 +45,17 @@ PLACED_M = 0.05
 def run_case(split: str, seed: int, seconds: float) -> dict[str, Any]:
     """Draw one walk, place its maps, and compare with the truth."""
     from bodycap_batch.merging.camera_selection import choices  # gtsam takes a second to import
-    from bodycap_batch.merging.map_alignment.align import use_together
+    from bodycap_batch.merging.map_alignment.align import align_cameras
 
     cameras = ARMS if len(SPLITS[split]) == len(ARMS) else PALMS
     options = SynthOptions(seconds=seconds, cameras=cameras, seed=seed, poses_only=True)
     capture = posed(options, SPLITS[split])
     started = time.process_time()
     main, further = choices(capture.inputs)[0]
-    together = use_together(capture.inputs, main, further, lambda: None)
+    together = align_cameras(capture.inputs, main, further, lambda: None)
     return {
         "seconds": time.process_time() - started,
-        "off_m": _off(capture, together.places, main[0].gauge),
+        "off_m": _off(capture, together.main_from_gauge, main[0].gauge),
         "sigma_m": {camera: shift for camera, (_, shift) in together.sigmas.items()},
         "refused": dict(together.unused),
     }

@@ -13,10 +13,10 @@ from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import Cancelled, EstimationError
 from bodycap_batch.merging import merge_trajectories
-from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.cameras.track import make_track
-from bodycap_batch.merging.graph.motion_graph import MotionGraph, Solution
-from bodycap_batch.merging.graph.windows import solve_motion, stretches
+from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution
+from bodycap_batch.merging.graph.windows import solve_windows, split_timeline
 from bodycap_batch.model.geometry import Similarity, align_points
 from bodycap_batch.model.merge_data import CameraClock, MergeResult
 from bodycap_batch.model.scene import FrameStatus
@@ -328,7 +328,7 @@ def test_two_cameras_a_hair_apart_share_a_state(walk, context):
 
 def test_stretches_of_a_long_capture_join_without_a_seam(walk):
     recorded = _recorded(walk, **{name: {"seconds": 7.0} for name in ROLES})
-    bones = graph_bones(walk.skeleton, set(ROLES.values()))
+    bones = kinematic_chain(walk.skeleton, set(ROLES.values()))
     index = {bone.role: position for position, bone in enumerate(bones)}
     inputs = make_inputs(walk, recorded)
     tracks = []
@@ -340,13 +340,13 @@ def test_stretches_of_a_long_capture_join_without_a_seam(walk):
     ticks = tracks[0].times_ns
     mounts = {name: mount.joint_from_cam for name, mount in walk.mounts.items()}
 
-    def solve(chunk_ticks: int) -> Solution:
-        return solve_motion(
+    def solve(window_ticks: int) -> MotionSolution:
+        return solve_windows(
             lambda times, seen: MotionGraph(walk.skeleton, bones, times, seen, mounts),
             ticks,
             tracks,
             lambda: None,
-            chunk_ticks=chunk_ticks,
+            window_ticks=window_ticks,
         )
 
     whole, pieces = solve(1000), solve(70)
@@ -354,5 +354,5 @@ def test_stretches_of_a_long_capture_join_without_a_seam(walk):
     assert_allclose(pieces.world_from_bone[..., :3, 3], whole.world_from_bone[..., :3, 3], atol=1e-3)
     for camera, residual in whole.residual_m.items():
         assert_allclose(pieces.residual_m[camera], residual, atol=1e-3)
-    assert stretches(ticks, tracks, 70) == [(0, 70), (70, 140), (140, 210)]
-    assert stretches(ticks, [tracks[0].keep(np.arange(210) < 20)], 70) == [(0, 210)]
+    assert split_timeline(ticks, tracks, 70) == [(0, 70), (70, 140), (140, 210)]
+    assert split_timeline(ticks, [tracks[0].keep(np.arange(210) < 20)], 70) == [(0, 210)]

@@ -47,15 +47,15 @@ _PRIORS = {
     "Foot": _JointPrior(0.0, (10.0, 10.0, 20.0), 18.0, 24.0),
     "ToeBase": _JointPrior(0.0, (5.0, 5.0, 20.0), 18.0, 24.0),
 }
-_HINGED = {"ForeArm": "Hand", "Leg": "Foot"}
-LIMB_LINKS: dict[str, tuple[str | None, str]] = {
+_BONE_AFTER_HINGE = {"ForeArm": "Hand", "Leg": "Foot"}
+LIMB_CHAINS: dict[str, tuple[str | None, str]] = {
     "Arm": ("ForeArm", "Hand"),
     "ForeArm": (None, "Hand"),
     "UpLeg": ("Leg", "Foot"),
     "Leg": (None, "Foot"),
 }
 """Limb bones: the bone that follows (None: the next is the end) and the limb's end."""
-_HANGING = {"Arm": 10.0, "UpLeg": 0.0}
+_REST_ABDUCTION_DEG = {"Arm": 10.0, "UpLeg": 0.0}
 """Limbs that hang at ease, with their abduction in degrees."""
 
 
@@ -105,7 +105,7 @@ class Bone:
     off_hinge_m: float = 0.0
 
 
-def graph_bones(skeleton: SkeletonModel, mounted_roles: Iterable[str]) -> tuple[Bone, ...]:
+def kinematic_chain(skeleton: SkeletonModel, mounted_roles: Iterable[str]) -> tuple[Bone, ...]:
     """Pick the bones between the mounted ones; a parent stands before its children.
 
     Args:
@@ -113,7 +113,7 @@ def graph_bones(skeleton: SkeletonModel, mounted_roles: Iterable[str]) -> tuple[
         mounted_roles: Roles that carry a camera; each is a joint of the skeleton.
     """
     joints = [skeleton.roles.index(role) for role in set(mounted_roles)]
-    chains = [_ancestors(skeleton, joint) for joint in joints]
+    chains = [joints_to_root(skeleton, joint) for joint in joints]
     top = max(set.intersection(*(set(chain) for chain in chains)))
     between = {joint for chain in chains for joint in chain if joint >= top and skeleton.roles[joint]}
     kept = sorted(between | {top})
@@ -122,7 +122,7 @@ def graph_bones(skeleton: SkeletonModel, mounted_roles: Iterable[str]) -> tuple[
     return tuple(_make_bone(skeleton, joint, order, rest) for joint in kept)
 
 
-def _ancestors(skeleton: SkeletonModel, joint: int) -> list[int]:
+def joints_to_root(skeleton: SkeletonModel, joint: int) -> list[int]:
     chain = [joint]
     while skeleton.parents[chain[-1]] >= 0:
         chain.append(int(skeleton.parents[chain[-1]]))
@@ -130,42 +130,42 @@ def _ancestors(skeleton: SkeletonModel, joint: int) -> list[int]:
 
 
 def _make_bone(skeleton: SkeletonModel, joint: int, order: dict[int, int], rest: FloatArray) -> Bone:
-    above = next((j for j in _ancestors(skeleton, joint)[1:] if j in order), None)
+    above = next((j for j in joints_to_root(skeleton, joint)[1:] if j in order), None)
     role = skeleton.roles[joint]
     prior = _PRIORS[split_side(role)[1]] if role else _PRIORS["Spine"]
-    axes = proper_axes(skeleton, role)
+    axes = anatomical_axes(skeleton, role)
     spread = np.diag(np.radians(prior.sigma_deg) ** 2)
     return Bone(
         joint=joint,
         role=role,
         parent=-1 if above is None else order[above],
         offset_m=rest[joint] - (rest[above] if above is not None else 0.0),
-        mean_rotation=_relaxed(skeleton, role, prior),
+        mean_rotation=_rest_rotation(skeleton, role, prior),
         rotation_covariance=axes @ spread @ axes.T,
         psd=np.repeat([prior.psd_rotation, prior.psd_translation], 3),
     )
 
 
-def proper_axes(skeleton: SkeletonModel, role: str) -> FloatArray:
+def anatomical_axes(skeleton: SkeletonModel, role: str) -> FloatArray:
     """Along, forward and flexion axis (along × forward) as columns: a rotation on either side."""
     axes = segment_axes(skeleton, role)
     return np.column_stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])])
 
 
-def _relaxed(skeleton: SkeletonModel, role: str, prior: _JointPrior) -> FloatArray:
+def _rest_rotation(skeleton: SkeletonModel, role: str, prior: _JointPrior) -> FloatArray:
     """parent_from_bone of a person standing at ease."""
     side, part = split_side(role)
     flexion = so3_exp([0.0, 0.0, np.radians(prior.relaxed_flexion_deg)])
-    axes = proper_axes(skeleton, role)
-    if part in _HANGING:
-        tilt = np.radians(_HANGING[part])
+    axes = anatomical_axes(skeleton, role)
+    if part in _REST_ABDUCTION_DEG:
+        tilt = np.radians(_REST_ABDUCTION_DEG[part])
         outward = 1.0 if side == "Left" else -1.0
         along = np.array([outward * np.sin(tilt), 0.0, -np.cos(tilt)])
         forward = np.array([0.0, -1.0, 0.0])
         hanging = np.column_stack([along, forward, np.cross(along, forward)])
         return np.asarray(hanging @ flexion @ axes.T)
-    if part in _HINGED:
-        upper = proper_axes(skeleton, side + {"ForeArm": "Arm", "Leg": "UpLeg"}[part])
+    if part in _BONE_AFTER_HINGE:
+        upper = anatomical_axes(skeleton, side + {"ForeArm": "Arm", "Leg": "UpLeg"}[part])
         return np.asarray(upper @ flexion @ axes.T)
     return np.eye(3)
 
@@ -176,10 +176,10 @@ def hinges(skeleton: SkeletonModel, bones: tuple[Bone, ...]) -> tuple[Hinge, ...
     out = []
     for bone in bones:
         side, part = split_side(bone.role)
-        following = index.get(side + _HINGED[part]) if part in _HINGED else None
+        following = index.get(side + _BONE_AFTER_HINGE[part]) if part in _BONE_AFTER_HINGE else None
         if following is None or bone.parent < 0:
             continue
-        axis = proper_axes(skeleton, bones[bone.parent].role)[:, 2]
+        axis = anatomical_axes(skeleton, bones[bone.parent].role)[:, 2]
         length = float(np.linalg.norm(bones[following].offset_m))
         out.append(
             Hinge(

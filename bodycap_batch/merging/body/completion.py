@@ -8,12 +8,12 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.merging.body.bones import Bone
-from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.model.geometry import interpolate_pose, make_transform
 from bodycap_batch.model.skeleton import SkeletonModel
 
 
-def complete_body(
+def complete_skeleton(
     skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
     """Pose all joints.
@@ -36,7 +36,7 @@ def complete_body(
         out[:, bone.joint] = world_from_bone[:, position]
         solved[bone.joint] = True
     placed = solved.copy()
-    _place_above(skeleton, bones[0], out, placed)
+    _straighten_trunk_above(skeleton, bones[0], out, placed)
     for joint in range(count):
         if not placed[joint]:
             parent = out[:, skeleton.parents[joint]]
@@ -44,13 +44,13 @@ def complete_body(
     return out, solved
 
 
-def _place_above(skeleton: SkeletonModel, first: Bone, out: FloatArray, placed: BoolArray) -> None:
+def _straighten_trunk_above(skeleton: SkeletonModel, first: Bone, out: FloatArray, placed: BoolArray) -> None:
     chain = [first.joint]
     while skeleton.parents[chain[-1]] >= 0:
         chain.append(int(skeleton.parents[chain[-1]]))
     trunk = out[:, first.joint].copy()
     trunk[:, :3, :3] = trunk[:, :3, :3] @ first.mean_rotation.T
-    pelvis = make_transform(_upright_facing(trunk[:, :3, :3]), np.zeros(3))
+    pelvis = make_transform(_yaw_only(trunk[:, :3, :3]), np.zeros(3))
     # Joints that play no role (helpers, mostly without length) stay at zero: they turn with their parent.
     last = len(chain) - 1
     bending = [step for step in range(1, len(chain)) if skeleton.roles[chain[step]] or step == last]
@@ -63,7 +63,7 @@ def _place_above(skeleton: SkeletonModel, first: Bone, out: FloatArray, placed: 
         placed[joint] = True
 
 
-def _upright_facing(rotation: FloatArray) -> FloatArray:
+def _yaw_only(rotation: FloatArray) -> FloatArray:
     """Rotations (T,3,3) about Z alone that face where the given ones face (zero pose faces −Y)."""
     forward, left = -rotation[:, :, 1], rotation[:, :, 0]
     # A body bent over far has its forward pointing down: then its left tells more.
@@ -81,7 +81,7 @@ def _upright_facing(rotation: FloatArray) -> FloatArray:
 def observed_joints(
     skeleton: SkeletonModel,
     bones: Sequence[Bone],
-    tracks: Sequence[Track],
+    tracks: Sequence[CameraTrack],
     tick_times_ns: IntArray,
     max_gap_s: float,
 ) -> BoolArray:
@@ -92,9 +92,9 @@ def observed_joints(
     """
     seen: dict[int, BoolArray] = {}
     for track in tracks:
-        _, valid = track.at(tick_times_ns, reach_ns=round(max_gap_s * 1e9))
+        _, valid = track.poses_at(tick_times_ns, max_gap_ns=round(max_gap_s * 1e9))
         half_step = np.median(np.diff(tick_times_ns)) / 2 if len(tick_times_ns) > 1 else 0
-        near = np.abs(_nearest(track.times_ns, tick_times_ns) - tick_times_ns) <= half_step
+        near = np.abs(_nearest_times(track.times_ns, tick_times_ns) - tick_times_ns) <= half_step
         seen[track.bone] = seen.get(track.bone, np.zeros(len(tick_times_ns), dtype=bool)) | valid | near
     below = {bone: mask.copy() for bone, mask in seen.items()}
     none = np.zeros(len(tick_times_ns), dtype=bool)
@@ -102,13 +102,13 @@ def observed_joints(
         parent = bones[index].parent
         below[parent] = below.get(parent, none) | below.get(index, none)
     out = np.zeros((len(tick_times_ns), len(skeleton.joints)), dtype=bool)
-    above: Mapping[int, BoolArray] = _seen_above(bones, seen, below, none)
+    above: Mapping[int, BoolArray] = _observed_above(bones, seen, below, none)
     for index, bone in enumerate(bones):
         out[:, bone.joint] = seen.get(index, none) | (above[index] & below.get(index, none))
     return out
 
 
-def _seen_above(
+def _observed_above(
     bones: Sequence[Bone],
     seen: Mapping[int, BoolArray],
     below: Mapping[int, BoolArray],
@@ -127,7 +127,7 @@ def _seen_above(
     return above
 
 
-def _nearest(sorted_ns: IntArray, times_ns: IntArray) -> IntArray:
+def _nearest_times(sorted_ns: IntArray, times_ns: IntArray) -> IntArray:
     after = np.clip(np.searchsorted(sorted_ns, times_ns), 0, len(sorted_ns) - 1)
     before = np.maximum(after - 1, 0)
     closer = np.abs(sorted_ns[before] - times_ns) <= np.abs(sorted_ns[after] - times_ns)

@@ -8,20 +8,20 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body.bones import LIMB_LINKS, Bone, proper_axes
-from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.merging.body.bones import LIMB_CHAINS, Bone, anatomical_axes
+from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.model.geometry import interpolate_pose, invert, make_transform
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import split_side
 
 _REACH_QUANTILE = 0.9
-_STRETCHED = 0.96
+_MAX_EXTENSION = 0.96
 """A limb's extension over its length when nearly straight: walking elbows keep 15 to 30° of flexion."""
 
 
 def provisional_scale(
     bones: Sequence[Bone],
-    tracks: Sequence[Track],
+    tracks: Sequence[CameraTrack],
     mounts: Mapping[str, Mount],
     guessed: Collection[str] = (),
 ) -> float:
@@ -40,8 +40,8 @@ def provisional_scale(
         EstimationError: No two cameras were localised at the same time, or they never moved apart.
     """
     links = [
-        linked(bones, track, other, mounts)
-        for track, other in related(bones, tracks)
+        distance_constraint(bones, track, other, mounts)
+        for track, other in kinematic_neighbours(bones, tracks)
         if track.camera not in guessed
     ]
     pairs = [link for link in links if link is not None]
@@ -69,11 +69,13 @@ def provisional_scale(
 def _reach_cost(scale: float, apart: FloatArray, fixed: FloatArray, reach: float) -> float:
     distance = np.linalg.norm(scale * apart + fixed, axis=1)
     if reach > 0.0:
-        return abs(float(np.quantile(distance, _REACH_QUANTILE)) - _STRETCHED * reach)
+        return abs(float(np.quantile(distance, _REACH_QUANTILE)) - _MAX_EXTENSION * reach)
     return float(np.median(distance))
 
 
-def related(bones: Sequence[Bone], tracks: Sequence[Track]) -> list[tuple[Track, Track]]:
+def kinematic_neighbours(
+    bones: Sequence[Bone], tracks: Sequence[CameraTrack]
+) -> list[tuple[CameraTrack, CameraTrack]]:
     """Each camera with its nearest measured relative up the tree, else with the one nearest to the root."""
     out = []
     by_bone = {track.bone: track for track in reversed(tracks)}
@@ -88,18 +90,18 @@ def related(bones: Sequence[Bone], tracks: Sequence[Track]) -> list[tuple[Track,
     return out
 
 
-def linked(
-    bones: Sequence[Bone], track: Track, other: Track, mounts: Mapping[str, Mount]
+def distance_constraint(
+    bones: Sequence[Bone], track: CameraTrack, other: CameraTrack, mounts: Mapping[str, Mount]
 ) -> tuple[FloatArray, FloatArray, float] | None:
     """Centre differences (N,3) in map units, mount parts (N,3) in metres, and reach of two cameras.
 
     None where the body does not know their distance, or they were hardly localised at the same time.
     """
-    geometry = anchor_and_reach(bones, track.bone, other.bone)
+    geometry = reach_constraint(bones, track.bone, other.bone)
     if geometry is None:
         return None
     anchor, reach = geometry
-    poses, valid = other.at(track.times_ns, reach_ns=200_000_000)
+    poses, valid = other.poses_at(track.times_ns, max_gap_ns=200_000_000)
     if valid.sum() < 10:
         return None
     mine, theirs = track.map_from_cam[valid], poses[valid]
@@ -110,30 +112,30 @@ def linked(
     return mine[:, :3, 3] - theirs[:, :3, 3], tip - base, reach
 
 
-def anchor_and_reach(bones: Sequence[Bone], bone: int, other: int) -> tuple[FloatArray, float] | None:
+def reach_constraint(bones: Sequence[Bone], bone: int, other: int) -> tuple[FloatArray, float] | None:
     """Point in the other bone's frame from which `bone`'s joint is at most `reach` away.
 
     None where a second limb lies between them: then the distance says nothing about either's length.
     """
-    up, down = _ancestry(bones, other), _ancestry(bones, bone)
+    up, down = _bones_to_root(bones, other), _bones_to_root(bones, bone)
     shared = next(index for index in down if index in up)
     above = up[: up.index(shared)]
     if above and split_side(bones[other].role)[1] == "Arm":
         # An upper arm swings about every axis: where the trunk is from there it does not tell.
         return None
-    if any(split_side(bones[bones[index].parent].role)[1] in LIMB_LINKS for index in above):
+    if any(split_side(bones[bones[index].parent].role)[1] in LIMB_CHAINS for index in above):
         return None
     anchor, reach = -np.sum([bones[index].offset_m for index in above], axis=0) + np.zeros(3), 0.0
     for index in down[: down.index(shared)]:
         parent = bones[index].parent
-        if split_side(bones[parent].role)[1] in LIMB_LINKS and parent != other:
+        if split_side(bones[parent].role)[1] in LIMB_CHAINS and parent != other:
             reach += float(np.linalg.norm(bones[index].offset_m))
         else:
             anchor += bones[index].offset_m
     return anchor, reach
 
 
-def _ancestry(bones: Sequence[Bone], bone: int) -> list[int]:
+def _bones_to_root(bones: Sequence[Bone], bone: int) -> list[int]:
     chain = [bone]
     while bones[chain[-1]].parent >= 0:
         chain.append(bones[chain[-1]].parent)
@@ -166,18 +168,18 @@ def pose_bones(
     """
     ticks = len(next(iter(measured.values())))
     out = np.tile(np.eye(4), (ticks, len(bones), 1, 1))
-    out[:, 0] = measured[0] if 0 in measured else _first_from_below(bones, measured)
+    out[:, 0] = measured[0] if 0 in measured else _first_bone_from_below(bones, measured)
     index = {bone.role: position for position, bone in enumerate(bones)}
     for position, bone in enumerate(bones):
         if position in measured:
             out[:, position] = measured[position]
         elif position > 0:
             out[:, position] = out[:, bone.parent] @ make_transform(bone.mean_rotation, bone.offset_m)
-            _reach_for_next(skeleton, bones, index, out, (position, measured))
+            _aim_limb(skeleton, bones, index, out, (position, measured))
     return out
 
 
-def _first_from_below(bones: Sequence[Bone], measured: Mapping[int, FloatArray]) -> FloatArray:
+def _first_bone_from_below(bones: Sequence[Bone], measured: Mapping[int, FloatArray]) -> FloatArray:
     """Pose of the first bone from the nearest measured one, every joint between at ease."""
     nearest = min(measured)
     pose, current = measured[nearest], nearest
@@ -188,7 +190,7 @@ def _first_from_below(bones: Sequence[Bone], measured: Mapping[int, FloatArray])
     return np.asarray(pose)
 
 
-def _reach_for_next(
+def _aim_limb(
     skeleton: SkeletonModel,
     bones: Sequence[Bone],
     index: Mapping[str, int],
@@ -198,12 +200,12 @@ def _reach_for_next(
     """Turn an unmeasured limb bone towards the measured end of its limb."""
     position, measured = target
     side, part = split_side(bones[position].role)
-    links = LIMB_LINKS.get(part)
+    links = LIMB_CHAINS.get(part)
     if links is None:
         return
     lower, end = (index.get(side + name) if name else None for name in links)
     joint = out[:, position, :3, 3]
-    axes = proper_axes(skeleton, bones[position].role)
+    axes = anatomical_axes(skeleton, bones[position].role)
     flexion = out[:, position, :3, :3] @ axes[:, 2]
     aim = next((bone for bone in (lower, end if lower is None else None) if bone in measured), None)
     if aim is not None:
@@ -213,16 +215,18 @@ def _reach_for_next(
         trunk = out[:, bones[position].parent, :3, :3]
         to_goal = measured[end][:, :3, 3] - joint
         if part == "Arm":
-            along, flexion = _two_bones(to_goal, lengths, trunk @ [0.5 if side == "Left" else -0.5, 1.0, 0.0])
+            along, flexion = _two_bone_ik(
+                to_goal, lengths, trunk @ [0.5 if side == "Left" else -0.5, 1.0, 0.0]
+            )
         else:
-            along, extension = _two_bones(to_goal, lengths, trunk @ [0.0, -1.0, 0.0])
+            along, extension = _two_bone_ik(to_goal, lengths, trunk @ [0.0, -1.0, 0.0])
             flexion = -extension
     else:
         return
-    out[:, position, :3, :3] = _frame(along, flexion) @ axes.T
+    out[:, position, :3, :3] = _rotation_from_axes(along, flexion) @ axes.T
 
 
-def _two_bones(
+def _two_bone_ik(
     to_goal: FloatArray, lengths: Sequence[float], pole: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Direction (N,3) of the upper bone that reaches a goal with the middle joint at the pole's side.
@@ -241,7 +245,7 @@ def _two_bones(
     return along, np.cross(side, towards)
 
 
-def _frame(along: FloatArray, third: FloatArray) -> FloatArray:
+def _rotation_from_axes(along: FloatArray, third: FloatArray) -> FloatArray:
     """Rotations (N,3,3) with columns along, third × along, third (made orthogonal to along)."""
     along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
     third = third - (third * along).sum(axis=1, keepdims=True) * along

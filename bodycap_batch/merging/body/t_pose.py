@@ -8,28 +8,30 @@ from dataclasses import replace
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.merging.body.bones import Bone, proper_axes
-from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.merging.body.bones import Bone, anatomical_axes
+from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.model.skeleton_presets import split_side
 
-_T_ANGLE_RAD = float(np.radians(140.0))
-_T_SPAN_SHARE = 0.93
-_T_SPEED = 0.15
-_T_SHORTEST_S = 0.5
+_MIN_ARM_ANGLE_RAD = float(np.radians(140.0))
+_MIN_SPAN_RATIO = 0.93
+_MAX_SPEED = 0.15
+_MIN_DURATION_S = 0.5
 """A T-pose, without axes or scale: the two hands seen from the trunk's camera are this far apart in angle,
 about as far from each other as they ever come, and hardly move (spans per second) for at least so long."""
 
 # What people who stand in a T-pose are off: the arms' twist most, since palms may face down or forward.
-_T_SIGMA_DEG = {
+_SIGMA_DEG = {
     "Shoulder": (4.0, 4.0, 4.0), "Arm": (15.0, 6.0, 6.0), "ForeArm": (20.0, 6.0, 6.0),
     "Hand": (8.0, 8.0, 8.0), "Neck": (6.0, 6.0, 6.0), "Head": (8.0, 8.0, 8.0), "UpLeg": (8.0, 5.0, 5.0),
     "Leg": (6.0, 5.0, 6.0), "Foot": (8.0, 8.0, 8.0), "ToeBase": (5.0, 5.0, 8.0),
 }  # fmt: skip
-_T_TRUNK_DEG = (4.0, 4.0, 4.0)
+_TRUNK_SIGMA_DEG = (4.0, 4.0, 4.0)
 
 
-def find_t_pose(bones: Sequence[Bone], tracks: Sequence[Track], span_map: float) -> tuple[int, int] | None:
+def find_t_pose(
+    bones: Sequence[Bone], tracks: Sequence[CameraTrack], span_map: float
+) -> tuple[int, int] | None:
     """Find the longest T-pose on the common clock (ns), or None.
 
     Args:
@@ -42,7 +44,7 @@ def find_t_pose(bones: Sequence[Bone], tracks: Sequence[Track], span_map: float)
     trunk = tracks[0]
     if ends[0] is None or ends[1] is None or split_side(bones[trunk.bone].role)[0] or len(trunk.times_ns) < 3:
         return None
-    looks = [end.at(trunk.times_ns, reach_ns=200_000_000) for end in ends if end is not None]
+    looks = [end.poses_at(trunk.times_ns, max_gap_ns=200_000_000) for end in ends if end is not None]
     arms = [poses[:, :3, 3] - trunk.map_from_cam[:, :3, 3] for poses, _ in looks]
     valid = looks[0][1] & looks[1][1]
     apart = np.linalg.norm(arms[0] - arms[1], axis=1)
@@ -51,10 +53,12 @@ def find_t_pose(bones: Sequence[Bone], tracks: Sequence[Track], span_map: float)
     widest = float(np.percentile(apart[valid], 99.0))
     lengths = np.linalg.norm(arms[0], axis=1) * np.linalg.norm(arms[1], axis=1)
     angle = np.arccos(np.clip((arms[0] * arms[1]).sum(axis=1) / np.maximum(lengths, 1e-12), -1.0, 1.0))
-    good = valid & (angle > _T_ANGLE_RAD) & (apart > _T_SPAN_SHARE * widest) & (apart > 0.75 * span_map)
+    good = (
+        valid & (angle > _MIN_ARM_ANGLE_RAD) & (apart > _MIN_SPAN_RATIO * widest) & (apart > 0.75 * span_map)
+    )
     for points in (trunk.map_from_cam[:, :3, 3], arms[0], arms[1]):
-        good &= _speed(points, trunk.times_ns) < _T_SPEED * widest
-    return _longest(good, trunk.times_ns)
+        good &= _speed(points, trunk.times_ns) < _MAX_SPEED * widest
+    return _longest_run(good, trunk.times_ns)
 
 
 def _speed(points: FloatArray, times_ns: IntArray) -> FloatArray:
@@ -66,13 +70,13 @@ def _speed(points: FloatArray, times_ns: IntArray) -> FloatArray:
     return np.asarray(np.linalg.norm(points[high] - points[low], axis=1) / seconds)
 
 
-def _longest(mask: BoolArray, times_ns: IntArray) -> tuple[int, int] | None:
+def _longest_run(mask: BoolArray, times_ns: IntArray) -> tuple[int, int] | None:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     stretches = [
         (int(times_ns[a]), int(times_ns[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)
     ]
     best = max(stretches, key=lambda span: span[1] - span[0], default=(0, 0))
-    return best if best[1] - best[0] >= _T_SHORTEST_S * 1e9 else None
+    return best if best[1] - best[0] >= _MIN_DURATION_S * 1e9 else None
 
 
 def arm_span(bones: Sequence[Bone], skeleton: SkeletonModel) -> float:
@@ -87,35 +91,35 @@ def arm_span(bones: Sequence[Bone], skeleton: SkeletonModel) -> float:
     return total + (0.2 if None not in shoulders else 0.0)
 
 
-def t_posed(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[Bone, ...]:
+def with_t_pose_prior(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[Bone, ...]:
     """The bones with the T-pose as their joints' prior."""
     out = []
     for bone in bones:
         part = split_side(bone.role)[1]
-        axes = proper_axes(skeleton, bone.role)
-        spread = np.diag(np.radians(_T_SIGMA_DEG.get(part, _T_TRUNK_DEG)) ** 2)
+        axes = anatomical_axes(skeleton, bone.role)
+        spread = np.diag(np.radians(_SIGMA_DEG.get(part, _TRUNK_SIGMA_DEG)) ** 2)
         out.append(
             replace(
                 bone,
-                mean_rotation=_in_t_pose(skeleton, bone, bones),
+                mean_rotation=_t_pose_rotation(skeleton, bone, bones),
                 rotation_covariance=axes @ spread @ axes.T,
             )
         )
     return tuple(out)
 
 
-def _in_t_pose(skeleton: SkeletonModel, bone: Bone, bones: Sequence[Bone]) -> FloatArray:
+def _t_pose_rotation(skeleton: SkeletonModel, bone: Bone, bones: Sequence[Bone]) -> FloatArray:
     """parent_from_bone in a T-pose, whatever the rig's zero pose is."""
     if bone.parent < 0:
         return np.eye(3)
-    above, own = (_t_frame(skeleton, each.role) for each in (bones[bone.parent], bone))
+    above, own = (_t_pose_axes(skeleton, each.role) for each in (bones[bone.parent], bone))
     return np.asarray(above.T @ own)
 
 
-def _t_frame(skeleton: SkeletonModel, role: str) -> FloatArray:
+def _t_pose_axes(skeleton: SkeletonModel, role: str) -> FloatArray:
     """world_from_bone (3,3) of someone in a T-pose who faces −Y."""
     side, part = split_side(role)
-    axes = proper_axes(skeleton, role)
+    axes = anatomical_axes(skeleton, role)
     if part in ("Arm", "ForeArm", "Hand"):
         along = np.array([1.0 if side == "Left" else -1.0, 0.0, 0.0])
     elif part in ("UpLeg", "Leg"):

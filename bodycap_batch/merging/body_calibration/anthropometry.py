@@ -8,7 +8,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body.bones import Bone
-from bodycap_batch.merging.graph.error_modes import Spread
+from bodycap_batch.merging.graph.error_modes import ErrorModes
 from bodycap_batch.model.skeleton_presets import split_side
 
 PROPORTION_SIGMA = 0.04
@@ -32,7 +32,7 @@ is the root mean square distance from ours, were every rig between the extremes 
 backwards a round 1 %."""
 
 
-def proportions(bones: Sequence[Bone], cameras: Sequence[str]) -> Spread:
+def proportions(bones: Sequence[Bone], cameras: Sequence[str]) -> ErrorModes:
     """The ways in which bones may be longer than a height has them, each by its share, both sides alike.
 
     Args:
@@ -48,7 +48,7 @@ def proportions(bones: Sequence[Bone], cameras: Sequence[str]) -> Spread:
     return _of_offsets(offsets_m, cameras)
 
 
-def placements(bones: Sequence[Bone], cameras: Sequence[str], stature_m: float) -> Spread:
+def placements(bones: Sequence[Bone], cameras: Sequence[str], stature_m: float) -> ErrorModes:
     """The ways in which other rigs place the joints of a body of that stature, both sides alike.
 
     A joint that lies elsewhere leaves those that follow it where they are, but for the arms': each of their
@@ -79,10 +79,10 @@ def _parts(bones: Sequence[Bone]) -> list[str]:
     return [split_side(bone.role)[1] for bone in bones]
 
 
-def _of_offsets(offsets_m: FloatArray, cameras: Sequence[str]) -> Spread:
+def _of_offsets(offsets_m: FloatArray, cameras: Sequence[str]) -> ErrorModes:
     """Directions (B,3,M) in which nothing but the bones differs."""
     count = offsets_m.shape[2]
-    return Spread(
+    return ErrorModes(
         mounts={camera: np.zeros((6, count)) for camera in cameras},
         log_scale=np.zeros(count),
         rest=np.zeros_like(offsets_m),

@@ -11,7 +11,7 @@ from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.body.t_pose import arm_span, find_t_pose
-from bodycap_batch.merging.body.trunk_lean import body_up, body_up_from_prior
+from bodycap_batch.merging.body.trunk_lean import trunk_orientation, trunk_orientation_from_prior
 from bodycap_batch.merging.body_calibration.anthropometry import PROPORTION_SIGMA, placements, proportions
 from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
 from bodycap_batch.merging.body_calibration.camera_roll import RollSearch, rolled, search_rolls, trunk_roll
@@ -26,11 +26,11 @@ from bodycap_batch.merging.body_calibration.scale import (
     find_scale,
     floor_source,
 )
-from bodycap_batch.merging.cameras.track import Track
-from bodycap_batch.merging.graph.error_modes import Spread, joined
-from bodycap_batch.merging.graph.posture import mostly_walks
-from bodycap_batch.merging.world.floor import WALKING_HEIGHT, standing_height, walked_floor
-from bodycap_batch.merging.world.vertical import Around, Direction, Say, find_up
+from bodycap_batch.merging.cameras.track import CameraTrack
+from bodycap_batch.merging.graph.error_modes import ErrorModes, stack_modes
+from bodycap_batch.merging.graph.posture import is_mostly_walking
+from bodycap_batch.merging.world.floor import WALKING_HEIGHT_RATIO, floor_beside_path, standing_height
+from bodycap_batch.merging.world.vertical import SceneContext, Vertical, VerticalHypothesis, estimate_vertical
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
@@ -53,7 +53,7 @@ class Cleaned:
         places: By gauge, where each used map lies in the tracks' gauge; None where all are in one map.
     """
 
-    tracks: Sequence[Track]
+    tracks: Sequence[CameraTrack]
     provisional: float
     placed: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     places: Mapping[str, Similarity] | None = None
@@ -86,8 +86,8 @@ class Calibrated:
     limbs: tuple[ScaleSource, ...]
     mounts: tuple[Mount, ...]
     trunk: Mount
-    spread: Spread
-    up: Direction
+    spread: ErrorModes
+    up: Vertical
     height_over_floor_m: float | None
     t_pose_ns: tuple[int, int] | None
     rolls: tuple[RollSearch, ...]
@@ -118,13 +118,15 @@ def calibrate_body(
         estimate = find_scale(calibration, estimate.scale)
     poses = calibration.poses()
     path_m = estimate.scale * tracks[0].map_from_cam[:, :3, 3]
-    around = Around(
+    around = SceneContext(
         points_m=estimate.scale * points,
         path_m=path_m,
         standing_m=standing_height(inputs.skeleton, bones[0].joint),
-        walks=not split_side(bones[0].role)[0] and mostly_walks(tracks[0].scaled(estimate.scale)),
+        walks=not split_side(bones[0].role)[0] and is_mostly_walking(tracks[0].scaled(estimate.scale)),
     )
-    up = find_up(body_up(inputs.skeleton, bones, poses), around, np.random.default_rng(0), says)
+    up = estimate_vertical(
+        trunk_orientation(inputs.skeleton, bones, poses), around, np.random.default_rng(0), says
+    )
     walking = samples.posture.walking
     # Who bends down or sits is not as tall as who walks.
     erect = poses[walking] if walking.sum() >= ENOUGH_WALKING else poses
@@ -147,7 +149,7 @@ def calibrate_body(
         limbs=limb_scales(inputs, tracks, scale, (known_up, t_pose_ns), step),
         mounts=calibration.solved_mounts(constant),
         trunk=priors[tracks[0].camera],
-        spread=joined([constant, passing]),
+        spread=stack_modes([constant, passing]),
         up=up,
         height_over_floor_m=height,
         t_pose_ns=t_pose_ns,
@@ -156,7 +158,9 @@ def calibrate_body(
     )
 
 
-def _bodies(inputs: MergeInputs, bones: Sequence[Bone], cameras: Sequence[str]) -> tuple[Spread, Spread]:
+def _bodies(
+    inputs: MergeInputs, bones: Sequence[Bone], cameras: Sequence[str]
+) -> tuple[ErrorModes, ErrorModes]:
     """How people, and rigs, of one stature differ."""
     stature_m = MEAN_HEIGHT_M if inputs.height_m is None else inputs.height_m
     return proportions(bones, cameras), placements(bones, cameras, stature_m)
@@ -166,7 +170,7 @@ def _right_way_up(
     inputs: MergeInputs,
     bones: Sequence[Bone],
     cleaned: Cleaned,
-    known: tuple[tuple[int, int] | None, Sequence[Say]],
+    known: tuple[tuple[int, int] | None, Sequence[VerticalHypothesis]],
     step: Callable[[], None],
 ) -> tuple[MergeInputs, FloatArray | None, tuple[RollSearch, ...]]:
     """The priors with each camera the way up it sits, the vertical where it is known, and what was tried."""
@@ -181,15 +185,15 @@ def _right_way_up(
 def trunk_way_up(
     inputs: MergeInputs,
     bones: Sequence[Bone],
-    tracks: Sequence[Track],
+    tracks: Sequence[CameraTrack],
     provisional: float,
-    stated: Sequence[Say],
-) -> tuple[float, Direction | None]:
+    stated: Sequence[VerticalHypothesis],
+) -> tuple[float, Vertical | None]:
     """Roll (degrees) of the leading camera of a map's tracks, and the vertical where it is known early."""
     trunk = tracks[0].scaled(provisional)
     points_m = provisional * points_around(inputs, trunk.camera)
     prior = inputs.mount_of(trunk.camera)
-    ways: dict[float, Direction] = {}
+    ways: dict[float, Vertical] = {}
 
     def up_of(degrees: float) -> FloatArray | None:
         found = early_up(inputs.skeleton, bones, (trunk, rolled(prior, degrees)), points_m, stated)
@@ -201,13 +205,13 @@ def trunk_way_up(
     def own_up(degrees: float) -> FloatArray | None:
         if split_side(bones[trunk.bone].role)[0]:
             return None
-        return body_up_from_prior(bones, trunk, rolled(prior, degrees)).erect()
+        return trunk_orientation_from_prior(bones, trunk, rolled(prior, degrees)).upright_up()
 
     roll, _ = trunk_roll(inputs, tracks, up_of, own_up)
     return roll, ways.get(roll)
 
 
-def stated_up(options: MergeOptions, board: Board | None) -> tuple[Say, ...]:
+def stated_up(options: MergeOptions, board: Board | None) -> tuple[VerticalHypothesis, ...]:
     """What the job itself says of up."""
     if board is None or options.marker_board is None:
         return ()
@@ -239,10 +243,10 @@ def _t_pose(
 def early_up(
     skeleton: SkeletonModel,
     bones: Sequence[Bone],
-    worn: tuple[Track, Mount],
+    worn: tuple[CameraTrack, Mount],
     points_m: FloatArray,
-    stated: Sequence[Say] = (),
-) -> Direction | None:
+    stated: Sequence[VerticalHypothesis] = (),
+) -> Vertical | None:
     """The vertical where the job, planes or the walk tell it, before anything is solved.
 
     None from a limb's camera: a swinging arm tells neither the vertical nor the way the body faces.
@@ -250,20 +254,22 @@ def early_up(
     trunk, prior = worn
     if split_side(bones[trunk.bone].role)[0]:
         return None
-    around = Around(
+    around = SceneContext(
         points_m=points_m,
         path_m=trunk.map_from_cam[:, :3, 3],
         standing_m=standing_height(skeleton, bones[trunk.bone].joint),
     )
-    found = find_up(body_up_from_prior(bones, trunk, prior), around, np.random.default_rng(0), stated)
-    return None if found.source == "body" or not found.determined() else found
+    found = estimate_vertical(
+        trunk_orientation_from_prior(bones, trunk, prior), around, np.random.default_rng(0), stated
+    )
+    return None if found.source == "body" or not found.is_determined() else found
 
 
 def _height_over_floor(
     inputs: MergeInputs,
     bones: Sequence[Bone],
     poses: FloatArray,
-    up: Direction,
+    up: Vertical,
     around: tuple[FloatArray, FloatArray],
 ) -> float | None:
     """Median height of the trunk's first solved joint over the walked floor, None if none was seen."""
@@ -272,7 +278,7 @@ def _height_over_floor(
         return None
     height = float(np.median(poses[:, 0, :3, 3] @ up.up))
     standing = standing_height(inputs.skeleton, bones[0].joint)
-    floor = walked_floor(points_m, path_m, up, height - WALKING_HEIGHT * standing, standing)
+    floor = floor_beside_path(points_m, path_m, up, height - WALKING_HEIGHT_RATIO * standing, standing)
     return None if floor is None else height - floor.height_m
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.body.bones import JOINT_SLACK_M, Bone, hinges
 from bodycap_batch.merging.body.initial_poses import fill_gaps, pose_bones
-from bodycap_batch.merging.body.t_pose import t_posed
+from bodycap_batch.merging.body.t_pose import with_t_pose_prior
 from bodycap_batch.merging.body_calibration.hinge_test import FREE_M, loosened, off_hinges, told
 from bodycap_batch.merging.body_calibration.joint_variability import passing_shares
 from bodycap_batch.merging.body_calibration.mount_covariance import (
@@ -24,14 +24,14 @@ from bodycap_batch.merging.body_calibration.mount_covariance import (
 )
 from bodycap_batch.merging.body_calibration.samples import Samples
 from bodycap_batch.merging.graph.error_modes import (
-    BETWEEN_SHARE,
-    Body,
-    Spread,
-    habits,
-    joined,
-    map_bends,
-    mount_slope,
-    scale_direction,
+    POSTURE_BIAS_SHARE,
+    BodyModel,
+    ErrorModes,
+    map_error_modes,
+    mount_perturbation,
+    posture_bias_modes,
+    scale_modes,
+    stack_modes,
 )
 from bodycap_batch.merging.graph.factors import (
     JointFactors,
@@ -39,22 +39,22 @@ from bodycap_batch.merging.graph.factors import (
     add_mount_measurements,
     add_mount_prior,
     bone_key,
-    insert_mount,
-    mount_change,
+    insert_mount_points,
+    levenberg_marquardt,
+    mount_from_points,
+    mount_jacobian,
     mount_keys,
-    optimise,
-    pose_values,
-    read_mount,
+    values_from_poses,
 )
-from bodycap_batch.merging.graph.linearisation import Linear, linearise
-from bodycap_batch.merging.graph.posture import PostureFactors, per_gesture, widened
+from bodycap_batch.merging.graph.linearisation import LinearisedGraph, linearise
+from bodycap_batch.merging.graph.posture import AttitudeFactors, samples_per_gesture, widen_joint_priors
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_RAD
 
 PRIOR_SCALE = 4.0
 """The pose prior counts once per tick here; its sigmas are widened, or it would outvote the cameras."""
-_FLEETING = float(np.sqrt(1.0 - BETWEEN_SHARE**2))
+_FLEETING = float(np.sqrt(1.0 - POSTURE_BIAS_SHARE**2))
 """Of a joint's everyday range, what comes and goes."""
 
 
@@ -83,7 +83,7 @@ class Calibration:
         step: Callable[[], None],
     ) -> None:
         self._skeleton, self._bones, self._samples = skeleton, bones, samples
-        self._at_ease, self._t_posed = tuple(bones), t_posed(skeleton, bones)
+        self._at_ease, self._t_posed = tuple(bones), with_t_pose_prior(skeleton, bones)
         self._hinges = hinges(skeleton, tuple(bones))
         self._priors, self._step = priors, step
         self._slack_map = JOINT_SLACK_M * np.sqrt(samples.repeats) / provisional
@@ -114,19 +114,19 @@ class Calibration:
         graph = self._graph(poses, scale)
         start = self._start(poses, scale)
         last = [key for camera in range(len(self._samples.cameras)) for key in mount_keys(camera)]
-        self._values, _ = optimise(graph, start, iterations=iterations, last=last, step=self._step)
+        self._values, _ = levenberg_marquardt(graph, start, iterations=iterations, last=last, step=self._step)
         self._scale = scale
         for camera, name in enumerate(self._samples.cameras):
-            self.mounts[name] = read_mount(self._values, camera, points[camera])
+            self.mounts[name] = mount_from_points(self._values, camera, points[camera])
         return float(graph.error(self._values))
 
     def widen_postures(self) -> None:
-        """Believe less in the usual postures where the last solution shows unusual ones; see `widened`."""
+        """Believe less in the usual postures where the last solution shows unusual ones; see `widen_joint_priors`."""
         # A T-pose is asked for: it has a prior of its own, and says nothing about the posture at other ticks.
         usual = ~self._samples.posture.t_pose
         if usual.any():
             poses, times_ns = self.poses()[usual], self._samples.times_ns[usual]
-            self._at_ease = widened(self._skeleton, self._bones, poses, times_ns)
+            self._at_ease = widen_joint_priors(self._skeleton, self._bones, poses, times_ns)
 
     def test_hinges(self) -> bool:
         """Let go of the hinges that cameras can contradict, and keep those loose that give.
@@ -144,7 +144,8 @@ class Calibration:
         self._use(loosened(self._at_ease, {hinge.lower: FREE_M for hinge in tested}), once=1.0)
         self.solve(self._scale)
         self._use(
-            loosened(self._at_ease, off_hinges(self.solved())), once=per_gesture(self._samples.times_ns)
+            loosened(self._at_ease, off_hinges(self.solved())),
+            once=samples_per_gesture(self._samples.times_ns),
         )
         if not self.off_hinge_m():
             self._at_ease, self._hinges, self._values, self.mounts = kept
@@ -167,8 +168,8 @@ class Calibration:
         sigma_log: float,
         slope: Mapping[str, FloatArray],
         placed: Mapping[str, tuple[float, float]],
-        bodies: Sequence[tuple[Spread, Spread]] = (),
-    ) -> tuple[Spread, Spread]:
+        bodies: Sequence[tuple[ErrorModes, ErrorModes]] = (),
+    ) -> tuple[ErrorModes, ErrorModes]:
         """How far off the last solution may be, and what comes and goes while it is used.
 
         Constant are the noise's effect, the wearer's habits and the scale, and the mounts with them; a map's
@@ -186,22 +187,25 @@ class Calibration:
         solved = mounts.eliminated()
         factors = self.row_variance(mounts, solved)
         bent = self._bent(mounts, solved)
-        person = [habits(self._at_ease, cameras, BETWEEN_SHARE), *(people for people, _ in bodies)]
-        follow = {name: mount_slope(self.mounts[name], slope[name]) for name in cameras}
+        person = [
+            posture_bias_modes(self._at_ease, cameras, POSTURE_BIAS_SHARE),
+            *(people for people, _ in bodies),
+        ]
+        follow = {name: mount_perturbation(self.mounts[name], slope[name]) for name in cameras}
         bends = np.sqrt(bent) * np.stack([samples.sigma_rad, self._scale * samples.sigma_map], axis=1)
         bends = np.hypot(bends, [placed.get(name, (0.0, 0.0)) for name in cameras])
-        constant = joined(
+        constant = stack_modes(
             [
-                mounts.spread(solved, factors, joined(person)),
-                scale_direction(self._bones, sigma_log, follow),
+                mounts.spread(solved, factors, stack_modes(person)),
+                scale_modes(self._bones, sigma_log, follow),
             ]
         )
         passing = [
-            habits(self._bones, cameras, self._passing(mounts, solved)),
-            map_bends(self._bones, dict(zip(cameras, bends, strict=True))),
+            posture_bias_modes(self._bones, cameras, self._passing(mounts, solved)),
+            map_error_modes(self._bones, dict(zip(cameras, bends, strict=True))),
             *(mounts.followed(solved, rigs) for _, rigs in bodies),
         ]
-        return constant, joined(passing)
+        return constant, stack_modes(passing)
 
     def _passing(self, mounts: SolvedMounts, solved: Eliminated) -> FloatArray:
         """Share (B,) of each joint's everyday range that comes and goes."""
@@ -220,12 +224,12 @@ class Calibration:
         repeats = self._samples.repeats
         measured = self._samples.white_share + repeats * self._bent(mounts, solved)
         # What is left of a gap may repeat itself as the map's error does.
-        joined = repeats * mounts.variance(solved, JOINED, 1.0 / repeats)
+        joint_gaps = repeats * mounts.variance(solved, JOINED, 1.0 / repeats)
         # Rotations are weighed at the pose prior's widened sigmas; what comes and goes differs by sample.
         posed = (_FLEETING / PRIOR_SCALE) ** 2
-        return np.array([1.0, measured, joined, posed, (NOMINAL_ERROR_RAD / NOMINAL_SIGMA_RAD) ** 2])
+        return np.array([1.0, measured, joint_gaps, posed, (NOMINAL_ERROR_RAD / NOMINAL_SIGMA_RAD) ** 2])
 
-    def measurement_shifts(self, linear: Linear, directions: FloatArray) -> FloatArray:
+    def measurement_shifts(self, linear: LinearisedGraph, directions: FloatArray) -> FloatArray:
         """How the residuals change as the measured cameras move: rows (R,P).
 
         Args:
@@ -246,7 +250,7 @@ class Calibration:
                     directions[camera, ticks, :, :3], arm[:, None]
                 )
                 in_bone = np.einsum("kji,kpj->kip", bones[ticks, samples.bones[camera], :3, :3], shift)
-                derivative = linear.blocks(factors, 3, [key] * len(ticks))[..., :3]
+                derivative = linear.pose_jacobians(factors, 3, [key] * len(ticks))[..., :3]
                 rows = linear.first_row[factors][:, None] + np.arange(3)
                 out[rows] = derivative @ in_bone
             first += 4 * len(ticks)
@@ -275,13 +279,13 @@ class Calibration:
         share the smallest scale would look best. How far a camera is turned does not depend on the scale.
         """
         linear, samples, first = mounts.linear, self._samples, 0
-        out = np.where(mounts.kinds == JOINED, -linear.right, 0.0)
+        out = np.where(mounts.kinds == JOINED, -linear.rhs, 0.0)
         for camera in range(len(samples.cameras)):
             first += 4  # the prior of the mount's four points
             factors = first + 4 * np.arange(int(samples.valid[camera].sum()))
             centre = linear.first_row[factors][:, None] + np.arange(3)
-            for point, share in enumerate((1.0, *[MountPoints.AXIS_SHARE] * 3)):
-                out[centre + 3 * point] = -share * linear.right[centre]
+            for point, share in enumerate((1.0, *[MountPoints.AXIS_WHITENING_RATIO] * 3)):
+                out[centre + 3 * point] = -share * linear.rhs[centre]
             first += 4 * len(factors)
         return out
 
@@ -293,7 +297,7 @@ class Calibration:
         poses[..., :3, 3] *= self._scale
         graph = self._graph(poses, self._scale)
         linear = linearise(graph, self._values)
-        body = Body(bones=self._at_ease, hinges=self._hinges)
+        body = BodyModel(bones=self._at_ease, hinges=self._hinges)
         each, last = body.factors_per_tick, self._samples.valid.shape[1]
         posed = np.flatnonzero(self._samples.posture.t_pose)
         stated = (self._first_joint + each * posed[:, None] + np.arange(each)).reshape(-1)
@@ -306,7 +310,7 @@ class Calibration:
                 for camera, name in enumerate(cameras)
             },
             mount_change={
-                name: mount_change(self.mounts[name], all_points[camera])
+                name: mount_jacobian(self.mounts[name], all_points[camera])
                 for camera, name in enumerate(cameras)
             },
             kinds=kinds_of(
@@ -315,7 +319,7 @@ class Calibration:
             first_joint=self._first_joint,
         )
 
-    def solved_mounts(self, spread: Spread) -> tuple[Mount, ...]:
+    def solved_mounts(self, spread: ErrorModes) -> tuple[Mount, ...]:
         """The mounts of the last solution with their sigmas."""
         out = []
         for name in self._samples.cameras:
@@ -353,7 +357,7 @@ class Calibration:
         self._first_joint = int(graph.size())
         for tick in range(samples.valid.shape[1]):
             (t_pose if samples.posture.t_pose[tick] else usual).add(graph, tick)
-        posture = PostureFactors(self._bones, samples.posture)
+        posture = AttitudeFactors(self._bones, samples.posture)
         for tick in range(samples.valid.shape[1]):
             posture.add(graph, tick)
         return graph
@@ -379,11 +383,11 @@ class Calibration:
             if samples.valid[camera].any()
         }
         poses = pose_bones(self._skeleton, self._bones, measured)
-        return self._with_mounts(pose_values(poses), scale)
+        return self._with_mounts(values_from_poses(poses), scale)
 
     def _with_mounts(self, values: Any, scale: float) -> Any:
         for camera, points in enumerate(self._samples.points(scale)):
-            insert_mount(values, camera, self.mounts[self._samples.cameras[camera]], points)
+            insert_mount_points(values, camera, self.mounts[self._samples.cameras[camera]], points)
         return values
 
     def _rescaled(self, ratio: float) -> Any:
@@ -391,7 +395,7 @@ class Calibration:
         poses = self.poses()
         shift = (ratio - 1.0) * poses[:, :1, :3, 3]
         poses[..., :3, 3] += shift
-        return pose_values(poses)
+        return values_from_poses(poses)
 
     def poses(self) -> FloatArray:
         """World_from_bone (K,B,4,4) of the last solution."""

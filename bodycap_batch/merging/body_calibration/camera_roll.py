@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
 from bodycap_batch.merging.body_calibration.samples import take_samples
-from bodycap_batch.merging.cameras.track import SAMPLE_REACH_NS, Track
+from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.skeleton import Mount
@@ -67,7 +67,7 @@ def rolled(mount: Mount, degrees: float) -> Mount:
 
 def search_rolls(
     inputs: MergeInputs,
-    tracks: Sequence[Track],
+    tracks: Sequence[CameraTrack],
     scale: float,
     known: tuple[FloatArray | None, tuple[int, int] | None],
     step: Callable[[], None],
@@ -87,7 +87,7 @@ def search_rolls(
         for track in tracks[1:]
         if is_open(inputs.mount_of(track.camera))
         and inputs.mount_of(track.camera).role != inputs.mount_of(trunk.camera).role
-        and track.at(trunk.times_ns, reach_ns=SAMPLE_REACH_NS)[1].sum() >= _ENOUGH_TOGETHER
+        and track.poses_at(trunk.times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS)[1].sum() >= _ENOUGH_TOGETHER
     )
 
 
@@ -98,13 +98,13 @@ def is_open(mount: Mount) -> bool:
 
 def _search(
     inputs: MergeInputs,
-    pair: tuple[Track, Track],
+    pair: tuple[CameraTrack, CameraTrack],
     known: tuple[float, FloatArray | None, tuple[int, int] | None],
     step: Callable[[], None],
 ) -> RollSearch:
     scale, up, t_pose_ns = known
     roles = [inputs.mount_of(track.camera).role for track in pair]
-    bones = graph_bones(inputs.skeleton, roles)
+    bones = kinematic_chain(inputs.skeleton, roles)
     index = {bone.role: position for position, bone in enumerate(bones)}
     own = [replace(track, bone=index[role]) for track, role in zip(pair, roles, strict=True)]
     samples = take_samples(own, scale, _TICKS, up, t_pose_ns)
@@ -119,7 +119,7 @@ def _search(
     return RollSearch(camera, tuple(off.tolist()), ROLLS_DEG[best] if off[best] < -CLEARLY else 0.0)
 
 
-def _hangers(inputs: MergeInputs, tracks: Sequence[Track]) -> list[Track]:
+def _hangers(inputs: MergeInputs, tracks: Sequence[CameraTrack]) -> list[CameraTrack]:
     """The cameras that hang below the trunk's, the first: none where those of one side alone do.
 
     One hand alone lies beside the chest, which is no hanging.
@@ -130,11 +130,11 @@ def _hangers(inputs: MergeInputs, tracks: Sequence[Track]) -> list[Track]:
     return [track for _, track in found] if {"Left", "Right"} <= {side for side, _ in found} else []
 
 
-def hanging(trunk: Track, limbs: Sequence[Track], up: FloatArray) -> float:
+def hanging(trunk: CameraTrack, limbs: Sequence[CameraTrack], up: FloatArray) -> float:
     """Mean cosine between down and the way from the trunk's camera to the limbs', else 0."""
     cosines = [np.zeros(0)]
     for track in limbs:
-        poses, valid = track.at(trunk.times_ns, reach_ns=SAMPLE_REACH_NS)
+        poses, valid = track.poses_at(trunk.times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS)
         way = trunk.map_from_cam[valid, :3, 3] - poses[valid, :3, 3]
         cosines.append((way @ up) / np.maximum(np.linalg.norm(way, axis=1), 1e-12))
     together = np.concatenate(cosines)
@@ -143,7 +143,7 @@ def hanging(trunk: Track, limbs: Sequence[Track], up: FloatArray) -> float:
 
 def trunk_roll(
     inputs: MergeInputs,
-    tracks: Sequence[Track],
+    tracks: Sequence[CameraTrack],
     up_of: Callable[[float], FloatArray | None],
     own_up: Callable[[float], FloatArray | None] = lambda _: None,
 ) -> tuple[float, FloatArray | None]:
@@ -169,7 +169,9 @@ def trunk_roll(
     return (best[1], best[2]) if best[0] > hang + _CLEARLY_BELOW else (0.0, usual)
 
 
-def _own_way_up(trunk: Track, limbs: Sequence[Track], own_up: Callable[[float], FloatArray | None]) -> float:
+def _own_way_up(
+    trunk: CameraTrack, limbs: Sequence[CameraTrack], own_up: Callable[[float], FloatArray | None]
+) -> float:
     """The roll (degrees) at which limbs hang below the trunk as it points itself; 0 unless that is clear."""
     hang = {roll: hanging(trunk, limbs, up) for roll in ROLLS_DEG if (up := own_up(roll)) is not None}
     if not hang:

@@ -18,12 +18,12 @@ import numpy as np
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.merging.body.bones import JOINT_SLACK_M, Bone, Hinge
 from bodycap_batch.merging.body_calibration.mount_covariance import SolvedMounts
-from bodycap_batch.merging.graph.error_modes import Body
-from bodycap_batch.merging.graph.factors import HINGE_SLACK
+from bodycap_batch.merging.graph.error_modes import BodyModel
+from bodycap_batch.merging.graph.factors import HINGE_SLACK_RATIO
 
 FREE_M = 0.1
 """Sigma of the distances of a hinge that is let go: ten times that of one that holds."""
-KEPT_M = HINGE_SLACK * JOINT_SLACK_M
+KEPT_M = HINGE_SLACK_RATIO * JOINT_SLACK_M
 _CLEARLY = 1.5
 """Times the variance of a hinge that is kept to, beyond which it gives. Let go, distances are off by 3 to 6
 mm where elbows are hinges, by 14 and 24 mm where they turn by 6 and 12 degrees about another axis, too."""
@@ -54,7 +54,7 @@ def off_hinges(mounts: SolvedMounts) -> dict[int, float]:
         if hinge.sigma_m < FREE_M:
             continue
         rows = mounts.linear.first_row[_factors(mounts.body, number, mounts)]
-        residuals = float((mounts.linear.right[rows] ** 2).sum())
+        residuals = float((mounts.linear.rhs[rows] ** 2).sum())
         redundancy = max(float(solved.redundancy[rows].sum()), 1.0)
         variance = hinge.sigma_m**2 * residuals / redundancy
         gives = variance > _CLEARLY * KEPT_M**2
@@ -70,7 +70,7 @@ def loosened(bones: Sequence[Bone], off_hinge_m: Mapping[int, float]) -> tuple[B
     )
 
 
-def _factors(body: Body, number: int, mounts: SolvedMounts) -> IntArray:
+def _factors(body: BodyModel, number: int, mounts: SolvedMounts) -> IntArray:
     """Indices of one hinge's two distances at every tick."""
     ticks = np.arange(len(mounts.world_from_bone))
     first = mounts.first_joint + sum(bone.parent >= 0 for bone in body.bones) + 2 * number

@@ -10,8 +10,8 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.body_calibration.mount_covariance import Eliminated, SolvedMounts
-from bodycap_batch.merging.graph.error_modes import BETWEEN_SHARE
-from bodycap_batch.merging.graph.posture import per_gesture
+from bodycap_batch.merging.graph.error_modes import POSTURE_BIAS_SHARE
+from bodycap_batch.merging.graph.posture import samples_per_gesture
 
 _BELIEF = 6.0
 """Redundant rotations, each of a gesture of its own, that the everyday range counts as much as: two gestures
@@ -32,16 +32,16 @@ def passing_shares(
         prior_scale: By how much the everyday ranges were widened.
     """
     ticks, times_ns = samples
-    out = np.full(len(mounts.body.bones), 1.0 - BETWEEN_SHARE**2)
+    out = np.full(len(mounts.body.bones), 1.0 - POSTURE_BIAS_SHARE**2)
     if not len(ticks):
         return out
     # All samples of one gesture are one draw.
-    repeated = per_gesture(times_ns)
+    repeated = samples_per_gesture(times_ns)
     children = [index for index, bone in enumerate(mounts.body.bones) if bone.parent >= 0]
     for place, index in enumerate(children):
         factors = mounts.first_joint + place + mounts.body.factors_per_tick * ticks
         rows = mounts.linear.first_row[factors][:, None] + np.arange(3)
-        off = prior_scale * mounts.linear.right[rows]
+        off = prior_scale * mounts.linear.rhs[rows]
         varied = float(((off - off.mean(axis=0)) ** 2).sum()) / repeated
         redundancy = float(solved.redundancy[rows].sum()) / repeated
         out[index] = (_BELIEF * out[index] + varied) / (_BELIEF + redundancy)

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
-from bodycap_batch.merging.cameras.track import SAMPLE_REACH_NS, Track
+from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack
 from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.skeleton_presets import split_side
 
@@ -28,7 +28,7 @@ _LIMBS = {
 
 def limb_scales(
     inputs: MergeInputs,
-    tracks: Sequence[Track],
+    tracks: Sequence[CameraTrack],
     scale: float,
     known: tuple[FloatArray | None, tuple[int, int] | None],
     step: Callable[[], None],
@@ -45,7 +45,7 @@ def limb_scales(
     Returns:
         One a limb, fewer where a limb's own cost does not curve; empty for a single limb.
     """
-    limbs: dict[str, list[Track]] = {}
+    limbs: dict[str, list[CameraTrack]] = {}
     for track in tracks[1:]:
         side, part = split_side(inputs.mount_of(track.camera).role)
         if part in _LIMBS and _together(tracks[0], track) >= _ENOUGH_TOGETHER:
@@ -58,20 +58,20 @@ def limb_scales(
     return tuple(each for each in found if each is not None)
 
 
-def _together(trunk: Track, track: Track) -> int:
-    return int(track.at(trunk.times_ns, reach_ns=SAMPLE_REACH_NS)[1].sum())
+def _together(trunk: CameraTrack, track: CameraTrack) -> int:
+    return int(track.poses_at(trunk.times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS)[1].sum())
 
 
 def _alone(
     name: str,
     inputs: MergeInputs,
-    tracks: Sequence[Track],
+    tracks: Sequence[CameraTrack],
     known: tuple[float, FloatArray | None, tuple[int, int] | None],
     step: Callable[[], None],
 ) -> ScaleSource | None:
     scale, up, t_pose_ns = known
     roles = [inputs.mount_of(track.camera).role for track in tracks]
-    bones = graph_bones(inputs.skeleton, roles)
+    bones = kinematic_chain(inputs.skeleton, roles)
     index = {bone.role: position for position, bone in enumerate(bones)}
     own = [replace(track, bone=index[role]) for track, role in zip(tracks, roles, strict=True)]
     samples = take_samples(own, scale, _TICKS, up, t_pose_ns)

@@ -14,7 +14,7 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body_calibration.samples import MAP_ERROR_M, MAP_ERROR_S
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
-from bodycap_batch.merging.world.vertical import Say
+from bodycap_batch.merging.world.vertical import VerticalHypothesis
 from bodycap_batch.model.geometry import Similarity, invert, so3_exp, so3_log
 from bodycap_batch.model.merge_data import BoardView, MergeInputs
 
@@ -44,13 +44,13 @@ class Board:
     scale: ScaleSource
     axes: FloatArray
 
-    def ups(self, placed: Literal["lying", "hanging"] | None) -> tuple[Say, ...]:
+    def ups(self, placed: Literal["lying", "hanging"] | None) -> tuple[VerticalHypothesis, ...]:
         """What it says of up: its normal where it lies, any of its edges where it hangs."""
         if placed is None:
             return ()
         edges = [sign * self.axes[:, axis] for axis in (0, 1) for sign in (1.0, -1.0)]
         ups = [self.axes[:, 2]] if placed == "lying" else edges
-        return tuple(Say(source=NAME, up=up, sigma_deg=_PLACED_SIGMA_DEG) for up in ups)
+        return tuple(VerticalHypothesis(source=NAME, up=up, sigma_deg=_PLACED_SIGMA_DEG) for up in ups)
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,9 +20,16 @@ from scipy.linalg import block_diag
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.graph.error_modes import BETWEEN_SHARE, Body, Spread, habits, joined, joint_shifts
+from bodycap_batch.merging.graph.error_modes import (
+    POSTURE_BIAS_SHARE,
+    BodyModel,
+    ErrorModes,
+    joint_residual_jacobian,
+    posture_bias_modes,
+    stack_modes,
+)
 from bodycap_batch.merging.graph.factors import bone_key, mount_keys
-from bodycap_batch.merging.graph.linearisation import Linear
+from bodycap_batch.merging.graph.linearisation import LinearisedGraph
 
 PRIOR, MEASURED, JOINED, POSED, NAMED = range(5)
 """Kinds of rows: what is believed beforehand, camera points, gaps of joints and hinges, joint rotations, and
@@ -45,8 +52,8 @@ class SolvedMounts:
         first_joint: Index of the first joint factor.
     """
 
-    linear: Linear
-    body: Body
+    linear: LinearisedGraph
+    body: BodyModel
     world_from_bone: FloatArray
     mount_columns: Mapping[str, IntArray]
     mount_change: Mapping[str, FloatArray]
@@ -104,14 +111,14 @@ class SolvedMounts:
         # Four points hold twelve coordinates of a pose that has six: the others never disagree.
         idle = 0.5 * mine.sum() if kind == MEASURED else 0.0
         redundancy = max(float(solved.redundancy[mine].sum()) - idle, 0.0)
-        return (_BELIEF * believed + float((self.linear.right[mine] ** 2).sum())) / (_BELIEF + redundancy)
+        return (_BELIEF * believed + float((self.linear.rhs[mine] ** 2).sum())) / (_BELIEF + redundancy)
 
     def habit_shifts(self) -> Any:
         """How the residuals change with the wearer's habits: rows (R,M), sparse, one sigma each."""
-        bias = habits(self.body.bones, tuple(self.mount_columns), BETWEEN_SHARE)
-        return joint_shifts(self.linear, self.body, self.first_joint, self.world_from_bone, bias)
+        bias = posture_bias_modes(self.body.bones, tuple(self.mount_columns), POSTURE_BIAS_SHARE)
+        return joint_residual_jacobian(self.linear, self.body, self.first_joint, self.world_from_bone, bias)
 
-    def spread(self, solved: Eliminated, factors: FloatArray, bias: Spread) -> Spread:
+    def spread(self, solved: Eliminated, factors: FloatArray, bias: ErrorModes) -> ErrorModes:
         """How far off the mounts may be.
 
         Args:
@@ -129,15 +136,15 @@ class SolvedMounts:
         white = vectors * np.sqrt(np.maximum(values, 0.0))
         count = len(white)
         nothing = np.zeros((len(self.body.bones), 3, count))
-        noisy = Spread(
+        noisy = ErrorModes(
             mounts=self._by_camera(white), log_scale=np.zeros(count), rest=nothing, offsets_m=nothing
         )
-        return joined([noisy, self.followed(solved, bias)])
+        return stack_modes([noisy, self.followed(solved, bias)])
 
-    def followed(self, solved: Eliminated, bias: Spread) -> Spread:
+    def followed(self, solved: Eliminated, bias: ErrorModes) -> ErrorModes:
         """Directions in which the body differs from what was believed, with the mounts that follow it."""
         gain = solved.covariance @ solved.influence.T
-        shifts = joint_shifts(self.linear, self.body, self.first_joint, self.world_from_bone, bias)
+        shifts = joint_residual_jacobian(self.linear, self.body, self.first_joint, self.world_from_bone, bias)
         shifts = sparse.diags_array((self.kinds != PRIOR).astype(np.float64)) @ shifts
         follow = block_diag(*self.mount_change.values()) @ np.asarray(shifts.T @ gain.T).T
         return replace(bias, mounts=self._by_camera(follow))
@@ -161,7 +168,7 @@ class Eliminated:
     redundancy: FloatArray
 
 
-def kinds_of(linear: Linear, joints: tuple[int, int], stated: IntArray, named: IntArray) -> IntArray:
+def kinds_of(linear: LinearisedGraph, joints: tuple[int, int], stated: IntArray, named: IntArray) -> IntArray:
     """Kind of each row (R,) from what it touches.
 
     Args:

@@ -9,7 +9,13 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.cameras.track import MIN_SIGMA_M, MIN_SIGMA_RAD, SAMPLE_REACH_NS, Track, evenly
+from bodycap_batch.merging.cameras.track import (
+    MAX_SAMPLE_GAP_NS,
+    MIN_SIGMA_M,
+    MIN_SIGMA_RAD,
+    CameraTrack,
+    pick_evenly,
+)
 from bodycap_batch.merging.graph.factors import MountPoints
 from bodycap_batch.merging.graph.posture import Posture, find_posture
 
@@ -61,7 +67,7 @@ class Samples:
 
 
 def take_samples(
-    tracks: Sequence[Track],
+    tracks: Sequence[CameraTrack],
     provisional: float,
     count: int,
     up: FloatArray | None = None,
@@ -80,7 +86,7 @@ def take_samples(
         EstimationError: Two cameras were hardly ever measured together.
     """
     times_ns = _sample_times(tracks, count, t_pose_ns)
-    looks = [track.at(times_ns, reach_ns=SAMPLE_REACH_NS) for track in tracks]
+    looks = [track.poses_at(times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS) for track in tracks]
     seconds = 1e-9 * float(times_ns[-1] - times_ns[0])
     repeats = max(1.0, MAP_ERROR_S * len(times_ns) / max(seconds, 1e-3))
     white_rad = np.array([max(float(np.median(track.sigma_rad)), MIN_SIGMA_RAD) for track in tracks])
@@ -105,22 +111,22 @@ def take_samples(
     )
 
 
-def _sample_times(tracks: Sequence[Track], count: int, t_pose_ns: tuple[int, int] | None) -> IntArray:
+def _sample_times(tracks: Sequence[CameraTrack], count: int, t_pose_ns: tuple[int, int] | None) -> IntArray:
     """Times of the first camera; of a camera that is seldom seen with it, its own beside a third one."""
     times_ns = tracks[0].times_ns
-    looks = np.array([track.at(times_ns, reach_ns=SAMPLE_REACH_NS)[1] for track in tracks])
+    looks = np.array([track.poses_at(times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS)[1] for track in tracks])
     together = looks.sum(axis=0)
     full = np.flatnonzero(together == together.max())
     shared = np.flatnonzero(together >= min(2, len(tracks)))
-    pick = evenly(full if len(full) >= count else shared, count)
+    pick = pick_evenly(full if len(full) >= count else shared, count)
     if t_pose_ns is not None:
         inside = np.flatnonzero((times_ns >= t_pose_ns[0]) & (times_ns <= t_pose_ns[1]) & (together >= 2))
-        pick = np.union1d(pick, evenly(inside, T_POSE_TICKS))
+        pick = np.union1d(pick, pick_evenly(inside, T_POSE_TICKS))
     further: list[IntArray] = []
     for track, seen in zip(tracks, looks, strict=True):
         if seen[pick].sum() < min(FEWEST_SAMPLES, count):
             beside = np.flatnonzero(seen & (together >= 2))
-            pick = np.union1d(pick, evenly(beside, FEWEST_SAMPLES))
+            pick = np.union1d(pick, pick_evenly(beside, FEWEST_SAMPLES))
             if len(beside) < FEWEST_SAMPLES:
                 further.append(_own_times(track, tracks))
     enough = len(shared) + sum(len(own) for own in further)
@@ -133,7 +139,11 @@ def _sample_times(tracks: Sequence[Track], count: int, t_pose_ns: tuple[int, int
     return np.unique(np.concatenate([times_ns[pick], *further]))
 
 
-def _own_times(track: Track, tracks: Sequence[Track]) -> IntArray:
+def _own_times(track: CameraTrack, tracks: Sequence[CameraTrack]) -> IntArray:
     """A few of a camera's own times at which another one was measured too."""
-    beside = [other.at(track.times_ns, reach_ns=SAMPLE_REACH_NS)[1] for other in tracks if other is not track]
-    return track.times_ns[evenly(np.flatnonzero(np.any(beside, axis=0)), FEWEST_SAMPLES)]
+    beside = [
+        other.poses_at(track.times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS)[1]
+        for other in tracks
+        if other is not track
+    ]
+    return track.times_ns[pick_evenly(np.flatnonzero(np.any(beside, axis=0)), FEWEST_SAMPLES)]

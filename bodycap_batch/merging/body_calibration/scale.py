@@ -9,7 +9,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
-from bodycap_batch.merging.world.floor import WALKING_HEIGHT
+from bodycap_batch.merging.world.floor import WALKING_HEIGHT_RATIO
 
 _COARSE = 0.16
 _FINE = 0.05
@@ -114,7 +114,7 @@ def floor_source(body: ScaleSource, height_m: float, standing_m: float) -> Scale
     """
     if height_m <= 0.0:
         return ScaleSource(name="floor", scale=body.scale, sigma_log=FLOOR_SIGMA, used=False)
-    difference = float(np.log(WALKING_HEIGHT * standing_m / height_m))
+    difference = float(np.log(WALKING_HEIGHT_RATIO * standing_m / height_m))
     believed = difference**2 <= 4.0 * (body.sigma_log**2 + FLOOR_SIGMA**2)
     scale = body.scale * float(np.exp(difference))
     return ScaleSource(name="floor", scale=scale, sigma_log=FLOOR_SIGMA, used=believed)

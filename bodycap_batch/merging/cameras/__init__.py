@@ -1,1 +1,1 @@
-"""The path of each camera, cleaned and checked."""
+"""The path of each camera: outlier removal, and checks of clock, side and stationary cameras."""

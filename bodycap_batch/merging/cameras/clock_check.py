@@ -1,95 +1,117 @@
-"""Do the cameras share one clock? Limbs that move about the trunk too early or too late."""
+"""Check of the clock offsets: find cameras on limbs that move about the trunk too early or too late."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.cameras.track import SAMPLE_REACH_NS, Track, evenly
+from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack, pick_evenly
 from bodycap_batch.model.geometry import invert
 
-_STEP_S = 0.05
-_FURTHEST_S = 3.0
-_OVERLAP_SHARE = 3.0
-"""Shifts are looked for up to a third of the time that both cameras share."""
-_SAMPLES = 200
-_FEWEST = 30
-_LEAST_S = 0.25
-_LEAST_GAIN = 0.7
-"""A clock is doubted where a shift of so much leaves at most that share of the scatter. Over 26 pairs of 12
-captures (walks, arms thrown about, kitchen work, turning on the spot, bending and lifting) none is with
-right clocks (shifts up to 0.25 s gained most, 0.71 of the scatter at the best), 22 with clocks half a second
-off and 23 with a second. Nine of ten shifts are told within 0.2 s; one in a clip of 5 s was 0.4 s off, one
-2.3. With the cameras' turns weighed beside their places there was no false alarm either, 19 and 21 were
-found, all within 0.3 s, but that clip's lag and one of half a second went unseen."""
+_SEARCH_STEP_S = 0.05
+"""Seconds between the shifts that are tried: a quarter of the accuracy that is reached."""
+_MAX_SHIFT_S = 3.0
+"""Largest shift in seconds that is tried. Evidence: none."""
+_MIN_OVERLAP_RATIO = 3.0
+"""The time that both cameras share must be this many times the largest shift. Evidence: none."""
+_MAX_SAMPLES = 200
+"""Frames of the limb's camera that are compared at most; they bound the time of the search."""
+_MIN_SAMPLES = 30
+"""Frames below which a scatter means nothing: one second at 30 fps. Evidence: none."""
+_MIN_SHIFT_S = 0.25
+"""Smallest shift in seconds that makes a clock suspicious: right clocks gain most by shifts up to this one.
+Evidence: docs/decisions/merging.md."""
+_MAX_SCATTER_RATIO = 0.7
+"""Largest scatter with the shift, as a ratio of the scatter without, that makes a clock suspicious.
+Evidence: docs/decisions/merging.md."""
 
 
-def doubted_clocks(tracks: Sequence[Track]) -> dict[str, dict[str, float]]:
-    """Cameras that sit more steadily on the body when their clock is shifted.
+@dataclass(frozen=True, slots=True)
+class TimeShift:
+    """The shift of a camera's clock with the smallest scatter.
 
-    Where a limb's camera is in the axes of the trunk's scatters by what the limb does; with a wrong clock by
-    where the whole body went in the meantime as well. Straight walks tell nothing: they move it to one side,
-    and there a swinging arm may happen to follow the trunk's turns; but then it lies farther off, as it
-    hardly does with the right clock.
+    Attributes:
+        shift_s: To be added to the camera's times.
+        scatter_ratio: Scatter with the shift over the scatter without.
+    """
+
+    shift_s: float
+    scatter_ratio: float
+
+
+def suspicious_clocks(tracks: Sequence[CameraTrack]) -> dict[str, dict[str, float]]:
+    """Find cameras that move more rigidly with the body if their clock is shifted.
+
+    In the axes of the trunk's camera, the position of a limb's camera varies with the movement of the limb.
+    With a wrong clock, it also varies with the movement of the whole body in the meantime.
+
+    A straight walk does not reveal a wrong clock: it moves the limb by a constant. A swinging arm may then
+    accidentally follow the turns of the trunk at a wrong shift. Such a shift increases the distance between
+    the cameras, which the right one hardly does; so a shift must also decrease the distance.
 
     Args:
-        tracks: Paths in one map, the trunk's first.
+        tracks: Tracks in one map, the trunk's first.
 
     Returns:
-        By camera ``shift_s``, to be added to its times, and ``scatter_left``, the share that is left then.
+        By camera, ``shift_s`` to be added to its times, and ``scatter_left``, the ratio of the scatters.
     """
     out = {}
     for limb in tracks[1:]:
-        found = best_shift(tracks[0], limb)
-        if found is None or abs(found[0]) < _LEAST_S or found[1] > _LEAST_GAIN:
+        found = best_time_shift(tracks[0], limb)
+        if found is None or abs(found.shift_s) < _MIN_SHIFT_S or found.scatter_ratio > _MAX_SCATTER_RATIO:
             continue
-        if _distance(tracks[0], limb, found[0]) < _distance(tracks[0], limb, 0.0):
-            out[limb.camera] = {"shift_s": round(found[0], 2), "scatter_left": round(found[1], 3)}
+        if _median_distance(tracks[0], limb, found.shift_s) < _median_distance(tracks[0], limb, 0.0):
+            out[limb.camera] = {
+                "shift_s": round(found.shift_s, 2),
+                "scatter_left": round(found.scatter_ratio, 3),
+            }
     return out
 
 
-def best_shift(trunk: Track, limb: Track) -> tuple[float, float] | None:
-    """Seconds that bring a limb's path nearest to the trunk's, and the share of the scatter that leaves.
+def best_time_shift(trunk: CameraTrack, limb: CameraTrack) -> TimeShift | None:
+    """Search the time shift of a limb's camera that makes its position in the trunk's axes scatter least.
 
-    None where the two were measured together for too short a time.
+    Returns:
+        None if both cameras were localised together for too short a time.
     """
     start, end = (pick(trunk.times_ns[at], limb.times_ns[at]) for pick, at in ((max, 0), (min, -1)))
-    reach_s = min(_FURTHEST_S, 1e-9 * float(end - start) / _OVERLAP_SHARE)
-    if reach_s < _LEAST_S:
+    max_shift_s = min(_MAX_SHIFT_S, 1e-9 * float(end - start) / _MIN_OVERLAP_RATIO)
+    if max_shift_s < _MIN_SHIFT_S:
         return None
-    shifts_s = _STEP_S * np.arange(-int(reach_s / _STEP_S), int(reach_s / _STEP_S) + 1)
-    margin_ns = round(1e9 * reach_s)
+    steps = int(max_shift_s / _SEARCH_STEP_S)
+    shifts_s = _SEARCH_STEP_S * np.arange(-steps, steps + 1)
+    margin_ns = round(1e9 * max_shift_s)
     inside = np.flatnonzero((limb.times_ns >= start + margin_ns) & (limb.times_ns <= end - margin_ns))
-    if len(inside) < _FEWEST:
+    if len(inside) < _MIN_SAMPLES:
         return None
-    limb = limb.keep(np.isin(np.arange(len(limb.times_ns)), evenly(inside, _SAMPLES)))
-    scatter = np.array([_scatter(trunk, limb, float(shift_s)) for shift_s in shifts_s])
-    best, now = int(np.argmin(scatter)), scatter[len(scatter) // 2]
-    if not (np.isfinite(now) and now > 0.0):
+    limb = limb.keep(np.isin(np.arange(len(limb.times_ns)), pick_evenly(inside, _MAX_SAMPLES)))
+    scatter = np.array([_position_scatter(trunk, limb, float(shift_s)) for shift_s in shifts_s])
+    best, unshifted = int(np.argmin(scatter)), scatter[len(scatter) // 2]
+    if not (np.isfinite(unshifted) and unshifted > 0.0):
         return None
-    return float(shifts_s[best]), float(scatter[best] / now)
+    return TimeShift(float(shifts_s[best]), float(scatter[best] / unshifted))
 
 
-def _scatter(trunk: Track, limb: Track, shift_s: float) -> float:
-    """Root mean square distance of a limb's camera from its usual place in the trunk camera's axes."""
-    seen = _seen(trunk, limb, shift_s)
-    if len(seen) < _FEWEST:
+def _position_scatter(trunk: CameraTrack, limb: CameraTrack, shift_s: float) -> float:
+    """Return the RMS distance (map units) of a limb's camera from its median position in the trunk's axes."""
+    positions = _positions_in_trunk(trunk, limb, shift_s)
+    if len(positions) < _MIN_SAMPLES:
         return np.inf
-    return float(np.sqrt(((seen - np.median(seen, axis=0)) ** 2).sum(axis=1).mean()))
+    return float(np.sqrt(((positions - np.median(positions, axis=0)) ** 2).sum(axis=1).mean()))
 
 
-def _distance(trunk: Track, limb: Track, shift_s: float) -> float:
-    """Median distance of a limb's camera from the trunk's.
+def _median_distance(trunk: CameraTrack, limb: CameraTrack, shift_s: float) -> float:
+    """Return the median distance (map units) of a limb's camera from the trunk's camera.
 
-    The right clock brought 47 of 49 nearer (by 8 to 62 %) for which it was found, in six captures, and took
-    two 1 and 3 % farther. A right clock that was doubted: 6 % farther.
+    Evidence: docs/decisions/merging.md.
     """
-    return float(np.median(np.linalg.norm(_seen(trunk, limb, shift_s), axis=1)))
+    return float(np.median(np.linalg.norm(_positions_in_trunk(trunk, limb, shift_s), axis=1)))
 
 
-def _seen(trunk: Track, limb: Track, shift_s: float) -> FloatArray:
-    """(N,3) where a limb's camera is in the trunk camera's axes, its times shifted."""
-    poses, known = trunk.at(limb.times_ns + round(1e9 * shift_s), reach_ns=SAMPLE_REACH_NS)
-    return np.asarray((invert(poses[known]) @ limb.map_from_cam[known])[:, :3, 3])
+def _positions_in_trunk(trunk: CameraTrack, limb: CameraTrack, shift_s: float) -> FloatArray:
+    """Return positions (N,3) of a limb's camera in the axes of the trunk's camera, its times shifted."""
+    poses, valid = trunk.poses_at(limb.times_ns + round(1e9 * shift_s), max_gap_ns=MAX_SAMPLE_GAP_NS)
+    return np.asarray((invert(poses[valid]) @ limb.map_from_cam[valid])[:, :3, 3])

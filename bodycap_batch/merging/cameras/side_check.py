@@ -1,4 +1,4 @@
-"""Are left and right what the cameras' names say? Limbs seen on the other side of the trunk."""
+"""Check of left and right: find cameras of limbs that stay on the other side of the trunk."""
 
 from __future__ import annotations
 
@@ -7,45 +7,50 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.cameras.track import SAMPLE_REACH_NS, Track
+from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import split_side
 
-_FEWEST = 10
+_MIN_SAMPLES = 10
+"""Frames below which a camera's side is not judged. Evidence: none."""
 _SIDES = {"Right": 1.0, "Left": -1.0}
-_LEVEL = 0.8
-"""Share along the vertical of what is ahead of a trunk up to which it tells the way the body faces."""
-_UPRIGHT = 0.5
-"""Cosine between the vertical and the trunk, as its camera is said to sit on it, from which both agree."""
-_WRONG = 0.8
-"""On 12 captures (walks, kitchen work, arms thrown about, bending and lifting) each of 24 limbs' cameras was
-on its own side of the chest's at 90 % of the times and more."""
+"""Sign of the position along the axis to the right."""
+_MAX_FORWARD_COSINE = 0.8
+"""Largest cosine between the trunk's forward axis and the vertical at which the trunk shows where the body
+faces. Evidence: none."""
+_MIN_UP_COSINE = 0.5
+"""Smallest median cosine between the vertical and the trunk's up axis, as the mount prior implies it. Below,
+the prior is wrong or the person lies. Evidence: none."""
+_MIN_WRONG_RATIO = 0.8
+"""Smallest ratio of frames on the wrong side for a swap. Evidence: docs/decisions/merging.md."""
 
 
-def exchanged_sides(tracks: Sequence[Track], mounts: Mapping[str, Mount], up: FloatArray) -> dict[str, float]:
-    """Cameras of limbs that stay on the other side of the body, if all of them do.
+def swapped_sides(
+    tracks: Sequence[CameraTrack], mounts: Mapping[str, Mount], up: FloatArray
+) -> dict[str, float]:
+    """Find limb cameras that stay on the other side of the body, if all of them do.
 
     Args:
-        tracks: Paths in one map, the trunk's first.
-        mounts: By camera, how it is said to sit on the body: what is ahead of the trunk follows from that.
+        tracks: Tracks in one map, the trunk's first.
+        mounts: Mount priors by camera. The prior of the first camera implies where the body faces.
         up: (3,) the vertical in the map.
 
     Returns:
-        By camera the share of the time it is on the wrong side; nothing where one limb is where it belongs,
-        or where the first camera does not tell: it rides on a limb, on a trunk that lies, or on its head.
+        By camera, the ratio of frames on the wrong side. Empty if one limb is on its own side, or if the
+        first camera does not show where the body faces: it is on a limb, upside down, or the person lies.
     """
-    worn = mounts[tracks[0].camera]
-    joint = tracks[0].map_from_cam[:, :3, :3] @ worn.joint_from_cam[:3, :3].T
-    if split_side(worn.role)[0] or np.median(joint[:, :, 2] @ up) < _UPRIGHT:
+    trunk_mount = mounts[tracks[0].camera]
+    joint = tracks[0].map_from_cam[:, :3, :3] @ trunk_mount.joint_from_cam[:3, :3].T
+    if split_side(trunk_mount.role)[0] or np.median(joint[:, :, 2] @ up) < _MIN_UP_COSINE:
         return {}
     out: dict[str, float] = {}
     for limb in tracks[1:]:
         side = _SIDES.get(split_side(mounts[limb.camera].role)[0], 0.0)
-        trunk, known = tracks[0].at(limb.times_ns, reach_ns=SAMPLE_REACH_NS)
-        ahead = -trunk[:, :3, :3] @ worn.joint_from_cam[:3, :3].T[:, 1]
-        known &= np.abs(ahead @ up) < _LEVEL
-        if side and known.sum() >= _FEWEST:
-            away = limb.map_from_cam[:, :3, 3] - trunk[:, :3, 3]
-            to_the_right = (away * np.cross(ahead, up)).sum(axis=1)[known]
+        trunk, valid = tracks[0].poses_at(limb.times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS)
+        forward = -trunk[:, :3, :3] @ trunk_mount.joint_from_cam[:3, :3].T[:, 1]
+        valid &= np.abs(forward @ up) < _MAX_FORWARD_COSINE
+        if side and valid.sum() >= _MIN_SAMPLES:
+            offset = limb.map_from_cam[:, :3, 3] - trunk[:, :3, 3]
+            to_the_right = (offset * np.cross(forward, up)).sum(axis=1)[valid]
             out[limb.camera] = round(float((side * to_the_right < 0.0).mean()), 3)
-    return out if out and min(out.values()) >= _WRONG else {}
+    return out if out and min(out.values()) >= _MIN_WRONG_RATIO else {}

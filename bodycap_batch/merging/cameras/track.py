@@ -1,4 +1,4 @@
-"""Measured camera paths on the common clock, cleaned of gross errors."""
+"""The camera paths that merging works on: localised frames on the common clock, without gross errors."""
 
 from __future__ import annotations
 
@@ -6,42 +6,50 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, evenly_spaced, runs
 from bodycap_batch.model.geometry import Similarity, interpolate_pose
 from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_M
 
-CLEAN_HALF_WINDOW = 6
-CLEAN_LIMIT_M = 0.12
-"""A quadratic over ±6 frames at 30 fps follows a swinging hand to a few cm; wrong poses are off by more."""
+OUTLIER_HALF_WINDOW = 6
+"""Frames on either side that a frame is compared with, 0.2 s at 30 fps. A quadratic follows a swinging hand to
+a few centimetres over that time. Evidence: none."""
+OUTLIER_LIMIT_M = 0.12
+"""Distance from the quadratic, in metres, above which a pose is wrong: several times a swing's deviation from
+it. Evidence: none."""
 
 MIN_SIGMA_M = 0.004
 MIN_SIGMA_RAD = float(np.radians(0.4))
-"""Floors of a pose's sigma: PnP's covariance knows image noise, not the map's error or a strap's give."""
+"""Smallest sigmas of a measured pose per axis, metres and radians. The covariance of PnP contains the image
+noise, but neither the error of the map nor the movement of the strap. Evidence: none."""
 
-_UNTOLD_RAD, _UNTOLD_M = 0.98 * NOMINAL_ERROR_RAD, 0.98 * NOMINAL_SIGMA_M
-"""A mount known less well than both was not calibrated: its name alone promises as much. (The wearer's habits
-alone turn a calibrated palm's by up to that.)"""
+_UNCALIBRATED_SIGMA_RAD, _UNCALIBRATED_SIGMA_M = 0.98 * NOMINAL_ERROR_RAD, 0.98 * NOMINAL_SIGMA_M
+"""A mount with both sigmas (radians, metres per axis) above these was not calibrated: its prior has hardly
+larger ones. One sigma alone says nothing: the posture's systematic bias alone gives a calibrated palm such a
+rotation sigma."""
 
 
-SAMPLE_REACH_NS = 100_000_000
-"""Longest hole between two frames that is interpolated for a sample."""
+MAX_SAMPLE_GAP_NS = 100_000_000
+"""Longest time between two frames, in nanoseconds, over which a pose is interpolated for the calibration and
+the checks: three frames at 30 fps."""
+MAX_COARSE_GAP_NS = 200_000_000
+"""The same for initial values and for the search for a T-pose, where centimetres of error do no harm."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Track:
+class CameraTrack:
     """The localised frames of one camera.
 
     Attributes:
         camera: Camera name.
-        bone: Index of the bone that carries it.
+        bone: Index of the bone that carries the camera.
         frames: (N,) indices into the trajectory.
-        times_ns: (N,) common clock, increasing.
+        times_ns: (N,) common time, increasing.
         map_from_cam: (N,4,4) poses in the map's gauge.
         sigma_rad: (N,) rotation sigma per axis.
-        sigma_map: (N,) centre sigma per axis, map units.
+        sigma_map: (N,) sigma of the centre per axis, map units.
     """
 
     camera: str
@@ -52,8 +60,8 @@ class Track:
     sigma_rad: FloatArray
     sigma_map: FloatArray
 
-    def keep(self, mask: BoolArray) -> Track:
-        """Keep the frames where `mask` (N,) is True."""
+    def keep(self, mask: BoolArray) -> CameraTrack:
+        """Return the track with the frames where `mask` (N,) is True."""
         return replace(
             self,
             frames=self.frames[mask],
@@ -63,21 +71,29 @@ class Track:
             sigma_map=self.sigma_map[mask],
         )
 
-    def scaled(self, scale: float) -> Track:
-        """The same path with that many units in each of its own."""
+    def scaled(self, scale: float) -> CameraTrack:
+        """Return the track in another unit of length.
+
+        Args:
+            scale: New units per present unit.
+        """
         poses = self.map_from_cam.copy()
         poses[:, :3, 3] *= scale
         return replace(self, map_from_cam=poses, sigma_map=scale * self.sigma_map)
 
-    def at(self, times_ns: IntArray, *, reach_ns: int) -> tuple[FloatArray, BoolArray]:
-        """Interpolate between neighbouring frames.
+    def poses_at(self, times_ns: IntArray, *, max_gap_ns: int) -> tuple[FloatArray, BoolArray]:
+        """Interpolate the poses between neighbouring frames.
+
+        `bodycap_batch.model.geometry.poses_at` returns the identity where there is no pose; here a pose is
+        needed there too, and a time at which there is a frame gets exactly the pose of that frame.
 
         Args:
-            times_ns: (T,) wanted times.
-            reach_ns: Largest time between the two frames around a wanted time.
+            times_ns: (T,) common times.
+            max_gap_ns: Longest time between the two frames around a requested time.
 
         Returns:
-            Poses (T,4,4), nearest-frame ones where there is nothing to interpolate, and (T,) whether it was.
+            Poses (T,4,4), and (T,) whether each is valid: inside the track and not in a longer gap. A pose
+            in a gap is interpolated over it; one outside the track is that of the first or last frame.
         """
         last = len(self.times_ns) - 1
         after = np.clip(np.searchsorted(self.times_ns, times_ns, side="left"), 0, last)
@@ -86,11 +102,17 @@ class Track:
         alpha = np.clip((times_ns - self.times_ns[before]) / span, 0.0, 1.0)
         poses = interpolate_pose(self.map_from_cam[before], self.map_from_cam[after], alpha)
         inside = (times_ns >= self.times_ns[0]) & (times_ns <= self.times_ns[-1])
-        return poses, inside & (self.times_ns[after] - self.times_ns[before] <= reach_ns)
+        return poses, inside & (self.times_ns[after] - self.times_ns[before] <= max_gap_ns)
 
 
-def make_track(inputs: MergeInputs, trajectory: Trajectory, bone: int) -> Track:
-    """Take the localised frames of a trajectory onto the common clock."""
+def make_track(inputs: MergeInputs, trajectory: Trajectory, bone: int) -> CameraTrack:
+    """Return the localised frames of a trajectory on the common clock.
+
+    Args:
+        inputs: The clocks, and the image rows that the poses belong to.
+        trajectory: Of one camera.
+        bone: Index of the bone that carries the camera.
+    """
     frames = np.flatnonzero(trajectory.localised)
     rows = inputs.row_fraction.get(trajectory.camera)
     times_ns = inputs.clocks[trajectory.camera].common_times_ns(
@@ -98,7 +120,7 @@ def make_track(inputs: MergeInputs, trajectory: Trajectory, bone: int) -> Track:
     )
     order = np.argsort(times_ns, kind="stable")
     variances = np.diagonal(trajectory.covariance[frames], axis1=1, axis2=2)[order]
-    return Track(
+    return CameraTrack(
         camera=trajectory.camera,
         bone=bone,
         frames=frames[order].astype(np.int64),
@@ -109,8 +131,8 @@ def make_track(inputs: MergeInputs, trajectory: Trajectory, bone: int) -> Track:
     )
 
 
-def moved(track: Track, target_from_map: Similarity) -> Track:
-    """The track in another map's gauge, or in metres."""
+def transform_track(track: CameraTrack, target_from_map: Similarity) -> CameraTrack:
+    """Return the track in another frame of reference, such as another map's gauge."""
     return replace(
         track,
         map_from_cam=target_from_map.apply_to_poses(track.map_from_cam),
@@ -118,8 +140,14 @@ def moved(track: Track, target_from_map: Similarity) -> Track:
     )
 
 
-def in_gauge(trajectory: Trajectory, target_from_map: Similarity, gauge: str) -> Trajectory:
-    """The trajectory in another frame of that name."""
+def transform_trajectory(trajectory: Trajectory, target_from_map: Similarity, gauge: str) -> Trajectory:
+    """Return the trajectory in another frame of reference.
+
+    Args:
+        trajectory: Poses and covariances in their own gauge.
+        target_from_map: From that gauge.
+        gauge: Name of the new frame of reference.
+    """
     unit = np.repeat([1.0, target_from_map.scale], 3)
     return replace(
         trajectory,
@@ -129,46 +157,44 @@ def in_gauge(trajectory: Trajectory, target_from_map: Similarity, gauge: str) ->
     )
 
 
-def clean(track: Track, scale: float, fps: float) -> tuple[Track, int]:
-    """Drop frames whose centre jumps off a robust quadratic through its neighbours.
+def remove_outliers(track: CameraTrack, scale: float, fps: float) -> CameraTrack:
+    """Remove frames whose centre jumps off a robust quadratic through the neighbouring frames.
 
     Args:
         track: The measured path.
-        scale: Metres per map unit (a provisional one will do).
+        scale: Metres per map unit; a provisional value is accurate enough.
         fps: Nominal rate of the camera.
-
-    Returns:
-        The cleaned track and how many frames were dropped.
     """
     count = len(track.times_ns)
-    steps = np.array([step for step in range(-CLEAN_HALF_WINDOW, CLEAN_HALF_WINDOW + 1) if step])
+    steps = np.array([step for step in range(-OUTLIER_HALF_WINDOW, OUTLIER_HALF_WINDOW + 1) if step])
     index = np.arange(count)[:, None] + steps
     valid = (index >= 0) & (index < count)
     index = np.clip(index, 0, count - 1)
     time = (track.times_ns[index] - track.times_ns[:, None]) * (1e-9 * fps)
-    valid &= np.abs(time) <= CLEAN_HALF_WINDOW + 0.5
+    valid &= np.abs(time) <= OUTLIER_HALF_WINDOW + 0.5
     centre = scale * (track.map_from_cam[index, :3, 3] - track.map_from_cam[:, None, :3, 3])
-    predicted = _robust_quadratic(time / CLEAN_HALF_WINDOW, centre, valid)
-    # Extrapolation at the end of a stretch cannot tell a turn of the path from an error.
+    predicted = _robust_quadratic(time / OUTLIER_HALF_WINDOW, centre, valid)
+    # At the end of an interval the quadratic extrapolates: a turn of the path looks like an error there.
     inner = ((time < 0) & valid).sum(axis=1).clip(max=2) + ((time > 0) & valid).sum(axis=1).clip(max=2) == 4
-    bad = (np.linalg.norm(predicted, axis=1) > CLEAN_LIMIT_M) & inner & (valid.sum(axis=1) >= 6)
-    bad = _jumping(bad, scale * track.map_from_cam[:, :3, 3])
-    return track.keep(~bad), int(bad.sum())
+    bad = (np.linalg.norm(predicted, axis=1) > OUTLIER_LIMIT_M) & inner & (valid.sum(axis=1) >= 6)
+    return track.keep(~_runs_with_jumps(bad, scale * track.map_from_cam[:, :3, 3]))
 
 
-def _jumping(bad: BoolArray, centre_m: FloatArray) -> BoolArray:
-    """Those stretches of bad frames (N,) that jump: a thrown arm leaves any quadratic, but smoothly."""
+def _runs_with_jumps(bad: BoolArray, centre_m: FloatArray) -> BoolArray:
+    """Select the runs of bad frames (N,) in which the path jumps.
+
+    The path of a thrown arm leaves any quadratic, but it has no jump.
+    """
     jump = np.zeros(len(bad), dtype=bool)
-    jump[1:-1] = np.linalg.norm(np.diff(centre_m, n=2, axis=0), axis=1) > CLEAN_LIMIT_M
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], bad.astype(np.int8), [0]])))
+    jump[1:-1] = np.linalg.norm(np.diff(centre_m, n=2, axis=0), axis=1) > OUTLIER_LIMIT_M
     out = np.zeros(len(bad), dtype=bool)
-    for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        out[first:end] = jump[max(first - 1, 0) : end + 1].any()
+    for start, stop in runs(bad):
+        out[start:stop] = jump[max(start - 1, 0) : stop + 1].any()
     return out
 
 
 def _robust_quadratic(time: FloatArray, centre: FloatArray, valid: BoolArray) -> FloatArray:
-    """Value at time 0 (N,3) of quadratics through (N,W) times and (N,W,3) centres, Cauchy-weighted."""
+    """Fit quadratics with Cauchy weights to centres (N,W,3) at times (N,W); return their values (N,3) at 0."""
     basis = np.stack([np.ones_like(time), time, time**2], axis=-1)
     weight = valid.astype(np.float64)
     for _ in range(8):
@@ -176,22 +202,26 @@ def _robust_quadratic(time: FloatArray, centre: FloatArray, valid: BoolArray) ->
         normal = np.einsum("nwi,nwj->nij", weighted, basis) + 1e-9 * np.eye(3)
         coefficients = np.linalg.solve(normal, np.einsum("nwi,nwk->nik", weighted, centre))
         residual = np.linalg.norm(centre - basis @ coefficients, axis=-1)
-        weight = valid / (1.0 + (residual / (0.25 * CLEAN_LIMIT_M)) ** 2)
+        weight = valid / (1.0 + (residual / (0.25 * OUTLIER_LIMIT_M)) ** 2)
     return np.asarray(coefficients[:, 0])
 
 
-def untold(mount: Mount) -> bool:
-    """Whether a solved mount is known no better than its name promises."""
-    return mount.sigma_rad >= _UNTOLD_RAD and mount.sigma_m >= _UNTOLD_M
+def is_uncalibrated(mount: Mount) -> bool:
+    """Return whether the calibration left a mount as uncertain as the prior by its name."""
+    return mount.sigma_rad >= _UNCALIBRATED_SIGMA_RAD and mount.sigma_m >= _UNCALIBRATED_SIGMA_M
 
 
-def loosened(track: Track, mount: Mount) -> Track:
-    """The track (metres) at the uncertainty of its mount, where the motion told next to nothing of it.
+def inflate_sigmas(track: CameraTrack, mount: Mount) -> CameraTrack:
+    """Add the uncertainty of an uncalibrated mount to the sigmas of its track.
 
-    A camera never seen together with others keeps the mount its name promises: 9° and 2.9 cm an axis.
-    At its poses' own millimetres it would bend the body to that guess.
+    A camera that is never localised together with others keeps the mount that its name implies, known to 9°
+    and 2.9 cm per axis. With the millimetres of its own poses, it would bend the body to that guess.
+
+    Args:
+        track: Poses in metres.
+        mount: The solved mount.
     """
-    if not untold(mount):
+    if not is_uncalibrated(mount):
         return track
     return replace(
         track,
@@ -200,8 +230,6 @@ def loosened(track: Track, mount: Mount) -> Track:
     )
 
 
-def evenly(pool: IntArray, count: int) -> IntArray:
-    """Up to `count` of the pool, evenly; none of an empty one."""
-    if not len(pool):
-        return pool
-    return np.asarray(pool[np.unique(np.linspace(0, len(pool) - 1, count).round().astype(np.int64))])
+def pick_evenly(pool: IntArray, count: int) -> IntArray:
+    """Return up to `count` items of a pool (N,), evenly spaced."""
+    return np.asarray(pool[evenly_spaced(len(pool), count)])

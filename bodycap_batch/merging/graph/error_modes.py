@@ -12,12 +12,12 @@ from scipy import sparse
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body.bones import Bone, Hinge
 from bodycap_batch.merging.graph.factors import bone_key
-from bodycap_batch.merging.graph.linearisation import Linear
+from bodycap_batch.merging.graph.linearisation import LinearisedGraph
 from bodycap_batch.model.geometry import invert, make_transform
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Body:
+class BodyModel:
     """The graph's bones and hinges."""
 
     bones: Sequence[Bone]
@@ -30,7 +30,7 @@ class Body:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Spread:
+class ErrorModes:
     """Independent directions in which what the motion is solved with may be off, each by one sigma.
 
     Attributes:
@@ -45,14 +45,14 @@ class Spread:
     rest: FloatArray
     offsets_m: FloatArray
 
-    def of_bone(self, bone: Bone, index: int) -> FloatArray:
+    def joint_modes(self, bone: Bone, index: int) -> FloatArray:
         """(6,M) change of where a joint rests, right perturbation of its resting pose."""
         return np.concatenate([self.rest[index], bone.mean_rotation.T @ self.offsets_m[index]])
 
 
-def joined(parts: Sequence[Spread]) -> Spread:
+def stack_modes(parts: Sequence[ErrorModes]) -> ErrorModes:
     """All directions of several, which are independent of each other."""
-    return Spread(
+    return ErrorModes(
         mounts={
             camera: np.concatenate([part.mounts[camera] for part in parts], axis=1)
             for camera in parts[0].mounts
@@ -75,8 +75,12 @@ def adjoint(poses: FloatArray) -> FloatArray:
     return out
 
 
-def joint_shifts(
-    linear: Linear, body: Body, first_factor: int, world_from_bone: FloatArray, spread: Spread
+def joint_residual_jacobian(
+    linear: LinearisedGraph,
+    body: BodyModel,
+    first_factor: int,
+    world_from_bone: FloatArray,
+    spread: ErrorModes,
 ) -> Any:
     """How the residuals of joints and hinges change along each direction: rows (R,M), sparse.
 
@@ -97,9 +101,9 @@ def joint_shifts(
         bone, factors = body.bones[child], first_factor + place + each * ticks
         at_rest = make_transform(bone.mean_rotation, bone.offset_m)
         turned = invert(world_from_bone[:, child]) @ world_from_bone[:, bone.parent] @ at_rest
-        moved = adjoint(turned) @ spread.of_bone(bone, child)
-        derivative = linear.blocks(factors, 6, [bone_key(tick, child) for tick in ticks.tolist()])
-        out = out + linear.shifts(factors, derivative @ moved)
+        moved = adjoint(turned) @ spread.joint_modes(bone, child)
+        derivative = linear.pose_jacobians(factors, 6, [bone_key(tick, child) for tick in ticks.tolist()])
+        out = out + linear.sparse_rows(factors, derivative @ moved)
     for number, hinge in enumerate(body.hinges if spread.offsets_m.any() else ()):
         anchor = spread.offsets_m[hinge.lower]
         along = (
@@ -111,18 +115,20 @@ def joint_shifts(
         for side in range(2):
             factors = first_factor + len(children) + 2 * number + side + each * ticks
             keys = [bone_key(tick, hinge.following) for tick in ticks.tolist()]
-            derivative = linear.blocks(factors, 1, keys)[..., 3:]
+            derivative = linear.pose_jacobians(factors, 1, keys)[..., 3:]
             stiffness = np.linalg.norm(derivative, axis=-1, keepdims=True)
-            out = out + linear.shifts(factors, derivative @ (along @ anchor) + stiffness * longer)
+            out = out + linear.sparse_rows(factors, derivative @ (along @ anchor) + stiffness * longer)
     return out
 
 
-BETWEEN_SHARE = 0.5
+POSTURE_BIAS_SHARE = 0.5
 """Of a joint's everyday range that is a person's habit over the whole capture; the rest comes and goes within
 seconds. Both shares count at any one tick, only the habit bends the mounts."""
 
 
-def habits(bones: Sequence[Bone], cameras: Sequence[str], share: float | FloatArray) -> Spread:
+def posture_bias_modes(
+    bones: Sequence[Bone], cameras: Sequence[str], share: float | FloatArray
+) -> ErrorModes:
     """The ways in which joints may be held other than at ease, as a share of their everyday range.
 
     Args:
@@ -136,7 +142,7 @@ def habits(bones: Sequence[Bone], cameras: Sequence[str], share: float | FloatAr
     for place, index in enumerate(jointed):
         half = np.linalg.cholesky(bones[index].rotation_covariance)
         rest[index, :, 3 * place : 3 * place + 3] = shares[index] * half
-    return Spread(
+    return ErrorModes(
         mounts={camera: np.zeros((6, rest.shape[-1])) for camera in cameras},
         log_scale=np.zeros(rest.shape[-1]),
         rest=rest,
@@ -144,7 +150,7 @@ def habits(bones: Sequence[Bone], cameras: Sequence[str], share: float | FloatAr
     )
 
 
-def map_bends(bones: Sequence[Bone], sigmas: Mapping[str, FloatArray]) -> Spread:
+def map_error_modes(bones: Sequence[Bone], sigmas: Mapping[str, FloatArray]) -> ErrorModes:
     """A camera's measured poses off together, for a stretch of its path: to the body, as if its mount were.
 
     Args:
@@ -156,17 +162,17 @@ def map_bends(bones: Sequence[Bone], sigmas: Mapping[str, FloatArray]) -> Spread
     for index, (camera, (turn, shift)) in enumerate(sigmas.items()):
         mounts[camera][:, 6 * index : 6 * index + 6] = np.diag(np.repeat([turn, shift], 3))
     nothing = np.zeros((len(bones), 3, count))
-    return Spread(mounts=mounts, log_scale=np.zeros(count), rest=nothing, offsets_m=nothing)
+    return ErrorModes(mounts=mounts, log_scale=np.zeros(count), rest=nothing, offsets_m=nothing)
 
 
-def mount_slope(joint_from_cam: FloatArray, change: FloatArray) -> FloatArray:
+def mount_perturbation(joint_from_cam: FloatArray, change: FloatArray) -> FloatArray:
     """Change (4,4) of a mount as its right perturbation (6,), rotation first."""
     turn = joint_from_cam[:3, :3].T @ change[:3, :3]
     turn = 0.5 * (turn - turn.T)
     return np.array([turn[2, 1], turn[0, 2], turn[1, 0], *(joint_from_cam[:3, :3].T @ change[:3, 3])])
 
 
-def scale_direction(bones: Sequence[Bone], sigma_log: float, slope: Mapping[str, FloatArray]) -> Spread:
+def scale_modes(bones: Sequence[Bone], sigma_log: float, slope: Mapping[str, FloatArray]) -> ErrorModes:
     """The metric scale off by a sigma, and the mounts with it.
 
     Args:
@@ -174,7 +180,7 @@ def scale_direction(bones: Sequence[Bone], sigma_log: float, slope: Mapping[str,
         sigma_log: Sigma of the scale's logarithm.
         slope: By camera (6,), change of the mount per unit of log scale.
     """
-    return Spread(
+    return ErrorModes(
         mounts={camera: sigma_log * change[:, None] for camera, change in slope.items()},
         log_scale=np.array([sigma_log]),
         rest=np.zeros((len(bones), 3, 1)),

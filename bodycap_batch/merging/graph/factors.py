@@ -19,9 +19,9 @@ MAX_BONES = 64
 GEMAN_MCCLURE_C = 6.0
 """In sigmas of a six-dimensional residual, whose typical length is 2.4: at 3 the motion model wins over right
 measurements of violent motion (palm 6.4 cm off instead of 0.6); gross errors have been dropped before."""
-_LEAST_DAMPING = 1e-5
+_MIN_DAMPING = 1e-5
 """Damping is raised tenfold from here until the error falls; each try is a solve, at the end all in vain."""
-HINGE_SLACK = 2.0
+HINGE_SLACK_RATIO = 2.0
 """Sigma of a hinge's distances over that of a joint's gap."""
 _AXIS_WEIGHT = 0.1
 """Information of a mount's axis points over its centre's: small, so that turning and moving decouple."""
@@ -53,7 +53,7 @@ class MountPoints:
     sigma_rad: float
     sigma_m: float
 
-    AXIS_SHARE: ClassVar[float] = float(np.sqrt(_AXIS_WEIGHT))
+    AXIS_WHITENING_RATIO: ClassVar[float] = float(np.sqrt(_AXIS_WEIGHT))
     """A shift of all four points in sigmas of an axis point over the same in sigmas of the centre point."""
 
     @property
@@ -71,7 +71,7 @@ class MountPoints:
         return np.vstack([np.zeros(3), self.radius_m * np.eye(3)])
 
 
-def robust(noise: Any) -> Any:
+def geman_mcclure(noise: Any) -> Any:
     """Wrap a noise model in Geman-McClure's loss."""
     kernel = gtsam.noiseModel.mEstimator.GemanMcClure.Create(GEMAN_MCCLURE_C)
     return gtsam.noiseModel.Robust.Create(kernel, noise)
@@ -103,7 +103,7 @@ class JointFactors:
         }
         self._noise = {index: _joint_noise(bone, prior_scale, slack_m) for index, bone in self._children}
         self._hinge_noises = [
-            gtsam.noiseModel.Isotropic.Sigma(1, float(np.hypot(HINGE_SLACK * slack_m, hinge.sigma_m)))
+            gtsam.noiseModel.Isotropic.Sigma(1, float(np.hypot(HINGE_SLACK_RATIO * slack_m, hinge.sigma_m)))
             for hinge in joints
         ]
         self._anchors = [
@@ -142,7 +142,7 @@ def add_mount_measurements(
     """
     x_in_world = points.x_in_cam() @ world_from_cam[:, :3, :3].swapaxes(1, 2) + world_from_cam[:, None, :3, 3]
     sigmas = (points.sigma_m, points.axis_sigma_m, points.axis_sigma_m, points.axis_sigma_m)
-    noises = [robust(gtsam.noiseModel.Isotropic.Sigma(3, sigma)) for sigma in sigmas]
+    noises = [geman_mcclure(gtsam.noiseModel.Isotropic.Sigma(3, sigma)) for sigma in sigmas]
     keys = mount_keys(camera)
     for bone, measured in zip(bones, x_in_world, strict=True):
         for key, x, noise in zip(keys, measured, noises, strict=True):
@@ -170,7 +170,7 @@ def add_mount_prior(
         graph.add(gtsam.BetweenFactorPoint3(centre, key, points.radius_m * joint_from_cam[:3, axis], arm))
 
 
-def read_mount(values: Any, camera: int, points: MountPoints) -> FloatArray:
+def mount_from_points(values: Any, camera: int, points: MountPoints) -> FloatArray:
     """Read joint_from_cam (4,4) off a mount's four points by a rigid fit about the centre point."""
     centre, *axes = (np.asarray(values.atPoint3(key)) for key in mount_keys(camera))
     u, _, vt = np.linalg.svd((np.array(axes) - centre).T)
@@ -183,7 +183,7 @@ def read_mount(values: Any, camera: int, points: MountPoints) -> FloatArray:
     return out
 
 
-def mount_change(joint_from_cam: FloatArray, points: MountPoints) -> FloatArray:
+def mount_jacobian(joint_from_cam: FloatArray, points: MountPoints) -> FloatArray:
     """(6,12) from changes of a mount's four points to joint_from_cam's right perturbation, rotation first."""
     turn, shift = np.zeros((3, 12)), np.zeros((3, 12))
     shift[:, :3] = np.eye(3)
@@ -202,14 +202,14 @@ def mount_change(joint_from_cam: FloatArray, points: MountPoints) -> FloatArray:
     return np.vstack([joint_from_cam[:3, :3].T @ turn, joint_from_cam[:3, :3].T @ shift])
 
 
-def insert_mount(values: Any, camera: int, joint_from_cam: FloatArray, points: MountPoints) -> None:
+def insert_mount_points(values: Any, camera: int, joint_from_cam: FloatArray, points: MountPoints) -> None:
     """Put a mount's four points among the start values."""
     x_in_joint = points.x_in_cam() @ joint_from_cam[:3, :3].T + joint_from_cam[:3, 3]
     for key, x in zip(mount_keys(camera), x_in_joint, strict=True):
         values.insert(key, x)
 
 
-def optimise(
+def levenberg_marquardt(
     graph: Any,
     values: Any,
     *,
@@ -233,7 +233,7 @@ def optimise(
     """
     params = gtsam.LevenbergMarquardtParams()
     params.setMaxIterations(iterations)
-    params.setlambdaLowerBound(_LEAST_DAMPING)
+    params.setlambdaLowerBound(_MIN_DAMPING)
     if last:
         params.setOrdering(gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, list(last)))
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
@@ -248,10 +248,10 @@ def optimise(
     return optimizer.values(), iterations
 
 
-def optimise_from_near(
+def gauss_newton_then_lm(
     graph: Any, values: Any, *, iterations: int, step: Callable[[], None], tolerance: float
 ) -> tuple[Any, int]:
-    """Gauss-Newton steps while each lowers the error, what is left by `optimise`.
+    """Gauss-Newton steps while each lowers the error, what is left by `levenberg_marquardt`.
 
     A step without damping takes two thirds of a damped one's time: damping is a factor more for every state.
 
@@ -284,13 +284,13 @@ def optimise_from_near(
         if not decrease >= 0.0:
             break
         error -= decrease
-    found, more = optimise(
+    found, more = levenberg_marquardt(
         graph, values, iterations=max(iterations - count, 1), step=step, tolerance=tolerance
     )
     return found, count + more
 
 
-def pose_values(poses: FloatArray) -> Any:
+def values_from_poses(poses: FloatArray) -> Any:
     """Values of bone poses (T,B,4,4)."""
     values = gtsam.Values()
     for tick in range(poses.shape[0]):

@@ -11,25 +11,25 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.merging.body.bones import Bone
-from bodycap_batch.merging.cameras.track import SAMPLE_REACH_NS, Track
+from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack
 from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.model.geometry import invert, make_transform
 from bodycap_batch.model.merge_data import standing_sigma_m
 from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions
 
-_WINDOW_S = 0.07
+_HALF_WINDOW_S = 0.07
 """Half of the time over which an ankle's speed is taken: 5 mm of noise are 5 cm/s an axis at 30 Hz."""
-_REST_M_PER_S = 0.25
+_MAX_STANDING_SPEED_M_PER_S = 0.25
 """Standing ankles of recorded walks (CMU 12_01, 131_03) move at 0.02 to 0.1 m/s, swinging ones at 1 to 3."""
-_LOW_M = 0.04
+_MAX_HEEL_RISE_M = 0.04
 """The heel rises by more than this before the foot leaves the floor."""
-_SHORTEST_S = 0.1
-_FREE_RAD = 10.0
+_MIN_DURATION_S = 0.1
+_FREE_ROTATION_SIGMA_RAD = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class Contact:
+class FootContact:
     """An ankle, and when its foot stands.
 
     Attributes:
@@ -54,7 +54,9 @@ class Contact:
             return
         # The ankle's own motion is the bone's, seen from the ankle: its covariance carried to the joint.
         adjoint = gtsam.Pose3(make_transform(np.eye(3), self.ankle_m)).AdjointMap()
-        covariance = adjoint @ np.diag(np.repeat([_FREE_RAD, self.sigma_m], 3) ** 2) @ adjoint.T
+        covariance = (
+            adjoint @ np.diag(np.repeat([_FREE_ROTATION_SIGMA_RAD, self.sigma_m], 3) ** 2) @ adjoint.T
+        )
         noise = gtsam.noiseModel.Robust.Create(
             gtsam.noiseModel.mEstimator.Huber.Create(2.0), gtsam.noiseModel.Gaussian.Covariance(covariance)
         )
@@ -65,11 +67,11 @@ class Contact:
 def find_contacts(
     skeleton: SkeletonModel,
     bones: Sequence[Bone],
-    tracks: Sequence[Track],
+    tracks: Sequence[CameraTrack],
     mounts: Mapping[str, FloatArray],
     up: FloatArray,
     tick_times_ns: IntArray,
-) -> tuple[Contact, ...]:
+) -> tuple[FootContact, ...]:
     """Find when feet stand: the measured ankle is slow, and about as low as it ever gets.
 
     Args:
@@ -94,21 +96,21 @@ def find_contacts(
             if track is None or ankle is None:
                 continue
             ankle_m = rest[ankle] - rest[bones[track.bone].joint]
-            poses, seen = track.at(tick_times_ns, reach_ns=SAMPLE_REACH_NS)
+            poses, seen = track.poses_at(tick_times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS)
             centre = (poses @ invert(mounts[track.camera]) @ np.append(ankle_m, 1.0))[:, :3]
             tick_s = 1e-9 * float(np.median(np.diff(tick_times_ns)))
-            standing = _standing(centre, seen, centre @ up, tick_s)
+            standing = _contact_ticks(centre, seen, centre @ up, tick_s)
             sigma_m = standing_sigma_m(1.0 / tick_s)
-            out.append(Contact(f"{side} foot", ankle, track.bone, ankle_m, standing, sigma_m))
+            out.append(FootContact(f"{side} foot", ankle, track.bone, ankle_m, standing, sigma_m))
             break
     return tuple(out)
 
 
-def _standing(centre: FloatArray, seen: BoolArray, height: FloatArray, tick_s: float) -> BoolArray:
+def _contact_ticks(centre: FloatArray, seen: BoolArray, height: FloatArray, tick_s: float) -> BoolArray:
     """Ticks (T,) at which an ankle (T,3) stands."""
     if not seen.any():
         return seen
-    half = max(1, round(_WINDOW_S / tick_s))
+    half = max(1, round(_HALF_WINDOW_S / tick_s))
     steps = np.arange(-half, half + 1)
     index = np.clip(np.arange(len(centre))[:, None] + steps, 0, len(centre) - 1)
     weight = seen[index] * (np.arange(len(centre))[:, None] + steps == index)
@@ -117,25 +119,27 @@ def _standing(centre: FloatArray, seen: BoolArray, height: FloatArray, tick_s: f
     away = steps - (weight * steps).sum(axis=1)[:, None] / count[:, None]
     squares = np.maximum((weight * away**2).sum(axis=1), 1e-9) * tick_s
     speed = np.linalg.norm(np.einsum("tw,twi->ti", weight * away, centre[index]), axis=1) / squares
-    rest = seen & (count > half) & (speed < _REST_M_PER_S)
-    rest &= height < np.percentile(height[seen], 5.0) + _LOW_M
+    rest = seen & (count > half) & (speed < _MAX_STANDING_SPEED_M_PER_S)
+    rest &= height < np.percentile(height[seen], 5.0) + _MAX_HEEL_RISE_M
     out = np.zeros_like(rest)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], rest.astype(np.int8), [0]])))
     for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         # At its ends the foot comes down or peels off.
-        if (end - first) * tick_s >= _SHORTEST_S:
+        if (end - first) * tick_s >= _MIN_DURATION_S:
             out[first + 1 : end - 1] = True
     return np.asarray(out, dtype=np.bool_)
 
 
-def during(contacts: Sequence[Contact], tick_times_ns: IntArray, ticks: IntArray) -> tuple[Contact, ...]:
+def contacts_in_window(
+    contacts: Sequence[FootContact], tick_times_ns: IntArray, ticks: IntArray
+) -> tuple[FootContact, ...]:
     """The contacts of a stretch of the timeline (T,), given as its own ticks."""
     first = int(np.searchsorted(tick_times_ns, ticks[0]))
     return tuple(replace(each, standing=each.standing[first : first + len(ticks)]) for each in contacts)
 
 
-def accounts(
-    contacts: Sequence[Contact], world_from_bone: FloatArray, fps: float
+def contact_statistics(
+    contacts: Sequence[FootContact], world_from_bone: FloatArray, fps: float
 ) -> dict[str, dict[str, float]]:
     """How often each foot stood, and how fast it slides in solved poses (T,B,4,4) meanwhile, m/s."""
     out = {}
@@ -150,7 +154,7 @@ def accounts(
     return out
 
 
-def standing_joints(contacts: Sequence[Contact], ticks: int, joints: int) -> BoolArray | None:
+def standing_joints(contacts: Sequence[FootContact], ticks: int, joints: int) -> BoolArray | None:
     """(T,J) where an ankle's foot stands; None where no foot can be seen to."""
     if not contacts:
         return None

@@ -12,14 +12,14 @@ from scipy import sparse
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.memory import release_memory
 from bodycap_batch.merging.body.bones import Bone
-from bodycap_batch.merging.cameras.track import Track
-from bodycap_batch.merging.graph.error_modes import Body, Spread, adjoint, joint_shifts
+from bodycap_batch.merging.cameras.track import CameraTrack
+from bodycap_batch.merging.graph.error_modes import BodyModel, ErrorModes, adjoint, joint_residual_jacobian
 from bodycap_batch.merging.graph.factors import bone_key
-from bodycap_batch.merging.graph.linearisation import Linear, linearise
-from bodycap_batch.model.block_tridiagonal import Chain
+from bodycap_batch.merging.graph.linearisation import LinearisedGraph, linearise
+from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
 from bodycap_batch.model.geometry import invert
 
-_DIRECTIONS = 48
+_MODES_PER_SOLVE = 48
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,16 +40,16 @@ class SolvedGraph:
 
     graph: Any
     values: Any
-    body: Body
+    body: BodyModel
     tick_times_ns: IntArray
     chains: Sequence[Sequence[tuple[int, int, int]]]
-    tracks: Sequence[Track]
+    tracks: Sequence[CameraTrack]
     measured_keys: Mapping[str, Sequence[int]]
     mounts: Mapping[str, FloatArray]
     first_joint: int
 
 
-def joint_covariance(solved: SolvedGraph, world_from_bone: FloatArray, spread: Spread) -> FloatArray:
+def joint_covariance(solved: SolvedGraph, world_from_bone: FloatArray, spread: ErrorModes) -> FloatArray:
     """Covariance (T,B,3,3) of each bone's joint centre minus the first bone's, m², in the solution's axes.
 
     The marginal of the graph knows the noise of the measurements; what was held while it was solved moves
@@ -65,15 +65,17 @@ def joint_covariance(solved: SolvedGraph, world_from_bone: FloatArray, spread: S
     """
     linear = linearise(solved.graph, solved.values)
     release_memory()  # GTSAM's own derivatives
-    order, bounds = _blocks(solved, linear)
+    order, bounds = _tick_blocks(solved, linear)
     try:
-        chain = Chain((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
+        chain = BlockTridiagonal((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
     except np.linalg.LinAlgError:
         # A state that nothing holds: the solution stands, how well it is known cannot be told.
         return np.full((*world_from_bone.shape[:2], 3, 3), np.nan)
     release_memory()
-    shifts = _measurement_shifts(solved, linear, spread)
-    shifts = shifts + joint_shifts(linear, solved.body, solved.first_joint, world_from_bone, spread)
+    shifts = _measurement_residual_jacobian(solved, linear, spread)
+    shifts = shifts + joint_residual_jacobian(
+        linear, solved.body, solved.first_joint, world_from_bone, spread
+    )
     shifts = shifts.tocsc()
     place = np.argsort(order)
     ticks, count = world_from_bone.shape[:2]
@@ -94,11 +96,11 @@ def joint_covariance(solved: SolvedGraph, world_from_bone: FloatArray, spread: S
         reader = readers(tick)
         out[tick, 1:] += reader @ covariance @ reader.swapaxes(1, 2)
 
-    chain.covariances(read)
+    chain.marginals(read)
     release_memory()
-    for first in range(0, shifts.shape[1], _DIRECTIONS):
+    for first in range(0, shifts.shape[1], _MODES_PER_SOLVE):
         # A few directions at a time: all of eleven cameras' at once take gigabytes.
-        right = (linear.matrix.T @ shifts[:, first : first + _DIRECTIONS]).toarray()
+        right = (linear.matrix.T @ shifts[:, first : first + _MODES_PER_SOLVE]).toarray()
         moved = chain.solve(right)
         for tick, each in enumerate(moved):
             shift = readers(tick) @ each
@@ -106,7 +108,7 @@ def joint_covariance(solved: SolvedGraph, world_from_bone: FloatArray, spread: S
     return out
 
 
-def _blocks(solved: SolvedGraph, linear: Linear) -> tuple[IntArray, IntArray]:
+def _tick_blocks(solved: SolvedGraph, linear: LinearisedGraph) -> tuple[IntArray, IntArray]:
     """Columns tick by tick, states between two ticks with the earlier one, and where each tick begins."""
     keys, ticks = [], []
     for chain in solved.chains:
@@ -122,7 +124,7 @@ def _blocks(solved: SolvedGraph, linear: Linear) -> tuple[IntArray, IntArray]:
     return np.asarray(order), np.asarray(bounds, dtype=np.int64)
 
 
-def _measurement_shifts(solved: SolvedGraph, linear: Linear, spread: Spread) -> Any:
+def _measurement_residual_jacobian(solved: SolvedGraph, linear: LinearisedGraph, spread: ErrorModes) -> Any:
     """How the residuals of the measurements change when mounts and scale do: rows (R,M), sparse."""
     out = sparse.csr_matrix((linear.matrix.shape[0], len(spread.log_scale)))
     middle = np.concatenate([track.map_from_cam[:, :3, 3] for track in solved.tracks]).mean(axis=0)
@@ -135,12 +137,12 @@ def _measurement_shifts(solved: SolvedGraph, linear: Linear, spread: Spread) -> 
         away = track.map_from_cam[:, :3, 3] - middle
         stretched = np.einsum("nji,nj->ni", bones[:, :3, :3], away)
         moved[:, 3:] += stretched[:, :, None] * spread.log_scale
-        out = out + linear.shifts(factors, linear.blocks(factors, 6, keys) @ moved)
+        out = out + linear.sparse_rows(factors, linear.pose_jacobians(factors, 6, keys) @ moved)
         first += len(keys)
     return out
 
 
-def joints_in_axes(
+def skeleton_covariance(
     rotation: FloatArray, bones: Sequence[Bone], covariance: FloatArray | None, joints: int
 ) -> FloatArray | None:
     """Covariance (T,J,3,3) in turned axes, NaN for joints that are no bones, from the bones' (T,B,3,3)."""
@@ -151,7 +153,7 @@ def joints_in_axes(
     return out
 
 
-def sigma_summary(
+def sigma_percentiles(
     roles: Sequence[str], covariance: FloatArray | None, observed: BoolArray
 ) -> dict[str, dict[str, dict[str, float]]]:
     """Percentiles of the joints' sigmas per axis by role, for measured and for filled ticks apart.

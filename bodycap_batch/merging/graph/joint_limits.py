@@ -10,24 +10,24 @@ import gtsam
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.body.bones import HINGE_ARM_M, Bone, hinges, proper_axes
+from bodycap_batch.merging.body.bones import HINGE_ARM_M, Bone, anatomical_axes, hinges
 from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.model.merge_data import Activity
 from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions, split_side
 
-_SIGMA_M = 0.05
-_LIMIT_SIGMA_M = 0.02
-_SHRUG_M = 0.05
+_REACH_SIGMA_M = 0.05
+_HINGE_SIGMA_M = 0.02
+_SHOULDER_MOTION_M = 0.05
 """How far a shoulder's centre moves on the trunk when the clavicle turns by 15 to 20°."""
-_ANCHOR_M = 1.0
+_ANCHOR_DISTANCE_M = 1.0
 """Distance of the points from which height and side are judged: far enough that spheres are nearly planes."""
-_CROSSING_M = 0.1
+_MAX_CROSSING_M = 0.1
 """How far a walking palm may cross the body's middle before it is pulled back."""
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class DistanceLimit:
     """A bone's joint keeps a distance within bounds from a point of another bone.
 
     Attributes:
@@ -46,7 +46,7 @@ class Rule:
     anchor_m: FloatArray
     low_m: float
     high_m: float
-    sigma_m: float = _SIGMA_M
+    sigma_m: float = _REACH_SIGMA_M
 
     def add(self, graph: Any, tick: int) -> None:
         """Add the soft factor of one tick: no force inside the bounds, a spring outside."""
@@ -65,16 +65,18 @@ class Rule:
         return np.asarray(np.maximum(np.maximum(self.low_m - distance, distance - self.high_m), 0.0))
 
 
-def soft_rules(skeleton: SkeletonModel, bones: Sequence[Bone], activity: Activity) -> tuple[Rule, ...]:
+def soft_limits(
+    skeleton: SkeletonModel, bones: Sequence[Bone], activity: Activity
+) -> tuple[DistanceLimit, ...]:
     """All rules that apply to the bones of the graph."""
     return (
-        *limit_rules(skeleton, bones),
-        *reach_rules(skeleton, bones),
-        *activity_rules(skeleton, bones, activity),
+        *hinge_limits(skeleton, bones),
+        *arm_reach_limits(skeleton, bones),
+        *activity_limits(skeleton, bones, activity),
     )
 
 
-def limit_rules(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[Rule, ...]:
+def hinge_limits(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[DistanceLimit, ...]:
     """Elbows and knees do not bend backwards.
 
     The lower bone's far end keeps to the half space of a point on the side the joint closes to; the hinge
@@ -83,18 +85,18 @@ def limit_rules(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[Rule, .
     rules = []
     for hinge in hinges(skeleton, tuple(bones)):
         side, part = split_side(bones[hinge.upper].role)
-        forward = proper_axes(skeleton, bones[hinge.upper].role)[:, 1] * (1.0 if part == "Arm" else -1.0)
+        forward = anatomical_axes(skeleton, bones[hinge.upper].role)[:, 1] * (1.0 if part == "Arm" else -1.0)
         joint = hinge.anchors_m.mean(axis=0)
         length = float(np.linalg.norm(bones[hinge.following].offset_m))
         name = f"{side} {'elbow' if part == 'Arm' else 'knee'} not overstretched"
         # At right angles to the point the limb is straight; nearer is bent.
         furthest = float(np.hypot(HINGE_ARM_M, length))
         anchor = joint + HINGE_ARM_M * forward
-        rules.append(Rule(name, hinge.upper, hinge.following, anchor, 0.0, furthest, _LIMIT_SIGMA_M))
+        rules.append(DistanceLimit(name, hinge.upper, hinge.following, anchor, 0.0, furthest, _HINGE_SIGMA_M))
     return tuple(rules)
 
 
-def reach_rules(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[Rule, ...]:
+def arm_reach_limits(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[DistanceLimit, ...]:
     """Palms stay within an arm's length of the shoulder, where the chest alone says where that is."""
     index = {bone.role: position for position, bone in enumerate(bones)}
     chest = index.get("Spine1")
@@ -105,12 +107,14 @@ def reach_rules(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[Rule, .
             continue
         shoulder = rest[bones[arm].joint] - rest[bones[chest].joint]
         links = [bones[index[side + part]].offset_m for part in ("ForeArm", "Hand")]
-        reach = float(sum(np.linalg.norm(link) for link in links)) + _SHRUG_M
-        rules.append(Rule(f"{side} palm within reach", chest, hand, shoulder, 0.0, reach))
+        reach = float(sum(np.linalg.norm(link) for link in links)) + _SHOULDER_MOTION_M
+        rules.append(DistanceLimit(f"{side} palm within reach", chest, hand, shoulder, 0.0, reach))
     return tuple(rules)
 
 
-def activity_rules(skeleton: SkeletonModel, bones: Sequence[Bone], activity: Activity) -> tuple[Rule, ...]:
+def activity_limits(
+    skeleton: SkeletonModel, bones: Sequence[Bone], activity: Activity
+) -> tuple[DistanceLimit, ...]:
     """The rules of an activity; ``generic`` has none beyond the limits and the reach."""
     index = {bone.role: position for position, bone in enumerate(bones)}
     chest = index.get("Spine1")
@@ -123,9 +127,18 @@ def activity_rules(skeleton: SkeletonModel, bones: Sequence[Bone], activity: Act
         if hand is None or arm is None:
             continue
         shoulder = rest[arm] - rest[bones[chest].joint]
-        above = shoulder + np.array([0.0, 0.0, _ANCHOR_M])
-        beside = shoulder + np.array([sign * _ANCHOR_M, 0.0, 0.0])
-        across = _ANCHOR_M + abs(float(shoulder[0])) + _CROSSING_M
-        rules.append(Rule(f"{side} palm below the shoulder", chest, hand, above, _ANCHOR_M, 3.0 * _ANCHOR_M))
-        rules.append(Rule(f"{side} palm on its side", chest, hand, beside, 0.0, across))
+        above = shoulder + np.array([0.0, 0.0, _ANCHOR_DISTANCE_M])
+        beside = shoulder + np.array([sign * _ANCHOR_DISTANCE_M, 0.0, 0.0])
+        across = _ANCHOR_DISTANCE_M + abs(float(shoulder[0])) + _MAX_CROSSING_M
+        rules.append(
+            DistanceLimit(
+                f"{side} palm below the shoulder",
+                chest,
+                hand,
+                above,
+                _ANCHOR_DISTANCE_M,
+                3.0 * _ANCHOR_DISTANCE_M,
+            )
+        )
+        rules.append(DistanceLimit(f"{side} palm on its side", chest, hand, beside, 0.0, across))
     return tuple(rules)

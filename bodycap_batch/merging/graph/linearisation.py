@@ -13,7 +13,7 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
-class Linear:
+class LinearisedGraph:
     """A graph's whitened Jacobian at a solution, robust weights included.
 
     Attributes:
@@ -26,9 +26,9 @@ class Linear:
     matrix: Any
     columns: Mapping[int, int]
     first_row: IntArray
-    right: FloatArray
+    rhs: FloatArray
 
-    def blocks(self, factors: IntArray, height: int, keys: Sequence[int]) -> FloatArray:
+    def pose_jacobians(self, factors: IntArray, height: int, keys: Sequence[int]) -> FloatArray:
         """Dense (N,height,6) derivatives of the factors (N,), each of that height, by one pose each."""
         wanted = (self.first_row[factors][:, None] + np.arange(height)).ravel()
         start = np.array([self.columns[key] for key in keys], dtype=np.int64)
@@ -40,7 +40,7 @@ class Linear:
         out[which[inside], line[inside], column[inside]] = picked.data[inside]
         return out
 
-    def shifts(self, factors: IntArray, moved: FloatArray) -> Any:
+    def sparse_rows(self, factors: IntArray, moved: FloatArray) -> Any:
         """Rows (R,M), sparse, that are `moved` (N,height,M) at the factors (N,) and zero elsewhere."""
         count, height, width = moved.shape
         row = np.repeat((self.first_row[factors][:, None] + np.arange(height)).ravel(), width)
@@ -49,7 +49,7 @@ class Linear:
         return sparse.csr_matrix((moved.ravel(), (row, column)), shape=shape)
 
 
-def linearise(graph: Any, values: Any) -> Linear:
+def linearise(graph: Any, values: Any) -> LinearisedGraph:
     """Take the derivatives of all factors at `values`."""
     first_row = np.cumsum([0, *(graph.at(index).dim() for index in range(graph.size()))])
     sizes = values.zeroVectors()
@@ -63,4 +63,4 @@ def linearise(graph: Any, values: Any) -> Linear:
     matrix = sparse.csr_matrix((entry[kept], place), shape=(int(first_row[-1]), count))
     right = np.zeros(matrix.shape[0])
     right[row[~kept].astype(np.int64) - 1] = entry[~kept]
-    return Linear(matrix, columns, np.asarray(first_row, dtype=np.int64), right)
+    return LinearisedGraph(matrix, columns, np.asarray(first_row, dtype=np.int64), right)

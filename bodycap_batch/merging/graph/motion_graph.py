@@ -14,24 +14,24 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.memory import release_memory
 from bodycap_batch.merging.body.bones import Bone, hinges
 from bodycap_batch.merging.body.initial_poses import fill_gaps, pose_bones
-from bodycap_batch.merging.cameras.track import MIN_SIGMA_M, MIN_SIGMA_RAD, Track
-from bodycap_batch.merging.graph.error_modes import Body, Spread
+from bodycap_batch.merging.cameras.track import MIN_SIGMA_M, MIN_SIGMA_RAD, CameraTrack
+from bodycap_batch.merging.graph.error_modes import BodyModel, ErrorModes
 from bodycap_batch.merging.graph.factors import (
     GEMAN_MCCLURE_C,
     MAX_BONES,
     JointFactors,
     bone_key,
-    optimise_from_near,
-    robust,
+    gauss_newton_then_lm,
+    geman_mcclure,
     velocity_key,
 )
-from bodycap_batch.merging.graph.foot_contact import Contact
+from bodycap_batch.merging.graph.foot_contact import FootContact
 from bodycap_batch.merging.graph.joint_covariance import SolvedGraph, joint_covariance
-from bodycap_batch.merging.graph.joint_limits import Rule
+from bodycap_batch.merging.graph.joint_limits import DistanceLimit
 from bodycap_batch.model.geometry import interpolate_pose, invert, so3_log
 from bodycap_batch.model.skeleton import SkeletonModel
 
-ON_TICK_NS = 1_000_000
+ON_TICK_TOLERANCE_NS = 1_000_000
 """A measurement this close to a tick counts there: at 3 m/s the hand moves 3 mm in a millisecond."""
 
 _TOLERANCE = 1e-4
@@ -39,12 +39,12 @@ _TOLERANCE = 1e-4
 
 _VELOCITY_SIGMA = np.array([8.0, 8.0, 8.0, 3.0, 3.0, 3.0])
 """Weak prior on the first and last velocity, where the motion model has one neighbour only (rad/s, m/s)."""
-_CALM_SIGMA = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
+_REST_VELOCITY_SIGMA = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
 """Before the first and after the last measurement of all cameras the body rests instead of flying on."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Solution:
+class MotionSolution:
     """Bones at every tick.
 
     Attributes:
@@ -88,9 +88,9 @@ class MotionGraph:
         skeleton: SkeletonModel,
         bones: Sequence[Bone],
         tick_times_ns: IntArray,
-        tracks: Sequence[Track],
+        tracks: Sequence[CameraTrack],
         mounts: Mapping[str, FloatArray],
-        rules: Sequence[Rule | Contact] = (),
+        rules: Sequence[DistanceLimit | FootContact] = (),
     ) -> None:
         self._skeleton, self._bones, self._times = skeleton, bones, tick_times_ns
         self._tracks, self._mounts, self._rules = tracks, mounts, rules
@@ -103,7 +103,9 @@ class MotionGraph:
         self._add_joints()
         self._add_rules()
 
-    def solve(self, iterations: int, step: Callable[[], None], spread: Spread | None = None) -> Solution:
+    def solve(
+        self, iterations: int, step: Callable[[], None], spread: ErrorModes | None = None
+    ) -> MotionSolution:
         """Optimise and read the result off.
 
         Args:
@@ -111,7 +113,7 @@ class MotionGraph:
             step: Called after each; may raise to stop.
             spread: How far off the calibration may be; None leaves the joints' covariance out.
         """
-        values, count = optimise_from_near(
+        values, count = gauss_newton_then_lm(
             self._graph, self._start(), iterations=iterations, step=step, tolerance=_TOLERANCE
         )
         poses = np.array(
@@ -131,7 +133,7 @@ class MotionGraph:
         return SolvedGraph(
             graph=self._graph,
             values=values,
-            body=Body(bones=self._bones, hinges=hinges(self._skeleton, tuple(self._bones))),
+            body=BodyModel(bones=self._bones, hinges=hinges(self._skeleton, tuple(self._bones))),
             tick_times_ns=self._times,
             chains=self._chains,
             tracks=self._tracks,
@@ -158,9 +160,9 @@ class MotionGraph:
             poses = track.map_from_cam @ invert(self._mounts[track.camera])
             for time, pose, noise in zip(track.times_ns.tolist(), poses, noises, strict=True):
                 node = self._nearest_tick(time)
-                if abs(node - time) > ON_TICK_NS:
+                if abs(node - time) > ON_TICK_TOLERANCE_NS:
                     # Cameras of one bone share a state: two states closer than this are singular.
-                    node = _shared_time(taken[track.bone], time)
+                    node = _merge_state_time(taken[track.bone], time)
                     if node not in nodes[track.bone]:
                         index = extra[track.bone] * MAX_BONES + track.bone
                         nodes[track.bone][node] = (
@@ -169,7 +171,7 @@ class MotionGraph:
                         )
                         extra[track.bone] += 1
                 key = nodes[track.bone][node][0]
-                self._graph.add(gtsam.PriorFactorPose3(key, gtsam.Pose3(pose), robust(noise)))
+                self._graph.add(gtsam.PriorFactorPose3(key, gtsam.Pose3(pose), geman_mcclure(noise)))
                 keys.append(key)
             self._measured_keys[track.camera] = keys
         self._chains = [sorted((time, *keys) for time, keys in chain.items()) for chain in nodes]
@@ -184,7 +186,7 @@ class MotionGraph:
         before = self._graph.size()
         start = int(self._times[0])
         weak = gtsam.noiseModel.Diagonal.Sigmas(_VELOCITY_SIGMA)
-        calm = gtsam.noiseModel.Diagonal.Sigmas(_CALM_SIGMA)
+        calm = gtsam.noiseModel.Diagonal.Sigmas(_REST_VELOCITY_SIGMA)
         seen_from = min(int(track.times_ns[0]) for track in self._tracks)
         seen_to = max(int(track.times_ns[-1]) for track in self._tracks)
         for bone, chain in zip(self._bones, self._chains, strict=True):
@@ -217,7 +219,7 @@ class MotionGraph:
     def _start(self) -> Any:
         measured = {}
         for track in reversed(self._tracks):
-            poses, valid = track.at(self._times, reach_ns=200_000_000)
+            poses, valid = track.poses_at(self._times, max_gap_ns=200_000_000)
             # Frames that are all far apart are joined as they are.
             whole = fill_gaps(poses, valid) if valid.any() else poses
             measured[track.bone] = whole @ invert(self._mounts[track.camera])
@@ -226,27 +228,27 @@ class MotionGraph:
         values = gtsam.Values()
         for bone, chain in enumerate(self._chains):
             times = 1e-9 * (np.array([time for time, _, _ in chain]) - self._times[0])
-            at_states, velocities = _states(poses[:, bone], seconds, times)
+            at_states, velocities = _initial_states(poses[:, bone], seconds, times)
             for (_, pose_key, speed_key), pose, velocity in zip(chain, at_states, velocities, strict=True):
                 values.insert(pose_key, gtsam.Pose3(pose))
                 values.insert(speed_key, velocity)
         return values
 
-    def _read(self, values: Any, poses: FloatArray, count: int) -> Solution:
+    def _read(self, values: Any, poses: FloatArray, count: int) -> MotionSolution:
         residual_m, residual_rad, weights, world_from_cam = {}, {}, {}, {}
         for track in self._tracks:
             mount = self._mounts[track.camera]
             keys = self._measured_keys[track.camera]
             solved = np.array([values.atPose3(key).matrix() for key in keys]).reshape(-1, 4, 4) @ mount
             world_from_cam[track.camera] = solved
-            residual_m[track.camera], residual_rad[track.camera], weights[track.camera] = missed(
-                track, solved
+            residual_m[track.camera], residual_rad[track.camera], weights[track.camera] = (
+                measurement_residuals(track, solved)
             )
         errors, first = {}, 0
         for kind, size in self._sizes.items():
             errors[kind] = float(sum(self._graph.at(i).error(values) for i in range(first, first + size)))
             first += size
-        return Solution(
+        return MotionSolution(
             world_from_bone=poses,
             residual_m=residual_m,
             residual_rad=residual_rad,
@@ -257,23 +259,25 @@ class MotionGraph:
         )
 
 
-def missed(track: Track, world_from_cam: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def measurement_residuals(
+    track: CameraTrack, world_from_cam: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """How far (N,) the measured poses lie from solved ones, metres and rad, and the weights they keep."""
     off = invert(track.map_from_cam) @ world_from_cam
-    whitened = np.linalg.solve(np.linalg.cholesky(camera_covariance(track)), _log(off)[..., None])
+    whitened = np.linalg.solve(np.linalg.cholesky(camera_covariance(track)), _pose_error(off)[..., None])
     distance_m, turn_rad = (np.linalg.norm(part, axis=1) for part in (off[:, :3, 3], so3_log(off[:, :3, :3])))
-    return distance_m, turn_rad, _geman_mcclure(np.linalg.norm(whitened[..., 0], axis=1))
+    return distance_m, turn_rad, _geman_mcclure_weight(np.linalg.norm(whitened[..., 0], axis=1))
 
 
-def _shared_time(taken: dict[int, int], time_ns: int) -> int:
-    """Time of the state off the ticks that is within `ON_TICK_NS`, or the given one, then remembered."""
-    place = time_ns // ON_TICK_NS
+def _merge_state_time(taken: dict[int, int], time_ns: int) -> int:
+    """Time of the state off the ticks that is within `ON_TICK_TOLERANCE_NS`, or the given one, then remembered."""
+    place = time_ns // ON_TICK_TOLERANCE_NS
     near = [taken[cell] for cell in (place - 1, place, place + 1) if cell in taken]
-    found = next((time for time in near if abs(time - time_ns) <= ON_TICK_NS), time_ns)
-    return taken.setdefault(found // ON_TICK_NS, found)
+    found = next((time for time in near if abs(time - time_ns) <= ON_TICK_TOLERANCE_NS), time_ns)
+    return taken.setdefault(found // ON_TICK_TOLERANCE_NS, found)
 
 
-def camera_covariance(track: Track) -> FloatArray:
+def camera_covariance(track: CameraTrack) -> FloatArray:
     """(N,6,6) of each measured pose in the camera's frame, rotation first, with the floors in place."""
     variances = np.empty((len(track.times_ns), 6))
     variances[:, :3] = np.maximum(track.sigma_rad, MIN_SIGMA_RAD)[:, None] ** 2
@@ -281,25 +285,27 @@ def camera_covariance(track: Track) -> FloatArray:
     return np.asarray(variances[:, :, None] * np.eye(6))
 
 
-def _measurement_noises(track: Track, joint_from_cam: FloatArray) -> list[Any]:
+def _measurement_noises(track: CameraTrack, joint_from_cam: FloatArray) -> list[Any]:
     """Noise of the bone's pose behind each measurement: the camera's, carried through the mount."""
     adjoint = gtsam.Pose3(joint_from_cam).AdjointMap()
     covariance = adjoint @ camera_covariance(track) @ adjoint.T
     return [gtsam.noiseModel.Gaussian.Covariance(each) for each in covariance]
 
 
-def _log(pose: FloatArray) -> FloatArray:
+def _pose_error(pose: FloatArray) -> FloatArray:
     """Rotation vector and translation (N,6) of small poses (N,4,4)."""
     return np.hstack([so3_log(pose[:, :3, :3]), pose[:, :3, 3]])
 
 
-def _geman_mcclure(distance: FloatArray) -> FloatArray:
+def _geman_mcclure_weight(distance: FloatArray) -> FloatArray:
     """Weight of a residual of that many sigmas."""
     squared = GEMAN_MCCLURE_C**2
     return np.asarray((squared / (squared + distance**2)) ** 2)
 
 
-def _states(poses: FloatArray, seconds: FloatArray, times: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _initial_states(
+    poses: FloatArray, seconds: FloatArray, times: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Poses (N,4,4) and velocities (N,6) at `times` (N,) from poses (T,4,4) at `seconds` (T,)."""
     last = len(seconds) - 1
     if last == 0:
@@ -308,7 +314,7 @@ def _states(poses: FloatArray, seconds: FloatArray, times: FloatArray) -> tuple[
     span = seconds[first + 1] - seconds[first]
     alpha = np.clip((times - seconds[first]) / span, 0.0, 1.0)
     step = invert(poses[first]) @ poses[first + 1]
-    return interpolate_pose(poses[first], poses[first + 1], alpha), _log(step) / span[:, None]
+    return interpolate_pose(poses[first], poses[first + 1], alpha), _pose_error(step) / span[:, None]
 
 
 def joint_gaps(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, FloatArray]:
@@ -321,7 +327,7 @@ def joint_gaps(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, 
     return out
 
 
-def hinge_errors(
+def hinge_deviations(
     skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray
 ) -> dict[str, FloatArray]:
     """How far the end of each hinged bone lies off its hinge's plane, by its role: (T,) metres."""

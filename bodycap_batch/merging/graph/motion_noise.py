@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from bodycap_batch.merging.body.bones import Bone
-from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.model.geometry import so3_log
 
-_WILDEST = 100.0
+_MAX_PSD_RATIO = 100.0
 """Largest factor on a motion model's density: accelerations ten times the table's."""
 
 
-def adapt_psd(bones: Sequence[Bone], tracks: Sequence[Track]) -> tuple[Bone, ...]:
+def scale_motion_noise(bones: Sequence[Bone], tracks: Sequence[CameraTrack]) -> tuple[Bone, ...]:
     """Loosen the motion model where the measured motion is wilder than its table.
 
     The second difference of a path that follows the model has variance 2/3 q h³ besides its noise's 6 σ².
@@ -44,7 +44,7 @@ def adapt_psd(bones: Sequence[Bone], tracks: Sequence[Track]) -> tuple[Bone, ...
     for index in range(len(bones) - 1, 0, -1):
         if bones[index].parent not in measured:
             ratio[bones[index].parent] = np.maximum(ratio[bones[index].parent], ratio[index].max())
-    ratio = np.minimum(ratio, _WILDEST)
+    ratio = np.minimum(ratio, _MAX_PSD_RATIO)
     return tuple(
         replace(bone, psd=bone.psd * np.repeat(factor, 3)) for bone, factor in zip(bones, ratio, strict=True)
     )

@@ -14,40 +14,40 @@ import gtsam
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.merging.body.bones import Bone, proper_axes
-from bodycap_batch.merging.cameras.track import Track, evenly
-from bodycap_batch.merging.graph.error_modes import BETWEEN_SHARE
+from bodycap_batch.merging.body.bones import Bone, anatomical_axes
+from bodycap_batch.merging.cameras.track import CameraTrack, pick_evenly
+from bodycap_batch.merging.graph.error_modes import POSTURE_BIAS_SHARE
 from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.model.geometry import so3_log
 from bodycap_batch.model.skeleton import SkeletonModel
 
-WALKING_M_PER_S = 0.5
-_STRIDE_NS = 500_000_000
+MIN_WALKING_SPEED_M_PER_S = 0.5
+_STEP_NS = 500_000_000
 """The velocity is taken over half a second, about a step: the trunk sways within one."""
-UPRIGHT_RAD = float(np.radians(5.0))
-AHEAD_RAD = float(np.radians(8.0))
+UPRIGHT_SIGMA_RAD = float(np.radians(5.0))
+HEADING_SIGMA_RAD = float(np.radians(8.0))
 """How far a walker's mean chest is off the vertical and off the way it goes: the lean and turn of a habit,
 and a rig's or preset's own idea of the chest's axes."""
-STANDING_RAD = float(np.radians(7.0))
+STANDING_SIGMA_RAD = float(np.radians(7.0))
 """The same for a chest that is at its highest in a capture without walking: who bends and lifts stands up in
 between. A walker's 5 degrees, and about as many for the bend that the height leaves open."""
-_MOSTLY_BELOW, _OFTEN_BELOW = 95.0, 25.0
-_HIGHEST_M = 0.02
+_HIGHEST_PERCENTILE, _LOW_PERCENTILE = 95.0, 25.0
+_STANDING_DROP_M = 0.02
 """How far below its highest a chest still counts as up: half a metre over hips, it bends by 16 degrees."""
-_FEW_STEPS = 0.125
+_MIN_WALKING_SHARE = 0.125
 """Share of the ticks below which walking is a step aside between other things, mostly bowed."""
-_BOWED_M = 0.12
+_BENT_DROP_M = 0.12
 """A chest this far below where it mostly is in walking is bowed, or knees are bent: walkers' move by 5 cm."""
-_SIDEWAYS_RAD = float(np.radians(35.0))
+_MAX_HEADING_CHANGE_RAD = float(np.radians(35.0))
 _BOUNCE_M = 0.03
 """Half of the rise and fall of a walking trunk, 4 to 5 cm from lowest to highest."""
-_LEVEL_SHARE = 0.6
-_NARROWEST_M = 0.3
+_MIN_LEVEL_SHARE = 0.6
+_MIN_PATH_WIDTH_M = 0.3
 """Standard deviation of the path across: at 0.3 m, steps whose bounce is 2 cm tilt the plane of ten of them
 by a degree."""
-_OFF_BODY_RAD = float(np.radians(30.0))
-_MOMENTS = 300
-GESTURE_S = 4.0
+_MAX_BODY_ANGLE_RAD = float(np.radians(30.0))
+_MAX_SAMPLES = 300
+GESTURE_DURATION_S = 4.0
 """A posture tells little of the one within two seconds before or after it: gestures last about as long."""
 _TRUNK = ("Spine1", "Spine", "Hips")
 
@@ -66,7 +66,7 @@ class Posture:
 
     up: FloatArray | None
     walking: BoolArray
-    ahead: FloatArray
+    walking_direction: FloatArray
     t_pose: BoolArray
     standing: BoolArray
 
@@ -74,11 +74,13 @@ class Posture:
     def unknown(count: int) -> Posture:
         """No knowledge of `count` ticks."""
         none = np.zeros(count, dtype=bool)
-        return Posture(up=None, walking=none, ahead=np.full((count, 3), np.nan), t_pose=none, standing=none)
+        return Posture(
+            up=None, walking=none, walking_direction=np.full((count, 3), np.nan), t_pose=none, standing=none
+        )
 
 
 def find_posture(
-    track: Track, times_ns: IntArray, up: FloatArray | None, t_pose_ns: tuple[int, int] | None
+    track: CameraTrack, times_ns: IntArray, up: FloatArray | None, t_pose_ns: tuple[int, int] | None
 ) -> Posture:
     """Tell where the trunk's camera walks ahead.
 
@@ -93,49 +95,49 @@ def find_posture(
         posture = replace(posture, t_pose=(times_ns >= t_pose_ns[0]) & (times_ns <= t_pose_ns[1]))
     if up is None:
         return posture
-    before, after = (track.at(times_ns + sign * _STRIDE_NS // 2, reach_ns=_STRIDE_NS) for sign in (-1, 1))
-    velocity = (after[0] - before[0])[:, :3, 3] / (1e-9 * _STRIDE_NS)
+    before, after = (track.poses_at(times_ns + sign * _STEP_NS // 2, max_gap_ns=_STEP_NS) for sign in (-1, 1))
+    velocity = (after[0] - before[0])[:, :3, 3] / (1e-9 * _STEP_NS)
     velocity -= np.outer(velocity @ up, up)
     speed = np.linalg.norm(velocity, axis=1)
-    moving = before[1] & after[1] & (speed > WALKING_M_PER_S)
+    moving = before[1] & after[1] & (speed > MIN_WALKING_SPEED_M_PER_S)
     ahead = np.where(moving[:, None], velocity / np.maximum(speed, 1e-9)[:, None], np.nan)
-    poses, _ = track.at(times_ns, reach_ns=_STRIDE_NS)
+    poses, _ = track.poses_at(times_ns, max_gap_ns=_STEP_NS)
     height_m = poses[:, :3, 3] @ up
-    moving &= height_m > np.percentile(height_m[moving], 75.0) - _BOWED_M if moving.any() else False
-    walking = moving & _facing_ahead(poses[:, :3, :3], ahead, up)
+    moving &= height_m > np.percentile(height_m[moving], 75.0) - _BENT_DROP_M if moving.any() else False
+    walking = moving & _faces_walking_direction(poses[:, :3, :3], ahead, up)
     if walking.sum() < max(5, 0.5 * moving.sum()):
         # Half of the steps go sideways or backwards: which way this body faces is not told by where it goes.
         walking, ahead = moving, np.full_like(ahead, np.nan)
-    if walking.mean() < _FEW_STEPS:
+    if walking.mean() < _MIN_WALKING_SHARE:
         walking = np.zeros_like(walking)
-    standing = np.zeros_like(walking) if walking.any() else _standing(track, height_m, up)
+    standing = np.zeros_like(walking) if walking.any() else _standing_ticks(track, height_m, up)
     return replace(
         posture,
         up=up,
         walking=walking,
-        ahead=np.where(walking[:, None], ahead, np.nan),
+        walking_direction=np.where(walking[:, None], ahead, np.nan),
         standing=standing & ~posture.t_pose,
     )
 
 
-def mostly_walks(track: Track) -> bool:
+def is_mostly_walking(track: CameraTrack) -> bool:
     """Whether a trunk's camera (metres) goes as fast as a walk for more than half of the time."""
-    times_ns = track.times_ns[evenly(np.arange(len(track.times_ns)), _MOMENTS)]
-    before, after = (track.at(times_ns + sign * _STRIDE_NS // 2, reach_ns=_STRIDE_NS) for sign in (-1, 1))
-    speed = np.linalg.norm((after[0] - before[0])[:, :3, 3], axis=1) / (1e-9 * _STRIDE_NS)
-    return bool((before[1] & after[1] & (speed > WALKING_M_PER_S)).mean() > 0.5)
+    times_ns = track.times_ns[pick_evenly(np.arange(len(track.times_ns)), _MAX_SAMPLES)]
+    before, after = (track.poses_at(times_ns + sign * _STEP_NS // 2, max_gap_ns=_STEP_NS) for sign in (-1, 1))
+    speed = np.linalg.norm((after[0] - before[0])[:, :3, 3], axis=1) / (1e-9 * _STEP_NS)
+    return bool((before[1] & after[1] & (speed > MIN_WALKING_SPEED_M_PER_S)).mean() > 0.5)
 
 
-def _standing(track: Track, height_m: FloatArray, up: FloatArray) -> BoolArray:
+def _standing_ticks(track: CameraTrack, height_m: FloatArray, up: FloatArray) -> BoolArray:
     """Where heights (K,) are about the greatest of the trunk's path, nowhere if it hardly rises and falls.
 
     Who sits, or leans on a desk or a cart, is never upright, however high.
     """
-    often, highest = np.percentile(track.map_from_cam[:, :3, 3] @ up, [_OFTEN_BELOW, _MOSTLY_BELOW])
-    return np.asarray((height_m > highest - _HIGHEST_M) & (highest - often > _BOWED_M))
+    often, highest = np.percentile(track.map_from_cam[:, :3, 3] @ up, [_LOW_PERCENTILE, _HIGHEST_PERCENTILE])
+    return np.asarray((height_m > highest - _STANDING_DROP_M) & (highest - often > _BENT_DROP_M))
 
 
-def _facing_ahead(rotation: FloatArray, ahead: FloatArray, up: FloatArray) -> BoolArray:
+def _faces_walking_direction(rotation: FloatArray, ahead: FloatArray, up: FloatArray) -> BoolArray:
     """Where the camera's heading (T,) is at its usual angle to the way it goes."""
     level = rotation - up[:, None] * np.einsum("i,tij->tj", up, rotation)[:, None, :]
     axis = level[:, :, int(np.argmax(np.linalg.norm(level, axis=1).mean(axis=0)))]
@@ -144,15 +146,15 @@ def _facing_ahead(rotation: FloatArray, ahead: FloatArray, up: FloatArray) -> Bo
     if not known.any():
         return np.asarray(known)
     off = np.angle(np.exp(1j * (angle[:, None] - angle[known])))
-    usual = angle[known][int(np.argmax((np.abs(off[known]) < _SIDEWAYS_RAD).sum(axis=0)))]
-    near = np.abs(np.angle(np.exp(1j * (np.nan_to_num(angle) - usual)))) < _SIDEWAYS_RAD
+    usual = angle[known][int(np.argmax((np.abs(off[known]) < _MAX_HEADING_CHANGE_RAD).sum(axis=0)))]
+    near = np.abs(np.angle(np.exp(1j * (np.nan_to_num(angle) - usual)))) < _MAX_HEADING_CHANGE_RAD
     return np.asarray(known & near)
 
 
 _OWN_UP, _OWN_LEFT = gtsam.Unit3(np.array([0.0, 0.0, 1.0])), gtsam.Unit3(np.array([1.0, 0.0, 0.0]))
 
 
-class PostureFactors:
+class AttitudeFactors:
     """Adds what is known of the posture at a tick.
 
     Args:
@@ -164,9 +166,11 @@ class PostureFactors:
         self._posture = posture
         self._trunk = [position for position, bone in enumerate(bones) if bone.role in _TRUNK]
         upright = posture.walking | posture.t_pose
-        self._upright = _once(UPRIGHT_RAD, int(upright.sum()))
-        self._standing = _once(STANDING_RAD, int(posture.standing.sum()))
-        self._facing = _once(AHEAD_RAD, int(np.isfinite(posture.ahead[:, 0]).sum()))
+        self._upright = _noise_for_one_observation(UPRIGHT_SIGMA_RAD, int(upright.sum()))
+        self._standing = _noise_for_one_observation(STANDING_SIGMA_RAD, int(posture.standing.sum()))
+        self._facing = _noise_for_one_observation(
+            HEADING_SIGMA_RAD, int(np.isfinite(posture.walking_direction[:, 0]).sum())
+        )
 
     def add(self, graph: Any, tick: int) -> None:
         """Add the factors of one tick: the trunk's up, and its left across the way it goes."""
@@ -178,17 +182,17 @@ class PostureFactors:
         for bone in self._trunk:
             key = bone_key(tick, bone)
             graph.add(gtsam.AttitudeFactorPose3(key, gtsam.Unit3(posture.up), noise, _OWN_UP))
-            if np.isfinite(posture.ahead[tick, 0]):
-                left = gtsam.Unit3(np.cross(posture.up, posture.ahead[tick]))
+            if np.isfinite(posture.walking_direction[tick, 0]):
+                left = gtsam.Unit3(np.cross(posture.up, posture.walking_direction[tick]))
                 graph.add(gtsam.AttitudeFactorPose3(key, left, self._facing, _OWN_LEFT))
 
 
-def _once(sigma: float, count: int) -> Any:
+def _noise_for_one_observation(sigma: float, count: int) -> Any:
     """Noise of a rule that is applied `count` times and counts once."""
     return gtsam.noiseModel.Isotropic.Sigma(2, sigma * float(np.sqrt(max(count, 1))))
 
 
-def widened(
+def widen_joint_priors(
     skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray, times_ns: IntArray
 ) -> tuple[Bone, ...]:
     """Bones whose everyday range is wider by what a capture happens to show.
@@ -204,35 +208,35 @@ def widened(
         world_from_bone: (K,B,4,4) poses solved at sampled ticks, none of them in a T-pose.
         times_ns: (K,) the ticks, increasing.
     """
-    few = 1.0 / _gestures(times_ns)
+    few = 1.0 / _gesture_count(times_ns)
     out = []
     for index, bone in enumerate(bones):
         if bone.parent < 0:
             out.append(bone)
             continue
         turn = np.swapaxes(world_from_bone[:, bone.parent, :3, :3], 1, 2) @ world_from_bone[:, index, :3, :3]
-        axes = proper_axes(skeleton, bone.role)
+        axes = anatomical_axes(skeleton, bone.role)
         off = so3_log(bone.mean_rotation.T @ turn) @ axes
         usual = np.diagonal(axes.T @ bone.rotation_covariance @ axes)
-        drawn = usual + off.var(axis=0) * few / BETWEEN_SHARE**2
-        spread = np.diag(np.maximum(drawn, (off.mean(axis=0) / BETWEEN_SHARE) ** 2))
+        drawn = usual + off.var(axis=0) * few / POSTURE_BIAS_SHARE**2
+        spread = np.diag(np.maximum(drawn, (off.mean(axis=0) / POSTURE_BIAS_SHARE) ** 2))
         out.append(replace(bone, rotation_covariance=axes @ spread @ axes.T))
     return tuple(out)
 
 
-def _gestures(times_ns: IntArray) -> float:
+def _gesture_count(times_ns: IntArray) -> float:
     """How many gestures ticks (K,) can have seen: those of the time they span, less where no tick fell."""
-    apart_ns = round(1e9 * GESTURE_S)
+    apart_ns = round(1e9 * GESTURE_DURATION_S)
     since_ns = times_ns - times_ns[0]
     return max(1.0, min(float(since_ns[-1]) / apart_ns, float(len(np.unique(since_ns // apart_ns)))))
 
 
-def per_gesture(times_ns: IntArray) -> float:
+def samples_per_gesture(times_ns: IntArray) -> float:
     """How many of the ticks (K,) fall into one gesture, 1 or more."""
-    return max(1.0, len(times_ns) / _gestures(times_ns))
+    return max(1.0, len(times_ns) / _gesture_count(times_ns))
 
 
-def walking_plane(path_m: FloatArray, body: FloatArray) -> FloatArray | None:
+def vertical_from_path(path_m: FloatArray, body: FloatArray) -> FloatArray | None:
     """The vertical from a trunk's path (N,3): walking is level, but for the bounce of the steps.
 
     Returns:
@@ -245,11 +249,11 @@ def walking_plane(path_m: FloatArray, body: FloatArray) -> FloatArray | None:
         normal = np.linalg.svd(centred * np.sqrt(weight)[:, None], full_matrices=False)[2][2]
         weight = 1.0 / (1.0 + (centred @ normal / _BOUNCE_M) ** 2)
     level = np.abs(centred @ normal) < 2.0 * _BOUNCE_M
-    if level.mean() < _LEVEL_SHARE or level.sum() < 30:
+    if level.mean() < _MIN_LEVEL_SHARE or level.sum() < 30:
         return None
     inside = path_m[level] - path_m[level].mean(axis=0)
     spread = np.linalg.svd(inside, compute_uv=False) / np.sqrt(level.sum())
     normal = normal if normal @ body > 0.0 else -normal
-    if spread[1] < _NARROWEST_M or normal @ body < np.cos(_OFF_BODY_RAD):
+    if spread[1] < _MIN_PATH_WIDTH_M or normal @ body < np.cos(_MAX_BODY_ANGLE_RAD):
         return None
     return np.asarray(normal)

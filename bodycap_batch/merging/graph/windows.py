@@ -7,44 +7,44 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
-from bodycap_batch.merging.cameras.track import SAMPLE_REACH_NS, Track
-from bodycap_batch.merging.graph.error_modes import Spread
-from bodycap_batch.merging.graph.motion_graph import MotionGraph, Solution, missed
+from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack
+from bodycap_batch.merging.graph.error_modes import ErrorModes
+from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution, measurement_residuals
 from bodycap_batch.model.geometry import interpolate_pose
 
-CHUNK_TICKS = 500
+WINDOW_TICKS = 500
 """Of 24 s of three cameras the solver takes 160 MB at once, in two stretches 100."""
 OVERLAP_S = 3.0
 """Two solutions of a stretch differ by what lies beyond; three seconds of measurements forget it."""
-_OVERLAPS_WANTED, _OVERLAPS_LEAST = 4.0, 2.0
+_PREFERRED_OVERLAPS, _MIN_OVERLAPS = 4.0, 2.0
 """Overlaps in a stretch of many ticks a second: at four every tick is solved 1.5 times, at two twice."""
-_STRETCH_BYTES = 5e8
-"""Of a stretch with its overlaps, where more than `_OVERLAPS_LEAST` allow it."""
+_MAX_WINDOW_BYTES = 5e8
+"""Of a stretch with its overlaps, where more than `_MIN_OVERLAPS` allow it."""
 _STATE_BYTES = 25e3
 """A tick of a stretch took 0.29 MB with nine bones and three cameras, 0.71 with 17 and eleven: so much for
 each bone and each camera whose frames lie between the ticks."""
-_SHORTEST_TICKS = 300
+_MIN_WINDOW_TICKS = 300
 _BLEND_S = 1.0
 """So long before and after a seam one solution passes into the next: where a camera is lost they may differ
 by 16° and 8 cm, which 2 s spread to less than a swinging arm moves a tick. Two seconds of overlap remain."""
-_ASIDE = 0.25
+_MAX_BOUNDARY_SHIFT = 0.25
 """Of a stretch: how far a seam may be moved to where more cameras are measured."""
 MAX_ITERATIONS = 20
 
 
-Part = tuple[Solution, Sequence[Track], tuple[int, int], int]
+WindowSolution = tuple[MotionSolution, Sequence[CameraTrack], tuple[int, int], int]
 """A stretch's solution, its tracks, the ticks it answers for and the first tick it was solved at."""
 
 
-def solve_motion(
-    build: Callable[[IntArray, Sequence[Track]], MotionGraph],
+def solve_windows(
+    build: Callable[[IntArray, Sequence[CameraTrack]], MotionGraph],
     tick_times_ns: IntArray,
-    tracks: Sequence[Track],
+    tracks: Sequence[CameraTrack],
     step: Callable[[], None],
     *,
-    chunk_ticks: int = CHUNK_TICKS,
-    spread: Spread | None = None,
-) -> Solution:
+    window_ticks: int = WINDOW_TICKS,
+    spread: ErrorModes | None = None,
+) -> MotionSolution:
     """Solve the whole timeline, stretch by stretch where it is long.
 
     Args:
@@ -52,17 +52,17 @@ def solve_motion(
         tick_times_ns: (T,) the timeline.
         tracks: Cleaned tracks, poses in metres.
         step: Called after each iteration; may raise to stop.
-        chunk_ticks: Longest stretch, without its overlaps.
+        window_ticks: Longest stretch, without its overlaps.
         spread: How far off the calibration may be; with it the joints' covariance is computed.
     """
-    parts: list[Part] = []
-    for first, last in stretches(tick_times_ns, tracks, chunk_ticks):
+    parts: list[WindowSolution] = []
+    for first, last in split_timeline(tick_times_ns, tracks, window_ticks):
         low, high = with_overlap(tick_times_ns, first, last)
-        inside = [_between(track, tick_times_ns, low, high) for track in tracks]
+        inside = [_clip_track(track, tick_times_ns, low, high) for track in tracks]
         seen = [track for track in inside if len(track.times_ns)]
         solution = build(tick_times_ns[low:high], seen).solve(MAX_ITERATIONS, step, spread)
         parts.append((solution, seen, (first, last), low))
-    return parts[0][0] if len(parts) == 1 else _joined(parts, tick_times_ns, tracks)
+    return parts[0][0] if len(parts) == 1 else _blend_windows(parts, tick_times_ns, tracks)
 
 
 def with_overlap(tick_times_ns: IntArray, first: int, last: int) -> tuple[int, int]:
@@ -73,31 +73,33 @@ def with_overlap(tick_times_ns: IntArray, first: int, last: int) -> tuple[int, i
     return low, high
 
 
-def longest_stretch(bones: int, tracks: Sequence[Track], tick_times_ns: IntArray) -> int:
+def max_window_ticks(bones: int, tracks: Sequence[CameraTrack], tick_times_ns: IntArray) -> int:
     """Ticks that one stretch may have without its overlaps.
 
-    At high rates that is more than `CHUNK_TICKS`, for the overlaps not to cost more than the stretches; many
+    At high rates that is more than `WINDOW_TICKS`, for the overlaps not to cost more than the stretches; many
     bones and cameras make it fewer, for its memory to stay bounded.
     """
     ticks_s = 1e9 / float(np.median(np.diff(tick_times_ns))) if len(tick_times_ns) > 1 else 1.0
     overlap = OVERLAP_S * ticks_s
-    room = _STRETCH_BYTES / (_STATE_BYTES * (bones + len(tracks))) - 2.0 * overlap
-    wanted = max(CHUNK_TICKS, _OVERLAPS_WANTED * overlap)
-    return round(max(min(wanted, room), _OVERLAPS_LEAST * overlap, _SHORTEST_TICKS))
+    room = _MAX_WINDOW_BYTES / (_STATE_BYTES * (bones + len(tracks))) - 2.0 * overlap
+    wanted = max(WINDOW_TICKS, _PREFERRED_OVERLAPS * overlap)
+    return round(max(min(wanted, room), _MIN_OVERLAPS * overlap, _MIN_WINDOW_TICKS))
 
 
-def stretches(tick_times_ns: IntArray, tracks: Sequence[Track], chunk_ticks: int) -> list[tuple[int, int]]:
+def split_timeline(
+    tick_times_ns: IntArray, tracks: Sequence[CameraTrack], window_ticks: int
+) -> list[tuple[int, int]]:
     """Cut the ticks into about equal stretches, each with measurements of its own.
 
     Seams lie where most cameras are measured: in a gap neither side sees both its ends. A stretch gets longer
-    than `chunk_ticks` by that, by a quarter at most.
+    than `window_ticks` by that, by a quarter at most.
     """
     count = len(tick_times_ns)
     times = np.sort(np.concatenate([track.times_ns for track in tracks]))
     out: list[tuple[int, int]] = []
     first = 0
-    for last in _cuts(tick_times_ns, tracks, max(1, -(-count // chunk_ticks))):
-        low, high = _window(tick_times_ns, first, last)
+    for last in _boundaries(tick_times_ns, tracks, max(1, -(-count // window_ticks))):
+        low, high = _time_span(tick_times_ns, first, last)
         if np.searchsorted(times, high) > np.searchsorted(times, low):
             out.append((first, last))
             first = last
@@ -107,12 +109,12 @@ def stretches(tick_times_ns: IntArray, tracks: Sequence[Track], chunk_ticks: int
     return out
 
 
-def _cuts(tick_times_ns: IntArray, tracks: Sequence[Track], parts: int) -> list[int]:
+def _boundaries(tick_times_ns: IntArray, tracks: Sequence[CameraTrack], parts: int) -> list[int]:
     """Where each of so many stretches ends: the best measured tick near its even share."""
     count = len(tick_times_ns)
     even = np.linspace(0, count, parts + 1).round().astype(int)
-    aside = int(_ASIDE * count / parts)
-    measured = _measured_around(tick_times_ns, tracks) if parts > 1 else np.zeros(count)
+    aside = int(_MAX_BOUNDARY_SHIFT * count / parts)
+    measured = _cameras_measured_near(tick_times_ns, tracks) if parts > 1 else np.zeros(count)
     cuts = [0]
     for place in even[1:-1].tolist():
         near = np.arange(place - aside, min(place, cuts[-1] + count // parts) + aside + 1)
@@ -121,7 +123,7 @@ def _cuts(tick_times_ns: IntArray, tracks: Sequence[Track], parts: int) -> list[
     return [*cuts[1:], count]
 
 
-def _measured_around(tick_times_ns: IntArray, tracks: Sequence[Track]) -> FloatArray:
+def _cameras_measured_near(tick_times_ns: IntArray, tracks: Sequence[CameraTrack]) -> FloatArray:
     """(T,) how many cameras are measured, on average, where a seam at that tick would be blended."""
     seen = np.zeros(len(tick_times_ns))
     for track in tracks:
@@ -129,7 +131,7 @@ def _measured_around(tick_times_ns: IntArray, tracks: Sequence[Track]) -> FloatA
         inside = (after > 0) & (after < len(track.times_ns))
         span = np.diff(track.times_ns)
         # A slow camera's frames are no gaps.
-        reach = max(SAMPLE_REACH_NS, 2.0 * float(np.median(span))) if len(span) else 0.0
+        reach = max(MAX_SAMPLE_GAP_NS, 2.0 * float(np.median(span))) if len(span) else 0.0
         seen[inside] += span[after[inside] - 1] <= reach
     total = np.concatenate([[0.0], np.cumsum(seen)])
     reach_ns = round(_BLEND_S * 1e9)
@@ -138,46 +140,48 @@ def _measured_around(tick_times_ns: IntArray, tracks: Sequence[Track]) -> FloatA
     return np.asarray((total[high] - total[low]) / (high - low))
 
 
-def _window(tick_times_ns: IntArray, first: int, last: int) -> tuple[int, int]:
+def _time_span(tick_times_ns: IntArray, first: int, last: int) -> tuple[int, int]:
     """From the first tick's time to the tick after the last; open at the ends of the timeline."""
     low = int(tick_times_ns[first]) if first > 0 else -(2**62)
     high = int(tick_times_ns[last]) if last < len(tick_times_ns) else 2**62
     return low, high
 
 
-def _between(track: Track, tick_times_ns: IntArray, first: int, last: int) -> Track:
-    low, high = _window(tick_times_ns, first, last)
+def _clip_track(track: CameraTrack, tick_times_ns: IntArray, first: int, last: int) -> CameraTrack:
+    low, high = _time_span(tick_times_ns, first, last)
     return track.keep((track.times_ns >= low) & (track.times_ns < high))
 
 
-def _share(times_ns: IntArray, seam_ns: int) -> FloatArray:
+def _blend_weight(times_ns: IntArray, seam_ns: int) -> FloatArray:
     """(N,) how far times about a seam are on its later side, 0 to 1, without a kink."""
     x = np.clip(0.5 + 0.5e-9 * (times_ns - seam_ns) / _BLEND_S, 0.0, 1.0)
     return np.asarray(x * x * (3.0 - 2.0 * x))
 
 
-def _joined(parts: Sequence[Part], tick_times_ns: IntArray, tracks: Sequence[Track]) -> Solution:
+def _blend_windows(
+    parts: Sequence[WindowSolution], tick_times_ns: IntArray, tracks: Sequence[CameraTrack]
+) -> MotionSolution:
     """The stretches' solutions in one, each passing into the next about the seam."""
     poses, spread = parts[0][0].world_from_bone, parts[0][0].joint_covariance
     cameras = {track.camera: np.zeros((0, 4, 4)) for track in tracks} | dict(parts[0][0].world_from_cam)
     for solution, _, (first, _), low in parts[1:]:
         seam_ns = int(tick_times_ns[first])
-        share = _share(tick_times_ns[low : len(poses)], seam_ns)
-        poses = _passing(poses, solution.world_from_bone, share)
+        share = _blend_weight(tick_times_ns[low : len(poses)], seam_ns)
+        poses = _blend_poses(poses, solution.world_from_bone, share)
         if spread is not None and solution.joint_covariance is not None:
             later, both = solution.joint_covariance, share[:, None, None, None]
             blended = (1.0 - both) * spread[low:] + both * later[: len(share)]
             spread = np.concatenate([spread[:low], blended, later[len(share) :]])
-        from_ns, _ = _window(tick_times_ns, low, low)
+        from_ns, _ = _time_span(tick_times_ns, low, low)
         for track in tracks:
             before, after = cameras[track.camera], solution.world_from_cam.get(track.camera)
             if after is not None:
                 times = track.times_ns[np.searchsorted(track.times_ns, from_ns) : len(before)]
-                cameras[track.camera] = _passing(before, after, _share(times, seam_ns))
-    return _whole(parts, tracks, poses, spread, cameras)
+                cameras[track.camera] = _blend_poses(before, after, _blend_weight(times, seam_ns))
+    return _assemble(parts, tracks, poses, spread, cameras)
 
 
-def _passing(before: FloatArray, after: FloatArray, share: FloatArray) -> FloatArray:
+def _blend_poses(before: FloatArray, after: FloatArray, share: FloatArray) -> FloatArray:
     """Join poses (M,...,4,4) and (N,...,4,4) whose last and first S share their times, by `share` (S,)."""
     both = len(share)
     alpha = share.reshape(-1, *[1] * (before.ndim - 3))
@@ -185,20 +189,20 @@ def _passing(before: FloatArray, after: FloatArray, share: FloatArray) -> FloatA
     return np.concatenate([before[: len(before) - both], blended, after[both:]])
 
 
-def _whole(
-    parts: Sequence[Part],
-    tracks: Sequence[Track],
+def _assemble(
+    parts: Sequence[WindowSolution],
+    tracks: Sequence[CameraTrack],
     poses: FloatArray,
     spread: FloatArray | None,
     cameras: dict[str, FloatArray],
-) -> Solution:
+) -> MotionSolution:
     """The solution of blended poses: what measurements miss them by is theirs."""
     errors: dict[str, float] = {}
     for solution, *_ in parts:
         for kind, error in solution.errors.items():
             errors[kind] = errors.get(kind, 0.0) + error
-    off = {track.camera: missed(track, cameras[track.camera]) for track in tracks}
-    return Solution(
+    off = {track.camera: measurement_residuals(track, cameras[track.camera]) for track in tracks}
+    return MotionSolution(
         world_from_bone=poses,
         residual_m={camera: metres for camera, (metres, _, _) in off.items()},
         residual_rad={camera: turns for camera, (_, turns, _) in off.items()},

@@ -15,29 +15,43 @@ import numpy as np
 
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body.bones import Bone, graph_bones
+from bodycap_batch.merging.body.bones import Bone, kinematic_chain
 from bodycap_batch.merging.body_calibration.calibrate_body import points_around, rolled_mounts, trunk_way_up
 from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
 from bodycap_batch.merging.body_calibration.samples import take_samples
-from bodycap_batch.merging.cameras.track import Track, clean, in_gauge, make_track, moved
-from bodycap_batch.merging.map_alignment.gauss_newton import Placing
-from bodycap_batch.merging.map_alignment.initial_alignment import Starts, require_common_time, starts_of
-from bodycap_batch.merging.map_alignment.scale_sources import Stated, floor_scale, stated_in
-from bodycap_batch.merging.world.vertical import Direction
+from bodycap_batch.merging.cameras.track import (
+    CameraTrack,
+    make_track,
+    remove_outliers,
+    transform_track,
+    transform_trajectory,
+)
+from bodycap_batch.merging.map_alignment.gauss_newton import MapAlignmentProblem
+from bodycap_batch.merging.map_alignment.initial_alignment import (
+    InitialAlignment,
+    align_maps_initially,
+    require_common_time,
+)
+from bodycap_batch.merging.map_alignment.scale_sources import (
+    StatedConstraints,
+    scale_from_walked_floor,
+    stated_constraints,
+)
+from bodycap_batch.merging.world.vertical import Vertical
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.scene import Trajectory
 
 MAX_SIGMA_M = 0.06
 """A map whose cameras are known less well than this, per axis, is not placed."""
-_SAMPLES = 240
+_MAX_SAMPLES = 240
 _REACH_SIGMA = 0.05
 """Of the log of the scale that the limbs' reach gives: walking elbows keep 15 to 30 degrees of flexion. With
 maps of their own, mounts and scale can make up for each other."""
-_APART_SIGMA = 0.15
+_SEPARATE_MAPS_SIGMA = 0.15
 """The same where no map holds the trunk and a limb's end: mounts are off by a tenth of half an arm. On 12
 walks with cameras on upper arms and palms it was 0 to 27 % too small, 12 % in the mean square."""
-_UNTOLD_SIGMA = 0.4
+_UNOBSERVABLE_SIGMA = 0.4
 """The same where nothing tells it but that, or two cameras that sit close together: palms alone gave 0.69
 and 0.72 of the true scale, and lay 20 to 30 cm too low at 5 cm stated."""
 _MAX_STRAIN = 2.0
@@ -45,7 +59,7 @@ _MAX_STRAIN = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Joined:
+class AlignedMap:
     """A further map's place.
 
     Attributes:
@@ -66,7 +80,7 @@ class Joined:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Together:
+class UsableCameras:
     """The cameras that can be used together.
 
     Attributes:
@@ -77,7 +91,7 @@ class Together:
     """
 
     trajectories: tuple[Trajectory, ...]
-    places: Mapping[str, Similarity]
+    main_from_gauge: Mapping[str, Similarity]
     sigmas: Mapping[str, tuple[float, float]]
     unused: Mapping[str, str]
 
@@ -89,13 +103,13 @@ class Together:
         }
 
 
-def use_together(
+def align_cameras(
     inputs: MergeInputs,
     main: Sequence[Trajectory],
     further: Sequence[Trajectory],
     step: Callable[[], None],
     options: MergeOptions | None = None,
-) -> Together:
+) -> UsableCameras:
     """Bring the cameras of further maps into the main one, as far as the body tells where they are.
 
     Args:
@@ -107,27 +121,31 @@ def use_together(
     """
     here = Similarity(1.0, np.eye(3), np.zeros(3))
     if not further:
-        return Together(trajectories=tuple(main), places={main[0].gauge: here}, sigmas={}, unused={})
-    bones = graph_bones(inputs.skeleton, {inputs.mount_of(each.camera).role for each in (*main, *further)})
+        return UsableCameras(
+            trajectories=tuple(main), main_from_gauge={main[0].gauge: here}, sigmas={}, unused={}
+        )
+    bones = kinematic_chain(
+        inputs.skeleton, {inputs.mount_of(each.camera).role for each in (*main, *further)}
+    )
     index = {bone.role: place for place, bone in enumerate(bones)}
-    tracks: dict[str, list[Track]] = {}
+    tracks: dict[str, list[CameraTrack]] = {}
     for each in (*main, *further):
         track = make_track(inputs, each, index[inputs.mount_of(each.camera).role])
         tracks.setdefault(each.gauge, []).append(track)
-    joined, unused = _joined(inputs, options or MergeOptions(), bones, tracks, step)
+    joined, unused = _align_all(inputs, options or MergeOptions(), bones, tracks, step)
     good = {item.gauge: item for item in joined if item.reason is None}
     moved_here = [
-        in_gauge(each, good[each.gauge].main_from_gauge, main[0].gauge)
+        transform_trajectory(each, good[each.gauge].main_from_gauge, main[0].gauge)
         for each in further
         if each.gauge in good
     ]
-    return Together(
+    return UsableCameras(
         trajectories=(*main, *moved_here),
-        places={main[0].gauge: here} | {gauge: item.main_from_gauge for gauge, item in good.items()},
+        main_from_gauge={main[0].gauge: here} | {gauge: item.main_from_gauge for gauge, item in good.items()},
         sigmas={camera: (item.sigma_rad, item.sigma_m) for item in good.values() for camera in item.cameras},
         unused=unused
         | {
-            camera: _cannot(item.gauge, (main[0].camera, main[0].gauge), item.reason)
+            camera: _exclusion_reason(item.gauge, (main[0].camera, main[0].gauge), item.reason)
             for item in joined
             if item.reason is not None
             for camera in item.cameras
@@ -135,20 +153,20 @@ def use_together(
     )
 
 
-def _joined(
+def _align_all(
     inputs: MergeInputs,
     options: MergeOptions,
     bones: Sequence[Bone],
-    tracks: dict[str, list[Track]],
+    tracks: dict[str, list[CameraTrack]],
     step: Callable[[], None],
-) -> tuple[tuple[Joined, ...], dict[str, str]]:
+) -> tuple[tuple[AlignedMap, ...], dict[str, str]]:
     """The further maps' places, and by camera why others were not even tried."""
     (main, (trunk, *_)), *others = tracks.items()
     unused: dict[str, str] = {}
 
     def leave(gauge: str, why: str) -> None:
         for track in tracks.pop(gauge):
-            unused[track.camera] = _cannot(gauge, (trunk.camera, main), why)
+            unused[track.camera] = _exclusion_reason(gauge, (trunk.camera, main), why)
 
     for gauge, group in others:
         try:
@@ -158,40 +176,40 @@ def _joined(
     if len(tracks) == 1:
         return (), unused
     try:
-        return join_maps(inputs, options, bones, tracks, step), unused
+        return align_maps(inputs, options, bones, tracks, step), unused
     except EstimationError as error:
         if len(tracks) == 2:
             leave(next(name for name in tracks if name != main), error.message)
             return (), unused
     # One map that fits no body spoils all of the others' places: each on its own.
-    found: tuple[Joined, ...] = ()
+    found: tuple[AlignedMap, ...] = ()
     for gauge in [name for name in tracks if name != main]:
         try:
-            found += join_maps(inputs, options, bones, {main: tracks[main], gauge: tracks[gauge]}, step)
+            found += align_maps(inputs, options, bones, {main: tracks[main], gauge: tracks[gauge]}, step)
         except EstimationError as error:
             leave(gauge, error.message)
     return found, unused
 
 
-def _cannot(gauge: str, trunk: tuple[str, str], why: str) -> str:
+def _exclusion_reason(gauge: str, trunk: tuple[str, str], why: str) -> str:
     """Why a camera is left out whose map is not the trunk's (camera, gauge)."""
     return f"its map {gauge} shares no view with {trunk[0]}'s {trunk[1]}, and the body cannot place it: {why}"
 
 
-def _begin(
+def _initialise(
     inputs: MergeInputs,
     bones: Sequence[Bone],
-    main: Sequence[Track],
-    others: Sequence[tuple[str, Sequence[Track]]],
-    stated: Stated,
-) -> tuple[MergeInputs, Starts, Direction | None]:
+    main: Sequence[CameraTrack],
+    others: Sequence[tuple[str, Sequence[CameraTrack]]],
+    stated: StatedConstraints,
+) -> tuple[MergeInputs, InitialAlignment, Vertical | None]:
     """The trunk's camera the way up it sits, where the maps start then, and the vertical if known."""
-    start = starts_of(bones, main, others, {mount.camera: mount for mount in inputs.mounts})
-    own = _cleaned(inputs, main, start.metric)
-    roll, up = trunk_way_up(inputs, bones, own, start.metric, stated.ups)
+    start = align_maps_initially(bones, main, others, {mount.camera: mount for mount in inputs.mounts})
+    own = _without_outliers(inputs, main, start.metres_per_unit)
+    roll, up = trunk_way_up(inputs, bones, own, start.metres_per_unit, stated.verticals)
     if roll:
         inputs = rolled_mounts(inputs, {main[0].camera: roll})
-        start = starts_of(bones, main, others, {mount.camera: mount for mount in inputs.mounts})
+        start = align_maps_initially(bones, main, others, {mount.camera: mount for mount in inputs.mounts})
     return inputs, start, up
 
 
@@ -204,17 +222,17 @@ def _require_one_scale(strain: float, reach_sigma: float) -> None:
         )
 
 
-def _cleaned(inputs: MergeInputs, tracks: Sequence[Track], scale: float) -> list[Track]:
-    return [clean(each, scale, inputs.clocks[each.camera].nominal_fps)[0] for each in tracks]
+def _without_outliers(inputs: MergeInputs, tracks: Sequence[CameraTrack], scale: float) -> list[CameraTrack]:
+    return [remove_outliers(each, scale, inputs.clocks[each.camera].nominal_fps) for each in tracks]
 
 
-def join_maps(
+def align_maps(
     inputs: MergeInputs,
     options: MergeOptions,
     bones: Sequence[Bone],
-    tracks: Mapping[str, Sequence[Track]],
+    tracks: Mapping[str, Sequence[CameraTrack]],
     step: Callable[[], None],
-) -> tuple[Joined, ...]:
+) -> tuple[AlignedMap, ...]:
     """Place further maps in the main one.
 
     Args:
@@ -229,27 +247,27 @@ def join_maps(
             together.
     """
     (here, main), *others = tracks.items()
-    stated = stated_in(inputs, options, here)
-    inputs, start, up = _begin(inputs, bones, main, others, stated)
+    stated = stated_constraints(inputs, options, here)
+    inputs, start, up = _initialise(inputs, bones, main, others, stated)
     mounts = {mount.camera: mount for mount in inputs.mounts}
-    starts, provisional = start.places, start.metric
-    together = [*main, *(moved(track, starts[gauge]) for gauge, group in others for track in group)]
-    together = _cleaned(inputs, together, provisional)
-    samples = take_samples(together, provisional, _SAMPLES, None if up is None else up.up)
+    starts, provisional = start.main_from_gauge, start.metres_per_unit
+    together = [*main, *(transform_track(track, starts[gauge]) for gauge, group in others for track in group)]
+    together = _without_outliers(inputs, together, provisional)
+    samples = take_samples(together, provisional, _MAX_SAMPLES, None if up is None else up.up)
     calibration = Calibration(inputs.skeleton, bones, samples, mounts, provisional, step)
     names = {gauge: tuple(track.camera for track in group) for gauge, group in others}
-    known = _REACH_SIGMA if start.spanned else _APART_SIGMA
-    reach_sigma = known if start.told else _UNTOLD_SIGMA
-    problem = Placing(
+    known = _REACH_SIGMA if start.one_map_spans_a_limb else _SEPARATE_MAPS_SIGMA
+    reach_sigma = known if start.scale_observable else _UNOBSERVABLE_SIGMA
+    problem = MapAlignmentProblem(
         calibration, list(names.values()), provisional, reach_sigma=reach_sigma, stated=stated.scales
     )
     problem.solve()
     # Reach and movement may disagree on what the job states.
     if not stated.scales:
-        _require_one_scale(abs(problem.from_reach()), reach_sigma)
+        _require_one_scale(abs(problem.scale_residual()), reach_sigma)
         points = points_around(inputs, together[0].camera)
-        floor = floor_scale(inputs, (together[0], up), problem.scale(), points)
-        problem.know(() if floor is None else (floor,))
+        floor = scale_from_walked_floor(inputs, (together[0], up), problem.scale(), points)
+        problem.add_scale_sources(() if floor is None else (floor,))
     out = []
     for index, (gauge, cameras) in enumerate(names.items()):
         sigma_rad, sigma_m = problem.sigmas(index)
@@ -260,10 +278,10 @@ def join_maps(
                 "walk, an upper arm's camera, a common view, a known distance or a marker board settle it"
             )
         out.append(
-            Joined(
+            AlignedMap(
                 gauge=gauge,
                 cameras=cameras,
-                main_from_gauge=problem.moved[index].after(starts[gauge]),
+                main_from_gauge=problem.corrections[index].after(starts[gauge]),
                 sigma_rad=sigma_rad,
                 sigma_m=sigma_m,
                 reason=why,

@@ -14,14 +14,14 @@ from bodycap_batch.merging.body_calibration.mount_covariance import PRIOR, Solve
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.model.geometry import Similarity, so3_exp
 
-_LOOSENED = (16.0, 4.0, 1.0)
+_SLACK_SCHEDULE = (16.0, 4.0, 1.0)
 """Slack of the joints in turn: a start that is a decimetre off must pull, not be taken for gross errors."""
-_STEPS = 8
-_CLOSE = 1e-3
+_MAX_STEPS = 8
+_CONVERGED = 1e-3
 """Share of the cost by which a step changes it that is the last."""
 
 
-class Placing:
+class MapAlignmentProblem:
     """A calibration whose further maps may move: their similarities by Gauss-Newton, all else eliminated.
 
     Args:
@@ -48,12 +48,12 @@ class Placing:
         )
         cameras = calibration.samples.cameras
         self._members = [[cameras.index(name) for name in group] for group in groups]
-        self.moved = [Similarity(1.0, np.eye(3), np.zeros(3)) for _ in groups]
+        self.corrections = [Similarity(1.0, np.eye(3), np.zeros(3)) for _ in groups]
         self._covariance = np.zeros((0, 0))
 
     def solve(self) -> None:
         """Move the maps until the body's cost no longer falls, its joints stiffer step by step."""
-        for slack in _LOOSENED:
+        for slack in _SLACK_SCHEDULE:
             self._calibration.slack_factor = slack
             self._descend()
         mounts, shifts = self._linearised()
@@ -66,7 +66,7 @@ class Placing:
         sigma = float(np.sqrt(self._covariance[0, 0]))
         return ScaleSource(name="body", scale=self._scale, sigma_log=sigma)
 
-    def know(self, sources: Sequence[ScaleSource]) -> None:
+    def add_scale_sources(self, sources: Sequence[ScaleSource]) -> None:
         """Weigh what else knows the scale into the solution."""
         if sources:
             self._sources += tuple(sources)
@@ -76,15 +76,15 @@ class Placing:
     def _descend(self) -> None:
         cost = self._cost()
         damping = 1e-4
-        for _ in range(_STEPS):
+        for _ in range(_MAX_STEPS):
             change, _ = self._step(damping)
-            before = self._calibration.samples, self._scale, list(self.moved)
+            before = self._calibration.samples, self._scale, list(self.corrections)
             self._apply(change)
             trial = self._cost()
-            close = abs(trial - cost) < _CLOSE * max(cost, 1.0)
+            close = abs(trial - cost) < _CONVERGED * max(cost, 1.0)
             if trial > cost:
                 self._calibration.move(before[0])
-                _, self._scale, self.moved = before
+                _, self._scale, self.corrections = before
                 self._calibration.solve(self._scale)
                 damping = max(100.0 * damping, 1e-2)
             else:
@@ -117,18 +117,18 @@ class Placing:
         told = np.zeros((len(self._sources), solved.influence.shape[1]))
         told[:, -count] = [1.0 / source.sigma_log for source in self._sources]
         influence = np.vstack([solved.influence, told])
-        right = np.append(mounts.linear.right, -self._from_sources())
+        right = np.append(mounts.linear.rhs, -self._source_residuals())
         normal = influence.T @ influence
         variance = self._calibration.row_variance(mounts, solved)[
             np.append(mounts.kinds, np.full(len(told), PRIOR))
         ]
-        gain = _solved(normal, influence.T)
+        gain = _solve_normal_equations(normal, influence.T)
         # A posture that is the wearer's habit, not the prior's, bends mounts and maps alike.
         habit = (mounts.habit_shifts().T @ gain[:, : -len(told)].T).T
         covariance = (gain * variance) @ gain.T + habit @ habit.T
         free = np.arange(len(normal) - count, len(normal))
         normal[free, free] *= 1.0 + damping
-        change = _solved(normal, influence.T @ right)[-count:]
+        change = _solve_normal_equations(normal, influence.T @ right)[-count:]
         return np.asarray(change, dtype=np.float64), np.asarray(covariance[-count:, -count:])
 
     def _linearised(self) -> tuple[SolvedMounts, FloatArray]:
@@ -139,13 +139,13 @@ class Placing:
         return mounts, shifts
 
     def _cost(self) -> float:
-        return self._calibration.solve(self._scale) + 0.5 * float((self._from_sources() ** 2).sum())
+        return self._calibration.solve(self._scale) + 0.5 * float((self._source_residuals() ** 2).sum())
 
-    def from_reach(self) -> float:
+    def scale_residual(self) -> float:
         """How far the scale has left the one that the limbs' reach gave, in sigmas."""
-        return float(self._from_sources()[0])
+        return float(self._source_residuals()[0])
 
-    def _from_sources(self) -> FloatArray:
+    def _source_residuals(self) -> FloatArray:
         """How far the scale is from what each source says, in sigmas."""
         return np.array([np.log(self._scale / each.scale) / each.sigma_log for each in self._sources])
 
@@ -176,12 +176,12 @@ class Placing:
             rotation, factor = so3_exp(turn), float(np.exp(stretch[0]))
             update = Similarity(factor, rotation, middle + shift / self._scale - factor * rotation @ middle)
             poses[members] = update.apply_to_poses(poses[members])
-            self.moved[index] = update.after(self.moved[index])
+            self.corrections[index] = update.after(self.corrections[index])
         self._calibration.move(replace(samples, map_from_cam=poses))
         self._scale *= float(np.exp(change[0]))
 
 
-def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
+def _solve_normal_equations(normal: FloatArray, right: FloatArray) -> FloatArray:
     """Solve the normal equations of the maps' places.
 
     Raises:

@@ -14,18 +14,18 @@ from bodycap_batch.merging.body_calibration.calibrate_body import ENOUGH_WALKING
 from bodycap_batch.merging.body_calibration.known_distance import known_distance
 from bodycap_batch.merging.body_calibration.marker_board import find_board
 from bodycap_batch.merging.body_calibration.scale import ScaleSource, floor_source
-from bodycap_batch.merging.cameras.track import SAMPLE_REACH_NS, Track, evenly
+from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack, pick_evenly
 from bodycap_batch.merging.graph.posture import find_posture
-from bodycap_batch.merging.world.floor import WALKING_HEIGHT, standing_height, walked_floor
-from bodycap_batch.merging.world.vertical import Direction, Say
+from bodycap_batch.merging.world.floor import WALKING_HEIGHT_RATIO, floor_beside_path, standing_height
+from bodycap_batch.merging.world.vertical import Vertical, VerticalHypothesis
 from bodycap_batch.model.geometry import Similarity, invert
 from bodycap_batch.model.merge_data import MergeInputs
 
-_TIMES = 240
+_MAX_SAMPLES = 240
 
 
 @dataclass(frozen=True, slots=True)
-class Stated:
+class StatedConstraints:
     """What the job itself says of the trunk's map.
 
     Attributes:
@@ -34,10 +34,10 @@ class Stated:
     """
 
     scales: tuple[ScaleSource, ...] = ()
-    ups: tuple[Say, ...] = ()
+    verticals: tuple[VerticalHypothesis, ...] = ()
 
 
-def stated_in(inputs: MergeInputs, options: MergeOptions, gauge: str) -> Stated:
+def stated_constraints(inputs: MergeInputs, options: MergeOptions, gauge: str) -> StatedConstraints:
     """What the job states of one map by itself.
 
     What lies in another map is left to the whole body, whose maps are together then.
@@ -55,11 +55,11 @@ def stated_in(inputs: MergeInputs, options: MergeOptions, gauge: str) -> Stated:
     with suppress(EstimationError):
         board = find_board(inputs, options, here)
     scales = (distance, None if board is None else board.scale)
-    return Stated(tuple(each for each in scales if each is not None), stated_up(options, board))
+    return StatedConstraints(tuple(each for each in scales if each is not None), stated_up(options, board))
 
 
-def floor_scale(
-    inputs: MergeInputs, trunk: tuple[Track, Direction | None], body: ScaleSource, points: FloatArray
+def scale_from_walked_floor(
+    inputs: MergeInputs, trunk: tuple[CameraTrack, Vertical | None], body: ScaleSource, points: FloatArray
 ) -> ScaleSource | None:
     """The scale by the trunk's height over the floor it walks, None where none was seen to be walked.
 
@@ -77,16 +77,16 @@ def floor_scale(
     if up is None or joint is None:
         return None
     metric = track.scaled(body.scale)
-    times_ns = track.times_ns[evenly(np.arange(len(track.times_ns)), _TIMES)]
+    times_ns = track.times_ns[pick_evenly(np.arange(len(track.times_ns)), _MAX_SAMPLES)]
     walking = find_posture(metric, times_ns, up.up, None).walking
     if walking.sum() < ENOUGH_WALKING:
         return None
-    walked, _ = metric.at(times_ns[walking], reach_ns=SAMPLE_REACH_NS)
+    walked, _ = metric.poses_at(times_ns[walking], max_gap_ns=MAX_SAMPLE_GAP_NS)
     path_m, walked_m = (
         (poses @ invert(mount.joint_from_cam))[:, :3, 3] for poses in (metric.map_from_cam, walked)
     )
     height_m, standing_m = float(np.median(walked_m @ up.up)), standing_height(inputs.skeleton, joint)
-    expected = height_m - WALKING_HEIGHT * standing_m
-    floor = walked_floor(body.scale * points, path_m, up, expected, standing_m)
+    expected = height_m - WALKING_HEIGHT_RATIO * standing_m
+    floor = floor_beside_path(body.scale * points, path_m, up, expected, standing_m)
     found = None if floor is None else floor_source(body, height_m - floor.height_m, standing_m)
     return found if found is not None and found.used else None

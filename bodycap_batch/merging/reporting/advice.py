@@ -102,12 +102,12 @@ def up_sentence(calibrated: Calibrated) -> str:
     """How well the vertical is known."""
     up = calibrated.up
     text = f"up is known to {up.sigma_deg:.1f}° (1 sigma), from the {up.source}"
-    if up.by_habit():
+    if up.rests_on_lean_only():
         text = (
             f"{text}, and not for certain: nothing else tells it, and a lean that lasts all the time "
             "does not show in it"
         )
-    elif not up.determined():
+    elif not up.is_determined():
         text = (
             f"{text}, and not for certain: another direction, at a right angle or so to it, explains the "
             f"leaning nearly as well"

@@ -10,10 +10,10 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body_calibration.calibrate_body import Calibrated
 from bodycap_batch.merging.body_calibration.scale import ScaleSource, disagreement
-from bodycap_batch.merging.cameras.clock_check import doubted_clocks
-from bodycap_batch.merging.cameras.side_check import exchanged_sides
-from bodycap_batch.merging.cameras.track import Track
-from bodycap_batch.merging.graph.motion_graph import Solution
+from bodycap_batch.merging.cameras.clock_check import suspicious_clocks
+from bodycap_batch.merging.cameras.side_check import swapped_sides
+from bodycap_batch.merging.cameras.track import CameraTrack
+from bodycap_batch.merging.graph.motion_graph import MotionSolution
 from bodycap_batch.merging.reporting.advice import (
     clock_sentence,
     hinge_sentence,
@@ -22,7 +22,7 @@ from bodycap_batch.merging.reporting.advice import (
     sides_sentence,
     up_sentence,
 )
-from bodycap_batch.merging.world.vertical import apart_deg
+from bodycap_batch.merging.world.vertical import angle_deg
 from bodycap_batch.model.geometry import rotation_angle_rad
 from bodycap_batch.model.merge_data import MergeInputs
 
@@ -30,8 +30,8 @@ from bodycap_batch.model.merge_data import MergeInputs
 def build_report(
     inputs: MergeInputs,
     calibrated: Calibrated,
-    solution: Solution,
-    tracks: Sequence[Track],
+    solution: MotionSolution,
+    tracks: Sequence[CameraTrack],
     notes: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Collect sources, values and residuals.
@@ -95,22 +95,22 @@ def build_report(
     }
 
 
-def _clocks(inputs: MergeInputs, tracks: Sequence[Track]) -> dict[str, Any]:
+def _clocks(inputs: MergeInputs, tracks: Sequence[CameraTrack]) -> dict[str, Any]:
     """Cameras whose clock is doubted, and the ``offset_s`` that would suit them; none of joined maps."""
     out: dict[str, Any] = {}
-    for camera, doubt in doubted_clocks(tracks).items():
+    for camera, doubt in suspicious_clocks(tracks).items():
         offset_s = round(inputs.clocks[camera].offset_s + doubt["shift_s"], 2)
         out[camera] = {**doubt, "offset_s": offset_s, "says": clock_sentence(camera, doubt, offset_s)}
     return out
 
 
 def _sides(
-    inputs: MergeInputs, calibrated: Calibrated, tracks: Sequence[Track], joined: Collection[str]
+    inputs: MergeInputs, calibrated: Calibrated, tracks: Sequence[CameraTrack], joined: Collection[str]
 ) -> dict[str, Any]:
     """Limbs' cameras on the other side of the body, where all are; nothing of joined maps."""
     own = [each for each in tracks if each.camera not in joined]
     mounts = {mount.camera: mount for mount in (*inputs.mounts, calibrated.trunk)}
-    wrong = exchanged_sides(own, mounts, calibrated.up.up)
+    wrong = swapped_sides(own, mounts, calibrated.up.up)
     return {"cameras": wrong, "says": sides_sentence(wrong)} if wrong else {}
 
 
@@ -153,11 +153,11 @@ def _up(calibrated: Calibrated) -> dict[str, Any]:
         "others": [
             {
                 "name": say.source,
-                "off_deg": round(apart_deg(say.up, up.up), 2),
+                "off_deg": round(angle_deg(say.up, up.up), 2),
                 "sigma_deg": round(say.sigma_deg, 2),
-                "less_likely_nats": round(say.nats - up.nats, 2),
+                "less_likely_nats": round(say.negative_log_likelihood - up.negative_log_likelihood, 2),
             }
-            for say in up.others
+            for say in up.alternatives
         ],
         "known_to": up_sentence(calibrated),
     }
@@ -214,7 +214,7 @@ def _percentiles(values: FloatArray) -> dict[str, float]:
     return {f"p{q}": round(float(np.percentile(values, q)), 5) for q in (50, 95)}
 
 
-def longest_gap_s(track: Track, start_ns: int, end_ns: int) -> float:
+def longest_gap_s(track: CameraTrack, start_ns: int, end_ns: int) -> float:
     """Longest time without a measurement; that before the first one and after the last one count, too."""
     times = np.concatenate([[start_ns], np.clip(track.times_ns, start_ns, end_ns), [end_ns]])
     return round(float(np.diff(times).max()) * 1e-9, 4)

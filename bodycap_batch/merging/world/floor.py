@@ -9,24 +9,24 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray
-from bodycap_batch.merging.world.vertical import Direction
+from bodycap_batch.merging.world.vertical import Vertical
 from bodycap_batch.model.geometry import Similarity, so3_exp
 from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions
 
-MOVING_M_PER_S = 0.4
-WALKING_HEIGHT = 0.97
+MIN_MOVING_SPEED_M_PER_S = 0.4
+WALKING_HEIGHT_RATIO = 0.97
 """Mean height of the trunk in walking over its standing height: 0.95 to 1.00 on four captures."""
 
 SLAB_M = 0.03
 _MIN_POINTS = 100
 _MIN_FLOOR_POINTS = 30
-_MOST_BELOW = 0.2
+_MAX_BELOW_RATIO = 0.2
 """Points below a floor over those in it: below what stands on a floor, the floor's own are more."""
-_FLOOR_REACH = 0.25
+_SEARCH_RATIO = 0.25
 """How far off the body's own idea of it the floor is looked for, as a share of the trunk's height."""
-_BESIDE_M = 0.8
-_WALKED_OVER = 5
+_PATH_DISTANCE_M = 0.8
+_MIN_PATH_POINTS = 5
 """A floor shows beside the walk, seen from above, in so many points of a slab, and in half of all there."""
 _LEGLESS_HIP_M = 0.9
 _ANKLE_OVER_LEG = 0.039 / 0.491
@@ -42,7 +42,7 @@ class Floor:
     support: int
 
 
-def find_floor(heights_m: FloatArray, up: Direction, expected_m: float, standing_m: float) -> Floor:
+def floor_from_points(heights_m: FloatArray, up: Vertical, expected_m: float, standing_m: float) -> Floor:
     """Find the floor among the heights (P,) of the map's points.
 
     The floor is a well-filled slab near where the standing body's soles are, with next to nothing below it.
@@ -56,11 +56,11 @@ def find_floor(heights_m: FloatArray, up: Direction, expected_m: float, standing
         standing_m: Height of a trunk joint above the soles; sets how far off the floor may be.
     """
     if up.source == "map" and len(heights_m) >= _MIN_POINTS:
-        reach = _FLOOR_REACH * standing_m
+        reach = _SEARCH_RATIO * standing_m
         edges = np.arange(expected_m - reach, expected_m + reach, 0.25 * SLAB_M)
         inside = (heights_m >= edges[:, None]) & (heights_m < edges[:, None] + SLAB_M)
         below = (heights_m < edges[:, None] - 2.0 * SLAB_M).sum(axis=1)
-        counts = np.where(below < _MOST_BELOW * inside.sum(axis=1), inside.sum(axis=1), 0)
+        counts = np.where(below < _MAX_BELOW_RATIO * inside.sum(axis=1), inside.sum(axis=1), 0)
         best = int(np.argmax(counts))
         # Clutter spreads evenly over heights; a floor stands out from it.
         if counts[best] >= max(_MIN_FLOOR_POINTS, 3.0 * float(np.median(inside.sum(axis=1)))):
@@ -69,8 +69,8 @@ def find_floor(heights_m: FloatArray, up: Direction, expected_m: float, standing
     return Floor(expected_m, "standing hip height", 0)
 
 
-def walked_floor(
-    points_m: FloatArray, path_m: FloatArray, up: Direction, expected_m: float, standing_m: float
+def floor_beside_path(
+    points_m: FloatArray, path_m: FloatArray, up: Vertical, expected_m: float, standing_m: float
 ) -> Floor | None:
     """Find the floor in the few points beside the walk: nobody walks through a table.
 
@@ -84,20 +84,20 @@ def walked_floor(
     if up.source != "map" or not len(points_m):
         return None
     level = np.linalg.svd(up.up[None])[2][1:].T
-    beside = cKDTree(path_m @ level).query(points_m @ level)[0] < _BESIDE_M
+    beside = cKDTree(path_m @ level).query(points_m @ level)[0] < _PATH_DISTANCE_M
     heights = np.sort(points_m[beside] @ up.up)
-    heights = heights[np.abs(heights - expected_m) < _FLOOR_REACH * standing_m]
+    heights = heights[np.abs(heights - expected_m) < _SEARCH_RATIO * standing_m]
     if not len(heights):
         return None
     ends = np.searchsorted(heights, heights + 2.0 * SLAB_M, side="right")
     first = int(np.argmax(ends - np.arange(len(heights))))
     slab = heights[first : ends[first]]
-    if len(slab) < max(_WALKED_OVER, 0.5 * len(heights)):
+    if len(slab) < max(_MIN_PATH_POINTS, 0.5 * len(heights)):
         return None
     return Floor(float(np.median(slab)), "map", len(slab))
 
 
-def feet_floor(skeleton: SkeletonModel, world_from_joint: FloatArray, solved: BoolArray) -> Floor | None:
+def floor_from_feet(skeleton: SkeletonModel, world_from_joint: FloatArray, solved: BoolArray) -> Floor | None:
     """Find the lowest height of the soles (Z up) where a foot was solved: the ankles' 2nd percentile."""
     ankles = [skeleton.index_of_role(side + "Foot") for side in ("Left", "Right")]
     heights = [world_from_joint[:, ankle, 2, 3] for ankle in ankles if ankle is not None and solved[ankle]]
@@ -137,7 +137,7 @@ def standing_height(skeleton: SkeletonModel, joint: int) -> float:
     return above_root + (float(rest[0][2]) if rest[0][2] > 0.3 else _LEGLESS_HIP_M)
 
 
-def heading(forward: FloatArray, centre_m: FloatArray, fps: float) -> float:
+def initial_heading(forward: FloatArray, centre_m: FloatArray, fps: float) -> float:
     """Mean heading (rad, from +X towards +Y) of the body's forward over the first moving second.
 
     Args:
@@ -149,13 +149,13 @@ def heading(forward: FloatArray, centre_m: FloatArray, fps: float) -> float:
     start = 0
     if len(centre_m) > stride:
         travelled = np.linalg.norm(centre_m[stride:, :2] - centre_m[:-stride, :2], axis=1)
-        moving = np.flatnonzero(travelled > MOVING_M_PER_S * stride / fps)
+        moving = np.flatnonzero(travelled > MIN_MOVING_SPEED_M_PER_S * stride / fps)
         start = int(moving[0]) if len(moving) else 0
     mean = forward[start : start + window, :2].sum(axis=0)
     return float(np.arctan2(mean[1], mean[0]))
 
 
-def upright(up: FloatArray) -> FloatArray:
+def rotation_to_z_up(up: FloatArray) -> FloatArray:
     """The smallest rotation (3,3) that takes `up` to +Z."""
     axis = np.cross(up, [0.0, 0.0, 1.0])
     norm = float(np.linalg.norm(axis))

@@ -8,44 +8,44 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.body.trunk_lean import BodyUp
-from bodycap_batch.merging.graph.posture import walking_plane
+from bodycap_batch.merging.body.trunk_lean import TrunkOrientation
+from bodycap_batch.merging.graph.posture import vertical_from_path
 from bodycap_batch.merging.world.planes import (
-    BENT_LIMIT_DEG,
-    THICKNESS_M,
+    BENT_TILT_LIMIT_DEG,
+    PLANE_HALF_THICKNESS_M,
     TILT_LIMIT_DEG,
     Plane,
     find_planes,
-    vertical,
+    vertical_from_planes,
 )
 
-_LEAN_NATS = 3.0
+_LEAN_SAMPLES = 3.0
 """How many independent moments a clip's leaning counts for: a habit lasts all of it."""
-_SHARE_NATS = 6.0
+_PLANE_SHARE_NATS = 6.0
 """What a vertical costs that none of the planes' points agree with."""
 _WALK_NATS, _BODY_NATS = 1.5, 12.0
 """What it costs to believe the walk rather than planes that agree with the body as well as it does, and to
 believe the body's leaning alone."""
-_STRANGE_NATS = 4.0
+_SCENE_NATS = 4.0
 """A trunk that moves further up and down than it stands high climbs stairs; and a room's points lie above
 its floor."""
 _FLOOR_NATS = 2.0
-_FLOOR_OFF, _MOST_BELOW = 0.35, 0.02
+_FLOOR_TOLERANCE, _MAX_SHARE_BELOW = 0.35, 0.02
 """How far the floor may be from where a trunk's height has it (a rough scale, bent knees); share of points
 below it that are wrong."""
-_DETERMINED_NATS = 3.0
+_MIN_MARGIN_NATS = 3.0
 """Twenty to one."""
 _STATED_SIGMAS = 3.0
-_APART_DEG = 20.0
+_DISTINCT_DEG = 20.0
 _SEARCH_DEG = 5.0
-_SAME_DEG, _LEVEL_DEG = 1.0, 5.0
-_LEAST_SIGMA_DEG, _WALK_SIGMA_DEG, _BODY_SIGMA_DEG = 0.7, 2.0, 15.0
+_SAME_DEG, _MAX_FLOOR_TILT_DEG = 1.0, 5.0
+_MIN_PLANE_SIGMA_DEG, _WALK_SIGMA_DEG, _BODY_SIGMA_DEG = 0.7, 2.0, 15.0
 """Walls and floors agree with the truth to 0.3 to 1.3 degrees on five captures; a walk's ground and bounce
 are level to two; what a camera's mount is turned by looks like a lean."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Say:
+class VerticalHypothesis:
     """What one source has to say about up.
 
     Attributes:
@@ -60,11 +60,11 @@ class Say:
     up: FloatArray
     sigma_deg: float
     share: float = 0.0
-    nats: float = 0.0
+    negative_log_likelihood: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
-class Direction:
+class Vertical:
     """Up in the solved frame, and what it rests on.
 
     Attributes:
@@ -84,23 +84,23 @@ class Direction:
     body_off_deg: float | None
     plane_share: float
     sigma_deg: float = 0.0
-    others: tuple[Say, ...] = ()
-    nats: float = 0.0
+    alternatives: tuple[VerticalHypothesis, ...] = ()
+    negative_log_likelihood: float = 0.0
     margin_nats: float | None = None
 
-    def determined(self) -> bool:
+    def is_determined(self) -> bool:
         """Whether the next best direction is clearly worse, and a lasting lean would have shown."""
-        if self.by_habit():
+        if self.rests_on_lean_only():
             return False
-        return self.margin_nats is None or self.margin_nats >= _DETERMINED_NATS
+        return self.margin_nats is None or self.margin_nats >= _MIN_MARGIN_NATS
 
-    def by_habit(self) -> bool:
+    def rests_on_lean_only(self) -> bool:
         """Whether it rests on nothing but a leaning that may have lasted all the time."""
-        return self.source == "body" and self.sigma_deg > _APART_DEG
+        return self.source == "body" and self.sigma_deg > _DISTINCT_DEG
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Around:
+class SceneContext:
     """What lies about a trunk.
 
     Attributes:
@@ -116,7 +116,12 @@ class Around:
     walks: bool = False
 
 
-def find_up(body: BodyUp, around: Around, rng: np.random.Generator, stated: Sequence[Say] = ()) -> Direction:
+def estimate_vertical(
+    body: TrunkOrientation,
+    around: SceneContext,
+    rng: np.random.Generator,
+    stated: Sequence[VerticalHypothesis] = (),
+) -> Vertical:
     """Weigh the verticals of the map's planes, of the walk and of the body's leaning against each other.
 
     A room's planes leave six directions or more; which of them is up is told by how the trunk would lean
@@ -131,95 +136,109 @@ def find_up(body: BodyUp, around: Around, rng: np.random.Generator, stated: Sequ
             whatever the others say.
     """
     planes = find_planes(around.points_m, rng)
-    hints = [body.usual(), body.mean(), body.erect()]
+    hints = [body.modal_up(), body.mean_up(), body.upright_up()]
     says = [
-        *_of_planes(planes, hints),
+        *_hypotheses_from_planes(planes, hints),
         *(
-            Say(source="walk", up=up, sigma_deg=_WALK_SIGMA_DEG, nats=_WALK_NATS)
-            for up in (walking_plane(around.path_m, hint) for hint in hints)
+            VerticalHypothesis(
+                source="walk", up=up, sigma_deg=_WALK_SIGMA_DEG, negative_log_likelihood=_WALK_NATS
+            )
+            for up in (vertical_from_path(around.path_m, hint) for hint in hints)
             if up is not None
         ),
         *(
-            Say(source="body", up=up, sigma_deg=_body_sigma_deg(body, up, around.walks), nats=_BODY_NATS)
+            VerticalHypothesis(
+                source="body",
+                up=up,
+                sigma_deg=_body_sigma_deg(body, up, around.walks),
+                negative_log_likelihood=_BODY_NATS,
+            )
             for up in hints[2:]
         ),
         *stated,
     ]
-    leans = _LEAN_NATS * body.strangeness(np.array([say.up for say in says]))
+    leans = _LEAN_SAMPLES * body.negative_log_likelihood(np.array([say.up for say in says]))
     says = [
-        Say(
+        VerticalHypothesis(
             source=say.source,
             up=say.up,
             sigma_deg=say.sigma_deg,
             share=say.share,
-            nats=say.nats + lean + _strange(say.up, planes, around),
+            negative_log_likelihood=say.negative_log_likelihood
+            + lean
+            + _scene_penalty(say.up, planes, around),
         )
         for say, lean in zip(says, leans.tolist(), strict=True)
     ]
     sources = {say.source for say in stated}
-    return _direction(_choose(says, sources), says, sources, hints[2])
+    return _vertical_from_hypotheses(_select(says, sources), says, sources, hints[2])
 
 
-def _choose(says: Sequence[Say], stated: Collection[str]) -> Say:
+def _select(says: Sequence[VerticalHypothesis], stated: Collection[str]) -> VerticalHypothesis:
     """The least strange; of stated ones, if any, and then as exact as planes that agree have it."""
-    best = min((say for say in says if not stated or say.source in stated), key=lambda say: say.nats)
+    best = min(
+        (say for say in says if not stated or say.source in stated),
+        key=lambda say: say.negative_log_likelihood,
+    )
     agree = [
         say
         for say in says
-        if stated and say.source == "map" and apart_deg(say.up, best.up) < _STATED_SIGMAS * best.sigma_deg
+        if stated and say.source == "map" and angle_deg(say.up, best.up) < _STATED_SIGMAS * best.sigma_deg
     ]
-    return min(agree, key=lambda say: say.nats, default=best)
+    return min(agree, key=lambda say: say.negative_log_likelihood, default=best)
 
 
-def _direction(chosen: Say, says: Sequence[Say], stated: Collection[str], erect: FloatArray) -> Direction:
+def _vertical_from_hypotheses(
+    chosen: VerticalHypothesis, says: Sequence[VerticalHypothesis], stated: Collection[str], erect: FloatArray
+) -> Vertical:
     """What was taken, beside what else might have been: of what the job states, another of that."""
-    best: dict[str, Say] = {}
-    for say in sorted(says, key=lambda say: say.nats):
+    best: dict[str, VerticalHypothesis] = {}
+    for say in sorted(says, key=lambda say: say.negative_log_likelihood):
         if say.source != chosen.source:
             best.setdefault(say.source, say)
     far = [
         say
         for say in says
-        if apart_deg(say.up, chosen.up) > _APART_DEG
+        if angle_deg(say.up, chosen.up) > _DISTINCT_DEG
         and (say.source in stated if stated else say.source != "body")
     ]
-    rival = min(far, key=lambda say: say.nats, default=None)
+    rival = min(far, key=lambda say: say.negative_log_likelihood, default=None)
     others = list(best.values())
     if rival is not None and all(rival is not say for say in others):
         others.append(rival)
-    return Direction(
+    return Vertical(
         up=chosen.up,
         source=chosen.source,
-        body_off_deg=None if chosen.source == "body" else apart_deg(chosen.up, erect),
+        body_off_deg=None if chosen.source == "body" else angle_deg(chosen.up, erect),
         plane_share=chosen.share,
         sigma_deg=chosen.sigma_deg,
-        others=tuple(others),
-        nats=chosen.nats,
-        margin_nats=None if rival is None else rival.nats - chosen.nats,
+        alternatives=tuple(others),
+        negative_log_likelihood=chosen.negative_log_likelihood,
+        margin_nats=None if rival is None else rival.negative_log_likelihood - chosen.negative_log_likelihood,
     )
 
 
-def _of_planes(planes: Sequence[Plane], hints: Sequence[FloatArray]) -> list[Say]:
+def _hypotheses_from_planes(planes: Sequence[Plane], hints: Sequence[FloatArray]) -> list[VerticalHypothesis]:
     """All the directions that most planes near them are level or upright to."""
     normals = [plane.normal for plane in planes]
     level = [np.cross(a, b) for i, a in enumerate(normals) for b in normals[:i]]
     axes = [axis / np.linalg.norm(axis) for axis in (*normals, *level) if np.linalg.norm(axis) > 0.5]
-    searches = [(hint, limit) for hint in hints for limit in (TILT_LIMIT_DEG, BENT_LIMIT_DEG)]
+    searches = [(hint, limit) for hint in hints for limit in (TILT_LIMIT_DEG, BENT_TILT_LIMIT_DEG)]
     searches += [(sign * axis, _SEARCH_DEG) for axis in axes for sign in (1.0, -1.0)]
-    out: list[Say] = []
+    out: list[VerticalHypothesis] = []
     for hint, limit_deg in searches:
-        if limit_deg == _SEARCH_DEG and any(apart_deg(hint, say.up) < _SAME_DEG for say in out):
+        if limit_deg == _SEARCH_DEG and any(angle_deg(hint, say.up) < _SAME_DEG for say in out):
             continue
-        found = vertical(planes, hint, limit_deg)
-        if found is None or any(apart_deg(found[0], say.up) < 0.1 * _SAME_DEG for say in out):
+        found = vertical_from_planes(planes, hint, limit_deg)
+        if found is None or any(angle_deg(found[0], say.up) < 0.1 * _SAME_DEG for say in out):
             continue
         out.append(
-            Say(
+            VerticalHypothesis(
                 source="map",
                 up=found[0],
                 sigma_deg=_plane_sigma_deg(planes, found[0]),
                 share=found[1],
-                nats=_SHARE_NATS * (1.0 - found[1]),
+                negative_log_likelihood=_PLANE_SHARE_NATS * (1.0 - found[1]),
             )
         )
     return out
@@ -230,37 +249,37 @@ def _plane_sigma_deg(planes: Sequence[Plane], up: FloatArray) -> float:
     angle = np.degrees(np.arccos(np.clip([abs(float(plane.normal @ up)) for plane in planes], 0.0, 1.0)))
     off = np.minimum(angle, 90.0 - angle)
     near = off[off < 1.5]
-    return float(np.hypot(_LEAST_SIGMA_DEG, np.sqrt((near**2).sum()) / max(len(near) - 1, 1)))
+    return float(np.hypot(_MIN_PLANE_SIGMA_DEG, np.sqrt((near**2).sum()) / max(len(near) - 1, 1)))
 
 
-def _body_sigma_deg(body: BodyUp, up: FloatArray, walks: bool) -> float:
+def _body_sigma_deg(body: TrunkOrientation, up: FloatArray, walks: bool) -> float:
     """Who walks is upright but for a camera's tilt, which looks like a lean: that, and half of how it moves.
 
     Who sits, stands or works may lean all the time, and nothing tells by how much.
     """
     if not walks:
-        return body.habit_deg(up)
+        return body.posterior_spread_deg(up)
     moved = np.degrees(np.arccos(np.clip(body.axes[:, :, 2] @ up, -1.0, 1.0)))
     return float(np.hypot(_BODY_SIGMA_DEG, 0.5 * np.sqrt((moved**2).mean())))
 
 
-def _strange(up: FloatArray, planes: Sequence[Plane], around: Around) -> float:
+def _scene_penalty(up: FloatArray, planes: Sequence[Plane], around: SceneContext) -> float:
     """What the room and the way through it say against a direction, nats."""
     heights = around.path_m @ up
     low, high = np.percentile(heights, [2.0, 98.0])
-    nats = _STRANGE_NATS if high - low > around.standing_m else 0.0
-    deepest = high - (1.0 + _FLOOR_OFF) * around.standing_m
-    if len(around.points_m) and float((around.points_m @ up < deepest).mean()) > _MOST_BELOW:
-        nats += _STRANGE_NATS
+    nats = _SCENE_NATS if high - low > around.standing_m else 0.0
+    deepest = high - (1.0 + _FLOOR_TOLERANCE) * around.standing_m
+    if len(around.points_m) and float((around.points_m @ up < deepest).mean()) > _MAX_SHARE_BELOW:
+        nats += _SCENE_NATS
     for plane in planes:
         along = float(plane.normal @ up)
-        if abs(along) > np.cos(np.radians(_LEVEL_DEG)):
+        if abs(along) > np.cos(np.radians(_MAX_FLOOR_TILT_DEG)):
             depth = high - plane.offset_m * float(np.sign(along))
-            if abs(depth - around.standing_m) < _FLOOR_OFF * around.standing_m + THICKNESS_M:
+            if abs(depth - around.standing_m) < _FLOOR_TOLERANCE * around.standing_m + PLANE_HALF_THICKNESS_M:
                 return nats - _FLOOR_NATS
     return nats
 
 
-def apart_deg(first: FloatArray, second: FloatArray) -> float:
+def angle_deg(first: FloatArray, second: FloatArray) -> float:
     """Angle between two unit directions (3,), degrees."""
     return float(np.degrees(np.arccos(np.clip(first @ second, -1.0, 1.0))))

@@ -14,8 +14,8 @@ from bodycap_batch.config.mounts import MOUNT_NAMES, ROLES, mount_of, role_of_se
 from bodycap_batch.config.rules import problems_in
 from bodycap_batch.config.trust import PathPolicy
 from bodycap_batch.core.errors import CaptureError, JobError
-from bodycap_batch.merging.body.bones import graph_bones
-from bodycap_batch.merging.body.initial_poses import anchor_and_reach
+from bodycap_batch.merging.body.bones import kinematic_chain
+from bodycap_batch.merging.body.initial_poses import reach_constraint
 from bodycap_batch.model.skeleton_presets import load_skeleton
 
 LENS = {"model": "PINHOLE", "params": [420, 420, 320, 240], "width": 640, "height": 480}
@@ -186,10 +186,10 @@ def test_cameras_that_cannot_tell_the_size_are_refused_beforehand() -> None:
     """The rule is the skeleton stage's, which would say so after the map."""
     skeleton, wrong = load_skeleton("full_body"), []
     for roles in combinations(ROLES, 2):
-        bones = graph_bones(skeleton, set(roles))
+        bones = kinematic_chain(skeleton, set(roles))
         place = {bone.role: index for index, bone in enumerate(bones)}
         known = any(
-            anchor_and_reach(bones, place[one], place[other]) is not None
+            reach_constraint(bones, place[one], place[other]) is not None
             for one, other in permutations(roles, 2)
         )
         cameras = [{"name": f"c{n}", "video": [f"{n}.mp4"], "segment": role} for n, role in enumerate(roles)]

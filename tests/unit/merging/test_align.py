@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
 from bodycap_batch.merging.body_calibration.mount_covariance import JOINED, MEASURED, NAMED
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.cameras.track import make_track
-from bodycap_batch.merging.map_alignment.align import use_together
-from bodycap_batch.merging.map_alignment.initial_alignment import start_of
+from bodycap_batch.merging.map_alignment.align import align_cameras
+from bodycap_batch.merging.map_alignment.initial_alignment import align_map
 from bodycap_batch.model.geometry import Similarity, so3_exp
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.joining import run_case
@@ -45,7 +45,7 @@ def recorded(walk):
 
 def _tracks(walk, recorded):
     inputs = make_inputs(walk, recorded)
-    bones = graph_bones(walk.skeleton, set(ROLES.values()))
+    bones = kinematic_chain(walk.skeleton, set(ROLES.values()))
     index = {bone.role: place for place, bone in enumerate(bones)}
     return inputs, bones, [make_track(inputs, each, index[ROLES[each.camera]]) for each in recorded]
 
@@ -72,7 +72,7 @@ def test_similarities_chain():
 def test_the_walk_and_the_stance_are_a_start(walk, recorded):
     inputs, bones, tracks = _tracks(walk, recorded)
     mounts = {mount.camera: mount for mount in inputs.mounts}
-    start = start_of(bones, tracks[0], [tracks[2]], (mounts, 1.0))
+    start = align_map(bones, tracks[0], [tracks[2]], (mounts, 1.0))
     # A palm strays about half an upper arm from where it hangs at ease; the path itself is a few metres long.
     assert _off_m(start, tracks[2]) < 0.25
     assert start.scale * FURTHER.scale == pytest.approx(1.0, abs=0.1)
@@ -96,7 +96,7 @@ def test_residuals_follow_moved_cameras_as_predicted(walk, recorded):
     after = calibration.solved().linear
     # The right-hand side grows by what the movement asks for; robust weights change in second order.
     assert np.abs(predicted).max() > 1e-4
-    assert_allclose(after.right - before.right, predicted, atol=0.15 * np.abs(predicted).max())
+    assert_allclose(after.rhs - before.rhs, predicted, atol=0.15 * np.abs(predicted).max())
 
 
 def test_the_cost_follows_the_scale_as_predicted(arms):
@@ -107,7 +107,7 @@ def test_the_cost_follows_the_scale_as_predicted(arms):
     directions = np.zeros((*samples.valid.shape, 1, 6))
     directions[..., 0, 3:] = metric * samples.map_from_cam[..., :3, 3]
     follow = calibration.measurement_shifts(mounts.linear, directions)[:, 0]
-    right, shrink = mounts.linear.right, calibration.unit_shifts(mounts)
+    right, shrink = mounts.linear.rhs, calibration.unit_shifts(mounts)
     # The cost is half the sum of squares, and all else is at its minimum: solves end within 1e-5 of theirs.
     end = 1e-5 * before / 0.01
     assert right @ (follow + shrink) == pytest.approx((after - before) / 0.01, abs=2.0 * end)
@@ -133,7 +133,7 @@ def test_what_no_residual_can_contradict_is_as_believed(arms):
     samples, calibration, metric = arms
     calibration.solve(metric)
     mounts = calibration.solved()
-    silent = replace(mounts, linear=replace(mounts.linear, right=np.zeros_like(mounts.linear.right)))
+    silent = replace(mounts, linear=replace(mounts.linear, rhs=np.zeros_like(mounts.linear.rhs)))
     free = replace(mounts.eliminated(), redundancy=np.zeros(len(mounts.kinds)))
     # Samples that share the map's error were weighed down for it; that does not make the map bend more.
     assert samples.repeats > 1.5
@@ -168,12 +168,12 @@ def test_a_walks_arms_are_placed():
 @pytest.mark.slow
 def test_a_palms_map_is_placed_or_refused_by_its_sigma(walk, recorded):
     inputs = make_inputs(walk, recorded)
-    together = use_together(inputs, recorded[:2], recorded[2:], lambda: None)
-    if "map-1" in together.places:
+    together = align_cameras(inputs, recorded[:2], recorded[2:], lambda: None)
+    if "map-1" in together.main_from_gauge:
         turn, shift = together.sigmas["right_palm"]
         assert 0.0 < turn < np.radians(15.0)
         # Three dimensions of the stated sigma, three times.
-        assert _off_m(together.places["map-1"], make_track(inputs, recorded[2], 0)) < 9.0 * shift
+        assert _off_m(together.main_from_gauge["map-1"], make_track(inputs, recorded[2], 0)) < 9.0 * shift
         assert [each.gauge for each in together.trajectories] == ["map-0"] * 3
     else:
         assert "the body cannot place it" in together.unused["right_palm"]
@@ -182,14 +182,14 @@ def test_a_palms_map_is_placed_or_refused_by_its_sigma(walk, recorded):
 def test_a_map_that_fits_no_person_is_left_out_with_the_reason(walk, recorded):
     far = replace(recorded[2], gauge_from_cam=recorded[2].gauge_from_cam[:, [1, 0, 2, 3]])
     lost = replace(far, times_ns=far.times_ns + 10**12)
-    together = use_together(make_inputs(walk, recorded), recorded[:2], [lost], lambda: None)
-    assert list(together.places) == ["map-0"]
+    together = align_cameras(make_inputs(walk, recorded), recorded[:2], [lost], lambda: None)
+    assert list(together.main_from_gauge) == ["map-0"]
     assert "map-1" in together.unused["right_palm"]
     assert len(together.trajectories) == 2
 
 
 def test_without_further_maps_nothing_changes(walk, recorded):
-    together = use_together(make_inputs(walk, recorded[:2]), recorded[:2], [], lambda: None)
+    together = align_cameras(make_inputs(walk, recorded[:2]), recorded[:2], [], lambda: None)
     assert together.trajectories == tuple(recorded[:2])
-    assert together.places["map-0"].scale == 1.0
+    assert together.main_from_gauge["map-0"].scale == 1.0
     assert not together.unused

@@ -8,7 +8,7 @@ import pytest
 
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError, JobError
-from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body_calibration.anthropometry import placements, proportions
 from bodycap_batch.merging.body_calibration.known_distance import known_distance
 from bodycap_batch.merging.reporting.advice import mount_sentence, scale_sentence
@@ -104,7 +104,7 @@ def test_the_scales_advice_follows_from_where_cameras_sit(roles, advice):
 def test_where_rigs_differ_the_rest_of_the_body_stays():
     """A chest's joint that lies higher in its rig leaves shoulders where they were beside the hips."""
     skeleton = load_skeleton("full_body", 1.80)
-    bones = graph_bones(skeleton, {"Hips", "LeftHand", "RightHand", "Head"})
+    bones = kinematic_chain(skeleton, {"Hips", "LeftHand", "RightHand", "Head"})
     elsewhere = placements(bones, ("torso",), 1.80)
     index = {bone.role: position for position, bone in enumerate(bones)}
     moved = np.zeros_like(elsewhere.offsets_m)

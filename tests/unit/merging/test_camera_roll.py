@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body_calibration.camera_roll import (
     ROLLS_DEG,
     RollSearch,
@@ -29,7 +29,7 @@ def _worn(rolls):
     worn = replace(walk, mounts=mounts)
     inputs = make_inputs(worn, [record(worn, name, rng) for name in ROLES])
     index = {
-        bone.role: position for position, bone in enumerate(graph_bones(inputs.skeleton, ROLES.values()))
+        bone.role: position for position, bone in enumerate(kinematic_chain(inputs.skeleton, ROLES.values()))
     }
     return inputs, [make_track(inputs, each, index[ROLES[each.camera]]) for each in inputs.trajectories]
 
@@ -89,7 +89,7 @@ def _beside(roles, over_m=None):
     mounts = {role: nominal_mount(role, role, skeleton) for role in roles}
     walk = Walk(skeleton, mounts)
     inputs = make_inputs(walk, [record(walk, role, rng) for role in roles], mounts=tuple(mounts.values()))
-    index = {bone.role: position for position, bone in enumerate(graph_bones(skeleton, roles))}
+    index = {bone.role: position for position, bone in enumerate(kinematic_chain(skeleton, roles))}
     tracks = [make_track(inputs, each, index[each.camera]) for each in inputs.trajectories]
     if over_m is not None:
         for track in tracks[1:]:
@@ -127,7 +127,7 @@ def test_hands_that_are_lifted_half_of_the_time_turn_no_trunk():
     lifted = []
     for track in tracks[1:]:
         poses = track.map_from_cam.copy()
-        trunk, seen = tracks[0].at(track.times_ns, reach_ns=100_000_000)
+        trunk, seen = tracks[0].poses_at(track.times_ns, max_gap_ns=100_000_000)
         late = seen & (track.times_ns > np.median(track.times_ns))
         below = (trunk[late, :3, 3] - poses[late, :3, 3]) @ UP
         poses[late, :3, 3] += 2.0 * below[:, None] * UP

@@ -16,7 +16,7 @@ from bodycap_batch.merging.body_calibration.samples import MAP_ERROR_RAD, take_s
 from bodycap_batch.merging.camera_selection import bring_together, choices, of_no_use, seldom_localised
 from bodycap_batch.merging.cameras.track import MIN_SIGMA_RAD, make_track
 from bodycap_batch.merging.map_alignment import align, gauss_newton
-from bodycap_batch.merging.map_alignment.align import Joined, use_together
+from bodycap_batch.merging.map_alignment.align import AlignedMap, align_cameras
 from bodycap_batch.merging.stage import timeline
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
 from bodycap_batch.model.scene import FrameStatus
@@ -180,7 +180,7 @@ def test_cameras_that_all_stand_still_are_worn(capture):
 
 def test_still_cameras_are_looked_for_once(walked, monkeypatch, tmp_path):
     asked = []
-    monkeypatch.setattr(camera_selection, "unworn", lambda *args: asked.append(args) or [])
+    monkeypatch.setattr(camera_selection, "stationary_cameras", lambda *args: asked.append(args) or [])
     merge_trajectories(walked, MergeOptions(), StageContext(work_dir=tmp_path))
     assert len(asked) == 1
 
@@ -204,7 +204,7 @@ def test_a_trunk_alone_in_a_small_map_is_a_further_map(capture):
 def test_a_map_that_makes_no_body_gives_way_to_one_that_does(capture, monkeypatch):
     alone = _in_maps(capture.inputs, {"torso": "own"})
     monkeypatch.setattr(
-        align, "join_maps", lambda *_: (_ for _ in ()).throw(EstimationError("nowhere to be placed"))
+        align, "align_maps", lambda *_: (_ for _ in ()).throw(EstimationError("nowhere to be placed"))
     )
     together = bring_together(alone, lambda: None)
     assert "torso" not in _names(together.trajectories)
@@ -232,7 +232,7 @@ def test_hands_alone_make_no_body_and_the_error_says_what_is_missing(capture):
 
 def test_a_limbs_camera_tells_no_vertical(capture):
     inputs = capture.inputs
-    bones = camera_selection.graph_bones(inputs.skeleton, {mount.role for mount in inputs.mounts})
+    bones = camera_selection.kinematic_chain(inputs.skeleton, {mount.role for mount in inputs.mounts})
     arm = next(mount for mount in inputs.mounts if mount.camera == "left_upper_arm")
     place = [bone.role for bone in bones].index(arm.role)
     trajectory = next(each for each in inputs.trajectories if each.camera == arm.camera)
@@ -261,7 +261,7 @@ def test_one_bad_map_does_not_take_the_others_with_it(capture, monkeypatch):
             raise EstimationError("fits no person")
         here = Similarity(1.0, np.eye(3), np.zeros(3))
         return (
-            Joined(
+            AlignedMap(
                 gauge="good",
                 cameras=("left_palm",),
                 main_from_gauge=here,
@@ -271,9 +271,9 @@ def test_one_bad_map_does_not_take_the_others_with_it(capture, monkeypatch):
             ),
         )
 
-    monkeypatch.setattr(align, "join_maps", place)
+    monkeypatch.setattr(align, "align_maps", place)
     main, further = choices(inputs)[0]
-    together = use_together(inputs, main, further, lambda: None)
+    together = align_cameras(inputs, main, further, lambda: None)
     assert asked == [("map-0", "good", "bad"), ("map-0", "good"), ("map-0", "bad")]
     assert "left_palm" in _names(together.trajectories)
     assert "fits no person" in together.unused["right_palm"]
@@ -282,7 +282,7 @@ def test_one_bad_map_does_not_take_the_others_with_it(capture, monkeypatch):
 
 def test_equations_without_an_answer_are_an_estimation_error():
     with pytest.raises(EstimationError, match="does not determine"):
-        gauss_newton._solved(np.zeros((2, 2)), np.ones(2))
+        gauss_newton._solve_normal_equations(np.zeros((2, 2)), np.ones(2))
 
 
 def _with_twin(inputs, **changes):
@@ -316,7 +316,7 @@ def test_cameras_at_one_place_know_it_together_no_better_than_one(capture):
 
 
 def test_a_map_that_bends_two_cameras_of_a_bone_alike_counts_once(capture):
-    bones = camera_selection.graph_bones(
+    bones = camera_selection.kinematic_chain(
         capture.inputs.skeleton, {mount.role for mount in capture.inputs.mounts}
     )
     index = {bone.role: place for place, bone in enumerate(bones)}

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.merging.cameras.clock_check import best_shift, doubted_clocks
-from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.merging.cameras.clock_check import best_time_shift, suspicious_clocks
+from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.reporting.advice import clock_sentence
 from bodycap_batch.model.geometry import make_transform, so3_exp
 
 
-def _track(camera: str, poses, times_s) -> Track:
+def _track(camera: str, poses, times_s) -> CameraTrack:
     count = len(times_s)
-    return Track(
+    return CameraTrack(
         camera=camera,
         bone=0,
         frames=np.arange(count),
@@ -26,7 +26,7 @@ def _track(camera: str, poses, times_s) -> Track:
     )
 
 
-def _walk(turns: float, seconds: float = 8.0) -> tuple[Track, Track]:
+def _walk(turns: float, seconds: float = 8.0) -> tuple[CameraTrack, CameraTrack]:
     """A trunk that walks and turns by so much there and back, and a palm that swings beside it."""
     times_s = np.arange(0.0, seconds, 1.0 / 30.0)
     heading = turns * np.sin(2.0 * np.pi * times_s / 3.7) * np.array([[0.0], [0.0], [1.0]])
@@ -38,7 +38,7 @@ def _walk(turns: float, seconds: float = 8.0) -> tuple[Track, Track]:
     return _track("torso", trunk, times_s), _track("palm", palm, times_s)
 
 
-def _straight_walk_of_turns_and_swings() -> tuple[Track, Track]:
+def _straight_walk_of_turns_and_swings() -> tuple[CameraTrack, CameraTrack]:
     """A trunk that walks straight ahead and turns with each step, and a palm that swings across it."""
     times_s = np.arange(0.0, 8.0, 1.0 / 30.0)
     step = np.sin(2.0 * np.pi * times_s / 1.1)
@@ -49,14 +49,14 @@ def _straight_walk_of_turns_and_swings() -> tuple[Track, Track]:
     return _track("torso", trunk, times_s), _track("palm", palm, times_s)
 
 
-def _late(track: Track, seconds: float) -> Track:
+def _late(track: CameraTrack, seconds: float) -> CameraTrack:
     return replace(track, times_ns=track.times_ns + round(1e9 * seconds))
 
 
 @pytest.mark.parametrize("late_s", [-1.2, -0.5, 0.4, 1.5])
 def test_a_clock_that_is_off_is_told_with_what_would_suit_it(late_s: float) -> None:
     trunk, palm = _walk(turns=1.0)
-    (doubt,) = doubted_clocks([trunk, _late(palm, late_s)]).values()
+    (doubt,) = suspicious_clocks([trunk, _late(palm, late_s)]).values()
     # A step of the search, and another for the arm's swing, which follows the turns now and then.
     assert doubt["shift_s"] == pytest.approx(-late_s, abs=0.1)
     assert doubt["scatter_left"] < 0.7
@@ -66,17 +66,17 @@ def test_a_clock_that_is_off_is_told_with_what_would_suit_it(late_s: float) -> N
 
 def test_right_clocks_straight_walks_and_short_clips_are_not_doubted() -> None:
     trunk, palm = _walk(turns=1.0)
-    assert doubted_clocks([trunk, palm]) == {}
-    assert doubted_clocks([trunk, _late(palm, 0.1)]) == {}
+    assert suspicious_clocks([trunk, palm]) == {}
+    assert suspicious_clocks([trunk, _late(palm, 0.1)]) == {}
     straight, swinging = _walk(turns=0.0)
     # The body is moved along its way, which looks like another mount.
-    assert doubted_clocks([straight, _late(swinging, 0.5)]) == {}
+    assert suspicious_clocks([straight, _late(swinging, 0.5)]) == {}
     # Half a step later the trunk's turns undo the arm's swing, but the arm is half a metre ahead.
     trunk_turns, arm_swings = _straight_walk_of_turns_and_swings()
-    found = best_shift(trunk_turns, arm_swings)
+    found = best_time_shift(trunk_turns, arm_swings)
     assert found is not None
-    assert found[0] > 0.25
-    assert found[1] < 0.7
-    assert doubted_clocks([trunk_turns, arm_swings]) == {}
-    assert best_shift(trunk, palm.keep(palm.times_ns < 1_000_000_000)) is None
-    assert best_shift(trunk, _late(palm, 9.0)) is None
+    assert found.shift_s > 0.25
+    assert found.scatter_ratio < 0.7
+    assert suspicious_clocks([trunk_turns, arm_swings]) == {}
+    assert best_time_shift(trunk, palm.keep(palm.times_ns < 1_000_000_000)) is None
+    assert best_time_shift(trunk, _late(palm, 9.0)) is None

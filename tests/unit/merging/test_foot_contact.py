@@ -12,10 +12,10 @@ from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.export.projection import _standing_joints
 from bodycap_batch.merging import merge_trajectories
-from bodycap_batch.merging.body.bones import graph_bones
-from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.merging.body.bones import kinematic_chain
+from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.graph.factors import bone_key
-from bodycap_batch.merging.graph.foot_contact import Contact, during, find_contacts
+from bodycap_batch.merging.graph.foot_contact import FootContact, contacts_in_window, find_contacts
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.skeleton_presets import load_skeleton
 from bodycap_batch.synthetic import SynthOptions
@@ -31,7 +31,7 @@ UP = np.array([0.0, 0.0, 1.0])
 def shin():
     """The skeleton, its bones, and a shin that rolls over its foot for 25 ticks, then swings ahead."""
     skeleton = load_skeleton("full_body", 1.75)
-    bones = graph_bones(skeleton, {"Hips", "LeftLeg"})
+    bones = kinematic_chain(skeleton, {"Hips", "LeftLeg"})
     index = [bone.role for bone in bones].index("LeftLeg")
     ankle_m = np.array([0.0, 0.0, -0.43])
     time = np.arange(COUNT) / FPS
@@ -46,7 +46,7 @@ def _track(index, poses, seed=0):
     rng = np.random.default_rng(seed)
     noisy = poses.copy()
     noisy[:, :3, 3] += rng.normal(scale=0.005, size=(COUNT, 3))
-    return Track(
+    return CameraTrack(
         camera="left_shin",
         bone=index,
         frames=np.arange(COUNT),
@@ -69,13 +69,13 @@ def test_a_foot_stands_where_its_ankle_is_slow_and_low(shin):
     assert (
         find_contacts(skeleton, bones, [_track(index, poses)], {"left_shin": np.eye(4)}, UP, TICKS[:1]) == ()
     )
-    part = during(found, TICKS, TICKS[10:30])
+    part = contacts_in_window(found, TICKS, TICKS[10:30])
     assert np.array_equal(part[0].standing, standing[10:30])
 
 
 def test_an_ankle_that_rests_costs_nothing_however_the_shin_turns(shin):
     _, _, _, poses = shin
-    contact = Contact("Left foot", 3, 0, np.array([0.0, 0.0, -0.43]), np.ones(COUNT, dtype=bool), 0.0017)
+    contact = FootContact("Left foot", 3, 0, np.array([0.0, 0.0, -0.43]), np.ones(COUNT, dtype=bool), 0.0017)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for tick in range(COUNT):
         values.insert(bone_key(tick, 0), gtsam.Pose3(poses[tick]))

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from bodycap_batch.merging.body.bones import graph_bones, hinges
+from bodycap_batch.merging.body.bones import hinges, kinematic_chain
 from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
 from bodycap_batch.merging.body_calibration.hinge_test import FREE_M, told
 from bodycap_batch.merging.body_calibration.samples import take_samples
-from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.reporting.advice import hinge_sentence
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import forward_kinematics
@@ -31,11 +31,11 @@ def _calibrated(sideways_rad: float) -> Calibration:
     sway = sideways_rad * np.sqrt(2.0) * np.sin(np.arange(240) / 7.0)
     local[:, elbow] = so3_exp(np.outer(sway, [0.0, 1.0, 0.0])) @ local[:, elbow]
     poses = forward_kinematics(skeleton, motion.root_in_world_m, local)
-    bones = graph_bones(skeleton, ROLES.values())
+    bones = kinematic_chain(skeleton, ROLES.values())
     index = {bone.role: place for place, bone in enumerate(bones)}
     mounts = {camera: nominal_mount(camera, role, skeleton) for camera, role in ROLES.items()}
     tracks = [
-        Track(
+        CameraTrack(
             camera=camera,
             bone=index[role],
             frames=np.arange(240),
@@ -81,7 +81,7 @@ def test_an_elbow_that_keeps_to_its_hinge_is_held_as_before():
 )
 def test_only_cameras_on_both_sides_contradict_a_hinge(cameras, tested):
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = graph_bones(skeleton, cameras)
+    bones = kinematic_chain(skeleton, cameras)
     measured = {place for place, bone in enumerate(bones) if bone.role in cameras}
     assert len(told(hinges(skeleton, bones), measured)) == tested
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body.initial_poses import provisional_scale
 from bodycap_batch.merging.camera_selection import choices
 from bodycap_batch.merging.cameras.track import make_track
-from bodycap_batch.merging.map_alignment.initial_alignment import starts_of
+from bodycap_batch.merging.map_alignment.initial_alignment import align_maps_initially
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.joining import SPLITS
 from tests.bench.posed import posed
@@ -22,7 +22,7 @@ def _groups(maps, seed):
     """Bones, mounts, tracks by map (the trunk's first), and units of its map a metre."""
     capture = posed(SynthOptions(seconds=20.0, cameras=tuple(maps), seed=seed, poses_only=True), maps)
     inputs, (main, further) = capture.inputs, choices(capture.inputs)[0]
-    bones = graph_bones(inputs.skeleton, {mount.role for mount in inputs.mounts})
+    bones = kinematic_chain(inputs.skeleton, {mount.role for mount in inputs.mounts})
     index = {bone.role: place for place, bone in enumerate(bones)}
     groups = {}
     for each in (*main, *further):
@@ -40,42 +40,42 @@ def _starts(maps, seed):
     """The starts, and the scale they found over the true one."""
     bones, mounts, groups, units = _groups(maps, seed)
     (_, first), *others = groups.items()
-    found = starts_of(bones, first, others, mounts)
-    return found, found.metric * units
+    found = align_maps_initially(bones, first, others, mounts)
+    return found, found.metres_per_unit * units
 
 
 @pytest.mark.parametrize("split", ["an arm each", "upper arms, palms"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_upper_arms_tell_the_scale_that_palms_in_another_map_do_not(split, seed):
     found, off = _starts(SPLITS[split], seed)
-    assert found.told
-    assert set(found.places) == set(SPLITS[split].values()) - {"a"}
+    assert found.scale_observable
+    assert set(found.main_from_gauge) == set(SPLITS[split].values()) - {"a"}
     # Two mounts 5 cm off, 25 cm apart, on two sides: one sigma is 20 %. Palms drew it to 0.63 (log -0.46).
     assert abs(np.log(off)) < 0.3
 
 
 def test_palms_in_maps_of_their_own_tell_no_scale():
     found, _ = _starts(SPLITS["a palm each"], 0)
-    assert not found.told
-    assert np.isfinite(found.metric)
+    assert not found.scale_observable
+    assert np.isfinite(found.metres_per_unit)
 
 
 @pytest.mark.parametrize("limb", [("left_forearm", "left_palm"), ("left_shin", "left_foot")])
 def test_a_limbs_own_cameras_tell_the_scale_not_their_reach_from_another_map(limb):
     bones, usual, groups, _ = _groups({"torso": "a", **dict.fromkeys(limb, "b")}, 0)
     mounts = {camera: replace(mount, sigma_m=0.04) for camera, mount in usual.items()}
-    found = starts_of(bones, groups["a"], [("b", groups["b"])], mounts)
+    found = align_maps_initially(bones, groups["a"], [("b", groups["b"])], mounts)
     # The two sit 14 to 20 cm apart, each 4 cm off.
-    assert not found.told
+    assert not found.scale_observable
     # What a map's own pair gives does not depend on where the map lies.
     alone = provisional_scale(bones, groups["b"], mounts)
-    assert found.metric * found.places["b"].scale == pytest.approx(alone, rel=1e-6)
+    assert found.metres_per_unit * found.main_from_gauge["b"].scale == pytest.approx(alone, rel=1e-6)
 
 
 def test_a_palm_beside_the_trunk_tells_the_scale_with_no_map_placed():
     maps = {"torso": "a", "left_upper_arm": "a", "left_palm": "b", "right_palm": "b"}
-    assert not _starts(maps, 0)[0].spanned
-    assert _starts({**maps, "right_palm": "a"}, 0)[0].spanned
+    assert not _starts(maps, 0)[0].one_map_spans_a_limb
+    assert _starts({**maps, "right_palm": "a"}, 0)[0].one_map_spans_a_limb
 
 
 def test_a_head_in_a_map_of_its_own_tells_no_scale():
@@ -83,9 +83,9 @@ def test_a_head_in_a_map_of_its_own_tells_no_scale():
     bones, mounts, groups, _ = _groups({**arms, "head": "h"}, 0)
     head = ("h", groups.pop("h"))
     (_, first), *others = groups.items()
-    beside, without = (starts_of(bones, first, each, mounts) for each in ([*others, head], others))
-    assert beside.told
-    assert beside.metric == without.metric
+    beside, without = (align_maps_initially(bones, first, each, mounts) for each in ([*others, head], others))
+    assert beside.scale_observable
+    assert beside.metres_per_unit == without.metres_per_unit
     with pytest.raises(EstimationError, match="'head' from 'torso' in another map tells no scale"):
         _starts({"torso": "a", "head": "b", "left_palm": "c", "right_palm": "d"}, 0)
 
@@ -94,7 +94,7 @@ def test_a_camera_that_was_hardly_localised_tells_no_scale():
     maps = {"torso": "a", "head": "a", "left_palm": "b", "right_palm": "c"}
     bones, mounts, groups, _ = _groups(maps, 0)
     (_, (trunk, head)), *others = groups.items()
-    assert starts_of(bones, [trunk, head], others, mounts).told
-    seldom = starts_of(bones, [trunk, head.keep(np.arange(len(head.frames)) < 9)], others, mounts)
-    assert not seldom.told
-    assert seldom.metric == starts_of(bones, [trunk], others, mounts).metric
+    assert align_maps_initially(bones, [trunk, head], others, mounts).scale_observable
+    seldom = align_maps_initially(bones, [trunk, head.keep(np.arange(len(head.frames)) < 9)], others, mounts)
+    assert not seldom.scale_observable
+    assert seldom.metres_per_unit == align_maps_initially(bones, [trunk], others, mounts).metres_per_unit

@@ -12,13 +12,13 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import sparse
 
-from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.cameras.track import make_track
-from bodycap_batch.merging.graph.error_modes import Spread, adjoint, joined
-from bodycap_batch.merging.graph.factors import bone_key, optimise
-from bodycap_batch.merging.graph.joint_covariance import joint_covariance, sigma_summary
-from bodycap_batch.merging.graph.motion_graph import MotionGraph, Solution
-from bodycap_batch.model.block_tridiagonal import Chain
+from bodycap_batch.merging.graph.error_modes import ErrorModes, adjoint, stack_modes
+from bodycap_batch.merging.graph.factors import bone_key, levenberg_marquardt
+from bodycap_batch.merging.graph.joint_covariance import joint_covariance, sigma_percentiles
+from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution
+from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from tests.stages.walker import FPS, ROLES, make_inputs, make_walk, record
 
@@ -38,12 +38,12 @@ def test_a_chain_of_blocks_is_the_dense_solution(held):
     shuffled = np.zeros_like(rows)
     shuffled[:, order] = rows
     information = shuffled.T @ shuffled
-    chain = Chain(sparse.csr_matrix(information), order, bounds, held)
+    chain = BlockTridiagonal(sparse.csr_matrix(information), order, bounds, held)
     right = rng.normal(size=(12, 2))
     assert_allclose(np.vstack(chain.solve(right)), np.linalg.solve(information, right)[order], atol=1e-9)
     inverse = np.linalg.inv(information)[np.ix_(order, order)]
     found = {}
-    chain.covariances(found.setdefault)
+    chain.marginals(found.setdefault)
     for block, (start, end) in enumerate(pairwise(bounds.tolist())):
         assert_allclose(found[block], inverse[start:end, start:end], atol=1e-9)
 
@@ -63,11 +63,11 @@ def test_a_long_chain_is_not_held_and_its_solution_is_the_same():
     found, kept = [], []
     for held in (1e9, 20_000.0):
         tracemalloc.start()
-        chain = Chain(information, order, bounds, held)
+        chain = BlockTridiagonal(information, order, bounds, held)
         kept.append(tracemalloc.get_traced_memory()[0])
         tracemalloc.stop()
         covariances = {}
-        chain.covariances(lambda block, each, known=covariances: known.setdefault(block, each[0, 0]))
+        chain.marginals(lambda block, each, known=covariances: known.setdefault(block, each[0, 0]))
         found.append((np.vstack(chain.solve(right)), covariances))
     assert np.array_equal(found[0][0], found[1][0])
     assert found[0][1] == found[1][1]
@@ -76,11 +76,11 @@ def test_a_long_chain_is_not_held_and_its_solution_is_the_same():
 
 def test_a_graph_that_holds_nothing_states_no_covariance(walk):
     graph, bones, _ = _graph(walk)
-    values, _ = optimise(graph._graph, graph._start(), iterations=1)
+    values, _ = levenberg_marquardt(graph._graph, graph._start(), iterations=1)
     loose = replace(graph._solved(values), graph=gtsam.NonlinearFactorGraph())
     poses = np.tile(np.eye(4), (round(FPS), len(bones), 1, 1))
     nothing = np.zeros((len(bones), 3, 0))
-    spread = Spread(mounts={}, log_scale=np.zeros(0), rest=nothing, offsets_m=nothing)
+    spread = ErrorModes(mounts={}, log_scale=np.zeros(0), rest=nothing, offsets_m=nothing)
     covariance = joint_covariance(loose, poses, spread)
     assert covariance.shape == (*poses.shape[:2], 3, 3)
     assert np.isnan(covariance).all()
@@ -98,7 +98,7 @@ def walk():
 
 def _graph(walk, mounts=None, change=None, scale=1.0, shift_s=0.0):
     """One second of walking; `change` alters the bones, `scale` the camera paths."""
-    bones = list(graph_bones(walk.skeleton, set(ROLES.values())))
+    bones = list(kinematic_chain(walk.skeleton, set(ROLES.values())))
     if change is not None:
         bones = [change(index, bone) for index, bone in enumerate(bones)]
     index = {bone.role: place for place, bone in enumerate(bones)}
@@ -119,13 +119,13 @@ def _graph(walk, mounts=None, change=None, scale=1.0, shift_s=0.0):
     return MotionGraph(walk.skeleton, bones, ticks, stretched, held), bones, held
 
 
-def _solve(graph, spread=None) -> Solution:
+def _solve(graph, spread=None) -> MotionSolution:
     return graph.solve(60, lambda: None, spread)
 
 
-def _nothing(bones) -> Spread:
+def _nothing(bones) -> ErrorModes:
     empty = np.zeros((len(bones), 3, 1))
-    return Spread(
+    return ErrorModes(
         mounts={name: np.zeros((6, 1)) for name in ROLES},
         log_scale=np.zeros(1),
         rest=empty,
@@ -133,7 +133,7 @@ def _nothing(bones) -> Spread:
     )
 
 
-def _relative(solution: Solution) -> np.ndarray:
+def _relative(solution: MotionSolution) -> np.ndarray:
     centres = solution.world_from_bone[..., :3, 3]
     return np.asarray(centres - centres[:, :1])
 
@@ -155,9 +155,9 @@ def test_without_a_spread_the_covariance_is_gtsams_marginal(walk):
 
 
 def _optimised(graph):
-    from bodycap_batch.merging.graph.factors import optimise
+    from bodycap_batch.merging.graph.factors import levenberg_marquardt
 
-    return optimise(graph._graph, graph._start(), iterations=60)
+    return levenberg_marquardt(graph._graph, graph._start(), iterations=60)
 
 
 @pytest.mark.parametrize("what", ["mount", "scale", "rest", "offset", "off the ticks"])
@@ -199,8 +199,8 @@ def test_the_solution_follows_the_calibration_as_predicted(walk, what):
 
 
 def test_directions_of_several_parts_stand_side_by_side(walk):
-    bones = graph_bones(walk.skeleton, set(ROLES.values()))
-    both = joined([_nothing(bones), _nothing(bones)])
+    bones = kinematic_chain(walk.skeleton, set(ROLES.values()))
+    both = stack_modes([_nothing(bones), _nothing(bones)])
     assert both.log_scale.shape == (2,)
     assert both.rest.shape == (len(bones), 3, 2)
     assert both.mounts["torso"].shape == (6, 2)
@@ -213,7 +213,7 @@ def test_sigmas_are_told_apart_where_measured_and_where_filled():
     observed = np.ones((10, 3), dtype=bool)
     observed[5:, 1] = False
     covariance[:, 0] = 0.0
-    found = sigma_summary(("Spine1", "LeftHand", "LeftFoot"), covariance, observed)
+    found = sigma_percentiles(("Spine1", "LeftHand", "LeftFoot"), covariance, observed)
     assert found == {
         "LeftHand": {"observed": {"p50": 0.01, "p95": 0.01}, "filled": {"p50": 0.02, "p95": 0.02}}
     }

@@ -42,7 +42,7 @@ def test_a_calm_walker_uses_a_part_of_the_everyday_range(solved):
 
 def test_what_nothing_shows_is_as_lively_as_ever(solved):
     mounts, times_ns = solved
-    silent = replace(mounts, linear=replace(mounts.linear, right=np.zeros_like(mounts.linear.right)))
+    silent = replace(mounts, linear=replace(mounts.linear, rhs=np.zeros_like(mounts.linear.rhs)))
     assert _shares(silent, times_ns, redundancy=0.0) == pytest.approx(EVERYDAY)
     # A joint that rests although each of five gestures could have shown it: 6 believed against 15 seen.
     assert _shares(silent, times_ns, redundancy=1.0)[1:] == pytest.approx(EVERYDAY * 6.0 / 21.0, rel=0.05)
@@ -50,7 +50,7 @@ def test_what_nothing_shows_is_as_lively_as_ever(solved):
 
 def test_who_moves_more_than_everyday_is_livelier(solved):
     mounts, times_ns = solved
-    wild = replace(mounts, linear=replace(mounts.linear, right=10.0 * mounts.linear.right))
+    wild = replace(mounts, linear=replace(mounts.linear, rhs=10.0 * mounts.linear.rhs))
     assert (_shares(wild, times_ns)[1:] > _shares(mounts, times_ns)[1:]).all()
     assert _shares(wild, times_ns).max() > 1.0
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bodycap_batch.merging.graph.factors import optimise, optimise_from_near
+from bodycap_batch.merging.graph.factors import gauss_newton_then_lm, levenberg_marquardt
 from bodycap_batch.model.geometry import make_transform, so3_exp
 
 REAL = gtsam.GaussNewtonOptimizer
@@ -28,8 +28,8 @@ def _pose_prior():
 
 def test_full_steps_end_where_damped_ones_do():
     steps = []
-    damped, _ = optimise(_pose_prior(), _start(), iterations=30)
-    found, count = optimise_from_near(
+    damped, _ = levenberg_marquardt(_pose_prior(), _start(), iterations=30)
+    found, count = gauss_newton_then_lm(
         _pose_prior(), _start(), iterations=30, step=lambda: steps.append(1), tolerance=1e-5
     )
     # Both stop a step after the error falls by less than 1e-5 of itself, at a residual of zero.
@@ -41,7 +41,7 @@ def test_what_nothing_holds_is_left_to_damping():
     graph = gtsam.NonlinearFactorGraph()
     noise = gtsam.noiseModel.Isotropic.Sigma(3, 0.01)
     graph.add(gtsam.PoseTranslationPrior3D(0, gtsam.Pose3(TURNED), noise))
-    found, _ = optimise_from_near(graph, _start(), iterations=30, step=lambda: None, tolerance=1e-5)
+    found, _ = gauss_newton_then_lm(graph, _start(), iterations=30, step=lambda: None, tolerance=1e-5)
     assert_allclose(found.atPose3(0).translation(), TURNED[:3, 3], atol=1e-4)
     assert_allclose(found.atPose3(0).rotation().matrix(), np.eye(3), atol=1e-6)
 
@@ -69,7 +69,7 @@ def test_a_full_step_that_makes_it_worse_is_not_taken():
     before = full.error()
     full.iterate()
     assert full.error() > before, "the case is no case: the full step helps"
-    found, _ = optimise_from_near(graph, values, iterations=50, step=lambda: None, tolerance=1e-9)
+    found, _ = gauss_newton_then_lm(graph, values, iterations=50, step=lambda: None, tolerance=1e-9)
     assert_allclose(np.hypot(*found.atPoint3(0)[1:]), ACROSS, atol=1e-4)
 
 
@@ -81,7 +81,7 @@ def test_a_stop_in_between_is_passed_on():
         raise Stop
 
     with pytest.raises(Stop):
-        optimise_from_near(_pose_prior(), _start(), iterations=30, step=stop, tolerance=1e-5)
+        gauss_newton_then_lm(_pose_prior(), _start(), iterations=30, step=stop, tolerance=1e-5)
 
 
 class _WorseFromTheSecondStep:
@@ -104,7 +104,7 @@ class _WorseFromTheSecondStep:
 def test_damping_goes_on_from_the_last_good_step(monkeypatch):
     monkeypatch.setattr(gtsam, "GaussNewtonOptimizer", _WorseFromTheSecondStep)
     graph, values = _ranges(0.15)
-    found, count = optimise_from_near(graph, values, iterations=20, step=lambda: None, tolerance=1e-9)
+    found, count = gauss_newton_then_lm(graph, values, iterations=20, step=lambda: None, tolerance=1e-9)
     assert found.size() == values.size()
     assert count > 2
     assert_allclose(found.atPoint3(0)[1], ACROSS, atol=1e-4)

@@ -10,15 +10,15 @@ import pytest
 
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body.bones import graph_bones
-from bodycap_batch.merging.body.initial_poses import anchor_and_reach
+from bodycap_batch.merging.body.bones import kinematic_chain
+from bodycap_batch.merging.body.initial_poses import reach_constraint
 from bodycap_batch.merging.body_calibration import calibration_graph
 from bodycap_batch.merging.body_calibration.anthropometry import placements, proportions
 from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
 from bodycap_batch.merging.body_calibration.known_distance import known_distance
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.body_calibration.scale import find_scale
-from bodycap_batch.merging.cameras.track import loosened, make_track
+from bodycap_batch.merging.cameras.track import inflate_sigmas, make_track
 from bodycap_batch.merging.graph.motion_graph import MotionGraph
 from bodycap_batch.merging.graph.windows import with_overlap
 from bodycap_batch.merging.map_alignment.initial_alignment import require_common_time
@@ -44,7 +44,7 @@ def recorded(walk):
 def body(walk, recorded):
     """Inputs, bones, and each camera's track in metres."""
     inputs = make_inputs(walk, recorded)
-    bones = graph_bones(walk.skeleton, set(ROLES.values()))
+    bones = kinematic_chain(walk.skeleton, set(ROLES.values()))
     index = {bone.role: place for place, bone in enumerate(bones)}
     return inputs, bones, [make_track(inputs, each, index[ROLES[each.camera]]) for each in recorded]
 
@@ -72,13 +72,13 @@ def test_a_camera_never_seen_with_others_keeps_its_usual_mount_and_weighs_as_lit
     assert np.abs(calibration.mounts["right_palm"] - usual).max() < 1e-3
     constant, _ = calibration.spread(0.05, {name: np.zeros((4, 4)) for name in ROLES}, {})
     solved = {mount.camera: mount for mount in calibration.solved_mounts(constant)}
-    loose = loosened(tracks[2], solved["right_palm"])
+    loose = inflate_sigmas(tracks[2], solved["right_palm"])
     # 15 degrees in all, 8.7 per axis.
     assert (loose.sigma_rad > np.radians(8.6)).all()
     assert (loose.sigma_map > 0.039).all()
-    assert loosened(tracks[1], solved["left_palm"]) is tracks[1]
+    assert inflate_sigmas(tracks[1], solved["left_palm"]) is tracks[1]
     turned = replace(solved["left_palm"], sigma_rad=np.radians(12.0), sigma_m=0.02)
-    assert loosened(tracks[1], turned) is tracks[1]
+    assert inflate_sigmas(tracks[1], turned) is tracks[1]
 
 
 def test_bones_of_a_height_alone_may_be_longer_on_both_sides_alike(body):
@@ -138,7 +138,7 @@ def test_a_t_pose_is_no_gesture(body, monkeypatch):
     calibration = Calibration(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
     calibration.solve(1.0, iterations=1)
     asked = []
-    monkeypatch.setattr(calibration_graph, "widened", lambda *args: asked.append(args[2:]) or bones)
+    monkeypatch.setattr(calibration_graph, "widen_joint_priors", lambda *args: asked.append(args[2:]) or bones)
     calibration.widen_postures()
     ((poses, times_ns),) = asked
     assert 0 < len(times_ns) < len(posed)
@@ -200,10 +200,10 @@ def test_a_known_distance_in_a_further_map_is_in_that_maps_units(body, recorded)
 
 
 def test_a_swinging_upper_arm_does_not_say_where_the_other_arm_is():
-    bones = graph_bones(load_skeleton("upper_body"), ("LeftArm", "LeftHand", "RightHand"))
+    bones = kinematic_chain(load_skeleton("upper_body"), ("LeftArm", "LeftHand", "RightHand"))
     index = {bone.role: place for place, bone in enumerate(bones)}
-    assert anchor_and_reach(bones, index["RightHand"], index["LeftArm"]) is None
-    assert anchor_and_reach(bones, index["LeftHand"], index["LeftArm"]) is not None
+    assert reach_constraint(bones, index["RightHand"], index["LeftArm"]) is None
+    assert reach_constraint(bones, index["LeftHand"], index["LeftArm"]) is not None
 
 
 @pytest.mark.slow

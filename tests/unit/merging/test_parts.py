@@ -10,37 +10,42 @@ import pytest
 from numpy.testing import assert_allclose
 
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body.bones import graph_bones, hinges, proper_axes
-from bodycap_batch.merging.body.completion import complete_body, observed_joints
+from bodycap_batch.merging.body.bones import anatomical_axes, hinges, kinematic_chain
+from bodycap_batch.merging.body.completion import complete_skeleton, observed_joints
 from bodycap_batch.merging.body.initial_poses import (
-    anchor_and_reach,
     fill_gaps,
     pose_bones,
     provisional_scale,
+    reach_constraint,
 )
 from bodycap_batch.merging.body_calibration.scale import ScaleSource, combine, disagreement, floor_source
-from bodycap_batch.merging.cameras.track import Track, clean
+from bodycap_batch.merging.cameras.track import CameraTrack, remove_outliers
 from bodycap_batch.merging.graph.factors import (
     MountPoints,
     add_mount_prior,
     bone_key,
-    insert_mount,
-    mount_change,
-    read_mount,
+    insert_mount_points,
+    mount_from_points,
+    mount_jacobian,
 )
-from bodycap_batch.merging.graph.joint_limits import activity_rules, limit_rules, reach_rules
-from bodycap_batch.merging.graph.motion_noise import adapt_psd
+from bodycap_batch.merging.graph.joint_limits import activity_limits, arm_reach_limits, hinge_limits
+from bodycap_batch.merging.graph.motion_noise import scale_motion_noise
 from bodycap_batch.merging.world.floor import (
-    feet_floor,
-    find_floor,
-    heading,
+    floor_beside_path,
+    floor_from_feet,
+    floor_from_points,
+    initial_heading,
     place,
+    rotation_to_z_up,
     standing_height,
-    upright,
-    walked_floor,
 )
-from bodycap_batch.merging.world.planes import BENT_LIMIT_DEG, TILT_LIMIT_DEG, find_planes, vertical
-from bodycap_batch.merging.world.vertical import Direction
+from bodycap_batch.merging.world.planes import (
+    BENT_TILT_LIMIT_DEG,
+    TILT_LIMIT_DEG,
+    find_planes,
+    vertical_from_planes,
+)
+from bodycap_batch.merging.world.vertical import Vertical
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp, so3_log
 from bodycap_batch.model.merge_data import CameraClock
 from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount, rest_positions
@@ -52,10 +57,10 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def _track(
     centres: np.ndarray, bone: int = 0, *, rotation: np.ndarray | None = None, fps: float = 30.0
-) -> Track:
+) -> CameraTrack:
     count = len(centres)
     turns = np.tile(np.eye(3), (count, 1, 1)) if rotation is None else rotation
-    return Track(
+    return CameraTrack(
         camera=f"cam{bone}",
         bone=bone,
         frames=np.arange(count),
@@ -81,7 +86,7 @@ def test_lower_rows_are_exposed_later():
 
 def test_paper_set_up_solves_nine_bones():
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = graph_bones(skeleton, PAPER)
+    bones = kinematic_chain(skeleton, PAPER)
     assert [bone.role for bone in bones] == [
         "Spine1", "LeftShoulder", "LeftArm", "LeftForeArm", "LeftHand",
         "RightShoulder", "RightArm", "RightForeArm", "RightHand",
@@ -91,9 +96,9 @@ def test_paper_set_up_solves_nine_bones():
 
 def test_bones_meet_where_the_branches_meet():
     skeleton = load_skeleton("full_body", 1.75)
-    roles = {bone.role for bone in graph_bones(skeleton, ("Head", "LeftFoot"))}
+    roles = {bone.role for bone in kinematic_chain(skeleton, ("Head", "LeftFoot"))}
     assert roles == {"Hips", "Spine", "Spine1", "Neck", "Head", "LeftUpLeg", "LeftLeg", "LeftFoot"}
-    assert [bone.role for bone in graph_bones(skeleton, ("LeftArm", "LeftHand"))] == [
+    assert [bone.role for bone in kinematic_chain(skeleton, ("LeftArm", "LeftHand"))] == [
         "LeftArm",
         "LeftForeArm",
         "LeftHand",
@@ -103,7 +108,7 @@ def test_bones_meet_where_the_branches_meet():
 @pytest.mark.parametrize("side", ["Left", "Right"])
 def test_a_body_at_ease_hangs_its_arms_and_bends_elbows_forward(side):
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = graph_bones(skeleton, PAPER)
+    bones = kinematic_chain(skeleton, PAPER)
     poses = pose_bones(skeleton, bones, {0: np.eye(4)[None]})[0]
     index = {bone.role: i for i, bone in enumerate(bones)}
     shoulder, elbow, wrist = (poses[index[side + part], :3, 3] for part in ("Arm", "ForeArm", "Hand"))
@@ -115,9 +120,9 @@ def test_a_body_at_ease_hangs_its_arms_and_bends_elbows_forward(side):
 
 def test_hinge_ranges_allow_flexion_and_twist_but_no_sideways_bend():
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = graph_bones(skeleton, ("LeftArm", "LeftHand"))
+    bones = kinematic_chain(skeleton, ("LeftArm", "LeftHand"))
     hinge = hinges(skeleton, bones)[0]
-    axes = proper_axes(skeleton, "LeftArm")
+    axes = anatomical_axes(skeleton, "LeftArm")
     length = 0.146 * 1.75
 
     def misfit(bend: np.ndarray) -> float:
@@ -131,7 +136,7 @@ def test_hinge_ranges_allow_flexion_and_twist_but_no_sideways_bend():
 @pytest.mark.parametrize("side", ["Left", "Right"])
 def test_two_bone_reach_puts_the_wrist_where_it_was_measured(side):
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = graph_bones(skeleton, ("Spine1", side + "Hand"))
+    bones = kinematic_chain(skeleton, ("Spine1", side + "Hand"))
     hand = make_transform(np.eye(3)[None], np.array([[0.25 if side == "Left" else -0.25, -0.3, 0.0]]))
     poses = pose_bones(skeleton, bones, {0: np.eye(4)[None], 4: hand})[0]
     elbow = poses[3]
@@ -144,7 +149,7 @@ def test_two_bone_reach_puts_the_wrist_where_it_was_measured(side):
 
 def test_provisional_scale_from_the_reach_of_the_arms():
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = graph_bones(skeleton, PAPER)
+    bones = kinematic_chain(skeleton, PAPER)
     mounts = {f"cam{bone}": nominal_mount(f"cam{bone}", bones[bone].role, skeleton) for bone in (0, 4, 8)}
     swing = so3_exp(np.outer(0.5 * np.sin(np.arange(60) / 5.0), [1.0, 0.0, 0.0]))
     still = np.tile(np.eye(4), (60, 1, 1))
@@ -164,7 +169,7 @@ def test_provisional_scale_from_the_reach_of_the_arms():
 
 def test_provisional_scale_needs_two_places_on_the_body():
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = graph_bones(skeleton, ("Spine1",))
+    bones = kinematic_chain(skeleton, ("Spine1",))
     mounts = {"cam0": nominal_mount("cam0", "Spine1", skeleton)}
     with pytest.raises(EstimationError, match="no two cameras"):
         provisional_scale(bones, [_track(np.zeros((30, 3)))], mounts)
@@ -174,11 +179,11 @@ def test_cleaning_drops_bursts_and_keeps_a_throw():
     seconds = np.arange(90) / 30.0
     # 2 Hz at 0.25 m is a violent arm: 3 m/s, 40 m/s².
     throw = np.stack([0.25 * np.sin(4.0 * np.pi * seconds), seconds, 0.0 * seconds], axis=1)
-    kept, dropped = clean(_track(throw), 1.0, 30.0)
+    kept, dropped = remove_outliers(_track(throw), 1.0, 30.0)
     assert dropped == 0
     wrong = throw.copy()
     wrong[[20, 21, 50]] += [0.4, -0.4, 0.2]
-    kept, dropped = clean(_track(wrong / 5.0), 5.0, 30.0)
+    kept, dropped = remove_outliers(_track(wrong / 5.0), 5.0, 30.0)
     assert dropped == 3
     assert not {20, 21, 50} & set(kept.frames.tolist())
 
@@ -187,14 +192,14 @@ def test_cleaning_keeps_an_arm_that_is_thrown_faster_than_a_quadratic_follows():
     seconds = np.arange(90) / 30.0
     # 2.5 Hz at 0.35 m: 5.5 m/s and 86 m/s²; a quadratic over 0.4 s, a whole period, is off by the amplitude.
     throw = np.stack([0.35 * np.sin(5.0 * np.pi * seconds), seconds, 0.0 * seconds], axis=1)
-    assert clean(_track(throw), 1.0, 30.0)[1] == 0
+    assert remove_outliers(_track(throw), 1.0, 30.0)[1] == 0
 
 
 def test_interpolation_of_a_track_knows_its_holes():
     track = _track(np.stack([np.arange(10.0), np.zeros(10), np.zeros(10)], axis=1))
     holed = track.keep(np.array([True] * 3 + [False] * 4 + [True] * 3))
     times = np.round(np.array([0.5, 1.0, 4.5, 9.0, 12.0]) * SECOND / 30).astype(np.int64)
-    poses, valid = holed.at(times, reach_ns=SECOND // 10)
+    poses, valid = holed.poses_at(times, max_gap_ns=SECOND // 10)
     assert valid.tolist() == [True, True, False, True, False]
     assert_allclose(poses[:, 0, 3], [0.5, 1.0, 4.5, 9.0, 9.0], atol=1e-6)
 
@@ -211,7 +216,7 @@ def test_gaps_are_filled_on_se3_and_ends_held():
 
 def test_wild_motion_loosens_the_limb_above_the_camera():
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = graph_bones(skeleton, PAPER)
+    bones = kinematic_chain(skeleton, PAPER)
     rng = np.random.default_rng(0)
     turns = so3_exp(np.cumsum(rng.normal(scale=0.06, size=(90, 3)), axis=0))
     spin = np.array(list(accumulate(turns, np.matmul)))
@@ -221,7 +226,8 @@ def test_wild_motion_loosens_the_limb_above_the_camera():
         _track(np.zeros((90, 3)), 8),
     ]
     ratio = [
-        after.psd[0] / before.psd[0] for before, after in zip(bones, adapt_psd(bones, tracks), strict=True)
+        after.psd[0] / before.psd[0]
+        for before, after in zip(bones, scale_motion_noise(bones, tracks), strict=True)
     ]
     # Increments of 0.06 rad a frame: 0.0036 / (2/3 · (1/30)³) = 146 rad²/s³ against the table's 30.
     assert ratio[4] == pytest.approx(146 / 30, rel=0.3)
@@ -230,7 +236,10 @@ def test_wild_motion_loosens_the_limb_above_the_camera():
     leaps = [tracks[0], _track(rng.normal(size=(90, 3)), 4), tracks[2]]
     # A metre from frame to frame is no motion of anybody: the model stays one.
     assert (
-        max(each.psd[3] / bone.psd[3] for bone, each in zip(bones, adapt_psd(bones, leaps), strict=True))
+        max(
+            each.psd[3] / bone.psd[3]
+            for bone, each in zip(bones, scale_motion_noise(bones, leaps), strict=True)
+        )
         == 100
     )
 
@@ -241,18 +250,18 @@ def test_mount_points_carry_exactly_the_pose_they_stand_for():
     points, mount = MountPoints(0.01, 0.005), make_transform(so3_exp([0.3, -0.2, 1.0]), [0.1, 0.02, -0.05])
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     add_mount_prior(graph, 0, mount, points, (0.2, 0.03))
-    insert_mount(values, 0, mount, points)
-    assert_allclose(read_mount(values, 0, points), mount, atol=1e-12)
+    insert_mount_points(values, 0, mount, points)
+    assert_allclose(mount_from_points(values, 0, points), mount, atol=1e-12)
     keys = gtsam.KeyVector([gtsam.symbol("m", i) for i in range(4)])
     covariance = gtsam.Marginals(graph, values).jointMarginalCovariance(keys).fullMatrix()
-    change = mount_change(mount, points)
+    change = mount_jacobian(mount, points)
     assert_allclose(np.diag(change @ covariance @ change.T)[:3], 0.2**2)
     # The derivative of reading the mount, by moving each coordinate of each point.
     for column in range(12):
         moved = gtsam.Values(values)
         point, axis = divmod(column, 3)
         moved.update(keys[point], values.atPoint3(keys[point]) + 1e-6 * np.eye(3)[axis])
-        off = invert(mount) @ read_mount(moved, 0, points)
+        off = invert(mount) @ mount_from_points(moved, 0, points)
         numeric = np.array([*so3_log(off[:3, :3]), *off[:3, 3]]) / 1e-6
         assert_allclose(change[:, column], numeric, atol=1e-4)
 
@@ -266,19 +275,19 @@ def test_walls_and_floor_give_the_vertical_and_the_floor():
     room = np.concatenate([wall, side, floor, clutter]) + rng.normal(scale=0.005, size=(500, 3))
     turn = so3_exp([0.4, -0.9, 0.3])
     planes = find_planes(room @ turn.T, np.random.default_rng(0))
-    found = vertical(planes, so3_exp([0.15, 0.1, 0.0]) @ turn @ UP, TILT_LIMIT_DEG)
+    found = vertical_from_planes(planes, so3_exp([0.15, 0.1, 0.0]) @ turn @ UP, TILT_LIMIT_DEG)
     assert found is not None
     # Planes 3 m wide with 5 mm of noise tilt by a fraction of a degree.
     assert np.degrees(np.arccos(found[0] @ turn @ UP)) < 0.5
     body = turn @ so3_exp([0.5, 0.2, 0.0]) @ UP  # 31 degrees: who mostly bends
-    assert vertical(planes, body, TILT_LIMIT_DEG) is None
-    bent = vertical(planes, body, BENT_LIMIT_DEG)
+    assert vertical_from_planes(planes, body, TILT_LIMIT_DEG) is None
+    bent = vertical_from_planes(planes, body, BENT_TILT_LIMIT_DEG)
     assert bent is not None
     assert np.degrees(np.arccos(bent[0] @ turn @ UP)) < 0.5
-    floor_found = find_floor(room @ UP, Direction(UP, "map", 0.0, 1.0), 0.08, 1.2)
+    floor_found = floor_from_points(room @ UP, Vertical(UP, "map", 0.0, 1.0), 0.08, 1.2)
     assert floor_found.source == "map"
     assert floor_found.height_m == pytest.approx(0.0, abs=0.01)
-    assert find_floor(room @ UP, Direction(UP, "body", None, 0.0), 0.08, 1.2).height_m == 0.08
+    assert floor_from_points(room @ UP, Vertical(UP, "body", None, 0.0), 0.08, 1.2).height_m == 0.08
 
 
 @pytest.mark.parametrize(("floor", "source"), [(0, "map"), (3, "map"), (13, "standing hip height")])
@@ -293,7 +302,7 @@ def test_what_stands_on_the_floor_is_no_floor(floor, source):
             rng.uniform(0.5, 2.5, size=3000),
         ]
     )
-    found = find_floor(heights, Direction(UP, "map", 0.0, 1.0), 0.01, 1.2)
+    found = floor_from_points(heights, Vertical(UP, "map", 0.0, 1.0), 0.01, 1.2)
     assert found.source == source
     if source != "map":
         assert found.height_m == 0.01
@@ -314,12 +323,12 @@ def _beside_a_walk(rng, floor, clutter):
 @pytest.mark.parametrize("expected", [-0.15, 0.0, 0.2])
 def test_a_few_points_beside_the_walk_are_the_floor_where_a_room_hides_it(expected):
     path, points = _beside_a_walk(np.random.default_rng(1), 8, 3)
-    found = walked_floor(points, path, Direction(UP, "map", 0.0, 1.0), expected, 1.2)
+    found = floor_beside_path(points, path, Vertical(UP, "map", 0.0, 1.0), expected, 1.2)
     assert found.source == "map"
     assert 8 <= found.support <= 11
     # Points within a centimetre of it, one of clutter among them at most moves the median by as much.
     assert found.height_m == pytest.approx(0.0, abs=0.01)
-    assert find_floor(points @ UP, Direction(UP, "map", 0.0, 1.0), expected, 1.2).source != "map"
+    assert floor_from_points(points @ UP, Vertical(UP, "map", 0.0, 1.0), expected, 1.2).source != "map"
 
 
 @pytest.mark.parametrize(
@@ -327,15 +336,15 @@ def test_a_few_points_beside_the_walk_are_the_floor_where_a_room_hides_it(expect
 )
 def test_clutter_beside_the_walk_is_no_floor(floor, clutter, source):
     path, points = _beside_a_walk(np.random.default_rng(1), floor, clutter)
-    assert walked_floor(points, path, Direction(UP, source, 0.0, 1.0), 0.0, 1.2) is None
-    assert walked_floor(points[:0], path, Direction(UP, source, 0.0, 1.0), 0.0, 1.2) is None
+    assert floor_beside_path(points, path, Vertical(UP, source, 0.0, 1.0), 0.0, 1.2) is None
+    assert floor_beside_path(points[:0], path, Vertical(UP, source, 0.0, 1.0), 0.0, 1.2) is None
 
 
 def test_one_wall_does_not_fix_the_vertical():
     rng = np.random.default_rng(4)
     wall = rng.uniform([0, 0, 0], [4, 0.005, 2.5], (300, 3))
-    assert vertical(find_planes(wall, np.random.default_rng(0)), UP, BENT_LIMIT_DEG) is None
-    assert vertical([], UP, BENT_LIMIT_DEG) is None
+    assert vertical_from_planes(find_planes(wall, np.random.default_rng(0)), UP, BENT_TILT_LIMIT_DEG) is None
+    assert vertical_from_planes([], UP, BENT_TILT_LIMIT_DEG) is None
     assert find_planes(wall[:50], np.random.default_rng(0)) == []
 
 
@@ -365,13 +374,13 @@ def test_disagreement_counts_sources_that_were_not_believed():
 
 def test_world_has_hips_over_the_origin_and_faces_minus_y():
     up = np.array([0.6, 0.0, 0.8])
-    rotation = upright(up)
+    rotation = rotation_to_z_up(up)
     assert_allclose(rotation @ up, UP, atol=1e-12)
     world = place(rotation, np.array([3.0, 2.0, 1.4]), 0.5, np.radians(30.0))
     assert_allclose(world.apply(np.array([3.0, 2.0, 1.4]) @ rotation), [0.0, 0.0, 0.9], atol=1e-12)
     facing = np.array([np.cos(np.radians(30.0)), np.sin(np.radians(30.0)), 0.0]) @ rotation
     assert_allclose(world.rotation @ facing, [0.0, -1.0, 0.0], atol=1e-12)
-    assert_allclose(upright(-UP) @ -UP, UP, atol=1e-12)
+    assert_allclose(rotation_to_z_up(-UP) @ -UP, UP, atol=1e-12)
 
 
 def test_heading_waits_for_the_first_step():
@@ -379,8 +388,8 @@ def test_heading_waits_for_the_first_step():
     centre = np.zeros((120, 3))
     centre[60:, 1] = np.arange(60) / 30.0
     # The step is seen up to a quarter of a second early: 7 ticks of 30 face the other way.
-    assert heading(forward, centre, 30.0) == pytest.approx(np.pi / 2, abs=np.arctan(7 / 23) + 1e-9)
-    assert heading(forward[:60], centre[:60], 30.0) == 0.0
+    assert initial_heading(forward, centre, 30.0) == pytest.approx(np.pi / 2, abs=np.arctan(7 / 23) + 1e-9)
+    assert initial_heading(forward[:60], centre[:60], 30.0) == 0.0
 
 
 def test_standing_height_adds_the_legs_up():
@@ -397,9 +406,9 @@ def test_standing_height_adds_the_legs_up():
 
 def test_the_rest_of_the_body_stands_under_a_leaning_chest():
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = graph_bones(skeleton, ("Spine1",))
+    bones = kinematic_chain(skeleton, ("Spine1",))
     lean = make_transform(so3_exp([[0.3, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.225]]))
-    joints, solved = complete_body(skeleton, bones, lean[:, None])
+    joints, solved = complete_skeleton(skeleton, bones, lean[:, None])
     assert solved.sum() == 1
     hips, foot = skeleton.roles.index("Hips"), skeleton.roles.index("LeftFoot")
     assert_allclose(joints[0, hips, :3, :3], np.eye(3), atol=1e-12)
@@ -416,14 +425,14 @@ def test_helpers_of_a_rig_stay_at_zero_under_a_leaning_chest():
     roles = tuple("" if role == "Spine" else role for role in plain.roles)
     skeleton = replace(plain, roles=roles)
     lean = make_transform(so3_exp([[0.3, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.225]]))
-    joints, _ = complete_body(skeleton, graph_bones(skeleton, ("Spine1",)), lean[:, None])
+    joints, _ = complete_skeleton(skeleton, kinematic_chain(skeleton, ("Spine1",)), lean[:, None])
     hips, helper = 0, plain.roles.index("Spine")
     assert_allclose(joints[0, helper, :3, :3], joints[0, hips, :3, :3], atol=1e-12)
 
 
 def test_observed_needs_a_camera_or_cameras_on_both_sides():
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = graph_bones(skeleton, PAPER)
+    bones = kinematic_chain(skeleton, PAPER)
     ticks = np.round(np.arange(90) * SECOND / 30).astype(np.int64)
     torso, left, right = (_track(np.zeros((90, 3)), bone) for bone in (0, 4, 8))
     left = left.keep((np.arange(90) < 30) | (np.arange(90) > 45))
@@ -446,9 +455,9 @@ def test_solved_feet_give_the_floor():
     joints = np.tile(make_transform(np.eye(3), rest_positions(skeleton))[None], (50, 1, 1, 1))
     joints[:, :, 2, 3] += 0.3
     solved = np.zeros(len(skeleton.joints), dtype=bool)
-    assert feet_floor(skeleton, joints, solved) is None
+    assert floor_from_feet(skeleton, joints, solved) is None
     solved[skeleton.roles.index("LeftFoot")] = True
-    floor = feet_floor(skeleton, joints, solved)
+    floor = floor_from_feet(skeleton, joints, solved)
     assert floor is not None
     assert floor.source == "feet"
     assert floor.height_m == pytest.approx(0.3, abs=1e-9)
@@ -456,9 +465,9 @@ def test_solved_feet_give_the_floor():
 
 def test_walking_palms_stay_low_and_on_their_side():
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = graph_bones(skeleton, PAPER)
-    assert activity_rules(skeleton, bones, "generic") == ()
-    rules = {rule.name: rule for rule in activity_rules(skeleton, bones, "walk")}
+    bones = kinematic_chain(skeleton, PAPER)
+    assert activity_limits(skeleton, bones, "generic") == ()
+    rules = {rule.name: rule for rule in activity_limits(skeleton, bones, "walk")}
     poses = pose_bones(skeleton, bones, {0: np.eye(4)[None]})
     assert all(not rule.violation_m(poses).any() for rule in rules.values())
     poses[0, 4, :3, 3] = [0.2, -0.3, 0.5]
@@ -472,8 +481,8 @@ def test_a_rule_pulls_only_outside_its_bounds():
     import gtsam
 
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = graph_bones(skeleton, PAPER)
-    rule = activity_rules(skeleton, bones, "walk")[0]
+    bones = kinematic_chain(skeleton, PAPER)
+    rule = activity_limits(skeleton, bones, "walk")[0]
     poses = pose_bones(skeleton, bones, {0: np.eye(4)[None]})
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     rule.add(graph, 0)
@@ -490,27 +499,27 @@ def test_a_rule_pulls_only_outside_its_bounds():
 
 def test_a_head_camera_reaches_the_palms_through_the_chest():
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = graph_bones(skeleton, ("Head", "LeftHand"))
+    bones = kinematic_chain(skeleton, ("Head", "LeftHand"))
     index = {bone.role: i for i, bone in enumerate(bones)}
-    found = anchor_and_reach(bones, index["LeftHand"], index["Head"])
+    found = reach_constraint(bones, index["LeftHand"], index["Head"])
     assert found is not None
     rest = rest_positions(skeleton)
     shoulder = rest[skeleton.roles.index("LeftArm")] - rest[skeleton.roles.index("Head")]
     assert_allclose(found[0], shoulder, atol=1e-12)
     assert found[1] == pytest.approx((0.186 + 0.146) * 1.75)
-    palms = graph_bones(skeleton, ("LeftHand", "RightHand"))
-    assert anchor_and_reach(palms, 4, len(palms) - 1) is None
+    palms = kinematic_chain(skeleton, ("LeftHand", "RightHand"))
+    assert reach_constraint(palms, 4, len(palms) - 1) is None
 
 
 @pytest.mark.parametrize("roles", [("Spine1", "LeftHand", "RightHand"), ("Hips", "LeftFoot", "RightFoot")])
 def test_elbows_and_knees_bend_one_way(roles):
     skeleton = load_skeleton("full_body", 1.75)
-    bones = graph_bones(skeleton, roles)
+    bones = kinematic_chain(skeleton, roles)
     index = {bone.role: position for position, bone in enumerate(bones)}
-    for rule in limit_rules(skeleton, bones):
+    for rule in hinge_limits(skeleton, bones):
         side = rule.name.split()[0]
         upper, lower, end = ("Arm", "ForeArm", "Hand") if "elbow" in rule.name else ("UpLeg", "Leg", "Foot")
-        axis = proper_axes(skeleton, side + upper)[:, 2]
+        axis = anatomical_axes(skeleton, side + upper)[:, 2]
         for degrees, wrong in ((0.0, False), (40.0, False), (120.0, False), (-15.0, True)):
             bend = degrees if upper == "Arm" else -degrees
             poses = np.tile(np.eye(4), (1, len(bones), 1, 1))
@@ -523,13 +532,13 @@ def test_elbows_and_knees_bend_one_way(roles):
             )
             # At -15 degrees the end is 3 to 5 cm too far; rounding leaves nothing at 0.
             assert bool(rule.violation_m(poses)[0] > 0.02) is wrong
-    assert len(limit_rules(skeleton, bones)) == 2
+    assert len(hinge_limits(skeleton, bones)) == 2
 
 
 def test_palms_stay_within_an_arms_length():
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = graph_bones(skeleton, PAPER)
-    left = next(rule for rule in reach_rules(skeleton, bones) if rule.name.startswith("Left"))
+    bones = kinematic_chain(skeleton, PAPER)
+    left = next(rule for rule in arm_reach_limits(skeleton, bones) if rule.name.startswith("Left"))
     assert left.high_m == pytest.approx((0.186 + 0.146) * 1.75 + 0.05)
     poses = np.tile(np.eye(4), (1, len(bones), 1, 1))
     poses[:, left.bone, :3, 3] = left.anchor_m - np.array([0.0, left.high_m + 0.1, 0.0])

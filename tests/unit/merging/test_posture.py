@@ -6,12 +6,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bodycap_batch.merging.body.bones import graph_bones, proper_axes
-from bodycap_batch.merging.body.t_pose import arm_span, find_t_pose, t_posed
-from bodycap_batch.merging.body.trunk_lean import usual_direction
-from bodycap_batch.merging.cameras.track import Track
-from bodycap_batch.merging.graph.error_modes import BETWEEN_SHARE
-from bodycap_batch.merging.graph.posture import GESTURE_S, find_posture, walking_plane, widened
+from bodycap_batch.merging.body.bones import anatomical_axes, kinematic_chain
+from bodycap_batch.merging.body.t_pose import arm_span, find_t_pose, with_t_pose_prior
+from bodycap_batch.merging.body.trunk_lean import modal_direction
+from bodycap_batch.merging.cameras.track import CameraTrack
+from bodycap_batch.merging.graph.error_modes import POSTURE_BIAS_SHARE
+from bodycap_batch.merging.graph.posture import (
+    GESTURE_DURATION_S,
+    find_posture,
+    vertical_from_path,
+    widen_joint_priors,
+)
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.skeleton import forward_kinematics
 from bodycap_batch.model.skeleton_presets import load_skeleton, rest_positions
@@ -24,7 +29,7 @@ TILT = so3_exp([0.5, -0.3, 0.2])
 
 def _track(poses, bone=0, camera="torso"):
     count = len(poses)
-    return Track(
+    return CameraTrack(
         camera=camera,
         bone=bone,
         frames=np.arange(count),
@@ -49,16 +54,16 @@ def test_a_walk_tells_the_vertical_of_a_tilted_map():
     path = _circle()[:, :3, 3]
     rng = np.random.default_rng(0)
     body = so3_exp([0.2, 0.1, 0.0]) @ TILT[:, 2]
-    up = walking_plane(path + rng.normal(scale=0.005, size=path.shape), body)
+    up = vertical_from_path(path + rng.normal(scale=0.005, size=path.shape), body)
     # The bounce averages out over 35 steps: 2 cm / (1 m of spread x sqrt(35)) is 0.2 degrees.
     assert np.degrees(np.arccos(up @ TILT[:, 2])) < 0.5
-    assert walking_plane(path, -body) @ TILT[:, 2] < 0.0  # what is up is the body's word
+    assert vertical_from_path(path, -body) @ TILT[:, 2] < 0.0  # what is up is the body's word
 
 
 def test_bending_down_in_between_does_not_tilt_the_walk():
     path = _circle()[:, :3, 3]
     path[100:160] -= 0.45 * TILT[:, 2]
-    up = walking_plane(path, TILT[:, 2])
+    up = vertical_from_path(path, TILT[:, 2])
     assert np.degrees(np.arccos(up @ TILT[:, 2])) < 0.5
 
 
@@ -71,7 +76,7 @@ def test_a_path_that_shows_no_level_gives_none(kind):
         path = path + np.outer(np.repeat(np.arange(20), 30) * 0.35, TILT[:, 2])
     else:
         path = path[:20]
-    assert walking_plane(path, TILT[:, 2]) is None
+    assert vertical_from_path(path, TILT[:, 2]) is None
 
 
 def test_the_way_ahead_follows_the_path_and_leaves_side_steps_out():
@@ -86,7 +91,7 @@ def test_the_way_ahead_follows_the_path_and_leaves_side_steps_out():
     angle = 2 * np.pi * track.times_ns[inner] * 1e-9 / 10.0
     tangent = np.column_stack([-np.sin(angle), np.cos(angle), 0.0 * angle]) @ TILT.T
     # The chord over half a second leaves the tangent's direction alone; the bounce is projected out.
-    assert_allclose(posture.ahead[inner], tangent, atol=1e-3)
+    assert_allclose(posture.walking_direction[inner], tangent, atol=1e-3)
 
 
 def _bending(seconds=20.0):
@@ -108,7 +113,7 @@ def test_who_bends_and_lifts_stands_upright_in_between():
     assert np.degrees(bend[posture.standing].max()) < 17.0
     assert not find_posture(track, track.times_ns, None, None).standing.any()
     # The mean of all bends leans by 26 degrees; what is usual does not.
-    assert np.degrees(np.arccos(usual_direction(poses[:, :3, 2]) @ TILT[:, 2])) < 10.0
+    assert np.degrees(np.arccos(modal_direction(poses[:, :3, 2]) @ TILT[:, 2])) < 10.0
 
 
 def test_who_leans_all_the_time_is_nowhere_upright():
@@ -146,14 +151,14 @@ def test_someone_who_faces_nowhere_in_particular_gets_no_heading():
     poses[:, :3, :3] = poses[:, :3, :3] @ so3_exp(np.outer(rng.uniform(-np.pi, np.pi, len(poses)), [0, 0, 1]))
     track = _track(poses)
     posture = find_posture(track, track.times_ns, TILT[:, 2], None)
-    assert np.isnan(posture.ahead).all()
+    assert np.isnan(posture.walking_direction).all()
     assert posture.walking.any()
 
 
 def _posed_tracks(arm_deg, still=True):
     """Three seconds of arms lowered by an angle from the side, then two of them hanging."""
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = graph_bones(skeleton, ROLES)
+    bones = kinematic_chain(skeleton, ROLES)
     count = 150
     local = np.tile(np.eye(3), (count, len(skeleton.joints), 1, 1))
     lowered = np.where(np.arange(count) < 90, arm_deg, 80.0)
@@ -216,8 +221,8 @@ def test_stretched_arms_in_passing_are_none():
 
 def test_the_t_pose_of_a_rig_that_rests_in_it_is_its_zero_pose():
     skeleton = load_skeleton("full_body", 1.75)
-    bones = graph_bones(skeleton, ("Hips", "LeftHand", "RightHand", "Head", "LeftFoot", "RightFoot"))
-    for bone in t_posed(skeleton, bones):
+    bones = kinematic_chain(skeleton, ("Hips", "LeftHand", "RightHand", "Head", "LeftFoot", "RightFoot"))
+    for bone in with_t_pose_prior(skeleton, bones):
         assert_allclose(bone.mean_rotation, np.eye(3), atol=1e-12)
         assert np.linalg.eigvalsh(bone.rotation_covariance).min() > 0.0
 
@@ -231,7 +236,7 @@ def test_the_t_pose_of_a_rig_whose_arms_hang_lifts_them():
             offsets[joint] = [0.0, 0.0, -np.linalg.norm(offsets[joint])]
     ends = np.where(np.isfinite(skeleton.end_offsets_m), skeleton.end_offsets_m, np.nan)
     hanging = replace(skeleton, offsets_m=offsets, end_offsets_m=ends)
-    bones = {bone.role: bone for bone in t_posed(hanging, graph_bones(hanging, ROLES))}
+    bones = {bone.role: bone for bone in with_t_pose_prior(hanging, kinematic_chain(hanging, ROLES))}
     lifted = bones["LeftArm"].mean_rotation @ bones["LeftForeArm"].offset_m
     assert_allclose(lifted, [np.linalg.norm(lifted), 0.0, 0.0], atol=1e-9)
     lifted = bones["RightArm"].mean_rotation @ bones["RightForeArm"].offset_m
@@ -242,16 +247,16 @@ def test_the_t_pose_of_a_rig_whose_arms_hang_lifts_them():
     ("times_s", "few"),
     [
         (np.linspace(5.0, 7.0, 20), 1.0),
-        (np.linspace(5.0, 5.0 + 10.0 * GESTURE_S, 20), 0.1),
+        (np.linspace(5.0, 5.0 + 10.0 * GESTURE_DURATION_S, 20), 0.1),
         # Two glimpses a long time apart show two gestures.
         (np.concatenate([np.linspace(0.0, 1.0, 10), np.linspace(60.0, 61.0, 10)]), 0.5),
     ],
 )
 def test_what_a_capture_happens_to_show_widens_a_joints_range(times_s, few):
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = graph_bones(skeleton, ROLES)
+    bones = kinematic_chain(skeleton, ROLES)
     elbow = [bone.role for bone in bones].index("LeftForeArm")
-    axes = proper_axes(skeleton, "LeftForeArm")
+    axes = anatomical_axes(skeleton, "LeftForeArm")
     # Thirty degrees to either side of a posture that is itself twenty off the usual one.
     flexion = np.radians(20.0 + 30.0 * np.tile([1.0, -1.0], 10))
     poses = np.tile(np.eye(4), (20, len(bones), 1, 1))
@@ -259,9 +264,9 @@ def test_what_a_capture_happens_to_show_widens_a_joints_range(times_s, few):
         if bone.parent >= 0:
             turn = so3_exp(np.outer(flexion if index == elbow else 0.0 * flexion, axes[:, 2]))
             poses[:, index, :3, :3] = poses[:, bone.parent, :3, :3] @ bone.mean_rotation @ turn
-    wider = widened(skeleton, bones, poses, np.round(1e9 * times_s).astype(np.int64))
+    wider = widen_joint_priors(skeleton, bones, poses, np.round(1e9 * times_s).astype(np.int64))
     grown = axes.T @ (wider[elbow].rotation_covariance - bones[elbow].rotation_covariance) @ axes
-    expected = np.diag([0.0, 0.0, few * np.radians(30.0) ** 2 / BETWEEN_SHARE**2])
+    expected = np.diag([0.0, 0.0, few * np.radians(30.0) ** 2 / POSTURE_BIAS_SHARE**2])
     assert_allclose(grown, expected, atol=1e-9)
     for index, (bone, other) in enumerate(zip(bones, wider, strict=True)):
         assert index == elbow or np.allclose(bone.rotation_covariance, other.rotation_covariance)
@@ -271,15 +276,15 @@ def test_what_a_capture_happens_to_show_widens_a_joints_range(times_s, few):
 @pytest.mark.parametrize(("off_deg", "sigma_deg"), [(15.0, 40.0), (50.0, 100.0)])
 def test_a_joint_held_far_off_its_ease_all_the_time_has_that_range(off_deg, sigma_deg):
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = graph_bones(skeleton, ROLES)
+    bones = kinematic_chain(skeleton, ROLES)
     elbow = [bone.role for bone in bones].index("LeftForeArm")
-    axes = proper_axes(skeleton, "LeftForeArm")
+    axes = anatomical_axes(skeleton, "LeftForeArm")
     poses = np.tile(np.eye(4), (20, len(bones), 1, 1))
     for index, bone in enumerate(bones):
         if bone.parent >= 0:
             turn = so3_exp(np.radians(off_deg if index == elbow else 0.0) * axes[:, 2])
             poses[:, index, :3, :3] = poses[:, bone.parent, :3, :3] @ bone.mean_rotation @ turn
-    wider = widened(skeleton, bones, poses, np.arange(20) * 1_000_000_000)
+    wider = widen_joint_priors(skeleton, bones, poses, np.arange(20) * 1_000_000_000)
     sigma = np.degrees(np.sqrt(np.diagonal(axes.T @ wider[elbow].rotation_covariance @ axes)))
     # A habit is half of a range: 50 degrees of habit need one of 100, 15 lie within the usual 40.
     assert_allclose(sigma, [40.0, 40.0, sigma_deg], atol=1e-6)

@@ -9,16 +9,20 @@ import pytest
 
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body.bones import graph_bones
+from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body_calibration.calibrate_body import trunk_way_up
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.merging.camera_selection import choices
-from bodycap_batch.merging.cameras.track import Track, make_track
+from bodycap_batch.merging.cameras.track import CameraTrack, make_track
 from bodycap_batch.merging.map_alignment import align
-from bodycap_batch.merging.map_alignment.align import use_together
-from bodycap_batch.merging.map_alignment.gauss_newton import Placing
-from bodycap_batch.merging.map_alignment.scale_sources import Stated, floor_scale, stated_in
-from bodycap_batch.merging.world.vertical import Direction, Say
+from bodycap_batch.merging.map_alignment.align import align_cameras
+from bodycap_batch.merging.map_alignment.gauss_newton import MapAlignmentProblem
+from bodycap_batch.merging.map_alignment.scale_sources import (
+    StatedConstraints,
+    scale_from_walked_floor,
+    stated_constraints,
+)
+from bodycap_batch.merging.world.vertical import Vertical, VerticalHypothesis
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.joining import SPLITS, _off
@@ -39,21 +43,21 @@ def short():
 
 
 def _direction(up, source="map"):
-    return Direction(up, source, None, 0.0)
+    return Vertical(up, source, None, 0.0)
 
 
 def _asked(capture, options, points=None, off=1.1, up="map"):
     """What is known of the trunk's map, by a body whose own scale is off by a factor."""
     inputs = capture.inputs
-    bones = graph_bones(inputs.skeleton, {mount.role for mount in inputs.mounts})
+    bones = kinematic_chain(inputs.skeleton, {mount.role for mount in inputs.mounts})
     trunk = next(each for each in inputs.trajectories if each.camera == "torso")
     index = [bone.role for bone in bones].index(inputs.mount_of("torso").role)
     gauge = capture.gauges[trunk.gauge]
     body = ScaleSource(name="body", scale=off / gauge.scale, sigma_log=0.1)
     seen = make_track(inputs, trunk, index), _direction(gauge.rotation @ UP, up) if up else None
     points = np.zeros((0, 3)) if points is None else gauge.apply(points)
-    stated = stated_in(inputs, options, trunk.gauge).scales
-    floor = floor_scale(inputs, seen, body, points)
+    stated = stated_constraints(inputs, options, trunk.gauge).scales
+    floor = scale_from_walked_floor(inputs, seen, body, points)
     return [
         (each.name, each.scale * gauge.scale, each.sigma_log)
         for each in (*stated, *(() if floor is None else (floor,)))
@@ -106,7 +110,7 @@ def _sitter(inputs, walks):
     heading = np.where(np.diff(sway, append=sway[-1]) > 0.0, 0.0, np.pi)
     level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     turned = so3_exp(heading[:, None] * UP) @ level
-    return Track(
+    return CameraTrack(
         camera="torso",
         bone=0,
         frames=count,
@@ -122,7 +126,7 @@ def test_who_sits_is_not_as_tall_as_who_walks(short):
     floor = np.column_stack([rng.uniform(-2.0, 2.0, (300, 2)), rng.normal(scale=0.005, size=300)])
     body = ScaleSource(name="body", scale=1.0, sigma_log=0.15)
     seen = [(_sitter(inputs, walks), _direction(UP)) for walks in (1.0, 0.4, 0.0)]
-    always, seldom, never = (floor_scale(inputs, each, body, floor) for each in seen)
+    always, seldom, never = (scale_from_walked_floor(inputs, each, body, floor) for each in seen)
     assert seldom.scale == pytest.approx(always.scale, abs=0.02)
     assert never is None
 
@@ -140,7 +144,7 @@ def test_a_distance_in_another_map_waits_until_that_is_placed(short):
 
 
 def test_a_join_is_told_what_the_job_states_of_up_and_how_the_trunks_camera_is_rolled(short, monkeypatch):
-    lying, told = Say(source="marker board", up=UP, sigma_deg=1.5), []
+    lying, told = VerticalHypothesis(source="marker board", up=UP, sigma_deg=1.5), []
 
     def way_up(*arguments):
         told.append(arguments[-1])
@@ -150,11 +154,11 @@ def test_a_join_is_told_what_the_job_states_of_up_and_how_the_trunks_camera_is_r
         told.append(mounts["torso"])
         raise EstimationError("enough")
 
-    monkeypatch.setattr(align, "stated_in", lambda *_: Stated(ups=(lying,)))
+    monkeypatch.setattr(align, "stated_constraints", lambda *_: StatedConstraints(verticals=(lying,)))
     monkeypatch.setattr(align, "trunk_way_up", way_up)
     monkeypatch.setattr(align, "Calibration", calibration)
     main, further = choices(short.inputs)[0]
-    assert "enough" in use_together(short.inputs, main, further[:1], lambda: None).unused[further[0].camera]
+    assert "enough" in align_cameras(short.inputs, main, further[:1], lambda: None).unused[further[0].camera]
     assert told[0] == (lying,)
     usual = short.inputs.mount_of("torso").joint_from_cam
     assert np.allclose(told[1].joint_from_cam[:3, :2], -usual[:3, :2])
@@ -162,30 +166,30 @@ def test_a_join_is_told_what_the_job_states_of_up_and_how_the_trunks_camera_is_r
 
 def test_what_is_stated_or_seen_early_says_where_it_is_from(short):
     inputs = short.inputs
-    bones = graph_bones(inputs.skeleton, {mount.role for mount in inputs.mounts})
+    bones = kinematic_chain(inputs.skeleton, {mount.role for mount in inputs.mounts})
     trunk = next(each for each in inputs.trajectories if each.camera == "torso")
     tracks = [make_track(inputs, trunk, [bone.role for bone in bones].index("Spine1"))]
     unit = short.gauges[trunk.gauge]
-    lying = Say(source="marker board", up=unit.rotation @ UP, sigma_deg=1.5)
+    lying = VerticalHypothesis(source="marker board", up=unit.rotation @ UP, sigma_deg=1.5)
     roll, up = trunk_way_up(inputs, bones, tracks, 1.0 / unit.scale, (lying,))
     assert (roll, up.source) == (0.0, "marker board")
 
 
-class _Strained(Placing):
+class _Strained(MapAlignmentProblem):
     """Maps whose cameras move as if the scale were nine sigmas from what the limbs reach."""
 
     def solve(self):
-        self._covariance = 1e-4 * np.eye(1 + 7 * len(self.moved))
+        self._covariance = 1e-4 * np.eye(1 + 7 * len(self.corrections))
 
-    def from_reach(self):
+    def scale_residual(self):
         return 9.0
 
 
 def test_a_stated_scale_saves_a_join_on_whose_scale_reach_and_movement_disagree(short, monkeypatch):
-    monkeypatch.setattr(align, "Placing", _Strained)
+    monkeypatch.setattr(align, "MapAlignmentProblem", _Strained)
     main, further = choices(short.inputs)[0]
     refused, placed = (
-        use_together(short.inputs, main, further[:1], lambda: None, options).unused
+        align_cameras(short.inputs, main, further[:1], lambda: None, options).unused
         for options in (MergeOptions(), _distance(short, "torso"))
     )
     assert "disagree on the scale" in refused[further[0].camera]
@@ -193,15 +197,15 @@ def test_a_stated_scale_saves_a_join_on_whose_scale_reach_and_movement_disagree(
 
 
 def test_maps_are_placed_at_the_stated_scale():
-    problem = Placing(
+    problem = MapAlignmentProblem(
         SimpleNamespace(samples=SimpleNamespace(cameras=())),
         [],
         1.0,
         reach_sigma=0.05,
         stated=(ScaleSource(name="known distance", scale=1.2, sigma_log=0.01),),
     )
-    assert problem._from_sources() == pytest.approx([0.0, -np.log(1.2) / 0.01])
-    assert problem.from_reach() == 0.0
+    assert problem._source_residuals() == pytest.approx([0.0, -np.log(1.2) / 0.01])
+    assert problem.scale_residual() == 0.0
 
 
 @pytest.mark.slow
@@ -210,9 +214,9 @@ def test_palms_lie_where_they_were_once_the_scale_is_known():
     main, further = choices(capture.inputs)[0]
     off = []
     for options in (MergeOptions(), _distance(capture, "torso")):
-        together = use_together(capture.inputs, main, further, lambda: None, options)
+        together = align_cameras(capture.inputs, main, further, lambda: None, options)
         assert not together.unused
-        off.append(_off(capture, together.places, main[0].gauge))
+        off.append(_off(capture, together.main_from_gauge, main[0].gauge))
         # Three dimensions of the stated sigma, twice.
         assert all(value < 2.0 * np.sqrt(3.0) * together.sigmas[name][1] for name, value in off[-1].items())
     # By the body's own scale, 11 % too small, they lay 9 and 13 cm off.

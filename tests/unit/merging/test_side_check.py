@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from bodycap_batch.merging.body_calibration.camera_roll import rolled
-from bodycap_batch.merging.cameras.side_check import exchanged_sides
-from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.merging.cameras.side_check import swapped_sides
+from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.reporting.advice import sides_sentence
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
@@ -21,9 +21,9 @@ BACK = replace(nominal_mount("torso_back", "Spine1", BODY), camera="torso")
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def _track(camera: str, poses) -> Track:
+def _track(camera: str, poses) -> CameraTrack:
     count = len(poses)
-    return Track(
+    return CameraTrack(
         camera=camera,
         bone=0,
         frames=np.arange(count),
@@ -34,7 +34,7 @@ def _track(camera: str, poses) -> Track:
     )
 
 
-def _tracks(*sides: tuple[str, float], down_rad: float = 0.0, count: int = 90) -> list[Track]:
+def _tracks(*sides: tuple[str, float], down_rad: float = 0.0, count: int = 90) -> list[CameraTrack]:
     """A trunk's camera that turns round, looking down by so much, and cameras so far to its right."""
     headings = np.linspace(0.0, 6.0, count)
     level = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -49,7 +49,7 @@ def _tracks(*sides: tuple[str, float], down_rad: float = 0.0, count: int = 90) -
 
 
 def test_exchanged_names_are_told() -> None:
-    wrong = exchanged_sides(_tracks(("left_palm", 0.3), ("right_palm", -0.3), ("head", 0.0)), MOUNTS, UP)
+    wrong = swapped_sides(_tracks(("left_palm", 0.3), ("right_palm", -0.3), ("head", 0.0)), MOUNTS, UP)
     assert wrong == {"left_palm": 1.0, "right_palm": 1.0}
     assert sides_sentence(wrong).startswith("left_palm and right_palm stay on the other side")
 
@@ -67,12 +67,12 @@ def test_exchanged_names_are_told() -> None:
     ],
     ids=["right", "one arm across", "in the middle", "no limb", "looking down"],
 )
-def test_sides_that_do_not_tell_are_left_alone(tracks: list[Track]) -> None:
-    assert exchanged_sides(tracks, MOUNTS, UP) == {}
+def test_sides_that_do_not_tell_are_left_alone(tracks: list[CameraTrack]) -> None:
+    assert swapped_sides(tracks, MOUNTS, UP) == {}
 
 
 def test_a_camera_on_its_head_does_not_tell() -> None:
-    assert exchanged_sides(_tracks(("left_palm", 0.3), ("right_palm", -0.3)), MOUNTS, -UP) == {}
+    assert swapped_sides(_tracks(("left_palm", 0.3), ("right_palm", -0.3)), MOUNTS, -UP) == {}
 
 
 @pytest.mark.parametrize("roll_deg", [0.0, 180.0])
@@ -84,12 +84,12 @@ def test_a_back_camera_has_the_left_hand_on_its_right(roll_deg: float) -> None:
         poses = tracks[0].map_from_cam.copy()
         poses[:, :3, :3] = poses[:, :3, :3] @ turn
         tracks[0] = replace(tracks[0], map_from_cam=poses)
-    assert exchanged_sides(own, mounts, UP) == {}
-    assert exchanged_sides(exchanged, mounts, UP) == {"left_palm": 1.0, "right_palm": 1.0}
+    assert swapped_sides(own, mounts, UP) == {}
+    assert swapped_sides(exchanged, mounts, UP) == {"left_palm": 1.0, "right_palm": 1.0}
 
 
 def test_a_limbs_camera_that_leads_does_not_tell() -> None:
     tracks = _tracks(("left_palm", 0.3), ("right_palm", -0.3))
     arm = replace(BACK, role="LeftArm")
     for worn in (arm, replace(MOUNTS["torso"], role="LeftArm")):
-        assert exchanged_sides(tracks, {**MOUNTS, "torso": worn}, UP) == {}
+        assert swapped_sides(tracks, {**MOUNTS, "torso": worn}, UP) == {}

@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bodycap_batch.merging.body.bones import graph_bones
-from bodycap_batch.merging.body.trunk_lean import BodyUp, body_up
-from bodycap_batch.merging.cameras.track import Track
-from bodycap_batch.merging.graph.posture import mostly_walks
+from bodycap_batch.merging.body.bones import kinematic_chain
+from bodycap_batch.merging.body.trunk_lean import TrunkOrientation, trunk_orientation
+from bodycap_batch.merging.cameras.track import CameraTrack
+from bodycap_batch.merging.graph.posture import is_mostly_walking
 from bodycap_batch.merging.reporting.advice import up_sentence
-from bodycap_batch.merging.world.vertical import Around, Direction, Say, find_up
+from bodycap_batch.merging.world.vertical import SceneContext, Vertical, VerticalHypothesis, estimate_vertical
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.skeleton_presets import load_skeleton
 
@@ -43,13 +43,15 @@ def _leaning(rng, forward_deg, share, side_deg=0.0):
     return axes, 0.45 * axes[:, :, 2] + [0.0, 0.0, STANDING_M - 0.45]
 
 
-def _found(axes, path, points, sided=True, stated=(), walks=False) -> Direction:
+def _found(axes, path, points, front_known=True, stated=(), walks=False) -> Vertical:
     """What is found in a frame that is turned, and turned back."""
-    around = Around(points_m=points @ TURN.T, path_m=path @ TURN.T, standing_m=STANDING_M, walks=walks)
-    return find_up(BodyUp(TURN @ axes, sided), around, np.random.default_rng(0), stated)
+    around = SceneContext(points_m=points @ TURN.T, path_m=path @ TURN.T, standing_m=STANDING_M, walks=walks)
+    return estimate_vertical(
+        TrunkOrientation(TURN @ axes, front_known), around, np.random.default_rng(0), stated
+    )
 
 
-def _off_deg(found: Direction) -> float:
+def _off_deg(found: Vertical) -> float:
     return float(np.degrees(np.arccos(np.clip(found.up @ TURN @ UP, -1.0, 1.0))))
 
 
@@ -73,7 +75,7 @@ def test_a_room_is_not_laid_on_its_side_by_who_bends_in_it(forward_deg, share):
     found = _found(*_leaning(rng, forward_deg, share), _box_room(rng))
     assert found.source == "map"
     assert _off_deg(found) < 0.5
-    assert found.determined()
+    assert found.is_determined()
 
 
 def test_a_room_seen_from_one_side_is_not_laid_on_its_side_either():
@@ -105,12 +107,12 @@ def test_a_lean_that_lasts_does_not_show_unless_it_walks(forward_deg, share):
     assert found.source == "body"
     assert 38.0 < found.sigma_deg < 50.0
     assert _off_deg(found) < 2.5 * found.sigma_deg
-    assert not found.determined()
+    assert not found.is_determined()
     assert "not for certain: nothing else tells it" in up_sentence(SimpleNamespace(up=found))
     if share == 1.0:
         walked = _found(axes, path, np.zeros((0, 3)), walks=True)
         assert walked.sigma_deg == pytest.approx(15.0, abs=0.5)
-        assert walked.determined()
+        assert walked.is_determined()
 
 
 def test_who_walks_most_of_the_time_is_told_from_who_bends_on_the_spot():
@@ -121,7 +123,7 @@ def test_who_walks_most_of_the_time_is_told_from_who_bends_on_the_spot():
         (np.column_stack([0.2 * np.sin(1.5 * seconds), still, 0.2 * np.cos(1.5 * seconds)]), False),
         (np.column_stack([np.minimum(0.9 * seconds, 2.7), still, still]), False),
     ):
-        track = Track(
+        track = CameraTrack(
             camera="torso",
             bone=0,
             frames=np.arange(300),
@@ -130,7 +132,7 @@ def test_who_walks_most_of_the_time_is_told_from_who_bends_on_the_spot():
             sigma_rad=np.full(300, 0.005),
             sigma_map=np.full(300, 0.005),
         )
-        assert mostly_walks(track) == walks
+        assert is_mostly_walking(track) == walks
 
 
 def test_a_wall_and_a_sloping_roof_do_not_tilt_a_level_walk():
@@ -143,11 +145,11 @@ def test_a_wall_and_a_sloping_roof_do_not_tilt_a_level_walk():
     angle = np.linspace(0.0, 10.0, 300)
     walk = np.column_stack([1.5 * np.sin(angle), 1.2 * np.cos(angle), 1.3 + 0.02 * np.sin(22.0 * angle)])
     axes, _ = _leaning(rng, 0.0, 1.0)
-    found = _found(axes, walk, attic, sided=False)
+    found = _found(axes, walk, attic, front_known=False)
     assert found.source == "walk"
     assert _off_deg(found) < 0.5
     # Who stands still has nothing better than what the planes agree on.
-    assert _found(axes, walk[:20], attic, sided=False).source == "map"
+    assert _found(axes, walk[:20], attic, front_known=False).source == "map"
 
 
 @pytest.mark.parametrize(("hung_deg", "taken"), [(3.0, "map"), (10.0, "marker board")])
@@ -156,7 +158,7 @@ def test_what_the_job_states_is_taken_and_the_others_are_told_against_it(hung_de
     room, (axes, path) = _box_room(rng), _leaning(rng, 0.0, 1.0)
     hung = TURN @ so3_exp([np.radians(hung_deg), 0.0, 0.0])
     edges = [
-        Say(source="marker board", up=sign * hung[:, axis], sigma_deg=1.5)
+        VerticalHypothesis(source="marker board", up=sign * hung[:, axis], sigma_deg=1.5)
         for axis in (0, 2)
         for sign in (1, -1)
     ]
@@ -165,7 +167,7 @@ def test_what_the_job_states_is_taken_and_the_others_are_told_against_it(hung_de
     assert _off_deg(found) == pytest.approx(0.0 if taken == "map" else hung_deg, abs=0.5)
     told = {
         say.source: np.degrees(np.arccos(np.clip(say.up @ found.up, -1.0, 1.0)))
-        for say in reversed(found.others)
+        for say in reversed(found.alternatives)
     }
     assert told["map" if taken == "marker board" else "marker board"] == pytest.approx(hung_deg, abs=0.5)
     assert "body" in told
@@ -174,11 +176,11 @@ def test_what_the_job_states_is_taken_and_the_others_are_told_against_it(hung_de
 def test_a_board_on_the_floor_tells_who_is_upside_down():
     rng = np.random.default_rng(1)
     axes, path = _leaning(rng, 0.0, 1.0)
-    lying = [Say(source="marker board", up=TURN @ UP, sigma_deg=1.5)]
+    lying = [VerticalHypothesis(source="marker board", up=TURN @ UP, sigma_deg=1.5)]
     found = _found(so3_exp([np.pi, 0.0, 0.0]) @ axes, path, _box_room(rng), stated=lying)
     assert _off_deg(found) < 0.5
     # However strange it is beside what the job does not say.
-    assert found.determined()
+    assert found.is_determined()
     assert up_sentence(SimpleNamespace(up=found)).endswith("from the map")
 
 
@@ -187,8 +189,8 @@ def test_a_board_hung_at_half_a_right_angle_leaves_two_of_its_edges():
     axes, path = _leaning(rng, 0.0, 1.0)
     hung = TURN @ so3_exp([0.0, np.radians(45.0), 0.0])
     ups = (-hung[:, 0], hung[:, 2])
-    edges = [Say(source="marker board", up=up, sigma_deg=1.5) for up in ups]
-    assert not _found(axes, path, np.zeros((0, 3)), stated=edges).determined()
+    edges = [VerticalHypothesis(source="marker board", up=up, sigma_deg=1.5) for up in ups]
+    assert not _found(axes, path, np.zeros((0, 3)), stated=edges).is_determined()
 
 
 def test_two_directions_that_explain_as_much_are_told():
@@ -196,18 +198,18 @@ def test_two_directions_that_explain_as_much_are_told():
     rng = np.random.default_rng(1)
     axes, _ = _leaning(rng, 45.0, 1.0)
     cabin = _box_room(rng) * [1.0, 0.52, 1.0] - [0.0, 0.0, 1.3]  # as wide as high, about the chest
-    found = _found(axes, np.zeros((20, 3)), cabin, sided=False)
-    assert not found.determined()
-    rival = max(found.others, key=lambda say: float(np.arccos(np.clip(say.up @ found.up, -1.0, 1.0))))
-    assert rival.nats - found.nats == pytest.approx(found.margin_nats)
+    found = _found(axes, np.zeros((20, 3)), cabin, front_known=False)
+    assert not found.is_determined()
+    rival = max(found.alternatives, key=lambda say: float(np.arccos(np.clip(say.up @ found.up, -1.0, 1.0))))
+    assert rival.negative_log_likelihood - found.negative_log_likelihood == pytest.approx(found.margin_nats)
 
 
 def test_hanging_limbs_tell_up_but_no_front():
     skeleton = load_skeleton("upper_body", 1.75)
-    bones = [bone for bone in graph_bones(skeleton, {"LeftArm"}) if bone.role == "LeftArm"]
+    bones = [bone for bone in kinematic_chain(skeleton, {"LeftArm"}) if bone.role == "LeftArm"]
     down = so3_exp([0.0, np.pi / 2.0, 0.0])  # the left arm of the zero pose points along +X
     poses = np.tile(make_transform(TURN @ down, np.zeros(3)), (3, 1, 1, 1))
-    body = body_up(skeleton, bones, poses)
-    assert not body.sided
-    assert np.allclose(body.usual(), TURN @ UP)
+    body = trunk_orientation(skeleton, bones, poses)
+    assert not body.front_known
+    assert np.allclose(body.modal_up(), TURN @ UP)
     assert np.allclose(np.linalg.det(body.axes), 1.0)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bodycap_batch.merging.cameras.track import Track
-from bodycap_batch.merging.graph.motion_graph import Solution
+from bodycap_batch.merging.cameras.track import CameraTrack
+from bodycap_batch.merging.graph.motion_graph import MotionSolution
 from bodycap_batch.merging.graph.windows import (
-    CHUNK_TICKS,
-    longest_stretch,
-    solve_motion,
-    stretches,
+    WINDOW_TICKS,
+    max_window_ticks,
+    solve_windows,
+    split_timeline,
     with_overlap,
 )
 from bodycap_batch.model.geometry import rotation_angle_rad, so3_exp
@@ -23,10 +23,10 @@ FPS = 30
 TICKS = np.round(np.arange(30 * FPS) * 1e9 / FPS).astype(np.int64)
 
 
-def _track(camera: str, *lost: tuple[float, float]) -> Track:
+def _track(camera: str, *lost: tuple[float, float]) -> CameraTrack:
     """A camera that does not move, lost for those seconds."""
     count = len(TICKS)
-    track = Track(
+    track = CameraTrack(
         camera=camera,
         bone=0,
         frames=np.arange(count),
@@ -41,15 +41,15 @@ def _track(camera: str, *lost: tuple[float, float]) -> Track:
 
 def test_seams_lie_where_all_cameras_are_measured():
     whole = _track("torso")
-    assert stretches(TICKS, [whole, _track("palm")], 450) == [(0, 450), (450, 900)]
+    assert split_timeline(TICKS, [whole, _track("palm")], 450) == [(0, 450), (450, 900)]
     for start, end in ((13.0, 16.0), (12.0, 15.2), (14.8, 17.0)):
-        ((_, cut), _) = stretches(TICKS, [whole, _track("palm", (start, end))], 450)
+        ((_, cut), _) = split_timeline(TICKS, [whole, _track("palm", (start, end))], 450)
         # A second beside the gap, and on its nearer side.
         nearest = min(FPS * (start - 1.0), FPS * (end + 1.0), key=lambda tick: abs(tick - 450))
         assert cut == pytest.approx(nearest, abs=4)
     # Lost longer than a seam may be moved: as even as ever.
-    assert stretches(TICKS, [whole, _track("palm", (5.0, 25.0))], 450) == [(0, 450), (450, 900)]
-    cuts = stretches(TICKS, [whole, _track("palm", (7.0, 11.0), (14.0, 17.0), (20.0, 22.0))], 150)
+    assert split_timeline(TICKS, [whole, _track("palm", (5.0, 25.0))], 450) == [(0, 450), (450, 900)]
+    cuts = split_timeline(TICKS, [whole, _track("palm", (7.0, 11.0), (14.0, 17.0), (20.0, 22.0))], 150)
     assert max(last - first for first, last in cuts) <= 188
     assert cuts[0][0] == 0
     assert cuts[-1][1] == 900
@@ -58,15 +58,15 @@ def test_seams_lie_where_all_cameras_are_measured():
 class _Turned:
     """A solution by itself: everything turned and moved by as much as its number says."""
 
-    def __init__(self, number: int, ticks: np.ndarray, seen: list[Track]) -> None:
+    def __init__(self, number: int, ticks: np.ndarray, seen: list[CameraTrack]) -> None:
         self._number, self._ticks, self._seen = number, ticks, seen
 
-    def solve(self, *_: object) -> Solution:
+    def solve(self, *_: object) -> MotionSolution:
         pose = np.eye(4)
         pose[:3, :3] = so3_exp(np.array([0.0, 0.0, 0.3 * self._number]))
         pose[0, 3] = 0.08 * self._number
         none = {track.camera: np.zeros(len(track.times_ns)) for track in self._seen}
-        return Solution(
+        return MotionSolution(
             world_from_bone=np.tile(pose, (len(self._ticks), 2, 1, 1)),
             residual_m=none,
             residual_rad=none,
@@ -81,12 +81,12 @@ class _Turned:
 def test_however_solutions_differ_none_jumps_at_a_seam():
     numbers = iter(range(9))
     tracks = [_track("torso"), _track("palm", (8.0, 14.0)), _track("late", (0.0, 21.5))]
-    joined = solve_motion(
+    joined = solve_windows(
         lambda ticks, seen: _Turned(next(numbers), ticks, seen),  # type: ignore[arg-type,return-value]
         TICKS,
         tracks,
         lambda: None,
-        chunk_ticks=300,
+        window_ticks=300,
     )
     poses = joined.world_from_bone
     assert len(poses) == len(TICKS)
@@ -109,15 +109,15 @@ def test_however_solutions_differ_none_jumps_at_a_seam():
 def test_at_no_rate_are_most_ticks_solved_more_than_twice(fps, again):
     ticks = np.round(np.arange(200 * fps) * 1e9 / fps).astype(np.int64)
     track = replace(_track("torso"), times_ns=ticks)
-    parts = stretches(ticks, [track], longest_stretch(9, [track] * 3, ticks))
+    parts = split_timeline(ticks, [track], max_window_ticks(9, [track] * 3, ticks))
     solved = sum(int(np.diff(with_overlap(ticks, *part))[0]) for part in parts)
     assert solved <= again * len(ticks)
 
 
 def test_stretches_get_shorter_with_many_cameras():
     tracks = [_track("torso")] * 12
-    assert longest_stretch(9, tracks[:3], TICKS) == longest_stretch(17, tracks[:11], TICKS) == CHUNK_TICKS
-    many = longest_stretch(21, [*tracks, *tracks[:2]], TICKS)
-    assert 300 < many < 0.8 * CHUNK_TICKS
-    assert longest_stretch(40, tracks * 4, TICKS) == 300
-    assert longest_stretch(9, tracks[:3], TICKS[:1]) == CHUNK_TICKS
+    assert max_window_ticks(9, tracks[:3], TICKS) == max_window_ticks(17, tracks[:11], TICKS) == WINDOW_TICKS
+    many = max_window_ticks(21, [*tracks, *tracks[:2]], TICKS)
+    assert 300 < many < 0.8 * WINDOW_TICKS
+    assert max_window_ticks(40, tracks * 4, TICKS) == 300
+    assert max_window_ticks(9, tracks[:3], TICKS[:1]) == WINDOW_TICKS

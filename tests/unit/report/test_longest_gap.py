@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodycap_batch.merging.cameras.track import Track
+from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.reporting.report import longest_gap_s
 
 SECOND = 1_000_000_000
 
 
-def track(seconds: list[float]) -> Track:
+def track(seconds: list[float]) -> CameraTrack:
     count = len(seconds)
-    return Track(
+    return CameraTrack(
         camera="torso",
         bone=0,
         frames=np.arange(count),
