@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from bodycap_batch import cli
-from bodycap_batch.cli.base import app
+from bodycap_batch.cli.application import app
 from bodycap_batch.config.calibration import read_calibration
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import Job

@@ -1,13 +1,13 @@
 """A lens from a clip of a calibration board."""
 
-from bodycap_batch.calibration.boards import Board
-from bodycap_batch.calibration.clip import CalibrationResult, LensChoice, calibrate_clip
-from bodycap_batch.calibration.files import write_calibration, write_preview
+from bodycap_batch.calibration.boards import CalibrationBoard
+from bodycap_batch.calibration.calibration_files import write_calibration, write_preview
+from bodycap_batch.calibration.clip_calibration import CalibrationResult, CameraModelChoice, calibrate_clip
 
 __all__ = [
-    "Board",
+    "CalibrationBoard",
     "CalibrationResult",
-    "LensChoice",
+    "CameraModelChoice",
     "calibrate_clip",
     "write_calibration",
     "write_preview",

@@ -14,12 +14,12 @@ from bodycap_batch.core.errors import JobError
 GreyImage = npt.NDArray[np.uint8]
 MIN_CORNERS = 8
 """Fewer corners than these say next to nothing about a lens once the board's pose is taken out."""
-_WINDOW_SHARE = 0.3
+_WINDOW_RATIO = 0.3
 _MAX_WINDOW_PX = 15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class View:
+class BoardCorners:
     """A board's corners in one picture.
 
     Attributes:
@@ -32,7 +32,7 @@ class View:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Board:
+class CalibrationBoard:
     """A flat board that was filmed.
 
     Attributes:
@@ -70,7 +70,7 @@ class Board:
             return f"chessboard of {self.columns}x{self.rows} inner corners"
         return f"ChArUco board of {self.columns}x{self.rows} squares ({self.dictionary})"
 
-    def find(self, image: GreyImage) -> View | None:
+    def find(self, image: GreyImage) -> BoardCorners | None:
         """Find the board's corners in a grey picture (H,W), None where too few of them are seen."""
         if self.kind == "chessboard":
             return self._find_chessboard(image)
@@ -79,7 +79,7 @@ class Board:
         if ids is None or len(ids) < MIN_CORNERS or board.checkCharucoCornersCollinear(ids):
             return None
         on_board, px = board.matchImagePoints(corners, ids)
-        return View(
+        return BoardCorners(
             board_m=np.asarray(on_board, dtype=np.float64).reshape(-1, 3),
             px=np.asarray(px, dtype=np.float64).reshape(-1, 2),
         )
@@ -90,17 +90,17 @@ class Board:
         size = (self.columns * square_px, self.rows * square_px)
         return np.asarray(board.generateImage(size), dtype=np.uint8)
 
-    def _find_chessboard(self, image: GreyImage) -> View | None:
+    def _find_chessboard(self, image: GreyImage) -> BoardCorners | None:
         import cv2
 
         size = (self.columns, self.rows)
         found, corners = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
         if not found:
             return None
-        corners = _refined(image, corners.reshape(self.rows, self.columns, 2))
+        corners = _refine_corners(image, corners.reshape(self.rows, self.columns, 2))
         x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
         on_board = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
-        return View(
+        return BoardCorners(
             board_m=on_board.astype(np.float64), px=np.asarray(corners, dtype=np.float64).reshape(-1, 2)
         )
 
@@ -124,7 +124,7 @@ class Board:
         return self._charuco[0], self._charuco[1]
 
 
-def _refined(image: GreyImage, corners: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+def _refine_corners(image: GreyImage, corners: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """Corners (R,C,2) to sub-pixels, in windows that hold no second corner.
 
     The detector's own are off by a tenth of a pixel, all to one side: a principal point 1 px wrong, measured
@@ -133,7 +133,7 @@ def _refined(image: GreyImage, corners: npt.NDArray[np.float32]) -> npt.NDArray[
     import cv2
 
     apart = min(float(np.linalg.norm(np.diff(corners, axis=axis), axis=-1).min()) for axis in (0, 1))
-    half = int(np.clip(_WINDOW_SHARE * apart, 2, _MAX_WINDOW_PX))
+    half = int(np.clip(_WINDOW_RATIO * apart, 2, _MAX_WINDOW_PX))
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-3)
     start = np.ascontiguousarray(corners.reshape(-1, 1, 2), dtype=np.float32)
     return np.asarray(cv2.cornerSubPix(image, start, (half, half), (-1, -1), criteria), dtype=np.float32)

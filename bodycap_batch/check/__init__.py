@@ -1,14 +1,14 @@
 """Pre-flight: open everything a job needs, compute nothing."""
 
-from bodycap_batch.check.limits import require_within
+from bodycap_batch.check.check_report import CameraSummary, CheckReport
 from bodycap_batch.check.preflight import check_job, check_path, require_ready
-from bodycap_batch.check.report import CameraFinding, CheckReport
+from bodycap_batch.check.video_limits import require_within_limits
 
 __all__ = [
-    "CameraFinding",
+    "CameraSummary",
     "CheckReport",
     "check_job",
     "check_path",
     "require_ready",
-    "require_within",
+    "require_within_limits",
 ]

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from bodycap_batch.check.report import CameraFinding
+from bodycap_batch.check.check_report import CameraSummary
 from bodycap_batch.config.models import SKELETON_PRESETS, Job
 
-_SLOW_FPS = 24.0
-_UNEVEN_S = 3.0
-_UNEVEN_SHARE = 0.1
-_SECONDS = (1.3, 5.0)
+_LOW_FPS = 24.0
+_MAX_MISSING_S = 3.0
+_MAX_MISSING_RATIO = 0.1
+_SECONDS_PER_VIDEO_SECOND = (1.3, 5.0)
 """Seconds of computing for one of a camera's video, on two cores: the README's easy and hard captures."""
-_LONG_S = 60.0
+_LONG_CAPTURE_S = 60.0
 
 
-def advice_on(job: Job, findings: Sequence[CameraFinding]) -> list[str]:
+def advise(job: Job, findings: Sequence[CameraSummary]) -> list[str]:
     """Sentences in the order of their weight; each says why and what to do.
 
     Args:
@@ -24,19 +24,25 @@ def advice_on(job: Job, findings: Sequence[CameraFinding]) -> list[str]:
     """
     if not findings:
         return []
-    return [*_lens(findings), *_clocks(job, findings), *_lengths(findings), *_scale(job), *_effort(findings)]
+    return [
+        *_intrinsics_advice(findings),
+        *_clock_advice(job, findings),
+        *_length_advice(findings),
+        *_scale_advice(job),
+        *_duration_advice(findings),
+    ]
 
 
-def _lens(findings: Sequence[CameraFinding]) -> Iterator[str]:
+def _intrinsics_advice(findings: Sequence[CameraSummary]) -> Iterator[str]:
     guessed = [finding.name for finding in findings if finding.guessed_lens]
     if guessed:
         yield (
-            f"the lens of {_listed(guessed)} will be estimated along with the map. It works on walks with "
+            f"the lens of {_joined_names(guessed)} will be estimated along with the map. It works on walks with "
             "much sideways movement; half a minute of a filmed board (bodycap calibrate) is safer"
         )
 
 
-def _clocks(job: Job, findings: Sequence[CameraFinding]) -> Iterator[str]:
+def _clock_advice(job: Job, findings: Sequence[CameraSummary]) -> Iterator[str]:
     cameras = job.capture.cameras
     stated = any(camera.offset_s for camera in cameras) or any(camera.timestamps for camera in cameras)
     if len(findings) > 1 and not stated:
@@ -47,7 +53,7 @@ def _clocks(job: Job, findings: Sequence[CameraFinding]) -> Iterator[str]:
         )
 
 
-def _lengths(findings: Sequence[CameraFinding]) -> Iterator[str]:
+def _length_advice(findings: Sequence[CameraSummary]) -> Iterator[str]:
     start, end = (
         min(finding.start_s for finding in findings),
         max(finding.end_s for finding in findings),
@@ -55,7 +61,7 @@ def _lengths(findings: Sequence[CameraFinding]) -> Iterator[str]:
     for finding in findings:
         late, early = finding.start_s - start, end - finding.end_s
         missing = max(late, early)
-        if missing > max(_UNEVEN_S, _UNEVEN_SHARE * (end - start)):
+        if missing > max(_MAX_MISSING_S, _MAX_MISSING_RATIO * (end - start)):
             when = "starts" if late >= early else "ends"
             order = "after" if late >= early else "before"
             yield (
@@ -63,14 +69,14 @@ def _lengths(findings: Sequence[CameraFinding]) -> Iterator[str]:
                 "inferred there. start_s and end_s cut the job to the time all cameras ran"
             )
     for finding in findings:
-        if finding.fps < _SLOW_FPS:
+        if finding.fps < _LOW_FPS:
             yield (
                 f"{finding.name} runs at {finding.fps:.3g} frames a second: enough for a slow walk, "
                 "hardly for swinging arms; 30 or more is better, 60 for fast movement"
             )
 
 
-def _scale(job: Job) -> Iterator[str]:
+def _scale_advice(job: Job) -> Iterator[str]:
     if job.skeleton in SKELETON_PRESETS and job.skeleton != "none" and job.height_m is not None:
         yield (
             "with a height alone the bones are those of a standard body, several centimetres off for a real "
@@ -78,15 +84,15 @@ def _scale(job: Job) -> Iterator[str]:
         )
 
 
-def _effort(findings: Sequence[CameraFinding]) -> Iterator[str]:
+def _duration_advice(findings: Sequence[CameraSummary]) -> Iterator[str]:
     seconds = sum(finding.used_frames / finding.fps for finding in findings if finding.fps > 0)
-    if seconds > _LONG_S:
-        least, most = (max(1.0, factor * seconds / 60.0) for factor in _SECONDS)
+    if seconds > _LONG_CAPTURE_S:
+        least, most = (max(1.0, factor * seconds / 60.0) for factor in _SECONDS_PER_VIDEO_SECOND)
         yield (
             f"{seconds:.0f} s of video in all: expect {least:.0f} to {most:.0f} minutes on two cores. To see "
             "sooner whether it works, try a short stretch first (start_s, end_s)"
         )
 
 
-def _listed(names: Sequence[str]) -> str:
+def _joined_names(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -17,10 +17,10 @@ from typing import Literal
 
 State = Literal["ok", "note", "problem"]
 
-_PYTHON = ((3, 11), (3, 14))
-_MEMORY_MB = 4000
+_PYTHON_VERSIONS = ((3, 11), (3, 14))
+_ENOUGH_MEMORY_MB = 4000
 """Three cameras, ten minutes: the map's stage takes 2 to 3 GB."""
-_DISK_MB = 5000
+_ENOUGH_DISK_MB = 5000
 _LIBRARIES = {
     "numpy": "numpy",
     "scipy": "scipy.optimize",
@@ -39,11 +39,11 @@ _EXTRAS = {
     "viewer": (("rerun",), "recordings for the Rerun viewer"),
 }
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox", "microsoft-edge")
-_TIMEOUT_S = 60
+_CHILD_TIMEOUT_S = 60
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Look:
+class MachineFinding:
     """One thing looked at.
 
     Attributes:
@@ -64,53 +64,57 @@ class Look:
         return f"{text}\n         -> {self.remedy}" if self.remedy else text
 
 
-def examine_machine(folder: Path) -> Iterator[Look]:
+def examine_machine(folder: Path) -> Iterator[MachineFinding]:
     """Look at Python, processors, memory, libraries, disk, extras and programs, one after the other.
 
     Args:
         folder: Where results will be written.
     """
-    yield _python()
-    yield _processors()
-    yield _memory()
+    yield _python_finding()
+    yield _processor_finding()
+    yield _memory_finding()
     # Each in a process of its own: a library that crashes when it is loaded takes no other with it.
     with ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1)) as pool:
-        yield from pool.map(_library, _LIBRARIES)
-    yield _video()
-    yield _disk(folder)
-    yield _writing(folder)
+        yield from pool.map(_library_finding, _LIBRARIES)
+    yield _video_finding()
+    yield _disk_finding(folder)
+    yield _writing_finding(folder)
     for extra in _EXTRAS:
-        yield _extra(extra)
-    yield _program("Blender", ("blender",), "opens every result; not needed to compute")
-    yield _program("a browser", _BROWSERS, "opens report.html and plays preview.mp4; any other will do")
+        yield _extra_finding(extra)
+    yield _program_finding("Blender", ("blender",), "opens every result; not needed to compute")
+    yield _program_finding(
+        "a browser", _BROWSERS, "opens report.html and plays preview.mp4; any other will do"
+    )
 
 
-def _python() -> Look:
+def _python_finding() -> MachineFinding:
     here = sys.version_info[:2]
     found = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
-    if _PYTHON[0] <= here < _PYTHON[1]:
-        return Look(what="Python", state="ok", found=found)
-    return Look(what="Python", state="problem", found=found, remedy="use Python 3.11, 3.12 or 3.13")
+    if _PYTHON_VERSIONS[0] <= here < _PYTHON_VERSIONS[1]:
+        return MachineFinding(what="Python", state="ok", found=found)
+    return MachineFinding(what="Python", state="problem", found=found, remedy="use Python 3.11, 3.12 or 3.13")
 
 
-def _processors() -> Look:
+def _processor_finding() -> MachineFinding:
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if count > 1:
-        return Look(what="processors", state="ok", found=f"{count}; no GPU is used")
-    return Look(what="processors", state="note", found="one", remedy="it works, at half the speed of two")
+        return MachineFinding(what="processors", state="ok", found=f"{count}; no GPU is used")
+    return MachineFinding(
+        what="processors", state="note", found="one", remedy="it works, at half the speed of two"
+    )
 
 
-def _memory() -> Look:
+def _memory_finding() -> MachineFinding:
     total_mb = _total_memory_mb()
     if total_mb is None:
-        return Look(
-            what="memory", state="note", found="unknown", remedy=f"{_MEMORY_MB / 1000:g} GB are enough"
+        return MachineFinding(
+            what="memory", state="note", found="unknown", remedy=f"{_ENOUGH_MEMORY_MB / 1000:g} GB are enough"
         )
     found = f"{total_mb / 1024:.1f} GB"
-    if total_mb >= _MEMORY_MB:
-        return Look(what="memory", state="ok", found=found)
-    remedy = f"long captures take {_MEMORY_MB / 1000:g} GB: cut them with start_s and end_s, or lower work_px"
-    return Look(what="memory", state="note", found=found, remedy=remedy)
+    if total_mb >= _ENOUGH_MEMORY_MB:
+        return MachineFinding(what="memory", state="ok", found=found)
+    remedy = f"long captures take {_ENOUGH_MEMORY_MB / 1000:g} GB: cut them with start_s and end_s, or lower work_px"
+    return MachineFinding(what="memory", state="note", found=found, remedy=remedy)
 
 
 def _total_memory_mb() -> int | None:
@@ -120,21 +124,25 @@ def _total_memory_mb() -> int | None:
         return None
 
 
-def _library(name: str) -> Look:
-    failure = _fails(f"import zlib, {_LIBRARIES[name]}")
+def _library_finding(name: str) -> MachineFinding:
+    failure = _error_of_code(f"import zlib, {_LIBRARIES[name]}")
     if failure is None:
-        return Look(what=name, state="ok", found=_version(name))
+        return MachineFinding(what=name, state="ok", found=_installed_version(name))
     remedy = "make setup (or pip install -r requirements.lock)"
     if ".so" in failure:
         remedy = f"a system library is missing: {_SYSTEM_PACKAGES}"
-    return Look(what=name, state="problem", found=failure, remedy=remedy)
+    return MachineFinding(what=name, state="problem", found=failure, remedy=remedy)
 
 
-def _fails(code: str) -> str | None:
+def _error_of_code(code: str) -> str | None:
     """The last line of what a child says that runs this code, None where it goes well."""
     try:
         done = subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, timeout=_TIMEOUT_S, check=False
+            [sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            timeout=_CHILD_TIMEOUT_S,
+            check=False,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         return str(error).splitlines()[0]
@@ -144,7 +152,7 @@ def _fails(code: str) -> str | None:
     return said[-1] if said else f"ended with {done.returncode}"
 
 
-def _version(name: str) -> str:
+def _installed_version(name: str) -> str:
     for each in (name, name.removesuffix("-cpu"), name.removesuffix("-headless")):
         try:
             return metadata.version(each)
@@ -153,44 +161,50 @@ def _version(name: str) -> str:
     return "there"
 
 
-def _video() -> Look:
+def _video_finding() -> MachineFinding:
     code = "import av; assert 'libx264' in av.codecs_available; av.Codec('h264', 'r'); av.Codec('hevc', 'r')"
-    failure = _fails(code)
+    failure = _error_of_code(code)
     if failure is None:
-        return Look(what="video", state="ok", found="reads H.264 and H.265, writes H.264")
+        return MachineFinding(what="video", state="ok", found="reads H.264 and H.265, writes H.264")
     remedy = "install PyAV from its wheel: pip install --force-reinstall av"
-    return Look(what="video", state="problem", found=failure, remedy=remedy)
+    return MachineFinding(what="video", state="problem", found=failure, remedy=remedy)
 
 
-def _disk(folder: Path) -> Look:
-    place = _nearest(folder)
+def _disk_finding(folder: Path) -> MachineFinding:
+    place = _nearest_existing(folder)
     free_mb = shutil.disk_usage(place).free >> 20
     found = f"{free_mb / 1024:.1f} GB free at {place}"
-    if free_mb >= _DISK_MB:
-        return Look(what="disk", state="ok", found=found)
+    if free_mb >= _ENOUGH_DISK_MB:
+        return MachineFinding(what="disk", state="ok", found=found)
     remedy = "free some, or name another place with --out and --store; `bodycap gc` drops what no job needs"
-    return Look(what="disk", state="note" if free_mb > 500 else "problem", found=found, remedy=remedy)
+    return MachineFinding(
+        what="disk", state="note" if free_mb > 500 else "problem", found=found, remedy=remedy
+    )
 
 
-def _writing(folder: Path) -> Look:
+def _writing_finding(folder: Path) -> MachineFinding:
     """Results come by hard link and rename: what the file system can do decides how fast."""
-    place = _nearest(folder)
+    place = _nearest_existing(folder)
     try:
         with tempfile.TemporaryDirectory(dir=place, prefix=".bodycap-doctor-") as scratch:
             first = Path(scratch) / "first"
             first.write_text("x")
             first.replace(Path(scratch) / "second")
-            linked = _links(Path(scratch) / "second", Path(scratch) / "third")
+            linked = _can_hard_link(Path(scratch) / "second", Path(scratch) / "third")
     except OSError as error:
         remedy = "choose a folder you may write to (--out, --store)"
-        return Look(what="writing", state="problem", found=f"{place}: {error.strerror}", remedy=remedy)
+        return MachineFinding(
+            what="writing", state="problem", found=f"{place}: {error.strerror}", remedy=remedy
+        )
     if linked:
-        return Look(what="writing", state="ok", found=f"{place} takes files, renames and hard links")
+        return MachineFinding(
+            what="writing", state="ok", found=f"{place} takes files, renames and hard links"
+        )
     remedy = "nothing has to be done: results are copied from the store and take twice the room"
-    return Look(what="writing", state="note", found=f"{place} has no hard links", remedy=remedy)
+    return MachineFinding(what="writing", state="note", found=f"{place} has no hard links", remedy=remedy)
 
 
-def _links(source: Path, target: Path) -> bool:
+def _can_hard_link(source: Path, target: Path) -> bool:
     try:
         os.link(source, target)
     except OSError:
@@ -198,7 +212,7 @@ def _links(source: Path, target: Path) -> bool:
     return True
 
 
-def _nearest(folder: Path) -> Path:
+def _nearest_existing(folder: Path) -> Path:
     """The folder, or the nearest one above it that exists."""
     folder = folder.resolve()
     while not folder.exists():
@@ -206,17 +220,19 @@ def _nearest(folder: Path) -> Path:
     return folder
 
 
-def _extra(name: str) -> Look:
+def _extra_finding(name: str) -> MachineFinding:
     modules, purpose = _EXTRAS[name]
     missing = [module for module in modules if util.find_spec(module) is None]
     if not missing:
-        return Look(what=f"extra [{name}]", state="ok", found=purpose)
+        return MachineFinding(what=f"extra [{name}]", state="ok", found=purpose)
     remedy = f"for {purpose}: pip install 'bodycap-batch[{name}]'"
-    return Look(what=f"extra [{name}]", state="note", found=f"no {', '.join(missing)}", remedy=remedy)
+    return MachineFinding(
+        what=f"extra [{name}]", state="note", found=f"no {', '.join(missing)}", remedy=remedy
+    )
 
 
-def _program(what: str, names: Sequence[str], purpose: str) -> Look:
+def _program_finding(what: str, names: Sequence[str], purpose: str) -> MachineFinding:
     found = next((place for name in names if (place := shutil.which(name))), None)
     if found:
-        return Look(what=what, state="ok", found=found)
-    return Look(what=what, state="note", found="not found", remedy=purpose)
+        return MachineFinding(what=what, state="ok", found=found)
+    return MachineFinding(what=what, state="note", found="not found", remedy=purpose)

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera, open_camera
-from bodycap_batch.check.advice import advice_on
-from bodycap_batch.check.files import check_files
-from bodycap_batch.check.pictures import look_at_frames
-from bodycap_batch.check.report import CameraFinding, CheckReport
-from bodycap_batch.check.settings import setting_notes
+from bodycap_batch.check.advice import advise
+from bodycap_batch.check.camera_settings import setting_notes
+from bodycap_batch.check.check_report import CameraSummary, CheckReport
+from bodycap_batch.check.file_mixups import require_distinct_videos
+from bodycap_batch.check.picture_quality import check_picture_quality
 from bodycap_batch.config.folder import job_file_in
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, CaptureConfig, Job
@@ -28,9 +28,9 @@ from bodycap_batch.store.disk_space import require_room
 
 # Frames whose distance differs by more than this share from the usual one make a variable rate.
 _RATE_TOLERANCE = 0.2
-_SHORT_S = 2.0
-_UNIX_TIME_S = 1e8
-_TRUNK = ("Hips", "Spine", "Spine1", "Neck", "Head")
+_MIN_DURATION_S = 2.0
+_MIN_UNIX_TIME_S = 1e8
+_TRUNK_ROLES = ("Hips", "Spine", "Spine1", "Neck", "Head")
 
 
 def check_path(path: Path, overrides: Overrides | None = None) -> CheckReport:
@@ -53,7 +53,7 @@ def require_ready(job: Job, threads: int = 1) -> CheckReport:
     The room on the disk is left out: it is another one at any moment. As many cameras are looked at side by
     side as there are threads.
     """
-    report = _checked(job, _ALWAYS, threads)
+    report = _run_checks(job, _CHECKS, threads)
     if report.errors:
         raise report.errors[0]
     return report
@@ -61,18 +61,18 @@ def require_ready(job: Job, threads: int = 1) -> CheckReport:
 
 def check_job(job: Job) -> CheckReport:
     """Check a resolved job: every video opened and looked at, calibration, clocks, skeleton, disk."""
-    report = _checked(job, (*_ALWAYS, _check_disk), os.cpu_count() or 1)
-    return replace(report, advice=tuple(advice_on(job, report.cameras))) if report.ready else report
+    report = _run_checks(job, (*_CHECKS, _check_disk), os.cpu_count() or 1)
+    return replace(report, advice=tuple(advise(job, report.cameras))) if report.ready else report
 
 
-def _checked(
-    job: Job, checks: Iterable[Callable[[Job, list[CameraFinding]], list[str]]], threads: int
+def _run_checks(
+    job: Job, checks: Iterable[Callable[[Job, list[CameraSummary]], list[str]]], threads: int
 ) -> CheckReport:
     errors: list[BodycapError] = []
-    findings: list[CameraFinding] = []
+    findings: list[CameraSummary] = []
     pool = ThreadPoolExecutor(max_workers=threads)
     try:
-        for look in [pool.submit(_look_at, job.capture, config) for config in job.capture.cameras]:
+        for look in [pool.submit(_check_camera, job.capture, config) for config in job.capture.cameras]:
             try:
                 findings.append(look.result())
             except CaptureError as error:
@@ -88,50 +88,50 @@ def _checked(
     return CheckReport(job=job, cameras=tuple(findings), notes=tuple(notes), errors=tuple(errors))
 
 
-def _look_at(capture: CaptureConfig, config: CameraConfig) -> CameraFinding:
+def _check_camera(capture: CaptureConfig, config: CameraConfig) -> CameraSummary:
     camera = open_camera(capture, config)
-    return _finding(camera, config, look_at_frames(camera))
+    return _summarise_camera(camera, config, check_picture_quality(camera))
 
 
-def _finding(camera: CaptureCamera, config: CameraConfig, notes: list[str]) -> CameraFinding:
+def _summarise_camera(camera: CaptureCamera, config: CameraConfig, notes: list[str]) -> CameraSummary:
     times_s = camera.common_times_ns() / 1e9
     steps = np.diff(camera.times_ns)
     usual = float(np.median(steps)) if len(steps) else 0.0
     variable = len(steps) > 0 and bool((np.abs(steps - usual) > _RATE_TOLERANCE * usual).any())
     duration = float(times_s[-1] - times_s[0])
-    return CameraFinding(
+    return CameraSummary(
         name=camera.name,
         role=config.role,
         files=tuple(path.name for path in camera.chapters),
         frames=sum(len(video.pts) for video in camera.videos),
         used_frames=len(camera.frame_numbers),
-        used_runs=_runs(camera.frame_numbers),
+        used_runs=_frame_runs(camera.frame_numbers),
         start_s=float(times_s[0]),
         end_s=float(times_s[-1]),
         fps=camera.nominal_fps,
         variable_rate=variable,
         size_px=camera.videos[0].shown_size,
         work_size_px=(camera.camera.width_px, camera.camera.height_px),
-        lens=_lens(camera),
+        lens=_intrinsics_text(camera),
         guessed_lens=not camera.calibrated,
         notes=(
             *camera.notes,
             *notes,
-            *_rate_notes(camera, usual),
+            *_dropped_frame_notes(camera, usual),
             *setting_notes(camera),
-            *_lens_notes(camera),
-            *_short(duration),
+            *_intrinsics_notes(camera),
+            *_duration_notes(duration),
         ),
     )
 
 
-def _runs(numbers: IntArray) -> tuple[tuple[int, int], ...]:
+def _frame_runs(numbers: IntArray) -> tuple[tuple[int, int], ...]:
     """First and last of each run of successive numbers."""
     runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
     return tuple((int(run[0]), int(run[-1])) for run in runs)
 
 
-def _lens(camera: CaptureCamera) -> str:
+def _intrinsics_text(camera: CaptureCamera) -> str:
     width, focal = max(camera.camera.width_px, camera.camera.height_px), camera.camera.focal_px
     view = 2.0 * np.degrees(np.arctan(0.5 * width / focal))
     if camera.calibrated:
@@ -139,7 +139,7 @@ def _lens(camera: CaptureCamera) -> str:
     return f"not calibrated: starts from a guess of {view:.0f}° along the long side, refined while mapping"
 
 
-def _lens_notes(camera: CaptureCamera) -> list[str]:
+def _intrinsics_notes(camera: CaptureCamera) -> list[str]:
     lens = camera.camera
     long_side = max(lens.width_px, lens.height_px)
     notes = []
@@ -158,7 +158,7 @@ def _lens_notes(camera: CaptureCamera) -> list[str]:
     return notes
 
 
-def _rate_notes(camera: CaptureCamera, usual_ns: float) -> list[str]:
+def _dropped_frame_notes(camera: CaptureCamera, usual_ns: float) -> list[str]:
     """Frames a recording dropped: times say so, whatever the nominal rate."""
     if usual_ns <= 0.0:
         return []
@@ -172,8 +172,10 @@ def _rate_notes(camera: CaptureCamera, usual_ns: float) -> list[str]:
     ]
 
 
-def _short(duration_s: float) -> list[str]:
-    return [f"only {duration_s:.1f} s: hardly enough movement for a map"] if duration_s < _SHORT_S else []
+def _duration_notes(duration_s: float) -> list[str]:
+    return (
+        [f"only {duration_s:.1f} s: hardly enough movement for a map"] if duration_s < _MIN_DURATION_S else []
+    )
 
 
 def _body_notes(job: Job) -> list[str]:
@@ -181,21 +183,21 @@ def _body_notes(job: Job) -> list[str]:
         return []
     roles = {camera.role for camera in job.capture.cameras}
     notes = []
-    if not roles & set(_TRUNK):
+    if not roles & set(_TRUNK_ROLES):
         notes.append("no camera on the trunk or head: where the body is can only be inferred from the limbs")
     if job.height_m is None and job.skeleton in SKELETON_PRESETS:
         notes.append("no height_m: a mean adult's is assumed, and distances scale with it")
     return notes
 
 
-def _check_clocks(job: Job, findings: list[CameraFinding]) -> list[str]:
+def _check_clocks(job: Job, findings: list[CameraSummary]) -> list[str]:
     """Cameras of one body must be running at the same time."""
     if len(findings) < 2:
         return []
     for camera in findings:
         others = [other for other in findings if other is not camera]
         if all(other.end_s <= camera.start_s or camera.end_s <= other.start_s for other in others):
-            raise _no_common_time(job, camera, others)
+            raise _no_common_time_error(job, camera, others)
     start, end = max(c.start_s for c in findings), min(c.end_s for c in findings)
     if end <= start:
         return ["there is no moment that all cameras saw"]
@@ -204,9 +206,9 @@ def _check_clocks(job: Job, findings: list[CameraFinding]) -> list[str]:
     ]
 
 
-def _no_common_time(job: Job, camera: CameraFinding, others: list[CameraFinding]) -> CaptureError:
+def _no_common_time_error(job: Job, camera: CameraSummary, others: list[CameraSummary]) -> CaptureError:
     config = next(c for c in job.capture.cameras if c.name == camera.name)
-    clocks = {c.start_s > _UNIX_TIME_S for c in (camera, *others)}
+    clocks = {c.start_s > _MIN_UNIX_TIME_S for c in (camera, *others)}
     hint = "set offset_s: common time = camera time + offset_s"
     if len(clocks) == 2:
         hint = "some timestamps are Unix times, others start near 0; " + hint
@@ -220,7 +222,7 @@ def _no_common_time(job: Job, camera: CameraFinding, others: list[CameraFinding]
     )
 
 
-def _check_skeleton(job: Job, _findings: list[CameraFinding]) -> list[str]:
+def _check_skeleton(job: Job, _findings: list[CameraSummary]) -> list[str]:
     """A skeleton file must be readable and have the bones the cameras ride on."""
     if job.skeleton is None or job.skeleton in SKELETON_PRESETS:
         return []
@@ -238,7 +240,7 @@ def _check_skeleton(job: Job, _findings: list[CameraFinding]) -> list[str]:
     return [f"skeleton {path.name}: {len(skeleton.joints)} joints"]
 
 
-def _check_formats(job: Job, _findings: list[CameraFinding]) -> list[str]:
+def _check_formats(job: Job, _findings: list[CameraSummary]) -> list[str]:
     """What the files take must be installed, and a rig of the user's own keeps its names."""
     if job.skeleton == NO_SKELETON:
         return []
@@ -256,7 +258,7 @@ def _check_formats(job: Job, _findings: list[CameraFinding]) -> list[str]:
     return []
 
 
-def _check_named_frames(job: Job, findings: list[CameraFinding]) -> list[str]:
+def _check_named_frames(job: Job, findings: list[CameraSummary]) -> list[str]:
     """Frames that the job names must be there and used; else a map would be made before they are missed."""
     known = {camera.name: camera for camera in findings}
     for (block, field, _), camera, number in named_frames(job):
@@ -279,16 +281,16 @@ def _check_named_frames(job: Job, findings: list[CameraFinding]) -> list[str]:
     return []
 
 
-def _check_files(job: Job, _findings: list[CameraFinding]) -> list[str]:
+def _check_files(job: Job, _findings: list[CameraSummary]) -> list[str]:
     """No video twice, no chapter missing."""
-    check_files(job)
+    require_distinct_videos(job)
     return []
 
 
-def _check_disk(job: Job, findings: list[CameraFinding]) -> list[str]:
+def _check_disk(job: Job, findings: list[CameraSummary]) -> list[str]:
     """Room for the job's results and intermediate files, and the right to write them."""
     frames, large = sum(each.used_frames for each in findings), sum(each.large_frames for each in findings)
     return require_room(job.out or Path("out").resolve(), frames, large)
 
 
-_ALWAYS = (_check_files, _check_clocks, _check_named_frames, _check_skeleton, _check_formats)
+_CHECKS = (_check_files, _check_clocks, _check_named_frames, _check_skeleton, _check_formats)

@@ -23,8 +23,8 @@ from bodycap_batch.cli import (
     watch,
     why,
 )
-from bodycap_batch.cli.base import app
-from bodycap_batch.cli.stop import exit_code_of_stop, stop_by_exception
+from bodycap_batch.cli.application import app
+from bodycap_batch.cli.signals import raise_on_signal, signal_exit_code
 from bodycap_batch.core.errors import EXIT_BUG, BodycapError, Cancelled, DiskAway
 
 __all__ = [
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit code. Without `arguments` the process is left with it.
     """
-    with stop_by_exception():
+    with raise_on_signal():
         code = _run(sys.argv[1:] if arguments is None else list(arguments))
     if arguments is None:
         sys.exit(code)
@@ -68,24 +68,24 @@ def _run(arguments: Sequence[str]) -> int:
     except SystemExit as leave:
         return leave.code if isinstance(leave.code, int) else 0
     except Cancelled as error:
-        _say(str(error))
-        return exit_code_of_stop()
+        _write_error(str(error))
+        return signal_exit_code()
     except BodycapError as error:
-        _say(f"error: {error}")
+        _write_error(f"error: {error}")
         for note in getattr(error, "__notes__", []):
-            _say(note)
+            _write_error(note)
         return error.exit_code
     except Exception as error:  # noqa: BLE001 - the one place where bugs are caught
-        if (away := _disk_away(error)) is not None:
-            _say(f"error: {away}")
+        if (away := _disk_error(error)) is not None:
+            _write_error(f"error: {away}")
             return away.exit_code
-        _say(traceback.format_exc())
-        _say("This is a bug in bodycap. Please report the lines above, the command and the job file.")
+        _write_error(traceback.format_exc())
+        _write_error("This is a bug in bodycap. Please report the lines above, the command and the job file.")
         return EXIT_BUG
     return 0
 
 
-def _disk_away(error: Exception) -> BodycapError | None:
+def _disk_error(error: Exception) -> BodycapError | None:
     """A disk that does not answer, which no look at a path expects; None for anything else."""
     if not isinstance(error, OSError):
         return None
@@ -95,6 +95,6 @@ def _disk_away(error: Exception) -> BodycapError | None:
     return found if isinstance(found, DiskAway) else None
 
 
-def _say(text: str) -> None:
+def _write_error(text: str) -> None:
     sys.stderr.write(text.rstrip() + "\n")
     sys.stderr.flush()

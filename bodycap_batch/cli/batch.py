@@ -15,10 +15,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from bodycap_batch.cli.base import app
-from bodycap_batch.cli.display import sentence
-from bodycap_batch.cli.options import BatchOutOption, BatchStoreOption, cores, default_out, results_folder
-from bodycap_batch.cli.stop import stoppable
+from bodycap_batch.cli.application import app
+from bodycap_batch.cli.progress_display import text_from_event
+from bodycap_batch.cli.shared_options import (
+    BatchOutOption,
+    BatchStoreOption,
+    cores,
+    default_out,
+    results_folder,
+)
+from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.core.errors import Cancelled, JobError
 from bodycap_batch.core.progress import Event
 
@@ -28,7 +34,7 @@ if TYPE_CHECKING:
     from bodycap_batch.runner import Executor
     from bodycap_batch.runner.dask_cluster import Cluster
 
-_JOBS_ON_A_CLUSTER = 32
+_MAX_CLUSTER_JOBS = 32
 """A job at work is a thread that waits; its tasks wait at the scheduler, in order of priority."""
 
 
@@ -78,11 +84,11 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
     from bodycap_batch.pipeline import Batch, Settings
     from bodycap_batch.store.artefacts import Store
 
-    wanted = _prioritised(list(dict.fromkeys(jobs)), priority or [])
+    wanted = _batch_jobs(list(dict.fromkeys(jobs)), priority or [])
     folder = (out or default_out()).resolve()
-    teller = _Teller(as_json=as_json)
+    teller = _BatchReporter(as_json=as_json)
     kept = Store(store or folder / ".store")
-    with stoppable() as stop, _executor(executor, threads, workers, worker_memory) as (shared, usual):
+    with event_on_signal() as stop, _executor(executor, threads, workers, worker_memory) as (shared, usual):
 
         def settings(job: BatchJob, _: Path | None) -> Settings:
             return Settings(
@@ -94,7 +100,7 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
                 priority=job.priority,
             )
 
-        work = Batch(settings, lambda job: _results_folder(job, folder), max_jobs or usual)
+        work = Batch(settings, lambda job: _batch_results_folder(job, folder), max_jobs or usual)
         outcomes = [teller.ended(outcome) for outcome in work.run(wanted)]
         if stop.is_set():
             raise Cancelled("stopped on request; finished stages are kept", hint="run it again to go on")
@@ -121,10 +127,10 @@ def _executor(kind: str, threads: int, workers: int, memory_mb: int) -> Iterator
             start_queue(kind, workers, threads, memory_mb) as queue,
             Cluster(queue.scheduler_address) as cluster,
         ):
-            yield _ready(cluster), _JOBS_ON_A_CLUSTER
+            yield _with_worker_note(cluster), _MAX_CLUSTER_JOBS
     elif kind.startswith(SCHEMES):
         with Cluster(kind) as cluster:
-            yield _ready(cluster), _JOBS_ON_A_CLUSTER
+            yield _with_worker_note(cluster), _MAX_CLUSTER_JOBS
     else:
         raise JobError(
             f"there is no executor {kind!r}",
@@ -133,7 +139,7 @@ def _executor(kind: str, threads: int, workers: int, memory_mb: int) -> Iterator
         )
 
 
-def _ready(cluster: Cluster) -> Cluster:
+def _with_worker_note(cluster: Cluster) -> Cluster:
     """Say so where nobody is there to work yet.
 
     What becomes of the jobs is told; Dask's own view of a lost connection is a page of traceback.
@@ -145,13 +151,13 @@ def _ready(cluster: Cluster) -> Cluster:
     return cluster
 
 
-def _results_folder(job: Job, folder: Path) -> Path:
+def _batch_results_folder(job: Job, folder: Path) -> Path:
     """A job that names no folder of its own has one of its name in the batch's."""
     usual = default_out() / job.name
     return folder / job.name if job.out in (None, usual) else results_folder(job)
 
 
-def _prioritised(jobs: Sequence[Path], priorities: Sequence[str]) -> list[BatchJob]:
+def _batch_jobs(jobs: Sequence[Path], priorities: Sequence[str]) -> list[BatchJob]:
     from bodycap_batch.pipeline import BatchJob
 
     known: dict[Path, int] = {}
@@ -167,7 +173,7 @@ def _prioritised(jobs: Sequence[Path], priorities: Sequence[str]) -> list[BatchJ
     return [BatchJob(path=path, priority=known.get(path, 0)) for path in jobs]
 
 
-class _Teller:
+class _BatchReporter:
     """Tells what happens in all jobs, as lines or JSON."""
 
     def __init__(self, *, as_json: bool) -> None:
@@ -181,7 +187,7 @@ class _Teller:
             if self._as_json:
                 self._line({"job": str(job), **event.to_dict()})
             elif event.kind != "progress":
-                self._say(f"{_called(job)}: {sentence(event)}")
+                self._say(f"{_shown_name(job)}: {text_from_event(event)}")
 
         return listen
 
@@ -190,7 +196,7 @@ class _Teller:
         if self._as_json:
             self._line({"kind": "job", **outcome.to_dict()})
         elif outcome.error is not None:
-            self._say(f"{_called(outcome.job.path)}: {outcome.error}")
+            self._say(f"{_shown_name(outcome.job.path)}: {outcome.error}")
             for note in getattr(outcome.error, "__notes__", []):
                 self._say(note)
         return outcome
@@ -200,9 +206,9 @@ class _Teller:
         if self._as_json:
             return
         found = {outcome.job: outcome for outcome in outcomes}
-        width = max(len(_called(job.path)) for job in jobs)
+        width = max(len(_shown_name(job.path)) for job in jobs)
         for job in jobs:
-            typer.echo(f"{_called(job.path):{width}}  {_end_of(found[job])}")
+            typer.echo(f"{_called(job.path):{width}}  {_outcome_text(found[job])}")
         failed = sum(outcome.exit_code != 0 for outcome in outcomes)
         typer.echo(f"{len(jobs) - failed} of {len(jobs)} jobs done")
 
@@ -217,14 +223,14 @@ class _Teller:
             sys.stdout.flush()
 
 
-def _called(job: Path) -> str:
+def _shown_name(job: Path) -> str:
     """What a job is called where many are told of: each folder may hold a ``job.yaml``."""
     from bodycap_batch.config.folder import JOB_FILES
 
     return f"{job.resolve().parent.name}/{job.name}" if job.name in JOB_FILES else job.name
 
 
-def _end_of(outcome: Outcome) -> str:
+def _outcome_text(outcome: Outcome) -> str:
     if outcome.summary is None:
         message = outcome.error.message if outcome.error is not None else ""
         return f"failed ({outcome.exit_code}): {message}"

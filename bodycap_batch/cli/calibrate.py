@@ -11,14 +11,14 @@ from typing import Annotated, Literal
 
 import typer
 
-from bodycap_batch.cli.base import app
-from bodycap_batch.cli.display import make_display
-from bodycap_batch.cli.stop import stoppable
+from bodycap_batch.cli.application import app
+from bodycap_batch.cli.progress_display import make_progress_display
+from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.core.progress import Event
 
 
-class Lens(StrEnum):
+class CameraModelOption(StrEnum):
     """Which camera model is fitted."""
 
     AUTO = "auto"
@@ -44,8 +44,8 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
         bool, typer.Option("--legacy", help="ChArUco: drawn by an OpenCV older than 4.6.")
     ] = False,
     lens: Annotated[
-        Lens, typer.Option(help="The camera model; auto: opencv, or fisheye if it fits better.")
-    ] = (Lens.AUTO),
+        CameraModelOption, typer.Option(help="The camera model; auto: opencv, or fisheye if it fits better.")
+    ] = (CameraModelOption.AUTO),
     camera: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Add it to the file under this camera (default: for all cameras)."),
@@ -69,16 +69,16 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap calibrate board.mp4 --chessboard 9x6 --camera torso --out my_walk/calib.json
       bodycap calibrate wide.mp4 --chessboard 9x6 --lens fisheye
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.calibration import Board, calibrate_clip, write_calibration, write_preview
+    from bodycap_batch.calibration import CalibrationBoard, calibrate_clip, write_calibration, write_preview
     from bodycap_batch.core.context import StageContext
 
     kind, columns, rows = _board_size(chessboard, charuco)
     printed = {"dictionary": dictionary, "marker": marker, "legacy": legacy}
-    board = Board(kind=kind, columns=columns, rows=rows, **printed)  # type: ignore[arg-type]
+    board = CalibrationBoard(kind=kind, columns=columns, rows=rows, **printed)  # type: ignore[arg-type]
     target = out or video.parent / "calib.json"
     with (
-        stoppable() as stop,
-        make_display(as_json=json_progress) as display,
+        event_on_signal() as stop,
+        make_progress_display(as_json=json_progress) as display,
         tempfile.TemporaryDirectory() as work,
     ):
 
@@ -100,13 +100,13 @@ def _board_size(
 ) -> tuple[Literal["chessboard", "charuco"], int, int]:
     """Kind, columns and rows of the one board that is named."""
     if charuco is not None and chessboard is None:
-        return ("charuco", *_grid(charuco, "--charuco"))
+        return ("charuco", *_parse_size(charuco, "--charuco"))
     if chessboard is not None and charuco is None:
-        return ("chessboard", *_grid(chessboard, "--chessboard"))
+        return ("chessboard", *_parse_size(chessboard, "--chessboard"))
     raise JobError("which board?", field="--charuco or --chessboard", hint="--charuco 7x5")
 
 
-def _grid(text: str, flag: str) -> tuple[int, int]:
+def _parse_size(text: str, flag: str) -> tuple[int, int]:
     found = re.fullmatch(r"(\d{1,3})[xX×](\d{1,3})", text.strip())
     if found is None:
         raise JobError(f"no board size: {text!r}", field=flag, hint="columns x rows, for example 7x5")

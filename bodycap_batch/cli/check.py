@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from bodycap_batch.cli.base import app
-from bodycap_batch.cli.options import HeightOption, JobArgument, OutOption, SkeletonOption
+from bodycap_batch.cli.application import app
+from bodycap_batch.cli.shared_options import HeightOption, JobArgument, OutOption, SkeletonOption
 
 
 @app.command()

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from bodycap_batch.cli.base import app
+from bodycap_batch.cli.application import app
 from bodycap_batch.core.errors import StoreError
 
 

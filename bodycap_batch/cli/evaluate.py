@@ -12,13 +12,13 @@ from typing import Annotated, Any
 
 import typer
 
-from bodycap_batch.cli.base import app
+from bodycap_batch.cli.application import app
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.core.percent import format_percent
 
 TUM_SUFFIXES = (".tum", ".txt")
-_MOTION = "motion.bvh"
-_JOINTS = ("joints.npz", "motion.bvh")
+_MOTION_FILE = "motion.bvh"
+_TRUTH_FILES = ("joints.npz", "motion.bvh")
 
 
 class Align(StrEnum):
@@ -63,22 +63,22 @@ def evaluate(
       bodycap evaluate camera.tum groundtruth.txt
       bodycap evaluate out/my_walk/motion.bvh mocap.bvh
     """  # noqa: D301 - \b keeps lines as they are
-    pairs, motions = _trajectories(estimate, truth), _motions(estimate, truth)
+    pairs, motions = _trajectory_pairs(estimate, truth), _motion_pair(estimate, truth)
     reports: dict[str, Any] = {}
     if pairs:
-        reports |= _score_trajectories(pairs, estimate, align.value, reference)
+        reports |= _evaluate_trajectories(pairs, estimate, align.value, reference)
     if motions is not None:
-        reports |= _score_motion(*motions)
+        reports |= _evaluate_motion(*motions)
     if not reports:
         raise JobError(
             f"nothing in {estimate} can be compared with {truth}",
             hint="give two .tum files, two .bvh files, or two folders whose .tum files have the same names",
         )
     values = {name: report.to_dict() for name, report in reports.items()}
-    typer.echo(json.dumps(values, indent=1) if as_json else "\n".join(_lines(values)))
+    typer.echo(json.dumps(values, indent=1) if as_json else "\n".join(_table_lines(values)))
 
 
-def _score_trajectories(
+def _evaluate_trajectories(
     pairs: dict[str, tuple[Path, Path]], results: Path, align: str, reference: str | None
 ) -> dict[str, Any]:
     from bodycap_batch.evaluate import TrajectoryOptions, relative_camera_error, score_trajectories
@@ -86,7 +86,7 @@ def _score_trajectories(
 
     mine = {name: read_tum(pair[0]) for name, pair in pairs.items()}
     theirs = {name: read_tum(pair[1]) for name, pair in pairs.items()}
-    frames = _frames(results) if results.is_dir() else {}
+    frames = _frame_counts(results) if results.is_dir() else {}
     reports: dict[str, Any] = {
         "trajectories": score_trajectories(mine, theirs, TrajectoryOptions(align=align), frames)  # type: ignore[arg-type]
     }
@@ -96,7 +96,7 @@ def _score_trajectories(
     return reports
 
 
-def _score_motion(estimate: Path, truth: Path) -> dict[str, Any]:
+def _evaluate_motion(estimate: Path, truth: Path) -> dict[str, Any]:
     """All joints, and those that a run's own figures call measured."""
     from bodycap_batch.evaluate import MotionOptions, evaluate_motion
 
@@ -120,7 +120,7 @@ def _motion_figures(results: Path) -> dict[str, Any]:
         return {}
 
 
-def _frames(results: Path) -> dict[str, int]:
+def _frame_counts(results: Path) -> dict[str, int]:
     """Frames of each camera's video, from the results' frames.csv."""
     try:
         with (results / "frames.csv").open(newline="", encoding="utf-8") as stream:
@@ -130,29 +130,29 @@ def _frames(results: Path) -> dict[str, int]:
         return {}
 
 
-def _lines(reports: dict[str, Any]) -> list[str]:
+def _table_lines(reports: dict[str, Any]) -> list[str]:
     """The figures as a person reads them."""
     lines: list[str] = []
     for name, report in reports.items():
         if name == "trajectories":
-            lines.append(f"{'camera':14}{'frames':>8}{'posed':>8}{'share':>8}{_HEADS}")
+            lines.append(f"{'camera':14}{'frames':>8}{'posed':>8}{'share':>8}{_CAMERA_COLUMNS}")
             rows = {**report["cameras"], "all": report["total"]}
             lines += [_camera_line(camera, score) for camera, score in rows.items()]
             lines.append(f"scale of the alignment: {report['scale']:.6g}")
         elif name.startswith("motion"):
             lines.append(f"{name}: {report['frames']} frames, {len(report['joints'])} joints")
             lines += [
-                f"  {label:32}{_stat(report[key], factor)}"
+                f"  {label:32}{_statistics_text(report[key], factor)}"
                 for key, label, factor in _MOTION_ROWS
                 if report[key]
             ]
         else:
             lines.append(f"{name}: {report['frames']} frames")
-            lines += [f"  {label:32}{_stat(report[key], 100)}" for key, label in _RELATIVE_ROWS]
+            lines += [f"  {label:32}{_statistics_text(report[key], 100)}" for key, label in _RELATIVE_ROWS]
     return lines
 
 
-_HEADS = f"{'ATE rmse':>10}{'max':>8}{'cm':>4}{'turn rmse':>11}{'deg':>5}{'RPE rmse':>10}{'cm/s':>6}"
+_CAMERA_COLUMNS = f"{'ATE rmse':>10}{'max':>8}{'cm':>4}{'turn rmse':>11}{'deg':>5}{'RPE rmse':>10}{'cm/s':>6}"
 _MOTION_ROWS = (
     ("mpjpe_m", "joints, cm", 100),
     ("root_relative_m", "joints from the root, cm", 100),
@@ -174,12 +174,12 @@ def _camera_line(name: str, score: dict[str, Any]) -> str:
     return line + (f"{100 * score['rpe_m']['rmse']:>10.3f}" if score["rpe_m"] else "")
 
 
-def _stat(summary: dict[str, float], factor: float) -> str:
+def _statistics_text(summary: dict[str, float], factor: float) -> str:
     parts = ((key, factor * summary[key]) for key in ("mean", "rmse", "median", "p95", "max"))
     return "  ".join(f"{key} {value:.3f}" for key, value in parts)
 
 
-def _trajectories(estimate: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
+def _trajectory_pairs(estimate: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
     """Estimate and truth of each camera that both sides have."""
     if estimate.is_file() and truth.is_file():
         both = estimate.suffix in TUM_SUFFIXES and truth.suffix in TUM_SUFFIXES
@@ -194,12 +194,12 @@ def _trajectories(estimate: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
     return {name: (mine[name], theirs[name]) for name in sorted(mine.keys() & theirs.keys())}
 
 
-def _motions(estimate: Path, truth: Path) -> tuple[Path, Path] | None:
+def _motion_pair(estimate: Path, truth: Path) -> tuple[Path, Path] | None:
     """A motion and its truth, if both sides have one."""
-    mine = estimate / _MOTION if estimate.is_dir() else estimate
+    mine = estimate / _MOTION_FILE if estimate.is_dir() else estimate
     theirs = truth
     if truth.is_dir():
-        found = [truth / part / name for part in ("", "gt") for name in _JOINTS]
+        found = [truth / part / name for part in ("", "gt") for name in _TRUTH_FILES]
         theirs = next((path for path in found if path.is_file()), truth)
     usable = (
         mine.suffix == ".bvh" and mine.is_file() and theirs.suffix in (".bvh", ".npz") and theirs.is_file()

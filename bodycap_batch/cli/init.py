@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from bodycap_batch.cli.base import app
+from bodycap_batch.cli.application import app
 
 
 @app.command()
@@ -25,12 +25,12 @@ def init(
       bodycap init my_walk/
       bodycap check my_walk/job.yaml
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.check.starting import UNKNOWN, write_starting_job
+    from bodycap_batch.check.job_template import UNKNOWN_MOUNT, write_job_template
 
-    path = write_starting_job(folder, replace=force)
+    path = write_job_template(folder, replace=force)
     text = path.read_text(encoding="utf-8")
     typer.echo(f"wrote {path}")
-    missing = text.count(UNKNOWN)
+    missing = text.count(UNKNOWN_MOUNT)
     if missing:
         typer.echo(
             f"fill in where {missing} camera{'s were' if missing > 1 else ' was'} worn (`mount:`), then"

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import typer
 
-from bodycap_batch.cli.base import app
-from bodycap_batch.cli.display import make_display
-from bodycap_batch.cli.options import (
+from bodycap_batch.cli.application import app
+from bodycap_batch.cli.progress_display import make_progress_display
+from bodycap_batch.cli.shared_options import (
     HeightOption,
     JobArgument,
     OutOption,
@@ -19,7 +19,7 @@ from bodycap_batch.cli.options import (
     default_store,
     results_folder,
 )
-from bodycap_batch.cli.stop import stoppable
+from bodycap_batch.cli.signals import event_on_signal
 
 
 @app.command()
@@ -45,10 +45,10 @@ def report(
     from bodycap_batch.pipeline import Settings, remake_report
     from bodycap_batch.store.artefacts import Store
 
-    file, folder = job_of(job)
+    file, folder = job_from_path(job)
     resolved = load_job(file, Overrides(out=out or folder, skeleton=skeleton, height_m=height))
     out_dir = results_folder(resolved)
-    with stoppable() as stop, make_display(as_json=False) as display:
+    with event_on_signal() as stop, make_progress_display(as_json=False) as display:
         settings = Settings(
             store=Store(store or default_store(out_dir)),
             threads=threads or cores(),
@@ -59,7 +59,7 @@ def report(
     typer.echo(f"report: {path}")
 
 
-def job_of(named: Path) -> tuple[Path, Path | None]:
+def job_from_path(named: Path) -> tuple[Path, Path | None]:
     """The job to load, and the results' folder where that is what was named."""
     if (named / "run.json").is_file() and (named / "job.yaml").is_file():
         return named / "job.yaml", named.resolve()

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from bodycap_batch.cli.base import app
-from bodycap_batch.cli.display import Display, JsonLines, make_display
-from bodycap_batch.cli.options import (
+from bodycap_batch.cli.application import app
+from bodycap_batch.cli.progress_display import JsonLines, ProgressDisplay, make_progress_display
+from bodycap_batch.cli.shared_options import (
     HeightOption,
     JobArgument,
     OutOption,
@@ -25,7 +25,7 @@ from bodycap_batch.cli.options import (
     default_store,
     results_folder,
 )
-from bodycap_batch.cli.stop import stoppable
+from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.core.errors import BodycapError, JobError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.tasks import ORDER, StageName, stages_from
@@ -80,7 +80,11 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
     first: StageName | None = "check" if force else from_
     redo = frozenset[str]() if first is None else stages_from(first)
     overrides = Overrides(out=out, skeleton=skeleton, height_m=height)
-    with stoppable() as stop, make_display(as_json=json_progress) as display, _told_to(display):
+    with (
+        event_on_signal() as stop,
+        make_progress_display(as_json=json_progress) as display,
+        _report_errors_as_json(display),
+    ):
 
         def settings(default_store: Path) -> Settings:
             return Settings(
@@ -104,11 +108,11 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
         resolved = load_job(job, overrides, prepare=prepare)
         out_dir = results_folder(resolved)
         summary = run_job(resolved, out_dir=out_dir, settings=settings(default_store(out_dir)))
-    _report(summary, resolved, display, verbose=verbose)
+    _print_summary(summary, resolved, display, verbose=verbose)
 
 
 @contextmanager
-def _told_to(display: Display) -> Iterator[None]:
+def _report_errors_as_json(display: ProgressDisplay) -> Iterator[None]:
     """Tell a failure to a machine that follows the progress, too."""
     try:
         yield
@@ -118,7 +122,7 @@ def _told_to(display: Display) -> Iterator[None]:
         raise
 
 
-def _report(summary: RunSummary, job: Job, display: Display, *, verbose: bool) -> None:
+def _print_summary(summary: RunSummary, job: Job, display: ProgressDisplay, *, verbose: bool) -> None:
     if isinstance(display, JsonLines):
         last = {"kind": "done", "out_dir": str(summary.out_dir), "files": list(summary.files)}
         sys.stdout.write(json.dumps({**last, "executed": summary.executed}) + "\n")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bodycap_batch.cli.base import app
+from bodycap_batch.cli.application import app
 from bodycap_batch.core.errors import JobError
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def skeleton(
     from bodycap_batch.formats.bvh import RigOptions, read_rig
     from bodycap_batch.formats.bvh.skeleton_description import describe_joints, missing_roles
 
-    options = RigOptions(roles=_pairs(roles or []), tpose_frame=tpose_frame)
+    options = RigOptions(roles=_parse_roles(roles or []), tpose_frame=tpose_frame)
     rig, motion = read_rig(file, options)
     if as_json:
         joints = [dataclasses.asdict(line) for line in describe_joints(rig)]
@@ -56,11 +56,17 @@ def skeleton(
             json.dumps({"joints": joints, "missing": missing_roles(rig)}, indent=1, ensure_ascii=False)
         )
         return
-    for line in (*_heading(file, rig, motion, tpose_frame), "", *_table(rig), "", *_ending(rig, options)):
+    for line in (
+        *_heading_lines(file, rig, motion, tpose_frame),
+        "",
+        *_joint_table(rig),
+        "",
+        *_closing_lines(rig, options),
+    ):
         typer.echo(line)
 
 
-def _pairs(words: list[str]) -> dict[str, str]:
+def _parse_roles(words: list[str]) -> dict[str, str]:
     """``JOINT=ROLE`` as a mapping."""
     pairs = [word.rpartition("=") for word in words]
     bad = next(
@@ -73,7 +79,7 @@ def _pairs(words: list[str]) -> dict[str, str]:
     return {name: role for name, _, role in pairs}
 
 
-def _heading(file: Path, rig: SkeletonModel, motion: Motion | None, frame: int | None) -> list[str]:
+def _heading_lines(file: Path, rig: SkeletonModel, motion: Motion | None, frame: int | None) -> list[str]:
     import numpy as np
 
     from bodycap_batch.formats.bvh.skeleton_description import describe_arm_pose
@@ -91,7 +97,7 @@ def _heading(file: Path, rig: SkeletonModel, motion: Motion | None, frame: int |
     ]
 
 
-def _table(rig: SkeletonModel) -> list[str]:
+def _joint_table(rig: SkeletonModel) -> list[str]:
     from bodycap_batch.formats.bvh.skeleton_description import describe_joints
 
     rows = [("joint", "role", "bone", "points", "")]
@@ -108,7 +114,7 @@ def _table(rig: SkeletonModel) -> list[str]:
     ]
 
 
-def _ending(rig: SkeletonModel, options: RigOptions) -> list[str]:
+def _closing_lines(rig: SkeletonModel, options: RigOptions) -> list[str]:
     from bodycap_batch.formats.bvh.skeleton_description import missing_roles, skeleton_warnings
 
     missing = missing_roles(rig)

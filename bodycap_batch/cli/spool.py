@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bodycap_batch.cli.base import app
+from bodycap_batch.cli.application import app
 from bodycap_batch.core.percent import format_percent
 
 if TYPE_CHECKING:
@@ -22,8 +22,8 @@ SpoolArgument = Annotated[
     ),
 ]
 NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="The job, as `bodycap status` lists it.")]
-_UNITS = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
-_CAUSE_CHARACTERS = 200
+_AGE_UNITS = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
+_MAX_CAUSE_LENGTH = 200
 
 
 @app.command(short_help="List the jobs of a watched folder and how they are.")
@@ -39,16 +39,16 @@ def status(
       bodycap status /mnt/nas/jobs --json
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.store.artefacts import disk_errors
-    from bodycap_batch.watch import rows_of, watchers_of
+    from bodycap_batch.watch import active_watchers, job_rows
 
-    place = _spool(spool)
+    place = _find_spool(spool)
     with disk_errors(place.root):
-        rows, watchers = rows_of(place), watchers_of(place)
+        rows, watchers = job_rows(place), active_watchers(place)
     if as_json:
         found = {"jobs": [row.to_dict() for row in rows], "watchers": [each.to_dict() for each in watchers]}
         _print(json.dumps(found, indent=1))
         return
-    for line in _table(rows):
+    for line in _job_table(rows):
         _print(line)
     for watching in watchers:
         _print(str(watching))
@@ -68,7 +68,7 @@ def retry(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.watch import retry_job
 
-    _print(f"back in the inbox: {retry_job(_spool(spool), name)}")
+    _print(f"back in the inbox: {retry_job(_find_spool(spool), name)}")
 
 
 @app.command()
@@ -81,7 +81,7 @@ def cancel(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.watch import cancel_job, read_status
 
-    place = cancel_job(_spool(spool), name)
+    place = cancel_job(_find_spool(spool), name)
     if place is None:
         _print(f"{name}: no watcher has stopped it yet; it is cancelled when one looks")
     elif (state := read_status(place).get("state")) != "cancelled":
@@ -90,24 +90,24 @@ def cancel(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
         _print(f"cancelled: {place.path}")
 
 
-def _spool(path: Path) -> Spool:
+def _find_spool(path: Path) -> Spool:
     from bodycap_batch.core.errors import JobError
-    from bodycap_batch.watch import spool_at
+    from bodycap_batch.watch import spool_from_path
 
     if not path.is_dir():
         raise JobError("no such folder", path=path, hint="name the watched folder, for example jobs/inbox")
-    return spool_at(path)
+    return spool_from_path(path)
 
 
-def _table(rows: list[JobRow]) -> list[str]:
+def _job_table(rows: list[JobRow]) -> list[str]:
     if not rows:
         return ["no jobs"]
     cells = [("JOB", "STATE", "STAGE", "PROGRESS", "AGE", "")]
     for row in rows:
         share = "" if row.progress is None else format_percent(row.progress)
         cause = " ".join(row.cause.split())
-        cause = cause if len(cause) <= _CAUSE_CHARACTERS else f"{cause[: _CAUSE_CHARACTERS - 1]}…"
-        cells.append((row.name, row.state, row.stage, share, _age(row.age_s), cause))
+        cause = cause if len(cause) <= _MAX_CAUSE_LENGTH else f"{cause[: _MAX_CAUSE_LENGTH - 1]}…"
+        cells.append((row.name, row.state, row.stage, share, _age_text(row.age_s), cause))
     widths = [max(len(line[column]) for line in cells) for column in range(5)]
     lines = [
         "  ".join(f"{part:{width}}" for part, width in zip(line, widths, strict=False)) for line in cells
@@ -115,10 +115,10 @@ def _table(rows: list[JobRow]) -> list[str]:
     return [f"{line}  {cell[5]}".rstrip() for line, cell in zip(lines, cells, strict=True)]
 
 
-def _age(seconds: float | None) -> str:
+def _age_text(seconds: float | None) -> str:
     if seconds is None:
         return ""
-    for size, unit in _UNITS:
+    for size, unit in _AGE_UNITS:
         if seconds >= size:
             return f"{seconds / size:.0f} {unit}"
     return f"{max(seconds, 0.0):.0f} s"

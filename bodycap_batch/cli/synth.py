@@ -10,10 +10,10 @@ from typing import Annotated, Any
 
 import typer
 
-from bodycap_batch.cli.base import app
-from bodycap_batch.cli.display import make_display
-from bodycap_batch.cli.options import ThreadsOption, cores
-from bodycap_batch.cli.stop import stoppable
+from bodycap_batch.cli.application import app
+from bodycap_batch.cli.progress_display import make_progress_display
+from bodycap_batch.cli.shared_options import ThreadsOption, cores
+from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.core.progress import Event
 
@@ -62,10 +62,10 @@ def synth(  # noqa: PLR0913, PLR0917 - the flags a user types
     values: dict[str, Any] = {"seconds": seconds, "fps": fps, "seed": seed, "motion": motion}
     values["cameras"] = cameras.split(",") if cameras else None
     values["poses_only"] = poses or None
-    options = _options({**values, **_size(size), **_more(more or [])})
+    options = _synth_options({**values, **_parse_size(size), **_parse_settings(more or [])})
     with (
-        stoppable() as stop,
-        make_display(as_json=json_progress) as display,
+        event_on_signal() as stop,
+        make_progress_display(as_json=json_progress) as display,
         tempfile.TemporaryDirectory() as work,
     ):
 
@@ -80,7 +80,7 @@ def synth(  # noqa: PLR0913, PLR0917 - the flags a user types
         sys.stdout.write(f"capture: {out.resolve()}\n")
 
 
-def _size(text: str | None) -> dict[str, int]:
+def _parse_size(text: str | None) -> dict[str, int]:
     if text is None:
         return {}
     width, _, height = text.lower().partition("x")
@@ -89,7 +89,7 @@ def _size(text: str | None) -> dict[str, int]:
     return {"width": int(width), "height": int(height)}
 
 
-def _more(settings: list[str]) -> dict[str, Any]:
+def _parse_settings(settings: list[str]) -> dict[str, Any]:
     import yaml
 
     found: dict[str, Any] = {}
@@ -105,7 +105,7 @@ def _more(settings: list[str]) -> dict[str, Any]:
     return found
 
 
-def _options(values: Mapping[str, Any]) -> Any:
+def _synth_options(values: Mapping[str, Any]) -> Any:
     from pydantic import ValidationError
 
     from bodycap_batch.synthetic import SynthOptions

@@ -9,9 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from bodycap_batch.cli.base import app
-from bodycap_batch.cli.options import JobArgument, OutOption, StoreOption, default_store, results_folder
-from bodycap_batch.cli.report import job_of
+from bodycap_batch.cli.application import app
+from bodycap_batch.cli.report import job_from_path
+from bodycap_batch.cli.shared_options import (
+    JobArgument,
+    OutOption,
+    StoreOption,
+    default_store,
+    results_folder,
+)
 from bodycap_batch.core.errors import BodycapError, JobError
 
 if TYPE_CHECKING:
@@ -19,7 +25,7 @@ if TYPE_CHECKING:
     from bodycap_batch.report.inputs import ReportInputs
     from bodycap_batch.report.marks import Marks
 
-_REPORT = ("report.html", "partial/report.html")
+_REPORT_FILES = ("report.html", "partial/report.html")
 
 
 @app.command(short_help="Look at a finished job beside its real videos.")
@@ -50,7 +56,7 @@ def view(
     from bodycap_batch.report.recording import write_recording
     from bodycap_batch.report.serving import LOOPBACK, make_server, what_to_serve
 
-    file, folder = job_of(job)
+    file, folder = job_from_path(job)
     resolved = load_job(file, Overrides(out=out or folder))
     out_dir = results_folder(resolved)
     store = store or default_store(out_dir)
@@ -58,7 +64,7 @@ def view(
         write_recording(_stored_inputs(resolved, out_dir, store), rerun)
         typer.echo(f"recording: {rerun}")
         return
-    page = next((out_dir / name for name in _REPORT if (out_dir / name).is_file()), None)
+    page = next((out_dir / name for name in _REPORT_FILES if (out_dir / name).is_file()), None)
     if page is None:
         raise JobError("there is no report", path=out_dir, hint="run the job, or `bodycap report` it")
     server = make_server(

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bodycap_batch.cli.base import app
-from bodycap_batch.cli.options import ThreadsOption, WatchStoreOption, cores
-from bodycap_batch.cli.stop import exit_code_of_stop, stoppable
+from bodycap_batch.cli.application import app
+from bodycap_batch.cli.shared_options import ThreadsOption, WatchStoreOption, cores
+from bodycap_batch.cli.signals import event_on_signal, signal_exit_code
 
 if TYPE_CHECKING:
     from bodycap_batch.watch import Watcher, WatchOptions
@@ -97,27 +97,29 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap status jobs                      how the jobs are
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.config.limits import limits_from
-    from bodycap_batch.watch import Terms, Watcher, WatchOptions, spool_at
+    from bodycap_batch.watch import JobPermissions, Watcher, WatchOptions, spool_from_path
 
-    spool = spool_at(inbox)
+    spool = spool_from_path(inbox)
     options = WatchOptions(
-        terms=Terms(roots=tuple(map(_folder, root or ())), limits=limits_from(limit or ())),
+        permissions=JobPermissions(
+            roots=tuple(map(_existing_folder, root or ())), limits=limits_from(limit or ())
+        ),
         store=store,
         jobs=jobs,
         threads=threads or cores(),
-        settle_s=settle,
+        unchanged_s=settle,
         stale_s=stale,
         poll=poll,
         once=once,
     )
-    with stoppable() as stop:
-        watcher = Watcher(spool, options, _say)
-        _say(f"watching {spool.inbox}; results go to {spool.done}")
+    with event_on_signal() as stop:
+        watcher = Watcher(spool, options, _write_line)
+        _write_line(f"watching {spool.inbox}; results go to {spool.done}")
         with _live_page(watcher, options, web, web_token):
             worst = _run(watcher, stop)
     if stop.is_set():
-        _say("stopped; running jobs go on at the next start")
-        raise typer.Exit(exit_code_of_stop())
+        _write_line("stopped; running jobs go on at the next start")
+        raise typer.Exit(signal_exit_code())
     raise typer.Exit(worst)
 
 
@@ -138,15 +140,15 @@ def _live_page(watcher: Watcher, options: WatchOptions, address: str | None, tok
     if address is None:
         yield
         return
-    from bodycap_batch.watch.web import LivePage, access_from
+    from bodycap_batch.watch.web import LivePage, access_from_address
 
-    access, limits = access_from(address, token), options.terms.limits
-    with LivePage(watcher.spool, access, limits, lambda: watcher.trouble.text) as page:
-        _say(f"live page: {page.access.url}{'?token=…' if page.access.token else ''}")
+    access, limits = access_from_address(address, token), options.permissions.limits
+    with LivePage(watcher.spool, access, limits, lambda: watcher.access_failures.text) as page:
+        _write_line(f"live page: {page.access.url}{'?token=…' if page.access.token else ''}")
         yield
 
 
-def _folder(path: Path) -> Path:
+def _existing_folder(path: Path) -> Path:
     from bodycap_batch.core.errors import JobError
 
     if not path.is_dir():
@@ -154,7 +156,7 @@ def _folder(path: Path) -> Path:
     return path.resolve()
 
 
-def _say(text: str) -> None:
+def _write_line(text: str) -> None:
     line = f"{time.strftime('%H:%M:%S')} {text}\n"
     sys.stderr.write(line.encode(errors="backslashreplace").decode())
     sys.stderr.flush()

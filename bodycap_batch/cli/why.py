@@ -10,8 +10,8 @@ from typing import Annotated
 
 import typer
 
-from bodycap_batch.cli.base import app
-from bodycap_batch.cli.options import (
+from bodycap_batch.cli.application import app
+from bodycap_batch.cli.shared_options import (
     STORE_VARIABLE,
     HeightOption,
     JobArgument,

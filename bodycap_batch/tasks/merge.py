@@ -66,7 +66,7 @@ def _with_board(
 
     import numpy as np
 
-    from bodycap_batch.calibration.in_room import find_board_views
+    from bodycap_batch.calibration.board_views import find_board_views
     from bodycap_batch.model.scene import FrameStatus
 
     frames, lenses = {}, {}

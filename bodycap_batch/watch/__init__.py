@@ -1,23 +1,23 @@
-"""A watched folder: what is dropped there is claimed, worked on and filed away."""
+"""Watch a folder: claim the jobs that are dropped there, run them, and file them under `done` or `failed`."""
 
-from bodycap_batch.watch.commands import JobRow, cancel_job, retry_job, rows_of
-from bodycap_batch.watch.intake import Terms
-from bodycap_batch.watch.options import WatchOptions
-from bodycap_batch.watch.presence import watchers_of
-from bodycap_batch.watch.spool import Spool, spool_at
-from bodycap_batch.watch.status import read_status
+from bodycap_batch.watch.commands import JobRow, cancel_job, job_rows, retry_job
+from bodycap_batch.watch.dropped_job import JobPermissions
+from bodycap_batch.watch.job_status import read_status
+from bodycap_batch.watch.spool import Spool, spool_from_path
+from bodycap_batch.watch.watch_options import WatchOptions
 from bodycap_batch.watch.watcher import Watcher
+from bodycap_batch.watch.watcher_status import active_watchers
 
 __all__ = [
+    "JobPermissions",
     "JobRow",
     "Spool",
-    "Terms",
     "WatchOptions",
     "Watcher",
+    "active_watchers",
     "cancel_job",
+    "job_rows",
     "read_status",
     "retry_job",
-    "rows_of",
-    "spool_at",
-    "watchers_of",
+    "spool_from_path",
 ]

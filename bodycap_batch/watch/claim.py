@@ -1,9 +1,8 @@
-"""Who works on a job: `owner.json`, its generation number and its heartbeat."""
+"""Claim a job: `owner.json`, the number of the claim, and its heartbeat."""
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import socket
@@ -15,61 +14,21 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.store.digests import write_atomically
-from bodycap_batch.watch.guard import MARKER, Guard, marker, read_owner
+from bodycap_batch.watch.ownership import MARKER_PREFIX, Ownership, generation_marker, read_owner
+from bodycap_batch.watch.process_identity import machine_id, process_start
 from bodycap_batch.watch.spool import JobDir
-
-_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-_PROCESS_NAMES = Path("/proc/self/ns/pid")
-
-
-def host_key() -> str:
-    """This machine since it was started, and where its process numbers hold (containers have their own)."""
-    try:
-        boot = _BOOT_ID.read_text(encoding="ascii").strip()
-        names = os.readlink(_PROCESS_NAMES)
-    except OSError:
-        return ""
-    return f"{socket.gethostname()}/{boot}/{names}"
-
-
-def start_of(pid: int) -> str:
-    """When a process of this machine was started, in the kernel's ticks; "" where there is none."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2]
-    except OSError:
-        return ""
-    words = fields.split()
-    return "" if words[0] in ("Z", "X") else words[19]
-
-
-def process_mark() -> str:
-    """This process, unlike any other of any machine, as part of a file's name."""
-    return f"{_machine_mark()}-{os.getpid()}-{start_of(os.getpid())}"
-
-
-def is_at_work(marked: str) -> bool:
-    """Whether the process whose `process_mark` a name begins with is a running one of this machine."""
-    machine, pid, start, *_ = [*marked.split("-"), "", ""]
-    here = bool(host_key()) and machine == _machine_mark()
-    return here and pid.isdecimal() and bool(start) and start_of(int(pid)) == start
-
-
-def is_of_this_machine(marked: str) -> bool:
-    """Whether a process of this machine, as long as it has been up, wrote that `process_mark`."""
-    return bool(host_key()) and marked.split("-", maxsplit=1)[0] == _machine_mark()
-
-
-def _machine_mark() -> str:
-    return hashlib.sha256(host_key().encode()).hexdigest()[:12]
 
 
 class Claim:
-    """One watcher's hold on a job.
+    """A watcher's claim on a job.
 
     Args:
         job: The job's folder.
         generation: Number of the claim.
-        token: Names it.
+        token: Unique name of the claim.
+
+    Attributes:
+        lost: Set once another watcher has taken the job over.
     """
 
     def __init__(self, job: JobDir, generation: int, token: str) -> None:
@@ -82,45 +41,53 @@ class Claim:
         self._ended = False
 
     @property
-    def guard(self) -> Guard:
-        """What is asked before anything becomes visible."""
-        return Guard(owner=self.job.owner, token=self._token, generation=self.generation)
+    def ownership(self) -> Ownership:
+        """The check that precedes each visible step."""
+        return Ownership(owner=self.job.owner, token=self._token, generation=self.generation)
 
-    def moved_to(self, job: JobDir) -> None:
-        """The job's folder has got another name."""
+    def set_job_dir(self, job: JobDir) -> None:
+        """Record that the job's folder has been renamed."""
         with self._lock:
             self.job = job
 
-    def beat(self) -> None:
-        """Show that this watcher is alive; notice that the job belongs to somebody else."""
+    def write_heartbeat(self) -> None:
+        """Show that this watcher is alive, and set `lost` if another watcher has the job."""
         with self._lock:
             if self._ended or self.lost.is_set():
                 return
-            with contextlib.suppress(OSError):  # a full or absent disk: the job itself will say so
-                if self.guard.holds():
+            with contextlib.suppress(OSError):  # the job itself reports a full or missing disk
+                if self.ownership.is_held():
                     self._write()
                 else:
                     self.lost.set()
 
     def release(self) -> None:
-        """Let the job be taken over at once."""
+        """Allow other watchers to take the job over at once."""
         with self._lock:
             self._ended = True
-            if self.guard.holds():
+            if self.ownership.is_held():
                 self._write(released=True)
 
-    def end(self) -> None:
-        """Beat no more: the job is being filed away."""
+    def stop_heartbeat(self) -> None:
+        """Write no more heartbeats, for example because the job is being filed."""
         with self._lock:
             self._ended = True
 
     def _write(self, *, released: bool = False) -> None:
         self._beat += 1
-        write_owner(self.job, self._token, self.generation, beat=self._beat, released=released)
+        write_owner(self.job, self._token, self.generation, write_heartbeat=self._beat, released=released)
 
 
 def write_owner(job: JobDir, token: str, generation: int, *, beat: int = 0, released: bool = False) -> None:
-    """Write `owner.json`."""
+    """Write `owner.json`.
+
+    Args:
+        job: The job's folder.
+        token: Unique name of the claim.
+        generation: Number of the claim.
+        beat: Count of heartbeats so far. Each one changes the file.
+        released: True if other watchers may take the job over at once.
+    """
     document = {
         "host": socket.gethostname(),
         "pid": os.getpid(),
@@ -128,81 +95,87 @@ def write_owner(job: JobDir, token: str, generation: int, *, beat: int = 0, rele
         "heartbeat": beat,
         "released": released,
         "token": token,
-        "machine": host_key(),
-        "process": start_of(os.getpid()),
+        "machine": machine_id(),
+        "process": process_start(os.getpid()),
     }
     write_atomically(job.owner, (json.dumps(document, indent=1) + "\n").encode())
 
 
-def first_claim(job: JobDir) -> Claim:
-    """Claim a folder that nobody else can see yet."""
+def create_claim(job: JobDir) -> Claim:
+    """Make the first claim of a folder that no other process can see yet."""
     token = uuid.uuid4().hex
-    marker(job.path, 1).touch(exist_ok=False)
+    generation_marker(job.path, 1).touch(exist_ok=False)
     write_owner(job, token, 1)
     return Claim(job, 1, token)
 
 
-def take_over(job: JobDir) -> Claim | None:
-    """Claim the next generation of a job whose owner is gone; None where somebody else was quicker."""
-    generation = 1 + max(_highest_marker(job), int(read_owner(job.owner).get("generation", 0)))
+def take_over_job(job: JobDir) -> Claim | None:
+    """Claim the next generation of a job that its watcher abandoned.
+
+    Returns:
+        The claim, or None if another watcher was faster.
+    """
+    generation = 1 + max(_highest_generation(job), int(read_owner(job.owner).get("generation", 0)))
     token = uuid.uuid4().hex
     try:
-        os.close(os.open(marker(job.path, generation), os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644))
+        os.close(
+            os.open(generation_marker(job.path, generation), os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
+        )
         write_owner(job, token, generation)
     except (FileExistsError, FileNotFoundError, NotADirectoryError):
         return None
     return Claim(job, generation, token)
 
 
-def clear_claim(job: JobDir) -> None:
-    """Remove the traces of ownership from a job that has been filed away."""
-    for path in (*job.path.glob(f"{MARKER}*"), job.owner, job.cancel):
+def remove_claim_files(job: JobDir) -> None:
+    """Remove the files of the claims from a job that has been filed."""
+    for path in (*job.path.glob(f"{MARKER_PREFIX}*"), job.owner, job.cancel):
         path.unlink(missing_ok=True)
 
 
-class Onlooker:
-    """Watches other watchers' heartbeats.
+class HeartbeatMonitor:
+    """Watch the heartbeats of other watchers.
 
-    A heartbeat counts as stopped when this process's own clock has seen no change of `owner.json` for long
-    enough: the clocks of hosts are never compared. Where the owner was a process of this machine that is
-    gone, or let the job go, there is nothing to wait for.
+    A heartbeat has stopped if `owner.json` has not changed for `stale_s` by this process's own clock. Clocks
+    of different machines are never compared. There is no wait if the owner released the job, or was a process
+    of this machine that has ended.
 
     Args:
-        stale_s: How long a heartbeat may stand still.
+        stale_s: Seconds without a heartbeat after which a job may be taken over.
         clock: This process's own clock, seconds.
     """
 
     def __init__(self, stale_s: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._stale_s = stale_s
         self._clock = clock
-        self._machine = host_key()
+        self._machine = machine_id()
         self._seen: dict[Path, tuple[tuple[int, str], float]] = {}
 
-    def abandoned(self, jobs: list[JobDir]) -> list[JobDir]:
-        """Those of the jobs that may be taken over."""
+    def find_abandoned(self, jobs: list[JobDir]) -> list[JobDir]:
+        """Return the jobs that may be taken over."""
         now = self._clock()
         before, self._seen = self._seen, {}
-        found = []
+        abandoned = []
         for job in jobs:
             owner = read_owner(job.owner)
-            state = (_highest_marker(job), json.dumps(owner, sort_keys=True))
-            known, since = before.get(job.path, (state, now))
-            since = since if known == state else now
+            state = (_highest_generation(job), json.dumps(owner, sort_keys=True))
+            last_state, since = before.get(job.path, (state, now))
+            since = since if last_state == state else now
             self._seen[job.path] = (state, since)
-            if self._is_gone(owner, state[0]) or now - since >= self._stale_s:
-                found.append(job)
-        return found
+            if self._is_owner_gone(owner, state[0]) or now - since >= self._stale_s:
+                abandoned.append(job)
+        return abandoned
 
-    def _is_gone(self, owner: dict[str, Any], highest: int) -> bool:
-        """The owner said so, or was a process of this machine that has ended."""
+    def _is_owner_gone(self, owner: dict[str, Any], highest: int) -> bool:
+        """Return True if the owner released the job, or was a process of this machine that has ended."""
         if not owner or owner.get("generation") != highest:
             return False
         if owner.get("released"):
             return True
         here = bool(self._machine) and owner.get("machine") == self._machine
-        return here and start_of(int(owner.get("pid", 0))) != owner.get("process")
+        return here and process_start(int(owner.get("pid", 0))) != owner.get("process")
 
 
-def _highest_marker(job: JobDir) -> int:
-    numbers = (path.name.removeprefix(MARKER) for path in job.path.glob(f"{MARKER}*"))
+def _highest_generation(job: JobDir) -> int:
+    numbers = (path.name.removeprefix(MARKER_PREFIX) for path in job.path.glob(f"{MARKER_PREFIX}*"))
     return max((int(number) for number in numbers if number.isdecimal()), default=0)

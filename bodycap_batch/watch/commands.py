@@ -1,4 +1,4 @@
-"""What people ask of a spool: how its jobs are, to try one again, to cancel one."""
+"""List the jobs of a spool, retry one, and cancel one."""
 
 from __future__ import annotations
 
@@ -17,32 +17,49 @@ from typing import Any
 from bodycap_batch.core.errors import Cancelled, JobError
 from bodycap_batch.store.artefacts import Store, disk_errors
 from bodycap_batch.store.references import moving
-from bodycap_batch.watch.claim import clear_claim, first_claim, host_key, process_mark, start_of
-from bodycap_batch.watch.claiming import dropped_in, give_back, is_there, settle_claim
-from bodycap_batch.watch.drops import NO_JOB, Drop, drops_in, look_at, strays_in
-from bodycap_batch.watch.guard import read_owner
-from bodycap_batch.watch.spool import CLAIM_PREFIX, RETRY_PREFIX, JobDir, Spool, move, spool_name, visible
-from bodycap_batch.watch.status import FINAL, StatusFile, read_status, time_text
+from bodycap_batch.watch.claim import create_claim, remove_claim_files
+from bodycap_batch.watch.inbox_entries import (
+    NOT_A_JOB,
+    InboxEntry,
+    entries_in,
+    ignored_paths_in,
+    take_snapshot,
+)
+from bodycap_batch.watch.inbox_transfer import input_path, move_to_running, path_exists, return_to_inbox
+from bodycap_batch.watch.job_status import FINAL, JobStatusFile, read_status, utc_text
+from bodycap_batch.watch.ownership import read_owner
+from bodycap_batch.watch.process_identity import machine_id, process_start, process_tag
+from bodycap_batch.watch.spool import (
+    CLAIM_PREFIX,
+    RETRY_PREFIX,
+    JobDir,
+    Spool,
+    folder_name_from_text,
+    move_to_free_name,
+    visible_entries,
+)
 
-_MANY_FILES = 1000
-_LOOK_S = 0.1
+_MAX_SNAPSHOT_FILES = 1000
+"""Number of files of a waiting entry that are inspected for a list of jobs. Evidence: none."""
+_POLL_S = 0.1
+"""Seconds between two looks at a job that is being cancelled. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobRow:
-    """One job as a table shows it.
+    """One job as a row of a table.
 
     Attributes:
-        name: The job.
-        state: waiting (in the inbox), ignored (no job), claimed, running, interrupted (its watcher is gone),
-            stopped, done, failed, cancelled.
-        stage: What it is at, camera included.
-        progress: Share of the stage, None where it is not known.
-        since: When the state began, UTC.
+        name: Name of the job.
+        state: waiting (in the inbox), ignored (not a job), claimed, running, interrupted (its watcher is
+            gone), stopped, done, failed, cancelled.
+        stage: Current stage with its camera.
+        progress: Completed fraction of the stage, None if it is unknown.
+        since: Start of the state, UTC.
         age_s: Seconds since then.
-        cause: What it waits for, or why it failed.
-        hint: What to do about it.
-        path: Where it lies.
+        cause: What the job waits for, or why it failed.
+        hint: What the user can do.
+        path: Path of the job.
     """
 
     name: str
@@ -56,108 +73,116 @@ class JobRow:
     path: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """The row as plain JSON values."""
+        """Return the row as plain JSON values."""
         return asdict(self)
 
 
-def rows_of(spool: Spool) -> list[JobRow]:
-    """Every job of a spool: waiting, running, done, failed."""
-    claimed = [claimed_row(JobDir(path)) for path in visible(spool.running) if path.is_dir()]
-    ended = [claimed_row(JobDir(path)) for folder in (spool.done, spool.failed) for path in visible(folder)]
-    return [*waiting_rows(spool), *claimed, *ended]
+def job_rows(spool: Spool) -> list[JobRow]:
+    """Return every job of a spool: waiting, running, done, failed."""
+    claimed = [job_row(JobDir(path)) for path in visible_entries(spool.running) if path.is_dir()]
+    ended = [
+        job_row(JobDir(path)) for folder in (spool.done, spool.failed) for path in visible_entries(folder)
+    ]
+    return [*inbox_rows(spool), *claimed, *ended]
 
 
-def waiting_rows(spool: Spool) -> list[JobRow]:
-    """What lies in the inbox."""
-    waiting = [_waiting(drop) for drop in drops_in(spool.inbox)]
-    strays = [
+def inbox_rows(spool: Spool) -> list[JobRow]:
+    """Return the entries of the inbox and the paths that are ignored."""
+    waiting = [_waiting_row(entry) for entry in entries_in(spool.inbox)]
+    ignored = [
         JobRow(
             name=path.name,
             state="ignored",
-            cause=NO_JOB,
-            hint="put videos into a folder and drop that",
+            cause=NOT_A_JOB,
+            hint="put the videos into a folder and drop the folder",
             path=str(path),
         )
-        for path in strays_in(spool.inbox)
+        for path in ignored_paths_in(spool.inbox)
     ]
-    return [*waiting, *strays]
+    return [*waiting, *ignored]
 
 
 def retry_job(spool: Spool, name: str) -> Path:
-    """Put a failed or cancelled job back into the inbox; finished stages are kept in the store.
+    """Move a failed or cancelled job back to the inbox. Finished stages stay in the store.
 
     Returns:
-        Where its input lies now.
+        The new path of its input.
 
     Raises:
-        JobError: There is no such job, or it has not failed, or it is being retried already.
+        JobError: There is no such job, it has not failed, or another process retries it already.
     """
     job = spool.find(name)
     if job is None or job.path.parent != spool.failed:
-        raise _no_such(spool, name, "has not failed", [path.name for path in visible(spool.failed)])
+        raise _unknown_job(
+            spool, name, "has not failed", [path.name for path in visible_entries(spool.failed)]
+        )
     with disk_errors(job.path):
-        if not is_there(dropped_in(job)):
-            raise JobError("its input is gone", path=job.path, hint="drop the videos again")
+        if not path_exists(input_path(job)):
+            raise JobError("the job's input is gone", path=job.path, hint="drop the videos again")
         dropped = str(read_status(job).get("dropped") or job.name)
-        hidden = JobDir(spool.failed / f"{RETRY_PREFIX}{process_mark()}-{uuid.uuid4().hex}")
-        with _stages_kept(job, hidden, spool) as keep_for:
+        hidden = JobDir(spool.failed / f"{RETRY_PREFIX}{process_tag()}-{uuid.uuid4().hex}")
+        with _keep_artefacts(job, hidden, spool) as keep_for:
             keep_for(spool.inbox / dropped)
             try:
                 os.rename(job.path, hidden.path)
             except FileNotFoundError:
                 hint = "`bodycap status` lists all jobs"
-                raise JobError(f"job {name!r} is just being retried", path=job.path, hint=hint) from None
-            target = give_back(spool, hidden, keep_for)
+                raise JobError(f"job {name!r} is being retried already", path=job.path, hint=hint) from None
+            target = return_to_inbox(spool, hidden, keep_for)
     return target or spool.inbox / dropped
 
 
 @contextmanager
-def _stages_kept(job: JobDir, hidden: JobDir, spool: Spool) -> Iterator[Callable[[Path], None]]:
-    """Keep a job's artefacts in the store on its way through the inbox, until it is at work again."""
+def _keep_artefacts(job: JobDir, hidden: JobDir, spool: Spool) -> Iterator[Callable[[Path], None]]:
+    """Keep a job's artefacts in the store until the job runs again.
+
+    Yields:
+        A function to call with the job's next path.
+    """
     store = read_status(job).get("store")
     if not store or not (Path(store) / "artefacts").is_dir():
-        yield lambda _: None  # it never got as far as a stage
+        yield lambda _: None  # the job has not started a stage
         return
     with moving(Store(Path(store)), job.result) as keep_for:
 
-        def bound_for(target: Path) -> None:
-            names = {job.name, spool_name(target.name), spool_name(target.stem)}
+        def keep_for_target(target: Path) -> None:
+            names = {job.name, folder_name_from_text(target.name), folder_name_from_text(target.stem)}
             later = [folder / name for folder in (spool.running, spool.failed) for name in sorted(names)]
             keep_for(target, hidden.path, *later)
 
-        yield bound_for
+        yield keep_for_target
 
 
 def cancel_job(spool: Spool, name: str, wait_s: float = 5.0) -> JobDir | None:
-    """Cancel a job that waits or runs; what its finished stages gave stays in the store.
+    """Cancel a job that waits or runs. The results of its finished stages stay in the store.
 
     Returns:
-        Where it lies now (it may have come to its end before it could be stopped: `read_status` tells), None
-        while no watcher has noticed: it is filed away when one does.
+        The job's folder. The job may have ended before it could be stopped: `read_status` gives its state.
+        None if no watcher has reacted yet; the next one files the job.
 
     Raises:
         JobError: There is no such job, or it has ended.
     """
     end = time.monotonic() + wait_s
     with disk_errors(spool.root):
-        while (asked := _ask_to_cancel(spool, name)) is None:
-            # A watcher is just claiming it: neither in the inbox nor under its name among the running ones.
+        while (asked := _request_cancel(spool, name)) is None:
+            # A watcher is claiming the job: it is in neither the inbox nor `running` under its name.
             if time.monotonic() > end:
                 return None
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
     if asked.path.parent != spool.running:
         return asked
     while asked.path.exists() and time.monotonic() < end:
-        time.sleep(_LOOK_S)
+        time.sleep(_POLL_S)
     return None if asked.path.exists() else spool.find(name)
 
 
-def _ask_to_cancel(spool: Spool, name: str) -> JobDir | None:
-    """Cancel a job that waits, mark one that runs; None where it is on its way from the one to the other.
+def _request_cancel(spool: Spool, name: str) -> JobDir | None:
+    """Cancel a waiting job or mark a running one. Return None if the job is being claimed.
 
-    On its way it is marked, too; but the mark is lost where what was dropped is put back.
+    A job that is being claimed is marked, too. The mark is lost if the entry is returned to the inbox.
     """
-    waiting = [drop for drop in drops_in(spool.inbox) if _same(drop.name, name)]
+    waiting = [entry for entry in entries_in(spool.inbox) if _is_same_name(entry.name, name)]
     job = spool.find(name)
     try:
         if job is not None and job.path.parent == spool.running:
@@ -165,114 +190,121 @@ def _ask_to_cancel(spool: Spool, name: str) -> JobDir | None:
             return job
         if waiting:
             return _cancel_waiting(spool, waiting[0])
-        for place in map(JobDir, spool.running.glob(f"{CLAIM_PREFIX}*")):
-            if name in _names_of(place):  # whoever claims it may be gone: the next watcher goes on with it
-                place.cancel.touch()
+        for job_dir in map(JobDir, spool.running.glob(f"{CLAIM_PREFIX}*")):
+            if name in _dropped_names(job_dir):  # if its watcher is gone, the next one continues the claim
+                job_dir.cancel.touch()
                 return None
-    except FileNotFoundError:  # it has just been claimed, or filed away
+    except FileNotFoundError:  # another process has claimed or filed it
         return None
-    raise _no_such(spool, name, "is not waiting or running", [drop.name for drop in drops_in(spool.inbox)])
+    raise _unknown_job(
+        spool, name, "is not waiting or running", [entry.name for entry in entries_in(spool.inbox)]
+    )
 
 
-def _names_of(place: JobDir) -> tuple[str, ...]:
-    """What a job that is just being claimed was called in the inbox."""
-    dropped = str(read_status(place).get("dropped", ""))
+def _dropped_names(job_dir: JobDir) -> tuple[str, ...]:
+    """Return the names that a job had in the inbox before it was claimed."""
+    dropped = str(read_status(job_dir).get("dropped", ""))
     return dropped, Path(dropped).stem
 
 
-def _cancel_waiting(spool: Spool, drop: Drop) -> JobDir:
-    """Move a drop that nobody has claimed to the failed jobs; `FileNotFoundError` where somebody just has."""
-    place = JobDir(spool.running / f"{CLAIM_PREFIX}{uuid.uuid4().hex}")
-    place.path.mkdir()
-    claim = first_claim(place)
-    status = StatusFile(place)
-    status.change(kind="file" if drop.is_file else "folder", dropped=drop.path.name)
-    if drop.is_file:
-        place.input.mkdir()
+def _cancel_waiting(spool: Spool, entry: InboxEntry) -> JobDir:
+    """Move a waiting entry to `failed`. Raise `FileNotFoundError` if another process has claimed it."""
+    job_dir = JobDir(spool.running / f"{CLAIM_PREFIX}{uuid.uuid4().hex}")
+    job_dir.path.mkdir()
+    claim = create_claim(job_dir)
+    status = JobStatusFile(job_dir)
+    status.update(kind="file" if entry.is_file else "folder", dropped=entry.path.name)
+    if entry.is_file:
+        job_dir.input.mkdir()
     try:
-        os.rename(drop.path, dropped_in(place))
+        os.rename(entry.path, input_path(job_dir))
     except FileNotFoundError:
-        shutil.rmtree(place.path)
+        shutil.rmtree(job_dir.path)
         raise
-    settle_claim(spool, claim)
-    status.moved_to(claim.job)
-    error = Cancelled("cancelled before it was started", hint=f"`bodycap retry {claim.job.name}` starts it")
-    target = move(
+    move_to_running(spool, claim)
+    status.set_job_dir(claim.job)
+    error = Cancelled("cancelled before it started", hint=f"`bodycap retry {claim.job.name}` starts it")
+    target = move_to_free_name(
         claim.job.path,
         spool.failed,
         claim.job.name,
         lambda path: status.finish("cancelled", error, path, spool.inbox),
     )
-    clear_claim(JobDir(target))
+    remove_claim_files(JobDir(target))
     return JobDir(target)
 
 
-def _waiting(drop: Drop) -> JobRow:
+def _waiting_row(entry: InboxEntry) -> JobRow:
+    """Return the row of an entry of the inbox."""
     try:
-        waits_for = look_at(drop, _MANY_FILES).waits_for
-        changed = drop.path.stat().st_mtime
+        waits_for = take_snapshot(entry, _MAX_SNAPSHOT_FILES).incomplete_reason
+        changed = entry.path.stat().st_mtime
     except OSError as error:
-        return JobRow(name=drop.name, state="waiting", cause=str(error), path=str(drop.path))
+        return JobRow(name=entry.name, state="waiting", cause=str(error), path=str(entry.path))
     return JobRow(
-        name=drop.name,
+        name=entry.name,
         state="waiting",
-        since=time_text(changed),
-        age_s=_age(time_text(changed)),
+        since=utc_text(changed),
+        age_s=_age_s(utc_text(changed)),
         cause=waits_for,
-        path=str(drop.path),
+        path=str(entry.path),
     )
 
 
-def claimed_row(job: JobDir) -> JobRow:
-    """A job that has been claimed, as its files tell it."""
+def job_row(job: JobDir) -> JobRow:
+    """Return the row of a claimed job, read from its files."""
     status = read_status(job)
     state = str(status.get("state", "claimed"))
-    if state == "running" and _is_alone(job):
+    if state == "running" and _is_watcher_gone(job):
         state = "interrupted"
     error = status.get("error") or {}
-    began = (
+    since = (
         status.get("finished_at") if state in FINAL else status.get("started_at") or status.get("claimed_at")
     )
     running = state == "running"
     cause = str(error.get("message", ""))
-    if state == "stopped" and cause:  # a disk that is away, a cleaner at work
+    if state == "stopped" and cause:  # a missing disk, or a running `bodycap gc`
         where = error.get("path")
-        cause = f"goes on later: {f'{where}: ' if where else ''}{cause}"
+        cause = f"continues later: {f'{where}: ' if where else ''}{cause}"
     if state == "interrupted":
-        cause = "its watcher is gone; it goes on when one starts"
+        cause = "its watcher is gone; the job continues when a watcher starts"
     return JobRow(
         name=job.name,
         state=state,
         stage=f"{status.get('stage', '')} {status.get('camera', '')}".strip() if state != "done" else "",
         progress=status.get("progress") if running else None,
-        since=str(began or ""),
-        age_s=_age(began),
+        since=str(since or ""),
+        age_s=_age_s(since),
         cause=cause,
         hint=str(error.get("hint") or ""),
         path=str(job.path),
     )
 
 
-def _is_alone(job: JobDir) -> bool:
+def _is_watcher_gone(job: JobDir) -> bool:
+    """Return True if the job's watcher released it, or was a process of this machine that has ended."""
     owner = read_owner(job.owner)
-    here = bool(host_key()) and owner.get("machine") == host_key()
+    is_local = bool(machine_id()) and owner.get("machine") == machine_id()
     return bool(owner.get("released")) or (
-        here and start_of(int(owner.get("pid", 0))) != owner.get("process")
+        is_local and process_start(int(owner.get("pid", 0))) != owner.get("process")
     )
 
 
-def _age(moment: object) -> float | None:
+def _age_s(moment: object) -> float | None:
+    """Return the seconds since a moment given as text; None if the text is not a time."""
     try:
         return round(time.time() - datetime.fromisoformat(str(moment)).timestamp(), 1)
     except ValueError:
         return None
 
 
-def _same(one: str, other: str) -> bool:
+def _is_same_name(one: str, other: str) -> bool:
+    """Compare two names regardless of their Unicode normal form."""
     return unicodedata.normalize("NFC", one) == unicodedata.normalize("NFC", other)
 
 
-def _no_such(spool: Spool, name: str, why: str, names: list[str]) -> JobError:
+def _unknown_job(spool: Spool, name: str, why: str, names: list[str]) -> JobError:
+    """Return the error for a job that does not exist or has the wrong state."""
     import difflib
 
     known = spool.find(name)

@@ -1,4 +1,4 @@
-"""Watch a folder: claim what is complete, work on it, take over what was left behind."""
+"""Watch a folder: claim complete jobs, run them, and take over abandoned ones."""
 
 from __future__ import annotations
 
@@ -10,245 +10,269 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from bodycap_batch.core.errors import BodycapError, StoreError
-from bodycap_batch.watch.changes import Changes
-from bodycap_batch.watch.claim import Claim, Onlooker, take_over
-from bodycap_batch.watch.claiming import claim_drop, discard_empty, finish_retries, settle_claim
-from bodycap_batch.watch.drops import NO_JOB, Drop, Look, Settling, drops_in, strays_in
-from bodycap_batch.watch.options import WatchOptions
-from bodycap_batch.watch.presence import Presence
-from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir, Spool, visible
-from bodycap_batch.watch.trouble import Trouble
-from bodycap_batch.watch.work import Outcome, Worker
+from bodycap_batch.watch.access_failures import AccessFailures
+from bodycap_batch.watch.change_notifier import ChangeNotifier
+from bodycap_batch.watch.claim import Claim, HeartbeatMonitor, take_over_job
+from bodycap_batch.watch.inbox_entries import (
+    NOT_A_JOB,
+    CompletionTracker,
+    EntrySnapshot,
+    InboxEntry,
+    entries_in,
+    ignored_paths_in,
+)
+from bodycap_batch.watch.inbox_transfer import (
+    claim_entry,
+    finish_interrupted_retries,
+    move_to_running,
+    remove_empty_claim,
+)
+from bodycap_batch.watch.job_worker import JobOutcome, JobWorker
+from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir, Spool, visible_entries
+from bodycap_batch.watch.watch_options import WatchOptions
+from bodycap_batch.watch.watcher_status import WatcherStatusFile
 
-Teller = Callable[[str], None]
-_LOOK_S = 1.0
-_IDLE_LOOK_S = 5.0
-"""A look at the folder although nobody told a change, with and without something being copied."""
-_LOOK_SHARE = 20.0
-"""A thousand large folders on a slow disk take seconds to look at: then one look in twenty times that."""
-_ORPHANS_S = 2.0
+MessageSink = Callable[[str], None]
+_BUSY_POLL_S = 1.0
+"""Seconds between two scans of the inbox while something is running or being copied. Evidence: none."""
+_IDLE_POLL_S = 5.0
+"""Seconds between two scans without such activity, in case a change was not reported. Evidence: none."""
+_SCAN_PAUSE_FACTOR = 20.0
+"""Least time between two scans as a multiple of a scan's duration, so that scans take at most 5 % of the
+time. A scan of a thousand large folders on a slow disk takes seconds."""
+_TAKEOVER_PERIOD_S = 2.0
+"""Seconds between two searches for abandoned jobs. Evidence: none."""
 
 
 class Watcher:
-    """One process that works on a spool; others may work on the same one.
+    """One process that runs the jobs of a spool. Several processes may work on the same spool.
 
     Args:
         spool: The folders.
         options: How they are watched.
-        tell: Called with a line for the operator.
+        write_line: Called with a line for the operator.
 
     Attributes:
         spool: The folders.
-        trouble: What keeps it from them, while something does.
+        access_failures: Why the folders cannot be accessed, if so.
 
     Raises:
-        StoreError: The folders cannot be written, or do not lie on one file system.
+        StoreError: The folders cannot be written, or are not on one file system.
     """
 
-    def __init__(self, spool: Spool, options: WatchOptions, tell: Teller) -> None:
+    def __init__(self, spool: Spool, options: WatchOptions, write_line: MessageSink) -> None:
         spool.make()
-        self.trouble = Trouble(spool, tell)
+        self.access_failures = AccessFailures(spool, write_line)
         self.spool = spool
         self._options = options
-        self._tell = tell
+        self._write_line = write_line
         self._stop = threading.Event()
         self._woken = threading.Event()
-        self._settling = Settling(options.settle_s, int(options.terms.limits.files))
-        self._onlooker = Onlooker(options.stale_s)
-        self._worker = Worker(spool, options, self._stop)
-        self._running: dict[Future[Outcome], Claim] = {}
-        self._refused: dict[str, tuple[str, float]] = {}
+        self._tracker = CompletionTracker(options.unchanged_s, int(options.permissions.limits.files))
+        self._heartbeat_monitor = HeartbeatMonitor(options.stale_s)
+        self._worker = JobWorker(spool, options, self._stop)
+        self._running: dict[Future[JobOutcome], Claim] = {}
+        self._unmovable: dict[str, tuple[str, float]] = {}
         self._unreadable: dict[Path, str] = {}
-        self._complete: collections.deque[tuple[Drop, Look]] = collections.deque()
-        self._retry_told = False
-        self._held_up: dict[str, str] = {}
-        self._waiting = False
-        self._left = False
-        self._look_at = 0.0
-        self._orphans_at = 0.0
-        self._worst = 0
+        self._complete: collections.deque[tuple[InboxEntry, EntrySnapshot]] = collections.deque()
+        self._retry_failure_reported = False
+        self._last_reports: dict[str, str] = {}
+        self._has_waiting = False
+        self._has_left_jobs = False
+        self._next_scan_at = 0.0
+        self._next_takeover_at = 0.0
+        self._worst_exit_code = 0
 
     def stop(self) -> None:
-        """End: running jobs stop and are left for the next start. May be called from anywhere."""
+        """End the watcher; may be called from any thread. Running jobs stop and continue at the next start."""
         self._stop.set()
         self._woken.set()
 
     def run(self) -> int:
         """Watch until stopped, or with `once` until nothing is left to do.
 
-        A disk that goes away is waited for, with growing pauses; with `once` no longer than a job of another
-        watcher is.
+        The watcher waits for a missing disk with growing pauses. With `once` it waits no longer than for a
+        job of another watcher.
 
         Returns:
             The worst exit code of the jobs that ended.
         """
-        heart = threading.Thread(target=self._beat, name="heartbeat")
+        heartbeat = threading.Thread(target=self._write_heartbeats, name="heartbeat")
         with (
-            Changes(self.spool.inbox, self._woken, poll=self._options.poll),
+            ChangeNotifier(self.spool.inbox, self._woken, poll=self._options.poll),
             ThreadPoolExecutor(max_workers=self._options.jobs, thread_name_prefix="job") as pool,
         ):
-            heart.start()
+            heartbeat.start()
             try:
                 while not self._stop.is_set():
                     self._collect()
                     if (pause_s := self._step(pool)) is None:
                         break
                     self._woken.wait(pause_s)
-                    self._woken.clear()  # and only then look whether to stop: `stop` says so before it wakes
+                    self._woken.clear()  # before the test of `_stop`, because `stop` sets `_stop` first
             finally:
                 self._stop.set()
-                heart.join()
+                heartbeat.join()
         self._collect()
-        return self._worst
+        return self._worst_exit_code
 
     def _step(self, pool: ThreadPoolExecutor) -> float | None:
-        """Start what can be started; seconds until the next look, None where none is wanted."""
+        """Start the jobs that can start. Return the seconds until the next scan, or None to end."""
         try:
-            over = not self._fill(pool) and self._options.once
-            if over:
-                self._tell_what_is_left()
+            is_finished = not self._fill(pool) and self._options.once
+            if is_finished:
+                self._report_left_entries()
         except (OSError, StoreError) as error:
-            pause_s = self.trouble.met(error)
-            if not self._options.once or self.trouble.lasted_s < self._options.stale_s:
+            pause_s = self.access_failures.record(error)
+            if not self._options.once or self.access_failures.duration_s < self._options.stale_s:
                 return pause_s
-            self._worst = max(self._worst, StoreError.exit_code)
+            self._worst_exit_code = max(self._worst_exit_code, StoreError.exit_code)
             return None
-        self.trouble.over()
-        if over:
+        self.access_failures.clear()
+        if is_finished:
             return None
-        return _LOOK_S if self._settling.waiting or self._running or self._left else _IDLE_LOOK_S
+        return (
+            _BUSY_POLL_S
+            if self._tracker.is_tracking or self._running or self._has_left_jobs
+            else _IDLE_POLL_S
+        )
 
     def _finish_retries(self) -> None:
         try:
-            finish_retries(self.spool)
+            finish_interrupted_retries(self.spool)
         except (OSError, StoreError) as error:
-            if not self._retry_told:
-                self._tell(f"a retry that was cut short is still in {self.spool.failed}: {error}")
-            self._retry_told = True
+            if not self._retry_failure_reported:
+                self._write_line(f"an interrupted retry is still in {self.spool.failed}: {error}")
+            self._retry_failure_reported = True
 
-    def _tell_what_is_left(self) -> None:
-        """Say why something stays in the inbox although nothing is left to do."""
-        for path, reason in self._settling.held.items():
-            self._tell(f"{path.name}: left in the inbox: {reason}")
-        for path in strays_in(self.spool.inbox):
-            self._tell(f"{path.name}: left in the inbox: {NO_JOB}")
+    def _report_left_entries(self) -> None:
+        """Report why paths stay in the inbox although nothing is left to do."""
+        for path, reason in self._tracker.incomplete.items():
+            self._write_line(f"{path.name}: left in the inbox: {reason}")
+        for path in ignored_paths_in(self.spool.inbox):
+            self._write_line(f"{path.name}: left in the inbox: {NOT_A_JOB}")
 
-    def _beat(self) -> None:
-        presence = Presence(self.spool)
-        presence.tell(self.trouble.text)
-        while not self._stop.wait(self._options.beat_s):
-            presence.tell(self.trouble.text)
+    def _write_heartbeats(self) -> None:
+        status_file = WatcherStatusFile(self.spool)
+        status_file.write(self.access_failures.text)
+        while not self._stop.wait(self._options.heartbeat_period_s):
+            status_file.write(self.access_failures.text)
             for claim in list(self._running.values()):
-                claim.beat()
-        presence.end()
+                claim.write_heartbeat()
+        status_file.remove()
 
     def _collect(self) -> None:
-        """Tell how the jobs ended that have."""
+        """Report the jobs that have ended."""
         for future in [future for future in self._running if future.done()]:
             del self._running[future]
             outcome = future.result()
-            self._left |= outcome.state == "stopped"
+            self._has_left_jobs |= outcome.state == "stopped"
             if outcome.state not in ("lost", "stopped"):
-                self._worst = max(self._worst, outcome.exit_code)
-            self._tell_end(outcome)
+                self._worst_exit_code = max(self._worst_exit_code, outcome.exit_code)
+            self._report_end(outcome)
 
-    def _tell_end(self, outcome: Outcome) -> None:
-        """Say how a job ended; what holds it up time and again only once."""
-        where = f" -> {outcome.place}" if outcome.place is not None else ""
+    def _report_end(self, outcome: JobOutcome) -> None:
+        """Report how a job ended. A repeated reason to postpone it is reported once."""
+        where = f" -> {outcome.path}" if outcome.path is not None else ""
         line = f"{outcome.name}: {outcome.state}{where}" + (f": {outcome.message}" if outcome.message else "")
-        if line != self._held_up.pop(outcome.name, ""):
-            self._tell(line)
+        if line != self._last_reports.pop(outcome.name, ""):
+            self._write_line(line)
         if outcome.state in ("stopped", "stuck"):
-            self._held_up[outcome.name] = line
+            self._last_reports[outcome.name] = line
 
     def _fill(self, pool: ThreadPoolExecutor) -> bool:
-        """Start jobs while there is room; False where nothing runs and nothing is to come."""
+        """Start jobs while there is room. Return False if nothing runs and nothing is expected."""
         free = self._options.jobs - len(self._running)
-        for claim in self._orphans(free):
+        for claim in self._take_over_abandoned(free):
             self._start(pool, claim, None)
             free -= 1
-        self._look()
+        self._scan_inbox()
         while free > 0 and self._complete:
-            if (claimed := self._claim(*self._complete.popleft())) is not None:
+            if (claimed := self._try_claim(*self._complete.popleft())) is not None:
                 self._start(pool, *claimed)
                 free -= 1
-        return bool(self._running or self._complete or self._waiting or self._left)
+        return bool(self._running or self._complete or self._has_waiting or self._has_left_jobs)
 
-    def _look(self) -> None:
-        """See what lies in the inbox; not so often that looking is all there is time for."""
+    def _scan_inbox(self) -> None:
+        """Scan the inbox, unless the last scan was too recent for its duration."""
         started = time.monotonic()
-        if started < self._look_at:
+        if started < self._next_scan_at:
             return
         if not self.spool.inbox.is_dir():
             raise StoreError(
-                "the inbox is gone", path=self.spool.inbox, hint="mount its disk, or make it again"
+                "the inbox is gone", path=self.spool.inbox, hint="mount its disk, or create it again"
             )
-        drops = drops_in(self.spool.inbox)
-        self._complete = collections.deque(self._settling.complete(drops))
-        names = {str(drop.path) for drop in drops}
-        self._refused = {name: told for name, told in self._refused.items() if name in names}
-        self._waiting = bool(names - self._refused.keys() - set(map(str, self._settling.held)))
-        self._tell_unreadable()
+        entries = entries_in(self.spool.inbox)
+        self._complete = collections.deque(self._tracker.complete_entries(entries))
+        names = {str(entry.path) for entry in entries}
+        self._unmovable = {name: value for name, value in self._unmovable.items() if name in names}
+        self._has_waiting = bool(names - self._unmovable.keys() - set(map(str, self._tracker.incomplete)))
+        self._report_unreadable()
         now = time.monotonic()
-        self._look_at = now + _LOOK_SHARE * (now - started)
+        self._next_scan_at = now + _SCAN_PAUSE_FACTOR * (now - started)
 
-    def _tell_unreadable(self) -> None:
-        """Say once what cannot even be looked at."""
-        found = self._settling.unreadable
+    def _report_unreadable(self) -> None:
+        """Report each entry that cannot be read, once."""
+        found = self._tracker.unreadable
         for path in found.keys() - self._unreadable.keys():
-            self._worst = max(self._worst, StoreError.exit_code)
-            self._tell(f"{path.name}: cannot be looked at: {found[path]}")
+            self._worst_exit_code = max(self._worst_exit_code, StoreError.exit_code)
+            self._write_line(f"{path.name}: cannot be read: {found[path]}")
         self._unreadable = found
 
-    def _start(self, pool: ThreadPoolExecutor, claim: Claim, refused: BodycapError | None) -> None:
-        if refused is None and claim.job.name not in self._held_up:
-            self._tell(f"{claim.job.name}: started")
-        future = pool.submit(self._worker.work, claim, refused)
+    def _start(self, pool: ThreadPoolExecutor, claim: Claim, read_error: BodycapError | None) -> None:
+        if read_error is None and claim.job.name not in self._last_reports:
+            self._write_line(f"{claim.job.name}: started")
+        future = pool.submit(self._worker.process, claim, read_error)
         self._running[future] = claim
         future.add_done_callback(lambda _: self._woken.set())
 
-    def _claim(self, drop: Drop, look: Look) -> tuple[Claim, BodycapError | None] | None:
-        """Claim a drop; one that cannot be moved is told once, and tried again later or when it changes."""
-        digest, until = self._refused.get(str(drop.path), ("", 0.0))
-        if digest == look.digest and time.monotonic() < until:
+    def _try_claim(
+        self, entry: InboxEntry, snapshot: EntrySnapshot
+    ) -> tuple[Claim, BodycapError | None] | None:
+        """Claim an entry. If it cannot be moved, report that once and retry later or when it changes."""
+        digest, until = self._unmovable.get(str(entry.path), ("", 0.0))
+        if digest == snapshot.digest and time.monotonic() < until:
             return None
         try:
-            return claim_drop(self.spool, drop, look, self._options.terms)
+            return claim_entry(self.spool, entry, snapshot, self._options.permissions)
         except StoreError as error:
-            self._refused[str(drop.path)] = (look.digest, time.monotonic() + self._options.stale_s)
-            self._worst = max(self._worst, error.exit_code)
-            if digest != look.digest:
-                self._tell(f"{drop.name}: cannot be taken out of the inbox: {error}")
+            self._unmovable[str(entry.path)] = (snapshot.digest, time.monotonic() + self._options.stale_s)
+            self._worst_exit_code = max(self._worst_exit_code, error.exit_code)
+            if digest != snapshot.digest:
+                self._write_line(f"{entry.name}: cannot be moved out of the inbox: {error}")
             return None
 
-    def _orphans(self, most: int) -> list[Claim]:
-        """Take over jobs whose watcher is gone."""
+    def _take_over_abandoned(self, max_jobs: int) -> list[Claim]:
+        """Take over up to `max_jobs` jobs whose watcher is gone."""
         now = time.monotonic()
-        if most <= 0 or now < self._orphans_at:
+        if max_jobs <= 0 or now < self._next_takeover_at:
             return []
-        mine = {claim.job.path for claim in self._running.values()}
-        half_claimed = [JobDir(path) for path in sorted(self.spool.running.glob(f"{CLAIM_PREFIX}*"))]
-        jobs = [*half_claimed, *(JobDir(path) for path in visible(self.spool.running) if path.is_dir())]
+        own_jobs = {claim.job.path for claim in self._running.values()}
+        unfinished_claims = [JobDir(path) for path in sorted(self.spool.running.glob(f"{CLAIM_PREFIX}*"))]
+        jobs = [
+            *unfinished_claims,
+            *(JobDir(path) for path in visible_entries(self.spool.running) if path.is_dir()),
+        ]
         self._finish_retries()
-        self._orphans_at = now + _ORPHANS_S
+        self._next_takeover_at = now + _TAKEOVER_PERIOD_S
         found: list[Claim] = []
-        for job in self._onlooker.abandoned([job for job in jobs if job.path not in mine]):
-            if len(found) < most and (claim := self._adopt(job)) is not None:
+        for job in self._heartbeat_monitor.find_abandoned([job for job in jobs if job.path not in own_jobs]):
+            if len(found) < max_jobs and (claim := self._take_over(job)) is not None:
                 found.append(claim)
-        self._left = bool(found)  # there may be more of them than there was room for
+        self._has_left_jobs = bool(found)  # there may be more of them than free slots
         return found
 
-    def _adopt(self, job: JobDir) -> Claim | None:
-        """Take a job over; one that the disk does not let go of is tried again when it is stale anew."""
+    def _take_over(self, job: JobDir) -> Claim | None:
+        """Take a job over. If the disk fails, the next attempt follows when the claim is stale again."""
         try:
-            claim = take_over(job)
+            claim = take_over_job(job)
             if claim is None or not job.path.name.startswith(CLAIM_PREFIX):
                 return claim
-            if discard_empty(job):  # its watcher ended before it had claimed anything
+            if remove_empty_claim(job):  # its watcher ended before it moved the entry
                 return None
-            settle_claim(self.spool, claim)
+            move_to_running(self.spool, claim)
         except (StoreError, OSError) as error:
-            self._worst = max(self._worst, StoreError.exit_code)
-            self._tell(f"{job.name}: cannot be taken over: {error}")
+            self._worst_exit_code = max(self._worst_exit_code, StoreError.exit_code)
+            self._write_line(f"{job.name}: cannot be taken over: {error}")
             return None
         return claim

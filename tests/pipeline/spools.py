@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.watch import Spool, Terms, Watcher, WatchOptions
+from bodycap_batch.watch import JobPermissions, Spool, Watcher, WatchOptions
 from bodycap_batch.watch.spool import JobDir
 from tests.pipeline.fake_stages import ORDERS
 
@@ -52,9 +52,9 @@ class SpoolBench:
         return capture.rename(self.spool.inbox / name)
 
     def options(self, **changes: Any) -> WatchOptions:
-        terms = Terms(**{key: changes.pop(key) for key in ("roots", "limits") if key in changes})
+        terms = JobPermissions(**{key: changes.pop(key) for key in ("roots", "limits") if key in changes})
         usual: dict[str, Any] = {"settle_s": 0.0, "once": True, "threads": 1, "command": CHILD}
-        return WatchOptions(terms=terms, **{**usual, **changes})
+        return WatchOptions(permissions=terms, **{**usual, **changes})
 
     def watcher(self, **changes: Any) -> Watcher:
         return Watcher(self.spool, self.options(**changes), self.told.append)

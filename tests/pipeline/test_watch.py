@@ -21,12 +21,12 @@ from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.store.artefacts import Store
 from bodycap_batch.store.references import collect_garbage
-from bodycap_batch.watch import Terms, cancel_job, claiming, retry_job, rows_of
-from bodycap_batch.watch.claim import Claim, first_claim, take_over
-from bodycap_batch.watch.commands import claimed_row
-from bodycap_batch.watch.drops import Drop, Look, look_at
+from bodycap_batch.watch import JobPermissions, cancel_job, inbox_transfer, job_rows, retry_job
+from bodycap_batch.watch.claim import Claim, create_claim, take_over_job
+from bodycap_batch.watch.commands import job_row
+from bodycap_batch.watch.inbox_entries import EntrySnapshot, InboxEntry, take_snapshot
+from bodycap_batch.watch.job_status import JobStatusFile
 from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir
-from bodycap_batch.watch.status import StatusFile
 from tests.pipeline.spools import SpoolBench, wait_for
 from tests.pipeline.test_cli import gone
 
@@ -226,7 +226,7 @@ def test_a_job_waits_while_the_store_is_cleaned(bench: SpoolBench) -> None:
             thread.start()
             wait_for(lambda: any("goes on later" in line for line in bench.told))
             cause = f"goes on later: {bench.spool.root / '.store'}: the store is being cleaned"
-            wait_for(lambda: claimed_row(bench.job("walk")).cause == cause)
+            wait_for(lambda: job_row(bench.job("walk")).cause == cause)
         wait_for((bench.spool.done / "walk").is_dir)
     finally:
         watcher.stop()
@@ -258,7 +258,7 @@ def test_a_watcher_that_works_off_what_is_there_leaves_no_job_behind(bench: Spoo
     bench.work_off()
     for name in ("one", "two"):
         place = JobDir(Path(shutil.move(bench.job(name).path, bench.spool.running / name)))
-        first_claim(place).release()
+        create_claim(place).release()
     bench.drop("walk")
     with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
         fcntl.flock(cleaning, fcntl.LOCK_EX)
@@ -322,15 +322,17 @@ def test_footage_is_given_back_where_it_cannot_be_looked_at_any_more(
 ) -> None:
     before = {path.name: path.read_bytes() for path in bench.drop("walk").iterdir()}
 
-    def fail(*_: object) -> Look:  # a copying program renames a file just now, a network disk hiccups
+    def fail(
+        *_: object,
+    ) -> EntrySnapshot:  # a copying program renames a file just now, a network disk hiccups
         raise FileNotFoundError(errno.ENOENT, "gone", "head.mp4")
 
-    terms = Terms()
-    drop = Drop(bench.spool.inbox / "walk")
-    look = look_at(drop, 100)
-    monkeypatch.setattr(claiming, "look_at", fail)
+    terms = JobPermissions()
+    drop = InboxEntry(bench.spool.inbox / "walk")
+    look = take_snapshot(drop, 100)
+    monkeypatch.setattr(inbox_transfer, "take_snapshot", fail)
     with pytest.raises(StoreError):
-        claiming.claim_drop(bench.spool, drop, look, terms)
+        inbox_transfer.claim_entry(bench.spool, drop, look, terms)
     assert {path.name: path.read_bytes() for path in drop.path.iterdir()} == before
     assert leftovers(bench) == []
 
@@ -339,10 +341,10 @@ def test_an_abandoned_claim_is_removed_only_while_nothing_is_in_it(bench: SpoolB
     for name, dropped in (("empty", False), ("full", True)):
         place = JobDir(bench.spool.running / f"{CLAIM_PREFIX}{name}")
         place.path.mkdir()
-        first_claim(place).release()
+        create_claim(place).release()
         if dropped:
             bench.drop("walk").rename(place.input)
-            StatusFile(place).change(dropped="walk")
+            JobStatusFile(place).update(dropped="walk")
     assert bench.work_off() == JobError.exit_code
     assert bench.status("walk")["error"]["message"] == "the job was never read"
     assert (bench.job("walk").input / "torso.mp4").is_file()
@@ -352,13 +354,13 @@ def test_an_abandoned_claim_is_removed_only_while_nothing_is_in_it(bench: SpoolB
 def test_a_job_that_cannot_be_taken_over_stops_no_watcher(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first_claim(JobDir(bench.drop("left").rename(bench.spool.running / "left"))).release()
+    create_claim(JobDir(bench.drop("left").rename(bench.spool.running / "left"))).release()
     bench.drop("walk")
 
     def fail(*_: object) -> Claim:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("bodycap_batch.watch.watcher.take_over", fail)
+    monkeypatch.setattr("bodycap_batch.watch.watcher.take_over_job", fail)
     assert bench.work_off() == StoreError.exit_code
     assert bench.status("walk")["state"] == "done"
     assert any(line.startswith("left: cannot be taken over") for line in bench.told)
@@ -369,7 +371,7 @@ def test_what_is_no_job_stays_in_the_inbox_and_is_told(bench: SpoolBench) -> Non
     (bench.spool.inbox / ".hidden").mkdir()
     (bench.spool.inbox / "copying.part").mkdir()
     assert bench.work_off() == 0
-    states = {row.name: row.state for row in rows_of(bench.spool)}
+    states = {row.name: row.state for row in job_rows(bench.spool)}
     assert states == {"torso.mp4": "ignored", "copying.part": "ignored"}
 
 
@@ -420,7 +422,7 @@ def test_a_copy_in_progress_is_left_alone_until_it_is_complete(bench: SpoolBench
     thread = threading.Thread(target=watcher.run)
     thread.start()
     try:
-        wait_for(lambda: rows_of(bench.spool)[0].cause == "head.mp4.part is being copied")
+        wait_for(lambda: job_rows(bench.spool)[0].cause == "head.mp4.part is being copied")
         time.sleep(0.3)
         assert dropped.is_dir()
         (dropped / "head.mp4.part").rename(dropped / "head.mp4")
@@ -467,7 +469,7 @@ def test_a_killed_watcher_is_replaced_at_once_on_the_same_machine(bench: SpoolBe
     bench.hanging()
     process.kill()
     process.wait()
-    (row,) = rows_of(bench.spool)
+    (row,) = job_rows(bench.spool)
     assert row.state == "interrupted"
     bench.order()
     assert bench.work_off(stale_s=1000.0) == 0
@@ -567,27 +569,27 @@ def test_a_watcher_that_was_suspended_gives_up_when_it_wakes(bench: SpoolBench) 
 
 def test_an_owner_that_was_replaced_writes_nothing_more(bench: SpoolBench) -> None:
     job = JobDir(bench.drop("walk").rename(bench.spool.running / "walk"))
-    first = first_claim(job)
-    status = StatusFile(job, None, first.guard.holds)
-    status.change(state="running")
+    first = create_claim(job)
+    status = JobStatusFile(job, None, first.ownership.is_held)
+    status.update(state="running")
     status(Event(kind="started", stage="map"))
     before = {path: path.read_bytes() for path in job.path.rglob("*") if path.is_file() and path != job.owner}
-    assert take_over(job) is not None
+    assert take_over_job(job) is not None
     status(Event(kind="finished", stage="map"))
-    status.change(state="done")
+    status.update(state="done")
     status.finish("done", None, bench.spool.done / "walk", bench.spool.inbox)
     assert {path: path.read_bytes() for path in before} == before
 
 
 def test_only_one_takes_a_job_over(bench: SpoolBench) -> None:
     job = JobDir(bench.drop("walk").rename(bench.spool.running / "walk"))
-    first = first_claim(job)
+    first = create_claim(job)
     claims: list[object] = []
     barrier = threading.Barrier(8)
 
     def contend() -> None:
         barrier.wait()
-        claims.append(take_over(job))
+        claims.append(take_over_job(job))
 
     threads = [threading.Thread(target=contend) for _ in range(8)]
     for thread in threads:
@@ -596,9 +598,9 @@ def test_only_one_takes_a_job_over(bench: SpoolBench) -> None:
         thread.join()
     held = [claim for claim in claims if claim is not None]
     # Each that came too late for a number may still get the next one; the last of them alone holds the job.
-    assert sum(claim.guard.holds() for claim in held) == 1  # type: ignore[attr-defined]
-    assert not first.guard.holds()
-    first.beat()
+    assert sum(claim.ownership.is_held() for claim in held) == 1  # type: ignore[attr-defined]
+    assert not first.ownership.is_held()
+    first.write_heartbeat()
     assert first.lost.is_set()
 
 
@@ -610,7 +612,7 @@ def test_a_watcher_that_ends_between_the_last_word_and_the_move_is_finished_by_t
     job = bench.job("walk")
     metrics = (job.result / "metrics.json").stat().st_mtime_ns
     place = JobDir(Path(shutil.move(job.path, bench.spool.running / "walk")))
-    first_claim(place).release()
+    create_claim(place).release()
     assert bench.work_off() == 0
     assert (bench.job("walk").result / "metrics.json").stat().st_mtime_ns == metrics
     assert bench.job("walk").path.parent == bench.spool.done

@@ -19,12 +19,12 @@ from bodycap_batch.cli import main
 from bodycap_batch.core.errors import DiskAway, StoreError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.store.artefacts import Store
-from bodycap_batch.watch import Watcher, claiming, rows_of, watchers_of
-from bodycap_batch.watch.presence import Presence
+from bodycap_batch.watch import Watcher, active_watchers, inbox_transfer, job_rows
+from bodycap_batch.watch.access_failures import AccessFailures
+from bodycap_batch.watch.job_status import JobStatusFile, read_status
+from bodycap_batch.watch.job_worker import JobWorker
 from bodycap_batch.watch.spool import JobDir
-from bodycap_batch.watch.status import StatusFile, read_status
-from bodycap_batch.watch.trouble import Trouble
-from bodycap_batch.watch.work import Worker
+from bodycap_batch.watch.watcher_status import WatcherStatusFile
 from tests.pipeline.spools import SpoolBench, wait_for
 
 
@@ -53,11 +53,11 @@ def failing(times: int, function: Callable[..., Any], number: int = errno.EIO) -
     return fail
 
 
-@pytest.mark.parametrize("name", ["drops_in", "visible", "strays_in"])
+@pytest.mark.parametrize("name", ["entries_in", "visible_entries", "ignored_paths_in"])
 def test_a_folder_that_cannot_be_read_for_a_while_is_waited_for(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    """`visible` lists what is running, `drops_in` what is in the inbox, `strays_in` what stays there."""
+    """`visible_entries` lists the running jobs, `entries_in` and `ignored_paths_in` list the inbox."""
     from bodycap_batch.watch import watcher as module
 
     bench.drop("walk")
@@ -74,12 +74,12 @@ def test_an_inbox_that_vanishes_is_waited_for_and_not_made_anew(bench: SpoolBenc
     away = bench.folder / "unmounted"
     with running(bench.watcher(once=False)) as watcher:
         bench.spool.inbox.rename(away)
-        wait_for(lambda: "the inbox is gone" in watcher.trouble.text)
+        wait_for(lambda: "the inbox is gone" in watcher.access_failures.text)
         assert not bench.spool.inbox.exists()
         away.rename(bench.spool.inbox)
         bench.drop("walk")
         wait_for((bench.spool.done / "walk").is_dir)
-    assert watcher.trouble.text == ""
+    assert watcher.access_failures.text == ""
     assert sum("the inbox is gone" in line for line in bench.told) == 1
 
 
@@ -92,23 +92,23 @@ def test_a_watcher_that_is_to_leave_does_not_wait_for_ever(bench: SpoolBench) ->
 
 def test_pauses_grow_and_each_cause_is_told_once(bench: SpoolBench) -> None:
     now = [0.0]
-    trouble = Trouble(bench.spool, bench.told.append, lambda: now[0])
-    pauses = [trouble.met(OSError(errno.EIO, "x", "a")) for _ in range(9)]
+    trouble = AccessFailures(bench.spool, bench.told.append, lambda: now[0])
+    pauses = [trouble.record(OSError(errno.EIO, "x", "a")) for _ in range(9)]
     assert pauses == [1, 2, 4, 8, 16, 32, 60, 60, 60]
-    trouble.met(OSError(errno.EACCES, "x", "a"))
+    trouble.record(OSError(errno.EACCES, "x", "a"))
     now[0] = 90.0
     trouble.over()
     trouble.over()
     assert len(bench.told) == 3
     assert "after 90 s" in bench.told[-1]
-    assert trouble.met(OSError(errno.EIO, "x", "a")) == 1
+    assert trouble.record(OSError(errno.EIO, "x", "a")) == 1
 
 
 def test_trouble_that_ends_while_it_is_asked_for_stops_no_heartbeat(bench: SpoolBench) -> None:
-    trouble = Trouble(bench.spool, bench.told.append)
-    trouble.met(OSError(errno.EIO, "x", "a"))
+    trouble = AccessFailures(bench.spool, bench.told.append)
+    trouble.record(OSError(errno.EIO, "x", "a"))
 
-    class Over(Trouble):
+    class Over(AccessFailures):
         """The disk answers again as soon as somebody has looked."""
 
         @property
@@ -145,26 +145,30 @@ def test_a_full_disk_while_the_store_is_cleaned_stops_no_watcher(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To clean up is what one does about a full disk; just then a job has only to be filed away."""
-    claim = claiming.first_claim(JobDir(bench.drop("walk").rename(bench.spool.running / "walk")))
-    StatusFile(claim.job).change(state="done")
-    worker = Worker(bench.spool, bench.options(), threading.Event())
-    monkeypatch.setattr(claiming.Claim, "release", failing(1, claiming.Claim.release, errno.ENOSPC))
+    claim = inbox_transfer.create_claim(JobDir(bench.drop("walk").rename(bench.spool.running / "walk")))
+    JobStatusFile(claim.job).update(state="done")
+    worker = JobWorker(bench.spool, bench.options(), threading.Event())
+    monkeypatch.setattr(
+        inbox_transfer.Claim, "release", failing(1, inbox_transfer.Claim.release, errno.ENOSPC)
+    )
     with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
         fcntl.flock(cleaning, fcntl.LOCK_EX)
-        outcome = worker.work(claim)
+        outcome = worker.process(claim)
     assert (outcome.state, outcome.exit_code) == ("stuck", StoreError.exit_code)
-    assert worker.work(claim).place == bench.spool.done / "walk"
+    assert worker.process(claim).path == bench.spool.done / "walk"
 
 
 def test_a_job_that_ends_while_the_store_is_cleaned_holds_nobody_up(bench: SpoolBench) -> None:
     (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
-    drop = claiming.Drop(bench.spool.inbox / "walk.yaml")
-    claimed = claiming.claim_drop(bench.spool, drop, claiming.look_at(drop, 100), bench.options().terms)
+    drop = inbox_transfer.InboxEntry(bench.spool.inbox / "walk.yaml")
+    claimed = inbox_transfer.claim_entry(
+        bench.spool, drop, inbox_transfer.take_snapshot(drop, 100), bench.options().permissions
+    )
     assert claimed is not None
-    worker = Worker(bench.spool, bench.options(), threading.Event())
+    worker = JobWorker(bench.spool, bench.options(), threading.Event())
     with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
         fcntl.flock(cleaning, fcntl.LOCK_EX)
-        outcome = worker.work(*claimed)
+        outcome = worker.process(*claimed)
     assert (outcome.state, outcome.message) == ("stopped", "goes on later: the store is being cleaned")
     before = bench.status("walk")
     assert bench.work_off() == 2
@@ -178,18 +182,18 @@ def test_a_job_that_ends_while_the_store_is_cleaned_holds_nobody_up(bench: Spool
 def test_a_job_whose_disk_goes_away_goes_on_later(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    from bodycap_batch.watch import work
+    from bodycap_batch.watch import job_worker
 
     bench.drop("walk")
     error = DiskAway("Stale file handle", path="videos") if how == "in a stage" else None
-    run_job, left = work.run_job, [1]
+    run_job, left = job_worker.run_job, [1]
 
     def fail(*arguments: Any, **values: Any) -> Any:
         if left.pop() if left else 0:
             raise error or OSError(errno.ESTALE, os.strerror(errno.ESTALE), "videos")
         return run_job(*arguments, **values)
 
-    monkeypatch.setattr(work, "run_job", fail)
+    monkeypatch.setattr(job_worker, "run_job", fail)
     with running(bench.watcher(once=False, stale_s=1.0)):
         wait_for((bench.spool.done / "walk").is_dir)
     (told,) = [line for line in bench.told if line.startswith("walk: stuck")]
@@ -204,15 +208,17 @@ def test_a_job_whose_disk_never_answers_has_failed_in_the_end(
     def fail(*_: Any, **__: Any) -> None:
         raise DiskAway("Input/output error", path="videos", hint="is the disk mounted?")
 
-    monkeypatch.setattr("bodycap_batch.watch.work.run_job", fail)
-    worker = Worker(bench.spool, bench.options(), threading.Event())
-    look = claiming.look_at(drop := claiming.Drop(bench.drop("walk")), 100)
-    claim, _ = claiming.claim_drop(bench.spool, drop, look, bench.options().terms) or pytest.fail("no claim")
+    monkeypatch.setattr("bodycap_batch.watch.job_worker.run_job", fail)
+    worker = JobWorker(bench.spool, bench.options(), threading.Event())
+    look = inbox_transfer.take_snapshot(drop := inbox_transfer.InboxEntry(bench.drop("walk")), 100)
+    claim, _ = inbox_transfer.claim_entry(
+        bench.spool, drop, look, bench.options().permissions
+    ) or pytest.fail("no claim")
     states = []
     while not states or states[-1] == "stuck":
-        states.append(worker.work(claim).state)
+        states.append(worker.process(claim).state)
         if states[-1] == "stuck":
-            claim = claiming.Claim(claim.job, claim.generation, claim._token)
+            claim = inbox_transfer.Claim(claim.job, claim.generation, claim._token)
     assert states == ["stuck"] * 5 + ["failed"]
     assert bench.status("walk")["error"]["message"] == "Input/output error"
 
@@ -236,28 +242,30 @@ def test_a_job_whose_footage_is_away_waits_as_long_as_that_takes(
             settings.listener(Event(kind="finished", stage="keyframes"))
         raise DiskAway("Stale file handle", path=footage / "torso.mp4", hint="is the disk mounted?")
 
-    monkeypatch.setattr("bodycap_batch.watch.work.os.listdir", look)
-    monkeypatch.setattr("bodycap_batch.watch.work.run_job", fail)
-    worker = Worker(bench.spool, bench.options(), threading.Event())
-    look_ = claiming.look_at(drop := claiming.Drop(bench.drop("walk")), 100)
-    claim, _ = claiming.claim_drop(bench.spool, drop, look_, bench.options().terms) or pytest.fail("no claim")
+    monkeypatch.setattr("bodycap_batch.watch.job_worker.os.listdir", look)
+    monkeypatch.setattr("bodycap_batch.watch.job_worker.run_job", fail)
+    worker = JobWorker(bench.spool, bench.options(), threading.Event())
+    look_ = inbox_transfer.take_snapshot(drop := inbox_transfer.InboxEntry(bench.drop("walk")), 100)
+    claim, _ = inbox_transfer.claim_entry(
+        bench.spool, drop, look_, bench.options().permissions
+    ) or pytest.fail("no claim")
     for _ in range(20):
-        assert worker.work(claim).state == "stuck"
-        claim = claiming.Claim(claim.job, claim.generation, claim._token)
+        assert worker.process(claim).state == "stuck"
+        claim = inbox_transfer.Claim(claim.job, claim.generation, claim._token)
     assert main(["status"]) == 0
     assert f"goes on later: {footage / 'torso.mp4'}: Stale file handle" in capfd.readouterr().out
     claim.job.cancel.touch()
-    assert worker.work(claim).place == bench.spool.failed / "walk"
+    assert worker.process(claim).path == bench.spool.failed / "walk"
     assert bench.status("walk")["state"] == "cancelled"
 
 
 def test_what_holds_a_job_up_again_and_again_is_told_once(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from bodycap_batch.watch import work
+    from bodycap_batch.watch import job_worker
 
     bench.drop("walk")
-    monkeypatch.setattr(work, "run_job", failing(2, work.run_job, errno.ESTALE))
+    monkeypatch.setattr(job_worker, "run_job", failing(2, job_worker.run_job, errno.ESTALE))
     with running(bench.watcher(once=False, stale_s=0.2)):
         wait_for((bench.spool.done / "walk").is_dir)
     assert sum("Stale file handle" in line for line in bench.told) == 1
@@ -272,9 +280,9 @@ def test_footage_is_never_removed_because_the_disk_did_not_answer(
     bench.drop("walk").rename(place.input)
     monkeypatch.setattr(Path, "lstat", failing(1, Path.lstat))
     with pytest.raises(OSError, match="Input/output"):
-        claiming.give_back(bench.spool, place)
+        inbox_transfer.return_to_inbox(bench.spool, place)
     assert (place.input / "torso.mp4").is_file()
-    assert claiming.give_back(bench.spool, place) == bench.spool.inbox / ".claim-1"
+    assert inbox_transfer.return_to_inbox(bench.spool, place) == bench.spool.inbox / ".claim-1"
 
 
 def test_what_stays_in_the_inbox_is_told_when_a_watcher_leaves(bench: SpoolBench) -> None:
@@ -282,7 +290,7 @@ def test_what_stays_in_the_inbox_is_told_when_a_watcher_leaves(bench: SpoolBench
     (bench.drop("copied", ready=False) / "head.mp4.part").touch()
     (bench.spool.inbox / "torso.mp4").touch()
     bench.drop("walk")
-    assert bench.work_off(settle_s=0.5) == 0
+    assert bench.work_off(unchanged_s=0.5) == 0
     assert bench.status("walk")["state"] == "done"
     left = dict(line.split(": left in the inbox: ") for line in bench.told if "left in the inbox" in line)
     assert left == {
@@ -324,11 +332,11 @@ def test_a_status_that_somebody_garbled_harms_nothing(bench: SpoolBench, text: s
     bench.work_off()
     job = bench.job("walk")
     job.status.write_text(text)
-    assert [row.name for row in rows_of(bench.spool)] == ["walk"]
+    assert [row.name for row in job_rows(bench.spool)] == ["walk"]
     left = JobDir(job.path.rename(bench.spool.running / "walk"))
-    claiming.first_claim(left)
+    inbox_transfer.create_claim(left)
     left.owner.write_text('{"generation": "one", "pid": [], "token": 5, "machine": null, "process": {}}')
-    assert [row.name for row in rows_of(bench.spool)] == ["walk"]
+    assert [row.name for row in job_rows(bench.spool)] == ["walk"]
     assert bench.work_off() == 0, "nobody's: it is waited for as for another machine's"
     with running(bench.watcher(once=False, stale_s=1.0)):
         wait_for((bench.spool.done / "walk").is_dir)
@@ -347,7 +355,7 @@ def test_who_watches_and_what_holds_it_up_is_told_with_the_jobs(
 
     bench.drop("walk", ready=False)
     assert told() == [f"no watcher is at work here: `bodycap watch {bench.spool.inbox}` starts one"]
-    with running(bench.watcher(once=False, settle_s=1000.0, stale_s=1.0)):
+    with running(bench.watcher(once=False, unchanged_s=1000.0, stale_s=1.0)):
         wait_for(lambda: any(f"(process {os.getpid()}) since" in line for line in told()))
         assert len(told()) == 1
         assert main(["status", "--json"]) == 0
@@ -362,7 +370,7 @@ def test_who_watches_and_what_holds_it_up_is_told_with_the_jobs(
 
 
 def test_a_killed_watcher_is_not_taken_for_one_at_work(bench: SpoolBench) -> None:
-    presence = Presence(bench.spool)
+    presence = WatcherStatusFile(bench.spool)
     presence.tell("")
     (mine,) = bench.spool.running.glob(".watcher-*")
     machine, pid, start, *rest = mine.name.removeprefix(".watcher-").split("-")
@@ -373,7 +381,7 @@ def test_a_killed_watcher_is_not_taken_for_one_at_work(bench: SpoolBench) -> Non
     (yesterday,) = bench.spool.running.glob(".watcher-yesterday*")
     os.utime(yesterday, (old, old))
     (bench.spool.running / ".watcher-garbled.json").write_text("{")
-    assert [bool(found.seen) for found in watchers_of(bench.spool)] == [False, True]
+    assert [bool(found.seen) for found in active_watchers(bench.spool)] == [False, True]
     presence.end()
-    assert [bool(found.seen) for found in watchers_of(bench.spool)] == [True]
+    assert [bool(found.seen) for found in active_watchers(bench.spool)] == [True]
     assert not yesterday.exists()

@@ -18,7 +18,7 @@ import pytest
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.watch.web import Access, LivePage
-from bodycap_batch.watch.web.feed import Feed
+from bodycap_batch.watch.web.job_list import JobList
 from tests.pipeline.spools import SpoolBench, wait_for
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -82,13 +82,13 @@ def test_a_disk_that_does_not_answer_is_told_and_the_jobs_stay_in_sight(
 ) -> None:
     bench.drop("walk")
     told = [""]
-    feed = Feed(bench.spool, lambda: told[0])
+    feed = JobList(bench.spool, lambda: told[0])
     assert json.loads(feed.text())["trouble"] == ""
 
     def fail(*_: object) -> None:
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr("bodycap_batch.watch.web.feed.waiting_rows", fail)
+    monkeypatch.setattr("bodycap_batch.watch.web.job_list.inbox_rows", fail)
     for trouble, shown in (("", "Input/output error"), ("the inbox is gone", "the inbox is gone")):
         told[0] = trouble
         feed._read_at = -math.inf

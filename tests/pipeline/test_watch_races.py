@@ -14,11 +14,11 @@ from bodycap_batch.core.errors import JobError
 from bodycap_batch.pipeline import Settings
 from bodycap_batch.store.artefacts import Store
 from bodycap_batch.store.references import collect_garbage
-from bodycap_batch.watch import cancel_job, claiming, commands, retry_job, work
-from bodycap_batch.watch.claim import process_mark
-from bodycap_batch.watch.drops import Drop, look_at
+from bodycap_batch.watch import cancel_job, commands, inbox_transfer, job_worker, retry_job
+from bodycap_batch.watch.inbox_entries import InboxEntry, take_snapshot
+from bodycap_batch.watch.job_status import JobStatusFile
+from bodycap_batch.watch.process_identity import process_tag
 from bodycap_batch.watch.spool import CLAIM_PREFIX, RETRY_PREFIX, JobDir
-from bodycap_batch.watch.status import StatusFile
 from tests.pipeline.spools import SpoolBench, wait_for
 
 
@@ -49,9 +49,9 @@ def test_a_retried_jobs_finished_stages_are_kept_until_it_has_run_again(bench: S
         assert kept(bench)
     retry_job(bench.spool, "walk")
     bench.order()
-    drop = Drop(bench.spool.inbox / "walk")
-    claim, _ = claiming.claim_drop(
-        bench.spool, drop, look_at(drop, 100), bench.options().terms
+    drop = InboxEntry(bench.spool.inbox / "walk")
+    claim, _ = inbox_transfer.claim_entry(
+        bench.spool, drop, take_snapshot(drop, 100), bench.options().permissions
     ) or pytest.fail("not claimed")
     assert kept(bench), "claimed, but not yet at work"
     claim.release()
@@ -70,7 +70,7 @@ def test_the_store_is_not_cleaned_in_the_middle_of_a_retry(
     bench.work_off()
     told = []
     store = str(bench.spool.root / ".store")
-    for name in ("os.rename", "give_back"):
+    for name in ("os.rename", "return_to_inbox"):
         *_, last = name.split(".")
         module = commands.os if name.startswith("os") else commands  # type: ignore[attr-defined]
         action = between(getattr(module, last), lambda: told.append(main(["gc", store, "--delete"])))
@@ -104,12 +104,12 @@ def test_a_watcher_that_starts_leaves_a_retry_under_way_alone_and_ends_a_killed_
     (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
     assert bench.work_off() == 2
     job = bench.job("walk")
-    alive = JobDir(job.path.rename(bench.spool.failed / f"{RETRY_PREFIX}{process_mark()}-1"))
-    claiming.finish_retries(bench.spool)
+    alive = JobDir(job.path.rename(bench.spool.failed / f"{RETRY_PREFIX}{process_tag()}-1"))
+    inbox_transfer.finish_interrupted_retries(bench.spool)
     assert alive.input.is_dir()
-    machine, pid, start = process_mark().split("-")
+    machine, pid, start = process_tag().split("-")
     alive.path.rename(bench.spool.failed / f"{RETRY_PREFIX}{machine}-{pid}-{int(start) - 1}-1")
-    claiming.finish_retries(bench.spool)
+    inbox_transfer.finish_interrupted_retries(bench.spool)
     assert [path.name for path in bench.spool.inbox.iterdir()] == ["walk.yaml"]
     assert list(bench.spool.failed.iterdir()) == []
 
@@ -135,15 +135,15 @@ def test_two_who_put_a_drop_back_do_it_once(bench: SpoolBench, monkeypatch: pyte
     place = JobDir(bench.spool.failed / f"{RETRY_PREFIX}1")
     place.path.mkdir()
     bench.drop("walk").rename(place.input)
-    move = claiming.move
+    move = inbox_transfer.move_to_free_name
     first: list[Path | None] = []
 
     def other() -> None:
-        monkeypatch.setattr(claiming, "move", move)
-        first.append(claiming.give_back(bench.spool, place))
+        monkeypatch.setattr(inbox_transfer, "move_to_free_name", move)
+        first.append(inbox_transfer.return_to_inbox(bench.spool, place))
 
-    monkeypatch.setattr(claiming, "move", between(move, other))
-    assert claiming.give_back(bench.spool, place) is None
+    monkeypatch.setattr(inbox_transfer, "move_to_free_name", between(move, other))
+    assert inbox_transfer.return_to_inbox(bench.spool, place) is None
     assert first == [bench.spool.inbox / place.name]
     assert (bench.spool.inbox / place.name / "torso.mp4").is_file()
     assert list(bench.spool.failed.iterdir()) == []
@@ -153,8 +153,8 @@ def test_two_who_put_a_drop_back_do_it_once(bench: SpoolBench, monkeypatch: pyte
 def test_a_job_that_is_claimed_while_it_is_cancelled_is_cancelled(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, moment: str
 ) -> None:
-    drop = Drop(bench.drop("walk"))
-    look, terms = look_at(drop, 100), bench.options().terms
+    drop = InboxEntry(bench.drop("walk"))
+    look, terms = take_snapshot(drop, 100), bench.options().permissions
     asked = threading.Event()
     cancelled: list[JobDir | None] = []
 
@@ -166,7 +166,7 @@ def test_a_job_that_is_claimed_while_it_is_cancelled_is_cancelled(
         def claim() -> None:
             monkeypatch.undo()
             monkeypatch.chdir(bench.folder)
-            assert claiming.claim_drop(bench.spool, drop, look, terms) is not None
+            assert inbox_transfer.claim_entry(bench.spool, drop, look, terms) is not None
 
         rename = commands.os.rename  # type: ignore[attr-defined]
         monkeypatch.setattr(commands.os, "rename", between(rename, claim))  # type: ignore[attr-defined]
@@ -178,8 +178,8 @@ def test_a_job_that_is_claimed_while_it_is_cancelled_is_cancelled(
             thread.start()
             asked.wait(0.5)  # some looks find neither a drop nor a job
 
-        monkeypatch.setattr(claiming, "settle_claim", between(claiming.settle_claim, ask))
-        assert claiming.claim_drop(bench.spool, drop, look, terms) is not None
+        monkeypatch.setattr(inbox_transfer, "move_to_running", between(inbox_transfer.move_to_running, ask))
+        assert inbox_transfer.claim_entry(bench.spool, drop, look, terms) is not None
         thread.join()
     assert cancelled == [None], "no watcher has noticed yet"
     assert bench.job("walk").cancel.exists()
@@ -189,9 +189,9 @@ def test_a_job_that_is_claimed_while_it_is_cancelled_is_cancelled(
 def test_a_job_whose_watcher_was_killed_while_it_claimed_it_can_be_cancelled(bench: SpoolBench) -> None:
     place = JobDir(bench.spool.running / f"{CLAIM_PREFIX}1")
     place.path.mkdir()
-    claiming.first_claim(place).release()
+    inbox_transfer.create_claim(place).release()
     bench.drop("walk").rename(place.input)
-    StatusFile(place).change(dropped="walk")
+    JobStatusFile(place).update(dropped="walk")
     assert cancel_job(bench.spool, "walk", wait_s=0.0) is None, "no watcher has noticed yet"
     bench.work_off()
     assert bench.status("walk")["state"] == "cancelled"
@@ -224,7 +224,7 @@ def test_jobs_side_by_side_do_not_make_the_same_twice(
     def run(job: object, *, out_dir: Path, settings: Settings) -> None:
         shared.append(settings.turns)
 
-    monkeypatch.setattr(work, "run_job", run)
+    monkeypatch.setattr(job_worker, "run_job", run)
     bench.drop("one")
     bench.drop("two")
     assert bench.work_off(jobs=2) == 0

@@ -1,6 +1,6 @@
-"""The live page of a watched folder."""
+"""The live page of a watched folder: a web page with the state of all jobs."""
 
-from bodycap_batch.watch.web.access import Access, access_from
+from bodycap_batch.watch.web.access import Access, access_from_address
 from bodycap_batch.watch.web.server import LivePage
 
-__all__ = ["Access", "LivePage", "access_from"]
+__all__ = ["Access", "LivePage", "access_from_address"]

@@ -1,8 +1,9 @@
-"""Who may use the live page.
+"""Decide who may use the live page.
 
-Listening on loopback alone does not keep other web pages out: one that the user has open can send requests
-to 127.0.0.1, and with a name server of its own (DNS rebinding) even read the answers. So the Host header must
-name this page as it was meant to be reached, and whatever changes something must come from the page itself.
+A server that listens on loopback only is still open to other web pages. A page in the user's browser can send
+requests to 127.0.0.1; with a name server of its own (DNS rebinding) it can even read the answers. Therefore
+the Host header must be a name of this page, and a request that changes something must come from the page
+itself.
 """
 
 from __future__ import annotations
@@ -19,22 +20,24 @@ from urllib.parse import parse_qs
 from bodycap_batch.core.errors import JobError
 
 COOKIE = "bodycap_token"
-_SAFE = ("GET", "HEAD")
-_SHORTEST_TOKEN = 16
+_READING_METHODS = ("GET", "HEAD")
+"""HTTP methods that change nothing."""
+_MIN_TOKEN_LENGTH = 16
+"""Characters of a token. 16 characters of the permitted 64 are 96 bits, too many to guess."""
 _PORT = re.compile(r":[0-9]+$")
-"""Browsers leave the usual port out."""
-_TOKEN = re.compile(rf"[A-Za-z0-9_\-]{{{_SHORTEST_TOKEN},200}}")
+"""A port in a Host header. Browsers omit the default port."""
+_TOKEN = re.compile(rf"[A-Za-z0-9_\-]{{{_MIN_TOKEN_LENGTH},200}}")
 _TOKEN_HINT = "python3 -c 'import secrets; print(secrets.token_urlsafe())' makes one"  # noqa: S105 - a remedy
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Access:
-    """Where the page listens and what it asks for.
+    """Where the page listens, and the token that it requires.
 
     Attributes:
-        host: Address it listens on.
-        port: Port it listens on.
-        token: What a browser has to show; "" where none is asked for (loopback).
+        host: Address to listen on.
+        port: Port to listen on.
+        token: Token that a browser must send; "" if none is required (loopback).
     """
 
     host: str
@@ -44,32 +47,32 @@ class Access:
     @property
     def url(self) -> str:
         """Address of the page."""
-        return f"http://{_bracketed(self.host)}:{self.port}/"
+        return f"http://{_host_in_url(self.host)}:{self.port}/"
 
     def refusal(self, method: str, headers: Mapping[str, str], query: str) -> tuple[int, str] | None:
-        """Why a request is refused, with the status code; None where it may pass.
+        """Return the status code and the reason if a request is refused, or None if it is allowed.
 
         Args:
-            method: GET, POST …
-            headers: By lower-case name.
+            method: HTTP method, for example GET or POST.
+            headers: Headers by lower-case name.
             query: The part of the address after the question mark.
         """
         host = headers.get("host", "").lower()
         if not self._is_this_page(host):
-            return 421, "this page is not reached under that name"
+            return 421, "this page does not have that name"
         origin = headers.get("origin")
-        changes = method not in _SAFE
+        changes = method not in _READING_METHODS
         if (changes and origin is None) or (origin is not None and origin.lower() != f"http://{host}"):
             return 403, "the request comes from another page"
-        followed = not changes and headers.get("sec-fetch-dest") == "document"  # a link to this page
-        if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none") and not followed:
+        is_link = not changes and headers.get("sec-fetch-dest") == "document"
+        if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none") and not is_link:
             return 403, "the request comes from another page"
         if self.token and not self._shows_token(headers, "" if changes else query):
             return 401, "a token is needed: open the page as /?token=…"
         return None
 
     def token_in(self, query: str) -> bool:
-        """True where the address carries the right token."""
+        """Return True if the query holds the correct token."""
         return bool(self.token) and self._is_token(parse_qs(query).get("token", [""])[0])
 
     def _is_this_page(self, host: str) -> bool:
@@ -77,9 +80,9 @@ class Access:
         if not port.isdecimal() or int(port) != self.port:
             return False
         if is_loopback(self.host):
-            return name in ("localhost", "127.0.0.1", "[::1]", _bracketed(self.host))
-        # Another site can point its name here, but not an address, and not this machine's own name.
-        return _is_address(name) or name in (self.host.lower(), *_own_names())
+            return name in ("localhost", "127.0.0.1", "[::1]", _host_in_url(self.host))
+        # Another site can point its own name here, but it can use neither an address nor this machine's name.
+        return _is_address(name) or name in (self.host.lower(), *_host_names())
 
     def _shows_token(self, headers: Mapping[str, str], query: str) -> bool:
         scheme, _, bearer = headers.get("authorization", "").partition(" ")
@@ -95,32 +98,32 @@ class Access:
         return hmac.compare_digest(text.encode(errors="replace"), self.token.encode())
 
 
-def access_from(address: str, token: str) -> Access:
-    """Read ``HOST:PORT`` of the command line.
+def access_from_address(address: str, token: str) -> Access:
+    """Return the access for ``HOST:PORT`` of the command line.
 
     Raises:
-        JobError: No address, or one that is not loopback without a token.
+        JobError: The text is not an address, or the address is not loopback and there is no token.
     """
     host, _, port = address.rpartition(":")
     host = host.strip("[]")
     if not host or not port.isdecimal() or not 0 <= int(port) < 1 << 16:
         raise JobError(
-            f"no address: {address!r}", field="--web", hint="HOST:PORT, for example 127.0.0.1:8080"
+            f"not an address: {address!r}", field="--web", hint="HOST:PORT, for example 127.0.0.1:8080"
         )
     if not is_loopback(host) and not token:
         raise JobError(
-            f"{host} can be reached from other machines: the page needs a token there",
+            f"{host} can be reached from other machines, so the page needs a token",
             field="--web",
             hint=f"set BODYCAP_WEB_TOKEN ({_TOKEN_HINT}), or listen on 127.0.0.1 and use an SSH tunnel",
         )
     if token and not _TOKEN.fullmatch(token):
-        hint = f"{_SHORTEST_TOKEN} letters, digits, - or _, or more; {_TOKEN_HINT}"
-        raise JobError("the token is too short or has odd characters", field="BODYCAP_WEB_TOKEN", hint=hint)
+        hint = f"at least {_MIN_TOKEN_LENGTH} letters, digits, - or _; {_TOKEN_HINT}"
+        raise JobError("the token is too short or has other characters", field="BODYCAP_WEB_TOKEN", hint=hint)
     return Access(host=host, port=int(port), token=token)
 
 
 def is_loopback(host: str) -> bool:
-    """True for an address that only this machine can reach."""
+    """Return True for an address that only this machine can reach."""
     if host == "localhost":
         return True
     try:
@@ -137,9 +140,9 @@ def _is_address(name: str) -> bool:
     return True
 
 
-def _own_names() -> tuple[str, ...]:
+def _host_names() -> tuple[str, ...]:
     return socket.gethostname().lower(), socket.getfqdn().lower()
 
 
-def _bracketed(host: str) -> str:
+def _host_in_url(host: str) -> str:
     return f"[{host}]" if ":" in host else host

@@ -1,4 +1,4 @@
-"""The live page's requests."""
+"""Answer the requests of the live page."""
 
 from __future__ import annotations
 
@@ -26,23 +26,26 @@ from bodycap_batch.core.errors import BodycapError, CaptureError, StoreError
 from bodycap_batch.watch.commands import cancel_job, retry_job
 from bodycap_batch.watch.spool import JobDir
 from bodycap_batch.watch.web.access import COOKIE, Access
-from bodycap_batch.watch.web.feed import Feed, files_of, log_of
+from bodycap_batch.watch.web.job_list import JobList, list_result_files, read_log_end
 from bodycap_batch.watch.web.uploads import Uploads
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Receive, Scope, Send
 
-_PAGE = Path(__file__).with_name("page")
-_PERIOD_S = 1.0
+_PAGE_FOLDER = Path(__file__).with_name("page")
+_UPDATE_PERIOD_S = 1.0
+"""Seconds between two looks for changes to send. Evidence: none."""
 _KEEP_ALIVE_S = 15.0
-_MOST_JSON_BYTES = 4096
+"""Seconds of silence after which a comment keeps the connection open. Evidence: none."""
+_MAX_JSON_BYTES = 4096
+"""Bytes of a request's JSON document, which holds a name only. Evidence: none."""
 _PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; "
     "form-action 'none'; frame-ancestors 'none'; base-uri 'none'"
 )
-# A result is a document of its own: what it runs cannot speak for this page.
+# A result is sandboxed: its scripts cannot send requests in the name of this page.
 _RESULT_POLICY = "sandbox allow-scripts allow-popups allow-downloads"
-_ALWAYS = {
+_COMMON_HEADERS = {
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
     "cache-control": "no-store",
@@ -50,16 +53,16 @@ _ALWAYS = {
 }
 
 
-def make_app(feed: Feed, access: Access, uploads: Uploads, stopped: threading.Event) -> ASGIApp:
-    """The page as an ASGI application.
+def make_app(job_list: JobList, access: Access, uploads: Uploads, stopped: threading.Event) -> ASGIApp:
+    """Return the page as an ASGI application.
 
     Args:
-        feed: The jobs that it shows.
-        access: Who may use it.
-        uploads: Takes what browsers send.
-        stopped: Set when the watcher ends: streams end, too.
+        job_list: Jobs to show.
+        access: Who may use the page.
+        uploads: Receives the files that browsers send.
+        stopped: Set when the watcher ends; it ends the event streams.
     """
-    page = _Page(feed, uploads, stopped)
+    page = _Routes(job_list, uploads, stopped)
     routes = [
         Route("/", page.index),
         Route("/{name:str}", page.asset),
@@ -69,18 +72,18 @@ def make_app(feed: Feed, access: Access, uploads: Uploads, stopped: threading.Ev
         Route("/api/jobs/{name}/files", page.files),
         Route("/api/jobs/{name}/retry", page.retry, methods=["POST"]),
         Route("/api/jobs/{name}/cancel", page.cancel, methods=["POST"]),
-        Route("/api/uploads", page.begin, methods=["POST"]),
-        Route("/api/uploads/{key}", page.drop, methods=["DELETE"]),
-        Route("/api/uploads/{key}/finish", page.finish, methods=["POST"]),
-        Route("/api/uploads/{key}/{name:path}", page.write, methods=["PUT"]),
+        Route("/api/uploads", page.start_upload, methods=["POST"]),
+        Route("/api/uploads/{key}", page.discard_upload, methods=["DELETE"]),
+        Route("/api/uploads/{key}/finish", page.finish_upload, methods=["POST"]),
+        Route("/api/uploads/{key}/{name:path}", page.write_upload, methods=["PUT"]),
         Route("/results/{name}/{file:path}", page.result),
     ]
-    app = Starlette(routes=routes, exception_handlers={BodycapError: _told})
-    return _Gate(app, access)
+    app = Starlette(routes=routes, exception_handlers={BodycapError: _error_response})
+    return _AccessControl(app, access)
 
 
-class _Gate:
-    """Lets through what `Access` allows, and remembers a token that was shown in the address."""
+class _AccessControl:
+    """Pass on the requests that `Access` allows, and store a token from the address in a cookie."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app = app
@@ -95,114 +98,126 @@ class _Gate:
         refusal = self._access.refusal(request.method, dict(request.headers), query)
         if refusal is not None:
             code, reason = refusal
-            await PlainTextResponse(f"{reason}\n", code, headers=_ALWAYS)(scope, receive, send)
+            await PlainTextResponse(f"{reason}\n", code, headers=_COMMON_HEADERS)(scope, receive, send)
         elif request.url.path == "/" and self._access.token_in(query):
-            response = RedirectResponse("/", 303, headers=_ALWAYS)
+            response = RedirectResponse("/", 303, headers=_COMMON_HEADERS)
             response.set_cookie(COOKIE, self._access.token, httponly=True, samesite="strict")
             await response(scope, receive, send)
         else:
             await self._app(scope, receive, send)
 
 
-class _Page:
-    """The routes."""
+class _Routes:
+    """Functions that answer the requests."""
 
-    def __init__(self, feed: Feed, uploads: Uploads, stopped: threading.Event) -> None:
-        self._spool = feed.spool
+    def __init__(self, job_list: JobList, uploads: Uploads, stopped: threading.Event) -> None:
+        self._spool = job_list.spool
         self._uploads = uploads
         self._stopped = stopped
-        self._feed = feed
+        self._job_list = job_list
 
     async def index(self, _: Request) -> Response:
         return self._static("index.html")
 
     async def asset(self, request: Request) -> Response:
         name = request.path_params["name"]
-        return self._static(name) if name in ("page.js", "page.css") else _missing()
+        return self._static(name) if name in ("page.js", "page.css") else _not_found()
 
     async def jobs(self, _: Request) -> Response:
-        text = await run_in_threadpool(self._feed.text)
-        return Response(text, media_type="application/json", headers=_ALWAYS)
+        text = await run_in_threadpool(self._job_list.json_text)
+        return Response(text, media_type="application/json", headers=_COMMON_HEADERS)
 
     async def events(self, request: Request) -> Response:
-        return StreamingResponse(self._changes(request), media_type="text/event-stream", headers=_ALWAYS)
+        return StreamingResponse(
+            self._changes(request), media_type="text/event-stream", headers=_COMMON_HEADERS
+        )
 
     async def log(self, request: Request) -> Response:
         job = await run_in_threadpool(self._job, request)
-        return PlainTextResponse(await run_in_threadpool(log_of, job), headers=_ALWAYS) if job else _missing()
+        return (
+            PlainTextResponse(await run_in_threadpool(read_log_end, job), headers=_COMMON_HEADERS)
+            if job
+            else _not_found()
+        )
 
     async def files(self, request: Request) -> Response:
         job = await run_in_threadpool(self._job, request)
-        return JSONResponse(await run_in_threadpool(files_of, job), headers=_ALWAYS) if job else _missing()
+        return (
+            JSONResponse(await run_in_threadpool(list_result_files, job), headers=_COMMON_HEADERS)
+            if job
+            else _not_found()
+        )
 
     async def result(self, request: Request) -> Response:
-        """One file of a job's results; nothing outside of them."""
+        """Return one file of a job's results, and no file outside of them."""
         job = await run_in_threadpool(self._job, request)
         if job is None:
-            return _missing()
+            return _not_found()
         path = (job.result / request.path_params["file"]).resolve()
         if not path.is_relative_to(job.result.resolve()) or not path.is_file():
-            return _missing()
-        return FileResponse(path, headers={**_ALWAYS, "content-security-policy": _RESULT_POLICY})
+            return _not_found()
+        return FileResponse(path, headers={**_COMMON_HEADERS, "content-security-policy": _RESULT_POLICY})
 
     async def retry(self, request: Request) -> Response:
         path = await run_in_threadpool(retry_job, self._spool, request.path_params["name"])
-        return JSONResponse({"name": path.name}, headers=_ALWAYS)
+        return JSONResponse({"name": path.name}, headers=_COMMON_HEADERS)
 
     async def cancel(self, request: Request) -> Response:
         await run_in_threadpool(cancel_job, self._spool, request.path_params["name"])
-        return JSONResponse({}, headers=_ALWAYS)
+        return JSONResponse({}, headers=_COMMON_HEADERS)
 
-    async def begin(self, request: Request) -> Response:
-        body = await _small_json(request)
-        key = await run_in_threadpool(self._uploads.begin, str(body.get("name", "")))
-        return JSONResponse({"key": key}, headers=_ALWAYS)
+    async def start_upload(self, request: Request) -> Response:
+        body = await _read_small_json(request)
+        key = await run_in_threadpool(self._uploads.start, str(body.get("name", "")))
+        return JSONResponse({"key": key}, headers=_COMMON_HEADERS)
 
-    async def write(self, request: Request) -> Response:
+    async def write_upload(self, request: Request) -> Response:
         size = request.headers.get("content-length", "")
         if not size.isdecimal():
-            raise CaptureError("the size of the file was not announced", hint="send a Content-Length")
+            raise CaptureError("the size of the file is not stated", hint="send a Content-Length")
         key, name = request.path_params["key"], request.path_params["name"]
         try:
             await self._uploads.write(key, name, int(size), request.stream())
-        except ClientDisconnect:  # nobody is there to be told
+        except ClientDisconnect:  # nobody receives an error message
             return Response(status_code=400)
-        return JSONResponse({}, headers=_ALWAYS)
+        return JSONResponse({}, headers=_COMMON_HEADERS)
 
-    async def finish(self, request: Request) -> Response:
+    async def finish_upload(self, request: Request) -> Response:
         name = await run_in_threadpool(self._uploads.finish, request.path_params["key"])
-        return JSONResponse({"name": name}, headers=_ALWAYS)
+        return JSONResponse({"name": name}, headers=_COMMON_HEADERS)
 
-    async def drop(self, request: Request) -> Response:
-        await run_in_threadpool(self._uploads.drop, request.path_params["key"])
-        return JSONResponse({}, headers=_ALWAYS)
+    async def discard_upload(self, request: Request) -> Response:
+        await run_in_threadpool(self._uploads.discard, request.path_params["key"])
+        return JSONResponse({}, headers=_COMMON_HEADERS)
 
     def _job(self, request: Request) -> JobDir | None:
         return self._spool.find(request.path_params["name"])
 
     def _static(self, name: str) -> Response:
-        return FileResponse(_PAGE / name, headers={**_ALWAYS, "content-security-policy": _PAGE_POLICY})
+        return FileResponse(
+            _PAGE_FOLDER / name, headers={**_COMMON_HEADERS, "content-security-policy": _PAGE_POLICY}
+        )
 
     async def _changes(self, request: Request) -> AsyncIterator[str]:
-        """All jobs whenever something about them has changed, as server-sent events."""
+        """Yield all jobs as server-sent events whenever one of them has changed."""
         sent, silent_s = "", 0.0
         while not self._stopped.is_set() and not await request.is_disconnected():
-            text = await run_in_threadpool(self._feed.text)
+            text = await run_in_threadpool(self._job_list.json_text)
             if text != sent:
                 yield f"data: {text}\n\n"
                 sent, silent_s = text, 0.0
             elif silent_s >= _KEEP_ALIVE_S:
                 yield ": still here\n\n"
                 silent_s = 0.0
-            await asyncio.sleep(_PERIOD_S)
-            silent_s += _PERIOD_S
+            await asyncio.sleep(_UPDATE_PERIOD_S)
+            silent_s += _UPDATE_PERIOD_S
 
 
-async def _small_json(request: Request) -> dict[str, Any]:
+async def _read_small_json(request: Request) -> dict[str, Any]:
     body = b""
     async for chunk in request.stream():
         body += chunk
-        if len(body) > _MOST_JSON_BYTES:
+        if len(body) > _MAX_JSON_BYTES:
             return {}
     try:
         found = json.loads(body)
@@ -211,12 +226,12 @@ async def _small_json(request: Request) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-async def _told(_: Request, error: Exception) -> Response:
-    """A typed error as the page shows it."""
+async def _error_response(_: Request, error: Exception) -> Response:
+    """Return a typed error as the page shows it."""
     assert isinstance(error, BodycapError)
     code = 507 if isinstance(error, StoreError) else 413 if isinstance(error, CaptureError) else 400
-    return JSONResponse({"message": error.message, "hint": error.hint}, code, headers=_ALWAYS)
+    return JSONResponse({"message": error.message, "hint": error.hint}, code, headers=_COMMON_HEADERS)
 
 
-def _missing() -> Response:
-    return PlainTextResponse("there is no such thing here\n", 404, headers=_ALWAYS)
+def _not_found() -> Response:
+    return PlainTextResponse("not found\n", 404, headers=_COMMON_HEADERS)

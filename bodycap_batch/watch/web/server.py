@@ -1,4 +1,4 @@
-"""The live page's server, in a thread of the watcher."""
+"""Serve the live page in a thread of the watcher."""
 
 from __future__ import annotations
 
@@ -12,23 +12,24 @@ from bodycap_batch.config.limits import Limits
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.watch.spool import Spool
 from bodycap_batch.watch.web.access import Access
-from bodycap_batch.watch.web.feed import Feed
-from bodycap_batch.watch.web.uploads import Uploads, sweep
+from bodycap_batch.watch.web.job_list import JobList
+from bodycap_batch.watch.web.uploads import Uploads, remove_abandoned_uploads
 
-_END_S = 2
+_SHUTDOWN_S = 2
+"""Seconds that open connections have to end. Evidence: none."""
 
 
 class LivePage:
-    """Serves the page; a context manager.
+    """The server of the live page; a context manager.
 
     Args:
-        spool: The spool it shows.
-        access: Where it listens (port 0: any), and who may use it.
-        limits: How much may be sent.
-        trouble: Asked what keeps the watcher from its folders at the moment.
+        spool: The spool to show.
+        access: Address to listen on (port 0: any free port), and the required token.
+        limits: Largest uploads.
+        trouble: Returns why the watcher cannot access its folders; "" if it can.
 
     Raises:
-        JobError: The extra `web` is not installed, or the address cannot be listened on.
+        JobError: The extra `web` is not installed, or the server cannot listen on the address.
     """
 
     def __init__(
@@ -43,16 +44,16 @@ class LivePage:
         self._spool = spool
         self._stopped = threading.Event()
         self._uploads = Uploads(spool, limits)
-        self._feed = Feed(spool, trouble)
+        self._job_list = JobList(spool, trouble)
 
     def __enter__(self) -> LivePage:
-        """Start serving."""
+        """Start the server."""
         import uvicorn
 
         from bodycap_batch.watch.web.app import make_app
 
-        sweep(self._spool.inbox)
-        app = make_app(self._feed, self.access, self._uploads, self._stopped)
+        remove_abandoned_uploads(self._spool.inbox)
+        app = make_app(self._job_list, self.access, self._uploads, self._stopped)
         config = uvicorn.Config(
             app,
             log_level="warning",
@@ -61,7 +62,7 @@ class LivePage:
             server_header=False,
             proxy_headers=False,
             ws="none",
-            timeout_graceful_shutdown=_END_S,
+            timeout_graceful_shutdown=_SHUTDOWN_S,
         )
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(
@@ -73,7 +74,7 @@ class LivePage:
     def __exit__(self, *_: object) -> None:
         self._stopped.set()
         self._server.should_exit = True
-        self._thread.join(2 * _END_S)
+        self._thread.join(2 * _SHUTDOWN_S)
         self._socket.close()
         self._uploads.clear()
 
@@ -86,5 +87,6 @@ def _listen(access: Access) -> socket.socket:
         raise JobError(
             f"cannot listen on {access.host}:{access.port}: {error.strerror or error}",
             field="--web",
-            hint="another program uses the port, or the address is not this machine's: --web 127.0.0.1:8081",
+            hint="another program uses the port, or the address belongs to another machine; "
+            "try --web 127.0.0.1:8081",
         ) from error

@@ -1,4 +1,4 @@
-"""Videos sent by the browser: written beside the inbox's drops, out of sight until all are there."""
+"""Receive videos from browsers: each upload is written to a hidden folder of the inbox until it is complete."""
 
 from __future__ import annotations
 
@@ -16,32 +16,35 @@ from bodycap_batch.config.folder import JOB_FILES, VIDEO_SUFFIXES
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.core.errors import CaptureError, JobError, StoreError
 from bodycap_batch.store.artefacts import disk_errors
-from bodycap_batch.watch.claim import is_at_work, is_of_this_machine, process_mark
-from bodycap_batch.watch.drops import READY
-from bodycap_batch.watch.spool import Spool, move, spool_name
+from bodycap_batch.watch.inbox_entries import READY
+from bodycap_batch.watch.process_identity import is_from_this_machine, is_process_running, process_tag
+from bodycap_batch.watch.spool import Spool, folder_name_from_text, move_to_free_name
 
 _PREFIX = ".upload-"
-_ALSO = ("calib.json", *JOB_FILES)
-_ALSO_SUFFIXES = (".timestamps.txt", ".bvh", ".png")
-_SMALL_BYTES = 64 << 20
-"""What is no video is small: calibrations, times, masks, skeletons."""
+_OTHER_FILES = ("calib.json", *JOB_FILES)
+_OTHER_SUFFIXES = (".timestamps.txt", ".bvh", ".png")
+_MAX_OTHER_BYTES = 64 << 20
+"""Largest size of a file that is not a video: calibration, timestamps, mask, skeleton. Evidence: none."""
 _NAME = re.compile(r"[^/\\\x00-\x1f\x7f.][^/\\\x00-\x1f\x7f]{0,199}")
-_KEEP_FREE_BYTES = 1 << 30
-_MOST_OPEN = 8
-_STALE_S = 86_400.0
+_MIN_FREE_BYTES = 1 << 30
+"""Bytes that an upload leaves free on the disk. Evidence: none."""
+_MAX_OPEN_UPLOADS = 8
+"""Folders that may be uploaded at the same time. Evidence: none."""
+_MAX_SILENCE_S = 86_400.0
+"""Seconds without data after which an upload is removed: a day. Evidence: none."""
 
 
 @dataclass(slots=True)
 class _Upload:
-    """A folder being sent.
+    """A folder that is being uploaded.
 
     Attributes:
-        name: What the job will be called.
-        folder: Where it is written to.
-        touched: When something came last.
-        files: Files that are there.
-        coming: Files that are being sent just now, with their bytes.
-        dropped: Nobody wants it any more.
+        name: Name that the job will get.
+        folder: Hidden folder that receives the files.
+        touched: Time of the last data, by the monotonic clock in seconds.
+        files: Complete files.
+        coming: Files that are being received, with their sizes in bytes.
+        discarded: True if the upload was cancelled.
     """
 
     name: str
@@ -49,15 +52,15 @@ class _Upload:
     touched: float
     files: set[str] = field(default_factory=set)
     coming: dict[str, int] = field(default_factory=dict)
-    dropped: bool = False
+    discarded: bool = False
 
 
 class Uploads:
-    """Folders that browsers are sending.
+    """The folders that browsers are uploading.
 
     Args:
-        spool: Where complete folders are dropped.
-        limits: How much may be sent.
+        spool: Spool whose inbox gets the complete folders.
+        limits: Largest files and their number.
     """
 
     def __init__(self, spool: Spool, limits: Limits) -> None:
@@ -66,155 +69,159 @@ class Uploads:
         self._open: dict[str, _Upload] = {}
         self._lock = threading.Lock()
 
-    def begin(self, name: str) -> str:
-        """Start a folder; returns its key.
+    def start(self, name: str) -> str:
+        """Start the upload of a folder; return its key.
 
         Raises:
-            JobError: The name is none, or too much is being sent at once.
+            JobError: The name cannot be used, or there are too many uploads at the same time.
         """
         if not _NAME.fullmatch(name.strip()):
             hint = "letters, digits, spaces; no / and no leading dot"
-            raise JobError(f"{name[:40]!r} is no name for a job", hint=hint)
+            raise JobError(f"{name[:40]!r} cannot be the name of a job", hint=hint)
         with self._lock:
             self._forget_stale()
-            if len(self._open) >= _MOST_OPEN:
+            if len(self._open) >= _MAX_OPEN_UPLOADS:
                 raise JobError(
-                    f"{_MOST_OPEN} folders are being sent already", hint="wait until one of them is there"
+                    f"{_MAX_OPEN_UPLOADS} folders are being sent already", hint="wait until one is complete"
                 )
             key = uuid.uuid4().hex
-            folder = self._spool.inbox / f"{_PREFIX}{process_mark()}-{key}"
+            folder = self._spool.inbox / f"{_PREFIX}{process_tag()}-{key}"
             with disk_errors(folder):
                 folder.mkdir()
-            self._open[key] = _Upload(name=spool_name(name), folder=folder, touched=time.monotonic())
+            self._open[key] = _Upload(
+                name=folder_name_from_text(name), folder=folder, touched=time.monotonic()
+            )
             return key
 
     async def write(self, key: str, name: str, size: int, chunks: AsyncIterator[bytes]) -> None:
         """Write one file.
 
         Args:
-            key: What `begin` returned.
+            key: The key that `start` returned.
             name: The file's path in the folder, at most one folder deep.
-            size: How many bytes there will be.
-            chunks: The bytes.
+            size: Stated size in bytes.
+            chunks: The content.
 
         Raises:
-            JobError: An unknown key or a name that is not expected here.
-            CaptureError: More bytes than allowed, or not as many as were announced.
+            JobError: The key is unknown, or the name is not permitted.
+            CaptureError: The file is too large, or its size differs from the stated one.
             StoreError: The disk is full.
         """
-        upload, path = self._reserved(key, name, size)
+        upload, path = self._reserve(key, name, size)
         target = upload.folder / path
         try:
             with disk_errors(target):
-                await _take_in(target, size, chunks, upload)
+                await _receive_file(target, size, chunks, upload)
         except (CaptureError, StoreError):
-            self._require_wanted(upload)
+            self._require_not_discarded(upload)
             raise
         finally:
             with self._lock:
                 del upload.coming[name]
-                if upload.dropped:
+                if upload.discarded:
                     shutil.rmtree(upload.folder, ignore_errors=True)
         upload.files.add(name)
 
     def finish(self, key: str) -> str:
-        """Drop the folder into the inbox; returns the name it has there.
+        """Move the complete folder into the inbox; return its name there.
 
         Raises:
-            JobError: There is no video in it, or one is still being sent.
+            JobError: The folder holds no video, or a file is still being sent.
         """
         with self._lock:
             upload = self._get(key)
             if upload.coming:
                 some = ", ".join(sorted(upload.coming)[:3])
-                raise JobError(f"{some}: still being sent", hint="finish when every file is there")
+                raise JobError(f"{some}: still being sent", hint="finish when every file is complete")
             if not any(PurePosixPath(name).suffix.lower() in VIDEO_SUFFIXES for name in upload.files):
                 raise JobError(
                     "no video was sent", hint="name them torso.mp4, left_palm.mp4, right_palm.mp4 …"
                 )
             with disk_errors(upload.folder):
                 (upload.folder / READY).touch()
-                target = move(upload.folder, self._spool.inbox, upload.name)
+                target = move_to_free_name(upload.folder, self._spool.inbox, upload.name)
             del self._open[key]
         return target.name
 
-    def drop(self, key: str) -> None:
-        """Forget a folder that will not be completed."""
+    def discard(self, key: str) -> None:
+        """Remove an upload that will not be completed."""
         with self._lock:
             if (upload := self._open.pop(key, None)) is not None:
                 self._remove(upload)
 
     def clear(self) -> None:
-        """Remove what is not complete: the page ends, nobody can go on with it."""
+        """Remove all incomplete uploads: nobody can continue them after the page ends."""
         for key in list(self._open):
-            self.drop(key)
+            self.discard(key)
 
     def _get(self, key: str) -> _Upload:
         if key not in self._open:
-            raise _unknown()
+            raise _unknown_upload()
         return self._open[key]
 
-    def _reserved(self, key: str, name: str, size: int) -> tuple[_Upload, PurePosixPath]:
-        """The upload, with a place in it that no other request can have."""
+    def _reserve(self, key: str, name: str, size: int) -> tuple[_Upload, PurePosixPath]:
+        """Return the upload and the checked path, reserved for this request."""
         with self._lock:
             upload = self._get(key)
             with disk_errors(upload.folder):
-                path = self._checked(upload, name, size)
+                path = self._checked_path(upload, name, size)
             upload.coming[name] = size
             return upload, path
 
     @staticmethod
-    def _require_wanted(upload: _Upload) -> None:
-        """Tell of a folder that was dropped while a file came, rather than of the file."""
-        if upload.dropped:
-            raise _unknown() from None
+    def _require_not_discarded(upload: _Upload) -> None:
+        """Raise the error of an unknown upload, instead of the file's error, if the upload was discarded."""
+        if upload.discarded:
+            raise _unknown_upload() from None
 
     @staticmethod
     def _remove(upload: _Upload) -> None:
-        """Take a folder away; whoever is still writing to it notices, and takes the rest away."""
-        upload.dropped = True
+        """Remove the folder. A request that still writes to it removes the rest."""
+        upload.discarded = True
         shutil.rmtree(upload.folder, ignore_errors=True)
 
-    def _checked(self, upload: _Upload, name: str, size: int) -> PurePosixPath:
+    def _checked_path(self, upload: _Upload, name: str, size: int) -> PurePosixPath:
         path = PurePosixPath(name)
         if not 1 <= len(path.parts) <= 2 or not all(map(_NAME.fullmatch, name.split("/"))):
-            raise JobError(f"{name[:80]!r} is no name for a file", hint="a file, at most one folder deep")
+            raise JobError(
+                f"{name[:80]!r} cannot be the name of a file", hint="send files at most one folder deep"
+            )
         video = path.suffix.lower() in VIDEO_SUFFIXES
-        if not video and path.name not in _ALSO and not path.name.lower().endswith(_ALSO_SUFFIXES):
-            known = ", ".join((*_ALSO, *_ALSO_SUFFIXES))
-            raise JobError(f"{path.name} is no video, nor any of {known}", hint="leave it out")
+        if not video and path.name not in _OTHER_FILES and not path.name.lower().endswith(_OTHER_SUFFIXES):
+            known = ", ".join((*_OTHER_FILES, *_OTHER_SUFFIXES))
+            raise JobError(f"{path.name} is neither a video nor any of {known}", hint="leave it out")
         sent = {*upload.files, *upload.coming}
-        # Not by the disk alone: some of them do not tell upper from lower case.
+        # Compare the names too: some disks do not distinguish upper and lower case.
         if name.lower() in {other.lower() for other in sent} or (upload.folder / path).exists():
             raise JobError(f"{name} was sent twice", hint="give each file its own name")
         if any(str(path.parent) == other or str(PurePosixPath(other).parent) == name for other in sent):
-            raise JobError(f"{name} is a file and a folder", hint="give each its own name")
+            raise JobError(f"{name} is both a file and a folder", hint="give each its own name")
         if len(sent) >= self._limits.files:
             raise CaptureError(f"more than {self._limits.files:g} files", hint="one folder per recording")
-        most = 1e9 * self._limits.video_gb if video else _SMALL_BYTES
+        most = 1e9 * self._limits.video_gb if video else _MAX_OTHER_BYTES
         if not 0 < size <= most:
             hint = "cut the recording, or ask the operator to raise --limit video_gb"
             raise CaptureError(f"{size / 1e9:.3g} GB, the limit is {most / 1e9:.3g}", path=name, hint=hint)
-        # What others have announced may not be there yet: rather too careful than a full disk.
+        # Other uploads may not have received all their bytes yet; count them so that the disk does not fill up.
         coming = sum(sum(other.coming.values()) for other in self._open.values())
-        if shutil.disk_usage(upload.folder).free - coming - size < _KEEP_FREE_BYTES:
+        if shutil.disk_usage(upload.folder).free - coming - size < _MIN_FREE_BYTES:
             raise StoreError(
-                "too little room on the disk", path=self._spool.inbox, hint="make room, then try again"
+                "too little space on the disk", path=self._spool.inbox, hint="free some space, then try again"
             )
         return path
 
     def _forget_stale(self) -> None:
         now = time.monotonic()
-        for key in [key for key, upload in self._open.items() if now - upload.touched > _STALE_S]:
+        for key in [key for key, upload in self._open.items() if now - upload.touched > _MAX_SILENCE_S]:
             self._remove(self._open.pop(key))
 
 
-def _unknown() -> JobError:
-    return JobError("this upload is not known (any more)", hint="drop the folder again")
+def _unknown_upload() -> JobError:
+    return JobError("there is no such upload, or no longer", hint="drop the folder again")
 
 
-def sweep(inbox: Path) -> None:
-    """Remove what killed pages left; those of other watchers may be taking videos in just now."""
+def remove_abandoned_uploads(inbox: Path) -> None:
+    """Remove the uploads of killed servers. Other watchers' uploads stay, because they may be in progress."""
     for folder in inbox.glob(f"{_PREFIX}*"):
         with contextlib.suppress(OSError):
             if _is_abandoned(folder):
@@ -222,28 +229,29 @@ def sweep(inbox: Path) -> None:
 
 
 def _is_abandoned(folder: Path) -> bool:
-    marked = folder.name.removeprefix(_PREFIX)
-    if is_of_this_machine(marked):
-        return not is_at_work(marked)
-    return time.time() - folder.stat().st_mtime > _STALE_S
+    """Return True if the process that receives the upload has ended, or nothing has changed for a day."""
+    tag = folder.name.removeprefix(_PREFIX)
+    if is_from_this_machine(tag):
+        return not is_process_running(tag)
+    return time.time() - folder.stat().st_mtime > _MAX_SILENCE_S
 
 
-async def _take_in(target: Path, size: int, chunks: AsyncIterator[bytes], upload: _Upload) -> None:
-    """Write what comes beside its place; it gets its name when all of it is there."""
+async def _receive_file(target: Path, size: int, chunks: AsyncIterator[bytes], upload: _Upload) -> None:
+    """Write a file under a temporary name, and rename it once it is complete."""
     target.parent.mkdir(exist_ok=True)
     partial = target.with_name(f"{target.name}.part")
     try:
-        written = await _write(partial, size, chunks, upload)
+        written = await _write_chunks(partial, size, chunks, upload)
         if written != size:
-            wrong = f"{written} bytes came, {size} were announced"
-            raise CaptureError(wrong, path=target.name, hint="send it again")
+            message = f"received {written} bytes, {size} were stated"
+            raise CaptureError(message, path=target.name, hint="send it again")
         partial.rename(target)
     finally:
         partial.unlink(missing_ok=True)
 
 
-async def _write(path: Path, size: int, chunks: AsyncIterator[bytes], upload: _Upload) -> int:
-    """Write what comes, at most one piece more than announced; returns how many bytes came."""
+async def _write_chunks(path: Path, size: int, chunks: AsyncIterator[bytes], upload: _Upload) -> int:
+    """Write the content, at most one chunk more than stated; return the number of bytes received."""
     written = 0
     with path.open("xb") as stream:
         async for chunk in chunks:

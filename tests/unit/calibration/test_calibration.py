@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from bodycap_batch import cli
-from bodycap_batch.calibration import Board, calibrate_clip, write_calibration, write_preview
-from bodycap_batch.calibration.boards import View
-from bodycap_batch.calibration.clip import coverage, spread
-from bodycap_batch.calibration.solve import fit_lens
+from bodycap_batch.calibration import CalibrationBoard, calibrate_clip, write_calibration, write_preview
+from bodycap_batch.calibration.boards import BoardCorners
+from bodycap_batch.calibration.clip_calibration import corner_coverage, select_diverse_views
+from bodycap_batch.calibration.intrinsics_fit import fit_intrinsics
 from bodycap_batch.capture import open_camera
 from bodycap_batch.config.calibration import read_calibration
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
@@ -28,8 +28,8 @@ from tests.boards import (
 )
 from tests.videos import write_video
 
-CHARUCO = Board(kind="charuco", columns=9, rows=6)
-CHESSBOARD = Board(kind="chessboard", columns=9, rows=6)
+CHARUCO = CalibrationBoard(kind="charuco", columns=9, rows=6)
+CHESSBOARD = CalibrationBoard(kind="chessboard", columns=9, rows=6)
 
 
 def _clip(folder, lens, board, views=16):
@@ -177,13 +177,13 @@ def _exact_views(lens, rng, count, noise_px=0.0):
         turn = so3_exp(rng.uniform(-0.5, 0.5, 3))
         centre = np.append(rng.uniform(-2, 2, 2), rng.uniform(9, 13))
         px = lens.project((board - [4.0, 2.5, 0.0]) @ turn.T + centre) - CV2_PIXEL_OFFSET_PX
-        views.append(View(board_m=board, px=px + rng.normal(0, noise_px, px.shape)))
+        views.append(BoardCorners(board_m=board, px=px + rng.normal(0, noise_px, px.shape)))
     return views
 
 
 @pytest.mark.parametrize("lens", [PINHOLE_LENS, FISHEYE_LENS])
 def test_exact_corners_give_the_exact_lens_and_pixel_origin(lens):
-    fit = fit_lens(lens.model, _exact_views(lens, np.random.default_rng(0), 12), (640, 480))
+    fit = fit_intrinsics(lens.model, _exact_views(lens, np.random.default_rng(0), 12), (640, 480))
     # Single precision corners of the pinhole solver: 3e-5 px.
     assert np.abs(np.array(fit.params[:4]) - lens.params[:4]).max() < 0.01
     assert fit.rms_px < 1e-3
@@ -192,8 +192,8 @@ def test_exact_corners_give_the_exact_lens_and_pixel_origin(lens):
 def test_a_view_that_does_not_fit_is_left_out():
     rng = np.random.default_rng(0)
     views = _exact_views(PINHOLE_LENS, rng, 12, noise_px=0.05)
-    views[5] = View(board_m=views[5].board_m, px=views[5].px + rng.normal(0, 4.0, views[5].px.shape))
-    fit = fit_lens("OPENCV", views, (640, 480))
+    views[5] = BoardCorners(board_m=views[5].board_m, px=views[5].px + rng.normal(0, 4.0, views[5].px.shape))
+    fit = fit_intrinsics("OPENCV", views, (640, 480))
     assert fit.kept == tuple(index for index in range(12) if index != 5)
     assert fit.rms_px < 0.1
 
@@ -201,12 +201,14 @@ def test_a_view_that_does_not_fit_is_left_out():
 def test_views_are_chosen_to_differ():
     rng = np.random.default_rng(0)
     near = _exact_views(PINHOLE_LENS, np.random.default_rng(1), 1)
-    same = [View(board_m=near[0].board_m, px=near[0].px + rng.normal(0, 0.1, (54, 2))) for _ in range(30)]
+    same = [
+        BoardCorners(board_m=near[0].board_m, px=near[0].px + rng.normal(0, 0.1, (54, 2))) for _ in range(30)
+    ]
     others = _exact_views(PINHOLE_LENS, rng, 5)
-    chosen = spread(same + others, (640, 480), 6)
+    chosen = select_diverse_views(same + others, (640, 480), 6)
     assert set(range(30, 35)) <= set(chosen)
 
 
 def test_coverage_counts_cells():
-    assert coverage([np.array([[0.0, 0.0], [1.0, 1.0]])], (640, 480)) == 1 / 48
-    assert coverage([np.array([[-0.5, -0.5], [639.5, 479.5]])], (640, 480)) == 2 / 48
+    assert corner_coverage([np.array([[0.0, 0.0], [1.0, 1.0]])], (640, 480)) == 1 / 48
+    assert corner_coverage([np.array([[-0.5, -0.5], [639.5, 479.5]])], (640, 480)) == 2 / 48

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from bodycap_batch.check import machine
-from bodycap_batch.check.machine import Look, examine_machine
+from bodycap_batch.check.machine import MachineFinding, examine_machine
 from bodycap_batch.cli import main
 
 
-def look(name: str, folder: Path) -> Look:
+def look(name: str, folder: Path) -> MachineFinding:
     return next(each for each in examine_machine(folder) if each.what == name)
 
 
@@ -20,7 +20,9 @@ def look(name: str, folder: Path) -> Look:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """One small library instead of all: open3d alone takes seconds."""
     monkeypatch.setattr(machine, "_LIBRARIES", {"numpy": "numpy"})
-    monkeypatch.setattr(machine, "_video", lambda: Look(what="video", state="ok", found="as ever"))
+    monkeypatch.setattr(
+        machine, "_video_finding", lambda: MachineFinding(what="video", state="ok", found="as ever")
+    )
 
 
 def test_a_fit_machine_is_called_fit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -48,7 +50,7 @@ def test_a_library_that_does_not_load_is_a_problem_with_its_remedy(
 
 def test_a_missing_system_library_names_the_packages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     said = "ImportError: libGL.so.1: cannot open shared object file"
-    monkeypatch.setattr(machine, "_fails", lambda code: said)
+    monkeypatch.setattr(machine, "_error_of_code", lambda code: said)
     assert "apt-get install" in look("numpy", tmp_path).remedy
 
 
@@ -65,7 +67,7 @@ def test_a_full_disk_and_a_folder_that_takes_no_files(
 
 
 def test_without_hard_links_results_are_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine, "_links", lambda source, target: False)
+    monkeypatch.setattr(machine, "_can_hard_link", lambda source, target: False)
     writing = look("writing", tmp_path)
     assert writing.state == "note"
     assert "copied" in writing.remedy

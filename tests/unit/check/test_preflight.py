@@ -11,7 +11,7 @@ import pytest
 
 from bodycap_batch.capture import open_capture
 from bodycap_batch.check import check_job, check_path, preflight, require_ready
-from bodycap_batch.check.pictures import sample_indices
+from bodycap_batch.check.picture_quality import sample_indices
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.errors import Cancelled, JobError, StoreError
@@ -226,7 +226,7 @@ def test_who_stops_a_check_does_not_wait_for_the_cameras_that_are_left(
         looked.append(config)
         time.sleep(0.5 if len(looked) == 1 else 0.0)
 
-    monkeypatch.setattr(preflight, "_look_at", look)
+    monkeypatch.setattr(preflight, "_check_camera", look)
     cameras = (job.capture.cameras[0], *job.capture.cameras[1:] * 50)
     many = job.model_copy(update={"capture": job.capture.model_copy(update={"cameras": cameras})})
     with pytest.raises(Cancelled):

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
-from bodycap_batch.check.starting import UNKNOWN, starting_job, write_starting_job
+from bodycap_batch.check.job_template import UNKNOWN_MOUNT, job_template, write_job_template
 from bodycap_batch.cli import main
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import Job
@@ -29,7 +29,7 @@ def folder(tmp_path: Path) -> Path:
 def test_the_job_written_means_what_the_folder_means(folder: Path) -> None:
     (folder / "calib.json").write_text(json.dumps(LENS))
     without = load_job(folder)
-    path = write_starting_job(folder)
+    path = write_job_template(folder)
     assert load_job(path) == without
     assert load_job(folder) == without
 
@@ -38,8 +38,8 @@ def test_the_job_written_means_what_the_folder_means(folder: Path) -> None:
 def test_names_that_look_like_numbers_stay_text(tmp_path: Path, named: str) -> None:
     for video in ("torso.mp4", "2.mp4"):
         write_video(tmp_path / named / video, FRAMES[:5])
-    path = write_starting_job(tmp_path / named)
-    path.write_text(path.read_text().replace(f'"{UNKNOWN}"', "head"))
+    path = write_job_template(tmp_path / named)
+    path.write_text(path.read_text().replace(f'"{UNKNOWN_MOUNT}"', "head"))
     job = load_job(path)
     assert job.name == named
     assert sorted(camera.name for camera in job.capture.cameras) == ["2", "torso"]
@@ -48,24 +48,26 @@ def test_names_that_look_like_numbers_stay_text(tmp_path: Path, named: str) -> N
 def test_no_name_is_given_twice(tmp_path: Path) -> None:
     for video in ("cam 1.mp4", "cam_1.mp4", "CAM-1.mp4", "left palm.mp4", "left_palm.mp4", f"{'x' * 80}.mp4"):
         write_video(tmp_path / video, FRAMES[:5])
-    cameras = yaml.safe_load(starting_job(tmp_path))["capture"]["cameras"]
+    cameras = yaml.safe_load(job_template(tmp_path))["capture"]["cameras"]
     names = [camera["name"] for camera in cameras]
     assert len({name.lower() for name in names}) == len(names) == 6
     assert {"cam_1", "cam_1_2", "left_palm", "left_palm_2"} <= set(names)
     assert max(map(len, names)) <= 64
     # what the file's name says of the place is not asked for again
-    assert [camera["name"] for camera in cameras if "mount" in camera and camera["mount"] != UNKNOWN] == []
-    assert sum(camera.get("mount") == UNKNOWN for camera in cameras) == 4
+    assert [
+        camera["name"] for camera in cameras if "mount" in camera and camera["mount"] != UNKNOWN_MOUNT
+    ] == []
+    assert sum(camera.get("mount") == UNKNOWN_MOUNT for camera in cameras) == 4
 
 
 def test_what_is_found_is_used_and_said(folder: Path) -> None:
     (folder / "subject.bvh").write_text(BVH)
-    text = starting_job(folder)
+    text = job_template(folder)
     assert yaml.safe_load(text)["skeleton"] == "subject.bvh"
     assert "# 64×48, 30 fps, 0.3 s" in text
     assert "calibration: auto" in text
     (folder / "calib.json").write_text(json.dumps(LENS))
-    assert yaml.safe_load(starting_job(folder))["capture"]["calibration"] == "calib.json"
+    assert yaml.safe_load(job_template(folder))["capture"]["calibration"] == "calib.json"
 
 
 def test_chapters_side_by_side_are_one_camera_whose_place_is_asked_for(
@@ -82,7 +84,7 @@ def test_chapters_side_by_side_are_one_camera_whose_place_is_asked_for(
         load_job(folder / "job.yaml")
     assert caught.value.line
     assert "left_palm" in str(caught.value.hint)
-    text = (folder / "job.yaml").read_text().replace(f'"{UNKNOWN}"', "head")
+    text = (folder / "job.yaml").read_text().replace(f'"{UNKNOWN_MOUNT}"', "head")
     (folder / "job.yaml").write_text(text)
     assert len(load_job(folder / "job.yaml").capture.cameras) == 3
 
@@ -95,7 +97,7 @@ def options_switched_on(text: str) -> dict[str, Any]:
 
 
 def test_every_option_of_every_stage_is_there_with_its_default(folder: Path) -> None:
-    found = options_switched_on(starting_job(folder))
+    found = options_switched_on(job_template(folder))
     plain = Job.model_validate({"capture": {"cameras": [{"name": "torso", "video": ["torso.mp4"]}]}})
     for stage, options in found.items():
         assert options == getattr(plain, stage).model_dump(mode="json"), stage
@@ -115,5 +117,5 @@ def test_a_job_that_is_there_is_kept_unless_told_otherwise(
 
 def test_a_folder_without_videos_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="no video in this folder"):
-        write_starting_job(tmp_path)
+        write_job_template(tmp_path)
     assert list(tmp_path.iterdir()) == []

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from bodycap_batch.capture import open_capture
-from bodycap_batch.check import check_path, pictures
-from bodycap_batch.check.pictures import sample_indices
+from bodycap_batch.check import check_path, picture_quality
+from bodycap_batch.check.picture_quality import sample_indices
 from bodycap_batch.config.job import load_job
 from tests.videos import Image, textured_frame, write_video
 
@@ -58,7 +58,7 @@ def test_nothing_is_told_of_what_lies_behind_the_pictures_looked_at(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # As of large pictures, few frames are decoded after a key frame.
-    monkeypatch.setattr(pictures, "_STRETCH", 25)
+    monkeypatch.setattr(picture_quality, "_MAX_DECODED_FRAMES", 25)
     assert not _notes(tmp_path / "ready", lambda index: _moving(max(0, index - 30)), 1000)
     assert not _notes(tmp_path / "slow", lambda index: _wide(0.25 * index), 40)
 

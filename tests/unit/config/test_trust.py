@@ -9,7 +9,7 @@ from typing import get_args
 import pytest
 from pydantic import BaseModel
 
-from bodycap_batch.check import require_within
+from bodycap_batch.check import require_within_limits
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.limits import Limits, limits_from
 from bodycap_batch.config.models import Job
@@ -88,12 +88,12 @@ def test_yaml_limits_are_applied(tmp_path: Path) -> None:
 def test_a_video_is_measured_by_its_container(tmp_path: Path) -> None:
     write_video(tmp_path / "torso.mp4", [textured_frame(index) for index in range(30)])
     job = load_job(tmp_path)
-    require_within(job, Limits())
+    require_within_limits(job, Limits())
     with pytest.raises(CaptureError, match="pixels") as found:
-        require_within(job, Limits(video_px=16))
+        require_within_limits(job, Limits(video_px=16))
     assert "video_px" in str(found.value)
     with pytest.raises(CaptureError, match="hours"):
-        require_within(job, Limits(video_hours=1e-5))
+        require_within_limits(job, Limits(video_hours=1e-5))
 
 
 def test_every_path_a_job_can_name_is_known_to_the_policy() -> None:

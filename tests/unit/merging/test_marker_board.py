@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from bodycap_batch.calibration.boards import Board
-from bodycap_batch.calibration.in_room import find_board_views
+from bodycap_batch.calibration.boards import CalibrationBoard
+from bodycap_batch.calibration.board_views import find_board_views
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.options import MarkerBoard, MergeOptions
@@ -198,7 +198,7 @@ def filmed(tmp_path_factory) -> tuple[Path, np.ndarray]:
     folder, poses = tmp_path_factory.mktemp("filmed"), _path(8)
     texels = 24
     picture = cv2.copyMakeBorder(
-        Board(kind="charuco", columns=7, rows=5).picture(texels),
+        CalibrationBoard(kind="charuco", columns=7, rows=5).picture(texels),
         *[texels] * 4,
         cv2.BORDER_CONSTANT,
         value=235,

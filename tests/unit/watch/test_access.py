@@ -7,7 +7,7 @@ import socket
 import pytest
 
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.watch.web.access import Access, access_from
+from bodycap_batch.watch.web.access import Access, access_from_address
 
 TOKEN = "s3cret-s3cret-s3cret"  # noqa: S105
 LOCAL = Access(host="127.0.0.1", port=8080)
@@ -84,9 +84,9 @@ def test_the_usual_port_is_not_named_by_browsers(host: str) -> None:
 
 
 def test_addresses_are_read() -> None:
-    assert access_from("127.0.0.1:8080", "") == LOCAL
-    assert access_from("[::1]:80", "").url == "http://[::1]:80/"
-    assert access_from("0.0.0.0:8080", TOKEN) == OPEN
+    assert access_from_address("127.0.0.1:8080", "") == LOCAL
+    assert access_from_address("[::1]:80", "").url == "http://[::1]:80/"
+    assert access_from_address("0.0.0.0:8080", TOKEN) == OPEN
     for address, token in (
         ("8080", ""),
         ("127.0.0.1:http", ""),
@@ -98,4 +98,4 @@ def test_addresses_are_read() -> None:
         ("0.0.0.0:8080", "with; semicolons and spaces"),
     ):
         with pytest.raises(JobError):
-            access_from(address, token)
+            access_from_address(address, token)

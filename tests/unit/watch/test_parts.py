@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 
 from bodycap_batch.core.errors import JobError, StoreError
-from bodycap_batch.watch.changes import Changes, on_network_disk
-from bodycap_batch.watch.claim import Onlooker, first_claim, take_over
-from bodycap_batch.watch.drops import Drop, Settling, drops_in, look_at
-from bodycap_batch.watch.intake import Terms, read_drop
-from bodycap_batch.watch.options import WatchOptions
-from bodycap_batch.watch.spool import JobDir, Spool, move, spool_at, spool_name
+from bodycap_batch.watch.change_notifier import ChangeNotifier, is_on_network_disk
+from bodycap_batch.watch.claim import HeartbeatMonitor, create_claim, take_over_job
+from bodycap_batch.watch.dropped_job import JobPermissions, read_dropped_job
+from bodycap_batch.watch.inbox_entries import CompletionTracker, InboxEntry, entries_in, take_snapshot
+from bodycap_batch.watch.spool import JobDir, Spool, folder_name_from_text, move_to_free_name, spool_from_path
+from bodycap_batch.watch.watch_options import WatchOptions
 
 ROOT = Path(__file__).parents[3]
 
@@ -31,13 +31,13 @@ class Clock:
         return self.now
 
 
-def completed(settling: Settling, inbox: Path) -> list[str]:
-    return [drop.name for drop, _ in settling.complete(drops_in(inbox))]
+def completed(settling: CompletionTracker, inbox: Path) -> list[str]:
+    return [drop.name for drop, _ in settling.complete_entries(entries_in(inbox))]
 
 
 def test_a_folder_is_complete_when_it_has_been_still_for_long_enough(tmp_path: Path) -> None:
     clock = Clock()
-    settling = Settling(10.0, 100, clock)
+    settling = CompletionTracker(10.0, 100, clock)
     folder = tmp_path / "walk"
     folder.mkdir()
     assert completed(settling, tmp_path) == []
@@ -60,14 +60,14 @@ def test_a_folder_is_complete_when_it_has_been_still_for_long_enough(tmp_path: P
 )
 def test_what_a_copying_program_left_holds_a_folder_back_until_ready(tmp_path: Path, left: str) -> None:
     clock = Clock()
-    settling = Settling(10.0, 100, clock)
+    settling = CompletionTracker(10.0, 100, clock)
     (tmp_path / "walk" / left).parent.mkdir(parents=True)
     (tmp_path / "walk" / left).touch()
     (tmp_path / "walk" / "torso.mp4").touch()
     completed(settling, tmp_path)
     clock.now += 1000
     assert completed(settling, tmp_path) == []
-    assert left in look_at(Drop(tmp_path / "walk"), 100).waits_for
+    assert left in take_snapshot(InboxEntry(tmp_path / "walk"), 100).incomplete_reason
     (tmp_path / "walk" / "READY").touch()
     assert completed(settling, tmp_path) == ["walk"]
 
@@ -76,12 +76,12 @@ def test_what_file_managers_leave_holds_nothing_back(tmp_path: Path) -> None:
     (tmp_path / "walk").mkdir()
     for name in ("torso.mp4", ".DS_Store", "._torso.mp4"):
         (tmp_path / "walk" / name).touch()
-    assert completed(Settling(0.0, 100), tmp_path) == ["walk"]
+    assert completed(CompletionTracker(0.0, 100), tmp_path) == ["walk"]
 
 
 def test_the_drop_that_has_been_complete_for_longest_comes_first(tmp_path: Path) -> None:
     clock = Clock()
-    settling = Settling(10.0, 100, clock)
+    settling = CompletionTracker(10.0, 100, clock)
     for name in ("b", "a", "c.yaml"):
         (tmp_path / name).write_text("x")
         completed(settling, tmp_path)
@@ -97,75 +97,75 @@ def test_the_drop_that_has_been_complete_for_longest_comes_first(tmp_path: Path)
 def test_a_heartbeat_counts_as_stopped_by_the_own_clock_alone(tmp_path: Path) -> None:
     job = JobDir(tmp_path / "walk")
     job.path.mkdir()
-    claim = first_claim(job)
+    claim = create_claim(job)
     clock = Clock()
-    onlooker = Onlooker(60.0, clock)
+    onlooker = HeartbeatMonitor(60.0, clock)
 
     def elsewhere() -> None:
         owner = json.loads(job.owner.read_text())
         job.owner.write_text(json.dumps({**owner, "machine": "another", "pid": 1}))
 
     for _ in range(5):
-        claim.beat()
+        claim.write_heartbeat()
         elsewhere()
         os.utime(job.owner, (1e9, 1e9))  # that host's clock is years behind: nobody asks
-        assert onlooker.abandoned([job]) == []
+        assert onlooker.find_abandoned([job]) == []
         clock.now += 59
-    assert onlooker.abandoned([job]) == []
+    assert onlooker.find_abandoned([job]) == []
     clock.now += 1
-    assert onlooker.abandoned([job]) == [job]
+    assert onlooker.find_abandoned([job]) == [job]
 
 
 @pytest.mark.parametrize("stale_s", [1.0, 4.0, 60.0, 1000.0])
 def test_a_heart_beats_several_times_before_it_counts_as_stopped(stale_s: float) -> None:
-    assert WatchOptions(stale_s=stale_s).beat_s <= min(5.0, stale_s / 3)
+    assert WatchOptions(stale_s=stale_s).heartbeat_period_s <= min(5.0, stale_s / 3)
 
 
 def test_an_owner_that_let_go_or_ended_on_this_machine_is_not_waited_for(tmp_path: Path) -> None:
     job = JobDir(tmp_path / "walk")
     job.path.mkdir()
-    claim = first_claim(job)
-    onlooker = Onlooker(1e9)
-    assert onlooker.abandoned([job]) == []
+    claim = create_claim(job)
+    onlooker = HeartbeatMonitor(1e9)
+    assert onlooker.find_abandoned([job]) == []
     owner = json.loads(job.owner.read_text())
     if owner["machine"]:
         job.owner.write_text(json.dumps({**owner, "process": "1"}))
         # its number belongs to another process now
-        assert onlooker.abandoned([job]) == [job]
+        assert onlooker.find_abandoned([job]) == [job]
     job.owner.write_text(json.dumps(owner))
     claim.release()
-    assert onlooker.abandoned([job]) == [job]
+    assert onlooker.find_abandoned([job]) == [job]
 
 
 def test_a_late_heartbeat_of_an_earlier_owner_takes_nothing_back(tmp_path: Path) -> None:
     job = JobDir(tmp_path / "walk")
     job.path.mkdir()
-    first = first_claim(job)
+    first = create_claim(job)
     stale = job.owner.read_bytes()
-    second = take_over(job)
+    second = take_over_job(job)
     assert second is not None
     assert second.generation == 2
     job.owner.write_bytes(stale)  # suspended between its look and its write
-    assert second.guard.holds()
-    assert not first.guard.holds()
-    second.beat()
+    assert second.ownership.is_held()
+    assert not first.ownership.is_held()
+    second.write_heartbeat()
     assert json.loads(job.owner.read_text())["generation"] == 2
     shutil.rmtree(job.path)
-    assert not second.guard.holds()
+    assert not second.ownership.is_held()
 
 
 def test_a_job_of_the_same_name_is_not_mistaken_for_the_one_that_was_taken_away(tmp_path: Path) -> None:
     job = JobDir(tmp_path / "walk")
     job.path.mkdir()
-    first = first_claim(job)
+    first = create_claim(job)
     job.path.rename(tmp_path / "filed away")
     job.path.mkdir()
-    other = first_claim(job)
-    assert other.guard.holds()
-    assert not first.guard.holds()
-    first.beat()
+    other = create_claim(job)
+    assert other.ownership.is_held()
+    assert not first.ownership.is_held()
+    first.write_heartbeat()
     assert first.lost.is_set()
-    assert other.guard.holds()
+    assert other.ownership.is_held()
 
 
 def test_moves_never_overwrite(tmp_path: Path) -> None:
@@ -173,7 +173,7 @@ def test_moves_never_overwrite(tmp_path: Path) -> None:
         (tmp_path / "from" / "walk").mkdir(parents=True)
         (tmp_path / "from" / "walk" / "n").write_text(str(number))
         (tmp_path / "to").mkdir(exist_ok=True)
-        move(tmp_path / "from" / "walk", tmp_path / "to", "walk")
+        move_to_free_name(tmp_path / "from" / "walk", tmp_path / "to", "walk")
     assert {path.name: (path / "n").read_text() for path in (tmp_path / "to").iterdir()} == {
         "walk": "0",
         "walk-2": "1",
@@ -182,20 +182,20 @@ def test_moves_never_overwrite(tmp_path: Path) -> None:
 
 
 def test_names_of_jobs_are_safe_to_show_and_to_type() -> None:
-    assert spool_name("küche 3") == "küche 3"
-    assert spool_name("e\u0301") == "é"
-    assert spool_name("a\n\x1b[31mb") == "a__[31mb"
-    assert spool_name("-rf")[0] != "-"
-    assert spool_name("..")[0] != "."
-    assert spool_name(" ") == "_"
-    assert len(spool_name("日" * 200).encode()) <= 200
+    assert folder_name_from_text("küche 3") == "küche 3"
+    assert folder_name_from_text("e\u0301") == "é"
+    assert folder_name_from_text("a\n\x1b[31mb") == "a__[31mb"
+    assert folder_name_from_text("-rf")[0] != "-"
+    assert folder_name_from_text("..")[0] != "."
+    assert folder_name_from_text(" ") == "_"
+    assert len(folder_name_from_text("日" * 200).encode()) <= 200
 
 
 def test_the_spool_is_found_from_its_inbox_and_from_its_folder(tmp_path: Path) -> None:
     (tmp_path / "jobs" / "inbox").mkdir(parents=True)
     want = Spool(inbox=tmp_path / "jobs" / "inbox", root=tmp_path / "jobs")
-    assert spool_at(tmp_path / "jobs") == want
-    assert spool_at(tmp_path / "jobs" / "inbox") == want
+    assert spool_from_path(tmp_path / "jobs") == want
+    assert spool_from_path(tmp_path / "jobs" / "inbox") == want
 
 
 def test_the_videos_of_a_linked_drop_are_those_beside_its_job_file(tmp_path: Path) -> None:
@@ -204,11 +204,11 @@ def test_the_videos_of_a_linked_drop_are_those_beside_its_job_file(tmp_path: Pat
     (footage / "torso.mp4").touch()
     (footage / "job.yaml").write_text("height_m: 1.75\n")
     (tmp_path / "tuesday").symlink_to(footage)
-    drop = Drop(tmp_path / "tuesday")
-    job = read_drop(drop, look_at(drop, 100), Terms(roots=(footage,)))
+    drop = InboxEntry(tmp_path / "tuesday")
+    job = read_dropped_job(drop, take_snapshot(drop, 100), JobPermissions(roots=(footage,)))
     assert (job.name, [camera.name for camera in job.capture.cameras]) == ("tuesday", ["torso"])
     with pytest.raises(JobError, match="outside"):
-        read_drop(drop, look_at(drop, 100), Terms())
+        read_dropped_job(drop, take_snapshot(drop, 100), JobPermissions())
 
 
 def test_an_unknown_folder_holds_the_inbox_and_what_is_in_it_is_no_job(tmp_path: Path) -> None:
@@ -216,28 +216,28 @@ def test_an_unknown_folder_holds_the_inbox_and_what_is_in_it_is_no_job(tmp_path:
     (tmp_path / "jobs" / "mine.yaml").touch()
     for name in ("jobs", "not yet there"):
         want = Spool(inbox=tmp_path / name / "inbox", root=tmp_path / name)
-        assert spool_at(tmp_path / name) == want
+        assert spool_from_path(tmp_path / name) == want
     Spool(inbox=tmp_path / "drop", root=tmp_path).make()
-    assert spool_at(tmp_path / "drop") == Spool(inbox=tmp_path / "drop", root=tmp_path)
+    assert spool_from_path(tmp_path / "drop") == Spool(inbox=tmp_path / "drop", root=tmp_path)
     with pytest.raises(StoreError, match="no folder"):
-        spool_at(tmp_path / "jobs" / "mine.yaml")
+        spool_from_path(tmp_path / "jobs" / "mine.yaml")
     (tmp_path / "broken").symlink_to("nowhere")
     with pytest.raises(StoreError, match="no folder"):
-        spool_at(tmp_path / "broken")
+        spool_from_path(tmp_path / "broken")
 
 
 def test_the_folders_that_jobs_are_moved_to_are_not_watched(tmp_path: Path) -> None:
-    spool = spool_at(tmp_path)
+    spool = spool_from_path(tmp_path)
     spool.make()
     for folder in (spool.running, spool.done, spool.failed):
         with pytest.raises(StoreError, match="moved to this folder"):
-            spool_at(folder)
+            spool_from_path(folder)
 
 
 @pytest.mark.parametrize("poll", [False, True])
 def test_a_change_wakes_the_watcher(tmp_path: Path, poll: bool) -> None:
     woken = threading.Event()
-    with Changes(tmp_path, woken, poll=poll):
+    with ChangeNotifier(tmp_path, woken, poll=poll):
         end = time.monotonic() + 20
         number = 0
         while not woken.is_set() and time.monotonic() < end:
@@ -251,9 +251,9 @@ def test_a_network_disk_is_known_by_its_mount(tmp_path: Path) -> None:
     mounts = tmp_path / "mounts"
     nas = f"{tmp_path}/my\\040nas"
     mounts.write_text(f"/dev/sda / ext4 rw 0 0\nhost:/x {nas} nfs4 rw 0 0\n/dev/sdb {nas}/disk xfs rw 0 0\n")
-    assert on_network_disk(tmp_path / "my nas" / "jobs", mounts)
-    assert not on_network_disk(tmp_path / "my nas" / "disk" / "jobs", mounts)
-    assert not on_network_disk(tmp_path, mounts)
+    assert is_on_network_disk(tmp_path / "my nas" / "jobs", mounts)
+    assert not is_on_network_disk(tmp_path / "my nas" / "disk" / "jobs", mounts)
+    assert not is_on_network_disk(tmp_path, mounts)
 
 
 def test_the_service_example_is_a_valid_unit(tmp_path: Path) -> None:

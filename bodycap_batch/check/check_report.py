@@ -11,12 +11,12 @@ from bodycap_batch.capture.kept import should_keep_all
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import BodycapError
 
-_MANY_FILES = 3
-_LINE = 100
+_MAX_SHOWN_FILES = 3
+_LINE_WIDTH = 100
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CameraFinding:
+class CameraSummary:
     """One camera as its files show it.
 
     Attributes:
@@ -60,8 +60,8 @@ class CameraFinding:
 
     def lines(self) -> list[str]:
         """The finding as a person reads it."""
-        files = ", ".join(self.files[:_MANY_FILES])
-        if len(self.files) > _MANY_FILES:
+        files = ", ".join(self.files[:_MAX_SHOWN_FILES])
+        if len(self.files) > _MAX_SHOWN_FILES:
             files += f" … ({len(self.files)} chapters)"
         width, height = self.size_px
         size = f"{width}×{height}"
@@ -93,7 +93,7 @@ class CheckReport:
     """
 
     job: Job | None = None
-    cameras: tuple[CameraFinding, ...] = ()
+    cameras: tuple[CameraSummary, ...] = ()
     notes: tuple[str, ...] = ()
     errors: tuple[BodycapError, ...] = ()
     advice: tuple[str, ...] = ()
@@ -117,7 +117,7 @@ class CheckReport:
             mark = f"advice {number}: "
             out += textwrap.wrap(
                 sentence,
-                _LINE,
+                _LINE_WIDTH,
                 initial_indent=mark,
                 subsequent_indent=" " * len(mark),
                 break_on_hyphens=False,

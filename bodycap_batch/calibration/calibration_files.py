@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bodycap_batch.calibration.clip import CalibrationResult
+from bodycap_batch.calibration.clip_calibration import CalibrationResult
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.atomic_files import atomic_replacement, write_text
 
@@ -26,15 +26,15 @@ def write_calibration(result: CalibrationResult, path: Path, camera: str | None)
         JobError: The file that is there holds something else.
         StoreError: It cannot be written.
     """
-    entry = _entry(result)
+    entry = _calibration_entry(result)
     content = entry
     if camera is not None:
-        content = _existing(path)
+        content = _read_camera_entries(path)
         content["cameras"] = {**content.get("cameras", {}), camera: entry}
     write_text(path, json.dumps(content, indent=1) + "\n")
 
 
-def _entry(result: CalibrationResult) -> dict[str, Any]:
+def _calibration_entry(result: CalibrationResult) -> dict[str, Any]:
     fit = result.fit
     return {
         "model": fit.model,
@@ -54,7 +54,7 @@ def _entry(result: CalibrationResult) -> dict[str, Any]:
     }
 
 
-def _existing(path: Path) -> dict[str, Any]:
+def _read_camera_entries(path: Path) -> dict[str, Any]:
     """The file's content where it holds several cameras, empty where there is no file."""
     if not path.exists():
         return {}

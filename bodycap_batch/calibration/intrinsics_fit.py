@@ -9,20 +9,20 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bodycap_batch.calibration.boards import View
+from bodycap_batch.calibration.boards import BoardCorners
 from bodycap_batch.core.arrays import FloatArray
 
-Size = tuple[int, int]
-_FISHEYE_STARTS = (0.5, 0.35, 0.7)
+ImageSize = tuple[int, int]
+_FISHEYE_INITIAL_FOCALS = (0.5, 0.35, 0.7)
 """Focal lengths over the long side from which the fisheye model is tried, best first."""
-_BAD_VIEW = 3.0
+_MAX_VIEW_ERROR_RATIO = 3.0
 """A view whose error is that many times the median's was blurred, or found wrongly."""
-_BAD_VIEW_AT_LEAST_PX = 0.3
-_LEAST_VIEWS = 6
+_MIN_OUTLIER_ERROR_PX = 0.3
+_MIN_FIT_VIEWS = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fit:
+class IntrinsicsFit:
     """A lens fitted to views.
 
     Attributes:
@@ -51,7 +51,7 @@ class Fit:
         return [float(value) for value in (fx, fy, *centre, *self.distortion)]
 
 
-def fit_lens(model: str, views: Sequence[View], size: Size) -> Fit | None:
+def fit_intrinsics(model: str, views: Sequence[BoardCorners], size: ImageSize) -> IntrinsicsFit | None:
     """Fit a lens, leave out views that do not fit, and fit again.
 
     Args:
@@ -69,21 +69,23 @@ def fit_lens(model: str, views: Sequence[View], size: Size) -> Fit | None:
     fit = None
     for _ in range(3):
         chosen = [views[index] for index in kept]
-        fit = _fisheye(chosen, size) if model == "OPENCV_FISHEYE" else _pinhole(model, chosen, size)
+        fit = _fit_fisheye(chosen, size) if model == "OPENCV_FISHEYE" else _fit_pinhole(model, chosen, size)
         if fit is None:
             return None
         errors = np.array(fit.view_rms_px)
-        limit = max(_BAD_VIEW * float(np.median(errors)), _BAD_VIEW_AT_LEAST_PX * max(size) / 640.0)
+        limit = max(
+            _MAX_VIEW_ERROR_RATIO * float(np.median(errors)), _MIN_OUTLIER_ERROR_PX * max(size) / 640.0
+        )
         good = [index for index, error in zip(kept, errors, strict=True) if error <= limit]
-        fit = _numbered(fit, kept)
-        if len(good) == len(kept) or len(good) < _LEAST_VIEWS:
+        fit = _with_kept_views(fit, kept)
+        if len(good) == len(kept) or len(good) < _MIN_FIT_VIEWS:
             return fit
         kept = good
     return fit
 
 
-def _numbered(fit: Fit, kept: Sequence[int]) -> Fit:
-    return Fit(
+def _with_kept_views(fit: IntrinsicsFit, kept: Sequence[int]) -> IntrinsicsFit:
+    return IntrinsicsFit(
         model=fit.model,
         matrix=fit.matrix,
         distortion=fit.distortion,
@@ -94,29 +96,29 @@ def _numbered(fit: Fit, kept: Sequence[int]) -> Fit:
     )
 
 
-def _points(views: Sequence[View], *, wide: bool) -> tuple[list[Any], list[Any]]:
+def _opencv_points(views: Sequence[BoardCorners], *, wide: bool) -> tuple[list[Any], list[Any]]:
     """Corner lists as OpenCV takes them: single precision, or (1,N,·) double for the fisheye functions."""
     if wide:
         return [view.board_m[None] for view in views], [view.px[None] for view in views]
     return [view.board_m.astype(np.float32) for view in views], [view.px.astype(np.float32) for view in views]
 
 
-def _pinhole(model: str, views: Sequence[View], size: Size) -> Fit | None:
+def _fit_pinhole(model: str, views: Sequence[BoardCorners], size: ImageSize) -> IntrinsicsFit | None:
     flags = cv2.CALIB_FIX_K3
     if model == "PINHOLE":
         flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_ZERO_TANGENT_DIST
-    on_board, px = _points(views, wide=False)
+    on_board, px = _opencv_points(views, wide=False)
     try:
         rms, matrix, distortion, _, _, sigmas, _, each = cv2.calibrateCameraExtended(
             on_board, px, size, None, None, flags=flags
         )
     except cv2.error:
         return None
-    if not _plausible(matrix, size):
+    if not _is_plausible(matrix, size):
         return None
     count = 0 if model == "PINHOLE" else 4
     deviation = np.asarray(sigmas).ravel()
-    return Fit(
+    return IntrinsicsFit(
         model=model,
         matrix=np.asarray(matrix, dtype=np.float64),
         distortion=np.asarray(distortion, dtype=np.float64).ravel()[:count],
@@ -127,15 +129,17 @@ def _pinhole(model: str, views: Sequence[View], size: Size) -> Fit | None:
     )
 
 
-def _fisheye(views: Sequence[View], size: Size) -> Fit | None:
+def _fit_fisheye(views: Sequence[BoardCorners], size: ImageSize) -> IntrinsicsFit | None:
     """The best of several starts: the model's own start is for half a sphere along the long side."""
-    tries = [_fisheye_from(start * max(size), views, size) for start in _FISHEYE_STARTS]
+    tries = [_fit_fisheye_from(start * max(size), views, size) for start in _FISHEYE_INITIAL_FOCALS]
     found = [fit for fit in tries if fit is not None]
     return min(found, key=lambda fit: fit.rms_px) if found else None
 
 
-def _fisheye_from(focal_px: float, views: Sequence[View], size: Size) -> Fit | None:
-    on_board, px = _points(views, wide=True)
+def _fit_fisheye_from(
+    focal_px: float, views: Sequence[BoardCorners], size: ImageSize
+) -> IntrinsicsFit | None:
+    on_board, px = _opencv_points(views, wide=True)
     matrix = np.array([[focal_px, 0, 0.5 * size[0] - 0.5], [0, focal_px, 0.5 * size[1] - 0.5], [0, 0, 1]])
     flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW | cv2.CALIB_USE_INTRINSIC_GUESS
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)
@@ -145,14 +149,17 @@ def _fisheye_from(focal_px: float, views: Sequence[View], size: Size) -> Fit | N
         )
     except cv2.error:
         return None
-    if not _plausible(matrix, size) or not np.isfinite(distortion).all():
+    if not _is_plausible(matrix, size) or not np.isfinite(distortion).all():
         return None
-    return _fisheye_figures(views, matrix, distortion, list(zip(turns, shifts, strict=True)))
+    return _fisheye_fit_with_errors(views, matrix, distortion, list(zip(turns, shifts, strict=True)))
 
 
-def _fisheye_figures(
-    views: Sequence[View], matrix: FloatArray, distortion: FloatArray, poses: Sequence[tuple[Any, Any]]
-) -> Fit:
+def _fisheye_fit_with_errors(
+    views: Sequence[BoardCorners],
+    matrix: FloatArray,
+    distortion: FloatArray,
+    poses: Sequence[tuple[Any, Any]],
+) -> IntrinsicsFit:
     """Errors of a fisheye fit, and its focal sigma from the normal equations with the poses taken out.
 
     Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999 (the Schur complement).
@@ -168,7 +175,7 @@ def _fisheye_figures(
         reduced += lens.T @ lens - mixed.T @ np.linalg.pinv(pose.T @ pose) @ mixed
     freedom = max(1, 2 * count - 8 - 6 * len(views))
     covariance = np.linalg.pinv(reduced) * total / freedom
-    return Fit(
+    return IntrinsicsFit(
         model="OPENCV_FISHEYE",
         matrix=np.asarray(matrix, dtype=np.float64),
         distortion=np.asarray(distortion, dtype=np.float64).ravel(),
@@ -179,7 +186,7 @@ def _fisheye_figures(
     )
 
 
-def _plausible(matrix: Any, size: Size) -> bool:
+def _is_plausible(matrix: Any, size: ImageSize) -> bool:
     """A focal length between a 170° and a 5° lens, equal in both directions, and a centre in the picture."""
     focal = np.array([matrix[0, 0], matrix[1, 1]])
     centre = np.array([matrix[0, 2], matrix[1, 2]]) / np.array(size)

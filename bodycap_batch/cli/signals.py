@@ -14,31 +14,31 @@ _received: list[int] = []
 
 
 @contextmanager
-def stop_by_exception() -> Iterator[None]:
+def raise_on_signal() -> Iterator[None]:
     """Let SIGINT and SIGTERM raise `Cancelled` in the main thread."""
 
     def stop() -> None:
         raise Cancelled("stopped on request")
 
-    with _handled(stop):
+    with _handle_signals(stop):
         yield
 
 
 @contextmanager
-def stoppable() -> Iterator[threading.Event]:
+def event_on_signal() -> Iterator[threading.Event]:
     """Yield an event that SIGINT and SIGTERM set, for work that ends itself in good order."""
     event = threading.Event()
-    with _handled(event.set):
+    with _handle_signals(event.set):
         yield event
 
 
-def exit_code_of_stop() -> int:
+def signal_exit_code() -> int:
     """128 + the signal that stopped the work."""
     return 128 + (_received[-1] if _received else signal.SIGINT)
 
 
 @contextmanager
-def _handled(action: Callable[[], None]) -> Iterator[None]:
+def _handle_signals(action: Callable[[], None]) -> Iterator[None]:
     def handle(number: int, _: FrameType | None) -> None:
         _received.append(number)
         action()

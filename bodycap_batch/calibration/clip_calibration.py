@@ -11,32 +11,32 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from bodycap_batch.calibration.boards import Board, GreyImage, View
-from bodycap_batch.calibration.solve import Fit, Size, fit_lens
+from bodycap_batch.calibration.boards import BoardCorners, CalibrationBoard, GreyImage
+from bodycap_batch.calibration.intrinsics_fit import ImageSize, IntrinsicsFit, fit_intrinsics
 from bodycap_batch.capture import CaptureCamera, open_camera
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import CaptureError, EstimationError
 
-LensChoice = Literal["auto", "pinhole", "opencv", "fisheye"]
+CameraModelChoice = Literal["auto", "pinhole", "opencv", "fisheye"]
 _MODELS: dict[str, tuple[str, ...]] = {
     "auto": ("OPENCV", "OPENCV_FISHEYE"),
     "pinhole": ("PINHOLE",),
     "opencv": ("OPENCV",),
     "fisheye": ("OPENCV_FISHEYE",),
 }
-_MAX_LOOKS = 160
+_MAX_PICTURES = 160
 """Pictures the board is looked for in: a minute of film, some seconds of work."""
-_LOOKS_PER_S = 5.0
-_KEEP = 40
+_PICTURES_PER_S = 5.0
+_MAX_VIEWS = 40
 MIN_VIEWS = 8
-_WORTH_FISHEYE = 0.9
+_MAX_FISHEYE_ERROR_RATIO = 0.9
 """The fisheye model is taken where its error is that much smaller; else the commoner one."""
-_GRID = (8, 6)
-_POOR_COVERAGE = 0.5
-_POOR_SIGMA = 0.005
-_POOR_RMS_PX = 1.0
+_COVERAGE_CELLS = (8, 6)
+_MIN_COVERAGE = 0.5
+_MAX_FOCAL_SIGMA_RATIO = 0.005
+_MAX_RMS_PX = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,12 +54,12 @@ class CalibrationResult:
         preview: Picture (H,W) of the sharpest view kept, for `write_preview`.
     """
 
-    board: Board
-    fit: Fit
-    size: Size
+    board: CalibrationBoard
+    fit: IntrinsicsFit
+    size: ImageSize
     looked_at: int
     found: int
-    coverage: float
+    corner_coverage: float
     notes: tuple[str, ...]
     preview: GreyImage
 
@@ -78,7 +78,9 @@ class CalibrationResult:
         ]
 
 
-def calibrate_clip(video: Path, board: Board, lens: LensChoice, context: StageContext) -> CalibrationResult:
+def calibrate_clip(
+    video: Path, board: CalibrationBoard, lens: CameraModelChoice, context: StageContext
+) -> CalibrationResult:
     """Calibrate a camera from a clip of a board.
 
     Args:
@@ -96,10 +98,10 @@ def calibrate_clip(video: Path, board: Board, lens: LensChoice, context: StageCo
         CameraConfig(name="camera", video=(video,)),
     )
     size = (camera.camera.width_px, camera.camera.height_px)
-    found: list[tuple[int, View]] = []
+    found: list[tuple[int, BoardCorners]] = []
     looked_at = 0
-    wanted = _look_at(camera)
-    for frame, image in _sharpest(camera, wanted):
+    wanted = _frame_blocks(camera)
+    for frame, image in _sharpest_pictures(camera, wanted):
         context.check_cancelled()
         looked_at += 1
         context.progress(looked_at, len(wanted), "pictures")
@@ -107,14 +109,14 @@ def calibrate_clip(video: Path, board: Board, lens: LensChoice, context: StageCo
         if view is not None:
             found.append((frame, view))
     if len(found) < MIN_VIEWS:
-        raise _too_few(video, board, len(found), looked_at)
-    kept = spread([view for _, view in found], size, _KEEP)
-    fit = _best([found[index][1] for index in kept], size, lens, video)
+        raise _too_few_views(video, board, len(found), looked_at)
+    kept = select_diverse_views([view for _, view in found], size, _MAX_VIEWS)
+    fit = _best_fit([found[index][1] for index in kept], size, lens, video)
     frames = [found[kept[index]][0] for index in fit.kept]
     views = [found[kept[index]][1] for index in fit.kept]
     shown = frames[int(np.argmax([len(view.px) for view in views]))]
     _, preview = next(iter(camera.read([shown])))
-    covered = coverage([view.px for view in views], size)
+    covered = corner_coverage([view.px for view in views], size)
     return CalibrationResult(
         board=board,
         fit=fit,
@@ -127,16 +129,18 @@ def calibrate_clip(video: Path, board: Board, lens: LensChoice, context: StageCo
     )
 
 
-def _look_at(camera: CaptureCamera) -> list[tuple[int, int]]:
+def _frame_blocks(camera: CaptureCamera) -> list[tuple[int, int]]:
     """Stretches of frames, first and one past the last; the sharpest picture of each is looked at."""
     count = len(camera.times_ns)
     seconds = (int(camera.times_ns[-1]) - int(camera.times_ns[0])) / 1e9 * count / max(count - 1, 1)
-    looks = int(np.clip(round(seconds * _LOOKS_PER_S), 1, min(_MAX_LOOKS, count)))
+    looks = int(np.clip(round(seconds * _PICTURES_PER_S), 1, min(_MAX_PICTURES, count)))
     edges = np.linspace(0, count, looks + 1).round().astype(int).tolist()
     return list(itertools.pairwise(edges))
 
 
-def _sharpest(camera: CaptureCamera, stretches: Sequence[tuple[int, int]]) -> Iterator[tuple[int, GreyImage]]:
+def _sharpest_pictures(
+    camera: CaptureCamera, stretches: Sequence[tuple[int, int]]
+) -> Iterator[tuple[int, GreyImage]]:
     """The sharpest picture of each stretch: a board held in the hand is still for moments only."""
     ends = iter(stretches)
     end = next(ends)[1]
@@ -153,9 +157,11 @@ def _sharpest(camera: CaptureCamera, stretches: Sequence[tuple[int, int]]) -> It
         yield best[1], best[2]
 
 
-def _best(views: Sequence[View], size: Size, lens: LensChoice, video: Path) -> Fit:
+def _best_fit(
+    views: Sequence[BoardCorners], size: ImageSize, lens: CameraModelChoice, video: Path
+) -> IntrinsicsFit:
     """The lens that fits best, the commoner model where there is little between them."""
-    fits = [fit for model in _MODELS[lens] if (fit := fit_lens(model, views, size)) is not None]
+    fits = [fit for model in _MODELS[lens] if (fit := fit_intrinsics(model, views, size)) is not None]
     if not fits:
         raise EstimationError(
             f"no lens fits the {len(views)} views of the board",
@@ -164,19 +170,19 @@ def _best(views: Sequence[View], size: Size, lens: LensChoice, video: Path) -> F
         )
     best = fits[0]
     for other in fits[1:]:
-        if other.rms_px < _WORTH_FISHEYE * best.rms_px:
+        if other.rms_px < _MAX_FISHEYE_ERROR_RATIO * best.rms_px:
             best = other
     return best
 
 
-def spread(views: Sequence[View], size: Size, count: int) -> list[int]:
+def select_diverse_views(views: Sequence[BoardCorners], size: ImageSize, count: int) -> list[int]:
     """Choose views that differ: the one with most corners first, then always the one farthest from all.
 
     A view is described by where the board's corners lie in the picture and how large and tilted it is.
 
     Source: T. Gonzalez, "Clustering to minimize the maximum intercluster distance", 1985.
     """
-    described = np.array([_description(view, size) for view in views])
+    described = np.array([_view_descriptor(view, size) for view in views])
     chosen = [int(np.argmax([len(view.px) for view in views]))]
     distance = np.linalg.norm(described - described[chosen[0]], axis=1)
     while len(chosen) < min(count, len(views)):
@@ -188,7 +194,7 @@ def spread(views: Sequence[View], size: Size, count: int) -> list[int]:
     return sorted(chosen)
 
 
-def _description(view: View, size: Size) -> FloatArray:
+def _view_descriptor(view: BoardCorners, size: ImageSize) -> FloatArray:
     """Centre, size and perspective of the board in the picture, each about 0 … 1."""
     homography, _ = cv2.findHomography(view.board_m[:, :2], view.px / max(size))
     centre = view.px.mean(axis=0) / max(size)
@@ -198,30 +204,30 @@ def _description(view: View, size: Size) -> FloatArray:
     return np.concatenate([centre, [0.3 * scale], np.clip(2.0 * extent * tilt, -1, 1)])
 
 
-def coverage(pixels: Sequence[FloatArray], size: Size) -> float:
+def corner_coverage(pixels: Sequence[FloatArray], size: ImageSize) -> float:
     """Share of the picture's cells in which a corner was seen."""
-    cells = np.zeros(_GRID, dtype=bool)
+    cells = np.zeros(_COVERAGE_CELLS, dtype=bool)
     for px in pixels:
-        cell = np.floor((px + 0.5) / np.array(size) * np.array(_GRID)).astype(int)
-        column, row = np.clip(cell, 0, np.array(_GRID) - 1).T
+        cell = np.floor((px + 0.5) / np.array(size) * np.array(_COVERAGE_CELLS)).astype(int)
+        column, row = np.clip(cell, 0, np.array(_COVERAGE_CELLS) - 1).T
         cells[column, row] = True
     return float(cells.mean())
 
 
-def _notes(fit: Fit, size: Size, covered: float) -> list[str]:
+def _notes(fit: IntrinsicsFit, size: ImageSize, covered: float) -> list[str]:
     notes = []
-    if covered < _POOR_COVERAGE:
+    if covered < _MIN_COVERAGE:
         notes.append(
             f"corners were seen in {100 * covered:.0f} % of the picture: the lens is a guess elsewhere; "
             "film the board in all corners, too"
         )
     sigma = max(fit.focal_sigma_px) / fit.matrix[0, 0]
-    if sigma > _POOR_SIGMA:
+    if sigma > _MAX_FOCAL_SIGMA_RATIO:
         notes.append(
             f"the focal length is known to {100 * sigma:.1f} % only: tilt the board more, to all sides, "
             "and film it nearer"
         )
-    if fit.rms_px > _POOR_RMS_PX * max(size) / 640.0:
+    if fit.rms_px > _MAX_RMS_PX * max(size) / 640.0:
         notes.append(
             f"an error of {fit.rms_px:.1f} px is large: is the board flat, its size right, the focus fixed "
             "and stabilisation off?"
@@ -229,7 +235,7 @@ def _notes(fit: Fit, size: Size, covered: float) -> list[str]:
     return notes
 
 
-def _too_few(video: Path, board: Board, found: int, looked_at: int) -> CaptureError:
+def _too_few_views(video: Path, board: CalibrationBoard, found: int, looked_at: int) -> CaptureError:
     size = "count squares, not corners"
     if board.kind == "chessboard":
         size = "count inner corners, not squares; all of it has to be in the picture, with white around it"

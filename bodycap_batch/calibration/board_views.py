@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bodycap_batch.calibration.boards import Board
+from bodycap_batch.calibration.boards import CalibrationBoard
 from bodycap_batch.capture import Capture
 from bodycap_batch.config.options import MarkerBoard
 from bodycap_batch.core.arrays import FloatArray, IntArray
@@ -36,7 +36,7 @@ def find_board_views(
         JobError: There is no such board.
         CaptureError: A frame cannot be decoded.
     """
-    board = Board(
+    board = CalibrationBoard(
         kind=wanted.kind,
         columns=wanted.columns,
         rows=wanted.rows,
@@ -54,7 +54,7 @@ def find_board_views(
             corners = wanted.square_m * seen.board_m
             rays = lenses[camera].unproject(seen.px + CV2_PIXEL_OFFSET_PX)
             known = np.isfinite(rays).all(axis=1)
-            pose = _pose(corners[known], rays[known]) if known.sum() >= 4 else None
+            pose = _estimate_board_pose(corners[known], rays[known]) if known.sum() >= 4 else None
             if pose is not None:
                 out.append(
                     BoardView(
@@ -68,7 +68,7 @@ def find_board_views(
     return tuple(out)
 
 
-def _pose(board_m: FloatArray, rays: FloatArray) -> FloatArray | None:
+def _estimate_board_pose(board_m: FloatArray, rays: FloatArray) -> FloatArray | None:
     """cam_from_board (4,4) of a flat board, None where OpenCV finds none."""
     import cv2
 

@@ -6,29 +6,29 @@ import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.capture.images import Image
-from bodycap_batch.check.stillness import outline, standing_still
+from bodycap_batch.check.static_pictures import block_means, static_notes
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.errors import CaptureError
 
 _SAMPLES = 8
 # Sensor noise of a covered lens stays below this grey value (of 255) in 99 of 100 pixels.
-_BLACK_LEVEL = 20.0
+_MAX_BLACK_GREY = 20.0
 # A wall out of focus, fog on the lens: fewer grey levels than this between dark and bright.
-_FLAT_CONTRAST = 12.0
+_MIN_CONTRAST = 12.0
 # Decoding this many frames for one sample takes a second or two.
-_STRETCH, _STRETCH_PIXELS = 250, 640 * 480
+_MAX_DECODED_FRAMES, _REFERENCE_PIXELS = 250, 640 * 480
 """So many frames of that size are decoded to see the last one, and as many where key frames are rare: a
 second of work each. Of 4K no more than nine."""
 # Sound captures have a median grey of 100 and more.
-_DARK_LEVEL = 45.0
+_MIN_MEDIAN_GREY = 45.0
 # FAST corners that stand out by this much: 229 and more in every picture looked at of four captures that
 # track well, 6 to 70 in most of the palms' that lose a third of their frames.
-_CORNER_CONTRAST = 15
-_FEW_CORNERS = 60
-_THUMBNAIL_PX = 160
+_FAST_THRESHOLD = 15
+_MIN_CORNERS = 60
+_MIN_WIDTH_PX = 160
 
 
-def look_at_frames(camera: CaptureCamera) -> list[str]:
+def check_picture_quality(camera: CaptureCamera) -> list[str]:
     """Decode a few evenly spread frames.
 
     Returns:
@@ -51,10 +51,10 @@ def look_at_frames(camera: CaptureCamera) -> list[str]:
         dark.append(float(low))
         bright.append(float(high))
         seen.append(index)
-        outlines.append(outline(image))
+        outlines.append(block_means(image))
         grey.append(float(np.median(image)))
-        corners.append(_corners(image))
-    black = int(np.sum(np.array(bright) < _BLACK_LEVEL))
+        corners.append(_corner_count(image))
+    black = int(np.sum(np.array(bright) < _MAX_BLACK_GREY))
     if black == len(bright):
         raise CaptureError(
             f"camera {camera.name} shows black pictures only ({black} of {black} looked at)",
@@ -67,38 +67,38 @@ def look_at_frames(camera: CaptureCamera) -> list[str]:
             "interlaced: make whole pictures of it first (ffmpeg -i in -vf bwdif=send_frame out.mp4)"
         )
     times_s = camera.common_times_ns() / 1e9
-    notes += standing_still(outlines, times_s[seen], float(times_s[-1] - times_s[0]))
+    notes += static_notes(outlines, times_s[seen], float(times_s[-1] - times_s[0]))
     if black:
         notes.append(
             f"{black} of {len(bright)} pictures looked at are black; cut them off with start_s and end_s"
         )
-    notes += _hard_to_track(grey, corners)
+    notes += _tracking_notes(grey, corners)
     contrast = np.array(bright) - np.array(dark)
-    if float(np.median(contrast)) < _FLAT_CONTRAST:
+    if float(np.median(contrast)) < _MIN_CONTRAST:
         notes.append("hardly any contrast in the pictures: little will be found to track")
     return notes
 
 
-def _corners(image: Image) -> float:
+def _corner_count(image: Image) -> float:
     """Corners in a picture, as many as there would be at 640 × 480; a thumbnail tells nothing of texture."""
-    if image.shape[1] < _THUMBNAIL_PX:
+    if image.shape[1] < _MIN_WIDTH_PX:
         return np.inf
     import cv2
 
-    detector = cv2.FastFeatureDetector.create(threshold=_CORNER_CONTRAST)
+    detector = cv2.FastFeatureDetector.create(threshold=_FAST_THRESHOLD)
     return len(detector.detect(image)) * 640.0 * 480.0 / image.size
 
 
-def _hard_to_track(grey: list[float], corners: list[float]) -> list[str]:
+def _tracking_notes(grey: list[float], corners: list[float]) -> list[str]:
     """What light and texture say; black pictures are told elsewhere."""
     out = []
-    lit = [value for value in grey if value >= _BLACK_LEVEL]
-    if lit and float(np.median(lit)) < _DARK_LEVEL:
+    lit = [value for value in grey if value >= _MAX_BLACK_GREY]
+    if lit and float(np.median(lit)) < _MIN_MEDIAN_GREY:
         out.append(
             f"dark pictures (median grey {np.median(lit):.0f} of 255): the shutter stays open long and "
             "movement blurs; more light helps more than any setting"
         )
-    bare = sum(count < _FEW_CORNERS for count in corners)
+    bare = sum(count < _MIN_CORNERS for count in corners)
     if 2 * bare >= len(corners) and bare > 1:
         out.append(
             f"{bare} of {len(corners)} pictures looked at show hardly anything to hold on to (plain walls, "
@@ -120,13 +120,13 @@ def sample_indices(camera: CaptureCamera, count: int) -> IntArray:
     picked = keys[np.abs(keys[None] - even[:, None]).argmin(axis=1)]
     # The end is where a broken recording shows; without a key frame near it, it costs too much.
     width, height = camera.videos[-1].stored_size
-    stretch = round(_STRETCH * min(1.0, _STRETCH_PIXELS / (width * height)))
+    stretch = round(_MAX_DECODED_FRAMES * min(1.0, _REFERENCE_PIXELS / (width * height)))
     end = min(last, int(keys[-1]) + stretch)
     far = even[2 * np.abs(picked - even) * max(1, len(even) - 1) > last]
-    return np.unique(np.concatenate([picked, _between(far, keys, last, stretch), [0, end]]))
+    return np.unique(np.concatenate([picked, _frames_between_keys(far, keys, last, stretch), [0, end]]))
 
 
-def _between(wanted: IntArray, keys: IntArray, last: int, stretch: int) -> IntArray:
+def _frames_between_keys(wanted: IntArray, keys: IntArray, last: int, stretch: int) -> IntArray:
     """Frames in the place of those that no key frame is near; `stretch` of them are decoded for it."""
     before = np.searchsorted(keys, wanted, side="right") - 1
     starts, counts = np.unique(before[before >= 0], return_counts=True)

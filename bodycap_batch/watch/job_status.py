@@ -1,4 +1,4 @@
-"""`status.json`: what a job is doing, for people, programs and the live page."""
+"""Write and read `status.json`: the state of a job for users, programs and the live page."""
 
 from __future__ import annotations
 
@@ -19,9 +19,12 @@ from bodycap_batch.watch.spool import JobDir
 
 State = Literal["claimed", "running", "stopped", "done", "failed", "cancelled"]
 FINAL = ("done", "failed", "cancelled")
-_PERIOD_S = 0.5
-_MOST_NOTES = 100
-_EXPECTED: Mapping[str, tuple[type, ...]] = {
+"""States in which a job is filed."""
+_WRITE_PERIOD_S = 0.5
+"""Seconds between two writes of progress. Evidence: none."""
+_MAX_NOTES = 100
+"""Number of notes that are kept, so that the file stays small. Evidence: none."""
+_FIELD_TYPES: Mapping[str, tuple[type, ...]] = {
     **dict.fromkeys(("kind", "dropped", "state", "stage", "camera"), (str,)),
     "store": (str, NoneType),
     **dict.fromkeys(("notes", "finished_stages"), (list,)),
@@ -30,24 +33,24 @@ _EXPECTED: Mapping[str, tuple[type, ...]] = {
     "progress": (int, float, NoneType),
     "error": (dict, NoneType),
 }
-"""What somebody has put into the file by hand counts only where it is of the right kind."""
-_UNENDED = "reading videos"
-"""No stage, so nobody tells its end: it is over when a stage begins."""
+"""Types of the fields. A value of another type, for example edited by hand, is ignored."""
+_ACTIVITY_WITHOUT_END = "reading videos"
+"""An activity that is not a stage and reports no end. It is over when a stage starts."""
 
 
-class StatusFile:
-    """Keeps a job's `status.json` and its log up to date; told events by the stages.
+class JobStatusFile:
+    """Keep a job's `status.json` and its log up to date; the stages call it with events.
 
     Args:
         job: The job's folder.
-        before: What was written there earlier.
-        may_write: Asked before each write; False once the job belongs to another watcher.
+        previous: Content of an earlier `status.json` of the job.
+        may_write: Called before each write; False once the job belongs to another watcher.
     """
 
     def __init__(
         self,
         job: JobDir,
-        before: Mapping[str, Any] | None = None,
+        previous: Mapping[str, Any] | None = None,
         may_write: Callable[[], bool] = lambda: True,
     ) -> None:
         self._job = job
@@ -55,85 +58,92 @@ class StatusFile:
         self._lock = threading.Lock()
         self._written = 0.0
         self._failed = False
-        now, before = time_text(), before or {}
+        now, previous = utc_text(), previous or {}
         self.document: dict[str, Any] = {
             "name": job.name,
-            "kind": before.get("kind", "folder"),
-            "dropped": before.get("dropped", job.name),
+            "kind": previous.get("kind", "folder"),
+            "dropped": previous.get("dropped", job.name),
             "state": "claimed",
             "stage": "",
             "camera": "",
             "progress": None,
             "active": {},
             "finished_stages": [],
-            "notes": list(before.get("notes", [])),
-            "claimed_at": before.get("claimed_at", now),
+            "notes": list(previous.get("notes", [])),
+            "claimed_at": previous.get("claimed_at", now),
             "started_at": None,
             "updated_at": now,
             "finished_at": None,
-            "attempts": int(before.get("attempts", 0)),
+            "attempts": int(previous.get("attempts", 0)),
             "host": None,
             "generation": None,
-            "store": before.get("store"),
+            "store": previous.get("store"),
             "exit_code": None,
             "error": None,
         }
 
     def __call__(self, event: Event) -> None:
-        """Take one event of the job in."""
+        """Record one event of the job."""
         with self._lock:
-            _take(self.document, event)
-            if event.kind != "note" and not self._failed:  # a report made afterwards is no end
+            _apply_event(self.document, event)
+            if event.kind != "note" and not self._failed:  # keep the failed stage, though a report follows
                 self.document.update(stage=event.stage, camera=event.camera)
                 self._failed = event.kind == "failed"
             if event.kind != "progress":
                 self._log(event)
-            if event.kind != "progress" or time.monotonic() - self._written >= _PERIOD_S:
+            if event.kind != "progress" or time.monotonic() - self._written >= _WRITE_PERIOD_S:
                 self._write()
 
-    def change(self, **values: Any) -> None:
+    def update(self, **values: Any) -> None:
         """Set fields and write the file."""
         with self._lock:
             self.document.update(values)
             self._write()
 
-    def moved_to(self, job: JobDir) -> None:
-        """The job's folder has got another name."""
+    def set_job_dir(self, job: JobDir) -> None:
+        """Record that the job's folder has been renamed."""
         with self._lock:
             self._job = job
             self.document["name"] = job.name
 
-    def note(self, text: str) -> None:
-        """Keep something worth telling."""
+    def add_note(self, text: str) -> None:
+        """Add a note for the user."""
         with self._lock:
             _add_note(self.document, text)
             self._write()
 
     def finish(self, state: State, error: BodycapError | None, target: Path, inbox: Path) -> None:
-        """Write the last word, paths as they will be once the job's folder is `target`."""
-        where = {
+        """Write the final state, with the paths that hold once the job's folder is `target`.
+
+        Args:
+            state: The final state.
+            error: Why the job failed, or None.
+            target: The job's folder after the move.
+            inbox: The folder in which the job was dropped.
+        """
+        new_paths = {
             str(inbox / self.document["dropped"]): str(target / "input"),
             str(self._job.path): str(target),
         }
         if self.document["kind"] == "file":
-            del where[str(inbox / self.document["dropped"])]
-            where[str(inbox)] = str(target / "input")
+            del new_paths[str(inbox / self.document["dropped"])]
+            new_paths[str(inbox)] = str(target / "input")
         with self._lock:
             self.document.update(
                 name=target.name,
                 state=state,
                 active={},
                 progress=1.0 if state == "done" else self.document["progress"],
-                finished_at=time_text(),
+                finished_at=utc_text(),
                 exit_code=0 if error is None else error.exit_code,
-                error=None if error is None else _relocated(error.to_dict(), where),
+                error=None if error is None else _with_replaced_paths(error.to_dict(), new_paths),
             )
             self._write()
 
     def _write(self) -> None:
-        self.document["updated_at"] = time_text()
+        self.document["updated_at"] = utc_text()
         self._written = time.monotonic()
-        if not self._job.path.is_dir() or not self._may_write():  # taken over, perhaps filed away already
+        if not self._job.path.is_dir() or not self._may_write():  # another watcher has it, or has filed it
             return
         temporary = self._job.path / f".status.{os.getpid()}.{threading.get_ident()}.part"
         with disk_errors(self._job.path):
@@ -154,15 +164,16 @@ def append_log(job: JobDir, text: str) -> None:
         with disk_errors(job.path):
             job.log.parent.mkdir(parents=True, exist_ok=True)
             with job.log.open("a", encoding="utf-8", errors="backslashreplace") as stream:
-                stream.write(f"{time_text()} {text}\n")
+                stream.write(f"{utc_text()} {text}\n")
 
 
 def read_status(job: JobDir, *, strict: bool = False) -> dict[str, Any]:
-    """What a job's `status.json` says; empty where there is none or it is garbled.
+    """Return the content of a job's `status.json`; empty if the file is missing or damaged.
 
     Args:
         job: The job's folder.
-        strict: Raise `OSError` where it is there but the disk does not give it, else empty then, too.
+        strict: Raise `OSError` if the file exists and the disk cannot read it. Otherwise the result is empty
+            then.
     """
     try:
         found = json.loads(job.status.read_text(encoding="utf-8"))
@@ -174,23 +185,25 @@ def read_status(job: JobDir, *, strict: bool = False) -> dict[str, Any]:
         return {}
     if not isinstance(found, dict):
         return {}
-    return {name: value for name, value in found.items() if isinstance(value, _EXPECTED.get(name, (object,)))}
+    return {
+        name: value for name, value in found.items() if isinstance(value, _FIELD_TYPES.get(name, (object,)))
+    }
 
 
-def time_text(seconds: float | None = None) -> str:
-    """A moment (now, or Unix seconds) as text: UTC, whole seconds."""
+def utc_text(seconds: float | None = None) -> str:
+    """Return a moment (now, or Unix seconds) as text: UTC, whole seconds."""
     moment = datetime.now(UTC) if seconds is None else datetime.fromtimestamp(seconds, UTC)
     return moment.isoformat(timespec="seconds").replace("+00:00", "Z")
 
 
-def _take(document: dict[str, Any], event: Event) -> None:
+def _apply_event(document: dict[str, Any], event: Event) -> None:
+    """Update the document with one event."""
     if event.kind == "note":
         _add_note(document, event.what)
         return
     if event.kind != "progress":
-        document["active"].pop(_UNENDED, None)
-    share = event.done / event.total if event.total else None
-    document["progress"] = share
+        document["active"].pop(_ACTIVITY_WITHOUT_END, None)
+    document["progress"] = event.done / event.total if event.total else None
     if event.kind in ("started", "progress"):
         document["active"][event.label] = {"done": event.done, "total": event.total, "what": event.what}
     else:
@@ -203,16 +216,17 @@ def _take(document: dict[str, Any], event: Event) -> None:
 
 
 def _add_note(document: dict[str, Any], text: str) -> None:
-    if text not in document["notes"] and len(document["notes"]) < _MOST_NOTES:
+    """Append a note unless it is known or there are too many."""
+    if text not in document["notes"] and len(document["notes"]) < _MAX_NOTES:
         document["notes"].append(text)
 
 
-def _relocated(error: Mapping[str, Any], where: Mapping[str, str]) -> dict[str, Any]:
-    """The error with paths as they will be."""
+def _with_replaced_paths(error: Mapping[str, Any], new_paths: Mapping[str, str]) -> dict[str, Any]:
+    """Return the error with its paths replaced by those after the move."""
 
     def changed(text: str) -> str:
-        for here, there in where.items():
-            text = text.replace(here, there)
+        for old, new in new_paths.items():
+            text = text.replace(old, new)
         return text
 
     return {key: changed(value) if isinstance(value, str) else value for key, value in error.items()}

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 _LINE_PERIOD_S = 5.0
 _LINE_PAUSE_S = 1.0
-_LINE_STEP = 0.1
+_LINE_PROGRESS = 0.1
 """A line every five seconds, or every tenth of a stage but not more often than once a second."""
 
 
-class Display(Protocol):
+class ProgressDisplay(Protocol):
     """Shows events; a context manager."""
 
     def __enter__(self) -> Self: ...
@@ -34,11 +34,11 @@ class Display(Protocol):
         """Show one event."""
 
 
-def make_display(*, as_json: bool) -> Display:
+def make_progress_display(*, as_json: bool) -> ProgressDisplay:
     """Bars on a terminal, JSON lines when asked for, else plain lines."""
     if as_json:
         return JsonLines()
-    return Bars() if sys.stderr.isatty() else Lines()
+    return ProgressBars() if sys.stderr.isatty() else ProgressLines()
 
 
 class JsonLines:
@@ -60,12 +60,12 @@ class JsonLines:
             sys.stdout.flush()
 
 
-class Lines:
+class ProgressLines:
     """Plain lines on standard error, every few seconds or every tenth of a stage."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._pace: dict[str, _Pace] = {}
+        self._pace: dict[str, _LinePacer] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -77,18 +77,18 @@ class Lines:
         """Write one event, unless the stage has just been heard of."""
         with self._lock:
             if event.kind == "progress":
-                pace = self._pace.setdefault(f"{event.label} {event.what}", _Pace())
+                pace = self._pace.setdefault(f"{event.label} {event.what}", _LinePacer())
                 if (text := pace.line(event)) is not None:
                     self._write(text)
             else:
-                self._write(sentence(event))
+                self._write(text_from_event(event))
 
     def _write(self, text: str) -> None:
         sys.stderr.write(f"{time.strftime('%H:%M:%S')} {text}\n")
         sys.stderr.flush()
 
 
-class _Pace:
+class _LinePacer:
     """When a stage was last written about, and how fast it goes."""
 
     def __init__(self) -> None:
@@ -100,7 +100,9 @@ class _Pace:
         now, share = time.monotonic(), event.done / event.total if event.total else 0.0
         self._first = self._first or (now, event.done)
         waited = now - self._written
-        if waited < _LINE_PERIOD_S and not (waited >= _LINE_PAUSE_S and share - self._share >= _LINE_STEP):
+        if waited < _LINE_PERIOD_S and not (
+            waited >= _LINE_PAUSE_S and share - self._share >= _LINE_PROGRESS
+        ):
             return None
         self._written, self._share = now, share
         seconds, done = now - self._first[0], event.done - self._first[1]
@@ -112,17 +114,17 @@ class _Pace:
         if rate is not None:
             text += f", {rate:.3g}/s"
             if event.done < event.total:
-                text += f", {_duration((event.total - event.done) / rate)} left"
+                text += f", {_duration_text((event.total - event.done) / rate)} left"
         return text
 
 
-class Bars:
+class ProgressBars:
     """A bar per stage and camera, with rate and time left, on standard error."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._bars: dict[str, TaskID] = {}
-        self._progress = _progress()
+        self._progress = _make_rich_progress()
 
     def __enter__(self) -> Self:
         self._progress.start()
@@ -151,7 +153,7 @@ class Bars:
         total = self._progress.tasks[bar].total or 1
         words = {
             "reused": "already done",
-            "finished": f"done in {_duration(event.seconds)}",
+            "finished": f"done in {_duration_text(event.seconds)}",
             "failed": "failed",
             "stopped": "stopped",
         }
@@ -161,7 +163,7 @@ class Bars:
         self._progress.stop_task(bar)
 
 
-def _progress() -> Progress:
+def _make_rich_progress() -> Progress:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
     from rich.text import Text
@@ -193,21 +195,21 @@ def _progress() -> Progress:
     )
 
 
-def sentence(event: Event) -> str:
+def text_from_event(event: Event) -> str:
     """An event as one reads it."""
     if event.kind == "note":
         return event.what
     words = {
         "started": "started",
         "reused": "already done, taken from the store",
-        "finished": f"done in {_duration(event.seconds)}",
+        "finished": f"done in {_duration_text(event.seconds)}",
         "failed": "failed",
         "stopped": "stopped",
     }
     return f"{event.label}: {words[event.kind]}"
 
 
-def _duration(seconds: float) -> str:
+def _duration_text(seconds: float) -> str:
     if seconds < 60:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)

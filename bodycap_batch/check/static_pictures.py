@@ -11,24 +11,24 @@ from bodycap_batch.capture.images import Image
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 
 _COLUMNS, _ROWS, _BLOCK_PX = 8, 6, 8
-_LEAST_CONTRAST = 3.0
+_MIN_BLOCK_SIGMA = 3.0
 """Grey levels, as a standard deviation, below which a block shows nothing that could be seen to move."""
-_LEAST_BLOCKS, _SAME = 6, 1.0
+_MIN_TEXTURED_BLOCKS, _MAX_GREY_DIFFERENCE = 6, 1.0
 """With fewer blocks that show something, pictures are alike where they are the same to a grey level."""
-_ALIKE = 0.9
-_STILL_SHARE = 0.7
+_MIN_CORRELATION = 0.9
+_MIN_STATIC_RATIO = 0.7
 """Of the blocks that show something. Pictures an eighth of a recording apart: at most 0.11 with 15 worn
 cameras of five captures, 1.0 with a frozen picture and a camera on a table, sensor noise and all."""
-_LEAST_S, _LEAST_LENGTH = 1.0, 0.125
+_MIN_STEP_S, _MIN_STEP_RATIO = 1.0, 0.125
 """Pictures less than a second or an eighth of the recording apart may well be alike: nobody moves all the
 time, and a slow turn of the body does not show in a few frames."""
-_LEAST_RUN, _RUN_STEPS = 3, 2
+_MIN_RUN_PICTURES, _MIN_RUN_STEPS = 3, 2
 """A part of a recording stands still with so many pictures alike, over so many of those steps of time."""
-_THROUGHOUT = 0.7
+_MIN_SPAN_RATIO = 0.7
 """Share of a recording that pictures have to span to tell of all of it."""
 
 
-def outline(image: Image) -> FloatArray:
+def block_means(image: Image) -> FloatArray:
     """What a grey picture (H,W) shows, coarsely: (R,C) grey levels, of blocks one after the other."""
     import cv2
 
@@ -36,7 +36,7 @@ def outline(image: Image) -> FloatArray:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float64)
 
 
-def standing_still(outlines: Sequence[FloatArray], times_s: FloatArray, length_s: float) -> list[str]:
+def static_notes(outlines: Sequence[FloatArray], times_s: FloatArray, length_s: float) -> list[str]:
     """Tell of pictures that do not move, if there are any.
 
     Where all pictures lie close together in a longer recording, nothing is known of the rest of it.
@@ -48,17 +48,17 @@ def standing_still(outlines: Sequence[FloatArray], times_s: FloatArray, length_s
     """
     same = np.eye(len(outlines), dtype=bool)
     for one, other in combinations(range(len(outlines)), 2):
-        same[one, other] = same[other, one] = _alike(outlines[one], outlines[other])
-    start, stop = _longest(same, times_s)
+        same[one, other] = same[other, one] = _is_same_view(outlines[one], outlines[other])
+    start, stop = _longest_static_run(same, times_s)
     first, last = times_s[start], times_s[stop]
-    step = max(_LEAST_S, _LEAST_LENGTH * length_s)
+    step = max(_MIN_STEP_S, _MIN_STEP_RATIO * length_s)
     pictures = stop - start + 1
-    if pictures == len(outlines) and last - first >= max(step, _THROUGHOUT * length_s):
+    if pictures == len(outlines) and last - first >= max(step, _MIN_SPAN_RATIO * length_s):
         return [
             "the picture stands still throughout: a frozen recording, or a camera that nobody wears; nothing "
             "can be solved from it, record it again or leave the camera out"
         ]
-    if pictures < _LEAST_RUN or last - first < _RUN_STEPS * step:
+    if pictures < _MIN_RUN_PICTURES or last - first < _MIN_RUN_STEPS * step:
         return []
     return [
         f"the picture stands still from about {first:.1f} to {last:.1f} s ({pictures} pictures "
@@ -67,15 +67,15 @@ def standing_still(outlines: Sequence[FloatArray], times_s: FloatArray, length_s
     ]
 
 
-def _alike(first: FloatArray, second: FloatArray) -> bool:
+def _is_same_view(first: FloatArray, second: FloatArray) -> bool:
     """Whether nearly all that two pictures show is at the same place in both, in whatever light."""
     (one, one_shows), (other, other_shows) = _blocks(first), _blocks(second)
-    shows = np.maximum(one_shows, other_shows) > _LEAST_CONTRAST
-    if shows.sum() < _LEAST_BLOCKS:
-        same = bool(np.abs(first - second).max() < _SAME)
-        return same and float(first.std()) > _LEAST_CONTRAST
-    alike = np.mean(one * other, axis=1) > _ALIKE * one_shows * other_shows
-    return bool(alike[shows].mean() > _STILL_SHARE)
+    shows = np.maximum(one_shows, other_shows) > _MIN_BLOCK_SIGMA
+    if shows.sum() < _MIN_TEXTURED_BLOCKS:
+        same = bool(np.abs(first - second).max() < _MAX_GREY_DIFFERENCE)
+        return same and float(first.std()) > _MIN_BLOCK_SIGMA
+    alike = np.mean(one * other, axis=1) > _MIN_CORRELATION * one_shows * other_shows
+    return bool(alike[shows].mean() > _MIN_STATIC_RATIO)
 
 
 def _blocks(picture: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -84,7 +84,7 @@ def _blocks(picture: FloatArray) -> tuple[FloatArray, FloatArray]:
     return cut - cut.mean(axis=1, keepdims=True), cut.std(axis=1)
 
 
-def _longest(same: BoolArray, times_s: FloatArray) -> tuple[int, int]:
+def _longest_static_run(same: BoolArray, times_s: FloatArray) -> tuple[int, int]:
     """First and last of those successive pictures, each alike to each (N,N), that span the longest time."""
     runs = [
         (start, stop)

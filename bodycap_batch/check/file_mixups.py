@@ -13,17 +13,17 @@ from bodycap_batch.core.errors import CaptureError
 _GOPRO_CHAPTER = re.compile(r"G[HXL](?P<chapter>[0-9]{2})(?P<video>[0-9]{4})", re.IGNORECASE)
 
 
-def check_files(job: Job) -> None:
+def require_distinct_videos(job: Job) -> None:
     """Refuse a video that two cameras share, and chapters with one missing between them.
 
     Raises:
         CaptureError: One of these; names the file.
     """
     for camera in job.capture.cameras:
-        _missing_chapter(camera)
+        _require_all_chapters(camera)
     for first, second in combinations(job.capture.cameras, 2):
         for video in second.video:
-            twin = next((other for other in first.video if _same(other, video)), None)
+            twin = next((other for other in first.video if _is_same_content(other, video)), None)
             if twin is not None:
                 raise CaptureError(
                     f"camera {second.name} shows the same video as camera {first.name} ({twin.name})",
@@ -32,7 +32,7 @@ def check_files(job: Job) -> None:
                 )
 
 
-def _same(first: Path, second: Path) -> bool:
+def _is_same_content(first: Path, second: Path) -> bool:
     """Whether two files hold the same bytes; other sizes answer at once. Missing files are told elsewhere."""
     try:
         size = first.stat().st_size
@@ -41,7 +41,7 @@ def _same(first: Path, second: Path) -> bool:
         return False
 
 
-def _missing_chapter(camera: CameraConfig) -> None:
+def _require_all_chapters(camera: CameraConfig) -> None:
     """A GoPro numbers the chapters of a recording; without one, all that follows would be too early."""
     if camera.timestamps:
         return

@@ -20,15 +20,15 @@ from bodycap_batch.config.mounts import MOUNT_NAMES, mount_of
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.atomic_files import write_text
 
-FILE = "job.yaml"
-UNKNOWN = "<where on the body?>"
+JOB_FILE = "job.yaml"
+UNKNOWN_MOUNT = "<where on the body?>"
 _STAGES = ("keyframes", "map", "registration", "merge", "export")
-_WIDTH = 34
-_LONGEST = 60
+_OPTION_WIDTH = 34
+_MAX_NAME_LENGTH = 60
 """A camera's name may have 64 characters, and a number may follow."""
 
 
-def write_starting_job(folder: Path, *, replace: bool = False) -> Path:
+def write_job_template(folder: Path, *, replace: bool = False) -> Path:
     """Write ``job.yaml`` for the videos found in a folder.
 
     Args:
@@ -43,50 +43,50 @@ def write_starting_job(folder: Path, *, replace: bool = False) -> Path:
         CaptureError: There are no videos, or one cannot be opened.
         StoreError: The file cannot be written.
     """
-    path = folder / FILE
+    path = folder / JOB_FILE
     if path.exists() and not replace:
         raise JobError("there is a job file already", path=path, hint="--force writes a new one over it")
-    write_text(path, starting_job(folder))
+    write_text(path, job_template(folder))
     return path
 
 
-def starting_job(folder: Path) -> str:
-    """The text of such a file. Raises as `write_starting_job`, but for what is there already."""
+def job_template(folder: Path) -> str:
+    """The text of such a file. Raises as `write_job_template`, but for what is there already."""
     recordings = recordings_in(folder)
     lines = [
         "# A job for bodycap. Paths are relative to this file; lines that begin with # are off.",
         "#   bodycap check job.yaml    says what would be used, and what is wrong with it",
         "#   bodycap run job.yaml      computes it",
         "",
-        f"name: {_quoted(_safe(folder.resolve().name))}",
+        f"name: {_yaml_text(_safe_name(folder.resolve().name))}",
         "",
-        *_body(folder),
+        *_body_lines(folder),
         "",
         "capture:",
-        *_calibration(folder),
+        *_calibration_lines(folder),
         "  # The stretch to use, in seconds on the common clock: cuts off the strapping-on.",
         "  # start_s: 12.0",
         "  # end_s: 95.5",
-        *(_places() if any(mount_of(name) is None for name, _ in recordings) else ()),
+        *(_mount_lines() if any(mount_of(name) is None for name, _ in recordings) else ()),
         "  cameras:",
     ]
-    for safe, (name, files) in zip(_names([name for name, _ in recordings]), recordings, strict=True):
-        lines += _camera(safe, name, files, folder)
+    for safe, (name, files) in zip(_unique_names([name for name, _ in recordings]), recordings, strict=True):
+        lines += _camera_lines(safe, name, files, folder)
     lines += [
         "",
         "# What follows are the defaults of every stage: change what you need, leave the rest.",
-        *_options(),
+        *_option_lines(),
     ]
     return "\n".join(lines) + "\n"
 
 
-def _body(folder: Path) -> list[str]:
+def _body_lines(folder: Path) -> list[str]:
     rigs = sorted(path.name for path in folder.glob("*.bvh"))
     lines = [
         "# Who was filmed. The height gives the metric scale; the subject's own skeleton gives it better."
     ]
     if rigs:
-        lines += [f"skeleton: {_quoted(rigs[0])}", "# height_m: 1.75"]
+        lines += [f"skeleton: {_yaml_text(rigs[0])}", "# height_m: 1.75"]
     else:
         lines += [
             "# height_m: 1.75",
@@ -95,7 +95,7 @@ def _body(folder: Path) -> list[str]:
     return [*lines, "# activity: walk             # walking's soft rules; default generic"]
 
 
-def _calibration(folder: Path) -> list[str]:
+def _calibration_lines(folder: Path) -> list[str]:
     if (folder / "calib.json").is_file():
         return ["  calibration: calib.json"]
     return [
@@ -105,25 +105,25 @@ def _calibration(folder: Path) -> list[str]:
     ]
 
 
-def _places() -> list[str]:
+def _mount_lines() -> list[str]:
     """What a mount can be called, for those whose file's name does not say."""
     listed = textwrap.wrap(", ".join(MOUNT_NAMES), 90)
     return ["  # Where a camera can be worn (`mount:`):", *(f"  #   {line}" for line in listed)]
 
 
-def _camera(safe: str, name: str, files: Sequence[Path], folder: Path) -> list[str]:
+def _camera_lines(safe: str, name: str, files: Sequence[Path], folder: Path) -> list[str]:
     paths = [path.relative_to(folder).as_posix() for path in files]
-    video = _quoted(paths[0]) if len(paths) == 1 else f"[{', '.join(map(_quoted, paths))}]"
-    lines = [f"    # {_found(files)}", f"    - name: {_quoted(safe)}", f"      video: {video}"]
+    video = _yaml_text(paths[0]) if len(paths) == 1 else f"[{', '.join(map(_yaml_text, paths))}]"
+    lines = [f"    # {_video_summary(files)}", f"    - name: {_yaml_text(safe)}", f"      video: {video}"]
     found = mount_of(name)
     if found is None or mount_of(safe) != found:
-        lines.append(f"      mount: {_quoted(UNKNOWN if found is None else found[0])}")
+        lines.append(f"      mount: {_yaml_text(UNKNOWN_MOUNT if found is None else found[0])}")
     if not list(folder.glob(f"{name}.timestamps.txt")):
         lines.append("      # offset_s: 0.0          # common time = camera time + offset_s: from the clap")
     return lines
 
 
-def _found(files: Sequence[Path]) -> str:
+def _video_summary(files: Sequence[Path]) -> str:
     """What the files of one camera are, in a line."""
     if files[0].is_dir():
         return f"chapters in {files[0].name}/"
@@ -134,7 +134,7 @@ def _found(files: Sequence[Path]) -> str:
     return f"{width}×{height}, {videos[0].fps:.4g} fps, {seconds:.1f} s{chapters}"
 
 
-def _options() -> Iterable[str]:
+def _option_lines() -> Iterable[str]:
     """All options with their defaults and meanings, switched off."""
     for stage in _STAGES:
         model = Job.model_fields[stage].annotation
@@ -142,36 +142,36 @@ def _options() -> Iterable[str]:
         assert issubclass(model, BaseModel)
         yield f"# {stage}:"
         for name, field in model.model_fields.items():
-            setting = f"{name}: {_default(field)}"
-            words = _words(field.annotation)
+            setting = f"{name}: {_default_text(field)}"
+            words = _choices_text(field.annotation)
             meaning = "# " + "; ".join(part for part in (field.description, words) if part)
-            yield f"#   {setting:{_WIDTH}}{meaning}".rstrip()
+            yield f"#   {setting:{_OPTION_WIDTH}}{meaning}".rstrip()
 
 
-def _words(annotation: Any) -> str:
+def _choices_text(annotation: Any) -> str:
     """The words an option takes, where it takes words of a list."""
     if typing.get_origin(annotation) is Literal:
         return "one of " + ", ".join(map(str, typing.get_args(annotation)))
-    inner = [words for argument in typing.get_args(annotation) if (words := _words(argument))]
+    inner = [words for argument in typing.get_args(annotation) if (words := _choices_text(argument))]
     return inner[0].replace("one of", "any of") if inner and typing.get_origin(annotation) is tuple else ""
 
 
-def _default(field: FieldInfo) -> str:
+def _default_text(field: FieldInfo) -> str:
     value: Any = field.get_default(call_default_factory=True)
     return json.dumps(value, ensure_ascii=False)
 
 
-def _quoted(text: str) -> str:
+def _yaml_text(text: str) -> str:
     """Text as a YAML value: quoted where YAML would take it for something else."""
     plain = re.fullmatch(r"[A-Za-z][\w./\-]*", text) and text.lower() not in {"null", "true", "false"}
     return text if plain else json.dumps(text, ensure_ascii=False)
 
 
-def _names(found: Sequence[str]) -> list[str]:
+def _unique_names(found: Sequence[str]) -> list[str]:
     """A name for each camera, none of them twice: "cam 1" and "cam_1" would be one folder of results."""
     out: list[str] = []
     taken: set[str] = set()
-    for plain in map(_safe, found):
+    for plain in map(_safe_name, found):
         name, number = plain, 2
         while name.lower() in taken:
             name, number = f"{plain}_{number}", number + 1
@@ -180,6 +180,6 @@ def _names(found: Sequence[str]) -> list[str]:
     return out
 
 
-def _safe(text: str) -> str:
+def _safe_name(text: str) -> str:
     """A name that the results' files can carry."""
-    return re.sub(r"[^A-Za-z0-9_\-]+", "_", text).strip("_-")[:_LONGEST] or "walk"
+    return re.sub(r"[^A-Za-z0-9_\-]+", "_", text).strip("_-")[:_MAX_NAME_LENGTH] or "walk"

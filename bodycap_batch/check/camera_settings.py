@@ -13,20 +13,20 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.capture.video import open_container
 from bodycap_batch.core.arrays import IntArray
 
-_CONTAINERS = (b"moov", b"udta")
-_GOPRO = b"GPMF"
-_MAX_SETTINGS_BYTES = 1 << 20
-_UNSTABILISED = ("", "N", "N/A", "NA", "OFF", "NONE")
-_PHONES = {
+_CONTAINER_BOXES = (b"moov", b"udta")
+_GOPRO_BOX = b"GPMF"
+_MAX_BOX_BYTES = 1 << 20
+_OFF_VALUES = ("", "N", "N/A", "NA", "OFF", "NONE")
+_PHONE_KEYS = {
     "com.apple.quicktime.model": "com.apple.quicktime.make",
     "com.android.model": "com.android.manufacturer",
 }
 """Keys of a phone's model and of its maker."""
-_VARYING = 1.5
+_MAX_RATE_RATIO = 1.5
 """The slowest of 20 frames takes so many times as long as the fastest: more than jitter."""
-_DROPPED = 1.75
+_DROPPED_STEP_RATIO = 1.75
 """A step of so many usual ones has a lost frame in it ..."""
-_MOSTLY = 0.75
+_MIN_REGULAR_RATIO = 0.75
 """... unless every fourth is like that."""
 
 
@@ -44,7 +44,7 @@ def gopro_settings(path: Path) -> dict[str, str]:
     with path.open("rb") as handle:
         handle.seek(0, 2)
         data = _find_box(handle, 0, handle.tell())
-    return dict(_values(data)) if data else {}
+    return dict(_text_items(data)) if data else {}
 
 
 def _find_box(handle: BinaryIO, start: int, end: int) -> bytes | None:
@@ -61,10 +61,10 @@ def _find_box(handle: BinaryIO, start: int, end: int) -> bytes | None:
         size = end - start if size == 0 else size
         if size < content:
             return None
-        if kind == _GOPRO and size <= _MAX_SETTINGS_BYTES:
+        if kind == _GOPRO_BOX and size <= _MAX_BOX_BYTES:
             handle.seek(start + content)
             return handle.read(size - content)
-        if kind in _CONTAINERS:
+        if kind in _CONTAINER_BOXES:
             found = _find_box(handle, start + content, min(start + size, end))
             if found is not None:
                 return found
@@ -72,7 +72,7 @@ def _find_box(handle: BinaryIO, start: int, end: int) -> bytes | None:
     return None
 
 
-def _values(data: bytes) -> Iterator[tuple[str, str]]:
+def _text_items(data: bytes) -> Iterator[tuple[str, str]]:
     """Texts among the key-length-value items, nested ones too; each is padded to four bytes."""
     place = 0
     while place + 8 <= len(data):
@@ -80,7 +80,7 @@ def _values(data: bytes) -> Iterator[tuple[str, str]]:
         length = size * repeat
         content = data[place + 8 : place + 8 + length]
         if kind == 0:
-            yield from _values(content)
+            yield from _text_items(content)
         elif kind == ord("c"):
             yield key.decode("ascii", "replace"), content.decode("latin-1").strip("\0 ")
         place += 8 + (length + 3) // 4 * 4
@@ -89,13 +89,13 @@ def _values(data: bytes) -> Iterator[tuple[str, str]]:
 def _gopro_notes(settings: dict[str, str]) -> list[str]:
     notes = []
     mode = settings.get("EISA", "")
-    if settings.get("EISE", mode).upper() not in _UNSTABILISED:
-        told = f" ({mode})" if mode.upper() not in (*_UNSTABILISED, "Y") else ""
+    if settings.get("EISE", mode).upper() not in _OFF_VALUES:
+        told = f" ({mode})" if mode.upper() not in (*_OFF_VALUES, "Y") else ""
         notes.append(
             f"stabilised in the camera{told}: the picture moves against the lens and no calibration fits it; "
             "film again with HyperSmooth off"
         )
-    if settings.get("DZOM", "N").upper() not in _UNSTABILISED:
+    if settings.get("DZOM", "N").upper() not in _OFF_VALUES:
         notes.append(
             "filmed with digital zoom: the calibration has to be of the same zoom; film without, "
             "or calibrate with it"
@@ -106,7 +106,7 @@ def _gopro_notes(settings: dict[str, str]) -> list[str]:
 def _phone_notes(path: Path) -> list[str]:
     with open_container(path) as container:
         metadata = dict(container.metadata)
-    for model, maker in _PHONES.items():
+    for model, maker in _PHONE_KEYS.items():
         if metadata.get(model):
             name = " ".join(part for part in (metadata.get(maker, ""), metadata[model]) if part)
             return [
@@ -122,11 +122,11 @@ def _rate_notes(times_ns: IntArray) -> list[str]:
     if len(steps) < 20:
         return []
     usual = float(np.median(steps))
-    single = steps[steps < _DROPPED * usual]
-    if len(single) < _MOSTLY * len(steps):
+    single = steps[steps < _DROPPED_STEP_RATIO * usual]
+    if len(single) < _MIN_REGULAR_RATIO * len(steps):
         single = steps
     fast, slow = np.percentile(single, [5, 95])
-    if slow < _VARYING * fast:
+    if slow < _MAX_RATE_RATIO * fast:
         return []
     return [
         f"the frame rate varies between {1e9 / slow:.0f} and {1e9 / fast:.0f} per second, exposure "

@@ -10,7 +10,7 @@ from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import CaptureError
 
 
-def require_within(job: Job, limits: Limits) -> None:
+def require_within_limits(job: Job, limits: Limits) -> None:
     """Look at what every video's container says of its size and duration.
 
     Raises:
@@ -18,10 +18,10 @@ def require_within(job: Job, limits: Limits) -> None:
     """
     for index, camera in enumerate(job.capture.cameras):
         for path in camera.video:
-            _require(path, limits, f"capture.cameras.{index}.video")
+            _require_video_within_limits(path, limits, f"capture.cameras.{index}.video")
 
 
-def _require(path: Path, limits: Limits, field: str) -> None:
+def _require_video_within_limits(path: Path, limits: Limits, field: str) -> None:
     with open_container(path) as container:
         stream = video_stream(container, path)
         side = max(stream.codec_context.width, stream.codec_context.height)

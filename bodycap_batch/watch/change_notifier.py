@@ -1,0 +1,103 @@
+"""Wake the watcher when something changes in the inbox."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from pathlib import Path
+
+_NETWORK_FILE_SYSTEMS = (
+    "nfs",
+    "cifs",
+    "smb",
+    "9p",
+    "fuse",
+    "afs",
+    "ceph",
+    "gluster",
+    "lustre",
+    "vboxsf",
+    "virtiofs",
+    "drvfs",
+)
+"""Prefixes of the kernel's names of file systems that report no changes made by another machine."""
+_POLL_MS = 1000
+"""Milliseconds between two looks at a folder that is polled. Evidence: none."""
+_STOP_CHECK_MS = 2000
+"""Milliseconds after which `watchfiles` checks the stop event, and the pause after an error. Evidence: none.
+"""
+
+
+class ChangeNotifier:
+    """Set an event when a folder changes; a context manager.
+
+    The event only shortens a wait. The watcher also scans the folder at intervals, so a missed event loses
+    nothing.
+
+    Args:
+        folder: Folder to watch.
+        woken: Set on every change.
+        poll: True to poll the folder. None polls it if it is on a network disk, because such a disk reports
+            no changes.
+    """
+
+    def __init__(self, folder: Path, woken: threading.Event, *, poll: bool | None) -> None:
+        self._folder = folder
+        self._woken = woken
+        self.polling = is_on_network_disk(folder) if poll is None else poll
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="changes", daemon=True)
+
+    def __enter__(self) -> ChangeNotifier:
+        """Start the thread that watches the folder."""
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        import watchfiles
+
+        while not self._stop.is_set():
+            try:
+                for _ in watchfiles.watch(
+                    self._folder,
+                    watch_filter=None,
+                    stop_event=self._stop,
+                    rust_timeout=_STOP_CHECK_MS,
+                    raise_interrupt=False,
+                    force_polling=self.polling,
+                    poll_delay_ms=_POLL_MS,
+                    ignore_permission_denied=True,
+                ):
+                    self._woken.set()
+            except (OSError, RuntimeError) as error:
+                # The system has no inotify watches left, or the folder vanished. The regular scans continue.
+                if not self.polling:
+                    sys.stderr.write(f"note: {self._folder} is polled from now on, because: {error}\n")
+                self.polling = True
+                self._stop.wait(_STOP_CHECK_MS / 1000)
+
+
+def is_on_network_disk(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> bool:
+    """Return True if a folder is on a disk of another machine, or of the host of this virtual machine.
+
+    Args:
+        folder: Folder to look up.
+        mounts: The kernel's table of mounts.
+    """
+    try:
+        rows = [line.split() for line in mounts.read_text(encoding="utf-8").splitlines()]
+    except OSError:
+        return False
+    full = folder.resolve()
+    mount_points = [(Path(_without_octal_escapes(row[1])), row[2]) for row in rows if len(row) > 2]
+    containing = [(len(place.parts), kind) for place, kind in mount_points if full.is_relative_to(place)]
+    return bool(containing) and max(containing, key=lambda each: each[0])[1].startswith(_NETWORK_FILE_SYSTEMS)
+
+
+def _without_octal_escapes(text: str) -> str:
+    """Return a mount point without the octal codes that the kernel writes for spaces."""
+    return text.encode("latin-1", "backslashreplace").decode("unicode_escape") if "\\" in text else text

@@ -1,0 +1,182 @@
+"""Read a dropped job, check which paths it may name, and write it for the run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import yaml
+
+from bodycap_batch.config.folder import job_file_in
+from bodycap_batch.config.job import load_job, safe_name
+from bodycap_batch.config.limits import Limits
+from bodycap_batch.config.models import SKELETON_PRESETS, CameraConfig, Job
+from bodycap_batch.config.trust import PathPolicy
+from bodycap_batch.core.errors import CaptureError, JobError
+from bodycap_batch.pipeline.results import write_results_file
+from bodycap_batch.watch.inbox_entries import YAML_SUFFIXES, EntrySnapshot, InboxEntry
+from bodycap_batch.watch.spool import JobDir, visible_entries
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobPermissions:
+    """What the operator permits a job to do.
+
+    Attributes:
+        roots: Folders that all jobs may read.
+        limits: How large a job may be.
+    """
+
+    roots: tuple[Path, ...] = ()
+    limits: Limits = field(default_factory=Limits)
+
+
+def read_dropped_job(entry: InboxEntry, snapshot: EntrySnapshot, permissions: JobPermissions) -> Job:
+    """Read and resolve a job in the inbox.
+
+    Args:
+        entry: A complete entry of the inbox.
+        snapshot: The state of its files.
+        permissions: What the job may name, and how large it may be.
+
+    Returns:
+        The job. Its paths are absolute, and all of them are permitted.
+
+    Raises:
+        JobError: The job is not valid, names a path that is not permitted, or exceeds a limit.
+        CaptureError: A calibration or a folder of videos cannot be used, or a video is too large.
+    """
+    if snapshot.undecodable:
+        shown = snapshot.undecodable.encode(errors="backslashreplace").decode()
+        raise JobError(f"the name {shown} is not UTF-8 text", hint="rename it and drop it again")
+    policy = path_policy(entry.path, permissions.roots, is_file=entry.is_file)
+    if policy.folder is None:
+        # A link must lead to a permitted folder. A file in the inbox itself may always be read.
+        if entry.path.is_symlink():
+            policy.require(entry.path)
+    elif snapshot.files > permissions.limits.files:
+        hint = "one folder per recording; the operator can raise --limit files"
+        raise CaptureError(f"more than {permissions.limits.files:g} files", path=entry.path, hint=hint)
+    if snapshot.special:
+        raise JobError(
+            f"{snapshot.special} is neither a file nor a folder",
+            path=entry.path,
+            hint="remove it from the folder",
+        )
+    decides = None if entry.is_file else job_file_in(entry.path)
+    if decides is not None:
+        policy.require(decides)
+    job = load_job(entry.path, policy=policy, limits=permissions.limits)
+    if decides is not None and job.name == safe_name(entry.path.resolve().name):
+        # The job file states no name. Use the name in the inbox: the entry may be a link to another folder.
+        job = job.model_copy(update={"name": safe_name(entry.name)})
+    _require_video_sizes(job, permissions.limits)
+    return job.model_copy(update={"capture": job.capture.model_copy(update={"synthetic": None})})
+
+
+def path_policy(path: Path, roots: tuple[Path, ...], *, is_file: bool) -> PathPolicy:
+    """Return which paths an entry may name: those in its own folder, unless it is a link or a single file."""
+    own = None if is_file or path.is_symlink() else path
+    return PathPolicy(folder=own, roots=roots)
+
+
+def unread_job_files(folder: Path) -> list[str]:
+    """Return the job files of a folder that are ignored because of their names."""
+    if job_file_in(folder) is not None:
+        return []
+    return [path.name for path in visible_entries(folder) if path.suffix.lower() in YAML_SUFFIXES]
+
+
+def write_job(job: Job, job_dir: JobDir, dropped: Path) -> None:
+    """Write a resolved job. Paths to its own input become relative to the job's folder.
+
+    Args:
+        job: The job, as `read_dropped_job` returned it.
+        job_dir: The job's folder.
+        dropped: Path of the job's input now.
+    """
+    here = dropped.resolve()
+    job_dir.job.write_text(
+        yaml_from_job(with_changed_paths(job, lambda path: _relocated(path, here, Path("input")))),
+        encoding="utf-8",
+    )
+
+
+def read_job(job_dir: JobDir, permissions: JobPermissions) -> Job:
+    """Load a job that `write_job` wrote, and check its paths again.
+
+    Raises:
+        JobError: The job cannot be read, or names a path that is not permitted.
+    """
+    policy = path_policy(job_dir.input, permissions.roots, is_file=False)
+    job = load_job(job_dir.job, policy=policy, limits=Limits())
+    _require_video_sizes(job, permissions.limits)
+    return job.model_copy(update={"out": job_dir.result})
+
+
+def make_result_paths_relative(job_dir: JobDir, job: Job) -> None:
+    """Make the paths to the videos in the results' `job.yaml` relative, because the job's folder will be
+    moved.
+
+    Args:
+        job_dir: The job's folder.
+        job: The job that was run.
+
+    Raises:
+        StoreError: The disk is full or fails.
+    """
+    for file in (job_dir.result / "job.yaml", job_dir.result / "partial" / "job.yaml"):
+        if file.is_file():
+            text = yaml_from_job(
+                with_changed_paths(job, lambda path, file=file: _relative_to_file(path, job_dir.path, file))
+            )  # type: ignore[misc]
+            write_results_file(file.parent, file.name, text)
+
+
+def with_changed_paths(job: Job, change: Callable[[Path], Path]) -> Job:
+    """Return the job with `change` applied to every path."""
+
+    def camera(config: CameraConfig) -> CameraConfig:
+        return config.model_copy(
+            update={
+                "video": tuple(map(change, config.video)),
+                "timestamps": tuple(map(change, config.timestamps)),
+                "mask": None if config.mask is None else change(config.mask),
+            }
+        )
+
+    capture = job.capture.model_copy(update={"cameras": tuple(map(camera, job.capture.cameras))})
+    skeleton = job.skeleton
+    if skeleton is not None and skeleton not in SKELETON_PRESETS:
+        skeleton = str(change(Path(skeleton)))
+    return job.model_copy(update={"capture": capture, "skeleton": skeleton, "out": None})
+
+
+def yaml_from_job(job: Job) -> str:
+    """Return a job as YAML text."""
+    document = job.model_dump(mode="json", exclude_none=True)
+    return yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
+
+
+def _relocated(path: Path, here: Path, there: Path) -> Path:
+    return there / path.relative_to(here) if path.is_relative_to(here) else path
+
+
+def _relative_to_file(path: Path, job_dir: Path, file: Path) -> Path:
+    if not path.is_relative_to(job_dir):
+        return path
+    return Path(*[".."] * len(file.parent.relative_to(job_dir).parts), *path.relative_to(job_dir).parts)
+
+
+def _require_video_sizes(job: Job, limits: Limits) -> None:
+    """Refuse a video that is too large before its bytes are read."""
+    for index, camera in enumerate(job.capture.cameras):
+        for path in camera.video:
+            if path.is_file() and path.stat().st_size > 1e9 * limits.video_gb:
+                raise CaptureError(
+                    f"{path.stat().st_size / 1e9:.3g} GB, the limit is {limits.video_gb:g}",
+                    path=path,
+                    field=f"capture.cameras.{index}.video",
+                    hint="cut the recording, or ask the operator to raise --limit video_gb",
+                )

@@ -1,0 +1,194 @@
+"""Move jobs from the inbox to `running`, where the rename is the claim, and back to the inbox."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+
+from bodycap_batch.config.models import Job
+from bodycap_batch.core.errors import BodycapError, StoreError
+from bodycap_batch.store.artefacts import store_error
+from bodycap_batch.watch.claim import Claim, create_claim
+from bodycap_batch.watch.dropped_job import JobPermissions, read_dropped_job, unread_job_files, write_job
+from bodycap_batch.watch.inbox_entries import EntrySnapshot, InboxEntry, take_snapshot
+from bodycap_batch.watch.job_status import JobStatusFile, read_status
+from bodycap_batch.watch.process_identity import is_process_running
+from bodycap_batch.watch.spool import (
+    CLAIM_PREFIX,
+    RETRY_PREFIX,
+    JobDir,
+    Spool,
+    folder_name_from_text,
+    move_to_free_name,
+)
+
+
+def claim_entry(
+    spool: Spool, entry: InboxEntry, snapshot: EntrySnapshot, permissions: JobPermissions
+) -> tuple[Claim, BodycapError | None] | None:
+    """Claim a complete entry of the inbox.
+
+    The job is read in the inbox and written to a hidden folder. The entry is then renamed into that folder:
+    this rename is the claim, because only one of two watchers can succeed. Finally the folder gets its name
+    in `running`.
+
+    Args:
+        spool: The spool.
+        entry: A complete entry.
+        snapshot: Its state when it was found to be complete.
+        permissions: What the job may name, and how large it may be.
+
+    Returns:
+        The claim and the job's error, if any. None if another watcher was faster or the entry is still
+        changing.
+
+    Raises:
+        StoreError: The entry cannot be moved.
+    """
+    job_dir = JobDir(spool.running / f"{CLAIM_PREFIX}{uuid.uuid4().hex}")
+    try:
+        spool.running.mkdir(exist_ok=True)  # a user may have removed it
+        job_dir.path.mkdir()
+        claim = create_claim(job_dir)
+        error = _write_job_files(job_dir, entry, snapshot, permissions)
+        if not _move_entry(job_dir, entry, snapshot, permissions):
+            shutil.rmtree(job_dir.path)
+            return None
+        move_to_running(spool, claim)
+    except (OSError, StoreError) as failed:
+        with contextlib.suppress(OSError, StoreError):  # if this fails, it stays claimed until a takeover
+            return_to_inbox(spool, job_dir)
+        raise store_error(failed, entry.path) if isinstance(failed, OSError) else failed from failed
+    return claim, error
+
+
+def move_to_running(spool: Spool, claim: Claim) -> None:
+    """Move a claimed folder to its final name in `running`."""
+    previous = read_status(claim.job, strict=True)
+    status = JobStatusFile(claim.job, previous)
+    dropped = str(previous.get("dropped") or "job")
+    wanted = folder_name_from_text(Path(dropped).stem if previous.get("kind") == "file" else dropped)
+
+    def rename(target: Path) -> None:
+        status.update(name=target.name)
+
+    claim.set_job_dir(
+        JobDir(move_to_free_name(claim.job.path, spool.running, spool.free_name(wanted), rename))
+    )
+
+
+def remove_empty_claim(job_dir: JobDir) -> bool:
+    """Remove a hidden folder of a claim if nothing was moved into it.
+
+    The folder is renamed before it is inspected. A watcher that created it and resumes now can then move
+    nothing into it.
+
+    Returns:
+        True if the folder was removed, False if it holds an entry.
+    """
+    hidden = JobDir(job_dir.path.with_name(f"{CLAIM_PREFIX}{uuid.uuid4().hex}"))
+    os.rename(job_dir.path, hidden.path)
+    if path_exists(input_path(hidden)):
+        os.rename(hidden.path, job_dir.path)
+        return False
+    shutil.rmtree(hidden.path, ignore_errors=True)
+    return True
+
+
+def path_exists(path: Path) -> bool:
+    """Return True if a file, folder or link exists. Raise `OSError` if the disk does not answer."""
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
+
+
+def input_path(job_dir: JobDir) -> Path:
+    """Return the path of what was dropped: the folder, or the job file that was dropped alone."""
+    document = read_status(job_dir, strict=True)
+    return job_dir.input / str(document.get("dropped")) if document.get("kind") == "file" else job_dir.input
+
+
+def return_to_inbox(
+    spool: Spool, job_dir: JobDir, before_move: Callable[[Path], None] | None = None
+) -> Path | None:
+    """Move what was dropped back to the inbox, and remove the rest of the job's folder.
+
+    Args:
+        spool: The spool.
+        job_dir: The job's folder.
+        before_move: Called with the target just before the move.
+
+    Returns:
+        The new path. None if nothing had been dropped, or another process has moved it already.
+    """
+    dropped, target = input_path(job_dir), None
+    if path_exists(dropped):
+        name = str(read_status(job_dir, strict=True).get("dropped") or job_dir.name)
+        suffix = dropped.suffix if dropped != job_dir.input else ""
+        try:
+            target = move_to_free_name(dropped, spool.inbox, name, before_move, suffix=suffix)
+        except FileNotFoundError:
+            if path_exists(dropped):
+                raise
+    shutil.rmtree(job_dir.path, ignore_errors=True)
+    return target
+
+
+def finish_interrupted_retries(spool: Spool) -> None:
+    """Complete the moves to the inbox of `retry` commands that were killed."""
+    for path in sorted(spool.failed.glob(f"{RETRY_PREFIX}*")):
+        if not is_process_running(path.name.removeprefix(RETRY_PREFIX)):
+            with contextlib.suppress(FileNotFoundError):  # another watcher is moving it
+                return_to_inbox(spool, JobDir(path))
+
+
+def _write_job_files(
+    job_dir: JobDir, entry: InboxEntry, snapshot: EntrySnapshot, permissions: JobPermissions
+) -> BodycapError | None:
+    """Read the job and write all its files except the input. Return the job's error, if any."""
+    job, error = _read_job_or_error(entry, snapshot, permissions)
+    if job is not None:
+        write_job(job, job_dir, entry.path.parent / entry.path.name if not entry.is_file else job_dir.input)
+    status = JobStatusFile(job_dir)
+    for name in [] if entry.is_file else unread_job_files(entry.path):
+        status.add_note(f"{name} was not read: a job file in a folder must be called job.yaml")
+    status.update(kind="file" if entry.is_file else "folder", dropped=entry.path.name)
+    return error
+
+
+def _move_entry(
+    job_dir: JobDir, entry: InboxEntry, snapshot: EntrySnapshot, permissions: JobPermissions
+) -> bool:
+    """Move the entry into the claimed folder. Return False if the entry is gone or has changed."""
+    if entry.is_file:
+        job_dir.input.mkdir()
+    target = job_dir.input / entry.path.name if entry.is_file else job_dir.input
+    leads_to = os.path.realpath(entry.path) if entry.path.is_symlink() else ""
+    try:
+        os.rename(entry.path, target)
+    except FileNotFoundError:
+        return False
+    if leads_to:  # a relative link would point to another path from the new folder
+        absolute_link = job_dir.path / "link"
+        absolute_link.symlink_to(leads_to)
+        os.replace(absolute_link, target)
+        return True
+    if take_snapshot(InboxEntry(target), int(permissions.limits.files)).digest == snapshot.digest:
+        return True
+    move_to_free_name(target, entry.path.parent, entry.path.name)
+    return False
+
+
+def _read_job_or_error(
+    entry: InboxEntry, snapshot: EntrySnapshot, permissions: JobPermissions
+) -> tuple[Job | None, BodycapError | None]:
+    try:
+        return read_dropped_job(entry, snapshot, permissions), None
+    except BodycapError as error:
+        return None, error

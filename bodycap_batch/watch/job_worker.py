@@ -1,0 +1,261 @@
+"""Run one claimed job and file it."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import traceback
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+from bodycap_batch.core.errors import BodycapError, Cancelled, DiskAway, JobError, StoreError, error_from_dict
+from bodycap_batch.pipeline import Settings, run_job
+from bodycap_batch.runner.turns import Turns
+from bodycap_batch.store.artefacts import Store, store_error
+from bodycap_batch.store.references import StoreBusy, moving
+from bodycap_batch.watch.claim import Claim, remove_claim_files
+from bodycap_batch.watch.dropped_job import make_result_paths_relative, read_job
+from bodycap_batch.watch.job_status import FINAL, JobStatusFile, State, append_log, read_status, utc_text
+from bodycap_batch.watch.spool import JobDir, Spool, move_to_free_name
+from bodycap_batch.watch.watch_options import WatchOptions
+
+_MAX_DISK_FAILURES = 5
+"""Disk failures after which a job has failed, if its folder could be listed in between. Evidence: none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobOutcome:
+    """How a job ended.
+
+    Attributes:
+        name: Name of the job.
+        state: As in `status.json`. "lost" if another watcher has the job now, "stuck" if its disk fails.
+        exit_code: 0, the exit code of the error, or 70.
+        message: One line for the operator.
+        path: The job's folder; None if the job was not filed.
+    """
+
+    name: str
+    state: str
+    exit_code: int = 0
+    message: str = ""
+    path: Path | None = None
+
+
+class JobWorker:
+    """Process claimed jobs; one instance for all of them.
+
+    Args:
+        spool: The spool.
+        options: How the spool is watched.
+        stop: Set when the watcher must end.
+    """
+
+    def __init__(self, spool: Spool, options: WatchOptions, stop: threading.Event) -> None:
+        self._spool = spool
+        self._options = options
+        self._stop = stop
+        self._disk_failures: Counter[str] = Counter()
+        self._stage_turns = Turns()
+        self._store = Store(options.store or spool.root / ".store")
+
+    def process(self, claim: Claim, read_error: BodycapError | None = None) -> JobOutcome:
+        """Run a claimed job until it is filed, or left for the next watcher.
+
+        Args:
+            claim: The claim on the job.
+            read_error: The error that was found when the job was read, or None.
+        """
+        try:
+            return self._process(claim, read_error)
+        except (BodycapError, OSError) as error:
+            return self._stuck(claim, error)
+
+    def _process(self, claim: Claim, read_error: BodycapError | None) -> JobOutcome:
+        previous = read_status(claim.job, strict=True)
+        if previous.get("state") in FINAL:  # its watcher ended after the final status, before the move
+            return self._file(claim, previous["state"], _error_from_status(previous), None)
+        status = JobStatusFile(claim.job, previous, claim.ownership.is_held)
+        try:
+            if read_error is not None:
+                raise read_error
+            self._run(claim, status)
+        except Cancelled as error:
+            return self._handle_cancelled(claim, status, error)
+        except StoreBusy as error:  # `bodycap gc` runs for some seconds; this was not an attempt
+            status.document["attempts"] = int(previous.get("attempts", 0))
+            return self._leave(claim, status, error)
+        except DiskAway as error:
+            return self._postpone(claim, status, error)
+        except BodycapError as error:
+            return self._end(claim, status, "failed", error)
+        except Exception as error:  # noqa: BLE001 - the one place where a job's bugs are caught
+            away = store_error(error, claim.job.path) if isinstance(error, OSError) else None
+            if isinstance(away, DiskAway):
+                return self._postpone(claim, status, away)
+            append_log(claim.job, traceback.format_exc())
+            hint = "this is a bug in bodycap; please report it with this log and the job"
+            bug = BodycapError(f"{type(error).__name__}: {error}", path=claim.job.log, hint=hint)
+            return self._end(claim, status, "failed", bug)
+        return self._end(claim, status, "done", None)
+
+    def _run(self, claim: Claim, status: JobStatusFile) -> None:
+        job_dir = claim.job
+        self._check_cancelled(claim)
+        status.update(
+            state="running",
+            started_at=utc_text(),
+            attempts=status.document["attempts"] + 1,
+            host=socket.gethostname(),
+            generation=claim.generation,
+            store=str(self._store.root),
+        )
+        if not job_dir.job.is_file():  # its watcher ended before it wrote the job
+            raise JobError("the job was never read", path=job_dir.input, hint="retry it, so that it is read")
+        job = read_job(job_dir, self._options.permissions)
+        settings = Settings(
+            store=self._store,
+            threads=max(1, self._options.threads // self._options.jobs),
+            listener=status,
+            cancelled=lambda: self._is_cancelled(claim),
+            command=self._options.command,
+            may_commit=claim.ownership.is_held,
+            limits=self._options.permissions.limits,
+            turns=self._stage_turns,
+        )
+        try:
+            run_job(job, out_dir=job_dir.result, settings=settings)
+        finally:
+            if claim.ownership.is_held():
+                make_result_paths_relative(job_dir, job)
+
+    def _is_cancelled(self, claim: Claim) -> bool:
+        return self._stop.is_set() or claim.lost.is_set() or claim.job.cancel.exists()
+
+    def _check_cancelled(self, claim: Claim) -> None:
+        if self._is_cancelled(claim):
+            raise Cancelled("stopped before it started", hint="retry it")
+
+    def _handle_cancelled(self, claim: Claim, status: JobStatusFile, error: Cancelled) -> JobOutcome:
+        """Handle the three causes: the user cancelled the job, the watcher ends, or another watcher has the
+        job.
+        """
+        name = claim.job.name
+        if not claim.ownership.is_held():
+            claim.lost.set()
+            return JobOutcome(name=name, state="lost", message="another watcher has taken it over")
+        if claim.job.cancel.exists():
+            error = Cancelled(
+                "cancelled; finished stages are kept", hint=f"`bodycap retry {name}` continues the job"
+            )
+            return self._end(claim, status, "cancelled", error)
+        return self._leave(claim, status, error)
+
+    def _postpone(self, claim: Claim, status: JobStatusFile, error: DiskAway) -> JobOutcome:
+        """Stop the heartbeat after a disk failure. The job starts again when its claim is stale."""
+        name = claim.job.name
+        if any(not stage["reused"] for stage in status.document["finished_stages"]):
+            del self._disk_failures[name]  # the job has finished a stage since the last failure
+        if _is_disk_readable(Path(error.path or claim.job.path)):
+            self._disk_failures[name] += 1
+        if self._disk_failures[name] > _MAX_DISK_FAILURES:
+            return self._end(claim, status, "failed", error)
+        claim.end()
+        append_log(claim.job, f"postponed: {error}")
+        status.update(state="stopped", active={}, error=error.to_dict())
+        return self._stuck(claim, error)
+
+    def _stuck(self, claim: Claim, error: Exception) -> JobOutcome:
+        """Stop the heartbeat because the spool's own disk fails. The job is processed again when its claim is
+        stale.
+        """
+        claim.end()
+        code, name = StoreError.exit_code, claim.job.name
+        return JobOutcome(name=name, state="stuck", exit_code=code, message=f"continues later: {error}")
+
+    def _leave(self, claim: Claim, status: JobStatusFile, error: BodycapError) -> JobOutcome:
+        """Leave the job in `running`, for the next watcher or a later attempt of this one."""
+        cause = None if isinstance(error, Cancelled) else error.to_dict()
+        status.update(state="stopped", active={}, error=cause)
+        return self._release(claim, error)
+
+    def _release(self, claim: Claim, error: BodycapError) -> JobOutcome:
+        claim.release()
+        message = (
+            "continues at the next start"
+            if isinstance(error, Cancelled)
+            else f"continues later: {error.message}"
+        )
+        return JobOutcome(name=claim.job.name, state="stopped", exit_code=error.exit_code, message=message)
+
+    def _end(
+        self, claim: Claim, status: JobStatusFile, state: State, error: BodycapError | None
+    ) -> JobOutcome:
+        del self._disk_failures[claim.job.name]
+        if error is not None:
+            append_log(claim.job, f"{state}: {error}")
+        return self._file(claim, state, error, status)
+
+    def _file(
+        self, claim: Claim, state: State, error: BodycapError | None, status: JobStatusFile | None
+    ) -> JobOutcome:
+        """Write the final status and file the job. If the store is being cleaned, leave the move for later."""
+        try:
+            return self._move(claim, state, error, status)
+        except StoreBusy as busy:
+            if status is not None:
+                status.finish(state, error, self._folder(state) / claim.job.name, self._spool.inbox)
+            return self._release(claim, busy)
+
+    def _folder(self, state: State) -> Path:
+        return self._spool.done if state == "done" else self._spool.failed
+
+    def _move(
+        self, claim: Claim, state: State, error: BodycapError | None, status: JobStatusFile | None
+    ) -> JobOutcome:
+        folder = self._folder(state)
+        with moving(self._store, claim.job.result, wait=False) as keep_for:
+            claim.end()
+            if not claim.ownership.is_held():
+                return JobOutcome(
+                    name=claim.job.name, state="lost", message="another watcher has taken it over"
+                )
+
+            def write_final_status(target: Path) -> None:
+                keep_for(JobDir(target).result)
+                if status is not None:
+                    status.finish(state, error, target, self._spool.inbox)
+
+            folder.mkdir(exist_ok=True)  # a user may have removed it together with the results
+            target = move_to_free_name(claim.job.path, folder, claim.job.name, write_final_status)
+        remove_claim_files(JobDir(target))
+        return JobOutcome(
+            name=target.name,
+            state=state,
+            exit_code=0 if error is None else error.exit_code,
+            message="" if error is None else error.message,
+            path=target,
+        )
+
+
+def _is_disk_readable(path: Path) -> bool:
+    """Return True if the disk of an unreadable file answers: then the file is at fault.
+
+    If the disk does not answer, it is missing, and the watcher waits for it without a limit.
+    """
+    try:
+        os.statvfs(path.parent)
+        os.listdir(path.parent)
+    except OSError as error:
+        return not isinstance(store_error(error, path), DiskAway)
+    return True
+
+
+def _error_from_status(document: dict[str, object]) -> BodycapError | None:
+    """Return the error of a status file, as far as its exit code and message matter."""
+    error = document.get("error")
+    if not isinstance(error, dict):
+        return None
+    return error_from_dict(error)

@@ -1,0 +1,78 @@
+"""Check whether this process may still write for a job that several machines can see.
+
+A watcher that was suspended does not know that another watcher has taken its job over. Therefore the
+ownership is checked before each visible step: a commit to the store, a result, a move.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bodycap_batch.core.errors import Cancelled
+
+MARKER_PREFIX = ".generation-"
+_FIELD_TYPES: Mapping[str, type] = {
+    "pid": int,
+    "generation": int,
+    "token": str,
+    "machine": str,
+    "process": str,
+}
+"""Types of the fields of `owner.json`. A value of another type, for example edited by hand, is ignored."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ownership:
+    """The ownership of a job by one claim.
+
+    Attributes:
+        owner: Path of the job's `owner.json`.
+        token: Unique name of the claim.
+        generation: Number of the claim; the first claim of a job has 1.
+    """
+
+    owner: Path
+    token: str
+    generation: int
+
+    def is_held(self) -> bool:
+        """Return True while no later claim has been made."""
+        folder = self.owner.parent
+        if (
+            generation_marker(folder, self.generation + 1).exists()
+            or not generation_marker(folder, self.generation).exists()
+        ):
+            return False
+        found = read_owner(self.owner)
+        # An earlier owner that was suspended may complete its last heartbeat after it lost the job.
+        outdated = int(found.get("generation", 0)) < self.generation
+        return outdated or (found.get("token"), found.get("generation")) == (self.token, self.generation)
+
+    def require(self) -> None:
+        """Raise `Cancelled` if another watcher has taken the job over."""
+        if not self.is_held():
+            raise Cancelled(
+                "another watcher has taken this job over",
+                path=self.owner,
+                hint="nothing to do: it goes on there, from the finished stages",
+            )
+
+
+def generation_marker(folder: Path, generation: int) -> Path:
+    """Return the path of the file that claims a generation. Only one process can create it."""
+    return folder / f"{MARKER_PREFIX}{generation}"
+
+
+def read_owner(path: Path) -> dict[str, Any]:
+    """Return the content of `owner.json`; empty if the file is missing or cannot be read."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    if not isinstance(found, dict):
+        return {}
+    return {name: value for name, value in found.items() if isinstance(value, _FIELD_TYPES.get(name, object))}

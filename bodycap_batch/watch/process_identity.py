@@ -1,0 +1,56 @@
+"""Identify processes across machines and restarts."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import socket
+from pathlib import Path
+
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+_PID_NAMESPACE = Path("/proc/self/ns/pid")
+
+
+def machine_id() -> str:
+    """Return an identifier of this machine since its last start, and of its namespace of process numbers.
+
+    A container has a process namespace of its own. The result is "" if the system has no such information.
+    """
+    try:
+        boot = _BOOT_ID.read_text(encoding="ascii").strip()
+        names = os.readlink(_PID_NAMESPACE)
+    except OSError:
+        return ""
+    return f"{socket.gethostname()}/{boot}/{names}"
+
+
+def process_start(pid: int) -> str:
+    """Return the start time of a process of this machine in kernel ticks; "" if there is no such process."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2]
+    except OSError:
+        return ""
+    words = fields.split()
+    return "" if words[0] in ("Z", "X") else words[19]
+
+
+def process_tag() -> str:
+    """Return a text that identifies this process among all machines; it is part of a file's name."""
+    return f"{_machine_tag()}-{os.getpid()}-{process_start(os.getpid())}"
+
+
+def is_process_running(tag: str) -> bool:
+    """Return True if the process whose `process_tag` begins the name runs on this machine."""
+    machine, pid, start, *_ = [*tag.split("-"), "", ""]
+    here = bool(machine_id()) and machine == _machine_tag()
+    return here and pid.isdecimal() and bool(start) and process_start(int(pid)) == start
+
+
+def is_from_this_machine(tag: str) -> bool:
+    """Return True if a process of this machine, since its last start, wrote the `process_tag`."""
+    return bool(machine_id()) and tag.split("-", maxsplit=1)[0] == _machine_tag()
+
+
+def _machine_tag() -> str:
+    """Return a short digest of this machine's identifier."""
+    return hashlib.sha256(machine_id().encode()).hexdigest()[:12]

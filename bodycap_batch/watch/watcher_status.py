@@ -1,0 +1,119 @@
+"""Show that a watcher runs and what stops it: a small file in `running`, for `bodycap status`."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from bodycap_batch.store.digests import write_atomically
+from bodycap_batch.watch.job_status import utc_text
+from bodycap_batch.watch.process_identity import is_from_this_machine, is_process_running, process_tag
+from bodycap_batch.watch.spool import Spool
+
+_PREFIX, _SUFFIX = ".watcher-", ".json"
+_MAX_SILENCE_S = 86_400.0
+"""Seconds. A killed watcher of another machine looks like a silent one; after a day it is no longer listed.
+"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WatcherStatus:
+    """A watcher as other processes see it.
+
+    Attributes:
+        host: Name of its machine.
+        pid: Its process number there.
+        since: Start of the watcher, UTC.
+        seen: Last update by the watcher's own clock, UTC. "" for a watcher of this machine, which is known to
+            run.
+        trouble: Why it cannot access its folders; "" if it can.
+    """
+
+    host: str
+    pid: int
+    since: str
+    seen: str = ""
+    trouble: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the watcher as plain JSON values."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        seen = f", last seen {self.seen}" if self.seen else ""
+        trouble = f", cannot continue: {self.trouble}" if self.trouble else ""
+        return f"watched by {self.host} (process {self.pid}) since {self.since}{seen}{trouble}"
+
+
+class WatcherStatusFile:
+    """The status file of this watcher. Write errors are ignored, because the disk may be the failure to
+    report.
+
+    Args:
+        spool: The folders that are watched.
+    """
+
+    def __init__(self, spool: Spool) -> None:
+        self._path = spool.running / f"{_PREFIX}{process_tag()}-{id(self):x}{_SUFFIX}"
+        self._since = utc_text()
+
+    def write(self, trouble: str) -> None:
+        """State that the watcher runs, and why it cannot access its folders ("" if it can)."""
+        document = {
+            "host": socket.gethostname(),
+            "pid": os.getpid(),
+            "since": self._since,
+            "seen": utc_text(),
+            "trouble": trouble,
+        }
+        with contextlib.suppress(OSError):
+            write_atomically(self._path, (json.dumps(document, indent=1) + "\n").encode())
+
+    def remove(self) -> None:
+        """Remove the file of this watcher, and those of killed watchers of this machine."""
+        with contextlib.suppress(OSError):
+            self._path.unlink(missing_ok=True)
+            for path in self._path.parent.glob(f"{_PREFIX}*{_SUFFIX}"):
+                if _is_abandoned(path):
+                    path.unlink(missing_ok=True)
+
+
+def active_watchers(spool: Spool) -> list[WatcherStatus]:
+    """Return the watchers of a spool that run, as far as this machine can determine."""
+    paths = sorted(spool.running.glob(f"{_PREFIX}*{_SUFFIX}"))
+    found = (_read_watcher_status(path) for path in paths if not _is_abandoned(path))
+    return [watching for watching in found if watching is not None]
+
+
+def _is_abandoned(path: Path) -> bool:
+    """Return True if the watcher of a file has ended, or has been silent for too long."""
+    tag = path.name.removeprefix(_PREFIX)
+    if is_from_this_machine(tag):
+        return not is_process_running(tag)
+    try:
+        return time.time() - path.stat().st_mtime > _MAX_SILENCE_S
+    except OSError:
+        return False
+
+
+def _read_watcher_status(path: Path) -> WatcherStatus | None:
+    """Return the content of a watcher's file; None if it cannot be read."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        here = is_from_this_machine(path.name.removeprefix(_PREFIX))
+        seen = "" if here else str(found["seen"])
+        return WatcherStatus(
+            host=str(found["host"]),
+            pid=int(found["pid"]),
+            since=str(found["since"]),
+            seen=seen,
+            trouble=str(found["trouble"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

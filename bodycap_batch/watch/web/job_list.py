@@ -1,0 +1,109 @@
+"""The jobs as the live page shows them, as JSON text. The spool is read once for all browsers."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from bodycap_batch.watch.commands import JobRow, inbox_rows, job_row
+from bodycap_batch.watch.job_status import read_status
+from bodycap_batch.watch.spool import JobDir, Spool, visible_entries
+
+REPORT = "report.html"
+_MAX_AGE_S = 0.8
+"""Seconds for which the text is reused, below the page's update period of 1 s."""
+_MAX_ENDED = 500
+"""Number of ended jobs on the page, the latest ones. Evidence: none."""
+_MAX_LOG_BYTES = 64 << 10
+"""Bytes of the end of a log that are shown. Evidence: none."""
+
+
+class JobList:
+    """The jobs of a spool in the page's format; thread-safe.
+
+    Args:
+        spool: The spool.
+        trouble: Returns why the watcher cannot access its folders; "" if it can.
+    """
+
+    def __init__(self, spool: Spool, trouble: Callable[[], str]) -> None:
+        self.spool = spool
+        self._trouble = trouble
+        self._last_jobs: dict[str, Any] = {"jobs": [], "more": 0}
+        self._lock = threading.Lock()
+        self._text, self._read_at = "", -_MAX_AGE_S
+        self._ended: dict[Path, tuple[int, dict[str, Any]]] = {}
+
+    def json_text(self) -> str:
+        """Return all jobs as JSON text, at most a second old. While the disk is missing, return the last
+        known jobs.
+        """
+        with self._lock:
+            now = time.monotonic()
+            if now - self._read_at >= _MAX_AGE_S:
+                trouble = self._trouble()
+                try:
+                    self._last_jobs = self._jobs()
+                except OSError as error:
+                    trouble = trouble or str(error)
+                self._text, self._read_at = json.dumps({**self._last_jobs, "trouble": trouble}), now
+            return self._text
+
+    def _jobs(self) -> dict[str, Any]:
+        waiting = [_browser_entry(row, None) for row in inbox_rows(self.spool)]
+        running = [_job_entry(JobDir(path)) for path in visible_entries(self.spool.running) if path.is_dir()]
+        before, self._ended = self._ended, {}
+        paths = [path for folder in (self.spool.done, self.spool.failed) for path in visible_entries(folder)]
+        for path in paths:
+            try:
+                changed = path.stat().st_mtime_ns
+            except OSError:
+                continue
+            known = before.get(path)
+            self._ended[path] = (
+                known if known and known[0] == changed else (changed, _job_entry(JobDir(path)))
+            )
+        ended = [entry for _, entry in sorted(self._ended.values(), key=lambda item: -item[0])]
+        return {"jobs": [*running, *waiting, *ended[:_MAX_ENDED]], "more": max(0, len(ended) - _MAX_ENDED)}
+
+
+def read_log_end(job: JobDir) -> str:
+    """Return the end of a job's log."""
+    try:
+        with job.log.open("rb") as stream:
+            stream.seek(0, 2)
+            stream.seek(max(0, stream.tell() - _MAX_LOG_BYTES))
+            return stream.read().decode(errors="replace")
+    except OSError:
+        return ""
+
+
+def list_result_files(job: JobDir) -> list[str]:
+    """Return the result files of a job, relative to its folder of results."""
+    if not job.result.is_dir():
+        return []
+    files = (path for path in job.result.rglob("*") if path.is_file() and not path.name.startswith("."))
+    return sorted(path.relative_to(job.result).as_posix() for path in files)
+
+
+def _job_entry(job: JobDir) -> dict[str, Any]:
+    return _browser_entry(job_row(job), job)
+
+
+def _browser_entry(row: JobRow, job: JobDir | None) -> dict[str, Any]:
+    """Return a row for the browser, which computes ages itself."""
+    entry = row.to_dict()
+    del entry["age_s"], entry["path"]
+    status = {} if job is None else read_status(job)
+    entry["active"] = status.get("active", {}) if row.state == "running" else {}
+    entry["notes"] = status.get("notes", [])
+    entry["finished"] = len(status.get("finished_stages", []))
+    reports = [] if job is None else [f"{REPORT}", f"partial/{REPORT}"]
+    entry["report"] = next(
+        (name for name in reports if job is not None and (job.result / name).is_file()), None
+    )
+    return entry
