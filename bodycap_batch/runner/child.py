@@ -39,7 +39,7 @@ FULL_DISK_BYTES = 8 << 20
 """Below this much free space a failure is put down to the full disk: libraries hide ENOSPC."""
 
 
-def main(arguments: Sequence[str], table: Mapping[str, TaskFunction] | None = None) -> int:
+def main(arguments: Sequence[str], stages: Mapping[str, TaskFunction]) -> int:
     """Run the task file named on the command line; without one, take orders until standard input closes.
 
     An order is one JSON line: ``{"task": file, "log": file}`` runs a task and sends its prints to the log;
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str], table: Mapping[str, TaskFunction] | None = No
 
     Args:
         arguments: The path of the task file, or nothing.
-        table: What to call for each stage; the project's own stages by default.
+        stages: By stage name, the function that runs its tasks.
 
     Returns:
         The exit code: 0, that of a typed error, or 70.
@@ -56,14 +56,14 @@ def main(arguments: Sequence[str], table: Mapping[str, TaskFunction] | None = No
     speak = _Speaker()
     orders = _Orders()
     if arguments:
-        return _perform(Path(arguments[0]), table, _Link(speak, orders, asks=False))
+        return _perform(Path(arguments[0]), stages, _Link(speak, orders, asks=False))
     for order in iter(orders.next, None):
         if "import" in order:
             _import(order["import"])
             continue
         _send_prints_to(Path(order["log"]))
         speak.say("begun")
-        if _perform(Path(order["task"]), table, _Link(speak, orders, asks=True)) == EXIT_BUG:
+        if _perform(Path(order["task"]), stages, _Link(speak, orders, asks=True)) == EXIT_BUG:
             return EXIT_BUG
     return 0
 
@@ -86,11 +86,11 @@ class _Link:
             raise Cancelled("not committed: the job was stopped or taken over", hint="run it again to go on")
 
 
-def _perform(order: Path, table: Mapping[str, TaskFunction] | None, link: _Link) -> int:
+def _perform(order: Path, stages: Mapping[str, TaskFunction], link: _Link) -> int:
     task, root = task_from_json(json.loads(order.read_text(encoding="utf-8")))
     try:
         store = Store(root)
-        _run(task, store, _function(task.key.stage, table), link)
+        _run(task, store, stages[task.key.stage], link)
     except BodycapError as error:
         link.speak.say("error", error=error.to_dict())
         return error.exit_code
@@ -129,23 +129,15 @@ def _run(task: Task, store: Store, function: TaskFunction, link: _Link) -> None:
             progress=link.speak.progress,
             cancelled=link.orders.closed.is_set,
         )
-        function(task.key.options, task.arguments, context, draft.files)
+        function(task.arguments, context, draft.files)
         made = {
             "seconds": round(time.monotonic() - started, 3),
             "cpu_seconds": round(time.process_time() - cpu_before, 3),
             "peak_memory_mb": round(peak_memory_mb(), 1),
             "threads": task.threads,
         }
-        store.commit(draft, task.key, made, before=link.before_commit, replace=task.again)
+        store.commit(draft, task.key, made, before=link.before_commit, replace=task.replaces)
     link.speak.say("done", **made)
-
-
-def _function(stage: str, table: Mapping[str, TaskFunction] | None) -> TaskFunction:
-    if table is None:
-        from bodycap_batch.tasks import STAGES
-
-        return STAGES[stage].function
-    return table[stage]
 
 
 class _DiskWatch:

@@ -11,6 +11,7 @@ import pytest
 
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import RegistrationOptions
+from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.bundle import read_bundle, write_bundle
 from bodycap_batch.model.camera import Camera
@@ -19,9 +20,11 @@ from bodycap_batch.model.relative_pose import RigPoses, mean_rotation, relative_
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 from bodycap_batch.registration import RigCamera, register_in_rig
 from bodycap_batch.registration.poses.batched_pnp import Views, linearise, make_views
-from bodycap_batch.tasks import read_summary, recover
+from bodycap_batch.tasks import recover
+from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.registered import RIG_POSES
 from bodycap_batch.tasks.registration import save_registration
+from bodycap_batch.tasks.stage import read_summary
 
 LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
 COUNT = 61
@@ -183,14 +186,23 @@ def test_what_the_rig_left_outlasts_the_search_for_lost_frames(
     relative = relative_pose(*(each.found.trajectory for each in cameras), 0)
     write_bundle(RigPoses(relative=(relative,)), folders[0], RIG_POSES)
     capture = SimpleNamespace(cameras=tuple(each.camera for each in cameras))
-    monkeypatch.setattr(recover, "load_capture", lambda _: capture)
+    monkeypatch.setattr(recover, "load_capture", lambda *_: capture)
     monkeypatch.setattr(recover, "load_map", lambda _: SimpleNamespace(maps=(scene_map,)))
     monkeypatch.setattr(recover, "load_keyframes", lambda _: selection)
     monkeypatch.setattr("bodycap_batch.registration.recover_lost", lambda found, *_: found)
     out = tmp_path / "out"
     out.mkdir()
-    arguments = {"registrations": [str(folder) for folder in folders], "map": "", "selection": ""}
-    recover.RECOVER.function({}, arguments, StageContext(work_dir=tmp_path, threads=1), out)
+    stored = {path.name: ArtefactRef(path=path, digest="") for path in folders}
+    config = CaptureConfig(cameras=(CameraConfig(name="torso", video=(Path("torso.mp4"),)),))
+    task = recover.RecoverTask(
+        options=RegistrationOptions(),
+        cameras=tuple(stored),
+        capture=CaptureRef(config=config, digests={}),
+        keyframes=stored,
+        map=ArtefactRef(path=tmp_path, digest=""),
+        registrations=stored,
+    )
+    recover.run_recover(task, StageContext(work_dir=tmp_path, threads=1), out)
     (kept,) = read_bundle(RigPoses, out, RIG_POSES).relative
     assert kept.cameras == relative.cameras
     assert read_summary(out) == read_summary(folders[0])
