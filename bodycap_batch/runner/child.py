@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
@@ -35,6 +35,9 @@ from bodycap_batch.store.artefacts import DISK_ERRORS, Store, store_error
 
 _PROGRESS_PERIOD_S = 0.2
 _GRACE_S = 3.0
+RELEASE_PERIOD_S = 0.5
+"""Least time between two releases of freed memory. One takes some 50 ms in a large process.
+Evidence: docs/decisions/pipeline.md."""
 FULL_DISK_BYTES = 8 << 20
 """Below this much free space a failure is put down to the full disk: libraries hide ENOSPC."""
 
@@ -126,7 +129,7 @@ def _run(task: Task, store: Store, function: TaskFunction, link: _Link) -> None:
         context = StageContext(
             work_dir=draft.work,
             threads=task.threads,
-            progress=link.speak.progress,
+            progress=StepReporter(link.speak.progress),
             cancelled=link.orders.closed.is_set,
         )
         function(task.arguments, context, draft.files)
@@ -253,6 +256,40 @@ class _Speaker:
             return
         self._last = now
         self.say("progress", done=int(done), total=int(total), what=what)
+
+
+class StepReporter:
+    """Reports the progress of a stage, and releases freed memory whenever the stage begins another step.
+
+    The C library keeps freed memory. Without its release, the peak of a stage would be nearly the sum of what
+    its steps need.
+
+    Args:
+        report: Called as ``report(done, total, what)``.
+        release: Releases freed memory.
+        period_s: Least time between two releases, seconds.
+    """
+
+    def __init__(
+        self,
+        report: Callable[[int, int, str], None],
+        release: Callable[[], None] = give_back,
+        period_s: float = RELEASE_PERIOD_S,
+    ) -> None:
+        self._report = report
+        self._release = release
+        self._period_s = period_s
+        self._step = ""
+        self._last = time.monotonic()
+
+    def __call__(self, done: int, total: int, what: str = "") -> None:
+        """Report that `done` of `total` units are done; another name `what` begins another step."""
+        if what != self._step:
+            self._step = what
+            if time.monotonic() - self._last >= self._period_s:
+                self._release()
+                self._last = time.monotonic()
+        self._report(done, total, what)
 
 
 class _Orders:

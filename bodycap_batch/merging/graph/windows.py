@@ -9,7 +9,7 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.cameras.track import SAMPLE_REACH_NS, Track
 from bodycap_batch.merging.graph.error_modes import Spread
-from bodycap_batch.merging.graph.motion_graph import MotionGraph, Solution, missed
+from bodycap_batch.merging.graph.motion_graph import MotionGraph, Solution, SolverProgress, missed
 from bodycap_batch.model.geometry import interpolate_pose
 
 CHUNK_TICKS = 500
@@ -40,7 +40,7 @@ def solve_motion(
     build: Callable[[IntArray, Sequence[Track]], MotionGraph],
     tick_times_ns: IntArray,
     tracks: Sequence[Track],
-    step: Callable[[], None],
+    step: SolverProgress,
     *,
     chunk_ticks: int = CHUNK_TICKS,
     spread: Spread | None = None,
@@ -51,7 +51,7 @@ def solve_motion(
         build: Makes the graph of a stretch from its ticks and tracks.
         tick_times_ns: (T,) the timeline.
         tracks: Cleaned tracks, poses in metres.
-        step: Called after each iteration; may raise to stop.
+        step: Called after each iteration, and with the name of each part of the work; may raise to stop.
         chunk_ticks: Longest stretch, without its overlaps.
         spread: How far off the calibration may be; with it the joints' covariance is computed.
     """

@@ -11,7 +11,6 @@ import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.core.memory import give_back
 from bodycap_batch.model.scene import FrameStatus, Registration
 from bodycap_batch.registration.tracking.klt import Anchor, Tracks, track_stretch
 
@@ -60,7 +59,7 @@ def all_tracks(
     todo = _joined([stretch for stretch in stretches if stretch not in done], count)
     parts += _track(camera, anchors, _shared_out(todo, frames, context.threads), context)
     tracks = Tracks.join(parts)  # which takes them out one by one: nothing else may hold them
-    give_back()  # the many small pieces: 330 MB after ten minutes of video
+    context.progress(0, 0, "poses")
     return tracks
 
 
