@@ -15,7 +15,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "bodycap_batch"
 LAYERS = (
     {"core", "presets"},
     {"model", "store"},
-    {"formats", "overlay"},
+    {"formats", "overlay", "runner"},
     {"config"},
     {"capture"},
     {
@@ -23,7 +23,6 @@ LAYERS = (
         "synthetic", "check", "calibration",
     },
     {"tasks"},
-    {"runner"},
     {"pipeline"},
     {"watch"},
     {"cli"},

@@ -28,7 +28,7 @@ from bodycap_batch.cli.shared_options import (
 from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.core.errors import BodycapError, JobError
 from bodycap_batch.core.progress import Event
-from bodycap_batch.tasks import ORDER, StageName, stages_from
+from bodycap_batch.tasks.order import STAGE_ORDER, StageName, stages_from
 
 if TYPE_CHECKING:
     from bodycap_batch.config.models import Job
@@ -133,7 +133,7 @@ def _print_summary(summary: RunSummary, job: Job, display: ProgressDisplay, *, v
             typer.echo(f"{cost}  {stage.stage} {stage.camera}{' (kept)' if stage.reused else ''}".rstrip())
     if not summary.files:
         # What is done while frames are registered is no stage that can be asked for.
-        reached = next(each.stage for each in reversed(summary.stages) if each.stage in ORDER)
+        reached = next(each.stage for each in reversed(summary.stages) if each.stage in STAGE_ORDER)
         typer.echo(f"{job.name}: stopped after {reached}, as asked; run it again for the rest")
         return
     if summary.executed == 0:

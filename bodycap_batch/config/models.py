@@ -50,6 +50,7 @@ AnyCalibration = Annotated[
 ]
 Seconds = Annotated[float, Field(ge=-_MAX_SECONDS, le=_MAX_SECONDS)]
 Row = tuple[float, float, float, float]
+Activity = Literal["walk", "generic"]
 
 
 class MountPose(_Block):
@@ -168,7 +169,7 @@ class Job(_Block):
     height_m: float | None = Field(
         None, ge=0.4, le=2.6, description="the subject's height in metres, e.g. 1.75"
     )
-    activity: Literal["walk", "generic"] = Field("generic", description="what the subject does")
+    activity: Activity = Field("generic", description="what the subject does")
     keyframes: KeyframeOptions = KeyframeOptions()
     map: MapOptions = MapOptions()
     registration: RegistrationOptions = RegistrationOptions()

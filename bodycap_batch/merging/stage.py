@@ -52,15 +52,18 @@ from bodycap_batch.model.scene import Trajectory
 
 
 class _Progress:
-    """Counts the optimiser's iterations, reports them, and stops the work when asked."""
+    """Counts the optimiser's iterations, reports them and the parts of the work, and stops it when asked."""
 
     def __init__(self, context: StageContext) -> None:
         self._context, self._done, self._total = context, 0, 80
         self.what = "calibrating"
 
-    def __call__(self) -> None:
+    def __call__(self, what: str = "", /) -> None:
         self._context.check_cancelled()
-        self._done += 1
+        if what:
+            self.what = what
+        else:
+            self._done += 1
         self._total = max(self._total, self._done + MAX_ITERATIONS)
         self._context.progress(self._done, self._total, self.what)
 

@@ -1,35 +1,21 @@
-"""What each stage is made from: digests for the store's keys, arguments for the child."""
+"""The inputs of the stages' tasks, from a job and its stored artefacts."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from bodycap_batch.capture.video import MAY_READ
 from bodycap_batch.config.models import CameraConfig, CaptureConfig, Job
 from bodycap_batch.core.errors import Cancelled, CaptureError, JobError
 from bodycap_batch.core.progress import Event, Listener
-from bodycap_batch.store.artefacts import DISK_ERRORS, Artefact, ArtefactKey, store_error
-from bodycap_batch.store.code_version import algorithm_version, library_versions
+from bodycap_batch.store.artefacts import DISK_ERRORS, Artefact, store_error
 from bodycap_batch.store.digests import FileDigests, json_digest
-from bodycap_batch.tasks import STAGES, read_summary
+from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, CaptureRef, FileRef, MountInput
 
-_FILES = ("video", "timestamps", "mask")
-_BODY = ("mount", "segment", "joint_from_cam", "sigma_deg", "sigma_m")
-"""Fields about where a camera sits: they matter to the skeleton only."""
-
-
-def key_of(stage: str, options: Mapping[str, Any], inputs: Mapping[str, Any]) -> ArtefactKey:
-    """Key of an artefact of `stage`."""
-    entry = STAGES[stage]
-    return ArtefactKey(
-        stage=stage,
-        algorithm=algorithm_version(entry.code),
-        options=dict(options),
-        inputs=dict(inputs),
-        libraries=library_versions(entry.libraries),
-    )
+_FILE_FIELDS = ("video", "timestamps", "mask")
+_MOUNT_FIELDS = ("mount", "segment", "joint_from_cam", "sigma_deg", "sigma_m")
+"""Fields about a camera's place on the body: only the skeleton depends on them."""
 
 
 def camera_digest(
@@ -38,13 +24,19 @@ def camera_digest(
     digests: FileDigests,
     on_bytes: Callable[[int], None] | None = None,
 ) -> str:
-    """Digest of all that decides what a camera's frames are: bytes of its files, clock, lens, window.
+    """Return the digest of what a camera's frames depend on: files, clock, intrinsics, time window.
+
+    Args:
+        capture: The capture block of the job.
+        camera: One of its cameras.
+        digests: Digests of files.
+        on_bytes: Called with the number of bytes of each block read.
 
     Raises:
         CaptureError: A file cannot be read.
-        StoreError: The disk fails; `DiskAway` where it does not answer.
+        StoreError: The disk fails; `DiskAway` if it does not answer.
     """
-    settings = camera.model_dump(mode="json", exclude=set(_FILES + _BODY))
+    settings = camera.model_dump(mode="json", exclude=set(_FILE_FIELDS + _MOUNT_FIELDS))
     shared = capture.model_dump(mode="json", include={"start_s", "end_s", "work_px"})
     content = [_footage_digest(path, digests, on_bytes) for path in camera.input_files()]
     return json_digest(
@@ -61,10 +53,10 @@ def camera_digest(
 def camera_digests(
     capture: CaptureConfig, digests: FileDigests, listener: Listener, cancelled: Callable[[], bool]
 ) -> dict[str, str]:
-    """By camera, `camera_digest`; tells how far reading the videos is.
+    """Return `camera_digest` by camera name, and report the progress of reading the videos.
 
     Raises:
-        Cancelled: Asked to stop meanwhile.
+        Cancelled: The job was stopped meanwhile.
         CaptureError, StoreError: See `camera_digest`.
     """
     videos = [path for camera in capture.cameras for path in camera.video]
@@ -94,76 +86,81 @@ def _footage_digest(path: Path, digests: FileDigests, on_bytes: Callable[[int], 
         raise CaptureError(f"cannot be read: {error.strerror}", path=path, hint=MAY_READ) from error
 
 
-def one_camera(capture: CaptureConfig, camera: CameraConfig) -> dict[str, Any]:
-    """The capture block with a single camera, as JSON values."""
-    return capture.model_copy(update={"cameras": (camera,), "synthetic": None}).model_dump(mode="json")
+def capture_ref(
+    capture: CaptureConfig, digests: Mapping[str, str], cameras: Sequence[CameraConfig] | None = None
+) -> CaptureRef:
+    """Return a task's input for the videos of a capture.
 
-
-def all_cameras(capture: CaptureConfig) -> dict[str, Any]:
-    """The capture block as JSON values."""
-    return capture.model_copy(update={"synthetic": None}).model_dump(mode="json")
-
-
-def body_arguments(job: Job) -> dict[str, Any]:
-    """Skeleton, stature, activity and mounts, as the merge task takes them.
-
-    Raises:
-        JobError: A camera's place on the body is not known.
+    Args:
+        capture: The capture block of the job.
+        digests: `camera_digest` by camera name; empty if a video cannot be read.
+        cameras: The task's cameras, in this order; default: all.
     """
-    path = skeleton_file(job)
-    return {
-        "skeleton": None if path else job.skeleton,
-        "skeleton_file": str(path) if path else None,
-        "skeleton_map": dict(job.skeleton_map) if path else {},
-        "tpose_frame": job.tpose_frame if path else None,
-        "height_m": job.height_m,
-        "activity": job.activity,
-        "mounts": [_mount_block(camera) for camera in job.capture.cameras],
-    }
+    chosen = capture.cameras if cameras is None else tuple(cameras)
+    config = capture.model_copy(update={"cameras": chosen, "synthetic": None})
+    return CaptureRef(
+        config=config,
+        digests={camera.name: digests[camera.name] for camera in chosen if camera.name in digests},
+    )
 
 
-def merge_arguments(job: Job, keyframes: Mapping[str, Artefact]) -> dict[str, Any]:
-    """The body, and the videos and their kept pictures where the merge looks for a board in them.
+def artefact_ref(artefact: Artefact) -> ArtefactRef:
+    """Return a task's input for a stored artefact."""
+    return ArtefactRef(path=artefact.path, digest=artefact.digest)
+
+
+def optional_ref(artefact: Artefact | None) -> ArtefactRef | None:
+    """Return a task's input for an artefact that may be missing."""
+    return None if artefact is None else artefact_ref(artefact)
+
+
+def refs_by_camera(artefacts: Mapping[str, Artefact]) -> dict[str, ArtefactRef]:
+    """Return a task's input for one artefact per camera."""
+    return {name: artefact_ref(artefact) for name, artefact in artefacts.items()}
+
+
+def body_input(job: Job, digests: FileDigests) -> BodyInput:
+    """Return a task's input for the body of a job: skeleton, stature, activity and mounts.
 
     Raises:
-        JobError: A camera's place on the body is not known.
-    """
-    if job.merge.marker_board is None:
-        return body_arguments(job)
-    return {**body_arguments(job), "capture": all_cameras(job.capture), "kept": kept_in(keyframes)}
-
-
-def body_digest(job: Job, digests: FileDigests) -> dict[str, Any]:
-    """The same with the skeleton file's content in the place of its path.
-
-    Raises:
-        JobError: The file cannot be read.
+        JobError: A camera's place on the body is unknown, or the skeleton file cannot be read.
         StoreError: The disk fails.
     """
     path = skeleton_file(job)
+    return BodyInput(
+        skeleton=None if path else job.skeleton,
+        skeleton_file=None if path is None else FileRef(path=path, digest=_skeleton_digest(path, digests)),
+        skeleton_map=dict(job.skeleton_map) if path else {},
+        tpose_frame=job.tpose_frame if path else None,
+        height_m=job.height_m,
+        activity=job.activity,
+        mounts=tuple(_mount_input(camera) for camera in job.capture.cameras),
+    )
+
+
+def _skeleton_digest(path: Path, digests: FileDigests) -> str:
     try:
-        content = digests.sha256(path) if path else None
+        return digests.sha256(path)
     except OSError as error:
-        if path is not None and error.errno in DISK_ERRORS:
+        if error.errno in DISK_ERRORS:
             raise store_error(error, path) from error
         raise JobError(
             f"cannot be read: {error.strerror}", path=path, field="skeleton", hint=MAY_READ
         ) from error
-    return {**body_arguments(job), "skeleton_file": content}
 
 
 def has_body(job: Job) -> bool:
-    """False where the job asks for no skeleton."""
+    """Return False if the job asks for no skeleton."""
     return job.skeleton not in (None, "none")
 
 
 def skeleton_file(job: Job) -> Path | None:
-    """The user's BVH file, if the job names one."""
+    """Return the user's BVH file, if the job names one."""
     named = job.skeleton or ""
     return Path(named) if named.lower().endswith(".bvh") else None
 
 
-def _mount_block(camera: CameraConfig) -> dict[str, Any]:
+def _mount_input(camera: CameraConfig) -> MountInput:
     if camera.role is None:
         raise JobError(
             f"where on the body is camera {camera.name!r}?",
@@ -171,61 +168,11 @@ def _mount_block(camera: CameraConfig) -> dict[str, Any]:
             hint="name its mount, e.g. `mount: torso`, or set `skeleton: none`",
         )
     stated = camera.mount_matrix()
-    return {
-        "camera": camera.name,
-        "role": camera.role,
-        "place": camera.mount or camera.name,
-        "joint_from_cam": None if stated is None else stated.tolist(),
-        "sigma_deg": camera.sigma_deg,
-        "sigma_m": camera.sigma_m,
-    }
-
-
-def content_of(artefacts: Mapping[str, Artefact]) -> dict[str, str]:
-    """Digests of artefacts by camera."""
-    return {name: artefact.digest for name, artefact in artefacts.items()}
-
-
-def kept_in(keyframes: Mapping[str, Artefact]) -> dict[str, str]:
-    """By camera, the artefact that keeps frames of its video."""
-    return {name: str(artefact.path) for name, artefact in keyframes.items()}
-
-
-def localised_in(registrations: Mapping[str, Artefact]) -> int:
-    """Localised frames of all cameras."""
-    return sum(int(read_summary(item.path)["localised"]) for item in registrations.values())
-
-
-def beside_others(
-    capture: CaptureConfig,
-    cameras: Sequence[CameraConfig],
-    digests: Mapping[str, str],
-    scene: Artefact,
-    keyframes: Mapping[str, Artefact],
-    registrations: Mapping[str, Artefact],
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Inputs of the key and arguments of a task that solves a camera's frames with those of others.
-
-    Args:
-        capture: All cameras.
-        cameras: The task's own camera, then the others.
-        digests: By camera, of what its frames are.
-        scene: The map.
-        keyframes: By camera.
-        registrations: By camera.
-    """
-    found = {camera.name: registrations[camera.name] for camera in cameras}
-    inputs = {
-        "cameras": [digests[name] for name in found],
-        "map": scene.digest,
-        "keyframes": [keyframes[name].digest for name in found],
-        "registrations": list(content_of(found).values()),
-    }
-    arguments = {
-        "capture": all_cameras(capture.model_copy(update={"cameras": tuple(cameras)})),
-        "map": str(scene.path),
-        "selection": str(keyframes[cameras[0].name].path),
-        "kept": kept_in({name: keyframes[name] for name in found}),
-        "registrations": [str(artefact.path) for artefact in found.values()],
-    }
-    return inputs, arguments
+    return MountInput(
+        camera=camera.name,
+        role=camera.role,
+        place=camera.mount or camera.name,
+        joint_from_cam=None if stated is None else tuple(tuple(row) for row in stated.tolist()),
+        sigma_deg=camera.sigma_deg,
+        sigma_m=camera.sigma_m,
+    )

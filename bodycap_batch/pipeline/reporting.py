@@ -1,24 +1,23 @@
-"""The report of a job that was run before, made again from what the store holds."""
+"""The report of a job that was run before, made again from stored results."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import BodycapError
 from bodycap_batch.pipeline.flow import Flow
-from bodycap_batch.pipeline.made import Made, report_task
 from bodycap_batch.pipeline.results import PARTIAL, publish
 from bodycap_batch.pipeline.run import files_of, run_stages
 from bodycap_batch.pipeline.settings import Settings
+from bodycap_batch.pipeline.stage_results import StageResults, report_task
 from bodycap_batch.runner import NotStored
+from bodycap_batch.tasks.report import ReportTask
 
 
-def stored_for_report(job: Job, *, out_dir: Path, settings: Settings) -> Mapping[str, Any]:
-    """Where the store holds what a job's report is made of; nothing is computed.
+def stored_for_report(job: Job, *, out_dir: Path, settings: Settings) -> ReportTask:
+    """Find the stored results that a job's report is made from; nothing is computed.
 
     Args:
         job: A resolved job.
@@ -26,33 +25,33 @@ def stored_for_report(job: Job, *, out_dir: Path, settings: Settings) -> Mapping
         settings: Store, threads, listener, cancellation.
 
     Returns:
-        The arguments of the report's task, for `bodycap_batch.tasks.report.load_inputs`.
+        The report's task, for `bodycap_batch.tasks.report.load_inputs`.
 
     Raises:
         BodycapError: The videos cannot be read, the disk fails, or nothing of the job is stored.
     """
-    made, stopped_by = _stored(job, out_dir, settings)
-    error = stopped_by or made.failure
-    return report_task(job, made, {}, None if error is None else made.failed_at(error)).arguments
+    results, stopped_by = _find_stored(job, out_dir, settings)
+    failure = results.describe_failure(stopped_by or results.failure)
+    return report_task(job, results, {}, settings.store.digests, failure)
 
 
-def _stored(job: Job, out_dir: Path, settings: Settings) -> tuple[Made, BodycapError | None]:
-    """The finished stages up to the results, and what the store lacks of them."""
-    made = Made()
-    with Flow(job, replace(settings, compute=False, redo=frozenset()), logs=out_dir / "logs") as looking:
+def _find_stored(job: Job, out_dir: Path, settings: Settings) -> tuple[StageResults, BodycapError | None]:
+    """Return the stored stages up to the export, and the error that names the first missing one."""
+    results = StageResults()
+    with Flow(job, replace(settings, compute=False, redo=frozenset()), logs=out_dir / "logs") as flow:
         try:
-            for stage in run_stages(job, looking, made):
+            for stage in run_stages(job, flow, results):
                 if stage == "export":
                     break
         except NotStored as error:
-            if not looking.records:
+            if not flow.runner.records:
                 raise
-            return made, error
-    return made, None
+            return results, error
+    return results, None
 
 
 def remake_report(job: Job, *, out_dir: Path, settings: Settings) -> Path:
-    """Write a job's report anew; no other stage is computed.
+    """Write a job's report again; no other stage is computed.
 
     Args:
         job: A resolved job.
@@ -60,18 +59,18 @@ def remake_report(job: Job, *, out_dir: Path, settings: Settings) -> Path:
         settings: Store, threads, listener, cancellation.
 
     Returns:
-        The report: beside the results where the job is complete, else in ``<out_dir>/partial``.
+        The report: beside the results if the job is complete, else in ``<out_dir>/partial``.
 
     Raises:
         BodycapError: The videos cannot be read, the disk fails, or nothing of the job is stored.
     """
-    made, stopped_by = _stored(job, out_dir, settings)
+    results, stopped_by = _find_stored(job, out_dir, settings)
     again = replace(settings, redo=settings.redo | {"report"})
     with Flow(job, again, logs=out_dir / "logs") as flow:
         flow.check()
-        reported = flow.report(made, stopped_by)
-    whole = made.exported is not None and made.failure is None
-    folder = out_dir if whole else out_dir / PARTIAL
+        reported = flow.report(results, stopped_by)
+    is_complete = results.exported is not None and results.failure is None
+    folder = out_dir if is_complete else out_dir / PARTIAL
     settings.require_owner()
     files = dict(files_of(reported))
     publish(files, folder)

@@ -1,4 +1,4 @@
-"""`run_job`: the stages in order, on one screen."""
+"""Run a job: the stages in order, and the results in the user's folder."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import BodycapError, Cancelled, CaptureError, EstimationError, JobError
 from bodycap_batch.pipeline.flow import Flow
 from bodycap_batch.pipeline.inputs import has_body
-from bodycap_batch.pipeline.made import Made
 from bodycap_batch.pipeline.results import (
     PARTIAL,
     clear_partial,
@@ -25,8 +24,10 @@ from bodycap_batch.pipeline.results import (
     write_results_file,
 )
 from bodycap_batch.pipeline.settings import Settings, StageRecord
+from bodycap_batch.pipeline.stage_results import StageResults
 from bodycap_batch.store.artefacts import Artefact
-from bodycap_batch.tasks import ORDER, RESULTS
+from bodycap_batch.tasks.order import STAGE_ORDER
+from bodycap_batch.tasks.stage import RESULTS_FOLDER
 
 JOB_FILE = "job.yaml"
 REPORT_FILE = "report.html"
@@ -34,13 +35,13 @@ REPORT_FILE = "report.html"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunSummary:
-    """What a finished job left behind.
+    """The outcome of a finished job.
 
     Attributes:
         out_dir: Folder of the results.
-        files: Their names, relative to it; none where the run ended before.
-        stages: Every stage that went into them, executed or reused.
-        versions: Python, this program and the libraries that computed.
+        files: Names of the results, relative to the folder; empty if the run ended before the last stage.
+        stages: Every task that went into the results, computed now or reused.
+        versions: Versions of Python, this program and the libraries that computed them.
     """
 
     out_dir: Path
@@ -50,109 +51,125 @@ class RunSummary:
 
     @property
     def executed(self) -> int:
-        """How many stages had to be computed."""
+        """Number of tasks that were computed in this run."""
         return sum(not stage.reused for stage in self.stages)
 
 
 def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
-    """Take a job through all stages; whatever the store already holds is not computed again.
+    """Take a job through all stages; stored results are not computed again.
 
     Args:
         job: A resolved job.
-        out_dir: Folder of the results; what an earlier run left there stays until this one has results, which
-            is before their video is made.
+        out_dir: Folder of the results. Results of an earlier run stay there until this run has its own, which
+            is before their video is rendered.
         settings: Store, threads, listener, cancellation.
 
     Raises:
-        BodycapError: A stage failed. Where the skeleton could not be solved, the map, the cameras' paths
-            and the frames are in ``<out_dir>/partial``. Where it was the report or the video, the other
-            results are there.
+        BodycapError: A stage failed. If the skeleton could not be solved, the map, the cameras' paths and the
+            frames are in ``<out_dir>/partial``. If the report or the video failed, the other results are
+            there.
     """
     settings.store.sweep()
     settings.require_owner()
-    made, whole = Made(), settings.until in ("", ORDER[-1])
+    results, runs_to_end = StageResults(), settings.until in ("", STAGE_ORDER[-1])
     with Flow(job, settings, logs=out_dir / "logs") as flow:
-        stopped_by = _run_until(job, flow, made, out_dir, settings)
-        summary = _summary(flow, made, out_dir)
-        if whole and made.exported is not None:
-            place = _hand_over(job, flow, made, out_dir, settings)
+        stopped_by = _run_until(job, flow, results, out_dir, settings)
+        summary = _summary(flow, results, out_dir)
+        if runs_to_end and results.exported is not None:
+            folder = _publish_results(job, flow, results, out_dir, settings)
             if stopped_by is not None:
-                _add_hint(stopped_by, f"the other results are in {place}")
-            if made.failure is None:
-                flow.keep_only_this()
+                _add_hint(stopped_by, f"the other results are in {folder}")
+            if results.failure is None:
+                flow.runner.keep_only_these()
         elif stopped_by is not None:
-            _tell_how_far(flow, made, stopped_by, out_dir, settings)
-    if (error := _first_of(made.failure, stopped_by)) is not None:
+            _publish_failure_report(flow, results, stopped_by, out_dir, settings)
+    if (error := _combined_error(results.failure, stopped_by)) is not None:
         raise error
-    return summary if whole else replace(summary, files=())
+    return summary if runs_to_end else replace(summary, files=())
 
 
-def run_stages(job: Job, flow: Flow, made: Made) -> Iterator[str]:
-    """Run one stage after another; yields the name of each when it is done."""
+def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
+    """Run the stages one after another, write their artefacts into `results`, and yield each stage's name.
+
+    A caller stops the job after a stage by leaving the loop.
+    """
     flow.check()
     yield "check"
-    made.stage = "keyframes"
-    made.keyframes = flow.keyframes()
+    results.stage = "keyframes"
+    results.keyframes = keyframes = flow.keyframes()
     yield "keyframes"
-    made.stage = "map"
-    made.scene = scene = flow.map(made.keyframes)
+    results.stage = "map"
+    results.map = scene_map = flow.map(keyframes)
     yield "map"
-    made.stage = "registration"
-    made.registrations = found = flow.registrations(scene, made.keyframes)
-    scene, found = flow.grow(scene, found, made.keyframes)
-    made.scene, found = flow.refine(scene, found, made.keyframes)
-    found = flow.solve_rigs(made.scene, found, made.keyframes)
-    made.registrations = flow.recover(made.scene, found, made.keyframes)
+    results.stage = "registration"
+    results.registrations = found = flow.register(scene_map, keyframes)
+    scene_map, found = flow.extend_map(scene_map, found, keyframes)
+    results.map, found = flow.refine_map(scene_map, found, keyframes)
+    found = flow.solve_rigs(results.map, found, keyframes)
+    results.registrations = flow.recover(results.map, found, keyframes)
     yield "registration"
-    made.stage = "merge"
-    made.merged, made.failure = _merge(job, flow, made)
+    results.stage = "merge"
+    results.merged, results.failure = _merge(job, flow, results)
     yield "merge"
-    made.filming = flow.start_preview(made) if job.export.preview else None
-    made.exported = flow.export(made.keyframes, made.scene, made.registrations, made.merged, made.failure)
+    results.preview = flow.start_preview(results) if job.export.preview else None
+    results.exported = flow.export(
+        keyframes, results.map, results.registrations, results.merged, results.failure
+    )
     yield "export"
-    made.reported = flow.report(made)
+    results.reported = flow.report(results)
     yield "report"
-    if made.filming is not None:
-        made.previewed = made.filming.result()
+    if results.preview is not None:
+        results.previewed = results.preview.result()
         yield "preview"
 
 
-def _run_until(job: Job, flow: Flow, made: Made, out_dir: Path, settings: Settings) -> BodycapError | None:
-    """Run the stages up to the last one wanted; returns what stopped them, if a report can tell of it.
+def _run_until(
+    job: Job, flow: Flow, results: StageResults, out_dir: Path, settings: Settings
+) -> BodycapError | None:
+    """Run the stages up to the last one wanted; return the error that stopped them if a report can show it.
 
-    The results do not wait for their video.
+    The results are published before their video is rendered.
     """
     try:
-        for stage in run_stages(job, flow, made):
+        for stage in run_stages(job, flow, results):
             if stage == settings.until:
                 break
-            if stage == "report" and made.filming is not None and not made.filming.done():
-                settings.results_ready(_hand_over(job, flow, made, out_dir, settings))
+            if stage == "report" and results.preview is not None and not results.preview.done():
+                settings.results_ready(_publish_results(job, flow, results, out_dir, settings))
     except BodycapError as error:
-        # Results that are there are handed over although the page about them could not be written.
-        tellable = made.exported is not None or isinstance(error, JobError | CaptureError | EstimationError)
-        if isinstance(error, Cancelled) or not tellable:
+        # Finished results are published although the report of them could not be written.
+        reportable = results.exported is not None or _is_about_data(error)
+        if isinstance(error, Cancelled) or not reportable:
             raise
         return error
     return None
 
 
-def _first_of(failure: EstimationError | None, stopped_by: BodycapError | None) -> BodycapError | None:
-    """What a job ends with: that there is no skeleton, unless the machine failed; the other is its hint."""
+def _is_about_data(error: BodycapError) -> bool:
+    """Return True if the job or its videos caused an error, False if the machine or the program did."""
+    return isinstance(error, JobError | CaptureError | EstimationError)
+
+
+def _combined_error(failure: EstimationError | None, stopped_by: BodycapError | None) -> BodycapError | None:
+    """Return the error that a job ends with; of two errors, the other one goes into its hint.
+
+    An error of the machine or the program precedes the missing skeleton; any other error follows it.
+    """
     if failure is None or stopped_by is None:
         return failure or stopped_by
-    of_data = isinstance(stopped_by, JobError | CaptureError | EstimationError)
-    first, second = (failure, stopped_by) if of_data else (stopped_by, failure)
+    first, second = (failure, stopped_by) if _is_about_data(stopped_by) else (stopped_by, failure)
     _add_hint(first, f"besides: {second.message}")
     return first
 
 
-def _tell_how_far(flow: Flow, made: Made, error: BodycapError, out_dir: Path, settings: Settings) -> None:
-    """Publish the report of a job that broke off before there were results."""
+def _publish_failure_report(
+    flow: Flow, results: StageResults, error: BodycapError, out_dir: Path, settings: Settings
+) -> None:
+    """Publish the report of a job that was stopped before it had results."""
     try:
-        made.reported = flow.report(made, error)
+        results.reported = flow.report(results, error)
         settings.require_owner()
-        publish(dict(files_of(made.reported)), out_dir / PARTIAL)
+        publish(dict(files_of(results.reported)), out_dir / PARTIAL)
     except BodycapError as another:
         error.add_note(f"and its report could not be written: {another.message}")
         return
@@ -160,45 +177,48 @@ def _tell_how_far(flow: Flow, made: Made, error: BodycapError, out_dir: Path, se
 
 
 def _add_hint(error: BodycapError, text: str) -> None:
-    """Say one thing more, once."""
+    """Append a text to an error's hint, once."""
     if text not in (error.hint or ""):
         error.hint = f"{error.hint}; {text}" if error.hint else text
 
 
-def _summary(flow: Flow, made: Made, out_dir: Path) -> RunSummary:
-    """What is there by now."""
+def _summary(flow: Flow, results: StageResults, out_dir: Path) -> RunSummary:
+    """Return the summary of what is stored so far."""
     return RunSummary(
-        out_dir=out_dir, files=tuple(_results(made)), stages=tuple(flow.records), versions=_versions(flow)
+        out_dir=out_dir,
+        files=tuple(_result_files(results)),
+        stages=tuple(flow.runner.records),
+        versions=_versions(flow),
     )
 
 
-def _hand_over(job: Job, flow: Flow, made: Made, out_dir: Path, settings: Settings) -> Path:
-    """Publish the results and return their folder; those without a skeleton are set apart, called partial."""
+def _publish_results(job: Job, flow: Flow, results: StageResults, out_dir: Path, settings: Settings) -> Path:
+    """Publish the results and return their folder, which is ``partial`` if there is no skeleton."""
     settings.require_owner()
-    if made.failure is None:
-        _finish(job, made, _summary(flow, made, out_dir), settings)
+    if results.failure is None:
+        _write_results(job, results, _summary(flow, results, out_dir), settings)
         clear_partial(out_dir)
         return out_dir
     partial = out_dir / PARTIAL
-    _finish(job, made, _summary(flow, made, partial), settings)
-    _add_hint(made.failure, f"the map, the cameras' paths and the frames are in {partial}")
+    _write_results(job, results, _summary(flow, results, partial), settings)
+    _add_hint(results.failure, f"the map, the cameras' paths and the frames are in {partial}")
     return partial
 
 
-def _merge(job: Job, flow: Flow, made: Made) -> tuple[Artefact | None, EstimationError | None]:
-    """The skeleton, or the reason why the data did not support one."""
-    if not has_body(job) or made.scene is None:
+def _merge(job: Job, flow: Flow, results: StageResults) -> tuple[Artefact | None, EstimationError | None]:
+    """Return the skeleton's motion, or the reason why the data did not support one."""
+    if not has_body(job) or results.map is None:
         return None, None
     try:
-        return flow.merge(made.scene, made.registrations, made.keyframes), None
+        return flow.merge(results.map, results.registrations, results.keyframes), None
     except EstimationError as error:
         return None, error
 
 
-def _finish(job: Job, made: Made, summary: RunSummary, settings: Settings) -> None:
-    """Results first, then the record of the run, so that the record never speaks of what is not there."""
+def _write_results(job: Job, results: StageResults, summary: RunSummary, settings: Settings) -> None:
+    """Write the result files, then the record of the run, which therefore names no missing file."""
     out_dir = summary.out_dir
-    publish(_results(made), out_dir)
+    publish(_result_files(results), out_dir)
     resolved = yaml.safe_dump(
         job.model_dump(mode="json", exclude_none=True), sort_keys=False, allow_unicode=True
     )
@@ -217,19 +237,19 @@ def _finish(job: Job, made: Made, summary: RunSummary, settings: Settings) -> No
 
 def _versions(flow: Flow) -> dict[str, str]:
     own = {"bodycap_batch": bodycap_batch.__version__, "python": platform.python_version()}
-    return {**own, **dict(sorted(flow.libraries.items()))}
+    return {**own, **dict(sorted(flow.runner.libraries.items()))}
 
 
 def files_of(artefact: Artefact) -> list[tuple[str, Path]]:
-    """Name in the results' folder and file in the store of each file meant for the user."""
+    """Return each file meant for the user: its name in the folder of results, its path in the store."""
     return [
-        (Path(name).relative_to(RESULTS).as_posix(), artefact.path / name)
+        (Path(name).relative_to(RESULTS_FOLDER).as_posix(), artefact.path / name)
         for name in artefact.files
-        if name.startswith(f"{RESULTS}/")
+        if name.startswith(f"{RESULTS_FOLDER}/")
     ]
 
 
-def _results(made: Made) -> dict[str, Path]:
-    """All files that go to the user."""
-    parts = (made.exported, made.reported, made.previewed)
+def _result_files(results: StageResults) -> dict[str, Path]:
+    """Return all files meant for the user, by name."""
+    parts = (results.exported, results.reported, results.previewed)
     return {name: path for part in parts if part is not None for name, path in files_of(part)}

@@ -1,4 +1,4 @@
-"""A sample capture that a job asks for, rendered on first use."""
+"""The synthetic capture of a job, rendered on first use."""
 
 from __future__ import annotations
 
@@ -12,49 +12,51 @@ from pydantic import ValidationError
 
 from bodycap_batch.config.explain import job_error, problems_of
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.pipeline.inputs import key_of
 from bodycap_batch.pipeline.results import publish, write_results_file
 from bodycap_batch.pipeline.settings import Settings
+from bodycap_batch.pipeline.task_keys import make_task
 from bodycap_batch.runner import Task
 from bodycap_batch.store.artefacts import ArtefactKey
 from bodycap_batch.store.digests import FileDigests
 from bodycap_batch.store.references import References, in_use
 from bodycap_batch.synthetic.options import SynthOptions
-from bodycap_batch.tasks import CAPTURE
+from bodycap_batch.tasks.inputs import FileRef
+from bodycap_batch.tasks.stage import CAPTURE_FOLDER
+from bodycap_batch.tasks.synth import SYNTH, SynthTask
 
 _STAMP = ".rendered.json"
 
 
 def prepare_capture(options: Mapping[str, Any], folder: Path, settings: Settings) -> None:
-    """Render a synthetic capture into a folder, unless the same one is complete there.
+    """Render a synthetic capture into a folder, unless the same capture is complete there.
 
     Args:
         options: Options of the renderer, as in the job.
-        folder: Where the videos belong; files of other names there stay.
+        folder: Folder of the videos; its other files stay.
         settings: Store, threads, listener, cancellation.
 
     Raises:
         BodycapError: The options are wrong, rendering failed, or the folder cannot be written.
     """
-    key = _key(options, folder, settings.store.digests)
-    if _is_complete(folder, key):
+    task = _synth_task(options, folder, settings)
+    if _is_complete(folder, task.key):
         return
     logs = folder / "logs"
     with in_use(settings.store), settings.runner(logs) as runner:
-        artefact, _ = runner.run(Task(key=key, threads=settings.threads))
+        artefact, _ = runner.run(task)
         References(settings.store, folder).add(artefact.path)
     files = {
-        Path(name).relative_to(CAPTURE).as_posix(): artefact.path / name
+        Path(name).relative_to(CAPTURE_FOLDER).as_posix(): artefact.path / name
         for name in artefact.files
-        if name.startswith(f"{CAPTURE}/")
+        if name.startswith(f"{CAPTURE_FOLDER}/")
     }
     publish(files, folder)
     sizes = {name: path.stat().st_size for name, path in files.items()}
-    write_results_file(folder, _STAMP, json.dumps({"key": key.name, "sizes": sizes}, indent=1))
+    write_results_file(folder, _STAMP, json.dumps({"key": task.key.name, "sizes": sizes}, indent=1))
     shutil.rmtree(logs, ignore_errors=True)
 
 
-def _key(options: Mapping[str, Any], folder: Path, digests: FileDigests) -> ArtefactKey:
+def _synth_task(options: Mapping[str, Any], folder: Path, settings: Settings) -> Task:
     try:
         checked = SynthOptions.model_validate(dict(options))
     except ValidationError as error:
@@ -62,15 +64,21 @@ def _key(options: Mapping[str, Any], folder: Path, digests: FileDigests) -> Arte
         refused.path = None
         refused.field = ".".join(part for part in ("capture.synthetic", refused.field) if part)
         raise refused from error
+    task = SynthTask(
+        options=checked,
+        motion=_motion_ref(checked.motion, settings.store.digests),
+        motion_name=None if checked.motion is None else checked.motion.name,
+    )
+    return make_task(SYNTH, task, threads=settings.threads)
+
+
+def _motion_ref(path: Path | None, digests: FileDigests) -> FileRef | None:
     try:
-        motion = digests.sha256(checked.motion) if checked.motion else None
+        return None if path is None else FileRef(path=path, digest=digests.sha256(path))
     except OSError as error:
         field = "capture.synthetic.motion"
         hint = "the path of a BVH file, relative to the job"
-        raise JobError(
-            f"cannot be read: {error.strerror}", path=checked.motion, field=field, hint=hint
-        ) from error
-    return key_of("synth", checked.model_dump(mode="json"), {"motion": motion})
+        raise JobError(f"cannot be read: {error.strerror}", path=path, field=field, hint=hint) from error
 
 
 def _is_complete(folder: Path, key: ArtefactKey) -> bool:

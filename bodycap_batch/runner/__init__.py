@@ -1,4 +1,4 @@
-"""One task, one child process: ``python -m bodycap_batch.runner task.json``."""
+"""Run tasks in child processes, here or on other machines. The stages themselves are handed in."""
 
 from bodycap_batch.runner.children import Children, Executor, Making
 from bodycap_batch.runner.parent import NotStored, Rules, Runner

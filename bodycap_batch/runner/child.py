@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
@@ -35,11 +35,14 @@ from bodycap_batch.store.artefacts import DISK_ERRORS, Store, store_error
 
 _PROGRESS_PERIOD_S = 0.2
 _GRACE_S = 3.0
+RELEASE_PERIOD_S = 0.5
+"""Least time between two releases of freed memory. One takes some 50 ms in a large process.
+Evidence: docs/decisions/pipeline.md."""
 FULL_DISK_BYTES = 8 << 20
 """Below this much free space a failure is put down to the full disk: libraries hide ENOSPC."""
 
 
-def main(arguments: Sequence[str], table: Mapping[str, TaskFunction] | None = None) -> int:
+def main(arguments: Sequence[str], stages: Mapping[str, TaskFunction]) -> int:
     """Run the task file named on the command line; without one, take orders until standard input closes.
 
     An order is one JSON line: ``{"task": file, "log": file}`` runs a task and sends its prints to the log;
@@ -48,7 +51,7 @@ def main(arguments: Sequence[str], table: Mapping[str, TaskFunction] | None = No
 
     Args:
         arguments: The path of the task file, or nothing.
-        table: What to call for each stage; the project's own stages by default.
+        stages: By stage name, the function that runs its tasks.
 
     Returns:
         The exit code: 0, that of a typed error, or 70.
@@ -56,14 +59,14 @@ def main(arguments: Sequence[str], table: Mapping[str, TaskFunction] | None = No
     speak = _Speaker()
     orders = _Orders()
     if arguments:
-        return _perform(Path(arguments[0]), table, _Link(speak, orders, asks=False))
+        return _perform(Path(arguments[0]), stages, _Link(speak, orders, asks=False))
     for order in iter(orders.next, None):
         if "import" in order:
             _import(order["import"])
             continue
         _send_prints_to(Path(order["log"]))
         speak.say("begun")
-        if _perform(Path(order["task"]), table, _Link(speak, orders, asks=True)) == EXIT_BUG:
+        if _perform(Path(order["task"]), stages, _Link(speak, orders, asks=True)) == EXIT_BUG:
             return EXIT_BUG
     return 0
 
@@ -86,11 +89,11 @@ class _Link:
             raise Cancelled("not committed: the job was stopped or taken over", hint="run it again to go on")
 
 
-def _perform(order: Path, table: Mapping[str, TaskFunction] | None, link: _Link) -> int:
+def _perform(order: Path, stages: Mapping[str, TaskFunction], link: _Link) -> int:
     task, root = task_from_json(json.loads(order.read_text(encoding="utf-8")))
     try:
         store = Store(root)
-        _run(task, store, _function(task.key.stage, table), link)
+        _run(task, store, stages[task.key.stage], link)
     except BodycapError as error:
         link.speak.say("error", error=error.to_dict())
         return error.exit_code
@@ -126,26 +129,18 @@ def _run(task: Task, store: Store, function: TaskFunction, link: _Link) -> None:
         context = StageContext(
             work_dir=draft.work,
             threads=task.threads,
-            progress=link.speak.progress,
+            progress=StepReporter(link.speak.progress),
             cancelled=link.orders.closed.is_set,
         )
-        function(task.key.options, task.arguments, context, draft.files)
+        function(task.arguments, context, draft.files)
         made = {
             "seconds": round(time.monotonic() - started, 3),
             "cpu_seconds": round(time.process_time() - cpu_before, 3),
             "peak_memory_mb": round(peak_memory_mb(), 1),
             "threads": task.threads,
         }
-        store.commit(draft, task.key, made, before=link.before_commit, replace=task.again)
+        store.commit(draft, task.key, made, before=link.before_commit, replace=task.replaces)
     link.speak.say("done", **made)
-
-
-def _function(stage: str, table: Mapping[str, TaskFunction] | None) -> TaskFunction:
-    if table is None:
-        from bodycap_batch.tasks import STAGES
-
-        return STAGES[stage].function
-    return table[stage]
 
 
 class _DiskWatch:
@@ -260,6 +255,40 @@ class _Speaker:
             return
         self._last = now
         self.say("progress", done=int(done), total=int(total), what=what)
+
+
+class StepReporter:
+    """Reports the progress of a stage, and releases freed memory whenever the stage begins another step.
+
+    The C library keeps freed memory. Without its release, the peak of a stage would be nearly the sum of what
+    its steps need.
+
+    Args:
+        report: Called as ``report(done, total, what)``.
+        release: Releases freed memory.
+        period_s: Least time between two releases, seconds.
+    """
+
+    def __init__(
+        self,
+        report: Callable[[int, int, str], None],
+        release: Callable[[], None] = give_back,
+        period_s: float = RELEASE_PERIOD_S,
+    ) -> None:
+        self._report = report
+        self._release = release
+        self._period_s = period_s
+        self._step = ""
+        self._last = time.monotonic()
+
+    def __call__(self, done: int, total: int, what: str = "") -> None:
+        """Report that `done` of `total` units are done; another name `what` begins another step."""
+        if what != self._step:
+            self._step = what
+            if time.monotonic() - self._last >= self._period_s:
+                self._release()
+                self._last = time.monotonic()
+        self._report(done, total, what)
 
 
 class _Orders:

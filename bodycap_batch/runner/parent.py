@@ -129,7 +129,7 @@ class Runner:
             may_commit=self._rules.may_commit,
             meanwhile=meanwhile,
         )
-        self._executor.make(replace(task, again=task.key.stage in self._rules.redo), making)
+        self._executor.make(replace(task, replaces=task.key.stage in self._rules.redo), making)
         if (artefact := self.store.find(task.key)) is None:
             raise StoreError(f"{task.label}: its result is gone", path=self.store.root, hint="run it again")
         return artefact

@@ -15,7 +15,9 @@ from typing import Any, BinaryIO
 
 import bodycap_batch
 
-CHILD = (sys.executable, "-P", "-m", "bodycap_batch.runner")
+CHILD = (sys.executable, "-P", "-m", "bodycap_batch.tasks")
+"""Command line of a child, without the task file. It names the package of the stages, which lies in a layer
+above and is not imported here."""
 KILL_AFTER_S = 3.0
 _POLL_S = 0.2
 _THREAD_VARIABLES = (

@@ -12,8 +12,6 @@ from bodycap_batch.core.errors import BodycapError, StoreError
 from bodycap_batch.runner.children import Children, Making
 from bodycap_batch.runner.task import Task, task_from_json
 from bodycap_batch.store.artefacts import Store
-from bodycap_batch.store.code_version import algorithm_version, library_versions
-from bodycap_batch.tasks import STAGES
 
 _children: dict[tuple[str, ...], Children] = {}
 _lock = threading.Lock()
@@ -21,8 +19,7 @@ _lock = threading.Lock()
 
 def order_of(task: Task, making: Making, command: tuple[str, ...]) -> dict[str, Any]:
     """All that another machine has to be told: paths on the shared disk, options, digests."""
-    order = {"task": task.to_json(making.store.root), "logs": str(making.logs), "command": list(command)}
-    return {**order, "checked": task.key.stage in STAGES and bool(task.key.libraries)}
+    return {"task": task.to_json(making.store.root), "logs": str(making.logs), "command": list(command)}
 
 
 def perform(
@@ -41,10 +38,9 @@ def perform(
     task, root = task_from_json(order["task"])
     try:
         _require_shared(root)
-        if order["checked"]:
-            _require_same_program(task)
+        _require_same_program(task)
         store = Store(root)
-        if not task.again and store.find(task.key) is not None:
+        if not task.replaces and store.find(task.key) is not None:
             return {}  # a worker that died committed it before it could say so
         making = Making(
             store=store,
@@ -75,11 +71,12 @@ def _require_shared(root: Path) -> None:
 
 
 def _require_same_program(task: Task) -> None:
-    """A result computed by another version must never be kept under this one's key."""
-    stage = STAGES[task.key.stage]
-    mine = algorithm_version(stage.code), library_versions(stage.libraries)
-    if mine != (task.key.algorithm, dict(task.key.libraries)):
-        other = {name for name, version in task.key.libraries.items() if mine[1].get(name) != version}
+    """Refuse a task if its program differs here: its result must not be stored under the task's key."""
+    if task.program is None:
+        return
+    algorithm, libraries = task.program.versions()
+    if (algorithm, libraries) != (task.key.algorithm, dict(task.key.libraries)):
+        other = {name for name, version in task.key.libraries.items() if libraries.get(name) != version}
         raise BodycapError(
             f"worker {platform.node()} has another version of {', '.join(sorted(other)) or 'bodycap_batch'}",
             hint="install the same bodycap_batch and the same requirements.lock on all machines",

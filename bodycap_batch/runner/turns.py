@@ -36,7 +36,7 @@ class Turns:
                     raise Cancelled(STOPPED, hint="run it again to go on")
             self._under_way.add(place)
         try:
-            yield not task.again and making.store.find(task.key) is not None
+            yield not task.replaces and making.store.find(task.key) is not None
         finally:
             with self._changed:
                 self._under_way.remove(place)

@@ -6,6 +6,7 @@ import ast
 import hashlib
 import re
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -19,6 +20,23 @@ _NOT_COMPUTING = frozenset(
 )
 """Modules that decide nothing about a result: options are part of the key by their values."""
 _SKIPPED_SUFFIXES = (".pyc", ".pyo")
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """The code that computes a result.
+
+    Attributes:
+        module: Module below this package that runs the stage; see `algorithm_version`.
+        libraries: Distributions that the result depends on; see `library_versions`.
+    """
+
+    module: str
+    libraries: tuple[str, ...]
+
+    def versions(self) -> tuple[str, dict[str, str]]:
+        """Return the version of the algorithm and those of the libraries, as installed here."""
+        return algorithm_version(self.module), library_versions(self.libraries)
 
 
 @cache

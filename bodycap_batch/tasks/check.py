@@ -2,26 +2,53 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from bodycap_batch.config.limits import Limits
+from bodycap_batch.config.models import Job
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.tasks.stage import SEEING, VISION, Json, Stage, write_summary
+from bodycap_batch.tasks.inputs import BodyInput
+from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, write_summary
+from bodycap_batch.tasks.typed_json import omitted_from_key
 
 
-def _check(_: Json, arguments: Json, context: StageContext, files: Path) -> None:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckTask:
+    """Check a job before anything is computed.
+
+    Attributes:
+        job: The resolved job. The fields below hold what the check depends on, so it is not in the key.
+        cameras: By camera name, the digest of everything that its frames depend on.
+        body: The body; None for a job without a skeleton.
+        formats: Files to export.
+        names: Joint names of the exported files.
+        limits: How large the videos may be; None for the user's own job.
+    """
+
+    job: Job = field(metadata=omitted_from_key())
+    cameras: Mapping[str, str]
+    body: BodyInput | None
+    formats: tuple[str, ...]
+    names: str
+    limits: Limits | None
+
+
+def run_check(task: CheckTask, context: StageContext, files: Path) -> None:
+    """Check the job; store notes for the user and the number of frames."""
     from bodycap_batch.check import require_ready, require_within_limits
-    from bodycap_batch.config.limits import Limits
-    from bodycap_batch.config.models import Job
 
     context.check_cancelled()
-    job = Job.model_validate(arguments["job"])
-    if (limits := arguments.get("limits")) is not None:
-        require_within_limits(job, Limits(**limits))
-    report = require_ready(job, context.threads)
+    if task.limits is not None:
+        require_within_limits(task.job, task.limits)
+    report = require_ready(task.job, context.threads)
     notes = [f"{camera.name}: {note}" for camera in report.cameras for note in camera.notes]
     frames = sum(camera.used_frames for camera in report.cameras)
     large = sum(camera.large_frames for camera in report.cameras)
     write_summary(files, notes=[*notes, *report.notes], frames=frames, large_frames=large)
 
 
-CHECK = Stage(function=_check, libraries=VISION, modules=SEEING)
+CHECK = Stage(
+    name="check", task=CheckTask, function=run_check, libraries=VISION_LIBRARIES, modules=VISION_MODULES
+)

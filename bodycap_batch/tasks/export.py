@@ -2,40 +2,70 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.tasks.inputs import ArtefactRef, paths_of
 from bodycap_batch.tasks.loading import load_keyframes, load_map
 from bodycap_batch.tasks.registered import Registered
-from bodycap_batch.tasks.stage import RESULTS, Json, Stage
+from bodycap_batch.tasks.stage import RESULTS_FOLDER, Stage
+from bodycap_batch.tasks.typed_json import omitted_from_key
 
 
-def _export(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
-    from bodycap_batch.config import ExportOptions
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExportTask:
+    """Write the files of the results.
+
+    Attributes:
+        options: The stage's options; the preview has a stage of its own.
+        map: The map.
+        registrations: By camera.
+        keyframes: By camera.
+        merge: The skeleton's motion; None if the job has none.
+        failure: Why there is no skeleton, although the job asks for one.
+        segments: Names of the cameras on each segment that carries several.
+    """
+
+    options: ExportOptions = field(metadata=omitted_from_key("preview"))
+    map: ArtefactRef
+    registrations: Mapping[str, ArtefactRef]
+    keyframes: Mapping[str, ArtefactRef]
+    merge: ArtefactRef | None
+    failure: str | None
+    segments: tuple[tuple[str, ...], ...]
+
+
+def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
+    """Write the results."""
     from bodycap_batch.export import ExportInputs, export_results
     from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.merge_data import MergeResult
 
-    scene = load_map(arguments["map"])
-    found = Registered.load(arguments["registrations"], scene.maps)
-    merged = arguments["merge"]
+    scene = load_map(task.map.path)
+    paths = paths_of(task.registrations.values())
+    found = Registered.load(paths, scene.maps)
     inputs = ExportInputs(
-        out_dir=files / RESULTS,
+        out_dir=files / RESULTS_FOLDER,
         maps=scene.maps,
         trajectories=found.trajectories,
         clocks=found.clocks,
-        selections=tuple(load_keyframes(path) for path in arguments["keyframes"]),
-        merge=None if merged is None else read_dataclass(MergeResult, Path(merged), "merge"),
-        partial_reason=arguments["failure"],
+        selections=tuple(load_keyframes(artefact.path) for artefact in task.keyframes.values()),
+        merge=None if task.merge is None else read_dataclass(MergeResult, task.merge.path, "merge"),
+        partial_reason=task.failure,
         row_fraction=found.row_fraction,
-        relative_poses=found.relative_poses(arguments["registrations"], arguments["segments"]),
+        relative_poses=found.relative_poses(paths, task.segments),
         log=scene.log,
     )
-    export_results(inputs, ExportOptions.model_validate(options), context)
+    export_results(inputs, task.options, context)
 
 
 EXPORT = Stage(
-    function=_export,
+    name="export",
+    task=ExportTask,
+    function=run_export,
     libraries=("numpy", "scipy", "open3d-cpu|open3d", "pygltflib", "usd-core", "ezc3d"),
     modules=(
         "bodycap_batch.export",

@@ -1,57 +1,66 @@
-"""Inputs of the stages, from what the stages before them saved."""
+"""Read the inputs of the stages from what earlier stages stored."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bodycap_batch.tasks.stage import Json
+from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 
 if TYPE_CHECKING:
     from bodycap_batch.capture import Capture, KeptFrames
     from bodycap_batch.model.scene import KeyframeSelection, MapResult, Registration
 
 
-def load_capture(arguments: Json, threads: int = 0) -> Capture:
-    """Open the capture block of a task's arguments, with the frames that its keyframes' artefacts keep."""
+def load_capture(
+    capture: CaptureRef, keyframes: Mapping[str, ArtefactRef] | None = None, *, threads: int = 0
+) -> Capture:
+    """Open the videos of a task.
+
+    Args:
+        capture: The cameras.
+        keyframes: By camera, the keyframes' artefacts. They hold copies of decoded frames, which are read
+            instead of the video.
+        threads: Threads of each video decoder; 0 lets the decoder choose.
+    """
     from bodycap_batch.capture import open_capture
-    from bodycap_batch.config.models import CaptureConfig
 
-    capture = open_capture(CaptureConfig.model_validate(arguments["capture"]), threads)
-    folders = arguments.get("kept", {})
-    cameras = (replace(each, kept=_kept(folders.get(each.name))) for each in capture.cameras)
-    return replace(capture, cameras=tuple(cameras))
+    opened = open_capture(capture.config, threads)
+    stored = keyframes or {}
+    cameras = (replace(camera, kept=_kept_frames(stored.get(camera.name))) for camera in opened.cameras)
+    return replace(opened, cameras=tuple(cameras))
 
 
-def _kept(folder: str | None) -> KeptFrames | None:
+def _kept_frames(keyframes: ArtefactRef | None) -> KeptFrames | None:
     from bodycap_batch.capture.kept import KEPT_NAME, KeptFrames
     from bodycap_batch.formats.dataclass_files import read_dataclass
 
-    if folder is None or not (Path(folder) / f"{KEPT_NAME}.json").exists():
+    if keyframes is None or not (keyframes.path / f"{KEPT_NAME}.json").exists():
         return None
-    return read_dataclass(KeptFrames, Path(folder), KEPT_NAME)
+    return read_dataclass(KeptFrames, keyframes.path, KEPT_NAME)
 
 
-def load_keyframes(path: str) -> KeyframeSelection:
-    """Read a camera's keyframes."""
+def load_keyframes(path: Path) -> KeyframeSelection:
+    """Read the keyframes of a camera."""
     from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.scene import KeyframeSelection
 
-    return read_dataclass(KeyframeSelection, Path(path), "keyframes")
+    return read_dataclass(KeyframeSelection, path, "keyframes")
 
 
-def load_map(path: str) -> MapResult:
+def load_map(path: Path) -> MapResult:
     """Read a map with its workspace."""
     from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.scene import MapResult
 
-    return read_dataclass(MapResult, Path(path), "map")
+    return read_dataclass(MapResult, path, "map")
 
 
-def load_registration(path: str) -> Registration:
-    """Read a camera's poses."""
+def load_registration(path: Path) -> Registration:
+    """Read the poses and observations of a camera."""
     from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.scene import Registration
 
-    return read_dataclass(Registration, Path(path), "registration")
+    return read_dataclass(Registration, path, "registration")

@@ -5,52 +5,130 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bodycap_batch.config.options import MapOptions
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
-from bodycap_batch.tasks.stage import SEEING, VISION, Json, Stage, write_summary
+from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, write_summary
 
 if TYPE_CHECKING:
     from bodycap_batch.model.scene import MapResult
 
 
-def _map(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
-    from bodycap_batch.config import MapOptions
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraDistance:
+    """The distances between two cameras that the body permits.
+
+    Attributes:
+        first: Camera name.
+        second: Camera name.
+        least_m: Smallest distance on a body of the preset's size.
+        most_m: Largest distance.
+    """
+
+    first: str
+    second: str
+    least_m: float
+    most_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapTask:
+    """Build the map of all keyframes.
+
+    Attributes:
+        options: The stage's options.
+        capture: All cameras.
+        keyframes: By camera.
+        reach: Distances that the body permits. These rather than the body: a mount that is stated a little
+            more exactly must not change the map.
+    """
+
+    options: MapOptions
+    capture: CaptureRef
+    keyframes: Mapping[str, ArtefactRef]
+    reach: tuple[CameraDistance, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExtendTask:
+    """Add keyframes to a map where frames were lost.
+
+    Attributes:
+        options: The stage's options.
+        capture: All cameras.
+        keyframes: By camera.
+        map: The map so far.
+        extra: By camera, indices of the frames to add as keyframes.
+    """
+
+    options: MapOptions
+    capture: CaptureRef
+    keyframes: Mapping[str, ArtefactRef]
+    map: ArtefactRef
+    extra: Mapping[str, tuple[int, ...]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RefineTask:
+    """Remove the deformation that rolling shutters cause from a map.
+
+    Attributes:
+        options: The stage's options.
+        capture: All cameras.
+        map: The map so far.
+        registrations: By camera.
+    """
+
+    options: MapOptions
+    capture: CaptureRef
+    map: ArtefactRef
+    registrations: Mapping[str, ArtefactRef]
+
+
+def run_map(task: MapTask, context: StageContext, files: Path) -> None:
+    """Build the map and store it."""
     from bodycap_batch.mapping import build_map
 
-    selections = [load_keyframes(path) for path in arguments["selections"]]
-    reach = {(first, second): (low, high) for first, second, low, high in arguments.get("reach", ())}
-    options_ = MapOptions.model_validate(options)
-    result = build_map(load_capture(arguments, context.threads), selections, options_, context, reach or None)
+    selections = [load_keyframes(artefact.path) for artefact in task.keyframes.values()]
+    reach = {(pair.first, pair.second): (pair.least_m, pair.most_m) for pair in task.reach}
+    capture = load_capture(task.capture, task.keyframes, threads=context.threads)
+    result = build_map(capture, selections, task.options, context, reach or None)
     _save_map(result, files)
 
 
-def _extend(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+def run_extend(task: ExtendTask, context: StageContext, files: Path) -> None:
+    """Extend the map and store it."""
     import numpy as np
 
-    from bodycap_batch.config import MapOptions
     from bodycap_batch.mapping import extend_map
 
-    extra = {name: np.asarray(frames, dtype=np.int64) for name, frames in arguments["extra"].items()}
-    previous = load_map(arguments["previous"])
-    options_ = MapOptions.model_validate(options)
-    _save_map(extend_map(load_capture(arguments, context.threads), previous, extra, options_, context), files)
+    extra = {name: np.asarray(frames, dtype=np.int64) for name, frames in task.extra.items()}
+    previous = load_map(task.map.path)
+    capture = load_capture(task.capture, task.keyframes, threads=context.threads)
+    _save_map(extend_map(capture, previous, extra, task.options, context), files)
 
 
-def _refine(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
-    from bodycap_batch.config import MapOptions
+def run_refine(task: RefineTask, context: StageContext, files: Path) -> None:
+    """Refine the map and store it."""
     from bodycap_batch.mapping import refine_map
 
-    paths = [load_registration(path).trajectory for path in arguments["registrations"]]
-    previous = load_map(arguments["previous"])
-    options_ = MapOptions.model_validate(options)
-    _save_map(refine_map(load_capture(arguments, context.threads), previous, paths, options_, context), files)
+    paths = [load_registration(artefact.path).trajectory for artefact in task.registrations.values()]
+    previous = load_map(task.map.path)
+    _save_map(
+        refine_map(
+            load_capture(task.capture, threads=context.threads), previous, paths, task.options, context
+        ),
+        files,
+    )
 
 
 def _save_map(result: MapResult, files: Path) -> None:
-    """Keep a map together with the workspace that is needed to extend it."""
+    """Store a map with the workspace that is needed to extend it."""
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.mapping.intrinsics.intrinsics_check import misfit_note
     from bodycap_batch.mapping.intrinsics.recalibration import FREED
@@ -75,10 +153,31 @@ def _save_map(result: MapResult, files: Path) -> None:
     )
 
 
-_LIBRARIES = (*VISION, "pycolmap")
-_MODULES = (*SEEING, "pycolmap")
+_LIBRARIES = (*VISION_LIBRARIES, "pycolmap")
+_MODULES = (*VISION_MODULES, "pycolmap")
 # 1,080 frames of an easy walk took 341 MB, a violent one has four times the keyframes.
 _MEMORY_MB = 1500
-MAP = Stage(function=_map, libraries=_LIBRARIES, modules=_MODULES, memory_mb=_MEMORY_MB)
-EXTEND = Stage(function=_extend, libraries=_LIBRARIES, modules=_MODULES, memory_mb=_MEMORY_MB)
-REFINE = Stage(function=_refine, libraries=_LIBRARIES, modules=_MODULES, memory_mb=_MEMORY_MB)
+MAP = Stage(
+    name="map",
+    task=MapTask,
+    function=run_map,
+    libraries=_LIBRARIES,
+    modules=_MODULES,
+    memory_mb=_MEMORY_MB,
+)
+EXTEND = Stage(
+    name="extend",
+    task=ExtendTask,
+    function=run_extend,
+    libraries=_LIBRARIES,
+    modules=_MODULES,
+    memory_mb=_MEMORY_MB,
+)
+REFINE = Stage(
+    name="refine",
+    task=RefineTask,
+    function=run_refine,
+    libraries=_LIBRARIES,
+    modules=_MODULES,
+    memory_mb=_MEMORY_MB,
+)

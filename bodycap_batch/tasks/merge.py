@@ -2,35 +2,70 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bodycap_batch.config.options import MarkerBoard, MergeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.tasks.body import load_body
+from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_map
 from bodycap_batch.tasks.registered import Registered
-from bodycap_batch.tasks.stage import VISION, Json, Stage, write_summary
+from bodycap_batch.tasks.stage import VISION_LIBRARIES, Stage, write_summary
 
 if TYPE_CHECKING:
-    from bodycap_batch.config.options import MarkerBoard
     from bodycap_batch.model.merge_data import MergeInputs
 
 
-def _merge(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
-    from bodycap_batch.config import MergeOptions
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoardFootage:
+    """The images in which a marker board is searched for.
+
+    Attributes:
+        capture: All cameras.
+        keyframes: By camera.
+    """
+
+    capture: CaptureRef
+    keyframes: Mapping[str, ArtefactRef]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MergeTask:
+    """Solve the motion of the skeleton in the world.
+
+    Attributes:
+        options: The stage's options.
+        map: The map.
+        registrations: By camera.
+        body: The body.
+        footage: Where the marker board is searched for; None if the job names none.
+    """
+
+    options: MergeOptions
+    map: ArtefactRef
+    registrations: Mapping[str, ArtefactRef]
+    body: BodyInput
+    footage: BoardFootage | None
+
+
+def run_merge(task: MergeTask, context: StageContext, files: Path) -> None:
+    """Solve the motion and store it."""
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.merging import merge_trajectories
 
-    inputs, options_ = _merge_inputs(arguments), MergeOptions.model_validate(options)
-    if options_.marker_board is not None:
-        inputs = _with_board(inputs, arguments, options_.marker_board, context)
+    inputs = _merge_inputs(task)
+    if task.footage is not None and task.options.marker_board is not None:
+        inputs = _with_board(inputs, task, task.footage, task.options.marker_board, context)
     try:
-        result = merge_trajectories(inputs, options_, context)
+        result = merge_trajectories(inputs, task.options, context)
     except EstimationError as error:
         from bodycap_batch.mapping.matching.flipped_cameras import explained
 
-        explained(error, load_map(arguments["map"]).log)
+        explained(error, load_map(task.map.path).log)
         raise
     write_dataclass(result, files, "merge")
     doubts = [*result.report.get("doubted_clocks", {}).values(), result.report.get("exchanged_sides", {})]
@@ -39,29 +74,29 @@ def _merge(options: Json, arguments: Json, context: StageContext, files: Path) -
     write_summary(files, unused_cameras=dict(result.unused_cameras), notes=notes)
 
 
-def _merge_inputs(arguments: Json) -> MergeInputs:
+def _merge_inputs(task: MergeTask) -> MergeInputs:
     from bodycap_batch.model.merge_data import MergeInputs
 
-    scene = load_map(arguments["map"])
-    found = Registered.load(arguments["registrations"], scene.maps)
-    skeleton, mounts = load_body(arguments)
+    scene = load_map(task.map.path)
+    found = Registered.load(paths_of(task.registrations.values()), scene.maps)
+    skeleton, mounts = load_body(task.body)
     return MergeInputs(
         trajectories=found.trajectories,
         clocks=found.clocks,
         skeleton=skeleton,
         mounts=mounts,
-        skeleton_is_measured=arguments["skeleton_file"] is not None,
-        height_m=arguments["height_m"],
-        activity=arguments["activity"],
+        skeleton_is_measured=task.body.skeleton_file is not None,
+        height_m=task.body.height_m,
+        activity=task.body.activity,
         map_points={item.gauge: item.points for item in scene.maps},
         row_fraction=found.row_fraction,
     )
 
 
 def _with_board(
-    inputs: MergeInputs, arguments: Json, wanted: MarkerBoard, context: StageContext
+    inputs: MergeInputs, task: MergeTask, footage: BoardFootage, board: MarkerBoard, context: StageContext
 ) -> MergeInputs:
-    """The inputs with every keyframe's view of the board."""
+    """Add what each keyframe sees of the marker board to the inputs."""
     import dataclasses
 
     import numpy as np
@@ -70,18 +105,21 @@ def _with_board(
     from bodycap_batch.model.scene import FrameStatus
 
     frames, lenses = {}, {}
-    maps = {item.gauge: item for item in load_map(arguments["map"]).maps}
+    maps = {item.gauge: item for item in load_map(task.map.path).maps}
     for path in inputs.trajectories:
         keyframes = np.array([status is FrameStatus.KEYFRAME for status in path.status], dtype=bool)
         if keyframes.any():
             frames[path.camera] = np.flatnonzero(keyframes)
             lenses[path.camera] = maps[path.gauge].cameras[path.camera]
-    views = find_board_views(load_capture(arguments, context.threads), frames, lenses, wanted, context)
+    capture = load_capture(footage.capture, footage.keyframes, threads=context.threads)
+    views = find_board_views(capture, frames, lenses, board, context)
     return dataclasses.replace(inputs, board=views)
 
 
 MERGE = Stage(
-    function=_merge,
-    libraries=("scipy", "gtsam", *VISION),
+    name="merge",
+    task=MergeTask,
+    function=run_merge,
+    libraries=("scipy", "gtsam", *VISION_LIBRARIES),
     modules=("bodycap_batch.merging", "gtsam", "scipy.optimize", "scipy.spatial.transform"),
 )

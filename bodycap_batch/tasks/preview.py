@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_map, load_registration
 from bodycap_batch.tasks.registered import Registered
-from bodycap_batch.tasks.stage import RESULTS, SEEING, VISION, Json, Stage
+from bodycap_batch.tasks.stage import RESULTS_FOLDER, VISION_LIBRARIES, VISION_MODULES, Stage
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,13 +23,35 @@ if TYPE_CHECKING:
     from bodycap_batch.preview import PreviewInputs
 
 
-def _preview(_: Json, arguments: Json, context: StageContext, files: Path) -> None:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PreviewTask:
+    """Render the results as a video.
+
+    Attributes:
+        capture: All cameras.
+        keyframes: By camera.
+        registrations: By camera.
+        map: The map.
+        merge: The skeleton's motion; None if the job has none.
+        failure: Why there is no skeleton, although the job asks for one.
+    """
+
+    capture: CaptureRef
+    keyframes: Mapping[str, ArtefactRef]
+    registrations: Mapping[str, ArtefactRef]
+    map: ArtefactRef
+    merge: ArtefactRef | None
+    failure: str | None
+
+
+def run_preview(task: PreviewTask, context: StageContext, files: Path) -> None:
+    """Render the video."""
     from bodycap_batch.preview import render_preview
 
-    render_preview(_inputs(arguments, files / RESULTS / "preview.mp4", context.threads), context)
+    render_preview(_preview_inputs(task, files / RESULTS_FOLDER / "preview.mp4", context.threads), context)
 
 
-def _inputs(arguments: Json, path: Path, threads: int) -> PreviewInputs:
+def _preview_inputs(task: PreviewTask, path: Path, threads: int) -> PreviewInputs:
     import numpy as np
 
     from bodycap_batch.export import project_motion
@@ -35,17 +60,17 @@ def _inputs(arguments: Json, path: Path, threads: int) -> PreviewInputs:
     from bodycap_batch.overlay import body_of, camera_views
     from bodycap_batch.preview import PreviewInputs
 
-    scene = load_map(arguments["map"])
-    found = Registered.load(arguments["registrations"], scene.maps)
-    merged = arguments["merge"]
-    merge = None if merged is None else read_dataclass(MergeResult, Path(merged), "merge")
-    registrations = [load_registration(path) for path in arguments["registrations"]]
+    scene = load_map(task.map.path)
+    paths = paths_of(task.registrations.values())
+    found = Registered.load(paths, scene.maps)
+    merge = None if task.merge is None else read_dataclass(MergeResult, task.merge.path, "merge")
+    registrations = [load_registration(artefact) for artefact in paths]
     shown = _shown(scene.maps, merge)
     moved = [shown[item.gauge].apply(item.points) for item in scene.maps if item.gauge in shown]
     colours = [item.colors for item in scene.maps if item.gauge in shown]
     return PreviewInputs(
         path=path,
-        capture=_trunk_first(load_capture(arguments, threads), merge),
+        capture=_trunk_first(load_capture(task.capture, task.keyframes, threads=threads), merge),
         views=camera_views(registrations, scene.maps, found.clocks, merge),
         frame="world" if merge is not None else scene.maps[0].gauge,
         points=np.concatenate(moved),
@@ -53,7 +78,7 @@ def _inputs(arguments: Json, path: Path, threads: int) -> PreviewInputs:
         body=None
         if merge is None
         else body_of(project_motion(merge, found.clocks, found.row_fraction).motion),
-        note=arguments["failure"] or "",
+        note=task.failure or "",
     )
 
 
@@ -82,7 +107,15 @@ def _trunk_first(capture: Capture, merge: MergeResult | None) -> Capture:
 
 
 PREVIEW = Stage(
-    function=_preview,
-    libraries=(*VISION, "scipy", "pycolmap"),
-    modules=(*SEEING, "bodycap_batch.export", "bodycap_batch.preview", "pycolmap", "scipy.spatial.transform"),
+    name="preview",
+    task=PreviewTask,
+    function=run_preview,
+    libraries=(*VISION_LIBRARIES, "scipy", "pycolmap"),
+    modules=(
+        *VISION_MODULES,
+        "bodycap_batch.export",
+        "bodycap_batch.preview",
+        "pycolmap",
+        "scipy.spatial.transform",
+    ),
 )

@@ -35,7 +35,7 @@ class Registered:
     row_fraction: Mapping[str, FloatArray]
 
     @staticmethod
-    def load(paths: Sequence[str], maps: Sequence[Map]) -> Registered:
+    def load(paths: Sequence[Path], maps: Sequence[Map]) -> Registered:
         """Read one artefact per camera; rows matter where a rolling shutter is still in the poses."""
         from bodycap_batch.formats.dataclass_files import read_dataclass
         from bodycap_batch.model.camera import Camera
@@ -51,13 +51,13 @@ class Registered:
             found = load_registration(path)
             name = found.trajectory.camera
             trajectories.append(found.trajectory)
-            clocks[name] = read_dataclass(CameraClock, Path(path), "clock")
+            clocks[name] = read_dataclass(CameraClock, path, "clock")
             if clocks[name].rolling_shutter_s and name not in corrected:
-                rows[name] = mean_row_fraction(found, read_dataclass(Camera, Path(path), "camera"))
+                rows[name] = mean_row_fraction(found, read_dataclass(Camera, path, "camera"))
         return Registered(trajectories=tuple(trajectories), clocks=clocks, row_fraction=rows)
 
     def relative_poses(
-        self, paths: Sequence[str], segments: Sequence[Sequence[str]]
+        self, paths: Sequence[Path], segments: Sequence[Sequence[str]]
     ) -> tuple[RelativePose, ...]:
         """Where cameras on one segment sit beside each other, every pair once.
 
@@ -71,7 +71,7 @@ class Registered:
         path_of = {each.camera: each for each in self.trajectories}
         kept = {
             each.cameras: each
-            for path in map(Path, paths)
+            for path in paths
             if (path / f"{RIG_POSES}.json").exists()
             for each in read_dataclass(RigPoses, path, RIG_POSES).relative
         }

@@ -1,32 +1,56 @@
-"""The task that registers a camera's frames."""
+"""The task that registers the frames of a camera."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bodycap_batch.config.options import RegistrationOptions
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
-from bodycap_batch.tasks.stage import SEEING, VISION, Json, Stage, write_summary
+from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, write_summary
+from bodycap_batch.tasks.typed_json import omitted_from_key
 
 if TYPE_CHECKING:
     from bodycap_batch.capture import CaptureCamera
     from bodycap_batch.model.scene import Registration
 
+NOT_ROUNDS = omitted_from_key("rounds")
+"""How often the map may be extended decides which rounds run, not the result of one round."""
 
-def _registration(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
-    from bodycap_batch.config import RegistrationOptions
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegistrationTask:
+    """Register every frame of one camera.
+
+    Attributes:
+        options: The stage's options.
+        capture: The camera.
+        keyframes: The camera's keyframes, by its name.
+        map: The map.
+        previous: The camera's registration against an earlier round of the map; its tracks are reused.
+    """
+
+    options: RegistrationOptions = field(metadata=NOT_ROUNDS)
+    capture: CaptureRef
+    keyframes: Mapping[str, ArtefactRef]
+    map: ArtefactRef
+    previous: ArtefactRef | None
+
+
+def run_registration(task: RegistrationTask, context: StageContext, files: Path) -> None:
+    """Register the camera's frames and store their poses."""
     from bodycap_batch.model.rolling_shutter import has_visible_rolling_shutter
     from bodycap_batch.registration import register_frames
 
-    camera = load_capture(arguments, context.threads).cameras[0]
-    selection = load_keyframes(arguments["selection"])
-    previous = load_registration(arguments["previous"]) if arguments.get("previous") else None
-    maps = load_map(arguments["map"]).maps
-    found = register_frames(
-        camera, maps, selection, RegistrationOptions.model_validate(options), context, previous
-    )
+    camera = load_capture(task.capture, task.keyframes, threads=context.threads).cameras[0]
+    selection = load_keyframes(task.keyframes[camera.name].path)
+    previous = None if task.previous is None else load_registration(task.previous.path)
+    maps = load_map(task.map.path).maps
+    found = register_frames(camera, maps, selection, task.options, context, previous)
     known = camera.rolling_shutter_known
     rolling = (
         bool(camera.rolling_shutter_s)
@@ -44,7 +68,15 @@ def save_registration(
     rolling: bool,
     notes: Sequence[str] = (),
 ) -> None:
-    """Keep a camera's poses with what the stages after it need to know of the camera."""
+    """Store the poses of a camera with what later stages need to know of the camera.
+
+    Args:
+        found: Poses and observations.
+        camera: The camera.
+        files: Folder of the artefact.
+        rolling: Whether its shutter rolls.
+        notes: Notes for the user.
+    """
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.model.merge_data import CameraClock
 
@@ -66,4 +98,10 @@ def save_registration(
     )
 
 
-REGISTRATION = Stage(function=_registration, libraries=(*VISION, "pycolmap"), modules=(*SEEING, "pycolmap"))
+REGISTRATION = Stage(
+    name="registration",
+    task=RegistrationTask,
+    function=run_registration,
+    libraries=(*VISION_LIBRARIES, "pycolmap"),
+    modules=(*VISION_MODULES, "pycolmap"),
+)

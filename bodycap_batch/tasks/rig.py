@@ -1,36 +1,64 @@
-"""The task that solves a camera's frames again with those of the others on its segment."""
+"""The task that solves a camera's frames together with those of the other cameras on its segment."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from bodycap_batch.config.options import RegistrationOptions
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.registered import RIG_POSES
-from bodycap_batch.tasks.registration import save_registration
-from bodycap_batch.tasks.stage import SEEING, VISION, Json, Stage
+from bodycap_batch.tasks.registration import NOT_ROUNDS, save_registration
+from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage
 
 
-def _rig(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
-    from bodycap_batch.config import RegistrationOptions
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RigTask:
+    """Solve one camera of a synchronised rig again, from what all cameras of the rig observe.
+
+    Attributes:
+        options: The stage's options.
+        cameras: Names of the rig's cameras: the task's own camera, then the others.
+        capture: These cameras, in this order.
+        keyframes: By camera.
+        map: The map.
+        registrations: By camera, in this order.
+    """
+
+    options: RegistrationOptions = field(metadata=NOT_ROUNDS)
+    cameras: tuple[str, ...]
+    capture: CaptureRef
+    keyframes: Mapping[str, ArtefactRef]
+    map: ArtefactRef
+    registrations: Mapping[str, ArtefactRef]
+
+
+def run_rig(task: RigTask, context: StageContext, files: Path) -> None:
+    """Solve the camera's frames within the rig; store their poses and those of the rig."""
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.model.relative_pose import RigPoses, not_rigid_note
     from bodycap_batch.registration import RegisteredCamera, register_in_rig
 
     context.check_cancelled()
     own, *others = (
-        RegisteredCamera(camera=camera, registration=load_registration(path))
-        for camera, path in zip(
-            load_capture(arguments, context.threads).cameras, arguments["registrations"], strict=True
-        )
+        RegisteredCamera(camera=camera, registration=load_registration(task.registrations[camera.name].path))
+        for camera in load_capture(task.capture, task.keyframes, threads=context.threads).cameras
     )
-    options_ = RegistrationOptions.model_validate(options)
-    selection = load_keyframes(arguments["selection"])
-    maps = load_map(arguments["map"]).maps
-    found, relative = register_in_rig(own, others, maps, selection, options_, context.threads)
+    selection = load_keyframes(task.keyframes[own.camera.name].path)
+    maps = load_map(task.map.path).maps
+    found, relative = register_in_rig(own, others, maps, selection, task.options, context.threads)
     notes = [not_rigid_note(each) for each in relative if not each.is_rigid]
     save_registration(found, own.camera, files, rolling=False, notes=notes)
     write_dataclass(RigPoses(relative=tuple(relative)), files, RIG_POSES)
 
 
-RIG = Stage(function=_rig, libraries=(*VISION, "pycolmap"), modules=(*SEEING, "pycolmap"))
+RIG = Stage(
+    name="rig",
+    task=RigTask,
+    function=run_rig,
+    libraries=(*VISION_LIBRARIES, "pycolmap"),
+    modules=(*VISION_MODULES, "pycolmap"),
+)

@@ -2,16 +2,41 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.tasks.stage import CAPTURE, Json, Stage
+from bodycap_batch.synthetic.options import SynthOptions
+from bodycap_batch.tasks.inputs import FileRef
+from bodycap_batch.tasks.stage import CAPTURE_FOLDER, Stage
+from bodycap_batch.tasks.typed_json import omitted_from_key
 
 
-def _synth(options: Json, _: Json, context: StageContext, files: Path) -> None:
-    from bodycap_batch.synthetic import SynthOptions, synthesise
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SynthTask:
+    """Render a synthetic capture.
 
-    synthesise(SynthOptions.model_validate(options), files / CAPTURE, context)
+    Attributes:
+        options: The renderer's options.
+        motion: The BVH file that the options name, if any.
+        motion_name: Name of that file, which is written to the ground truth.
+    """
+
+    options: SynthOptions = field(metadata=omitted_from_key("motion"))
+    motion: FileRef | None
+    motion_name: str | None
 
 
-SYNTH = Stage(function=_synth, libraries=("numpy", "av", "open3d-cpu|open3d"))
+def run_synth(task: SynthTask, context: StageContext, files: Path) -> None:
+    """Render the capture."""
+    from bodycap_batch.synthetic import synthesise
+
+    synthesise(task.options, files / CAPTURE_FOLDER, context)
+
+
+SYNTH = Stage(
+    name="synth",
+    task=SynthTask,
+    function=run_synth,
+    libraries=("numpy", "av", "open3d-cpu|open3d"),
+)

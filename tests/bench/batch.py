@@ -136,4 +136,4 @@ def _make(executor: Executor, store: Store, folder: Path, value: str) -> None:
         cancelled=lambda: False,
         may_commit=lambda: True,
     )
-    executor.make(Task(key=key), making)
+    executor.make(Task(key=key, arguments={"value": value}), making)

@@ -39,7 +39,7 @@ def last_poses(results: Path, store: Path) -> dict[str, Trajectory]:
         for stage in record["stages"]
         if stage["stage"] in _SOLVERS and stage["camera"] and stage.get("artefact")
     }
-    return {name: load_registration(str(folder)).trajectory for name, folder in sorted(folders.items())}
+    return {name: load_registration(folder).trajectory for name, folder in sorted(folders.items())}
 
 
 def consistency(results: Path, store: Path, truth: Path) -> dict[str, dict[str, float]]:

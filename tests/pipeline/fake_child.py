@@ -18,35 +18,35 @@ from bodycap_batch.runner.child import main
 Json = Mapping[str, Any]
 
 
-def work(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+def work(arguments: Json, context: StageContext, files: Path) -> None:
     for step in range(3):
         context.progress(step + 1, 3, "steps")
     loaded = [name for name in ("wave", "colorsys") if name in sys.modules]
     process = [context.threads, os.environ["OMP_NUM_THREADS"], os.getpid(), *loaded]
     (files / "process.txt").write_text(" ".join(map(str, process)))
-    (files / "result.txt").write_text(f"{options['value']} {arguments.get('say', '')}")
+    (files / "result.txt").write_text(f"{arguments['value']} {arguments.get('say', '')}")
 
 
-def noisy(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+def noisy(arguments: Json, context: StageContext, files: Path) -> None:
     os.write(1, b"a native library prints\n")
     print("so does Python")
     sys.stderr.write("and this is a log line\n")
     (files / "result.txt").write_text("done")
 
 
-def refuse(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+def refuse(arguments: Json, context: StageContext, files: Path) -> None:
     raise EstimationError("only 3 of 50 frames", path="video.mp4", hint="film more")
 
 
-def bug(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+def bug(arguments: Json, context: StageContext, files: Path) -> None:
     {}["nothing"]
 
 
-def crash(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+def crash(arguments: Json, context: StageContext, files: Path) -> None:
     ctypes.string_at(0)
 
 
-def hang(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+def hang(arguments: Json, context: StageContext, files: Path) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     (context.work_dir / "started").write_text(str(os.getpid()))
     Path(arguments["started"]).write_text(f"{os.getpid()} {context.work_dir}")
@@ -54,7 +54,7 @@ def hang(options: Json, arguments: Json, context: StageContext, files: Path) -> 
         time.sleep(0.05)
 
 
-def polite(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+def polite(arguments: Json, context: StageContext, files: Path) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     Path(arguments["started"]).write_text(f"{os.getpid()} {context.work_dir}")
     while True:
@@ -62,23 +62,23 @@ def polite(options: Json, arguments: Json, context: StageContext, files: Path) -
         time.sleep(0.02)
 
 
-def fill(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+def fill(arguments: Json, context: StageContext, files: Path) -> None:
     with (files / "big.bin").open("wb") as stream:
         for _ in range(1000):
             stream.write(bytes(1 << 20))
 
 
-def fill_quietly(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+def fill_quietly(arguments: Json, context: StageContext, files: Path) -> None:
     """As a library that hides the cause: the disk fills up and something else is raised."""
     try:
-        fill(options, arguments, context, files)
+        fill(arguments, context, files)
     except OSError:
         raise RuntimeError("cannot write database") from None
 
 
-def fill_and_die(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+def fill_and_die(arguments: Json, context: StageContext, files: Path) -> None:
     try:
-        fill(options, arguments, context, files)
+        fill(arguments, context, files)
     except OSError:
         os.abort()
 

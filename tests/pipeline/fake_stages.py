@@ -14,7 +14,6 @@ from typing import Any
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import CaptureError, EstimationError
 from bodycap_batch.runner import child
-from bodycap_batch.tasks import STAGES
 
 Json = Mapping[str, Any]
 ORDERS = "BODYCAP_FAKE_ORDERS"
@@ -30,8 +29,10 @@ def orders() -> dict[str, Any]:
 
 
 def made_of(value: Any) -> Any:
-    """A value with every artefact's path replaced by what that artefact holds."""
+    """A value with every reference to an artefact replaced by what that artefact holds."""
     if isinstance(value, Mapping):
+        if value.keys() == {"path", "digest"}:
+            return made_of(value["path"])
         return {key: made_of(part) for key, part in value.items() if key not in ("video", "out", "job")}
     if isinstance(value, list):
         return [made_of(part) for part in value]
@@ -41,9 +42,11 @@ def made_of(value: Any) -> Any:
 
 
 def stage(name: str) -> Any:
-    def run(options: Json, arguments: Json, context: StageContext, files: Path) -> None:
+    def run(arguments: Json, context: StageContext, files: Path) -> None:
         if name in orders().get("real", []):
-            return STAGES[name].function(options, arguments, context, files)
+            from bodycap_batch.tasks.stages import STAGES  # its libraries take seconds to load
+
+            return STAGES[name].run(arguments, context, files)
         context.progress(1, 1, "steps")
         meant = orders().get("on", "") in " ".join(videos(arguments))
         if orders().get("crash") == name and meant:
@@ -60,7 +63,9 @@ def stage(name: str) -> Any:
             with (files / "big.bin").open("wb") as stream:
                 for _ in range(1000):
                     stream.write(bytes(1 << 20))
-        content = [name, dict(options), made_of(arguments), videos(arguments)]
+        options = dict(arguments.get("options", {}))
+        inputs = {key: value for key, value in arguments.items() if key != "options"}
+        content = [name, options, made_of(inputs), videos(arguments)]
         (files / "made_of.txt").write_text(json.dumps(content, sort_keys=True))
         EXTRA.get(name, summary)(options, arguments, files)
         return None
@@ -73,7 +78,8 @@ def as_list(value: Any) -> list[Any]:
 
 
 def videos(arguments: Json) -> list[str]:
-    cameras = arguments.get("capture", {}).get("cameras", [])
+    capture = arguments.get("capture", {})
+    cameras = capture.get("config", capture).get("cameras", [])
     files = [Path(video) for camera in cameras for video in camera["video"]]
     return [file.read_bytes().decode("utf-8", "replace") for file in files if file.exists()]
 
@@ -84,11 +90,11 @@ def summary(options: Json, arguments: Json, files: Path) -> None:
 
 def registered(options: Json, arguments: Json, files: Path) -> None:
     before = arguments["previous"]
-    again = json.loads((Path(before) / "summary.json").read_text())["round"] + 1 if before else 0
+    again = json.loads((Path(before["path"]) / "summary.json").read_text())["round"] + 1 if before else 0
     wanted = [*orders().get("wanted", []), *[[]] * 9][again]
     localised = [*orders().get("localised", []), *[10] * 9][again]
     rolling = bool(orders().get("rolling"))
-    frames = localised + orders().get("lost", {}).get(arguments["capture"]["cameras"][0]["name"], 0)
+    frames = localised + orders().get("lost", {}).get(arguments["capture"]["config"]["cameras"][0]["name"], 0)
     values = {
         "round": again,
         "wanted": wanted,

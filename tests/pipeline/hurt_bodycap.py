@@ -24,7 +24,7 @@ from typing import Any
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.runner import child
 from bodycap_batch.runner.task import TaskFunction
-from bodycap_batch.tasks import STAGES
+from bodycap_batch.tasks.stages import STAGES
 
 ORDERS = "BODYCAP_HURT_ORDERS"
 PIDS = "BODYCAP_HURT_PIDS"
@@ -70,11 +70,9 @@ def deadly(rename: Callable[..., None], orders: Mapping[str, str]) -> Callable[.
 
 
 def filling(name: str, disk: Path) -> TaskFunction:
-    def run(
-        options: Mapping[str, Any], arguments: Mapping[str, Any], context: StageContext, files: Path
-    ) -> None:
+    def run(arguments: Mapping[str, Any], context: StageContext, files: Path) -> None:
         fill(disk)
-        STAGES[name].function(options, arguments, context, files)
+        STAGES[name].run(arguments, context, files)
 
     return run
 
@@ -94,7 +92,7 @@ def fill(disk: Path) -> None:
 def hurt() -> dict[str, TaskFunction]:
     """Prepare what was ordered; returns the stages to run."""
     orders = json.loads(Path(os.environ[ORDERS]).read_text())
-    table = {name: stage.function for name, stage in STAGES.items()}
+    table: dict[str, TaskFunction] = {name: stage.run for name, stage in STAGES.items()}
     (Path(os.environ[PIDS]) / str(os.getpid())).touch()
     if "kill" in orders:
         os.replace = deadly(os.replace, orders)

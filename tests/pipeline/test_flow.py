@@ -13,7 +13,7 @@ from bodycap_batch.pipeline import Settings, run_job
 from bodycap_batch.pipeline.flow import Flow
 from bodycap_batch.runner import Children, Making, Task
 from bodycap_batch.store.artefacts import Store
-from bodycap_batch.tasks import STAGES
+from bodycap_batch.tasks.stages import STAGES
 from tests.pipeline.test_run import CHILD, Bench, bench
 
 __all__ = ["bench"]
@@ -39,7 +39,8 @@ def test_the_last_cameras_share_all_threads(
     settings = Settings(
         store=Store(tmp_path), threads=threads, listener=lambda _: None, cancelled=lambda: False
     )
-    assert Flow(job, settings, logs=tmp_path / "out" / "logs")._shares() == expected
+    flow = Flow(job, settings, logs=tmp_path / "out" / "logs")
+    assert flow.runner.threads_per_camera() == expected
 
 
 class Watched(Children):
@@ -85,5 +86,5 @@ def test_a_board_is_looked_for_in_the_pictures_that_keyframes_keep(bench: Bench,
         executor=children,
     )
     run_job(bench.job(merge={"marker_board": board}), out_dir=bench.out, settings=settings)
-    kept = children.arguments["merge"].get("kept")
-    assert kept == (None if board is None else children.arguments["map"]["kept"])
+    footage, mapped = children.arguments["merge"]["footage"], children.arguments["map"]
+    assert footage == (None if board is None else {name: mapped[name] for name in ("capture", "keyframes")})

@@ -29,15 +29,16 @@ def test_the_finished_stages_are_found_and_nothing_is_computed(
     bench = Bench(tmp_path, monkeypatch)
     bench.run()
     found = stored_for_report(bench.job(), out_dir=bench.out, settings=looking(bench))
-    assert all(Path(found[name]).is_dir() for name in ("map", "merge", "export"))
-    assert len(found["registrations"]) == len(found["keyframes"]) == len(CAMERAS)
-    assert found["failure"] is None
+    assert all(item is not None and item.path.is_dir() for item in (found.map, found.merge, found.export))
+    assert len(found.registrations) == len(found.keyframes) == len(CAMERAS)
+    assert found.failure is None
     # another option of the skeleton: its stage and the export are not there, what comes before is
     found = stored_for_report(bench.job(merge={"max_gap_s": 0.5}), out_dir=bench.out, settings=looking(bench))
-    assert found["merge"] is None
-    assert found["export"] is None
-    assert len(found["registrations"]) == len(CAMERAS)
-    assert found["failure"]["stage"] == "merge"
+    assert found.merge is None
+    assert found.export is None
+    assert len(found.registrations) == len(CAMERAS)
+    assert found.failure is not None
+    assert found.failure["stage"] == "merge"
 
 
 def test_an_empty_store_gives_no_marks_and_is_told_once(

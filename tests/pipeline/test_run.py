@@ -316,7 +316,7 @@ def test_the_map_stops_growing_when_nothing_is_gained(bench: Bench, last: int, r
     bench.order(wanted=[[5], [7], [9]], localised=[5, 8, last])
     summary = bench.run()
     assert max(stage.round for stage in summary.stages) == 2
-    used = json.loads((bench.out / "result.ply").read_text())["registrations"][0]
+    used = json.loads((bench.out / "result.ply").read_text())["registrations"]["torso"]
     passes = 0
     while used is not None:
         used = json.loads(used)[2]["previous"]
@@ -340,11 +340,12 @@ def test_lost_frames_are_looked_for_once_in_what_was_kept(
     executed = bench.executed(registration={"rounds": rounds})
     assert [name for name in executed if name.startswith("recover")] == ["recover torso"]
     used = json.loads((bench.out / "result.ply").read_text())["registrations"]
-    names = [json.loads(each)[0] for each in used]
-    assert sorted(names) == ["recover", "registration"]
-    kept = json.loads(used[names.index("recover")])[2]
+    stages = {camera: json.loads(content)[0] for camera, content in used.items()}
+    assert stages == {"torso": "recover", "left_palm": "registration"}
+    kept = json.loads(used["torso"])[2]
     # The other camera's as the results have it.
-    assert used[names.index("registration")] in kept["registrations"]
+    assert used["left_palm"] == kept["registrations"]["left_palm"]
+    assert kept["cameras"] == ["torso", "left_palm"]
     assert bench.executed(registration={"rounds": rounds}) == []
 
 
@@ -358,7 +359,7 @@ def test_a_rolling_shutter_is_taken_out_of_the_map_and_every_frame_solved_again(
     executed = bench.executed()
     assert executed.count("refine") == 1
     assert executed.count("registration torso") == 2
-    used = json.loads(json.loads((bench.out / "result.ply").read_text())["registrations"][0])
+    used = json.loads(json.loads((bench.out / "result.ply").read_text())["registrations"]["torso"])
     assert used[2]["previous"] is not None, "the tracks of the first pass are kept"
     assert bench.executed() == []
 

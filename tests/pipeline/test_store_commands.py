@@ -17,7 +17,7 @@ from bodycap_batch.core.errors import Cancelled, StoreError
 from bodycap_batch.pipeline import Settings, explain_job, run_job
 from bodycap_batch.store.artefacts import ArtefactKey, Store
 from bodycap_batch.store.references import References, collect_garbage, in_use, moving
-from bodycap_batch.tasks import StageName, stages_from
+from bodycap_batch.tasks.order import StageName, stages_from
 from tests.pipeline.test_run import ALL, CHILD, PER_CAMERA, REGISTERED, Bench, bench, done, done_once
 
 __all__ = ["bench", "done", "done_once"]

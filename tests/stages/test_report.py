@@ -18,7 +18,7 @@ from bodycap_batch.capture import open_capture
 from bodycap_batch.config.models import CaptureConfig, Job
 from bodycap_batch.model.geometry import interpolate_pose
 from bodycap_batch.model.scene import FrameStatus, Trajectory
-from bodycap_batch.pipeline.made import Made, report_task
+from bodycap_batch.pipeline.stage_results import StageResults, report_task
 from bodycap_batch.report import ReportInputs
 from bodycap_batch.report.advice import advise, shared_points
 from bodycap_batch.report.figures.body import before_optimisation
@@ -31,6 +31,7 @@ from bodycap_batch.report.placing import common_times_s, place
 from bodycap_batch.report.solid import solid_data
 from bodycap_batch.report.tables import look_up
 from bodycap_batch.report.verdict import judge
+from bodycap_batch.store.digests import FileDigests
 from bodycap_batch.tasks.report import load_inputs
 from tests.reports import written
 from tests.videos import textured_frame, write_video
@@ -402,11 +403,12 @@ def test_a_gap_counts_as_bridged_by_the_jobs_own_limit(
     assert ("<title>5 frames lost: BLUR</title>" in text) != bridged
 
 
-def test_the_jobs_own_limit_is_handed_to_the_report() -> None:
+def test_the_jobs_own_limit_is_handed_to_the_report(tmp_path: Path) -> None:
     camera = {"name": "torso", "video": ["torso.mp4"]}
     job = Job.model_validate({"capture": {"cameras": [camera]}, "merge": {"max_gap_s": 0.4}})
-    task = report_task(job, Made(), {}, {"stage": "check", "message": "no video"})
-    assert load_inputs(task.arguments).max_gap_s == 0.4
+    failure = {"stage": "check", "message": "no video"}
+    task = report_task(job, StageResults(), {}, FileDigests(tmp_path), failure)
+    assert load_inputs(task).max_gap_s == 0.4
 
 
 def test_a_strip_of_any_length_stays_small(inputs: ReportInputs) -> None:

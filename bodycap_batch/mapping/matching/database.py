@@ -14,7 +14,6 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.core.memory import release_memory
 from bodycap_batch.mapping.matching.sift import features_of
 
 if TYPE_CHECKING:
@@ -123,7 +122,6 @@ def add_keyframes(
                 np.save(colours / f"{image_id}.npy", found.rgb)
                 done += 1
                 context.progress(done, total, "features")
-    release_memory()  # the detectors' pyramids: 90 MB with two threads, on top of which all else would come
 
 
 def drop_images(workspace: Path, cameras: Collection[str]) -> None:

@@ -14,7 +14,6 @@ import numpy as np
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.core.memory import release_memory
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pair, image_ids
 from bodycap_batch.mapping.matching.pair_matching import match_pairs
 from bodycap_batch.mapping.matching.retrieval import CHANCE, LARGEST, LIKELY, largest, likeness
@@ -236,7 +235,6 @@ def link_keyframes(
     while fresh := chooser.wider(held, tried) or chooser.unlinked(held, tried):
         held |= match_pairs(workspace, fresh, lenses, context)
         tried |= set(fresh)
-    release_memory()
     between = Counter(f"{a.camera} - {b.camera}" for a, b in held if a.camera != b.camera)
     log = {
         "pairs": len(tried),

@@ -101,7 +101,9 @@ def _keeps_position(path: _CameraPath, others: Iterable[_CameraPath]) -> bool:
     """Return whether a camera keeps its position while another one of its map moves."""
     span = int(path.times_ns.min()), int(path.times_ns.max())
     deviations = [other.deviations_during(*span) for other in others if other.gauge == path.gauge]
-    largest = max(float(np.percentile(each, _PERCENTILE)) for each in deviations if len(each) >= _WINDOW_FRAMES)
+    largest = max(
+        float(np.percentile(each, _PERCENTILE)) for each in deviations if len(each) >= _WINDOW_FRAMES
+    )
     centred = path.centres - np.median(path.centres, axis=0)
     return _deviates_little(centred, _MAX_DEVIATION_RATIO * largest, path.sigma_map)
 

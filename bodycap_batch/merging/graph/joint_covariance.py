@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,6 @@ import numpy as np
 from scipy import sparse
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.core.memory import release_memory
 from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.graph.error_modes import BodyModel, ErrorModes, adjoint, joint_residual_jacobian
@@ -49,7 +48,12 @@ class SolvedGraph:
     first_joint: int
 
 
-def joint_covariance(solved: SolvedGraph, world_from_bone: FloatArray, spread: ErrorModes) -> FloatArray:
+def joint_covariance(
+    solved: SolvedGraph,
+    world_from_bone: FloatArray,
+    spread: ErrorModes,
+    begin: Callable[[str], None] = lambda _: None,
+) -> FloatArray:
     """Covariance (T,B,3,3) of each bone's joint centre minus the first bone's, m², in the solution's axes.
 
     The marginal of the graph knows the noise of the measurements; what was held while it was solved moves
@@ -59,19 +63,21 @@ def joint_covariance(solved: SolvedGraph, world_from_bone: FloatArray, spread: E
         solved: The graph.
         world_from_bone: (T,B,4,4) its solution.
         spread: How far off the calibration may be.
+        begin: Called with the name of each part of the computation, before which freed memory is released.
 
     Returns:
         NaN throughout where the graph's equations are singular.
     """
+    begin("joint covariances")
     linear = linearise(solved.graph, solved.values)
-    release_memory()  # GTSAM's own derivatives
+    begin("normal equations")
     order, bounds = _tick_blocks(solved, linear)
     try:
         chain = BlockTridiagonal((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
     except np.linalg.LinAlgError:
         # A state that nothing holds: the solution stands, how well it is known cannot be told.
         return np.full((*world_from_bone.shape[:2], 3, 3), np.nan)
-    release_memory()
+    begin("covariances of the measurements")
     shifts = _measurement_residual_jacobian(solved, linear, spread)
     shifts = shifts + joint_residual_jacobian(
         linear, solved.body, solved.first_joint, world_from_bone, spread
@@ -97,7 +103,7 @@ def joint_covariance(solved: SolvedGraph, world_from_bone: FloatArray, spread: E
         out[tick, 1:] += reader @ covariance @ reader.swapaxes(1, 2)
 
     chain.marginals(read)
-    release_memory()
+    begin("covariances of the calibration")
     for first in range(0, shifts.shape[1], _MODES_PER_SOLVE):
         # A few directions at a time: all of eleven cameras' at once take gigabytes.
         right = (linear.matrix.T @ shifts[:, first : first + _MODES_PER_SOLVE]).toarray()

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
-from bodycap_batch.core.memory import release_memory
 from bodycap_batch.merging.body.bones import Bone, hinges
 from bodycap_batch.merging.body.initial_poses import fill_gaps, pose_bones
 from bodycap_batch.merging.cameras.track import MIN_SIGMA_M, MIN_SIGMA_RAD, CameraTrack
@@ -68,6 +67,13 @@ class MotionSolution:
     joint_covariance: FloatArray | None = None
 
 
+class SolverProgress(Protocol):
+    """Reports the progress of the optimisation, and stops it when asked."""
+
+    def __call__(self, what: str = "", /) -> None:
+        """Count an iteration; with a name, report that another part of the computation begins."""
+
+
 class MotionGraph:
     """The graph over the whole timeline.
 
@@ -104,15 +110,17 @@ class MotionGraph:
         self._add_rules()
 
     def solve(
-        self, iterations: int, step: Callable[[], None], spread: ErrorModes | None = None
+        self, iterations: int, step: SolverProgress, spread: ErrorModes | None = None
     ) -> MotionSolution:
         """Optimise and read the result off.
 
         Args:
             iterations: Most steps.
-            step: Called after each; may raise to stop.
+            step: Called after each, and with the name of each part of the computation; may raise to stop.
             spread: How far off the calibration may be; None leaves the joints' covariance out.
         """
+        if spread is not None:
+            step("solving")
         values, count = gauss_newton_then_lm(
             self._graph, self._start(), iterations=iterations, step=step, tolerance=_TOLERANCE
         )
@@ -125,9 +133,8 @@ class MotionGraph:
         solution = self._read(values, poses, count)
         if spread is None:
             return solution
-        # The optimiser's factors, 0.2 MB a tick, are of a size that nothing of what follows would take again.
-        release_memory()
-        return replace(solution, joint_covariance=joint_covariance(self._solved(values), poses, spread))
+        covariance = joint_covariance(self._solved(values), poses, spread, step)
+        return replace(solution, joint_covariance=covariance)
 
     def _solved(self, values: Any) -> SolvedGraph:
         return SolvedGraph(

@@ -9,7 +9,12 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack
 from bodycap_batch.merging.graph.error_modes import ErrorModes
-from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution, measurement_residuals
+from bodycap_batch.merging.graph.motion_graph import (
+    MotionGraph,
+    MotionSolution,
+    SolverProgress,
+    measurement_residuals,
+)
 from bodycap_batch.model.geometry import interpolate_pose
 
 WINDOW_TICKS = 500
@@ -40,7 +45,7 @@ def solve_windows(
     build: Callable[[IntArray, Sequence[CameraTrack]], MotionGraph],
     tick_times_ns: IntArray,
     tracks: Sequence[CameraTrack],
-    step: Callable[[], None],
+    step: SolverProgress,
     *,
     window_ticks: int = WINDOW_TICKS,
     spread: ErrorModes | None = None,
@@ -51,7 +56,7 @@ def solve_windows(
         build: Makes the graph of a stretch from its ticks and tracks.
         tick_times_ns: (T,) the timeline.
         tracks: Cleaned tracks, poses in metres.
-        step: Called after each iteration; may raise to stop.
+        step: Called after each iteration, and with the name of each part of the work; may raise to stop.
         window_ticks: Longest stretch, without its overlaps.
         spread: How far off the calibration may be; with it the joints' covariance is computed.
     """

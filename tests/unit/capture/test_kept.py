@@ -12,8 +12,10 @@ import pytest
 from bodycap_batch.capture import CaptureCamera, FrameKeeper, open_camera
 from bodycap_batch.capture.images import grey_from_planes, work_image, work_planes
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
+from bodycap_batch.config.options import KeyframeOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.tasks import STAGES
+from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
+from bodycap_batch.tasks.keyframes import KeyframesTask, run_keyframes
 from bodycap_batch.tasks.loading import load_capture, load_keyframes
 from tests.videos import write_video
 
@@ -151,9 +153,10 @@ def test_the_same_video_is_kept_in_the_same_bytes(tmp_path: Path) -> None:
 def test_the_stages_after_the_keyframes_find_these_kept(tmp_path: Path) -> None:
     video = write_video(tmp_path / "a.mp4", noisy_frames(64, 48))
     config = CameraConfig(name="torso", video=(video,), calibration="auto")
-    capture = {"capture": CaptureConfig(cameras=(config,)).model_dump(mode="json")}
-    STAGES["keyframes"].function({}, capture, StageContext(work_dir=tmp_path), tmp_path)
-    camera = load_capture({**capture, "kept": {"torso": str(tmp_path)}}).cameras[0]
+    capture = CaptureRef(config=CaptureConfig(cameras=(config,)), digests={})
+    task = KeyframesTask(options=KeyframeOptions(), capture=capture)
+    run_keyframes(task, StageContext(work_dir=tmp_path), tmp_path)
+    camera = load_capture(capture, {"torso": ArtefactRef(path=tmp_path, digest="")}).cameras[0]
     assert camera.kept is not None
-    assert camera.kept.frames.tolist() == load_keyframes(str(tmp_path)).frames.tolist()
+    assert camera.kept.frames.tolist() == load_keyframes(tmp_path).frames.tolist()
     assert load_capture(capture).cameras[0].kept is None

@@ -15,7 +15,7 @@ import pytest
 
 from bodycap_batch import merging
 from bodycap_batch.capture import CaptureCamera
-from bodycap_batch.config import MapOptions
+from bodycap_batch.config import MapOptions, MergeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, add_keyframes, image_ids, keypoint_colours
@@ -32,6 +32,7 @@ from bodycap_batch.mapping.matching.flipped_cameras import (
 from bodycap_batch.mapping.matching.retrieval import clear_matches, largest
 from bodycap_batch.model.scene import KeyframeSelection
 from bodycap_batch.tasks import merge
+from bodycap_batch.tasks.inputs import ArtefactRef
 
 
 def _wall() -> np.ndarray:
@@ -182,8 +183,15 @@ def test_a_body_that_cannot_be_solved_then_tells_of_the_mirror(
     monkeypatch.setattr(merging, "merge_trajectories", refuse)
     monkeypatch.setattr(merge, "_merge_inputs", lambda _: None)
     monkeypatch.setattr(merge, "load_map", lambda _: mapped)
+    task = merge.MergeTask(
+        options=MergeOptions(),
+        map=ArtefactRef(path=tmp_path, digest=""),
+        registrations={},
+        body=cast(Any, None),
+        footage=None,
+    )
     with pytest.raises(EstimationError) as caught:
-        merge.MERGE.function({}, {"map": "map"}, StageContext(work_dir=tmp_path, threads=1), tmp_path)
+        merge.run_merge(task, StageContext(work_dir=tmp_path, threads=1), tmp_path)
     assert str(caught.value.hint).startswith("cameras left and torso see mirror images of each other")
     assert str(caught.value.hint).endswith("film more")
 

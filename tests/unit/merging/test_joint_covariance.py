@@ -120,7 +120,7 @@ def _graph(walk, mounts=None, change=None, scale=1.0, shift_s=0.0):
 
 
 def _solve(graph, spread=None) -> MotionSolution:
-    return graph.solve(60, lambda: None, spread)
+    return graph.solve(60, lambda *_: None, spread)
 
 
 def _nothing(bones) -> ErrorModes:

@@ -138,7 +138,9 @@ def test_a_t_pose_is_no_gesture(body, monkeypatch):
     calibration = Calibration(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
     calibration.solve(1.0, iterations=1)
     asked = []
-    monkeypatch.setattr(calibration_graph, "widen_joint_priors", lambda *args: asked.append(args[2:]) or bones)
+    monkeypatch.setattr(
+        calibration_graph, "widen_joint_priors", lambda *args: asked.append(args[2:]) or bones
+    )
     calibration.widen_postures()
     ((poses, times_ns),) = asked
     assert 0 < len(times_ns) < len(posed)

@@ -11,6 +11,7 @@ import pytest
 
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import RegistrationOptions
+from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
 from bodycap_batch.model.camera import Camera
@@ -19,9 +20,11 @@ from bodycap_batch.model.relative_pose import RigPoses, estimate_relative_pose, 
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 from bodycap_batch.registration import RegisteredCamera, register_in_rig
 from bodycap_batch.registration.poses.batched_pnp import Observations, linearise, make_observations
-from bodycap_batch.tasks import read_summary, recover
+from bodycap_batch.tasks import recover
+from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.registered import RIG_POSES
 from bodycap_batch.tasks.registration import save_registration
+from bodycap_batch.tasks.stage import read_summary
 
 LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
 COUNT = 61
@@ -191,8 +194,17 @@ def test_what_the_rig_left_outlasts_the_search_for_lost_frames(
     )
     out = tmp_path / "out"
     out.mkdir()
-    arguments = {"registrations": [str(folder) for folder in folders], "map": "", "selection": ""}
-    recover.RECOVER.function({}, arguments, StageContext(work_dir=tmp_path, threads=1), out)
+    stored = {path.name: ArtefactRef(path=path, digest="") for path in folders}
+    config = CaptureConfig(cameras=(CameraConfig(name="torso", video=(Path("torso.mp4"),)),))
+    task = recover.RecoverTask(
+        options=RegistrationOptions(),
+        cameras=tuple(stored),
+        capture=CaptureRef(config=config, digests={}),
+        keyframes=stored,
+        map=ArtefactRef(path=tmp_path, digest=""),
+        registrations=stored,
+    )
+    recover.run_recover(task, StageContext(work_dir=tmp_path, threads=1), out)
     (kept,) = read_dataclass(RigPoses, out, RIG_POSES).relative
     assert kept.cameras == relative.cameras
     assert read_summary(out) == read_summary(folders[0])

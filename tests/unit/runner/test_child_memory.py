@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from bodycap_batch.core.memory import release_memory
+from bodycap_batch.runner.child import StepReporter
 
 _BLOCK, _COUNT = 64 * 1024, 1600
 
@@ -36,3 +37,26 @@ def test_what_earlier_tasks_freed_goes_back() -> None:
     release_memory()
     assert held - _resident_mb() > 80
     libc.free(blocks[-1])
+
+
+def test_freed_memory_is_released_when_another_step_begins() -> None:
+    released: list[int] = []
+    reported: list[tuple[int, int, str]] = []
+
+    def report(done: int, total: int, what: str) -> None:
+        reported.append((done, total, what))
+
+    progress = StepReporter(report, lambda: released.append(len(reported)), period_s=0.0)
+    steps = [(1, 2, "features"), (2, 2, "features"), (0, 9, "pairs"), (9, 9, "pairs"), (1, 2, "features")]
+    for step in steps:
+        progress(*step)
+    assert released == [0, 2, 4], "before the first report of each step"
+    assert reported == steps
+
+
+def test_freed_memory_is_not_released_at_each_of_many_short_steps() -> None:
+    released: list[str] = []
+    progress = StepReporter(lambda *_: None, lambda: released.append(""), period_s=60.0)
+    for number in range(10):
+        progress(number, 10, f"file {number}")
+    assert released == []

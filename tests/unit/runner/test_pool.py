@@ -121,7 +121,7 @@ def making_in(store: Store, cancelled: threading.Event | None = None) -> Making:
 
 @pytest.mark.parametrize("again", [False, True])
 def test_what_two_jobs_need_is_made_once_unless_it_is_to_be_made_again(tmp_path: Path, again: bool) -> None:
-    turns, store, task = Turns(), Store(tmp_path), replace(a_task(), again=again)
+    turns, store, task = Turns(), Store(tmp_path), replace(a_task(), replaces=again)
     made: list[int] = []
 
     def work(number: int) -> None:

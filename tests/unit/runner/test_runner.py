@@ -36,7 +36,7 @@ FAKE = (sys.executable, str(ROOT / "tests" / "pipeline" / "fake_child.py"))
 
 def a_task(stage: str, value: int = 1, **arguments: Any) -> Task:
     key = ArtefactKey(stage=stage, algorithm="1", options={"value": value}, inputs={}, libraries={})
-    return Task(key=key, arguments=arguments, camera="torso", threads=2)
+    return Task(key=key, arguments={"value": value, **arguments}, camera="torso", threads=2)
 
 
 class Bench:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from bodycap_batch.store import code_version
-from bodycap_batch.tasks import STAGES
+from bodycap_batch.tasks.stages import STAGES
 
 PACKAGE = Path(code_version.__file__).parent.parent
 IGNORED = {"core"}
@@ -36,7 +36,7 @@ def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def versions() -> dict[str, str]:
     forget()
-    return {name: code_version.algorithm_version(stage.code) for name, stage in STAGES.items()}
+    return {name: code_version.algorithm_version(stage.module) for name, stage in STAGES.items()}
 
 
 def changed_by(path: Path, text: str = "\nANOTHER = 1\n") -> set[str]:
@@ -55,12 +55,12 @@ def imported_rooms(path: Path) -> Iterator[str]:
 
 def test_the_same_sources_have_the_same_version(copied: Path) -> None:
     assert versions() == versions()
-    assert len(set(versions().values())) == len({stage.code for stage in STAGES.values()})
+    assert len(set(versions().values())) == len({stage.module for stage in STAGES.values()})
 
 
 @pytest.mark.parametrize("stage", sorted(STAGES))
 def test_everything_a_stage_imports_counts(copied: Path, stage: str) -> None:
-    found = code_version._closure(STAGES[stage].code)
+    found = code_version._closure(STAGES[stage].module)
     rooms = {path.relative_to(copied).parts[0].removesuffix(".py") for path in found}
     wanted = {room for path in found if path.suffix == ".py" for room in imported_rooms(path)}
     assert wanted - rooms - IGNORED - {"config"} == set()
@@ -167,7 +167,7 @@ def test_the_version_is_the_same_on_each_python() -> None:
 
 
 def test_a_further_stage_changes_no_other(copied: Path) -> None:
-    assert changed_by(copied / "tasks" / "__init__.py") == set()
+    assert changed_by(copied / "tasks" / "stages.py") == set()
 
 
 @pytest.mark.parametrize("name", ["humanoid.yaml", "mounts.yaml"])

@@ -24,7 +24,7 @@ from bodycap_batch.model.skeleton_presets import (
     load_skeleton,
     nominal_mount,
 )
-from bodycap_batch.pipeline.inputs import body_arguments, camera_digest
+from bodycap_batch.pipeline.inputs import body_input, camera_digest
 from bodycap_batch.store.digests import FileDigests
 from bodycap_batch.tasks.body import mount_prior
 
@@ -39,8 +39,8 @@ def a_job(folder: Path, **camera: Any) -> Job:
 
 
 def mount(folder: Path, **camera: Any) -> Mount:
-    block = body_arguments(a_job(folder, **camera))["mounts"][0]
-    return mount_prior(block, load_skeleton("upper_body", 1.75))
+    stated = body_input(a_job(folder, **camera), FileDigests(folder / "digests")).mounts[0]
+    return mount_prior(stated, load_skeleton("upper_body", 1.75))
 
 
 def test_a_mount_known_by_name_is_the_nominal_one(tmp_path: Path) -> None:

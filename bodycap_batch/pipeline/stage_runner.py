@@ -1,0 +1,162 @@
+"""Run the tasks of one job: side by side where possible, recorded, and stopped together."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+from bodycap_batch.core.errors import Cancelled
+from bodycap_batch.core.progress import Event
+from bodycap_batch.pipeline.settings import Settings, StageRecord
+from bodycap_batch.runner import NotStored, Task
+from bodycap_batch.store.artefacts import Artefact
+from bodycap_batch.store.disk_space import require_room
+from bodycap_batch.store.references import References, in_use
+from bodycap_batch.tasks.stage import read_summary
+
+
+class StageRunner:
+    """Runs the tasks of one job; a context manager that waits for its threads.
+
+    Attributes:
+        records: Every task that went into the results so far.
+        libraries: Version of each library that computed them.
+
+    Args:
+        settings: Store, threads, listener, cancellation.
+        logs: Folder of the children's logs.
+        cameras: Number of cameras of the job; as many tasks may run side by side.
+    """
+
+    def __init__(self, settings: Settings, *, logs: Path, cameras: int) -> None:
+        self.records: list[StageRecord] = []
+        self.libraries: dict[str, str] = {}
+        self._settings = settings
+        self._cameras = cameras
+        self._folders = (settings.store.root, logs.parent)
+        self._stop_all = threading.Event()
+        self._runner = settings.runner(logs, self._stop_all.is_set, self._require_room)
+        self._pool = ThreadPoolExecutor(max_workers=self.parallel_tasks)
+        self._references = References(settings.store, logs.parent)
+        self._frame_counts = (0, 0)
+        self._noted: set[str] = set()
+        self._opened = ExitStack()
+
+    def __enter__(self) -> StageRunner:
+        with ExitStack() as opened:
+            opened.enter_context(in_use(self._settings.store))
+            opened.callback(self._runner.close)
+            opened.callback(self._pool.shutdown, wait=True, cancel_futures=True)
+            opened.callback(self._stop_all.set)
+            self._opened = opened.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._opened.close()
+
+    @property
+    def parallel_tasks(self) -> int:
+        """Number of tasks of this job that are requested at once."""
+        at_once = self._cameras if self._settings.executor is not None else self._settings.threads
+        return max(1, min(at_once, self._cameras))
+
+    def threads_per_camera(self) -> list[int]:
+        """Return the threads of each of the tasks that run side by side, one per camera.
+
+        The last tasks, which run when the others have ended, share all threads.
+        """
+        if self._settings.executor is not None:
+            return [self._settings.threads] * self._cameras
+        last = self._cameras % self.parallel_tasks or self.parallel_tasks
+        first = [max(1, self._settings.threads // self.parallel_tasks)] * (self._cameras - last)
+        return first + [max(1, self._settings.threads // last)] * last
+
+    def expect_frames(self, frames: int, large_frames: int) -> None:
+        """Set the size of the job, from which the disk space it needs is estimated.
+
+        Args:
+            frames: Frames of all cameras.
+            large_frames: How many of them are much larger than the size they are processed at.
+        """
+        self._frame_counts = (frames, large_frames)
+
+    def run(self, task: Task, preload: Sequence[Sequence[str]] = ()) -> Artefact:
+        """Return a task's artefact, from the store or computed now.
+
+        Args:
+            task: The task.
+            preload: Modules that other children load while this task is computed, one list a child.
+
+        Raises:
+            BodycapError: The task failed; `NotStored` if nothing may be computed.
+        """
+        artefact, computed = self._runner.run(replace(task, priority=self._settings.priority), preload)
+        self._references.add(artefact.path)
+        self.libraries.update(task.key.libraries)
+        self.records.append(
+            StageRecord(
+                stage=task.key.stage,
+                camera=task.camera,
+                round=task.round,
+                reused=not computed,
+                seconds=float(artefact.made["seconds"]),
+                cpu_seconds=artefact.made.get("cpu_seconds"),
+                peak_memory_mb=float(artefact.made["peak_memory_mb"]),
+                artefact=artefact.path.relative_to(self._settings.store.root).as_posix(),
+            )
+        )
+        return artefact
+
+    def start(self, task: Task) -> Future[Artefact]:
+        """Run a task beside what follows."""
+        return self._pool.submit(self.run, task)
+
+    def run_all(self, tasks: Iterable[Task]) -> dict[str, Artefact]:
+        """Run one task per camera side by side and return the artefacts by camera.
+
+        The first failure stops the other tasks. If nothing may be computed, all tasks are looked up, so that
+        `NotStored` names every missing one.
+        """
+        ordered = list(tasks)
+        futures = [self._pool.submit(self.run, task) for task in ordered]
+        wait(futures, return_when=FIRST_EXCEPTION if self._settings.compute else ALL_COMPLETED)
+        failures = [error for future in futures if future.done() and (error := future.exception())]
+        if missing := [error for error in failures if isinstance(error, NotStored)]:
+            raise NotStored([task for error in missing for task in error.tasks], self._settings.store.root)
+        if failures:
+            self._stop(futures)
+            raise next((error for error in failures if not isinstance(error, Cancelled)), failures[0])
+        return {task.camera: future.result() for task, future in zip(ordered, futures, strict=True)}
+
+    def keep_only_these(self) -> None:
+        """Drop the references to artefacts that only earlier runs with other options used."""
+        self._references.keep_only(record.artefact for record in self.records)
+
+    def report_notes(self, artefact: Artefact, stage: str) -> None:
+        """Send the notes of an artefact to the listener, each one once."""
+        for note in read_summary(artefact.path).get("notes", []):
+            self._note(note, stage)
+
+    def _note(self, text: str, stage: str = "") -> None:
+        if text not in self._noted:
+            self._noted.add(text)
+            self._settings.listener(Event(kind="note", stage=stage, what=f"note: {text}"))
+
+    def _require_room(self, task: Task) -> None:
+        """Refuse to start a task that will not fit on the disk; space may have gone since the check."""
+        if task.key.stage != "check":
+            for folder in self._folders:
+                for note in require_room(folder, *self._frame_counts):
+                    self._note(note)
+
+    def _stop(self, futures: Sequence[Future[Artefact]]) -> None:
+        """Stop the tasks beside a failed one; tasks that follow, such as a report of the failure, may run."""
+        self._stop_all.set()
+        for future in futures:
+            future.cancel()
+        wait(futures)
+        self._stop_all.clear()

@@ -1,0 +1,49 @@
+"""Tasks of the runner, and the store's keys, from the typed tasks of the stages."""
+
+from __future__ import annotations
+
+from bodycap_batch.runner import Task
+from bodycap_batch.store.artefacts import ArtefactKey
+from bodycap_batch.store.code_version import Program
+from bodycap_batch.tasks.stage import Stage, TaskT
+from bodycap_batch.tasks.typed_json import key_inputs, key_options, to_json
+
+
+def make_task(
+    stage: Stage[TaskT], task: TaskT, *, camera: str = "", map_round: int = 0, threads: int = 1
+) -> Task:
+    """Return the runner's task for a typed task of a stage.
+
+    Args:
+        stage: The stage.
+        task: What it computes from.
+        camera: The camera that the task concerns, or "".
+        map_round: Round of the map, from 0.
+        threads: Number of threads that the task may keep busy.
+    """
+    return Task(
+        key=artefact_key(stage, task),
+        arguments=to_json(task),
+        program=_program(stage),
+        camera=camera,
+        round=map_round,
+        threads=threads,
+        modules=stage.modules,
+        memory_mb=stage.memory_mb,
+    )
+
+
+def artefact_key(stage: Stage[TaskT], task: TaskT) -> ArtefactKey:
+    """Return the key under which the store holds the result of a typed task."""
+    algorithm, libraries = _program(stage).versions()
+    return ArtefactKey(
+        stage=stage.name,
+        algorithm=algorithm,
+        options=key_options(task),
+        inputs=key_inputs(task),
+        libraries=libraries,
+    )
+
+
+def _program(stage: Stage[TaskT]) -> Program:
+    return Program(stage.module, stage.libraries)

@@ -1,0 +1,38 @@
+"""The table of all stages by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from bodycap_batch.tasks.check import CHECK
+from bodycap_batch.tasks.export import EXPORT
+from bodycap_batch.tasks.keyframes import KEYFRAMES
+from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE
+from bodycap_batch.tasks.merge import MERGE
+from bodycap_batch.tasks.preview import PREVIEW
+from bodycap_batch.tasks.recover import RECOVER
+from bodycap_batch.tasks.registration import REGISTRATION
+from bodycap_batch.tasks.report import REPORT
+from bodycap_batch.tasks.rig import RIG
+from bodycap_batch.tasks.stage import Stage
+from bodycap_batch.tasks.synth import SYNTH
+
+STAGES: Mapping[str, Stage[Any]] = {
+    stage.name: stage
+    for stage in (
+        SYNTH,
+        CHECK,
+        KEYFRAMES,
+        MAP,
+        EXTEND,
+        REFINE,
+        REGISTRATION,
+        RIG,
+        RECOVER,
+        MERGE,
+        EXPORT,
+        REPORT,
+        PREVIEW,
+    )
+}

@@ -1,0 +1,145 @@
+"""Task dataclasses as JSON, and the part of them that identifies a result in the store.
+
+The pipeline writes a task with `to_json` and keys its artefact with `key_inputs` and `key_options`. The child
+process reads the task back with `from_json`. Fields may be dataclasses, pydantic models, paths, JSON values,
+and mappings, tuples and options of these.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import (
+    Any,
+    Protocol,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+    runtime_checkable,
+)
+
+from pydantic import BaseModel
+
+_Loaded = TypeVar("_Loaded")
+_OPTIONS = "options"
+"""Name of the field that holds a stage's options; the store's key has a part of its own for it."""
+_OMITTED = "omitted from the key"
+
+
+@runtime_checkable
+class Reference(Protocol):
+    """A value that names content by its path; in the key only the content counts."""
+
+    def key_content(self) -> Any:
+        """Return the digests that identify the content."""
+
+
+def omitted_from_key(*names: str) -> Mapping[str, Any]:
+    """Return metadata for a dataclass field that does not count in the key, or of which some names do not.
+
+    Args:
+        names: Names inside the field's value; without any, the whole field is omitted.
+    """
+    return {_OMITTED: names}
+
+
+def to_json(value: Any) -> Any:
+    """Return a value of a task as plain JSON values, paths included."""
+    return _plain(value, lambda reference: _fields(reference, to_json))
+
+
+def from_json(kind: type[_Loaded], data: Any) -> _Loaded:
+    """Rebuild a task from `to_json`."""
+    return cast(_Loaded, _typed(kind, data))
+
+
+def key_inputs(task: Any) -> dict[str, Any]:
+    """Return the inputs of a task as its artefact's key holds them: digests instead of paths."""
+    return {
+        field.name: _without(_keyed(getattr(task, field.name)), field)
+        for field in dataclasses.fields(task)
+        if field.name != _OPTIONS and field.metadata.get(_OMITTED) != ()
+    }
+
+
+def key_options(task: Any) -> dict[str, Any]:
+    """Return the options of a task as its artefact's key holds them; empty for a stage without options."""
+    for field in dataclasses.fields(task):
+        if field.name == _OPTIONS:
+            return dict(_without(to_json(task.options), field))
+    return {}
+
+
+def _keyed(value: Any) -> Any:
+    return _plain(value, lambda reference: reference.key_content())
+
+
+def _without(value: Any, field: dataclasses.Field[Any]) -> Any:
+    names = field.metadata.get(_OMITTED, ())
+    return {name: part for name, part in value.items() if name not in names} if names else value
+
+
+def _plain(value: Any, describe: Callable[[Any], Any]) -> Any:
+    """Turn a value into JSON values; `describe` gives those of a `Reference`."""
+
+    def plain(part: Any) -> Any:
+        return _plain(part, describe)
+
+    if isinstance(value, Reference):
+        return describe(value)
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if dataclasses.is_dataclass(value):
+        return _fields(value, plain)
+    if isinstance(value, Mapping):
+        return {str(name): plain(part) for name, part in value.items()}
+    if isinstance(value, tuple | list):
+        return [plain(part) for part in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _fields(value: Any, plain: Callable[[Any], Any]) -> dict[str, Any]:
+    return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+
+
+def _typed(kind: Any, data: Any) -> Any:
+    """Rebuild a value of an annotated type from JSON values."""
+    if (origin := get_origin(kind)) is not None:
+        return _generic(origin, get_args(kind), data)
+    if kind is Path:
+        return Path(data)
+    if not isinstance(kind, type):
+        return data
+    if issubclass(kind, BaseModel):
+        return kind.model_validate(data)
+    if dataclasses.is_dataclass(kind):
+        hints = _hints(kind)
+        values = {
+            field.name: _typed(hints[field.name], data[field.name]) for field in dataclasses.fields(kind)
+        }
+        return cast(Any, kind)(**values)
+    return data
+
+
+def _generic(origin: Any, arguments: tuple[Any, ...], data: Any) -> Any:
+    """Rebuild a value of a type with parameters: ``X | None``, a tuple or a mapping."""
+    if origin in (Union, UnionType):
+        (kind,) = (argument for argument in arguments if argument is not NoneType)
+        return None if data is None else _typed(kind, data)
+    if origin is tuple:
+        kinds = [arguments[0]] * len(data) if arguments[-1] is Ellipsis else arguments
+        return tuple(_typed(kind, part) for kind, part in zip(kinds, data, strict=True))
+    if origin is Mapping or (isinstance(origin, type) and issubclass(origin, Mapping)):
+        return {name: _typed(arguments[1], part) for name, part in data.items()}
+    return data
+
+
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
+    return get_type_hints(kind)
