@@ -28,9 +28,9 @@ def _merge(options: Json, arguments: Json, context: StageContext, files: Path) -
     try:
         result = merge_trajectories(inputs, options_, context)
     except EstimationError as error:
-        from bodycap_batch.mapping.matching.flipped_cameras import explained
+        from bodycap_batch.mapping.matching.flipped_cameras import add_flip_hint
 
-        explained(error, load_map(arguments["map"]).log)
+        add_flip_hint(error, load_map(arguments["map"]).log)
         raise
     write_bundle(result, files, "merge")
     doubts = [*result.report.get("doubted_clocks", {}).values(), result.report.get("exchanged_sides", {})]
