@@ -11,20 +11,20 @@ from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping.inputs import common_times_ns, constant_cameras_of, lenses_of, shop_of
-from bodycap_batch.mapping.intrinsics.recalibration import as_mapped
+from bodycap_batch.mapping.inputs import common_times_ns, calibrated_camera_ids, intrinsics_of, make_mapping_context
+from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     ImageRef,
     add_keyframes,
-    camera_ids,
-    image_ids,
+    read_camera_ids,
+    read_image_ids,
 )
-from bodycap_batch.mapping.matching.pair_selection import PairChooser, link_keyframes
-from bodycap_batch.mapping.matching.skeletal_set import MANY
-from bodycap_batch.mapping.reconstruction.reconstruct import MODELS_NAME, write_models
-from bodycap_batch.mapping.results import result_of, settled
-from bodycap_batch.mapping.validation.repair import cut_doubtful, place_again
+from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_keyframes
+from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
+from bodycap_batch.mapping.reconstruction.reconstruct import MODELS_FOLDER, write_models
+from bodycap_batch.mapping.results import make_result, finalise_models
+from bodycap_batch.mapping.validation.repair import remove_misregistered, re_register_images
 from bodycap_batch.model.scene import MapResult
 
 
@@ -51,39 +51,39 @@ def extend_map(
     """
     import pycolmap
 
-    capture = as_mapped(capture, previous)
+    capture = with_map_intrinsics(capture, previous)
     workspace = context.work_dir / "workspace"
     shutil.copytree(previous.workspace, workspace)
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
-        known = image_ids(database)
-    cameras = camera_ids(workspace)
+        known = read_image_ids(database)
+    cameras = read_camera_ids(workspace)
     new = [ref for ref in _refs(extra_frames) if ref not in known]
     wanted = [
         (capture.camera(name), cameras[name], np.array(sorted(r.frame for r in new if r.camera == name)))
         for name in sorted({ref.camera for ref in new})
     ]
     add_keyframes(workspace, wanted, options, context)
-    chooser = PairChooser(workspace, new, common_times_ns(capture), options, context)
-    _, linked = link_keyframes(chooser, workspace, lenses_of(capture), context)
-    constant = constant_cameras_of(capture, cameras)
+    chooser = PairGenerator(workspace, new, common_times_ns(capture), options, context)
+    _, linked = match_keyframes(chooser, workspace, intrinsics_of(capture), context)
+    constant = calibrated_camera_ids(capture, cameras)
     doubted = {known[ref] for ref in _refs(extra_frames) if ref in known}
-    shop = shop_of(workspace, capture, options, constant, context)
+    shop = make_mapping_context(workspace, capture, options, constant, context)
     models, cut, placed = [], list[str](), list[set[int] | None]()
     for number in range(len(previous.maps)):
-        model = pycolmap.Reconstruction(str(workspace / MODELS_NAME / str(number)))
+        model = pycolmap.Reconstruction(str(workspace / MODELS_FOLDER / str(number)))
         standing = set(map(int, model.reg_image_ids())) - doubted
         inside = set(map(int, model.reg_image_ids())) & doubted
-        model, names = cut_doubtful(place_again(model, inside, shop, len(known) + len(new)), shop)
+        model, names = remove_misregistered(re_register_images(model, inside, shop, len(known) + len(new)), shop)
         models.append(model)
         cut += names
-        placed.append(set(map(int, model.reg_image_ids())) - standing if len(standing) > MANY else None)
-    dropped = settled(models, shop, capture, placed)
+        placed.append(set(map(int, model.reg_image_ids())) - standing if len(standing) > SKELETAL_ABOVE else None)
+    dropped = finalise_models(models, shop, capture, placed)
     write_models(workspace, models)
     told = {"placed_again": len(doubted), "cut": cut, "unconfirmed_points": dropped}
     entry = {"new_keyframes": len(new), **told, **linked}
     growth = [*previous.log.get("growth", []), entry]
     log = {**previous.log, "keyframes": len(known) + len(new), "growth": growth}
-    return result_of(models, workspace, log)
+    return make_result(models, workspace, log)
 
 
 def _refs(frames: Mapping[str, IntArray]) -> list[ImageRef]:

@@ -10,19 +10,19 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options
-from bodycap_batch.mapping.workspace import Workshop
+from bodycap_batch.mapping.workspace import MappingContext
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.optical_flow import pixel_scale
 
 
-def shop_of(
+def make_mapping_context(
     workspace: Path, capture: Capture, options: MapOptions, constant: Sequence[int], context: StageContext
-) -> Workshop:
+) -> MappingContext:
     """What mending a model takes: the workspace, the lenses and the mapper's settings."""
     scale = threshold_scale(capture)
-    return Workshop(
+    return MappingContext(
         workspace=workspace,
-        lenses=lenses_of(capture),
+        lenses=intrinsics_of(capture),
         settings=lambda: mapper_options(options, constant, scale),
         constant=constant,
         context=context,
@@ -35,7 +35,7 @@ def common_times_ns(capture: Capture) -> dict[str, IntArray]:
     return {camera.name: camera.common_times_ns() for camera in capture.cameras}
 
 
-def lenses_of(capture: Capture) -> dict[str, tuple[Camera, bool]]:
+def intrinsics_of(capture: Capture) -> dict[str, tuple[Camera, bool]]:
     """Intrinsics of each camera, and whether they are calibrated."""
     return {item.name: (item.camera, item.calibrated) for item in capture.cameras}
 
@@ -45,6 +45,6 @@ def threshold_scale(capture: Capture) -> float:
     return max(pixel_scale(item.camera.width_px, item.camera.height_px) for item in capture.cameras)
 
 
-def constant_cameras_of(capture: Capture, ids: Mapping[str, int]) -> list[int]:
+def calibrated_camera_ids(capture: Capture, ids: Mapping[str, int]) -> list[int]:
     """Database ids of the calibrated cameras."""
     return sorted(number for name, number in ids.items() if capture.camera(name).calibrated)

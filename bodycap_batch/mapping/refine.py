@@ -11,21 +11,21 @@ from typing import TYPE_CHECKING
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping.intrinsics.readout_time import RollingModel, readouts, with_readouts
-from bodycap_batch.mapping.intrinsics.recalibration import as_mapped
+from bodycap_batch.mapping.intrinsics.readout_time import RollingShutterModel, estimate_readouts, map_with_readouts
+from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
 from bodycap_batch.mapping.matching.database import (
-    camera_ids,
+    read_camera_ids,
 )
-from bodycap_batch.mapping.matching.skeletal_set import MANY
-from bodycap_batch.mapping.reconstruction.bundle_adjustment import refine, settle
-from bodycap_batch.mapping.reconstruction.reconstruct import MODELS_NAME, mapper_options, write_models
-from bodycap_batch.mapping.reconstruction.two_step_adjustment import refine_large
+from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, adjust_robustly
+from bodycap_batch.mapping.reconstruction.reconstruct import MODELS_FOLDER, mapper_options, write_models
+from bodycap_batch.mapping.reconstruction.two_step_adjustment import adjust_in_two_steps
 from bodycap_batch.model.scene import MapResult, Trajectory
 
 if TYPE_CHECKING:
     import pycolmap
-from bodycap_batch.mapping.inputs import constant_cameras_of, threshold_scale
-from bodycap_batch.mapping.results import result_of
+from bodycap_batch.mapping.inputs import calibrated_camera_ids, threshold_scale
+from bodycap_batch.mapping.results import make_result
 
 
 def refine_map(
@@ -59,7 +59,7 @@ def refine_map(
     """
     import pycolmap
 
-    capture = as_mapped(capture, previous)
+    capture = with_map_intrinsics(capture, previous)
     workspace = context.work_dir / "workspace"
     shutil.copytree(previous.workspace, workspace)
     settings, constant = _settings(capture, workspace, options)
@@ -68,26 +68,26 @@ def refine_map(
     for number, scene_map in enumerate(previous.maps):
         context.check_cancelled()
         context.progress(number, len(previous.maps), "maps refined")
-        model = pycolmap.Reconstruction(str(workspace / MODELS_NAME / str(number)))
+        model = pycolmap.Reconstruction(str(workspace / MODELS_FOLDER / str(number)))
         paths = {path.camera: path for path in trajectories if path.gauge == scene_map.gauge}
-        rolling = RollingModel(model, paths, cameras)
-        rolling, found = readouts(rolling, cameras, settings, constant)
+        rolling = RollingShutterModel(model, paths, cameras)
+        rolling, found = estimate_readouts(rolling, cameras, settings, constant)
         readout_s = {name: each.seconds for name, each in found.items() if each.seconds}
         if readout_s:
             moved = rolling.moved(readout_s)
-            if moved.num_reg_images() > MANY:
-                refine_large(moved, settings, constant)
+            if moved.num_reg_images() > SKELETAL_ABOVE:
+                adjust_in_two_steps(moved, settings, constant)
             else:
-                refine(moved, settings, constant)
-                settle(moved, settings, constant)
+                adjust_and_filter(moved, settings, constant)
+                adjust_robustly(moved, settings, constant)
             rolling.move(moved, {})
             model = moved
         models.append(model)
         found_in.append(found)
     write_models(workspace, models)
     log = {"rolling_shutter": [{name: asdict(each) for name, each in found.items()} for found in found_in]}
-    result = result_of(models, workspace, {**previous.log, **log})
-    maps = [with_readouts(item, each) for item, each in zip(result.maps, found_in, strict=True)]
+    result = make_result(models, workspace, {**previous.log, **log})
+    maps = [map_with_readouts(item, each) for item, each in zip(result.maps, found_in, strict=True)]
     return replace(result, maps=tuple(maps))
 
 
@@ -95,5 +95,5 @@ def _settings(
     capture: Capture, workspace: Path, options: MapOptions
 ) -> tuple[pycolmap.IncrementalPipelineOptions, list[int]]:
     """The mapper's settings for a workspace that exists, and the ids of its calibrated cameras."""
-    constant = constant_cameras_of(capture, camera_ids(workspace))
+    constant = calibrated_camera_ids(capture, read_camera_ids(workspace))
     return mapper_options(options, constant, threshold_scale(capture)), constant

@@ -8,15 +8,15 @@ from typing import Any
 
 from bodycap_batch.capture import Capture
 from bodycap_batch.mapping.inputs import common_times_ns
-from bodycap_batch.mapping.reconstruction.bundle_adjustment import settle
-from bodycap_batch.mapping.reconstruction.conversion import to_map
-from bodycap_batch.mapping.validation.transient_points import drop_unconfirmed
-from bodycap_batch.mapping.workspace import Workshop
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_robustly
+from bodycap_batch.mapping.reconstruction.conversion import map_from_reconstruction
+from bodycap_batch.mapping.validation.transient_points import remove_transient_points
+from bodycap_batch.mapping.workspace import MappingContext
 from bodycap_batch.model.scene import MapResult
 
 
-def settled(
-    models: Sequence[Any], shop: Workshop, capture: Capture, placed: Sequence[set[int] | None]
+def finalise_models(
+    models: Sequence[Any], shop: MappingContext, capture: Capture, placed: Sequence[set[int] | None]
 ) -> int:
     """Take unconfirmed points out of models, in place, and adjust what is left once more; how many.
 
@@ -26,16 +26,16 @@ def settled(
     total = 0
     for number, (model, mine) in enumerate(zip(models, placed, strict=True)):
         shop.context.progress(number, len(models), "maps adjusted")
-        total += drop_unconfirmed(model, times_ns)
+        total += remove_transient_points(model, times_ns)
         only = None if mine is None else mine & set(map(int, model.reg_image_ids()))
         if only is None or only:
-            settle(model, shop.settings(), shop.constant, only)
+            adjust_robustly(model, shop.settings(), shop.constant, only)
     return total
 
 
-def result_of(models: Sequence[Any], workspace: Path, log: dict[str, Any]) -> MapResult:
+def make_result(models: Sequence[Any], workspace: Path, log: dict[str, Any]) -> MapResult:
     """The stage's result, with the size and the mean reprojection error of each model in its log."""
-    maps = tuple(to_map(model, workspace) for model in models)
+    maps = tuple(map_from_reconstruction(model, workspace) for model in models)
     log = {
         **log,
         "models": [

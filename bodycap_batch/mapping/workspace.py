@@ -13,7 +13,7 @@ from bodycap_batch.model.camera import Camera
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Workshop:
+class MappingContext:
     """What a repair needs besides the map.
 
     Attributes:

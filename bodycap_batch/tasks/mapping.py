@@ -131,8 +131,8 @@ def _save_map(result: MapResult, files: Path) -> None:
     """Store a map with the workspace that is needed to extend it."""
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.mapping.intrinsics.intrinsics_check import misfit_note
-    from bodycap_batch.mapping.intrinsics.recalibration import FREED
-    from bodycap_batch.mapping.matching.flipped_cameras import mirror_notes
+    from bodycap_batch.mapping.intrinsics.recalibration import RECALIBRATED
+    from bodycap_batch.mapping.matching.flipped_cameras import flip_notes
 
     workspace = files / "workspace"
     os.rename(result.workspace, workspace)
@@ -144,9 +144,9 @@ def _save_map(result: MapResult, files: Path) -> None:
         keyframes=len(largest.keyframe_camera),
         points=len(largest.points),
         notes=[
-            *mirror_notes(result.log),
+            *flip_notes(result.log),
             *(
-                misfit_note(camera, factor, freed=camera in result.log.get(FREED, ()))
+                misfit_note(camera, factor, freed=camera in result.log.get(RECALIBRATED, ()))
                 for camera, factor in sorted(wrong.items())
             ),
         ],

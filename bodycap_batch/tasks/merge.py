@@ -63,9 +63,9 @@ def run_merge(task: MergeTask, context: StageContext, files: Path) -> None:
     try:
         result = merge_trajectories(inputs, task.options, context)
     except EstimationError as error:
-        from bodycap_batch.mapping.matching.flipped_cameras import explained
+        from bodycap_batch.mapping.matching.flipped_cameras import add_flip_hint
 
-        explained(error, load_map(task.map.path).log)
+        add_flip_hint(error, load_map(task.map.path).log)
         raise
     write_dataclass(result, files, "merge")
     doubts = [*result.report.get("doubted_clocks", {}).values(), result.report.get("exchanged_sides", {})]

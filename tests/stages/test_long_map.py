@@ -15,9 +15,9 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.mapping import build, build_map, extend, extend_map
 from bodycap_batch.mapping.reconstruction import reconstruct
-from bodycap_batch.mapping.reconstruction.bundle_adjustment import part_of
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import sub_model
 from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options
-from bodycap_batch.mapping.reconstruction.two_step_adjustment import refine_large
+from bodycap_batch.mapping.reconstruction.two_step_adjustment import adjust_in_two_steps
 from bodycap_batch.mapping.validation import repair
 from bodycap_batch.model.geometry import align_points
 from bodycap_batch.model.scene import KeyframeSelection, MapResult
@@ -38,7 +38,7 @@ def _built(
 ) -> MapResult:
     selections = [_selection(camera.name, frames) for camera in capture.cameras]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bodycap_batch.mapping.matching.pair_selection._FEW", 10)
+        patch.setattr("bodycap_batch.mapping.matching.pair_selection._EXHAUSTIVE_UP_TO", 10)
         return build_map(capture, selections, options, surroundings, many=40)
 
 
@@ -90,7 +90,7 @@ def test_a_carrying_keyframe_that_was_cut_is_placed(
         model, log = mended(*arguments)
         number = sorted(model.reg_image_ids())[-1]
         cut.append(model.image(number).name)
-        return part_of(model, set(model.reg_image_ids()) - {number}), log
+        return sub_model(model, set(model.reg_image_ids()) - {number}), log
 
     monkeypatch.setattr(build, "repair", cutting)
     found = _built(stroll_capture, MapOptions(), context(tmp_path))
@@ -139,7 +139,7 @@ def test_a_large_map_is_adjusted_in_two_steps(result: MapResult, monkeypatch: py
         return create(options, config, part)
 
     monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", noted)
-    refine_large(model, mapper_options(MapOptions(), sorted(model.cameras), 1.0), sorted(model.cameras))
+    adjust_in_two_steps(model, mapper_options(MapOptions(), sorted(model.cameras), 1.0), sorted(model.cameras))
     assert adjusted[0] + adjusted[2] == model.num_reg_images()
     assert before > 0.02
     assert _centres_off(model) < 0.005

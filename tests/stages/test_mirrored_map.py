@@ -14,7 +14,7 @@ from bodycap_batch.config import KeyframeOptions, MapOptions
 from bodycap_batch.config.job import load_job
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build, build_map
-from bodycap_batch.mapping.matching.flipped_cameras import MIRROR_IMAGES, MIRRORED
+from bodycap_batch.mapping.matching.flipped_cameras import UNDECIDED_GROUPS, FLIPPED_CAMERAS
 from bodycap_batch.model.scene import KeyframeSelection
 from tests.rooms import stroll, write_capture
 from tests.stages.conftest import context
@@ -68,7 +68,7 @@ def test_without_the_flipped_camera_the_map_is_that_of_the_others(
     monkeypatch.setattr(build, "add_keyframes", counted)
     options = MapOptions(init_frames=("left_palm:3", "torso:20"))
     found = build_map(flipped_capture, list(selections.values()), options, context(tmp_path / "all"))
-    assert found.log[MIRRORED] == ["left_palm"]
+    assert found.log[FLIPPED_CAMERAS] == ["left_palm"]
     assert len(extracted) == len(set(extracted)) == sum(len(each.frames) for each in selections.values())
     straight = [each for each in selections.values() if each.camera != "left_palm"]
     alone = build_map(
@@ -84,8 +84,8 @@ def test_two_cameras_that_see_mirror_images_are_mapped_each_for_itself(
 ) -> None:
     two = [each for each in selections.values() if each.camera != "head"]
     found = build_map(_without(flipped_capture, "head"), two, MapOptions(), context(tmp_path))
-    assert found.log[MIRROR_IMAGES] == [[["left_palm"], ["torso"]]]
-    assert MIRRORED not in found.log
+    assert found.log[UNDECIDED_GROUPS] == [[["left_palm"], ["torso"]]]
+    assert FLIPPED_CAMERAS not in found.log
     assert [set(each.keyframe_camera) for each in found.maps] in (
         [{"left_palm"}, {"torso"}],
         [{"torso"}, {"left_palm"}],

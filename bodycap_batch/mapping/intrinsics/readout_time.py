@@ -13,27 +13,27 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.mapping.matching.database import ImageRef
-from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust, part_of
-from bodycap_batch.mapping.reconstruction.conversion import lens_of
-from bodycap_batch.mapping.reconstruction.reprojection import image_residuals
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import bundle_adjust, sub_model
+from bodycap_batch.mapping.reconstruction.conversion import camera_from_pycolmap
+from bodycap_batch.mapping.reconstruction.reprojection import image_residuals_px
 from bodycap_batch.model.rolling_shutter import image_velocity, px_at_mid_row
 from bodycap_batch.model.scene import Map, Trajectory
 
 if TYPE_CHECKING:
     import pycolmap
 
-_PROBE_S = 0.01
-_PROBE_ITERATIONS = 40
-_PROBE_KEYFRAMES = 24
+_TRIAL_STEP_S = 0.01
+_TRIAL_ITERATIONS = 40
+_TRIAL_KEYFRAMES = 24
 """The readout time is looked for in so many successive keyframes, those that move most."""
-_PROBES = 4
-_CLOSE_S = 0.001
-_MAX_FRAMES = 1.1
+_MAX_TRIALS = 4
+_CONVERGED_S = 0.001
+_MAX_READOUT_FRAMES = 1.1
 """A readout takes at most the time between two frames."""
 _MIN_READOUT_S = 0.002
 _MIN_SIGMAS = 5.0
 _LOSS_PX = 1.0
-_SANE_PX = 8.0
+_MAX_RESIDUAL_PX = 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ class _Keypoints:
     velocity: FloatArray
 
 
-class RollingModel:
+class RollingShutterModel:
     """A model whose keypoints can be moved to the instant of the middle row.
 
     Args:
@@ -99,7 +99,9 @@ class RollingModel:
         self._trajectories = trajectories
         self._cameras = cameras
         self._lenses = {
-            ImageRef.parse(model.image(image_id).name).camera: lens_of(model.image(image_id).camera)
+            ImageRef.parse(model.image(image_id).name).camera: camera_from_pycolmap(
+                model.image(image_id).camera
+            )
             for image_id in model.reg_image_ids()
         }
         self._keypoints = [
@@ -122,7 +124,7 @@ class RollingModel:
             for feature, xy in zip(item.feature.tolist(), px, strict=True):
                 points[feature].xy = xy
 
-    def fastest(self) -> RollingModel:
+    def fastest(self) -> RollingShutterModel:
         """A model of each camera's successive keyframes that move most, without all others."""
         kept: set[int] = set()
         for name in self._lenses:
@@ -130,14 +132,14 @@ class RollingModel:
             mine.sort(key=lambda item: ImageRef.parse(self._model.image(item.image_id).name).frame)
             speed = [float(np.median(np.abs(item.velocity))) if len(item.velocity) else 0.0 for item in mine]
             total = np.concatenate([[0.0], np.cumsum(speed)])
-            size = min(_PROBE_KEYFRAMES, len(mine))
+            size = min(_TRIAL_KEYFRAMES, len(mine))
             start = int(np.argmax(total[size:] - total[: len(total) - size]))
             kept |= {item.image_id for item in mine[start : start + size]}
-        part = part_of(self._model, kept)
+        part = sub_model(self._model, kept)
         sideways = [name for name, lens in self._lenses.items() if lens.sideways]
-        return RollingModel(part, self._trajectories, self._cameras).read_along(sideways)
+        return RollingShutterModel(part, self._trajectories, self._cameras).read_along(sideways)
 
-    def read_along(self, sideways: Collection[str]) -> RollingModel:
+    def read_along(self, sideways: Collection[str]) -> RollingShutterModel:
         """The same model, these cameras' sensors read along the picture's columns, all others' along rows."""
         out = copy.copy(self)
         out._lenses = {name: replace(lens, sideways=name in sideways) for name, lens in self._lenses.items()}
@@ -159,25 +161,29 @@ class RollingModel:
         """
         moving = [name for name in self._lenses if name in self._trajectories]
         wanted = [name for name in moving if not self._cameras[name].rolling_shutter_known]
-        out = {name: _stated(self._cameras[name].rolling_shutter_s) for name in moving if name not in wanted}
+        out = {
+            name: _stated_readout(self._cameras[name].rolling_shutter_s)
+            for name in moving
+            if name not in wanted
+        }
         if not wanted:
             return out
         frame_s = {name: float(np.median(np.diff(self._cameras[name].times_ns))) * 1e-9 for name in wanted}
         times = {name: readout.seconds for name, readout in out.items()} | dict.fromkeys(wanted, 0.0)
         model = self.moved(times)
-        adjust(model, settings, constant, _PROBE_ITERATIONS)
+        bundle_adjust(model, settings, constant, _TRIAL_ITERATIONS)
         before = self._residuals(model)
-        step = dict.fromkeys(wanted, _PROBE_S)
-        for _ in range(_PROBES):
+        step = dict.fromkeys(wanted, _TRIAL_STEP_S)
+        for _ in range(_MAX_TRIALS):
             times = times | {name: times[name] + step[name] for name in wanted}
             self.move(model, times)
-            adjust(model, settings, constant, _PROBE_ITERATIONS)
+            bundle_adjust(model, settings, constant, _TRIAL_ITERATIONS)
             after = self._residuals(model)
             for name in wanted:
-                slope = _Slope.of(before[name], after[name], step[name])
+                slope = _ResidualSlope.of(before[name], after[name], step[name])
                 out[name] = slope.readout(times[name], frame_s[name])
-                step[name] = float(np.clip(out[name].best_s - times[name], -_PROBE_S, _PROBE_S))
-            if max(map(abs, step.values())) < _CLOSE_S:
+                step[name] = float(np.clip(out[name].best_s - times[name], -_TRIAL_STEP_S, _TRIAL_STEP_S))
+            if max(map(abs, step.values())) < _CONVERGED_S:
                 break
             before = after
         return out
@@ -188,7 +194,7 @@ class RollingModel:
         for name in self._lenses:
             camera = self._cameras[name]
             if camera.rolling_shutter_known:
-                out[name] = _stated(camera.rolling_shutter_s)
+                out[name] = _stated_readout(camera.rolling_shutter_s)
             else:
                 out[name] = Readout(0.0, 0.0, f"not determined: {reason}", 0.0)
         return out
@@ -221,13 +227,13 @@ class RollingModel:
         """Observed minus projected, in the same order for every copy, by camera."""
         out: dict[str, list[FloatArray]] = {name: [] for name in self._lenses}
         for item in self._keypoints:
-            found = image_residuals(model, model.image(item.image_id), item.feature)
+            found = image_residuals_px(model, model.image(item.image_id), item.feature)
             out[item.camera].append(found.ravel())
         return {name: np.concatenate([np.zeros(0), *parts]) for name, parts in out.items()}
 
 
 @dataclass(frozen=True, slots=True)
-class _Slope:
+class _ResidualSlope:
     """How the residuals of an adjusted map change with the readout time.
 
     Attributes:
@@ -241,16 +247,18 @@ class _Slope:
     spread: float
 
     @staticmethod
-    def of(before: FloatArray, after: FloatArray, step_s: float) -> _Slope:
+    def of(before: FloatArray, after: FloatArray, step_s: float) -> _ResidualSlope:
         """From the residuals of two adjustments, `step_s` apart; taken at the second."""
         change = (after - before) / (step_s if step_s else np.inf)
         # A point that an adjustment throws far away says nothing of the shutter.
-        sane = np.maximum(np.abs(after), np.abs(before)) < _SANE_PX
+        sane = np.maximum(np.abs(after), np.abs(before)) < _MAX_RESIDUAL_PX
         weight = np.where(sane, 1.0 / (1.0 + (after / _LOSS_PX) ** 2), 0.0)
         information = float((weight * change * change).sum())
         correlation = float((weight * change * after).sum())
         best = after - change * (correlation / information if information else 0.0)
-        return _Slope(correlation, information, float((weight * best**2).sum() / max(weight.sum(), 1.0)))
+        return _ResidualSlope(
+            correlation, information, float((weight * best**2).sum() / max(weight.sum(), 1.0))
+        )
 
     def readout(self, at_s: float, frame_s: float) -> Readout:
         """The readout time at which the residuals are smallest, if it stands out."""
@@ -258,16 +266,16 @@ class _Slope:
             return Readout(0.0, float("inf"), "none found", at_s)
         best_s = at_s - self.correlation / self.information
         sigma_s = float(np.sqrt(self.spread / self.information))
-        found = max(_MIN_READOUT_S, _MIN_SIGMAS * sigma_s) < abs(best_s) < _MAX_FRAMES * frame_s
+        found = max(_MIN_READOUT_S, _MIN_SIGMAS * sigma_s) < abs(best_s) < _MAX_READOUT_FRAMES * frame_s
         return Readout(best_s if found else 0.0, sigma_s, "estimated" if found else "none found", best_s)
 
 
-def readouts(
-    rolling: RollingModel,
+def estimate_readouts(
+    rolling: RollingShutterModel,
     cameras: Mapping[str, CaptureCamera],
     settings: pycolmap.IncrementalPipelineOptions,
     constant: Sequence[int],
-) -> tuple[RollingModel, dict[str, Readout]]:
+) -> tuple[RollingShutterModel, dict[str, Readout]]:
     """Readout times by camera, and the model read the way its cameras' sensors turn out to lie.
 
     Where trial adjustments fail none is used, and the log says so.
@@ -291,7 +299,7 @@ def readouts(
     return rolling.read_along(stated | better), found
 
 
-def with_readouts(scene: Map, found: Mapping[str, Readout]) -> Map:
+def map_with_readouts(scene: Map, found: Mapping[str, Readout]) -> Map:
     """A map of the cameras' middle rows that says how long their sensors took, and which way they lie."""
     read = {name: each for name, each in found.items() if each.seconds}
     cameras = {
@@ -301,5 +309,5 @@ def with_readouts(scene: Map, found: Mapping[str, Readout]) -> Map:
     return replace(scene, cameras=cameras, readout_s={name: each.seconds for name, each in read.items()})
 
 
-def _stated(readout_s: float) -> Readout:
+def _stated_readout(readout_s: float) -> Readout:
     return Readout(readout_s, 0.0, "stated", readout_s)

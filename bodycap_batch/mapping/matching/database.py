@@ -14,13 +14,13 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping.matching.sift import features_of
+from bodycap_batch.mapping.matching.sift import extract_features
 
 if TYPE_CHECKING:
     import pycolmap
 
 DATABASE_NAME = "database.db"
-_COLOURS = "colours"
+_COLOURS_FOLDER = "colours"
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -45,12 +45,12 @@ class ImageRef:
 Pair = tuple[ImageRef, ImageRef]
 
 
-def image_ids(database: pycolmap.Database) -> dict[ImageRef, int]:
+def read_image_ids(database: pycolmap.Database) -> dict[ImageRef, int]:
     """Image id of every keyframe in the database."""
     return {ImageRef.parse(image.name): int(image.image_id) for image in database.read_all_images()}
 
 
-def camera_ids(workspace: Path) -> dict[str, int]:
+def read_camera_ids(workspace: Path) -> dict[str, int]:
     """Database id of each camera that has keyframes."""
     import pycolmap
 
@@ -59,7 +59,7 @@ def camera_ids(workspace: Path) -> dict[str, int]:
     return {ImageRef.parse(image.name).camera: int(image.camera_id) for image in images}
 
 
-def matched_names(database: pycolmap.Database) -> set[str]:
+def read_matched_names(database: pycolmap.Database) -> set[str]:
     """Names of the keyframes that hold to another one."""
     import pycolmap
 
@@ -105,7 +105,7 @@ def add_keyframes(
     import pycolmap
 
     total = sum(len(frames) for _, _, frames in wanted)
-    colours = workspace / _COLOURS
+    colours = workspace / _COLOURS_FOLDER
     colours.mkdir(exist_ok=True)
     done = 0
     sift = pycolmap.FeatureExtractorType.SIFT
@@ -114,7 +114,7 @@ def add_keyframes(
         pycolmap.DatabaseTransaction(database),
     ):
         for camera, camera_id, frames in wanted:
-            for index, found in features_of(camera, frames, options.features, context):
+            for index, found in extract_features(camera, frames, options.features, context):
                 image_id = write_image(database, ImageRef(camera.name, index), camera_id)
                 database.write_keypoints(image_id, found.keypoints)
                 descriptors = pycolmap.FeatureDescriptors(sift, found.descriptors)
@@ -124,7 +124,7 @@ def add_keyframes(
                 context.progress(done, total, "features")
 
 
-def drop_images(workspace: Path, cameras: Collection[str]) -> None:
+def rewrite_without_cameras(workspace: Path, cameras: Collection[str]) -> None:
     """Write the database anew without some cameras, ids as if they had never been in it.
 
     Args:
@@ -133,14 +133,14 @@ def drop_images(workspace: Path, cameras: Collection[str]) -> None:
     """
     import pycolmap
 
-    colours = workspace / _COLOURS
+    colours = workspace / _COLOURS_FOLDER
     before = (workspace / DATABASE_NAME).rename(workspace / f"whole_{DATABASE_NAME}")
     with (
         pycolmap.Database.open(str(before)) as source,
         pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database,
         pycolmap.DatabaseTransaction(database),
     ):
-        images = sorted((number, ref) for ref, number in image_ids(source).items())
+        images = sorted((number, ref) for ref, number in read_image_ids(source).items())
         lens = {number: int(source.read_image(number).camera_id) for number, _ in images}
         dropped = {lens[number] for number, ref in images if ref.camera in cameras}
         models = sorted(source.read_all_cameras(), key=lambda model: int(model.camera_id))
@@ -158,9 +158,9 @@ def drop_images(workspace: Path, cameras: Collection[str]) -> None:
     before.unlink()
 
 
-def keypoint_colours(workspace: Path, image_id: int) -> npt.NDArray[np.uint8]:
+def read_keypoint_colours(workspace: Path, image_id: int) -> npt.NDArray[np.uint8]:
     """(N,3) RGB at each keypoint of an image."""
-    return np.asarray(np.load(workspace / _COLOURS / f"{image_id}.npy"), dtype=np.uint8)
+    return np.asarray(np.load(workspace / _COLOURS_FOLDER / f"{image_id}.npy"), dtype=np.uint8)
 
 
 def write_image(database: pycolmap.Database, ref: ImageRef, camera_id: int) -> int:

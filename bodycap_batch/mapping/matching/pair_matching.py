@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pair, image_ids
+from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pair, read_image_ids
 from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX, Camera
 from bodycap_batch.model.optical_flow import pixel_scale
 
@@ -31,7 +31,7 @@ _NORM = 512.0
 """Length of a descriptor: root-normalised bytes. Their products are whole numbers below 2^24, which
 float32 adds up exactly in any order: threads and libraries cannot change a match."""
 _MAX_ERROR_PX = 4.0
-_ROUNDS = 400
+_MAX_TRIALS = 400
 """Samples of a robust fit. COLMAP's 10,000 spend 60 ms on every pair that has nothing in common; a pair of
 which one match in three holds is found with 400 samples of five (0.33^5 x 400 = 1.6 right samples)."""
 _CONFIDENCE = 0.999
@@ -44,7 +44,7 @@ _CV_ASSERTION_FAILED = -215
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class KeyframeFeatures:
     """What matching needs of a keyframe.
 
     Attributes:
@@ -84,33 +84,33 @@ def match_pairs(
 
     held: dict[Pair, int] = {}
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
-        ids = image_ids(database)
-        views = _views(database, ids, {ref for pair in pairs for ref in pair}, cameras)
+        ids = read_image_ids(database)
+        views = _read_features(database, ids, {ref for pair in pairs for ref in pair}, cameras)
         for done in range(0, len(pairs), _BLOCK):
             context.progress(done, len(pairs), "pairs")
             block = pairs[done : done + _BLOCK]
             with pycolmap.DatabaseTransaction(database):
-                for (a, b), matches in zip(block, _matched(block, views, context), strict=True):
+                for (a, b), matches in zip(block, _match_block(block, views, context), strict=True):
                     if len(matches) >= MIN_INLIERS:
                         calibrated = views[a].calibrated and views[b].calibrated
-                        _write(database, ids[a], ids[b], matches, calibrated=calibrated)
+                        _write_matches(database, ids[a], ids[b], matches, calibrated=calibrated)
                         held[a, b] = len(matches)
     context.progress(len(pairs), len(pairs), "pairs")
     return held
 
 
-def _views(
+def _read_features(
     database: pycolmap.Database,
     ids: Mapping[ImageRef, int],
     refs: set[ImageRef],
     cameras: Mapping[str, tuple[Camera, bool]],
-) -> dict[ImageRef, View]:
+) -> dict[ImageRef, KeyframeFeatures]:
     out = {}
     for ref in sorted(refs):
         lens, calibrated = cameras[ref.camera]
         pixels = np.asarray(database.read_keypoints(ids[ref]), dtype=np.float64)[:, :2]
         error = _MAX_ERROR_PX * pixel_scale(lens.width_px, lens.height_px)
-        out[ref] = View(
+        out[ref] = KeyframeFeatures(
             descriptors=np.asarray(database.read_descriptors(ids[ref]).data),
             rays=lens.unproject(pixels) if calibrated else pixels - CV2_PIXEL_OFFSET_PX,
             error=error / lens.focal_px if calibrated else error,
@@ -119,8 +119,8 @@ def _views(
     return out
 
 
-def _matched(
-    pairs: Sequence[Pair], views: Mapping[ImageRef, View], context: StageContext
+def _match_block(
+    pairs: Sequence[Pair], views: Mapping[ImageRef, KeyframeFeatures], context: StageContext
 ) -> Iterator[IntArray]:
     """Verified matches of each pair, in the order of the pairs."""
     parts = [pairs[start :: context.threads] for start in range(context.threads)]
@@ -131,8 +131,8 @@ def _matched(
             context.check_cancelled()
             if a != last:
                 last, first = a, views[a].descriptors.astype(np.float32)
-            found = mutual_matches(first, views[b].descriptors.astype(np.float32))
-            out.append(verified(found, views[a], views[b]))
+            found = find_mutual_matches(first, views[b].descriptors.astype(np.float32))
+            out.append(verify_pair(found, views[a], views[b]))
         return out
 
     with ThreadPoolExecutor(context.threads) as pool:
@@ -141,7 +141,7 @@ def _matched(
         yield next(done[number % context.threads])
 
 
-def mutual_matches(first: Descriptors, second: Descriptors) -> IntArray:
+def find_mutual_matches(first: Descriptors, second: Descriptors) -> IntArray:
     """Pairs (M,2) of features that are each other's nearest, clearly nearer than the next.
 
     Args:
@@ -169,7 +169,7 @@ def _angle(alike: npt.NDArray[np.float32]) -> FloatArray:
     return np.asarray(np.arccos(np.clip(alike.astype(np.float64) / _NORM**2, -1.0, 1.0)))
 
 
-def verified(matches: IntArray, a: View, b: View) -> IntArray:
+def verify_pair(matches: IntArray, a: KeyframeFeatures, b: KeyframeFeatures) -> IntArray:
     """The matches (M,2) that one essential (a lens unknown: fundamental) matrix explains."""
     import cv2
 
@@ -184,12 +184,12 @@ def verified(matches: IntArray, a: View, b: View) -> IntArray:
     try:
         if a.calibrated and b.calibrated:
             limit = 0.5 * (a.error + b.error)
-            _, kept = cv2.findEssentialMat(first, second, np.eye(3), method, _CONFIDENCE, limit, _ROUNDS)
+            _, kept = cv2.findEssentialMat(first, second, np.eye(3), method, _CONFIDENCE, limit, _MAX_TRIALS)
         else:
             # A known lens beside an unknown one: its undistorted image, in pixels.
             first, second = first * (_pixel_error(a) / a.error), second * (_pixel_error(b) / b.error)
             limit = 0.5 * (_pixel_error(a) + _pixel_error(b))
-            _, kept = cv2.findFundamentalMat(first, second, method, limit, _CONFIDENCE, _ROUNDS)
+            _, kept = cv2.findFundamentalMat(first, second, method, limit, _CONFIDENCE, _MAX_TRIALS)
     except cv2.error as error:
         # Where no sample gives a model, OpenCV's local optimisation fails an assertion instead of saying so.
         if error.code != _CV_ASSERTION_FAILED:
@@ -198,11 +198,11 @@ def verified(matches: IntArray, a: View, b: View) -> IntArray:
     return none if kept is None else matches[kept.ravel().astype(bool)]
 
 
-def _pixel_error(view: View) -> float:
+def _pixel_error(view: KeyframeFeatures) -> float:
     return _MAX_ERROR_PX if view.calibrated else view.error
 
 
-def _write(database: pycolmap.Database, a: int, b: int, matches: IntArray, *, calibrated: bool) -> None:
+def _write_matches(database: pycolmap.Database, a: int, b: int, matches: IntArray, *, calibrated: bool) -> None:
     import pycolmap
 
     geometry: Any = pycolmap.TwoViewGeometry()

@@ -14,36 +14,42 @@ import numpy as np
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pair, image_ids
+from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pair, read_image_ids
 from bodycap_batch.mapping.matching.pair_matching import match_pairs
-from bodycap_batch.mapping.matching.retrieval import CHANCE, LARGEST, LIKELY, largest, likeness
-from bodycap_batch.mapping.matching.skeletal_set import spanning_rows
+from bodycap_batch.mapping.matching.retrieval import (
+    MIN_RETRIEVAL_MATCHES,
+    RETRIEVAL_FEATURES,
+    LIKELY_RETRIEVAL_MATCHES,
+    largest_descriptors,
+    count_preemptive_matches,
+)
+from bodycap_batch.mapping.matching.skeletal_set import select_skeletal_keyframes
 from bodycap_batch.model.camera import Camera
 
-_NEIGHBOURS = (1, 2, 3, 4, 6, 9, 14)
+_NEIGHBOUR_STEPS = (1, 2, 3, 4, 6, 9, 14)
 """Steps along a camera's own keyframes."""
 _SAME_INSTANT = 2
-_LOOK_ALIKES = 64
+_RETRIEVED = 64
 """Most alike partners of a keyframe: of what exhaustive matching verifies this leaves 99 % on room131 (with
 30 % of the pairs) and 73 % on walk131 (with 34 %; there a keyframe sees what half of the others see)."""
-_FEWEST_LOOK_ALIKES = 8
+_RETRIEVED_PER_CAMERA = 8
 """Of each camera, however alike the others are."""
-_ENOUGH = 24
+_MIN_LINKS = 24
 """Links to another camera or another time that tie a keyframe well, and the matches each must have: one with
 fewer is matched with the neighbours of what it was matched with. With 12 instead of 24 a keyframe of walk131
 stood 15 cm off."""
-_STRONG = 20
-_BESIDE = 4
+_MIN_LINK_MATCHES = 20
+_NEAR_KEYFRAMES = 4
 """Keyframes of one camera nearer than this show the same; a hand is back within a second."""
-_RETRIED = 50_000
+_MAX_RETRY_PAIRS = 50_000
 """Pairs that are tried at most of a camera without any link: some minutes; what holds beside them follows."""
-_FEW = 120
+_EXHAUSTIVE_UP_TO = 120
 """Keyframes up to which every pair is matched."""
-_PLACING = 8
+_RESECTION_RETRIEVALS = 8
 """Most alike keyframes of the map that one that is placed in it is matched with."""
 
 
-class PairChooser:
+class PairGenerator:
     """Chooses pairs with at least one new keyframe; their number grows with that of the new keyframes only.
 
     Args:
@@ -65,17 +71,19 @@ class PairChooser:
         import pycolmap
 
         with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
-            ids = image_ids(database)
+            ids = read_image_ids(database)
             self._images = sorted(ids)
             wanted = set(new)
             self._new = [row for row, ref in enumerate(self._images) if ref in wanted]
-            self.exhaustive = options.pairs == "exhaustive" or len(self._images) <= _FEW
+            self.exhaustive = options.pairs == "exhaustive" or len(self._images) <= _EXHAUSTIVE_UP_TO
             if not self.exhaustive:
-                images = np.empty((len(self._images), LARGEST, 128), np.float32)
+                images = np.empty((len(self._images), RETRIEVAL_FEATURES, 128), np.float32)
                 for row, ref in enumerate(self._images):
                     found = np.asarray(database.read_descriptors(ids[ref]).data)
-                    images[row] = largest(found, np.asarray(database.read_keypoints(ids[ref])))
-                alike = likeness(images, self._new, [ref.camera for ref in self._images], context)
+                    images[row] = largest_descriptors(found, np.asarray(database.read_keypoints(ids[ref])))
+                alike = count_preemptive_matches(
+                    images, self._new, [ref.camera for ref in self._images], context
+                )
                 self._alike = dict(zip(self._new, alike, strict=True))
         self._times = np.array([common_ns[ref.camera][ref.frame] for ref in self._images], dtype=np.int64)
         self._number()
@@ -85,13 +93,13 @@ class PairChooser:
         self._row = {ref: row for row, ref in enumerate(self._images)}
         self._rows_of = {name: np.flatnonzero(self._cameras == name) for name in np.unique(self._cameras)}
 
-    def spanning(self) -> PairChooser:
+    def spanning(self) -> PairGenerator:
         """The same among keyframes that carry a map of all; of all of them where every pair is matched."""
         if self.exhaustive:
             return self
-        rows = spanning_rows(np.array([self._alike[row] for row in self._new]), self._times)
+        rows = select_skeletal_keyframes(np.array([self._alike[row] for row in self._new]), self._times)
         out = copy.copy(self)
-        out.exhaustive = len(rows) <= _FEW
+        out.exhaustive = len(rows) <= _EXHAUSTIVE_UP_TO
         out._images = [self._images[row] for row in rows]
         out._new = list(range(len(rows)))
         out._alike = {new: self._alike[row][rows] for new, row in enumerate(rows)}
@@ -119,10 +127,10 @@ class PairChooser:
                 mine = rows[inside[rows]]
                 apart = np.abs(self._times[mine] - self._times[row])
                 own = self._cameras[rows[0]] == self._cameras[row]
-                near = mine[np.argsort(apart, kind="stable")[: _BESIDE if own else 1]]
+                near = mine[np.argsort(apart, kind="stable")[: _NEAR_KEYFRAMES if own else 1]]
                 pairs |= {(row, int(other)) for other in near}
-            likely = np.flatnonzero(inside & (self._alike[row] >= CHANCE))
-            best = likely[np.argsort(-self._alike[row][likely], kind="stable")[:_PLACING]]
+            likely = np.flatnonzero(inside & (self._alike[row] >= MIN_RETRIEVAL_MATCHES))
+            best = likely[np.argsort(-self._alike[row][likely], kind="stable")[:_RESECTION_RETRIEVALS]]
             pairs |= {(row, int(other)) for other in best} | set(self._beside(row, row))
         return self._sorted(pairs)
 
@@ -145,7 +153,11 @@ class PairChooser:
         if self.exhaustive:
             return []
         far: Counter[int] = Counter()
-        strong = [(self._row[a], self._row[b]) for (a, b), count in sorted(held.items()) if count >= _STRONG]
+        strong = [
+            (self._row[a], self._row[b])
+            for (a, b), count in sorted(held.items())
+            if count >= _MIN_LINK_MATCHES
+        ]
         for a, b in strong:
             if self._is_far(a, b):
                 far.update((a, b))
@@ -154,7 +166,7 @@ class PairChooser:
             (min(pair), max(pair))
             for a, b in strong
             for pair in self._beside(a, b)
-            if not new.isdisjoint(pair) and min(far[pair[0]], far[pair[1]]) < _ENOUGH
+            if not new.isdisjoint(pair) and min(far[pair[0]], far[pair[1]]) < _MIN_LINKS
         }
         return [pair for pair in self._sorted(beside) if pair not in tried]
 
@@ -168,7 +180,7 @@ class PairChooser:
         for camera in sorted({self._images[row].camera for row in alone}):
             mine = [row for row in alone if self._images[row].camera == camera]
             others = np.flatnonzero(self._cameras != camera)
-            step = math.ceil(math.sqrt(len(mine) * len(others) / _RETRIED))
+            step = math.ceil(math.sqrt(len(mine) * len(others) / _MAX_RETRY_PAIRS))
             every |= set(product(mine[::step], others[::step].tolist()))
         return [pair for pair in self._sorted(every) if pair not in tried]
 
@@ -184,7 +196,7 @@ class PairChooser:
                 yield x, y
 
     def _is_far(self, a: int, b: int) -> bool:
-        return bool(self._cameras[a] != self._cameras[b]) or abs(a - b) > _BESIDE
+        return bool(self._cameras[a] != self._cameras[b]) or abs(a - b) > _NEAR_KEYFRAMES
 
     def _sorted(self, rows: Collection[tuple[int, int]]) -> list[Pair]:
         ordered = sorted({(min(pair), max(pair)) for pair in rows if pair[0] != pair[1]})
@@ -194,7 +206,7 @@ class PairChooser:
         """Rows of the keyframes that one keyframe is matched with."""
         own = self._rows_of[self._cameras[row]]
         place = int(np.searchsorted(own, row))
-        steps = [step * sign for step in _NEIGHBOURS for sign in (-1, 1)]
+        steps = [step * sign for step in _NEIGHBOUR_STEPS for sign in (-1, 1)]
         out = {int(own[place + step]) for step in steps if 0 <= place + step < len(own)}
         for camera, rows in self._rows_of.items():
             if camera == self._cameras[row]:
@@ -206,20 +218,20 @@ class PairChooser:
     def _look_alikes(self, row: int) -> set[int]:
         """The most alike of each camera, and the most alike of all."""
         alike = self._alike[row]
-        likely = np.argsort(-alike, kind="stable")[: int((alike >= CHANCE).sum())].tolist()
+        likely = np.argsort(-alike, kind="stable")[: int((alike >= MIN_RETRIEVAL_MATCHES).sum())].tolist()
         order = [other for other in likely if self._is_far(row, other)]
         taken: Counter[str] = Counter()
         out: set[int] = set()
         for other in order:
             taken[self._cameras[other]] += 1
-            if taken[self._cameras[other]] <= _FEWEST_LOOK_ALIKES:
+            if taken[self._cameras[other]] <= _RETRIEVED_PER_CAMERA:
                 out.add(other)
-        rest = (other for other in order if other not in out and alike[other] >= LIKELY)
-        return out | set(islice(rest, max(0, _LOOK_ALIKES - len(out))))
+        rest = (other for other in order if other not in out and alike[other] >= LIKELY_RETRIEVAL_MATCHES)
+        return out | set(islice(rest, max(0, _RETRIEVED - len(out))))
 
 
-def link_keyframes(
-    chooser: PairChooser,
+def match_keyframes(
+    chooser: PairGenerator,
     workspace: Path,
     lenses: Mapping[str, tuple[Camera, bool]],
     context: StageContext,

@@ -17,13 +17,13 @@ from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX
 
-_SHRINK = 0.6
+_DETECTION_SCALE = 0.6
 """OpenCV's detector starts on the image at twice its size. On 0.6 of it, 1.2 times the frame, it takes
 half the time of a detector on the frame's own pixels, and the map's keyframes are as exact (walk12 0.55 and
 0.51 cm, room12 0.69 and 0.69); on 0.5 walk12 goes to 0.9."""
-_SMALLEST_PX = 384
+_MIN_LONG_SIDE_PX = 384
 """Long side below which an image is not shrunk further."""
-_CONTRAST = 0.02
+_CONTRAST_THRESHOLD = 0.02
 """Half of OpenCV's: blurred walls and ceilings have little else (room12 0.84 cm with the usual 0.04). The
 strongest 512 of what is found make as exact a map (keyframes of walk12 0.49 and 0.55 cm, room12 0.70 and
 0.69, tum_fr1_xyz 0.87 and 0.84), at half the matching."""
@@ -31,7 +31,7 @@ _NORM = 512.0
 
 
 @dataclass(frozen=True, slots=True)
-class Features:
+class SiftFeatures:
     """One image's features.
 
     Attributes:
@@ -45,34 +45,34 @@ class Features:
     rgb: npt.NDArray[np.uint8]
 
 
-def features_of(
+def extract_features(
     camera: CaptureCamera, frames: IntArray, count: int, context: StageContext
-) -> Iterator[tuple[int, Features]]:
+) -> Iterator[tuple[int, SiftFeatures]]:
     """Yield (frame, features) in frame order, at most `count` features a frame, none where a mask says so."""
     import cv2
 
     detectors = [
-        cv2.SIFT.create(count, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
+        cv2.SIFT.create(count, contrastThreshold=_CONTRAST_THRESHOLD, enable_precise_upscale=True)
         for _ in range(context.threads)
     ]
     if context.threads == 1:
         for index, rgb in camera.read(frames, colour=True):
             context.check_cancelled()
-            yield index, _detect(detectors[0], camera, rgb)
+            yield index, _detect_features(detectors[0], camera, rgb)
         return
     free: SimpleQueue[Any] = SimpleQueue()
     for detector in detectors:
         free.put(detector)
 
-    def work(rgb: npt.NDArray[np.uint8]) -> Features:
+    def work(rgb: npt.NDArray[np.uint8]) -> SiftFeatures:
         detector = free.get()
         try:
-            return _detect(detector, camera, rgb)
+            return _detect_features(detector, camera, rgb)
         finally:
             free.put(detector)
 
     with ThreadPoolExecutor(context.threads) as pool:
-        waiting: deque[tuple[int, Future[Features]]] = deque()
+        waiting: deque[tuple[int, Future[SiftFeatures]]] = deque()
         for index, rgb in camera.read(frames, colour=True):
             context.check_cancelled()
             waiting.append((index, pool.submit(work, rgb)))
@@ -83,16 +83,16 @@ def features_of(
             yield frame, job.result()
 
 
-def _detect(detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.uint8]) -> Features:
+def _detect_features(detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.uint8]) -> SiftFeatures:
     import cv2
 
     height, width = rgb.shape[:2]
-    shrink = min(1.0, max(_SHRINK, _SMALLEST_PX / max(height, width)))
+    shrink = min(1.0, max(_DETECTION_SCALE, _MIN_LONG_SIDE_PX / max(height, width)))
     size = (round(width * shrink), round(height * shrink))
     grey = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
     found, raw = detector.detectAndCompute(grey, None)
     if not found:
-        return Features(
+        return SiftFeatures(
             np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.uint8)
         )
     scale = np.array([width / size[0], height / size[1]])
@@ -105,10 +105,10 @@ def _detect(detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.uint8]) ->
     keypoints = keypoints[keep]
     column = np.clip(keypoints[:, 0].astype(int), 0, width - 1)
     row = np.clip(keypoints[:, 1].astype(int), 0, height - 1)
-    return Features(keypoints, _rooted(raw[keep]), rgb[row, column])
+    return SiftFeatures(keypoints, _root_sift(raw[keep]), rgb[row, column])
 
 
-def _rooted(raw: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+def _root_sift(raw: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
     """Square roots of descriptors that sum to one, as bytes of length 512.
 
     Source: Arandjelović, Zisserman, "Three things everyone should know to improve object

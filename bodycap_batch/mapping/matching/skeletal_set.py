@@ -9,16 +9,16 @@ import numpy.typing as npt
 
 from bodycap_batch.core.arrays import IntArray
 
-MANY = 1000
+SKELETAL_ABOVE = 1000
 """Keyframes beyond which the map is built from some of them, and the others are placed in it."""
-_SURE = 16
-_SUPPORT = 6
+_MIN_MATCHES = 16
+_MIN_SUPPORT = 6
 """Of 608 keyframes of three cameras, a minute in one room, 91 are chosen, and all stand 0.25 cm off (rms)
 after 35 CPU seconds; 0.17 after 39 with all adjusted together, 0.14 after 95 with the map built from all."""
 
 
-def spanning_rows(
-    alike: npt.NDArray[np.int16], times: IntArray, *, sure: int = _SURE, support: int = _SUPPORT
+def select_skeletal_keyframes(
+    alike: npt.NDArray[np.int16], times: IntArray, *, sure: int = _MIN_MATCHES, support: int = _MIN_SUPPORT
 ) -> IntArray:
     """Rows of keyframes that see all there is: each of the others is surely alike to some of them.
 

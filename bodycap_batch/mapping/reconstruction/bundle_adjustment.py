@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.mapping.reconstruction.reprojection import typical_residual_px
+from bodycap_batch.mapping.reconstruction.reprojection import median_residual_px
 
 if TYPE_CHECKING:
     import pycolmap
 
-_SETTLED_TOLERANCE = 1e-4
+_ROBUST_TOLERANCE = 1e-4
 """The same for the last adjustment, whose loss converges slowly. Half the time of 1e-5, keyframes as exact
 (walk12 0.30 and 0.30 cm, room12 0.71 and 0.73, violent arms 1.30 and 1.30); 1e-3 costs them up to 5 %."""
 
-_LONG_TRACKS = 14.0
+_MAX_DIRECT_TRACK_LENGTH = 14.0
 """Keyframes that see an observation's point, on average over the observations. Taking the points out of the
 equations costs the square of a track, conjugate gradients on what is left only the track. The last
 adjustment of walk131 (285 keyframes, 23) takes 3.15 CPU seconds with them instead of 5.4, tum_fr1_xyz (23)
@@ -32,18 +32,18 @@ _MIN_LOSS_PX = 0.05
 """Where all residuals vanish."""
 
 
-def refine(
+def adjust_and_filter(
     model: Any,
     settings: pycolmap.IncrementalPipelineOptions,
     constant_cameras: Collection[int],
     only: Collection[int] | None = None,
 ) -> None:
-    """One bundle adjustment by squares, outliers taken out. Arguments and errors are those of `adjust`."""
-    adjust(model, settings, constant_cameras, only=only)
-    _filter(model, settings)
+    """One bundle adjustment by squares, outliers taken out. Arguments and errors are those of `bundle_adjust`."""
+    bundle_adjust(model, settings, constant_cameras, only=only)
+    _filter_points(model, settings)
 
 
-def settle(
+def adjust_robustly(
     model: Any,
     settings: pycolmap.IncrementalPipelineOptions,
     constant_cameras: Collection[int],
@@ -64,18 +64,18 @@ def settle(
     Source: Zhang, "Parameter estimation techniques: a tutorial with application to conic fitting", 1997, for
         the loss; its width is the most likely scale of a Cauchy distribution.
     """
-    width_px = max(_MIN_LOSS_PX, typical_residual_px(model))
-    adjust(model, settings, constant_cameras, loss_px=width_px, only=only)
-    _filter(model, settings)
+    width_px = max(_MIN_LOSS_PX, median_residual_px(model))
+    bundle_adjust(model, settings, constant_cameras, loss_px=width_px, only=only)
+    _filter_points(model, settings)
 
 
-def _track_length(model: Any) -> float:
+def _mean_track_length(model: Any) -> float:
     """How many keyframes see the point of an observation, on average over the observations."""
     length = np.array([model.point3D(point).track.length() for point in model.point3D_ids()], dtype=float)
     return float((length**2).sum() / max(1.0, length.sum()))
 
 
-def _filter(model: Any, settings: pycolmap.IncrementalPipelineOptions) -> None:
+def _filter_points(model: Any, settings: pycolmap.IncrementalPipelineOptions) -> None:
     import pycolmap
 
     pycolmap.ObservationManager(model).filter_all_points3D(
@@ -84,7 +84,7 @@ def _filter(model: Any, settings: pycolmap.IncrementalPipelineOptions) -> None:
     model.update_point_3d_errors()
 
 
-def part_of(model: Any, image_ids: Collection[int]) -> Any:
+def sub_model(model: Any, image_ids: Collection[int]) -> Any:
     """A copy of a model with only these of its registered images."""
     part = copy.deepcopy(model)
     for image_id in part.reg_image_ids():
@@ -93,7 +93,7 @@ def part_of(model: Any, image_ids: Collection[int]) -> Any:
     return part
 
 
-def adjust(
+def bundle_adjust(
     model: Any,
     settings: pycolmap.IncrementalPipelineOptions,
     constant_cameras: Collection[int],
@@ -126,8 +126,8 @@ def adjust(
     if loss_px is not None:
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         adjustment.ceres.loss_function_scale = loss_px
-        adjustment.ceres.solver_options.function_tolerance = _SETTLED_TOLERANCE
-    iterative = only is not None or (loss_px is not None and _track_length(model) > _LONG_TRACKS)
+        adjustment.ceres.solver_options.function_tolerance = _ROBUST_TOLERANCE
+    iterative = only is not None or (loss_px is not None and _mean_track_length(model) > _MAX_DIRECT_TRACK_LENGTH)
     if iterative:
         # By the least numbers that COLMAP accepts, everything beyond which is solved that way.
         adjustment.ceres.max_num_images_direct_dense_cpu_solver = 1

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
-from bodycap_batch.mapping.matching.database import ImageRef, keypoint_colours
+from bodycap_batch.mapping.matching.database import ImageRef, read_keypoint_colours
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform
 from bodycap_batch.model.scene import Map
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-def to_map(model: pycolmap.Reconstruction, workspace: Path) -> Map:
+def map_from_reconstruction(model: pycolmap.Reconstruction, workspace: Path) -> Map:
     """Turn a reconstruction into a `Map`, keyframes and points in a fixed order."""
     images = sorted(
         ((ImageRef.parse(model.image(image_id).name), image_id) for image_id in model.reg_image_ids()),
@@ -31,7 +31,7 @@ def to_map(model: pycolmap.Reconstruction, workspace: Path) -> Map:
         image = model.image(image_id)
         cam_from_map = np.asarray(image.cam_from_world().matrix())
         poses.append(make_transform(cam_from_map[:, :3], cam_from_map[:, 3]))
-        colours = keypoint_colours(workspace, image_id)
+        colours = read_keypoint_colours(workspace, image_id)
         feature = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
         seen = [image.point2D(index) for index in feature.tolist()]
         rows = np.array([row_of_point[point.point3D_id] for point in seen], dtype=np.int64)
@@ -40,35 +40,35 @@ def to_map(model: pycolmap.Reconstruction, workspace: Path) -> Map:
         features.append(feature)
         pixels.append(np.array([point.xy for point in seen]).reshape(-1, 2))
         np.add.at(colour_sum, rows, colours[feature])
-    obs_point = _joined(point_rows)
+    obs_point = _concatenate(point_rows)
     counts = np.bincount(obs_point, minlength=len(point_ids))
     map_from_cam = invert(np.array(poses))
     return Map(
-        gauge=_gauge(map_from_cam),
-        cameras={ref.camera: lens_of(model.image(image_id).camera) for ref, image_id in images},
+        gauge=_gauge_id(map_from_cam),
+        cameras={ref.camera: camera_from_pycolmap(model.image(image_id).camera) for ref, image_id in images},
         keyframe_camera=tuple(ref.camera for ref, _ in images),
         keyframe_frame=np.array([ref.frame for ref, _ in images], dtype=np.int64),
         map_from_cam=map_from_cam,
         points=np.array([model.point3D(point_id).xyz for point_id in point_ids]).reshape(-1, 3),
         colors=np.round(colour_sum / np.maximum(counts, 1)[:, None]).astype(np.uint8),
         point_error_px=np.array([model.point3D(point_id).error for point_id in point_ids]),
-        obs_keyframe=_joined(keyframe_rows),
+        obs_keyframe=_concatenate(keyframe_rows),
         obs_point=obs_point,
-        obs_feature=_joined(features),
+        obs_feature=_concatenate(features),
         obs_px=np.concatenate([np.zeros((0, 2)), *pixels]),
     )
 
 
-def _joined(parts: list[IntArray]) -> IntArray:
+def _concatenate(parts: list[IntArray]) -> IntArray:
     return np.concatenate([np.zeros(0, dtype=np.int64), *parts])
 
 
-def _gauge(map_from_cam: FloatArray) -> str:
+def _gauge_id(map_from_cam: FloatArray) -> str:
     """Name a gauge by what defines it: the keyframes' poses."""
     return hashlib.sha256(np.ascontiguousarray(map_from_cam).tobytes()).hexdigest()[:12]
 
 
-def lens_of(camera: Any) -> Camera:
+def camera_from_pycolmap(camera: Any) -> Camera:
     """A reconstruction's camera as ours."""
     return Camera(
         model=camera.model.name,

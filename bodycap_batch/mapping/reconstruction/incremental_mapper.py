@@ -12,11 +12,11 @@ from bodycap_batch.mapping.matching.database import DATABASE_NAME
 if TYPE_CHECKING:
     import pycolmap
 
-_INIT_RELAXATIONS = 2
+_INITIAL_PAIR_RELAXATIONS = 2
 """How often COLMAP eases its demands on the initial pair before it gives up."""
 
 
-def grow(
+def register_images(
     workspace: Path,
     settings: pycolmap.IncrementalPipelineOptions,
     model: pycolmap.Reconstruction,
@@ -42,9 +42,9 @@ def grow(
 
     Source: Schönberger, Frahm, "Structure-from-motion revisited", CVPR 2016, as COLMAP has it.
     """
-    mapper = _mapper(workspace, settings)
+    mapper = _open_mapper(workspace, settings)
     mapper.begin_reconstruction(model)
-    run = _Run(mapper, settings, whole=whole)
+    run = _MapperRun(mapper, settings, whole=whole)
     if not model.num_reg_frames() and not run.start():
         mapper.end_reconstruction(True)
         return False
@@ -55,7 +55,7 @@ def grow(
     return True
 
 
-def place(
+def resect_images(
     workspace: Path,
     settings: pycolmap.IncrementalPipelineOptions,
     model: pycolmap.Reconstruction,
@@ -74,7 +74,7 @@ def place(
     Returns:
         Ids of those that found a place.
     """
-    mapper = _mapper(workspace, settings)
+    mapper = _open_mapper(workspace, settings)
     mapper.begin_reconstruction(model)
     options, triangulation = settings.get_mapper(), settings.get_triangulation()
     placed = set[int]()
@@ -88,7 +88,7 @@ def place(
     return placed
 
 
-def _mapper(workspace: Path, settings: pycolmap.IncrementalPipelineOptions) -> pycolmap.IncrementalMapper:
+def _open_mapper(workspace: Path, settings: pycolmap.IncrementalPipelineOptions) -> pycolmap.IncrementalMapper:
     import pycolmap
 
     options = pycolmap.DatabaseCacheOptions()
@@ -98,18 +98,18 @@ def _mapper(workspace: Path, settings: pycolmap.IncrementalPipelineOptions) -> p
     return pycolmap.IncrementalMapper(cache)
 
 
-def _eased(options: Any) -> Iterator[Any]:
+def _relaxed_options(options: Any) -> Iterator[Any]:
     """Demands on the initial pair, eased as COLMAP does: half the inliers, then half the angle, twice."""
     eased = copy.deepcopy(options)
     yield eased
-    for _ in range(_INIT_RELAXATIONS):
+    for _ in range(_INITIAL_PAIR_RELAXATIONS):
         eased.init_min_num_inliers //= 2
         yield eased
         eased.init_min_tri_angle /= 2
         yield eased
 
 
-class _Run:
+class _MapperRun:
     """One model's growth."""
 
     def __init__(
@@ -133,7 +133,7 @@ class _Run:
         pair = (self._settings.init_image_id1, self._settings.init_image_id2)
         if min(pair) < 0:  # none was chosen
             return False
-        for options in _eased(self._options):
+        for options in _relaxed_options(self._options):
             geometry = self._mapper.estimate_initial_two_view_geometry(options, *pair)
             if geometry is not None:
                 break

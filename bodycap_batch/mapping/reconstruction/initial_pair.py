@@ -11,29 +11,29 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, image_ids
+from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, read_image_ids
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.optical_flow import fit_rotation, unit_directions
 
 if TYPE_CHECKING:
     import pycolmap
 
-_LOOKED_AT = 200
+_MAX_CANDIDATES = 200
 """Pairs that are looked at closely."""
-_MANY_MATCHES = 50
+_CANDIDATE_MATCHES = 50
 """Pairs with so many are looked at, evenly from those with most to those with fewest: the most matches have
 neighbours, which hardly moved apart."""
 _ENOUGH_MATCHES = 100
 _ENOUGH_PARALLAX_RAD = float(np.radians(16.0))
 """Beyond these more of the same makes a start no better. The first pair then has 16, 18, 8 and 21 degrees
 between its rays (walk12, room12, tum_fr1_xyz, walk131); with 150 and 8 on tum_fr1_xyz 5."""
-_CELLS = 4
-_LEAST_PARALLAX_RAD = float(np.radians(1.5))
-_LEAST_SPREAD = 0.3
+_GRID_CELLS = 4
+_MIN_PARALLAX_RAD = float(np.radians(1.5))
+_MIN_COVERAGE = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
+class InitialPair:
     """A pair to start from.
 
     Attributes:
@@ -62,14 +62,14 @@ class Start:
     @property
     def usable(self) -> bool:
         """Whether its cameras moved apart and its matches are more than a patch of the images."""
-        return self.parallax_rad >= _LEAST_PARALLAX_RAD and self.spread >= _LEAST_SPREAD
+        return self.parallax_rad >= _MIN_PARALLAX_RAD and self.spread >= _MIN_COVERAGE
 
     @property
     def doubt(self) -> str:
         """What speaks against it, for the log."""
-        if self.parallax_rad < _LEAST_PARALLAX_RAD:
+        if self.parallax_rad < _MIN_PARALLAX_RAD:
             return f"the cameras hardly moved apart ({np.degrees(self.parallax_rad):.1f} degrees of parallax)"
-        if self.spread < _LEAST_SPREAD:
+        if self.spread < _MIN_COVERAGE:
             return f"the matches fill {self.spread:.0%} of the images"
         return f"{self.matches} matches were too few or their geometry too weak"
 
@@ -83,26 +83,26 @@ class Start:
         }
 
 
-def rank_starts(workspace: Path, lenses: Mapping[str, tuple[Camera, bool]]) -> list[Start]:
+def rank_initial_pairs(workspace: Path, lenses: Mapping[str, tuple[Camera, bool]]) -> list[InitialPair]:
     """Pairs of keyframes, the best to start from first, by parallax without rotation, matches and spread."""
     import pycolmap
 
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         pairs, counts = database.read_two_view_geometry_num_inliers()
         order = np.argsort(-np.asarray(counts), kind="stable")
-        many = order[: max(_LOOKED_AT, int((np.asarray(counts) >= _MANY_MATCHES).sum()))]
-        even = np.linspace(0, len(many) - 1, min(_LOOKED_AT, len(many))).round().astype(int)
+        many = order[: max(_MAX_CANDIDATES, int((np.asarray(counts) >= _CANDIDATE_MATCHES).sum()))]
+        even = np.linspace(0, len(many) - 1, min(_MAX_CANDIDATES, len(many))).round().astype(int)
         ids = [pycolmap.pair_id_to_image_pair(pairs[row]) for row in many[even]]
-        out = [_start(database, (int(a), int(b)), lenses) for a, b in ids]
+        out = [_measure_pair(database, (int(a), int(b)), lenses) for a, b in ids]
     return sorted(out, key=lambda start: (-start.score, start.ids))
 
 
-def named_start(
+def find_user_pair(
     workspace: Path,
     named: tuple[str, str],
     lenses: Mapping[str, tuple[Camera, bool]],
     numbers: Mapping[str, IntArray],
-) -> Start | None:
+) -> InitialPair | None:
     """The start a user names as two ``camera:frame``: each camera's keyframe nearest to the frame.
 
     Args:
@@ -120,16 +120,16 @@ def named_start(
     import pycolmap
 
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
-        known = image_ids(database)
-        ids = sorted(known[_nearest(name, known, numbers)] for name in named)
+        known = read_image_ids(database)
+        ids = sorted(known[_nearest_keyframe(name, known, numbers)] for name in named)
         if ids[0] == ids[1]:
             raise JobError(f"{' and '.join(named)} are one keyframe", field="map.init_frames")
         if not database.exists_two_view_geometry(*ids):
             return None
-        return _start(database, (ids[0], ids[1]), lenses)
+        return _measure_pair(database, (ids[0], ids[1]), lenses)
 
 
-def _nearest(name: str, known: Collection[ImageRef], numbers: Mapping[str, IntArray]) -> ImageRef:
+def _nearest_keyframe(name: str, known: Collection[ImageRef], numbers: Mapping[str, IntArray]) -> ImageRef:
     camera, _, frame = name.rpartition(":")
     mine = sorted(ref for ref in known if ref.camera == camera)
     if not mine:
@@ -141,9 +141,9 @@ def _nearest(name: str, known: Collection[ImageRef], numbers: Mapping[str, IntAr
     return min(mine, key=lambda ref: abs(int(numbers[camera][ref.frame]) - int(frame)))
 
 
-def _start(
+def _measure_pair(
     database: pycolmap.Database, ids: tuple[int, int], lenses: Mapping[str, tuple[Camera, bool]]
-) -> Start:
+) -> InitialPair:
     matches = np.asarray(database.read_two_view_geometry(*ids).inlier_matches)
     names = (database.read_image(ids[0]).name, database.read_image(ids[1]).name)
     seen = [lenses[ImageRef.parse(name).camera][0] for name in names]
@@ -158,10 +158,10 @@ def _start(
     if len(first):
         apart = np.linalg.norm(second - first @ fit_rotation(first, second).T, axis=1)
         parallax = float(2.0 * np.arcsin(np.clip(0.5 * np.median(apart), 0.0, 1.0)))
-        spread = float(np.mean([_spread(px, lens) for px, lens in zip(pixels, seen, strict=True)]))
-    return Start(ids, names, len(first), parallax, spread)
+        spread = float(np.mean([_grid_coverage(px, lens) for px, lens in zip(pixels, seen, strict=True)]))
+    return InitialPair(ids, names, len(first), parallax, spread)
 
 
-def _spread(px: FloatArray, lens: Camera) -> float:
-    cells = np.clip((px / (lens.width_px, lens.height_px) * _CELLS).astype(int), 0, _CELLS - 1)
-    return len(np.unique(cells @ (_CELLS, 1))) / _CELLS**2
+def _grid_coverage(px: FloatArray, lens: Camera) -> float:
+    cells = np.clip((px / (lens.width_px, lens.height_px) * _GRID_CELLS).astype(int), 0, _GRID_CELLS - 1)
+    return len(np.unique(cells @ (_GRID_CELLS, 1))) / _GRID_CELLS**2

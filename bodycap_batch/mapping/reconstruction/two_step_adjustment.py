@@ -11,20 +11,20 @@ from scipy import sparse
 
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.mapping.matching.database import ImageRef
-from bodycap_batch.mapping.matching.skeletal_set import spanning_rows
-from bodycap_batch.mapping.reconstruction.bundle_adjustment import part_of, refine, settle
+from bodycap_batch.mapping.matching.skeletal_set import select_skeletal_keyframes
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import sub_model, adjust_and_filter, adjust_robustly
 
 if TYPE_CHECKING:
     import pycolmap
 
-_SHARED = 60
+_MIN_SHARED_POINTS = 60
 """Points that two keyframes share which surely show the same."""
 
 
-def refine_large(
+def adjust_in_two_steps(
     model: Any, settings: pycolmap.IncrementalPipelineOptions, constant_cameras: Collection[int]
 ) -> None:
-    """`refine` and `settle` for very many keyframes, in place: all at once they would take hours.
+    """`adjust_and_filter` and `adjust_robustly` for very many keyframes, in place: all at once they would take hours.
 
     Those that see all there is are adjusted together, as a map of their own. The others follow, to points
     that stay; a point that the first map does not hold is theirs alone.
@@ -39,19 +39,19 @@ def refine_large(
     """
     images = np.array(sorted(model.reg_image_ids()), dtype=np.int64)
     carrying = set(
-        images[spanning_rows(_shared(model, images), _order(model, images), sure=_SHARED)].tolist()
+        images[select_skeletal_keyframes(_count_shared_points(model, images), _time_order(model, images), sure=_MIN_SHARED_POINTS)].tolist()
     )
-    part = part_of(model, carrying)
-    refine(part, settings, constant_cameras)
-    settle(part, settings, constant_cameras)
-    _take_over(model, part, carrying)
+    part = sub_model(model, carrying)
+    adjust_and_filter(part, settings, constant_cameras)
+    adjust_robustly(part, settings, constant_cameras)
+    _copy_back(model, part, carrying)
     others = set(map(int, model.reg_image_ids())) - carrying
     if others:
-        refine(model, settings, constant_cameras, others)
-        settle(model, settings, constant_cameras, others & set(map(int, model.reg_image_ids())))
+        adjust_and_filter(model, settings, constant_cameras, others)
+        adjust_robustly(model, settings, constant_cameras, others & set(map(int, model.reg_image_ids())))
 
 
-def _shared(model: Any, images: IntArray) -> npt.NDArray[np.int16]:
+def _count_shared_points(model: Any, images: IntArray) -> npt.NDArray[np.int16]:
     """(N,N) how many points two keyframes share."""
     seen = [
         np.array([points[index].point3D_id for index in image.get_observation_point2D_idxs()], dtype=np.int64)
@@ -64,12 +64,12 @@ def _shared(model: Any, images: IntArray) -> npt.NDArray[np.int16]:
     return np.asarray((rows @ rows.T).toarray(), dtype=np.int16)
 
 
-def _order(model: Any, images: IntArray) -> IntArray:
+def _time_order(model: Any, images: IntArray) -> IntArray:
     """(N,) where each keyframe stands in the order of time, about: cameras may differ in their rates."""
     return np.array([ImageRef.parse(model.image(number).name).frame for number in images.tolist()])
 
 
-def _take_over(model: Any, part: Any, carrying: Collection[int]) -> None:
+def _copy_back(model: Any, part: Any, carrying: Collection[int]) -> None:
     """Poses, lenses, points and outliers of a part's adjustment, for the whole model, in place."""
     for number, camera in part.cameras.items():
         model.camera(number).params = camera.params

@@ -14,7 +14,7 @@ from bodycap_batch.model.scene import Map
 Reach = Mapping[tuple[str, str], tuple[float, float]]
 """Smallest and largest distance of two cameras, metres, by camera names in alphabetical order."""
 
-MIN_EXPLAINED = 0.8
+MIN_WITHIN_REACH = 0.8
 """Share of distances that a scale has to put within reach; below, no verdict is given."""
 _MIN_DISTANCES = 20
 _MAX_GAP_NS = 1_000_000_000
@@ -25,7 +25,7 @@ _MIN_RUN = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
+class DistanceCheck:
     """What the body's reach says about a map.
 
     Attributes:
@@ -43,7 +43,7 @@ class Verdict:
     @property
     def judged(self) -> bool:
         """False where no scale fits the body: a wrong body or a wrong map, and no telling which."""
-        return self.metres_per_unit is not None and self.explained >= MIN_EXPLAINED
+        return self.metres_per_unit is not None and self.explained >= MIN_WITHIN_REACH
 
     def to_log(self) -> dict[str, object]:
         """JSON-able account, free of the map's arbitrary scale."""
@@ -56,11 +56,11 @@ class Verdict:
             "keyframes_out_of_reach": int(self.violating.sum()),
         }
         if not self.judged:
-            out["reason"] = f"no scale puts {MIN_EXPLAINED:.0%} of the distances within the body's reach"
+            out["reason"] = f"no scale puts {MIN_WITHIN_REACH:.0%} of the distances within the body's reach"
         return out
 
 
-def check_reach(scene: Map, common_ns: Mapping[str, IntArray], reach: Reach) -> Verdict:
+def check_distances(scene: Map, common_ns: Mapping[str, IntArray], reach: Reach) -> DistanceCheck:
     """Hold the distances between cameras, at the keyframes' instants, against the body.
 
     Args:
@@ -72,15 +72,15 @@ def check_reach(scene: Map, common_ns: Mapping[str, IntArray], reach: Reach) -> 
     wrong with it. Distances are ratios to one provisional scale, so the map's own does not matter.
     """
     none = np.zeros(len(scene.keyframe_camera), dtype=bool)
-    found = [_distances(scene, common_ns, pair) for pair in combinations(sorted(scene.cameras), 2)]
+    found = [_distances_both_ways(scene, common_ns, pair) for pair in combinations(sorted(scene.cameras), 2)]
     found = [each for each in found if each.pair in reach and len(each.distance)]
     count = sum(len(each.distance) for each in found)
     if count < _MIN_DISTANCES:
-        return Verdict(distances=count, explained=0.0, metres_per_unit=None, violating=none)
+        return DistanceCheck(distances=count, explained=0.0, metres_per_unit=None, violating=none)
     low = np.concatenate([np.log(reach[each.pair][0] / each.longest()) for each in found])
     high = np.concatenate([np.log(reach[each.pair][1] / each.shortest()) for each in found])
-    scale, explained = best_scale(low, high)
-    verdict = Verdict(
+    scale, explained = find_best_scale(low, high)
+    verdict = DistanceCheck(
         distances=count, explained=explained, metres_per_unit=float(np.exp(scale)), violating=none
     )
     if not verdict.judged:
@@ -90,15 +90,15 @@ def check_reach(scene: Map, common_ns: Mapping[str, IntArray], reach: Reach) -> 
     rows = np.concatenate([each.keyframe for each in found])
     np.add.at(votes, (rows, outside.astype(np.int64)), 1)
     bad = votes[:, 1] > votes[:, 0]
-    return Verdict(
+    return DistanceCheck(
         distances=count,
         explained=explained,
         metres_per_unit=float(np.exp(scale)),
-        violating=_runs(scene, bad),
+        violating=_keep_long_runs(scene, bad),
     )
 
 
-def best_scale(low: FloatArray, high: FloatArray) -> tuple[float, float]:
+def find_best_scale(low: FloatArray, high: FloatArray) -> tuple[float, float]:
     """The value that lies in most intervals [low, high] (the middle of where it does), and their share.
 
     Source: the maximum of a sweep over sorted end points.
@@ -126,13 +126,13 @@ class _Distances:
         return np.maximum(self.distance - _SLACK_SIGMAS * self.sigma, 1e-9 * self.distance + 1e-300)
 
 
-def _distances(scene: Map, common_ns: Mapping[str, IntArray], pair: tuple[str, str]) -> _Distances:
+def _distances_both_ways(scene: Map, common_ns: Mapping[str, IntArray], pair: tuple[str, str]) -> _Distances:
     """Distances of two cameras at the instants of either's keyframes, from the other's interpolated path."""
-    parts = [_one_way(scene, common_ns, a, b) for a, b in (pair, pair[::-1])]
+    parts = [_distances_at_keyframes(scene, common_ns, a, b) for a, b in (pair, pair[::-1])]
     return _Distances(pair, *(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 
-def _one_way(
+def _distances_at_keyframes(
     scene: Map, common_ns: Mapping[str, IntArray], camera: str, other: str
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     mine, theirs = scene.keyframes_of(camera), scene.keyframes_of(other)
@@ -153,7 +153,7 @@ def _one_way(
     return mine[inside], distance, sigma
 
 
-def _runs(scene: Map, bad: BoolArray) -> BoolArray:
+def _keep_long_runs(scene: Map, bad: BoolArray) -> BoolArray:
     """Keep runs of successive keyframes of one camera."""
     out = np.zeros(len(bad), dtype=bool)
     for camera in sorted(scene.cameras):

@@ -19,20 +19,20 @@ if TYPE_CHECKING:
 
 _MAX_ERROR_PX = 8.0
 """Twice the error that verification allows: a map bends a little, its pairs do not."""
-_MIN_INLIERS = 30
+_MIN_PAIR_MATCHES = 30
 """Pairs with fewer are now and then wrong themselves."""
-_MIN_AGREEING = 0.5
+_MIN_INLIER_RATIO = 0.5
 """Share of a pair's matches that the map's poses have to explain."""
-_MAX_CONTRADICTED = 0.25
+_MAX_IMAGE_INCONSISTENT_RATIO = 0.25
 """Share of a keyframe's matches in contradicted pairs above which its place is doubted."""
 
-MAX_CONTRADICTED_SHARE = 0.1
+MAX_INCONSISTENT_RATIO = 0.1
 """Right maps of nine captures: 0 to 0.9 %. A bare room with three pictures hung again and again, folded onto
 itself by a metre: 22 %."""
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class PairConsistency:
     """A verified pair and what the map makes of it."""
 
     first: int
@@ -41,7 +41,7 @@ class Link:
     agreeing: float
 
 
-def links_of(workspace: Path, model: pycolmap.Reconstruction) -> list[Link]:
+def evaluate_pairs(workspace: Path, model: pycolmap.Reconstruction) -> list[PairConsistency]:
     """Hold every verified pair of registered keyframes against the map's poses.
 
     Source: the symmetric epipolar distance of Hartley, Zisserman, "Multiple view geometry", 2004, 11.4.
@@ -62,11 +62,11 @@ def links_of(workspace: Path, model: pycolmap.Reconstruction) -> list[Link]:
         for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
             a, b = map(int, pycolmap.pair_id_to_image_pair(pair))
             matches = np.asarray(geometry.inlier_matches)
-            if a in poses and b in poses and len(matches) >= _MIN_INLIERS:
+            if a in poses and b in poses and len(matches) >= _MIN_PAIR_MATCHES:
                 error = focal[a] * _epipolar(
                     rays[a][matches[:, 0]], rays[b][matches[:, 1]], poses[a], poses[b]
                 )
-                out.append(Link(a, b, len(matches), float((error < _MAX_ERROR_PX).mean())))
+                out.append(PairConsistency(a, b, len(matches), float((error < _MAX_ERROR_PX).mean())))
     return out
 
 
@@ -82,7 +82,7 @@ def _epipolar(first: FloatArray, second: FloatArray, pose_a: Any, pose_b: Any) -
     return np.asarray(numerator / np.sqrt(np.maximum(slope, 1e-18)))
 
 
-def doubtful(links: Sequence[Link]) -> set[int]:
+def find_misregistered_images(links: Sequence[PairConsistency]) -> set[int]:
     """Keyframes in the wrong place: the fewest whose removal leaves no contradiction of weight.
 
     Greedily takes out the keyframe with the largest share of its matches in contradicted pairs: a misplaced
@@ -93,7 +93,7 @@ def doubtful(links: Sequence[Link]) -> set[int]:
     for link in links:
         for one, other in ((link.first, link.second), (link.second, link.first)):
             total[one] = total.get(one, 0) + link.inliers
-            if link.agreeing < _MIN_AGREEING:
+            if link.agreeing < _MIN_INLIER_RATIO:
                 wrong.setdefault(one, {})[other] = link.inliers
     out: set[int] = set()
     while True:
@@ -103,28 +103,28 @@ def doubtful(links: Sequence[Link]) -> set[int]:
             if image not in out
         }
         worst = max(sorted(share), key=lambda image: share[image], default=None)
-        if worst is None or share[worst] <= _MAX_CONTRADICTED:
+        if worst is None or share[worst] <= _MAX_IMAGE_INCONSISTENT_RATIO:
             return out
         out.add(worst)
 
 
-def contradicted_share(links: Sequence[Link]) -> float:
+def inconsistent_match_ratio(links: Sequence[PairConsistency]) -> float:
     """Share of all matches in verified pairs that belong to pairs the map contradicts."""
-    wrong = sum(link.inliers for link in links if link.agreeing < _MIN_AGREEING)
+    wrong = sum(link.inliers for link in links if link.agreeing < _MIN_INLIER_RATIO)
     return wrong / max(1, sum(link.inliers for link in links))
 
 
-def inconsistent(share: float, reach: Mapping[str, object] | None) -> EstimationError | None:
+def check_consistency(share: float, reach: Mapping[str, object] | None) -> EstimationError | None:
     """What to say of a map that a good part of its own pairs contradict: rooms whose parts look the same.
 
     Args:
-        share: `contradicted_share` of the map.
+        share: `inconsistent_match_ratio` of the map.
         reach: What the body's reach says, if there is a body.
 
     Returns:
         The error; None where the map can be right.
     """
-    if share <= MAX_CONTRADICTED_SHARE:
+    if share <= MAX_INCONSISTENT_RATIO:
         return None
     body = ""
     if reach is not None:
@@ -137,7 +137,7 @@ def inconsistent(share: float, reach: Mapping[str, object] | None) -> Estimation
     )
 
 
-def too_few(
+def check_coverage(
     models: Sequence[Any], keyframes: int, ladder: object, options: MapOptions
 ) -> EstimationError | None:
     """What to say of models that hold too few of the keyframes; None where they hold enough."""

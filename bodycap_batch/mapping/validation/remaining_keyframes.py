@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Any
 
-from bodycap_batch.mapping.matching.database import DATABASE_NAME, Pair, image_ids
+from bodycap_batch.mapping.matching.database import DATABASE_NAME, Pair, read_image_ids
 from bodycap_batch.mapping.matching.pair_matching import match_pairs
-from bodycap_batch.mapping.matching.pair_selection import PairChooser
-from bodycap_batch.mapping.reconstruction.bundle_adjustment import refine, settle
-from bodycap_batch.mapping.reconstruction.incremental_mapper import place
-from bodycap_batch.mapping.reconstruction.reconstruct import size, ticker
-from bodycap_batch.mapping.validation.repair import uncontradicted
-from bodycap_batch.mapping.workspace import Workshop
+from bodycap_batch.mapping.matching.pair_selection import PairGenerator
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, adjust_robustly
+from bodycap_batch.mapping.reconstruction.incremental_mapper import resect_images
+from bodycap_batch.mapping.reconstruction.reconstruct import model_order, progress_counter
+from bodycap_batch.mapping.validation.repair import remove_without_adjustment
+from bodycap_batch.mapping.workspace import MappingContext
 
 
-def place_others(
-    models: list[Any], chooser: PairChooser, tried: Collection[Pair], shop: Workshop
+def resect_remaining(
+    models: list[Any], chooser: PairGenerator, tried: Collection[Pair], shop: MappingContext
 ) -> tuple[list[set[int]], dict[str, object]]:
     """Settle maps, and place the keyframes in them, in place, that carry none; no pose that stands is moved.
 
@@ -37,28 +37,28 @@ def place_others(
     import pycolmap
 
     with pycolmap.Database.open(str(shop.workspace / DATABASE_NAME)) as database:
-        ids = image_ids(database)
+        ids = read_image_ids(database)
     carrying = {int(number) for model in models for number in model.reg_image_ids()}
     wanted = [ref for ref in chooser.refs if ids[ref] not in carrying]
     chosen = chooser.placing([ref for ref in chooser.refs if ids[ref] in carrying], wanted)
     pairs = [pair for pair in chosen if pair not in tried]
     held = match_pairs(shop.workspace, pairs, shop.lenses, shop.context)
     left = {ids[ref] for ref in wanted}
-    tick = ticker(shop.context, len(ids), shop.context.check_cancelled, len(carrying))
+    tick = progress_counter(shop.context, len(ids), shop.context.check_cancelled, len(carrying))
     cut = list[str]()
     made = list[tuple[Any, set[int], float]]()
     for model in models:
-        settle(model, shop.settings(), shop.constant)
-        found = place(shop.workspace, shop.settings(), model, left, tick)
+        adjust_robustly(model, shop.settings(), shop.constant)
+        found = resect_images(shop.workspace, shop.settings(), model, left, tick)
         kept, names, share = model, list[str](), 0.0
         if found:
-            refine(model, shop.settings(), shop.constant, found)
-            kept, names, share = uncontradicted(model, shop)
+            adjust_and_filter(model, shop.settings(), shop.constant, found)
+            kept, names, share = remove_without_adjustment(model, shop)
         cut += names
         found &= set(map(int, kept.reg_image_ids()))
         left -= found
         made.append((kept, found, share))
-    made.sort(key=lambda item: size(item[0]))
+    made.sort(key=lambda item: model_order(item[0]))
     models[:] = [model for model, _, _ in made]
     placed = [found for _, found, _ in made]
     return placed, {

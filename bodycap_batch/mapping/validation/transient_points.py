@@ -11,13 +11,13 @@ from bodycap_batch.mapping.matching.database import ImageRef
 if TYPE_CHECKING:
     import pycolmap
 
-_MOMENT_NS = 1_000_000_000
-_ENOUGH = 20
+_MIN_STATIC_NS = 1_000_000_000
+_MIN_STATIC_POINTS = 20
 """Confirmed points that carry a keyframe without the others. With 15 and 30 the first capture told of below
 has 0.93 and 0.99 cm."""
 
 
-def drop_unconfirmed(model: pycolmap.Reconstruction, times_ns: Mapping[str, IntArray]) -> int:
+def remove_transient_points(model: pycolmap.Reconstruction, times_ns: Mapping[str, IntArray]) -> int:
     """Take points out of a model that no other camera and no other time confirms; how many.
 
     What moves with a camera is a still room to that camera, for a moment, and pulls its keyframes along.
@@ -35,19 +35,19 @@ def drop_unconfirmed(model: pycolmap.Reconstruction, times_ns: Mapping[str, IntA
         int(point): [int(each.image_id) for each in model.point3D(point).track.elements]
         for point in model.point3D_ids()
     }
-    doubted = [point for point, images in sorted(seen.items()) if not _confirmed(images, refs, times_ns)]
+    doubted = [point for point, images in sorted(seen.items()) if not _is_static(images, refs, times_ns)]
     carrying = dict.fromkeys(refs, 0)
     for point in seen.keys() - set(doubted):
         for image in set(seen[point]):
             carrying[image] += 1
-    dropped = [point for point in doubted if all(carrying[image] >= _ENOUGH for image in seen[point])]
+    dropped = [point for point in doubted if all(carrying[image] >= _MIN_STATIC_POINTS for image in seen[point])]
     for point in dropped:
         model.delete_point3D(point)
     return len(dropped)
 
 
-def _confirmed(images: list[int], refs: Mapping[int, Any], times_ns: Mapping[str, IntArray]) -> bool:
+def _is_static(images: list[int], refs: Mapping[int, Any], times_ns: Mapping[str, IntArray]) -> bool:
     if len({refs[image].camera for image in images}) > 1:
         return True
     times = [int(times_ns[refs[image].camera][refs[image].frame]) for image in images]
-    return max(times) - min(times) > _MOMENT_NS
+    return max(times) - min(times) > _MIN_STATIC_NS

@@ -9,7 +9,7 @@ import pytest
 
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.mapping.reconstruction.bundle_adjustment import refine
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter
 from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options
 
 
@@ -32,4 +32,4 @@ def test_an_adjustment_that_fails_is_reported(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", failing)
     with pytest.raises(EstimationError, match="0 keyframes could not be refined: no convergence"):
-        refine(pycolmap.Reconstruction(), mapper_options(MapOptions(), [], 1.0), [])
+        adjust_and_filter(pycolmap.Reconstruction(), mapper_options(MapOptions(), [], 1.0), [])

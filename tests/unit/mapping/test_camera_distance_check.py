@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.mapping.validation.camera_distance_check import best_scale, check_reach
-from bodycap_batch.mapping.validation.epipolar_consistency import Link, contradicted_share, inconsistent
+from bodycap_batch.mapping.validation.camera_distance_check import find_best_scale, check_distances
+from bodycap_batch.mapping.validation.epipolar_consistency import PairConsistency, inconsistent_match_ratio, check_consistency
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.scene import Map
 from bodycap_batch.model.skeleton_presets import camera_reach, load_skeleton, nominal_mount
@@ -47,21 +47,21 @@ def _walk(units_per_metre: float = 1.0, shift_m: float = 0.0, rows: slice = slic
 
 @pytest.mark.parametrize("units_per_metre", [0.1, 1.0, 10.0])
 def test_scale_changes_no_verdict(units_per_metre: float) -> None:
-    right = check_reach(_walk(units_per_metre), _TIMES, _REACH)
+    right = check_distances(_walk(units_per_metre), _TIMES, _REACH)
     assert right.judged
     assert right.explained == 1.0
     assert not right.violating.any()
     # A hand 15 m off for four keyframes: 0.5 m and 15 m cannot both lie within a factor of ten.
-    wrong = check_reach(_walk(units_per_metre, 15.0, slice(10, 14)), _TIMES, _REACH)
+    wrong = check_distances(_walk(units_per_metre, 15.0, slice(10, 14)), _TIMES, _REACH)
     assert wrong.judged
     assert np.flatnonzero(wrong.violating).tolist()[:4] == list(range(10, 14))
-    assert wrong.to_log() == check_reach(_walk(1.0, 15.0, slice(10, 14)), _TIMES, _REACH).to_log()
+    assert wrong.to_log() == check_distances(_walk(1.0, 15.0, slice(10, 14)), _TIMES, _REACH).to_log()
 
 
 def test_one_keyframe_off_is_noise_and_half_of_them_no_body() -> None:
-    assert not check_reach(_walk(1.0, 15.0, slice(12, 13)), _TIMES, _REACH).violating.any()
+    assert not check_distances(_walk(1.0, 15.0, slice(12, 13)), _TIMES, _REACH).violating.any()
     folded = _walk(1.0, 15.0, slice(0, 15))
-    verdict = check_reach(folded, _TIMES, _REACH)
+    verdict = check_distances(folded, _TIMES, _REACH)
     assert not verdict.judged
     assert not verdict.violating.any()
     assert "no scale" in str(verdict.to_log()["reason"])
@@ -69,13 +69,13 @@ def test_one_keyframe_off_is_noise_and_half_of_them_no_body() -> None:
 
 def test_without_instants_in_common_nothing_is_said() -> None:
     later = {"hand": _TIMES["hand"], "torso": _TIMES["torso"] + 10**12}
-    assert not check_reach(_walk(), later, _REACH).judged
-    assert not check_reach(replace(_walk(), gauge="h"), _TIMES, {}).judged
+    assert not check_distances(_walk(), later, _REACH).judged
+    assert not check_distances(replace(_walk(), gauge="h"), _TIMES, {}).judged
 
 
 def test_the_best_scale_lies_in_most_intervals() -> None:
     low, high = np.array([0.0, 1.0, 2.0, 9.0]), np.array([3.0, 4.0, 5.0, 10.0])
-    middle, share = best_scale(low, high)
+    middle, share = find_best_scale(low, high)
     assert 2.0 <= middle <= 3.0
     assert share == 0.75
 
@@ -93,11 +93,11 @@ def test_reach_of_the_standard_body() -> None:
 
 
 def test_a_map_that_its_pairs_contradict_is_refused() -> None:
-    links = [Link(0, other, 50, 1.0) for other in range(1, 8)] + [
-        Link(0, other, 50, 0.1) for other in (8, 9, 10)
+    links = [PairConsistency(0, other, 50, 1.0) for other in range(1, 8)] + [
+        PairConsistency(0, other, 50, 0.1) for other in (8, 9, 10)
     ]
-    assert contradicted_share(links) == pytest.approx(0.3)
-    assert inconsistent(0.05, None) is None
-    error = inconsistent(contradicted_share(links), {"reason": "no scale fits"})
+    assert inconsistent_match_ratio(links) == pytest.approx(0.3)
+    assert check_consistency(0.05, None) is None
+    error = check_consistency(inconsistent_match_ratio(links), {"reason": "no scale fits"})
     assert error is not None
     assert re.search(r"30% .* look the same .* no scale fits", error.message)

@@ -18,18 +18,18 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions, MergeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.mapping.matching.database import DATABASE_NAME, add_keyframes, image_ids, keypoint_colours
+from bodycap_batch.mapping.matching.database import DATABASE_NAME, add_keyframes, read_image_ids, read_keypoint_colours
 from bodycap_batch.mapping.matching.flipped_cameras import (
-    MIRROR_IMAGES,
-    MIRRORED,
-    _judged,
-    explained,
-    flipped,
-    mirror_note,
-    mirror_notes,
-    without_mirrored,
+    UNDECIDED_GROUPS,
+    FLIPPED_CAMERAS,
+    label_cameras,
+    add_flip_hint,
+    mirror_descriptors,
+    excluded_camera_note,
+    flip_notes,
+    exclude_flipped_cameras,
 )
-from bodycap_batch.mapping.matching.retrieval import clear_matches, largest
+from bodycap_batch.mapping.matching.retrieval import count_ratio_test_matches, largest_descriptors
 from bodycap_batch.model.scene import KeyframeSelection
 from bodycap_batch.tasks import merge
 from bodycap_batch.tasks.inputs import ArtefactRef
@@ -94,7 +94,7 @@ def _workspace(folder: Path, *cameras: _Pan) -> list[KeyframeSelection]:
 
 def _left(folder: Path, *cameras: _Pan) -> tuple[list[str], dict[str, Any]]:
     """Names of the cameras that are not left out, and the log."""
-    left, _, log = without_mirrored(folder, _workspace(folder, *cameras), MapOptions())
+    left, _, log = exclude_flipped_cameras(folder, _workspace(folder, *cameras), MapOptions())
     return [item.camera for item in left], log
 
 
@@ -110,9 +110,9 @@ def _content(folder: Path) -> list[tuple[Any, ...]]:
                 database.read_image(number).camera_id,
                 np.asarray(database.read_keypoints(number)).tobytes(),
                 np.asarray(database.read_descriptors(number).data).tobytes(),
-                keypoint_colours(folder, number).tobytes(),
+                read_keypoint_colours(folder, number).tobytes(),
             )
-            for ref, number in sorted(image_ids(database).items())
+            for ref, number in sorted(read_image_ids(database).items())
         ]
 
 
@@ -125,18 +125,18 @@ def test_descriptors_of_a_mirrored_picture_are_known_without_it() -> None:
         rooted = 512 * np.sqrt(raw / raw.sum(axis=1, keepdims=True))
         bytes_ = rooted.round().clip(0, 255).astype(np.uint8)
         shape = np.array([(*each.pt, each.size, each.angle) for each in points], np.float32)
-        return largest(flipped(bytes_) if mirrored else bytes_, shape)
+        return largest_descriptors(mirror_descriptors(bytes_) if mirrored else bytes_, shape)
 
     there = found(np.ascontiguousarray(image[:, ::-1]), mirrored=False)
     # Nearly all of 128; features found on one side only and those with two directions are lost.
-    assert clear_matches(found(image, mirrored=True), there[None])[0] > 90
-    assert clear_matches(found(image, mirrored=False), there[None])[0] < 15
+    assert count_ratio_test_matches(found(image, mirrored=True), there[None])[0] > 90
+    assert count_ratio_test_matches(found(image, mirrored=False), there[None])[0] < 15
 
 
 def test_the_mirrored_one_of_three_is_left_out(tmp_path: Path) -> None:
     cameras = _Pan("head", 300), _Pan("left", 0, mirrored=True), _Pan("torso", 150, upside_down=True)
-    assert _left(tmp_path, *cameras) == (["head", "torso"], {MIRRORED: ["left"]})
-    assert "camera left shows the room mirrored" in mirror_note("left")
+    assert _left(tmp_path, *cameras) == (["head", "torso"], {FLIPPED_CAMERAS: ["left"]})
+    assert "camera left shows the room mirrored" in excluded_camera_note("left")
 
 
 def test_the_database_is_then_as_if_it_had_never_been_there(tmp_path: Path) -> None:
@@ -161,12 +161,12 @@ def test_a_camera_without_keyframes_is_kept(tmp_path: Path) -> None:
 
 def test_two_that_see_mirror_images_are_both_kept_and_named(tmp_path: Path) -> None:
     left, log = _left(tmp_path, _Pan("left", 0, mirrored=True), _Pan("torso", 150))
-    assert (left, log) == (["left", "torso"], {MIRROR_IMAGES: [[["left"], ["torso"]]]})
-    (note,) = mirror_notes(log)
+    assert (left, log) == (["left", "torso"], {UNDECIDED_GROUPS: [[["left"], ["torso"]]]})
+    (note,) = flip_notes(log)
     assert note.startswith("cameras left and torso see mirror images of each other: that is right where")
     assert note.count("wrong") == 1
     assert note.endswith("flip it back: ffmpeg -i in -vf hflip out.mp4")
-    error = explained(EstimationError("too few", hint="film more"), log)
+    error = add_flip_hint(EstimationError("too few", hint="film more"), log)
     assert error is not None
     assert error.hint is not None
     assert error.hint.startswith("cameras left and torso see mirror images")
@@ -179,7 +179,7 @@ def test_a_body_that_cannot_be_solved_then_tells_of_the_mirror(
     def refuse(*_: object) -> None:
         raise EstimationError("the body cannot place left", hint="film more")
 
-    mapped = SimpleNamespace(log={MIRROR_IMAGES: [[["left"], ["torso"]]]})
+    mapped = SimpleNamespace(log={UNDECIDED_GROUPS: [[["left"], ["torso"]]]})
     monkeypatch.setattr(merging, "merge_trajectories", refuse)
     monkeypatch.setattr(merge, "_merge_inputs", lambda _: None)
     monkeypatch.setattr(merge, "load_map", lambda _: mapped)
@@ -199,16 +199,16 @@ def test_a_body_that_cannot_be_solved_then_tells_of_the_mirror(
 def test_a_first_pair_of_a_camera_that_is_left_out_is_not_used(tmp_path: Path) -> None:
     cameras = _Pan("head", 300), _Pan("left", 0, mirrored=True), _Pan("torso", 150)
     named = MapOptions(init_frames=("left:1", "torso:2"))
-    _, options, log = without_mirrored(tmp_path, _workspace(tmp_path, *cameras), named)
+    _, options, log = exclude_flipped_cameras(tmp_path, _workspace(tmp_path, *cameras), named)
     assert options.init_frames is None
     assert "left out" in log["named_initial_pair"]["failed"]
-    assert "map.init_frames names camera left, which is left out: it is not used" in mirror_notes(log)
+    assert "map.init_frames names camera left, which is left out: it is not used" in flip_notes(log)
 
 
 def _told(evidence: dict[str, int]) -> tuple[set[str], list[list[list[str]]]]:
     """The judgement on five cameras of one letter; it is the same in whatever order they come."""
     found = [
-        _judged(cameras, {(pair[0], pair[1]): each for pair, each in evidence.items()})
+        label_cameras(cameras, {(pair[0], pair[1]): each for pair, each in evidence.items()})
         for cameras in permutations("abcde")
     ]
     assert all(each == found[0] for each in found)

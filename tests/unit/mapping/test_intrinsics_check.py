@@ -6,12 +6,12 @@ import pytest
 
 from bodycap_batch.config import MapOptions
 from bodycap_batch.mapping.intrinsics.intrinsics_check import (
-    better_lenses,
+    select_camera_models,
     misfit_note,
-    misfitting_lenses,
-    recentred_lenses,
+    find_misfit_intrinsics,
+    refine_principal_points,
 )
-from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import bundle_adjust
 from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options
 from bodycap_batch.model.geometry import so3_exp
 
@@ -31,7 +31,7 @@ def _model(factor, noise_px=0.5):
         camera.params = params
     settings = mapper_options(MapOptions(), list(model.cameras), 1.0)
     if factor != 1.0:
-        adjust(model, settings, list(model.cameras), 60)
+        bundle_adjust(model, settings, list(model.cameras), 60)
     return model, settings
 
 
@@ -41,14 +41,14 @@ def _names(model):
 
 def test_the_right_lens_raises_no_alarm():
     model, settings = _model(1.0)
-    assert misfitting_lenses(model, settings, _names(model)) == {}
+    assert find_misfit_intrinsics(model, settings, _names(model)) == {}
 
 
 @pytest.mark.parametrize("factor", [0.85, 1.15])
 def test_a_wrong_focal_length_is_found_and_measured(factor):
     model, settings = _model(factor)
     before = [np.array(camera.params) for camera in model.cameras.values()]
-    found = misfitting_lenses(model, settings, _names(model))
+    found = find_misfit_intrinsics(model, settings, _names(model))
     assert set(found) == set(_names(model).values())
     # 200 points at half a pixel, 24 pictures all around: well below a percent.
     assert all(value == pytest.approx(1.0 / factor, rel=0.02) for value in found.values())
@@ -60,20 +60,20 @@ def test_a_centre_that_was_given_wrongly_is_found():
     model, settings = _guessed("SIMPLE_RADIAL", [1280, 512, 384, 0.0], [1280, 600, 330, 0.0])
     for camera in model.cameras.values():
         camera.params = [1280, 600, 330, 0.0]
-    adjust(model, settings, list(model.cameras), 60)
-    found = misfitting_lenses(model, settings, _names(model))
+    bundle_adjust(model, settings, list(model.cameras), 60)
+    found = find_misfit_intrinsics(model, settings, _names(model))
     assert set(found) == set(_names(model).values())
     assert all(value == pytest.approx(1.0, abs=0.03) for value in found.values())
 
 
 def test_only_given_lenses_are_judged_and_a_handful_of_pictures_is_not():
     model, settings = _model(0.85)
-    assert misfitting_lenses(model, settings, {}) == {}
+    assert find_misfit_intrinsics(model, settings, {}) == {}
     first = next(iter(model.cameras))
-    assert set(misfitting_lenses(model, settings, {first: "torso"})) == {"torso"}
+    assert set(find_misfit_intrinsics(model, settings, {first: "torso"})) == {"torso"}
     for image_id in sorted(model.reg_image_ids())[9:]:
         model.deregister_frame(model.image(image_id).frame_id)
-    assert misfitting_lenses(model, settings, _names(model)) == {}
+    assert find_misfit_intrinsics(model, settings, _names(model)) == {}
 
 
 def test_the_note_says_what_to_do():
@@ -93,8 +93,8 @@ def test_a_lens_flagged_for_its_centre_alone_is_not_said_to_have_another_focal_l
 
 def test_a_guessed_lens_that_fits_keeps_its_model():
     model, settings = _model(1.0)
-    assert better_lenses(model, settings, set(model.cameras)) == ({}, frozenset())
-    assert better_lenses(model, settings, set()) == ({}, frozenset())
+    assert select_camera_models(model, settings, set(model.cameras)) == ({}, frozenset())
+    assert select_camera_models(model, settings, set()) == ({}, frozenset())
 
 
 def _guessed(model_name, params, wrong):
@@ -110,13 +110,13 @@ def _guessed(model_name, params, wrong):
     for camera in model.cameras.values():
         camera.model, camera.params = pycolmap.CameraModelId.SIMPLE_RADIAL, wrong
     settings = mapper_options(MapOptions(), [], 1.0)
-    adjust(model, settings, [], 60)
+    bundle_adjust(model, settings, [], 60)
     return model, settings
 
 
 def test_a_picture_cropped_off_its_centre_gets_its_principal_point():
     model, settings = _guessed("SIMPLE_RADIAL", [1280, 640, 300, 0.0], [1280, 512, 384, 0.0])
-    found, decentred = better_lenses(model, settings, set(model.cameras))
+    found, decentred = select_camera_models(model, settings, set(model.cameras))
     assert set(found) == decentred == set(model.cameras)
     for camera in found.values():
         # It was 128 and 84 px off; the mapped points that suited the wrong lens still hold it a little.
@@ -126,7 +126,7 @@ def test_a_picture_cropped_off_its_centre_gets_its_principal_point():
 
 def test_pixels_that_are_not_square_get_a_focal_length_for_each_axis():
     model, settings = _guessed("PINHOLE", [960, 1280, 512, 384], [1100, 512, 384, 0.0])
-    found, decentred = better_lenses(model, settings, set(model.cameras))
+    found, decentred = select_camera_models(model, settings, set(model.cameras))
     assert set(found) == set(model.cameras)
     assert decentred == frozenset()
     for camera in found.values():
@@ -138,7 +138,7 @@ def test_square_pixels_keep_one_focal_length_however_much_its_model_helps():
     # A lens that is not in line: that model bends across the radius, too.
     lens = [1280, 1280, 512, 384, -0.05, 0.0, 0.01, -0.01]
     model, settings = _guessed("OPENCV", lens, [1280, 512, 384, 0.0])
-    found, _ = better_lenses(model, settings, set(model.cameras))
+    found, _ = select_camera_models(model, settings, set(model.cameras))
     assert "OPENCV" not in {camera.model_name for camera in found.values()}
 
 
@@ -170,8 +170,8 @@ def test_a_fisheye_lens_with_square_pixels_gets_a_second_radial_term():
     model = _wide([400, 400, 512, 384, -0.1, 0.06, 0.0, 0.0])
     settings = mapper_options(MapOptions(), [], 1.0)
     model.camera(1).model, model.camera(1).params = pycolmap.CameraModelId.SIMPLE_RADIAL, [440, 512, 384, 0]
-    adjust(model, settings, [], 60)
-    found, decentred = better_lenses(model, settings, set(model.cameras))
+    bundle_adjust(model, settings, [], 60)
+    found, decentred = select_camera_models(model, settings, set(model.cameras))
     assert set(found) == set(model.cameras)
     assert decentred == frozenset()
     for camera in found.values():
@@ -189,7 +189,7 @@ def test_a_few_keypoints_do_not_tell_that_pixels_are_not_square():
     seen = [row for row, point in enumerate(image.points2D) if point.has_point3D()]
     for row in seen[8 * 10 - 1 :]:
         model.delete_observation(mine[0], row)
-    found, _ = better_lenses(model, settings, {first, second})
+    found, _ = select_camera_models(model, settings, {first, second})
     assert {number: camera.model_name for number, camera in found.items()} == {first: "OPENCV"}
 
 
@@ -198,17 +198,17 @@ def test_a_lens_that_was_given_stays_while_another_is_guessed():
     guessed, given = sorted(model.cameras)
     settings = mapper_options(MapOptions(), [given], 1.0)
     model.camera(given).params = [1280, 640, 300, 0.0]
-    adjust(model, settings, [given], 60)
+    bundle_adjust(model, settings, [given], 60)
     # The guess is right, and what is wrong was given: nothing of the guessed lens explains it.
-    assert better_lenses(model, settings, {guessed}) == ({}, frozenset())
-    assert set(better_lenses(model, settings, {guessed, given})[0]) == {guessed, given}
+    assert select_camera_models(model, settings, {guessed}) == ({}, frozenset())
+    assert set(select_camera_models(model, settings, {guessed, given})[0]) == {guessed, given}
 
 
 def test_what_is_off_the_centre_is_found_anew_in_a_better_map():
     model, settings = _guessed("SIMPLE_RADIAL", [1280, 640, 300, 0.0], [1280, 600, 330, 0.0])
-    found = recentred_lenses(model, settings, set(model.cameras))
+    found = refine_principal_points(model, settings, set(model.cameras))
     assert set(found) == set(model.cameras)
     assert all(camera.params[1:3] == pytest.approx([640, 300], abs=5.0) for camera in found.values())
     right, settings = _guessed("SIMPLE_RADIAL", [1280, 640, 300, 0.0], [1280, 640, 300, 0.0])
-    assert recentred_lenses(right, settings, set(right.cameras)) == {}
-    assert recentred_lenses(model, settings, set()) == {}
+    assert refine_principal_points(right, settings, set(right.cameras)) == {}
+    assert refine_principal_points(model, settings, set()) == {}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
-from bodycap_batch.mapping.matching.pair_matching import View, mutual_matches, verified
+from bodycap_batch.mapping.matching.pair_matching import KeyframeFeatures, find_mutual_matches, verify_pair
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import so3_exp
 
@@ -25,7 +25,7 @@ def test_features_seen_twice_are_matched_and_nothing_else() -> None:
     rng = np.random.default_rng(0)
     shared, only_first, only_second = (_unit_bytes(rng, 60) for _ in range(3))
     noisy = np.clip(shared + rng.integers(-3, 4, shared.shape), 0, 255).astype(np.float32)
-    found = mutual_matches(np.concatenate([only_first, shared]), np.concatenate([noisy, only_second]))
+    found = find_mutual_matches(np.concatenate([only_first, shared]), np.concatenate([noisy, only_second]))
     assert found.tolist() == [[60 + row, row] for row in range(60)]
 
 
@@ -33,7 +33,7 @@ def test_a_feature_with_two_likenesses_is_left_out() -> None:
     rng = np.random.default_rng(1)
     first = _unit_bytes(rng, 40)
     twice = np.concatenate([first, first[:10]])
-    found = mutual_matches(first, twice)
+    found = find_mutual_matches(first, twice)
     assert sorted(found[:, 0]) == list(range(10, 40))
 
 
@@ -41,7 +41,7 @@ def test_of_two_features_equally_near_to_a_third_the_first_has_it() -> None:
     rng = np.random.default_rng(4)
     second = _unit_bytes(rng, 40)
     first = np.concatenate([second[:1], second])
-    found = mutual_matches(first, second)
+    found = find_mutual_matches(first, second)
     assert found.tolist() == [[0, 0], *([row + 1, row] for row in range(1, 40))]
 
 
@@ -52,7 +52,7 @@ def test_the_order_of_sums_does_not_matter() -> None:
     assert (first @ second.T == backwards).all()
 
 
-def _two_views(rng: np.random.Generator, *, calibrated: bool) -> tuple[View, View, IntArray, int]:
+def _two_views(rng: np.random.Generator, *, calibrated: bool) -> tuple[KeyframeFeatures, KeyframeFeatures, IntArray, int]:
     """100 right matches between two views 0.5 apart with half a pixel of noise, then 100 wrong ones."""
     points = rng.uniform((-2, -1.5, 3), (2, 1.5, 6), (100, 3))
     turned = points @ so3_exp(np.array([0.02, 0.15, -0.03])).T + (0.5, 0.05, 0.1)
@@ -62,33 +62,33 @@ def _two_views(rng: np.random.Generator, *, calibrated: bool) -> tuple[View, Vie
     return views[0], views[1], np.column_stack([np.arange(200)] * 2), 100
 
 
-def _view(pixels: FloatArray, calibrated: bool) -> View:
+def _view(pixels: FloatArray, calibrated: bool) -> KeyframeFeatures:
     rays = _LENS.unproject(pixels) if calibrated else pixels
-    return View(descriptors=_NONE, rays=rays, error=4 / 420 if calibrated else 4.0, calibrated=calibrated)
+    return KeyframeFeatures(descriptors=_NONE, rays=rays, error=4 / 420 if calibrated else 4.0, calibrated=calibrated)
 
 
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_verification_keeps_what_one_motion_explains(calibrated: bool) -> None:
     a, b, matches, right = _two_views(np.random.default_rng(3), calibrated=calibrated)
-    kept = verified(matches, a, b)
+    kept = verify_pair(matches, a, b)
     # 4 px is 8 sigma: nothing right is lost. A stray match hits a band of 8 px out of 480 by chance 2 %
     # of the time; 12 of 100 would be five sigma above that.
     assert set(range(right)) <= set(kept[:, 0].tolist())
     assert len(kept) <= right + 12
-    assert kept.tolist() == verified(matches, a, b).tolist()
+    assert kept.tolist() == verify_pair(matches, a, b).tolist()
 
 
 def test_unrelated_views_do_not_hold() -> None:
     a, b, matches, right = _two_views(np.random.default_rng(4), calibrated=True)
     # Of 100 strays, one essential matrix picked among 400 explains a dozen or two; a hundred never.
-    assert len(verified(matches[right:], a, b)) < 40
-    assert len(verified(matches[:14], a, b)) == 0
+    assert len(verify_pair(matches[right:], a, b)) < 40
+    assert len(verify_pair(matches[:14], a, b)) == 0
 
 
 def test_a_known_lens_beside_an_unknown_one_is_verified_in_pixels() -> None:
     a, _, matches, right = _two_views(np.random.default_rng(3), calibrated=True)
     _, b, _, _ = _two_views(np.random.default_rng(3), calibrated=False)
-    kept = verified(matches, a, b)
+    kept = verify_pair(matches, a, b)
     assert set(range(right)) <= set(kept[:, 0].tolist())
     assert len(kept) <= right + 12
 
@@ -102,4 +102,4 @@ def test_a_fit_that_fails_inside_opencv_does_not_hold(
 
     a, b, matches, _ = _two_views(np.random.default_rng(3), calibrated=calibrated)
     monkeypatch.setattr(cv2, "findEssentialMat" if calibrated else "findFundamentalMat", failing)
-    assert len(verified(matches, a, b)) == 0
+    assert len(verify_pair(matches, a, b)) == 0

@@ -12,8 +12,8 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef
-from bodycap_batch.mapping.matching.pair_selection import PairChooser
-from bodycap_batch.mapping.matching.retrieval import CHANCE, _clear, largest, likeness
+from bodycap_batch.mapping.matching.pair_selection import PairGenerator
+from bodycap_batch.mapping.matching.retrieval import MIN_RETRIEVAL_MATCHES, _count_matches, largest_descriptors, count_preemptive_matches
 
 
 def _keypoints(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -33,44 +33,44 @@ def test_two_views_of_a_place_are_alike_and_others_not(tmp_path: Path) -> None:
     for _ in range(40):  # more than are looked at together
         descriptors, keypoints = _rooted(rng, 60), _keypoints(rng, 60)
         noisy = np.clip(descriptors + rng.normal(0, 4, descriptors.shape), 0, 255).astype(np.uint8)
-        images += [largest(descriptors, keypoints), largest(noisy, keypoints)]
+        images += [largest_descriptors(descriptors, keypoints), largest_descriptors(noisy, keypoints)]
     rows = list(range(0, 80, 7))
     every = np.array(images)
-    alike = likeness(every, rows, ["a"] * 80, StageContext(work_dir=tmp_path))
-    assert (likeness(every, rows, ["a"] * 80, StageContext(work_dir=tmp_path, threads=3)) == alike).all()
+    alike = count_preemptive_matches(every, rows, ["a"] * 80, StageContext(work_dir=tmp_path))
+    assert (count_preemptive_matches(every, rows, ["a"] * 80, StageContext(work_dir=tmp_path, threads=3)) == alike).all()
     partner = np.array(rows) ^ 1
     assert (alike[np.arange(len(rows)), partner] >= 50).all()
     alike[np.arange(len(rows)), partner] = 0
-    assert (alike < CHANCE).mean() > 0.99
-    empty = np.array([largest(_rooted(rng, 0), _keypoints(rng, 0))] * 2)
-    assert not likeness(empty, [0], ["a", "a"], StageContext(work_dir=tmp_path)).any()
+    assert (alike < MIN_RETRIEVAL_MATCHES).mean() > 0.99
+    empty = np.array([largest_descriptors(_rooted(rng, 0), _keypoints(rng, 0))] * 2)
+    assert not count_preemptive_matches(empty, [0], ["a", "a"], StageContext(work_dir=tmp_path)).any()
 
 
 def test_what_could_be_alike_is_found_without_looking_at_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(2)
-    monkeypatch.setattr("bodycap_batch.mapping.matching.retrieval._SHORTLIST", 12)
-    monkeypatch.setattr("bodycap_batch.mapping.matching.retrieval._SHORTLIST_OF_EACH", 2)
+    monkeypatch.setattr("bodycap_batch.mapping.matching.retrieval._SHORTLIST_SIZE", 12)
+    monkeypatch.setattr("bodycap_batch.mapping.matching.retrieval._SHORTLIST_SIZE_PER_CAMERA", 2)
     looked: list[int] = []
 
     def counted(alike: np.ndarray) -> np.ndarray:
         looked.append(alike.shape[1])
-        return _clear(alike)
+        return _count_matches(alike)
 
-    monkeypatch.setattr("bodycap_batch.mapping.matching.retrieval._clear", counted)
+    monkeypatch.setattr("bodycap_batch.mapping.matching.retrieval._count_matches", counted)
     images, cameras = [], []
     for number in range(120):
         descriptors, keypoints = _rooted(rng, 80), _keypoints(rng, 80)
         # Half of what an image shows is seen from somewhere else too, by another camera.
         other = np.vstack([descriptors[:40], _rooted(rng, 40)])
         noisy = np.clip(other + rng.normal(0, 4, other.shape), 0, 255).astype(np.uint8)
-        images += [largest(descriptors, keypoints), largest(noisy, keypoints)]
+        images += [largest_descriptors(descriptors, keypoints), largest_descriptors(noisy, keypoints)]
         cameras += ["a", "b" if number else "c"]
     rows = list(range(240))
     told = list[tuple[int, int]]()
     context = StageContext(work_dir=tmp_path, progress=lambda done, total, _: told.append((done, total)))
-    alike = likeness(np.array(images), rows, cameras, context)
+    alike = count_preemptive_matches(np.array(images), rows, cameras, context)
     assert told == [(number, 240) for number in rows]
     partner = np.array(rows) ^ 1
     assert (alike[rows, partner] >= 20).mean() > 0.99
@@ -78,14 +78,14 @@ def test_what_could_be_alike_is_found_without_looking_at_all(
     # 12 of all and 2 of each of three cameras.
     assert sum(looked) <= 18 * len(rows)
     # How many rows are looked at together changes nothing.
-    monkeypatch.setattr("bodycap_batch.mapping.matching.retrieval._BLOCK", 7)
-    assert (likeness(np.array(images), rows, cameras, context) == alike).all()
+    monkeypatch.setattr("bodycap_batch.mapping.matching.retrieval._BLOCK_SIZE", 7)
+    assert (count_preemptive_matches(np.array(images), rows, cameras, context) == alike).all()
 
 
 def test_looking_for_likenesses_stops_on_request(tmp_path: Path) -> None:
     context = StageContext(work_dir=tmp_path, cancelled=lambda: True)
     with pytest.raises(Cancelled):
-        likeness(np.zeros((3, 128, 128), np.float32), [0, 1, 2], ["a"] * 3, context)
+        count_preemptive_matches(np.zeros((3, 128, 128), np.float32), [0, 1, 2], ["a"] * 3, context)
 
 
 def _database(folder: Path, keyframes: int) -> dict[str, np.ndarray]:
@@ -108,7 +108,7 @@ def _database(folder: Path, keyframes: int) -> dict[str, np.ndarray]:
 def test_pairs_per_keyframe_are_bounded(tmp_path: Path, keyframes: int) -> None:
     times = _database(tmp_path, keyframes)
     refs = [ImageRef(camera, frame) for camera in times for frame in range(keyframes)]
-    pairs = PairChooser(
+    pairs = PairGenerator(
         tmp_path, refs, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
     ).first()
     # Per keyframe: 14 neighbours (each pair counts twice), 2 at the same instant, up to 64 that look alike.
@@ -116,7 +116,7 @@ def test_pairs_per_keyframe_are_bounded(tmp_path: Path, keyframes: int) -> None:
     assert len(set(pairs)) == len(pairs)
     assert (ImageRef("a", 7), ImageRef("b", 7)) in pairs
     assert (ImageRef("a", 7), ImageRef("a", 8)) in pairs
-    every = PairChooser(
+    every = PairGenerator(
         tmp_path, refs, times, MapOptions(pairs="exhaustive"), StageContext(work_dir=tmp_path)
     ).first()
     assert len(every) == len(refs) * (len(refs) - 1) // 2
@@ -127,7 +127,7 @@ def test_few_keyframes_are_matched_exhaustively(tmp_path: Path) -> None:
     refs = [ImageRef(camera, frame) for camera in times for frame in range(20)]
     assert (
         len(
-            PairChooser(
+            PairGenerator(
                 tmp_path, refs, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
             ).first()
         )
@@ -138,7 +138,7 @@ def test_few_keyframes_are_matched_exhaustively(tmp_path: Path) -> None:
 def test_growing_matches_new_keyframes_only(tmp_path: Path) -> None:
     times = _database(tmp_path, 70)
     new = [ImageRef("a", 5), ImageRef("b", 30)]
-    chooser = PairChooser(
+    chooser = PairGenerator(
         tmp_path, new, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
     )
     pairs = chooser.first()
@@ -151,7 +151,7 @@ def test_growing_matches_new_keyframes_only(tmp_path: Path) -> None:
 def test_who_is_placed_is_matched_with_those_beside_it_and_some_of_the_map(tmp_path: Path) -> None:
     times = _database(tmp_path, 80)
     refs = [ImageRef(camera, frame) for camera in times for frame in range(80)]
-    chooser = PairChooser(
+    chooser = PairGenerator(
         tmp_path, refs, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
     )
     carrying = [ref for ref in refs if ref.frame % 5 == 0]
@@ -168,7 +168,7 @@ def test_who_is_placed_is_matched_with_those_beside_it_and_some_of_the_map(tmp_p
 def test_what_hangs_by_few_links_is_matched_beside_what_held(tmp_path: Path) -> None:
     times = _database(tmp_path, 80)
     refs = [ImageRef(camera, frame) for camera in times for frame in range(80)]
-    chooser = PairChooser(
+    chooser = PairGenerator(
         tmp_path, refs, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
     )
     a, b = ImageRef("a", 40), ImageRef("b", 10)
@@ -190,10 +190,10 @@ def test_what_hangs_by_few_links_is_matched_beside_what_held(tmp_path: Path) -> 
 def test_a_long_camera_without_links_is_not_matched_with_everything(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bodycap_batch.mapping.matching.pair_selection._RETRIED", 500)
+    monkeypatch.setattr("bodycap_batch.mapping.matching.pair_selection._MAX_RETRY_PAIRS", 500)
     times = _database(tmp_path, 80)
     refs = [ImageRef(camera, frame) for camera in times for frame in range(80)]
-    chooser = PairChooser(
+    chooser = PairGenerator(
         tmp_path, refs, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
     )
     pairs = chooser.unlinked({(refs[0], refs[1]): 50}, set())

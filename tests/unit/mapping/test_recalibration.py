@@ -15,7 +15,7 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.mapping import build
-from bodycap_batch.mapping.intrinsics.recalibration import FREED, as_mapped, freed_where_contradicted
+from bodycap_batch.mapping.intrinsics.recalibration import RECALIBRATED, with_map_intrinsics, recalibrate_if_misfit
 from bodycap_batch.model.scene import MapResult
 from tests.scenes import small_map
 
@@ -50,8 +50,8 @@ def test_a_sensor_that_lies_sideways_does_so_behind_any_lens() -> None:
     palm = CAPTURE.camera("left_palm")
     turned = replace(palm, camera=replace(palm.camera, sideways=True))
     capture = replace(CAPTURE, cameras=(turned, CAPTURE.camera("torso")))
-    found = freed_where_contradicted(_mapped(0.9, {"left_palm": 1.31}), capture, lambda _: _mapped(0.5, {}))
-    later = as_mapped(capture, found)
+    found = recalibrate_if_misfit(_mapped(0.9, {"left_palm": 1.31}), capture, lambda _: _mapped(0.5, {}))
+    later = with_map_intrinsics(capture, found)
     assert {each.name: each.camera.sideways for each in later.cameras} == {"left_palm": True, "torso": False}
 
 
@@ -62,7 +62,7 @@ def test_a_contradicted_lens_starts_from_what_fits_and_is_refined() -> None:
         seen.append(capture)
         return _mapped(0.5, {}, zoom=1.33)
 
-    found = freed_where_contradicted(_mapped(0.9, {"left_palm": 1.31}), CAPTURE, build)
+    found = recalibrate_if_misfit(_mapped(0.9, {"left_palm": 1.31}), CAPTURE, build)
     (capture,) = seen
     assert not capture.camera("left_palm").calibrated
     start = capture.camera("left_palm").camera
@@ -71,8 +71,8 @@ def test_a_contradicted_lens_starts_from_what_fits_and_is_refined() -> None:
     assert np.allclose(start.params, [1.31 * 485, 318, 242, 0])
     assert capture.camera("torso") is CAPTURE.camera("torso")
     assert found.log["misfitting_lenses"] == {"left_palm": 1.33}
-    assert found.log[FREED] == ["left_palm"]
-    later = as_mapped(CAPTURE, found)
+    assert found.log[RECALIBRATED] == ["left_palm"]
+    later = with_map_intrinsics(CAPTURE, found)
     kept, mapped = later.camera("left_palm").camera, found.maps[0].cameras["left_palm"]
     assert (kept.model, kept.params.tolist()) == (mapped.model, mapped.params.tolist())
     assert not later.camera("left_palm").calibrated
@@ -87,11 +87,11 @@ def test_the_given_lens_stays_where_freeing_it_gives_no_better_map(again: MapRes
         return again
 
     first = _mapped(0.9, {"left_palm": 1.31})
-    found = freed_where_contradicted(first, CAPTURE, build)
+    found = recalibrate_if_misfit(first, CAPTURE, build)
     assert found.maps == first.maps
     assert found.log["misfitting_lenses"] == {"left_palm": 1.31}
-    assert FREED not in found.log
-    assert as_mapped(CAPTURE, found).cameras == CAPTURE.cameras
+    assert RECALIBRATED not in found.log
+    assert with_map_intrinsics(CAPTURE, found).cameras == CAPTURE.cameras
 
 
 def _without_palm(mapped: MapResult) -> MapResult:
@@ -114,10 +114,10 @@ def _without_palm(mapped: MapResult) -> MapResult:
 
 
 def test_a_freed_lens_outlives_its_cameras_keyframes() -> None:
-    found = freed_where_contradicted(
+    found = recalibrate_if_misfit(
         _mapped(0.9, {"left_palm": 1.31}), CAPTURE, lambda capture: _mapped(0.5, {}, zoom=1.33)
     )
-    lens = as_mapped(CAPTURE, _without_palm(found)).camera("left_palm")
+    lens = with_map_intrinsics(CAPTURE, _without_palm(found)).camera("left_palm")
     assert not lens.calibrated
     assert np.allclose(lens.camera.params, found.maps[0].cameras["left_palm"].params)
     assert json.loads(json.dumps(found.log)) == found.log
@@ -125,7 +125,7 @@ def test_a_freed_lens_outlives_its_cameras_keyframes() -> None:
 
 def test_a_map_that_loses_the_contradicted_camera_is_no_better() -> None:
     first = _mapped(0.9, {"left_palm": 1.31})
-    found = freed_where_contradicted(first, CAPTURE, lambda capture: _without_palm(_mapped(0.5, {})))
+    found = recalibrate_if_misfit(first, CAPTURE, lambda capture: _without_palm(_mapped(0.5, {})))
     assert found.maps == first.maps
     assert found.log["misfitting_lenses"] == {"left_palm": 1.31}
     assert found.log["freeing_refused"] == {"keyframes": {"torso": 3}, "mean_error_px": 0.5}
@@ -134,12 +134,12 @@ def test_a_map_that_loses_the_contradicted_camera_is_no_better() -> None:
 def test_a_map_that_cannot_be_used_is_refused_after_its_lenses_were_freed() -> None:
     refused = EstimationError("30% of the matches contradict the map", hint="x")
     bad = _mapped(0.4, {"left_palm": 1.31})
-    found = freed_where_contradicted(bad, CAPTURE, lambda capture: _mapped(0.5, {}, zoom=1.33), refused)
-    assert found.log[FREED] == ["left_palm"]
+    found = recalibrate_if_misfit(bad, CAPTURE, lambda capture: _mapped(0.5, {}, zoom=1.33), refused)
+    assert found.log[RECALIBRATED] == ["left_palm"]
     with pytest.raises(EstimationError, match="30%"):
-        freed_where_contradicted(bad, CAPTURE, lambda capture: _without_palm(_mapped(0.5, {})), refused)
+        recalibrate_if_misfit(bad, CAPTURE, lambda capture: _without_palm(_mapped(0.5, {})), refused)
     with pytest.raises(EstimationError, match="30%"):
-        freed_where_contradicted(_mapped(0.4, {}), CAPTURE, lambda capture: pytest.fail("built"), refused)
+        recalibrate_if_misfit(_mapped(0.4, {}), CAPTURE, lambda capture: pytest.fail("built"), refused)
 
 
 def test_freeing_is_tried_before_a_map_is_given_up(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -150,14 +150,14 @@ def test_freeing_is_tried_before_a_map_is_given_up(monkeypatch: pytest.MonkeyPat
             return _mapped(0.4, {"left_palm": 1.31}), refused
         return _mapped(0.5, {}, zoom=1.33), None
 
-    monkeypatch.setattr(build, "_build", built)
+    monkeypatch.setattr(build, "build_map_once", built)
     found = build.build_map(CAPTURE, [], MapOptions(), StageContext(work_dir=tmp_path))
-    assert found.log[FREED] == ["left_palm"]
-    monkeypatch.setattr(build, "_build", lambda *_: (_mapped(0.4, {"left_palm": 1.31}), refused))
+    assert found.log[RECALIBRATED] == ["left_palm"]
+    monkeypatch.setattr(build, "build_map_once", lambda *_: (_mapped(0.4, {"left_palm": 1.31}), refused))
     with pytest.raises(EstimationError, match="30%"):
         build.build_map(CAPTURE, [], MapOptions(), StageContext(work_dir=tmp_path))
 
 
 def test_lenses_that_fit_cost_no_second_map() -> None:
     first = _mapped(0.5, {})
-    assert freed_where_contradicted(first, CAPTURE, lambda capture: pytest.fail("built again")) is first
+    assert recalibrate_if_misfit(first, CAPTURE, lambda capture: pytest.fail("built again")) is first

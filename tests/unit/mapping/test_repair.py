@@ -18,24 +18,24 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.mapping import build
-from bodycap_batch.mapping.build import _begun
+from bodycap_batch.mapping.build import reconstruct_with_intrinsics
 from bodycap_batch.mapping.intrinsics import intrinsics_check
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     ImageRef,
     add_camera,
-    image_ids,
+    read_image_ids,
     write_image,
 )
-from bodycap_batch.mapping.matching.pair_matching import match_pairs, mutual_matches
-from bodycap_batch.mapping.reconstruction.bundle_adjustment import refine, settle
-from bodycap_batch.mapping.reconstruction.incremental_mapper import grow
-from bodycap_batch.mapping.reconstruction.initial_pair import named_start, rank_starts
+from bodycap_batch.mapping.matching.pair_matching import match_pairs, find_mutual_matches
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, adjust_robustly
+from bodycap_batch.mapping.reconstruction.incremental_mapper import register_images
+from bodycap_batch.mapping.reconstruction.initial_pair import find_user_pair, rank_initial_pairs
 from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options, reconstruct
-from bodycap_batch.mapping.validation.epipolar_consistency import Link, doubtful, links_of
-from bodycap_batch.mapping.validation.repair import cut_doubtful, place_again, repair
-from bodycap_batch.mapping.validation.transient_points import drop_unconfirmed
-from bodycap_batch.mapping.workspace import Workshop
+from bodycap_batch.mapping.validation.epipolar_consistency import PairConsistency, find_misregistered_images, evaluate_pairs
+from bodycap_batch.mapping.validation.repair import remove_misregistered, re_register_images, repair_model
+from bodycap_batch.mapping.validation.transient_points import remove_transient_points
+from bodycap_batch.mapping.workspace import MappingContext
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import align_points, invert, make_transform, so3_exp
 
@@ -48,13 +48,13 @@ _MOVED = (6, 7, 8)
 
 
 def test_the_misplaced_are_doubted_not_their_partners() -> None:
-    links = [Link(a, b, 100, 1.0) for a in range(10) for b in range(a)]
-    assert doubtful(links) == set()
+    links = [PairConsistency(a, b, 100, 1.0) for a in range(10) for b in range(a)]
+    assert find_misregistered_images(links) == set()
     wrong = [
-        Link(x.first, x.second, 100, 0.1 if (x.first in (4, 5)) != (x.second in (4, 5)) else 1.0)
+        PairConsistency(x.first, x.second, 100, 0.1 if (x.first in (4, 5)) != (x.second in (4, 5)) else 1.0)
         for x in links
     ]
-    assert doubtful(wrong) == {4, 5}
+    assert find_misregistered_images(wrong) == {4, 5}
 
 
 def _poses() -> FloatArray:
@@ -99,14 +99,14 @@ def _workspace(folder: Path) -> FloatArray:
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, FloatArray, Workshop, set[Any]]:
+def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, FloatArray, MappingContext, set[Any]]:
     folder = tmp_path_factory.mktemp("repair")
     poses = _workspace(folder)
     context = StageContext(work_dir=folder, threads=2)
     refs = [ImageRef("cam", frame) for frame in range(_KEYFRAMES)]
     pairs = [(a, b) for a in refs for b in refs if a < b and b.frame - a.frame <= 5]
     assert len(match_pairs(folder, pairs, _LENSES, context)) > 50
-    shop = Workshop(
+    shop = MappingContext(
         workspace=folder,
         lenses=_LENSES,
         settings=lambda: mapper_options(MapOptions(), [1], 1.0),
@@ -127,7 +127,7 @@ def _rms(model: Any, poses: FloatArray) -> float:
 
 
 def test_a_map_that_stands_is_adjusted_once_more(
-    built: tuple[Any, FloatArray, Workshop, set[Any]], monkeypatch: pytest.MonkeyPatch
+    built: tuple[Any, FloatArray, MappingContext, set[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, poses, shop, _ = built
     sizes: list[int] = []
@@ -139,9 +139,9 @@ def test_a_map_that_stands_is_adjusted_once_more(
 
     monkeypatch.setattr(pycolmap.IncrementalMapper, "iterative_global_refinement", counted)
     settings, model = shop.settings(), pycolmap.Reconstruction()
-    settings.init_image_id1, settings.init_image_id2 = rank_starts(shop.workspace, shop.lenses)[0].ids
+    settings.init_image_id1, settings.init_image_id2 = rank_initial_pairs(shop.workspace, shop.lenses)[0].ids
     settings.mapper.init_min_tri_angle = 2.0
-    assert grow(shop.workspace, settings, model, lambda: None)
+    assert register_images(shop.workspace, settings, model, lambda: None)
     assert model.num_reg_images() == _KEYFRAMES
     assert _rms(model, poses) < 0.01
     assert sizes[-1] == _KEYFRAMES
@@ -153,11 +153,11 @@ def test_an_empty_map_without_a_pair_to_begin_with_is_no_bug(tmp_path: Path) -> 
     with pycolmap.Database.open(str(tmp_path / DATABASE_NAME)):
         pass
     settings = mapper_options(MapOptions(), [], 1.0)
-    assert not grow(tmp_path, settings, pycolmap.Reconstruction(), lambda: None)
+    assert not register_images(tmp_path, settings, pycolmap.Reconstruction(), lambda: None)
 
 
 def test_long_tracks_are_settled_by_conjugate_gradients_to_the_same_map(
-    built: tuple[Any, FloatArray, Workshop, set[Any]], monkeypatch: pytest.MonkeyPatch
+    built: tuple[Any, FloatArray, MappingContext, set[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model, poses, shop, _ = built
     centres, solvers = [], []
@@ -169,9 +169,9 @@ def test_long_tracks_are_settled_by_conjugate_gradients_to_the_same_map(
 
     monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", noted)
     for limit in (0.0, np.inf):
-        monkeypatch.setattr("bodycap_batch.mapping.reconstruction.bundle_adjustment._LONG_TRACKS", limit)
+        monkeypatch.setattr("bodycap_batch.mapping.reconstruction.bundle_adjustment._MAX_DIRECT_TRACK_LENGTH", limit)
         settled = copy.deepcopy(model)
-        settle(settled, shop.settings(), shop.constant)
+        adjust_robustly(settled, shop.settings(), shop.constant)
         assert _rms(settled, poses) < 0.01
         found = sorted(settled.reg_image_ids())
         centres.append(np.array([settled.image(image).projection_center() for image in found]))
@@ -181,83 +181,83 @@ def test_long_tracks_are_settled_by_conjugate_gradients_to_the_same_map(
     assert np.linalg.norm(off, axis=1).max() < 1e-4
 
 
-def test_a_right_map_is_left_alone(built: tuple[Any, FloatArray, Workshop, set[Any]]) -> None:
+def test_a_right_map_is_left_alone(built: tuple[Any, FloatArray, MappingContext, set[Any]]) -> None:
     model, poses, shop, pairs = built
     assert model.num_reg_images() == _KEYFRAMES
     # Half a pixel at depth 4 and 420 px is 5 mm a point; a pose has dozens.
     assert _rms(model, poses) < 0.01
-    same, log = repair(model, set(pairs), shop)
+    same, log = repair_model(model, set(pairs), shop)
     assert same is model
     assert log == {"rounds": [], "cut": [], "contradicted_share": 0.0}
 
 
 def test_a_misplaced_block_is_found_and_put_right(
-    built: tuple[Any, FloatArray, Workshop, set[Any]],
+    built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:
     model, poses, shop, pairs = built
     ids = {ref.frame: number for ref, number in _ids(shop).items()}
     wrong = _with_moved_block(model, ids)
     assert _rms(wrong, poses) > 0.1
-    assert doubtful(links_of(shop.workspace, wrong)) == {ids[frame] for frame in _MOVED}
-    mended, log = repair(wrong, set(pairs), shop)
+    assert find_misregistered_images(evaluate_pairs(shop.workspace, wrong)) == {ids[frame] for frame in _MOVED}
+    mended, log = repair_model(wrong, set(pairs), shop)
     assert log["cut"] == []
     assert mended.num_reg_images() == _KEYFRAMES
     assert _rms(mended, poses) < 0.01
 
 
 def test_what_cannot_be_put_right_is_cut_out(
-    built: tuple[Any, FloatArray, Workshop, set[Any]], monkeypatch: pytest.MonkeyPatch
+    built: tuple[Any, FloatArray, MappingContext, set[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model, poses, shop, pairs = built
     wrong = _with_moved_block(model, {ref.frame: number for ref, number in _ids(shop).items()})
     # The mapper places it in the same wrong place again.
-    module = sys.modules[repair.__module__]
+    module = sys.modules[repair_model.__module__]
     monkeypatch.setattr(module, "extend", lambda *_: pycolmap.Reconstruction(wrong))
     monkeypatch.setattr(module, "refine", lambda *_: None)
     refs = sorted(_ids(shop))
-    alone, names = cut_doubtful(wrong, shop)
+    alone, names = remove_misregistered(wrong, shop)
     assert names == [f"cam/{frame:07d}" for frame in _MOVED]
     assert alone.num_reg_images() == _KEYFRAMES - len(_MOVED)
-    assert cut_doubtful(model, shop)[1] == []
-    cut, log = repair(wrong, pairs | {(a, b) for a in refs for b in refs if a < b}, shop)
+    assert remove_misregistered(model, shop)[1] == []
+    cut, log = repair_model(wrong, pairs | {(a, b) for a in refs for b in refs if a < b}, shop)
     assert log["cut"] == [f"cam/{frame:07d}" for frame in _MOVED]
     assert cut.num_reg_images() == _KEYFRAMES - len(_MOVED)
     assert _rms(cut, poses) < 0.01
 
 
 def test_keyframes_are_placed_again_against_the_rest(
-    built: tuple[Any, FloatArray, Workshop, set[Any]],
+    built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:
     model, poses, shop, _ = built
     ids = {ref.frame: number for ref, number in _ids(shop).items()}
     wrong = _with_moved_block(model, ids)
-    placed = place_again(wrong, {ids[frame] for frame in _MOVED}, shop, _KEYFRAMES)
+    placed = re_register_images(wrong, {ids[frame] for frame in _MOVED}, shop, _KEYFRAMES)
     assert placed.num_reg_images() == _KEYFRAMES
     assert _rms(placed, poses) < 0.01
 
 
 def test_points_of_a_moment_are_dropped_where_others_carry_the_keyframes(
-    built: tuple[Any, FloatArray, Workshop, set[Any]],
+    built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:
     model, poses, shop, _ = built
     seen_ns = np.arange(_KEYFRAMES) * 300_000_000
     some = pycolmap.Reconstruction(model)
     before = {image: some.image(image).num_points3D for image in some.reg_image_ids()}
-    dropped = drop_unconfirmed(some, {"cam": seen_ns})
+    dropped = remove_transient_points(some, {"cam": seen_ns})
     assert 0 < dropped == model.num_points3D() - some.num_points3D()
     # Points seen in keyframes more than three apart are confirmed; all others that can be spared are gone.
     for image in some.reg_image_ids():
         assert some.image(image).num_points3D >= min(20, before[image])
-    refine(some, shop.settings(), shop.constant)
+    adjust_and_filter(some, shop.settings(), shop.constant)
     assert _rms(some, poses) < 0.01
-    assert drop_unconfirmed(pycolmap.Reconstruction(model), {"cam": seen_ns * 10}) == 0
+    assert remove_transient_points(pycolmap.Reconstruction(model), {"cam": seen_ns * 10}) == 0
     # All in one moment: nothing is confirmed, so nothing can be spared.
-    assert drop_unconfirmed(pycolmap.Reconstruction(model), {"cam": seen_ns // 100}) == 0
+    assert remove_transient_points(pycolmap.Reconstruction(model), {"cam": seen_ns // 100}) == 0
 
 
 @pytest.mark.parametrize(("share", "gain"), [(0.0, 0.6), (0.25, 1.4)])
 def test_keypoints_that_lie_off_bend_no_settled_map(
-    built: tuple[Any, FloatArray, Workshop, set[Any]], share: float, gain: float
+    built: tuple[Any, FloatArray, MappingContext, set[Any]], share: float, gain: float
 ) -> None:
     model, poses, shop, _ = built
     rng = np.random.default_rng(3)
@@ -268,8 +268,8 @@ def test_keypoints_that_lie_off_bend_no_settled_map(
             if point.has_point3D() and rng.random() < share:
                 point.xy = point.xy + rng.uniform(2.2, 3.2) * np.array([1.0, 0.5])
     settled = pycolmap.Reconstruction(squared)
-    refine(squared, shop.settings(), shop.constant)
-    settle(settled, shop.settings(), shop.constant)
+    adjust_and_filter(squared, shop.settings(), shop.constant)
+    adjust_robustly(settled, shop.settings(), shop.constant)
     # Where noise is Gaussian throughout, a loss this narrow costs 1.4 times the error of squares.
     assert gain * _rms(settled, poses) < _rms(squared, poses)
     assert settled.num_points3D() > 0.9 * squared.num_points3D()
@@ -286,14 +286,14 @@ def _with_moved_block(model: Any, ids: dict[int, int]) -> Any:
     return wrong
 
 
-def _ids(shop: Workshop) -> dict[ImageRef, int]:
+def _ids(shop: MappingContext) -> dict[ImageRef, int]:
     with pycolmap.Database.open(str(shop.workspace / DATABASE_NAME)) as database:
-        return image_ids(database)
+        return read_image_ids(database)
 
 
-def test_starts_prefer_what_moved_sideways(built: tuple[Any, FloatArray, Workshop, set[Any]]) -> None:
+def test_starts_prefer_what_moved_sideways(built: tuple[Any, FloatArray, MappingContext, set[Any]]) -> None:
     _, _, shop, _ = built
-    best = rank_starts(shop.workspace, _LENSES)
+    best = rank_initial_pairs(shop.workspace, _LENSES)
     steps = [abs(int(a[-7:]) - int(b[-7:])) for a, b in (start.names for start in best)]
     # Neighbours 0.25 apart in front of a wall at 4 have 3.5 degrees of parallax, five steps more than 8.
     assert steps[0] >= 3
@@ -306,7 +306,7 @@ def test_keyframes_that_a_chosen_start_does_not_reach_make_a_model_of_their_own(
     context = StageContext(work_dir=tmp_path, threads=1)
     halves = [[ImageRef("cam", frame) for frame in half] for half in (range(8), range(8, _KEYFRAMES))]
     match_pairs(tmp_path, [(a, b) for half in halves for a in half for b in half if a < b], _LENSES, context)
-    start = rank_starts(tmp_path, _LENSES)[0]
+    start = rank_initial_pairs(tmp_path, _LENSES)[0]
     settings = mapper_options(MapOptions(), [1], 1.0)
     models, ladder = reconstruct(tmp_path, settings, context, _KEYFRAMES, [start])
     assert ladder == [{**ladder[0], "models": [8, 8], "pair": list(start.names)}]
@@ -318,13 +318,13 @@ def test_keyframes_that_a_chosen_start_does_not_reach_make_a_model_of_their_own(
 def _link_one_way(folder: Path) -> None:
     """Two halves of the walk; two keyframes of the first half see points that only the second half places."""
     with pycolmap.Database.open(str(folder / DATABASE_NAME)) as database:
-        ids = {ref.frame: number for ref, number in image_ids(database).items()}
+        ids = {ref.frame: number for ref, number in read_image_ids(database).items()}
         seen = {frame: np.asarray(database.read_descriptors(number).data) for frame, number in ids.items()}
         pairs = [(a, b) for a in range(_KEYFRAMES) for b in range(a + 1, min(a + 6, _KEYFRAMES))]
         for a, b in [
             pair for pair in pairs if pair[0] >= 8 or pair[1] < 8 or (pair[0] >= 6 and pair[1] <= 10)
         ]:
-            matches = mutual_matches(seen[a].astype(np.float32), seen[b].astype(np.float32))
+            matches = find_mutual_matches(seen[a].astype(np.float32), seen[b].astype(np.float32))
             odd = seen[a][matches[:, 0]].astype(int).sum(axis=1) % 2 == 1
             geometry: Any = pycolmap.TwoViewGeometry()
             geometry.config = 2
@@ -336,7 +336,7 @@ def test_a_start_on_the_side_that_leads_nowhere_loses_no_keyframes(tmp_path: Pat
     poses = _workspace(tmp_path)
     _link_one_way(tmp_path)
     context = StageContext(work_dir=tmp_path, threads=1)
-    start = named_start(tmp_path, ("cam:31", "cam:35"), _LENSES, _NUMBERS)
+    start = find_user_pair(tmp_path, ("cam:31", "cam:35"), _LENSES, _NUMBERS)
     assert start is not None
     settings = mapper_options(MapOptions(), [1], 1.0)
     models, _ = reconstruct(tmp_path, settings, context, _KEYFRAMES, [start])
@@ -345,27 +345,27 @@ def test_a_start_on_the_side_that_leads_nowhere_loses_no_keyframes(tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_a_named_start_is_used(built: tuple[Any, FloatArray, Workshop, set[Any]]) -> None:
+def test_a_named_start_is_used(built: tuple[Any, FloatArray, MappingContext, set[Any]]) -> None:
     _, poses, shop, _ = built
-    start = named_start(shop.workspace, ("cam:32", "cam:36"), _LENSES, _NUMBERS)
+    start = find_user_pair(shop.workspace, ("cam:32", "cam:36"), _LENSES, _NUMBERS)
     assert start is not None
     assert start.names == ("cam/0000002", "cam/0000006")
     models, ladder = reconstruct(shop.workspace, shop.settings(), shop.context, _KEYFRAMES, [start])
     assert ladder[-1]["pair"] == ["cam/0000002", "cam/0000006"]
     assert models[0].num_reg_images() == _KEYFRAMES
     assert _rms(models[0], poses) < 0.01
-    assert named_start(shop.workspace, ("cam:30", "cam:45"), _LENSES, _NUMBERS) is None
+    assert find_user_pair(shop.workspace, ("cam:30", "cam:45"), _LENSES, _NUMBERS) is None
     with pytest.raises(JobError, match="one keyframe"):
-        named_start(shop.workspace, ("cam:33", "cam:33"), _LENSES, _NUMBERS)
+        find_user_pair(shop.workspace, ("cam:33", "cam:33"), _LENSES, _NUMBERS)
     with pytest.raises(JobError, match="camera 'hat'"):
-        named_start(shop.workspace, ("hat:33", "cam:33"), _LENSES, _NUMBERS)
+        find_user_pair(shop.workspace, ("hat:33", "cam:33"), _LENSES, _NUMBERS)
 
 
-def _guessed_shop(workspace: Path) -> Workshop:
+def _guessed_shop(workspace: Path) -> MappingContext:
     """What maps the keyframes of `_workspace`, their lens being a guess."""
     _workspace(workspace)
     _link_one_way(workspace)
-    return Workshop(
+    return MappingContext(
         workspace=workspace,
         lenses=_LENSES,
         settings=lambda: mapper_options(MapOptions(), [], 1.0),
@@ -385,9 +385,9 @@ def test_a_named_start_is_used_again_where_a_guessed_lens_changes_its_model(
     shop = _guessed_shop(tmp_path)
     changed = _radial().to_pycolmap()
     changed.camera_id = 1
-    monkeypatch.setattr(intrinsics_check, "better_lenses", lambda *_: ({1: changed}, frozenset()))
+    monkeypatch.setattr(intrinsics_check, "select_camera_models", lambda *_: ({1: changed}, frozenset()))
     options = MapOptions(init_frames=("cam:31", "cam:35"))
-    models, log = _begun(shop, options, {1: "cam"}, _KEYFRAMES)
+    models, log = reconstruct_with_intrinsics(shop, options, {1: "cam"}, _KEYFRAMES)
     assert log["better_lenses"] == {"cam": "RADIAL"}
     assert models[0].camera(1).model_name == "RADIAL"
     assert log["initial_pair_ladder"][0]["pair"] == ["cam/0000001", "cam/0000005"]
@@ -412,8 +412,8 @@ def test_only_a_centre_that_was_found_off_is_found_anew(
         left = 50.0 if part.camera(1).model_name == "RADIAL" else 100.0
         return left * min(0.99, crop) if centre else left
 
-    monkeypatch.setattr(intrinsics_check, "_cost", cost)
-    _, log = _begun(shop, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam"}, _KEYFRAMES)
+    monkeypatch.setattr(intrinsics_check, "_adjustment_cost", cost)
+    _, log = reconstruct_with_intrinsics(shop, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam"}, _KEYFRAMES)
     assert log["better_lenses"] == {"cam": "RADIAL"}
     first_map = [False, False, False, True, False]
     assert freed_centre == first_map + ([False, True] if crop < 0.95 else [])
@@ -430,5 +430,5 @@ def test_the_log_holds_what_both_looks_at_the_lenses_found(
         return {name: (camera, False) for name, camera in found.items()}, decentred
 
     monkeypatch.setattr(build, "change_lenses", change)
-    _, log = _begun(shop, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam", 2: "hat"}, _KEYFRAMES)
+    _, log = reconstruct_with_intrinsics(shop, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam", 2: "hat"}, _KEYFRAMES)
     assert log["better_lenses"] == {"cam": "RADIAL", "hat": "RADIAL"}

@@ -12,7 +12,7 @@ import pytest
 
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping.matching.sift import Features, features_of
+from bodycap_batch.mapping.matching.sift import SiftFeatures, extract_features
 
 _CENTRES = np.array([(x, y) for y in range(40, 460, 70) for x in range(45, 620, 80)], dtype=np.float64)
 
@@ -36,10 +36,10 @@ class _Blobs:
             yield frame, cv2.GaussianBlur(image, (0, 0), 2.0)
 
 
-def _features(tmp_path: Path, frames: list[int], threads: int = 2, hidden: float = 0.0) -> list[Features]:
+def _features(tmp_path: Path, frames: list[int], threads: int = 2, hidden: float = 0.0) -> list[SiftFeatures]:
     camera = cast(CaptureCamera, _Blobs(hidden))
     found: list[Any] = list(
-        features_of(camera, np.array(frames), 2048, StageContext(work_dir=tmp_path, threads=threads))
+        extract_features(camera, np.array(frames), 2048, StageContext(work_dir=tmp_path, threads=threads))
     )
     assert [frame for frame, _ in found] == frames
     return [item for _, item in found]

@@ -14,7 +14,7 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.export.metrics import observation_errors
-from bodycap_batch.mapping.intrinsics.readout_time import Readout, RollingModel, readouts, with_readouts
+from bodycap_batch.mapping.intrinsics.readout_time import Readout, RollingShutterModel, estimate_readouts, map_with_readouts
 from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options
 from bodycap_batch.model import rolling_shutter
 from bodycap_batch.model.camera import Camera
@@ -132,13 +132,13 @@ def misfit_px(model: Any, film: Film) -> float:
 def rolling_model(film: Film, *, known: bool = False, stated_s: float = 0.0, posed: bool = True) -> Any:
     camera = camera_of(film, known=known, stated_s=stated_s)
     paths = {"head": film.trajectory()} if posed else {}
-    return RollingModel(the_map(film, range(1, FRAMES, 5)), paths, {"head": camera})
+    return RollingShutterModel(the_map(film, range(1, FRAMES, 5)), paths, {"head": camera})
 
 
 def readouts_of(film: Film, camera: Any) -> tuple[Any, Any]:
-    """The model as `readouts` leaves it, and what it tells of its camera."""
-    model = RollingModel(the_map(film, range(1, FRAMES, 5)), {"head": film.trajectory()}, {"head": camera})
-    model, told = readouts(model, {"head": camera}, mapper_options(MapOptions(), [1], 1.0), [1])
+    """The model as `estimate_readouts` leaves it, and what it tells of its camera."""
+    model = RollingShutterModel(the_map(film, range(1, FRAMES, 5)), {"head": film.trajectory()}, {"head": camera})
+    model, told = estimate_readouts(model, {"head": camera}, mapper_options(MapOptions(), [1], 1.0), [1])
     return model, told["head"]
 
 
@@ -192,7 +192,7 @@ def test_a_stated_readout_keeps_its_way_where_none_could_be_looked_for(
     def fails(*_: Any) -> None:
         raise EstimationError("no convergence")
 
-    monkeypatch.setattr(RollingModel, "find", fails)
+    monkeypatch.setattr(RollingShutterModel, "find", fails)
     film = Film(0.02, sideways=True)
     _, told = readouts_of(film, camera_of(film, known=True, stated_s=0.02, may_be_sideways=True))
     assert (told.seconds, told.sideways) == (0.02, True)
@@ -225,7 +225,7 @@ def test_a_map_says_which_way_its_sensors_are_read() -> None:
         "head": Readout(0.02, 0.0, "stated", 0.02, True),
         "torso": Readout(0.0, 1.0, "none found", 0.0, True),
     }
-    read = with_readouts(scene, told)
+    read = map_with_readouts(scene, told)
     assert read.readout_s == {"head": 0.02}
     assert {name: lens.sideways for name, lens in read.cameras.items()} == {"head": True, "torso": False}
 
@@ -248,7 +248,7 @@ def test_what_could_not_be_determined_says_why_and_keeps_what_was_stated() -> No
 
 def test_the_fastest_keyframes_are_looked_at() -> None:
     film = Film(0.0)
-    rolling = RollingModel(
+    rolling = RollingShutterModel(
         the_map(film, range(1, FRAMES, 2)),
         {"head": film.trajectory()},
         {"head": SimpleNamespace(rolling_shutter_known=False, rolling_shutter_s=0.0)},  # type: ignore[dict-item]
