@@ -9,17 +9,17 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body.bones import graph_bones
-from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
+from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.merging.cameras.track import SAMPLE_REACH_NS, Track
 from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.skeleton_presets import split_side
 
-_STEP = 0.1
-_TICKS = 40
+_LOG_SCALE_STEP = 0.1
+_SAMPLES = 40
 _ENOUGH_TOGETHER = 15
-_LIMBS = {
+_LIMB_OF_PART = {
     **dict.fromkeys(("Shoulder", "Arm", "ForeArm", "Hand"), "arm"),
     **dict.fromkeys(("UpLeg", "Leg", "Foot", "ToeBase"), "leg"),
     **dict.fromkeys(("Neck", "Head"), "head"),
@@ -48,21 +48,22 @@ def limb_scales(
     limbs: dict[str, list[Track]] = {}
     for track in tracks[1:]:
         side, part = split_side(inputs.mount_of(track.camera).role)
-        if part in _LIMBS and _together(tracks[0], track) >= _ENOUGH_TOGETHER:
-            limbs.setdefault(f"{side.lower()} {_LIMBS[part]}".strip(), []).append(track)
+        if part in _LIMB_OF_PART and _common_frames(tracks[0], track) >= _ENOUGH_TOGETHER:
+            limbs.setdefault(f"{side.lower()} {_LIMB_OF_PART[part]}".strip(), []).append(track)
     if len(limbs) < 2:
         return ()
     found = [
-        _alone(name, inputs, [tracks[0], *own], (scale, *known), step) for name, own in sorted(limbs.items())
+        _scale_of_limb(name, inputs, [tracks[0], *own], (scale, *known), step)
+        for name, own in sorted(limbs.items())
     ]
     return tuple(each for each in found if each is not None)
 
 
-def _together(trunk: Track, track: Track) -> int:
+def _common_frames(trunk: Track, track: Track) -> int:
     return int(track.at(trunk.times_ns, reach_ns=SAMPLE_REACH_NS)[1].sum())
 
 
-def _alone(
+def _scale_of_limb(
     name: str,
     inputs: MergeInputs,
     tracks: Sequence[Track],
@@ -74,13 +75,15 @@ def _alone(
     bones = graph_bones(inputs.skeleton, roles)
     index = {bone.role: position for position, bone in enumerate(bones)}
     own = [replace(track, bone=index[role]) for track, role in zip(tracks, roles, strict=True)]
-    samples = take_samples(own, scale, _TICKS, up, t_pose_ns)
+    samples = take_samples(own, scale, _SAMPLES, up, t_pose_ns)
     priors = {mount.camera: mount for mount in inputs.mounts}
-    calibration = Calibration(inputs.skeleton, bones, samples, priors, scale, step)
+    calibration = CalibrationGraph(inputs.skeleton, bones, samples, priors, scale, step)
     middle = calibration.solve(scale)
-    low, high = (calibration.solve(scale * float(np.exp(sign * _STEP))) for sign in (-1.0, 1.0))
+    low, high = (calibration.solve(scale * float(np.exp(sign * _LOG_SCALE_STEP))) for sign in (-1.0, 1.0))
     bend = low + high - 2.0 * middle
     if bend <= 0.0:
         return None
-    offset = 0.5 * _STEP * (low - high) / bend
-    return ScaleSource(name=name, scale=scale * float(np.exp(offset)), sigma_log=float(_STEP / np.sqrt(bend)))
+    offset = 0.5 * _LOG_SCALE_STEP * (low - high) / bend
+    return ScaleSource(
+        name=name, scale=scale * float(np.exp(offset)), sigma_log=float(_LOG_SCALE_STEP / np.sqrt(bend))
+    )

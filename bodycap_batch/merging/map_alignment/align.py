@@ -16,8 +16,12 @@ import numpy as np
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import Bone, graph_bones
-from bodycap_batch.merging.body_calibration.calibrate_body import points_around, rolled_mounts, trunk_way_up
-from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
+from bodycap_batch.merging.body_calibration.calibrate_body import (
+    map_points_of,
+    reference_camera_roll,
+    with_rolls,
+)
+from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.cameras.track import Track, clean, in_gauge, make_track, moved
 from bodycap_batch.merging.map_alignment.gauss_newton import Placing
@@ -188,9 +192,9 @@ def _begin(
     """The trunk's camera the way up it sits, where the maps start then, and the vertical if known."""
     start = starts_of(bones, main, others, {mount.camera: mount for mount in inputs.mounts})
     own = _cleaned(inputs, main, start.metric)
-    roll, up = trunk_way_up(inputs, bones, own, start.metric, stated.ups)
+    roll, up = reference_camera_roll(inputs, bones, own, start.metric, stated.ups)
     if roll:
-        inputs = rolled_mounts(inputs, {main[0].camera: roll})
+        inputs = with_rolls(inputs, {main[0].camera: roll})
         start = starts_of(bones, main, others, {mount.camera: mount for mount in inputs.mounts})
     return inputs, start, up
 
@@ -236,7 +240,7 @@ def join_maps(
     together = [*main, *(moved(track, starts[gauge]) for gauge, group in others for track in group)]
     together = _cleaned(inputs, together, provisional)
     samples = take_samples(together, provisional, _SAMPLES, None if up is None else up.up)
-    calibration = Calibration(inputs.skeleton, bones, samples, mounts, provisional, step)
+    calibration = CalibrationGraph(inputs.skeleton, bones, samples, mounts, provisional, step)
     names = {gauge: tuple(track.camera for track in group) for gauge, group in others}
     known = _REACH_SIGMA if start.spanned else _APART_SIGMA
     reach_sigma = known if start.told else _UNTOLD_SIGMA
@@ -247,7 +251,7 @@ def join_maps(
     # Reach and movement may disagree on what the job states.
     if not stated.scales:
         _require_one_scale(abs(problem.from_reach()), reach_sigma)
-        points = points_around(inputs, together[0].camera)
+        points = map_points_of(inputs, together[0].camera)
         floor = floor_scale(inputs, (together[0], up), problem.scale(), points)
         problem.know(() if floor is None else (floor,))
     out = []

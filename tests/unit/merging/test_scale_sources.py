@@ -10,9 +10,9 @@ import pytest
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import graph_bones
-from bodycap_batch.merging.body_calibration.calibrate_body import trunk_way_up
+from bodycap_batch.merging.body_calibration.calibrate_body import reference_camera_roll
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
-from bodycap_batch.merging.camera_selection import choices
+from bodycap_batch.merging.camera_selection import candidate_main_maps
 from bodycap_batch.merging.cameras.track import Track, make_track
 from bodycap_batch.merging.map_alignment import align
 from bodycap_batch.merging.map_alignment.align import use_together
@@ -153,7 +153,7 @@ def test_a_join_is_told_what_the_job_states_of_up_and_how_the_trunks_camera_is_r
     monkeypatch.setattr(align, "stated_in", lambda *_: Stated(ups=(lying,)))
     monkeypatch.setattr(align, "trunk_way_up", way_up)
     monkeypatch.setattr(align, "Calibration", calibration)
-    main, further = choices(short.inputs)[0]
+    main, further = candidate_main_maps(short.inputs)[0]
     assert "enough" in use_together(short.inputs, main, further[:1], lambda: None).unused[further[0].camera]
     assert told[0] == (lying,)
     usual = short.inputs.mount_of("torso").joint_from_cam
@@ -167,7 +167,7 @@ def test_what_is_stated_or_seen_early_says_where_it_is_from(short):
     tracks = [make_track(inputs, trunk, [bone.role for bone in bones].index("Spine1"))]
     unit = short.gauges[trunk.gauge]
     lying = Say(source="marker board", up=unit.rotation @ UP, sigma_deg=1.5)
-    roll, up = trunk_way_up(inputs, bones, tracks, 1.0 / unit.scale, (lying,))
+    roll, up = reference_camera_roll(inputs, bones, tracks, 1.0 / unit.scale, (lying,))
     assert (roll, up.source) == (0.0, "marker board")
 
 
@@ -183,7 +183,7 @@ class _Strained(Placing):
 
 def test_a_stated_scale_saves_a_join_on_whose_scale_reach_and_movement_disagree(short, monkeypatch):
     monkeypatch.setattr(align, "Placing", _Strained)
-    main, further = choices(short.inputs)[0]
+    main, further = candidate_main_maps(short.inputs)[0]
     refused, placed = (
         use_together(short.inputs, main, further[:1], lambda: None, options).unused
         for options in (MergeOptions(), _distance(short, "torso"))
@@ -207,7 +207,7 @@ def test_maps_are_placed_at_the_stated_scale():
 @pytest.mark.slow
 def test_palms_lie_where_they_were_once_the_scale_is_known():
     capture = _drawn(1000 / 30)
-    main, further = choices(capture.inputs)[0]
+    main, further = candidate_main_maps(capture.inputs)[0]
     off = []
     for options in (MergeOptions(), _distance(capture, "torso")):
         together = use_together(capture.inputs, main, further, lambda: None, options)
