@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from bodycap_batch.merging.body.bones import kinematic_chain
-from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
-from bodycap_batch.merging.body_calibration.samples import Samples, take_samples
+from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
+from bodycap_batch.merging.body_calibration.samples import CalibrationSamples, take_samples
 from bodycap_batch.merging.cameras.track import make_track
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.posed import GAUGE, posed
 
 
-def calibration_of(options: SynthOptions) -> tuple[Samples, Calibration, float]:
+def calibration_of(options: SynthOptions) -> tuple[CalibrationSamples, CalibrationGraph, float]:
     """Sixty samples of a walk in one map, their calibration, not yet solved, and metres per map unit."""
     capture = posed(options)
     inputs, roles = capture.inputs, {mount.camera: mount.role for mount in capture.mounts}
@@ -20,4 +20,4 @@ def calibration_of(options: SynthOptions) -> tuple[Samples, Calibration, float]:
     metric = 1.0 / capture.gauges[GAUGE].scale
     samples = take_samples(tracks, metric, 60)
     mounts = {mount.camera: mount for mount in inputs.mounts}
-    return samples, Calibration(inputs.skeleton, bones, samples, mounts, metric, lambda: None), metric
+    return samples, CalibrationGraph(inputs.skeleton, bones, samples, mounts, metric, lambda: None), metric

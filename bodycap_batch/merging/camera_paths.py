@@ -14,7 +14,7 @@ from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.model.skeleton import Mount
 
 
-def in_world(trajectory: Trajectory, world_from_map: Similarity, dropped: IntArray) -> Trajectory:
+def trajectory_in_world(trajectory: Trajectory, world_from_map: Similarity, dropped: IntArray) -> Trajectory:
     """The trajectory in the world, without the poses that proved to be gross errors."""
     placed = transform_trajectory(trajectory, world_from_map, "world")
     poses, covariance = np.array(placed.gauge_from_cam), np.array(placed.covariance)
@@ -25,7 +25,7 @@ def in_world(trajectory: Trajectory, world_from_map: Similarity, dropped: IntArr
     return replace(placed, gauge_from_cam=poses, covariance=covariance, status=tuple(status))
 
 
-def solved_with_body(
+def with_solved_centres(
     trajectory: Trajectory,
     track: CameraTrack,
     mount: Mount,
@@ -55,11 +55,11 @@ def solved_with_body(
         return trajectory
     solved = world_from_solved.apply_to_poses(solution.world_from_cam[track.camera])
     poses = np.array(trajectory.gauge_from_cam)
-    poses[track.frames] = _joined(poses[track.frames], solved, solution.weights[track.camera])
+    poses[track.frames] = _blend_centres(poses[track.frames], solved, solution.weights[track.camera])
     return replace(trajectory, gauge_from_cam=poses)
 
 
-def _joined(measured: FloatArray, solved: FloatArray, weight: FloatArray) -> FloatArray:
+def _blend_centres(measured: FloatArray, solved: FloatArray, weight: FloatArray) -> FloatArray:
     """Measured poses (N,4,4) with centres moved to the solved ones, by their weight (N,)."""
     out = measured.copy()
     out[:, :3, 3] += weight[:, None] * (solved[:, :3, 3] - measured[:, :3, 3])

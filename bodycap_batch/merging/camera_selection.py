@@ -11,22 +11,22 @@ from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body.initial_poses import reach_constraint
-from bodycap_batch.merging.body_calibration.camera_roll import is_open
+from bodycap_batch.merging.body_calibration.camera_roll import has_unknown_roll
 from bodycap_batch.merging.cameras.stationary import stationary_cameras
 from bodycap_batch.merging.map_alignment.align import UsableCameras, align_cameras
 from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import Mount
 
-MIN_FRAMES = 15
+MIN_LOCALISED_FRAMES = 15
 """Localised frames below which a camera tells nothing about a motion: half a second at 30 fps."""
-TRUNK = ("Spine1", "Spine", "Hips", "Neck", "Head")
+REFERENCE_ROLES = ("Spine1", "Spine", "Hips", "Neck", "Head")
 """Bones whose camera can lead, the best first: limbs are judged against it."""
-_SHORT = 0.25
+_MIN_TIME_RATIO = 0.25
 """Share of the longest camera's time below which a camera does not lead, nor its map become the main one."""
 
 
-def gather(
+def select_cameras(
     inputs: MergeInputs, step: Callable[[], None], options: MergeOptions
 ) -> tuple[MergeInputs, UsableCameras]:
     """The inputs with priors that cameras at one place share, and the cameras that make the body.
@@ -39,12 +39,12 @@ def gather(
     Raises:
         EstimationError: No map holds two cameras whose distance the body knows.
     """
-    useless = of_no_use(inputs)
-    shared = share_priors(inputs, useless)
-    return shared, bring_together(shared, step, options, useless)
+    useless = excluded_cameras(inputs)
+    shared = correlate_mount_priors(inputs, useless)
+    return shared, align_usable_cameras(shared, step, options, useless)
 
 
-def bring_together(
+def align_usable_cameras(
     inputs: MergeInputs,
     step: Callable[[], None],
     options: MergeOptions | None = None,
@@ -56,16 +56,16 @@ def bring_together(
         inputs: Trajectories, skeleton, mounts and clocks.
         step: Called after each iteration; may raise to stop.
         options: What the job states of the scale.
-        useless: What `of_no_use` says, where that is known.
+        useless: What `excluded_cameras` says, where that is known.
 
     Raises:
         EstimationError: No map holds two cameras whose distance the body knows.
     """
-    useless = of_no_use(inputs) if useless is None else useless
+    useless = excluded_cameras(inputs) if useless is None else useless
     left_out: dict[str, str] = {}
-    for main, further in choices(inputs, useless):
+    for main, further in candidate_main_maps(inputs, useless):
         together = align_cameras(inputs, main, further, step, options)
-        if _make_a_body(inputs, together.trajectories):
+        if _determine_scale(inputs, together.trajectories):
             return replace(together, unused={**useless, **together.unused})
         left_out = left_out or dict(together.unused)
     left_out = {**useless, **left_out}
@@ -79,22 +79,22 @@ def bring_together(
     )
 
 
-def share_priors(inputs: MergeInputs, useless: Mapping[str, str] | None = None) -> MergeInputs:
+def correlate_mount_priors(inputs: MergeInputs, useless: Mapping[str, str] | None = None) -> MergeInputs:
     """Cameras that are expected at the same place by their names alone are off it together, as a rig is.
 
     Each alone would say where the body is as if the others had been strapped on by somebody else.
     """
-    useless = of_no_use(inputs) if useless is None else useless
+    useless = excluded_cameras(inputs) if useless is None else useless
     paths = [each.camera for each in inputs.trajectories if each.camera not in useless]
     worn = [inputs.mount_of(camera) for camera in paths]
 
     def shared(mount: Mount) -> Mount:
         beside = sum(
-            is_open(other) and other.role == mount.role and _same(other, mount)
+            has_unknown_roll(other) and other.role == mount.role and _at_same_position(other, mount)
             for other in worn
             if other.camera != mount.camera
         )
-        if not beside or not is_open(mount):
+        if not beside or not has_unknown_roll(mount):
             return mount
         factor = float(np.sqrt(1.0 + beside))
         return replace(mount, sigma_rad=factor * mount.sigma_rad, sigma_m=factor * mount.sigma_m)
@@ -102,29 +102,29 @@ def share_priors(inputs: MergeInputs, useless: Mapping[str, str] | None = None) 
     return replace(inputs, mounts=tuple(shared(mount) for mount in inputs.mounts))
 
 
-def _same(first: Mount, second: Mount) -> bool:
+def _at_same_position(first: Mount, second: Mount) -> bool:
     return bool(np.allclose(first.joint_from_cam[:3, 3], second.joint_from_cam[:3, 3]))
 
 
-def of_no_use(inputs: MergeInputs) -> dict[str, str]:
+def excluded_cameras(inputs: MergeInputs) -> dict[str, str]:
     """By camera that tells nothing of the body's motion, why."""
-    seldom = seldom_localised(inputs)
+    seldom = rarely_localised(inputs)
     still = stationary_cameras(inputs, [each for each in inputs.trajectories if each.camera not in seldom])
     why = "it stands still while the others move: nobody wears it, or it is frozen"
     return {**seldom, **dict.fromkeys(still, why)}
 
 
-def seldom_localised(inputs: MergeInputs) -> dict[str, str]:
+def rarely_localised(inputs: MergeInputs) -> dict[str, str]:
     """By camera that is of no use, why."""
     counts = {each.camera: int(each.localised.sum()) for each in inputs.trajectories}
     return {
-        each.camera: f"{counts[each.camera]} localised frames of {len(each.status)}, {MIN_FRAMES} needed"
+        each.camera: f"{counts[each.camera]} localised frames of {len(each.status)}, {MIN_LOCALISED_FRAMES} needed"
         for each in inputs.trajectories
-        if counts[each.camera] < MIN_FRAMES
+        if counts[each.camera] < MIN_LOCALISED_FRAMES
     }
 
 
-def choices(
+def candidate_main_maps(
     inputs: MergeInputs, useless: Mapping[str, str] | None = None
 ) -> list[tuple[list[Trajectory], list[Trajectory]]]:
     """Each map as the main one, the best first: its cameras, the leading one first, and those of other maps.
@@ -137,10 +137,14 @@ def choices(
 
     def rank(trajectory: Trajectory) -> tuple[bool, int, int]:
         role, camera = inputs.mount_of(trajectory.camera).role, trajectory.camera
-        short = seconds[camera] < _SHORT * max(seconds.values())
-        return short, TRUNK.index(role) if role in TRUNK else len(TRUNK), -counts[camera]
+        short = seconds[camera] < _MIN_TIME_RATIO * max(seconds.values())
+        return (
+            short,
+            REFERENCE_ROLES.index(role) if role in REFERENCE_ROLES else len(REFERENCE_ROLES),
+            -counts[camera],
+        )
 
-    without = of_no_use(inputs) if useless is None else useless
+    without = excluded_cameras(inputs) if useless is None else useless
     ranked = sorted((each for each in inputs.trajectories if each.camera not in without), key=rank)
     return [
         ([each for each in ranked if each.gauge == gauge], [each for each in ranked if each.gauge != gauge])
@@ -148,7 +152,7 @@ def choices(
     ]
 
 
-def _make_a_body(inputs: MergeInputs, used: Sequence[Trajectory]) -> bool:
+def _determine_scale(inputs: MergeInputs, used: Sequence[Trajectory]) -> bool:
     """Whether the body knows the distance of any two cameras."""
     roles = [inputs.mount_of(each.camera).role for each in used]
     if len(roles) < 2:

@@ -15,13 +15,13 @@ from bodycap_batch.merging.body.bones import Bone, kinematic_chain
 from bodycap_batch.merging.body.completion import complete_skeleton, observed_joints
 from bodycap_batch.merging.body.initial_poses import provisional_scale
 from bodycap_batch.merging.body_calibration.calibrate_body import (
-    Calibrated,
-    Cleaned,
+    BodyCalibration,
+    CalibrationInput,
     calibrate_body,
-    points_around,
+    map_points_of,
 )
-from bodycap_batch.merging.camera_paths import in_world, solved_with_body
-from bodycap_batch.merging.camera_selection import gather
+from bodycap_batch.merging.camera_paths import trajectory_in_world, with_solved_centres
+from bodycap_batch.merging.camera_selection import select_cameras
 from bodycap_batch.merging.cameras.track import CameraTrack, inflate_sigmas, make_track, remove_outliers
 from bodycap_batch.merging.graph.foot_contact import (
     contact_statistics,
@@ -75,13 +75,13 @@ class _Progress:
 def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> MergeResult:
     """See `bodycap_batch.merging.merge_trajectories`."""
     step = _Progress(context)
-    inputs, together = gather(inputs, step, options)
+    inputs, together = select_cameras(inputs, step, options)
     used = together.trajectories
     bones = kinematic_chain(inputs.skeleton, {inputs.mount_of(each.camera).role for each in used})
     fps = options.fps or inputs.clocks[used[0].camera].nominal_fps
     tick_times = timeline(inputs, used, fps)
-    tracks, provisional, dropped = _clean_tracks(inputs, used, bones)
-    cleaned = Cleaned(tracks, provisional, together.sigmas, together.main_from_gauge)
+    tracks, provisional, dropped = _prepare_tracks(inputs, used, bones)
+    cleaned = CalibrationInput(tracks, provisional, together.sigmas, together.main_from_gauge)
     calibrated = calibrate_body(inputs, options, bones, cleaned, step)
     step.what = "solving"
     metric = [track.scaled(calibrated.scale) for track in tracks]
@@ -106,11 +106,11 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         window_ticks=max_window_ticks(len(bones), tracks, tick_times),
         spread=calibrated.spread,
     )
-    world_from_solved, joints, solved, floor = _place(inputs, bones, solution, calibrated, fps)
+    world_from_solved, joints, solved, floor = _place_in_world(inputs, bones, solution, calibrated, fps)
     place = Similarity(calibrated.scale, world_from_solved.rotation, world_from_solved.translation)
-    paths = tuple(in_world(each, place, dropped[each.camera]) for each in used)
+    paths = tuple(trajectory_in_world(each, place, dropped[each.camera]) for each in used)
     if options.camera_paths == "joint":
-        paths = _with_body(paths, metric, calibrated, solution, world_from_solved)
+        paths = _camera_paths(paths, metric, calibrated, solution, world_from_solved)
     observed = observed_joints(inputs.skeleton, bones, tracks, tick_times, options.max_gap_s)
     covariance = skeleton_covariance(
         world_from_solved.rotation, bones, solution.joint_covariance, len(solved)
@@ -159,7 +159,7 @@ def timeline(inputs: MergeInputs, used: Sequence[Trajectory], fps: float) -> Int
     return np.asarray(start + np.round(np.arange(count) * (1e9 / fps)), dtype=np.int64)
 
 
-def _clean_tracks(
+def _prepare_tracks(
     inputs: MergeInputs, used: Sequence[Trajectory], bones: Sequence[Bone]
 ) -> tuple[list[CameraTrack], float, dict[str, IntArray]]:
     """Tracks without gross errors, a provisional scale, and the frames that were dropped."""
@@ -175,21 +175,25 @@ def _clean_tracks(
     return cleaned, provisional_scale(bones, cleaned, mounts), dropped
 
 
-def _turned(rotation: FloatArray, poses: FloatArray) -> FloatArray:
+def _rotate_poses(rotation: FloatArray, poses: FloatArray) -> FloatArray:
     return Similarity(1.0, rotation, np.zeros(3)).apply_to_poses(poses)
 
 
-def _place(
-    inputs: MergeInputs, bones: Sequence[Bone], solution: MotionSolution, calibrated: Calibrated, fps: float
+def _place_in_world(
+    inputs: MergeInputs,
+    bones: Sequence[Bone],
+    solution: MotionSolution,
+    calibrated: BodyCalibration,
+    fps: float,
 ) -> tuple[Similarity, FloatArray, Any, Floor]:
     """Find the world and put the whole body into it."""
     rotation = rotation_to_z_up(calibrated.up.up)
-    turned = _turned(rotation, solution.world_from_bone)
+    turned = _rotate_poses(rotation, solution.world_from_bone)
     joints, solved = complete_skeleton(inputs.skeleton, bones, turned)
     hips = joints[:, 0, :3, 3]
     standing = standing_height(inputs.skeleton, 0)
     # The first mount is the trunk camera's: in a long capture the first stretch may lack it.
-    points = points_around(inputs, calibrated.mounts[0].camera)
+    points = map_points_of(inputs, calibrated.mounts[0].camera)
     points_m, path_m = calibrated.scale * points, solution.world_from_bone[:, 0, :3, 3]
     expected = float(np.median(hips[:, 2])) - WALKING_HEIGHT_RATIO * standing
     floor = floor_beside_path(points_m, path_m, calibrated.up, expected, standing) or floor_from_points(
@@ -203,10 +207,10 @@ def _place(
     return placed, to_world.apply_to_poses(joints), solved, floor
 
 
-def _with_body(
+def _camera_paths(
     paths: Sequence[Trajectory],
     tracks: Sequence[CameraTrack],
-    calibrated: Calibrated,
+    calibrated: BodyCalibration,
     solution: MotionSolution,
     world_from_solved: Similarity,
 ) -> tuple[Trajectory, ...]:
@@ -214,6 +218,6 @@ def _with_body(
     mounts = {mount.camera: mount for mount in calibrated.mounts}
     own = {track.camera: track for track in tracks}
     return tuple(
-        solved_with_body(path, own[path.camera], mounts[path.camera], solution, world_from_solved)
+        with_solved_centres(path, own[path.camera], mounts[path.camera], solution, world_from_solved)
         for path in paths
     )

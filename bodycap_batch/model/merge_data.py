@@ -16,7 +16,7 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 
 Activity = Literal["walk", "generic"]
 
-_STANDING_M_PER_S, _STANDING_HZ = 0.05, 30.0
+_STANDING_SPEED_M_PER_S, _STANDING_RATE_HZ = 0.05, 30.0
 """Speed of a standing foot's ankle, one sigma at 30 ticks a second: the shin rolls over the foot."""
 
 
@@ -25,7 +25,7 @@ def standing_sigma_m(fps: float) -> float:
 
     Per tick the square root of the rate less: over a second a foot is held as firmly at every rate.
     """
-    return _STANDING_M_PER_S / math.sqrt(_STANDING_HZ * fps)
+    return _STANDING_SPEED_M_PER_S / math.sqrt(_STANDING_RATE_HZ * fps)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

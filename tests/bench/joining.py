@@ -44,14 +44,14 @@ PLACED_M = 0.05
 
 def run_case(split: str, seed: int, seconds: float) -> dict[str, Any]:
     """Draw one walk, place its maps, and compare with the truth."""
-    from bodycap_batch.merging.camera_selection import choices  # gtsam takes a second to import
+    from bodycap_batch.merging.camera_selection import candidate_main_maps  # gtsam takes a second to import
     from bodycap_batch.merging.map_alignment.align import align_cameras
 
     cameras = ARMS if len(SPLITS[split]) == len(ARMS) else PALMS
     options = SynthOptions(seconds=seconds, cameras=cameras, seed=seed, poses_only=True)
     capture = posed(options, SPLITS[split])
     started = time.process_time()
-    main, further = choices(capture.inputs)[0]
+    main, further = candidate_main_maps(capture.inputs)[0]
     together = align_cameras(capture.inputs, main, further, lambda: None)
     return {
         "seconds": time.process_time() - started,
@@ -96,7 +96,7 @@ def summary(outcomes: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 def main(arguments: Sequence[str]) -> int:
     """Run and print; one line per seed and one per split."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench joining", description=__doc__)
-    parser.add_argument("--splits", nargs="*", default=list(SPLITS), choices=list(SPLITS))
+    parser.add_argument("--splits", nargs="*", default=list(SPLITS), candidate_main_maps=list(SPLITS))
     parser.add_argument(
         "--seeds", type=_seeds, default=range(24), help="the first so many, or FIRST-LAST, both included"
     )

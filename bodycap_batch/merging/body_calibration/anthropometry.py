@@ -16,7 +16,7 @@ PROPORTION_SIGMA = 0.04
 deviations of segment lengths over stature are 3 to 5 %: Winter's table gives means only; C. C. Gordon et al.,
 "2012 Anthropometric Survey of U.S. Army Personnel", Natick 2014)."""
 
-_RIGS = {
+_JOINT_PLACEMENT_SIGMA = {
     "Spine1": (0.0, 0.01, 0.055),
     "Arm": (0.02, 0.0, 0.0),
     "ForeArm": (0.025, 0.0, 0.0),
@@ -32,23 +32,23 @@ is the root mean square distance from ours, were every rig between the extremes 
 backwards a round 1 %."""
 
 
-def proportions(bones: Sequence[Bone], cameras: Sequence[str]) -> ErrorModes:
+def bone_length_modes(bones: Sequence[Bone], cameras: Sequence[str]) -> ErrorModes:
     """The ways in which bones may be longer than a height has them, each by its share, both sides alike.
 
     Args:
         bones: The graph's bones.
         cameras: Names of the cameras, whose mounts stay.
     """
-    parts = _parts(bones)
+    parts = _part_names(bones)
     names = sorted({part for part, bone in zip(parts, bones, strict=True) if bone.parent >= 0})
     offsets_m = np.zeros((len(bones), 3, len(names)))
     for index, bone in enumerate(bones):
         if bone.parent >= 0:
             offsets_m[index, :, names.index(parts[index])] = PROPORTION_SIGMA * bone.offset_m
-    return _of_offsets(offsets_m, cameras)
+    return _modes_from_offsets(offsets_m, cameras)
 
 
-def placements(bones: Sequence[Bone], cameras: Sequence[str], stature_m: float) -> ErrorModes:
+def joint_placement_modes(bones: Sequence[Bone], cameras: Sequence[str], stature_m: float) -> ErrorModes:
     """The ways in which other rigs place the joints of a body of that stature, both sides alike.
 
     A joint that lies elsewhere leaves those that follow it where they are, but for the arms': each of their
@@ -59,27 +59,30 @@ def placements(bones: Sequence[Bone], cameras: Sequence[str], stature_m: float) 
         cameras: Names of the cameras, whose mounts stay.
         stature_m: Of the body.
     """
-    parts = _parts(bones)
+    parts = _part_names(bones)
     ways = [
-        (part, axis) for part in sorted(set(parts) & set(_RIGS)) for axis in range(3) if _RIGS[part][axis]
+        (part, axis)
+        for part in sorted(set(parts) & set(_JOINT_PLACEMENT_SIGMA))
+        for axis in range(3)
+        if _JOINT_PLACEMENT_SIGMA[part][axis]
     ]
     offsets_m = np.zeros((len(bones), 3, len(ways)))
     for way, (part, axis) in enumerate(ways):
-        size = stature_m * _RIGS[part][axis]
+        size = stature_m * _JOINT_PLACEMENT_SIGMA[part][axis]
         for index, bone in enumerate(bones):
             outwards = -1.0 if axis == 0 and split_side(bone.role)[0] == "Right" else 1.0
             if parts[index] == part and bone.parent >= 0:
                 offsets_m[index, axis, way] += outwards * size
             if part == "Spine1" and bone.parent >= 0 and parts[bone.parent] == part:
                 offsets_m[index, axis, way] -= size
-    return _of_offsets(offsets_m, cameras)
+    return _modes_from_offsets(offsets_m, cameras)
 
 
-def _parts(bones: Sequence[Bone]) -> list[str]:
+def _part_names(bones: Sequence[Bone]) -> list[str]:
     return [split_side(bone.role)[1] for bone in bones]
 
 
-def _of_offsets(offsets_m: FloatArray, cameras: Sequence[str]) -> ErrorModes:
+def _modes_from_offsets(offsets_m: FloatArray, cameras: Sequence[str]) -> ErrorModes:
     """Directions (B,3,M) in which nothing but the bones differs."""
     count = offsets_m.shape[2]
     return ErrorModes(

@@ -12,19 +12,28 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.body.t_pose import arm_span, find_t_pose
 from bodycap_batch.merging.body.trunk_lean import trunk_orientation, trunk_orientation_from_prior
-from bodycap_batch.merging.body_calibration.anthropometry import PROPORTION_SIGMA, placements, proportions
-from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
-from bodycap_batch.merging.body_calibration.camera_roll import RollSearch, rolled, search_rolls, trunk_roll
+from bodycap_batch.merging.body_calibration.anthropometry import (
+    PROPORTION_SIGMA,
+    bone_length_modes,
+    joint_placement_modes,
+)
+from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
+from bodycap_batch.merging.body_calibration.camera_roll import (
+    RollSearch,
+    reference_roll,
+    search_rolls,
+    with_roll,
+)
 from bodycap_batch.merging.body_calibration.known_distance import known_distance
 from bodycap_batch.merging.body_calibration.limb_scales import limb_scales
-from bodycap_batch.merging.body_calibration.marker_board import Board, find_board
+from bodycap_batch.merging.body_calibration.marker_board import LocatedBoard, locate_board
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.body_calibration.scale import (
     ScaleEstimate,
     ScaleSource,
-    combine,
-    find_scale,
-    floor_source,
+    estimate_scale,
+    scale_from_floor,
+    weighted_mean,
 )
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.graph.error_modes import ErrorModes, stack_modes
@@ -36,14 +45,14 @@ from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import MEAN_HEIGHT_M, split_side
 
-_CALIBRATION_TICKS = 80
-ENOUGH_WALKING = 10
+_SAMPLES = 80
+MIN_WALKING_SAMPLES = 10
 STATURE_SIGMA = 0.055
 """Spread of adults' stature about one mean for both sexes (7 cm within each, means 14 cm apart)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Cleaned:
+class CalibrationInput:
     """Cleaned tracks in one gauge.
 
     Attributes:
@@ -60,7 +69,7 @@ class Cleaned:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Calibrated:
+class BodyCalibration:
     """What is constant over the capture.
 
     Attributes:
@@ -98,24 +107,24 @@ def calibrate_body(
     inputs: MergeInputs,
     options: MergeOptions,
     bones: Sequence[Bone],
-    cleaned: Cleaned,
+    cleaned: CalibrationInput,
     step: Callable[[], None],
-) -> Calibrated:
+) -> BodyCalibration:
     """Solve mounts and scale from the body's free motion, weighed with whatever else knows the scale."""
     tracks, provisional = cleaned.tracks, cleaned.provisional
-    points = points_around(inputs, tracks[0].camera)
-    t_pose_ns = _t_pose(inputs, options, bones, cleaned)
-    board = find_board(inputs, options, cleaned.places)
-    says = stated_up(options, board)
-    inputs, known_up, rolls = _right_way_up(inputs, bones, cleaned, (t_pose_ns, says), step)
+    points = map_points_of(inputs, tracks[0].camera)
+    t_pose_ns = _t_pose_interval(inputs, options, bones, cleaned)
+    board = locate_board(inputs, options, cleaned.places)
+    says = stated_verticals(options, board)
+    inputs, known_up, rolls = _resolve_camera_rolls(inputs, bones, cleaned, (t_pose_ns, says), step)
     priors = {mount.camera: mount for mount in inputs.mounts}
-    samples = take_samples(tracks, provisional, _CALIBRATION_TICKS, known_up, t_pose_ns)
-    calibration = Calibration(inputs.skeleton, bones, samples, priors, provisional, step)
+    samples = take_samples(tracks, provisional, _SAMPLES, known_up, t_pose_ns)
+    calibration = CalibrationGraph(inputs.skeleton, bones, samples, priors, provisional, step)
     calibration.solve(provisional)
     calibration.widen_postures()
-    estimate = find_scale(calibration, provisional)
+    estimate = estimate_scale(calibration, provisional)
     if calibration.test_hinges():
-        estimate = find_scale(calibration, estimate.scale)
+        estimate = estimate_scale(calibration, estimate.scale)
     poses = calibration.poses()
     path_m = estimate.scale * tracks[0].map_from_cam[:, :3, 3]
     around = SceneContext(
@@ -129,19 +138,19 @@ def calibrate_body(
     )
     walking = samples.posture.walking
     # Who bends down or sits is not as tall as who walks.
-    erect = poses[walking] if walking.sum() >= ENOUGH_WALKING else poses
+    erect = poses[walking] if walking.sum() >= MIN_WALKING_SAMPLES else poses
     height = _height_over_floor(inputs, bones, erect, up, (estimate.scale * points, path_m))
     stated = (known_distance(inputs, options, cleaned.places), board.scale if board else None)
     known = tuple(source for source in stated if source is not None)
     sources = _sources(inputs, bones, estimate, height, known)
-    scale, sigma = combine(sources)
+    scale, sigma = weighted_mean(sources)
     if not inputs.skeleton_is_measured and inputs.height_m is None and sources[0].used:
         sigma = float(np.hypot(sigma, STATURE_SIGMA))
     if scale != estimate.scale:
         calibration.solve(scale)
-    bodies = () if inputs.skeleton_is_measured else (_bodies(inputs, bones, samples.cameras),)
+    bodies = () if inputs.skeleton_is_measured else (_skeleton_error_modes(inputs, bones, samples.cameras),)
     constant, passing = calibration.spread(sigma, estimate.mount_slope, cleaned.placed, bodies)
-    return Calibrated(
+    return BodyCalibration(
         scale=scale,
         sigma_log=sigma,
         estimate=estimate,
@@ -158,31 +167,31 @@ def calibrate_body(
     )
 
 
-def _bodies(
+def _skeleton_error_modes(
     inputs: MergeInputs, bones: Sequence[Bone], cameras: Sequence[str]
 ) -> tuple[ErrorModes, ErrorModes]:
     """How people, and rigs, of one stature differ."""
     stature_m = MEAN_HEIGHT_M if inputs.height_m is None else inputs.height_m
-    return proportions(bones, cameras), placements(bones, cameras, stature_m)
+    return bone_length_modes(bones, cameras), joint_placement_modes(bones, cameras, stature_m)
 
 
-def _right_way_up(
+def _resolve_camera_rolls(
     inputs: MergeInputs,
     bones: Sequence[Bone],
-    cleaned: Cleaned,
+    cleaned: CalibrationInput,
     known: tuple[tuple[int, int] | None, Sequence[VerticalHypothesis]],
     step: Callable[[], None],
 ) -> tuple[MergeInputs, FloatArray | None, tuple[RollSearch, ...]]:
     """The priors with each camera the way up it sits, the vertical where it is known, and what was tried."""
     t_pose_ns, stated = known
-    roll, found = trunk_way_up(inputs, bones, cleaned.tracks, cleaned.provisional, stated)
+    roll, found = reference_camera_roll(inputs, bones, cleaned.tracks, cleaned.provisional, stated)
     up = None if found is None else found.up
-    inputs = rolled_mounts(inputs, {cleaned.tracks[0].camera: roll})
+    inputs = with_rolls(inputs, {cleaned.tracks[0].camera: roll})
     rolls = search_rolls(inputs, cleaned.tracks, cleaned.provisional, (up, t_pose_ns), step)
-    return rolled_mounts(inputs, {each.camera: each.chosen_deg for each in rolls}), up, rolls
+    return with_rolls(inputs, {each.camera: each.chosen_deg for each in rolls}), up, rolls
 
 
-def trunk_way_up(
+def reference_camera_roll(
     inputs: MergeInputs,
     bones: Sequence[Bone],
     tracks: Sequence[CameraTrack],
@@ -191,12 +200,14 @@ def trunk_way_up(
 ) -> tuple[float, Vertical | None]:
     """Roll (degrees) of the leading camera of a map's tracks, and the vertical where it is known early."""
     trunk = tracks[0].scaled(provisional)
-    points_m = provisional * points_around(inputs, trunk.camera)
+    points_m = provisional * map_points_of(inputs, trunk.camera)
     prior = inputs.mount_of(trunk.camera)
     ways: dict[float, Vertical] = {}
 
     def up_of(degrees: float) -> FloatArray | None:
-        found = early_up(inputs.skeleton, bones, (trunk, rolled(prior, degrees)), points_m, stated)
+        found = preliminary_vertical(
+            inputs.skeleton, bones, (trunk, with_roll(prior, degrees)), points_m, stated
+        )
         if found is None:
             return None
         ways[degrees] = found
@@ -205,33 +216,33 @@ def trunk_way_up(
     def own_up(degrees: float) -> FloatArray | None:
         if split_side(bones[trunk.bone].role)[0]:
             return None
-        return trunk_orientation_from_prior(bones, trunk, rolled(prior, degrees)).upright_up()
+        return trunk_orientation_from_prior(bones, trunk, with_roll(prior, degrees)).upright_up()
 
-    roll, _ = trunk_roll(inputs, tracks, up_of, own_up)
+    roll, _ = reference_roll(inputs, tracks, up_of, own_up)
     return roll, ways.get(roll)
 
 
-def stated_up(options: MergeOptions, board: Board | None) -> tuple[VerticalHypothesis, ...]:
+def stated_verticals(options: MergeOptions, board: LocatedBoard | None) -> tuple[VerticalHypothesis, ...]:
     """What the job itself says of up."""
     if board is None or options.marker_board is None:
         return ()
     return board.ups(options.marker_board.placed)
 
 
-def rolled_mounts(inputs: MergeInputs, degrees: Mapping[str, float]) -> MergeInputs:
+def with_rolls(inputs: MergeInputs, degrees: Mapping[str, float]) -> MergeInputs:
     """The priors with cameras turned about their optical axes."""
-    mounts = tuple(rolled(mount, degrees.get(mount.camera, 0.0)) for mount in inputs.mounts)
+    mounts = tuple(with_roll(mount, degrees.get(mount.camera, 0.0)) for mount in inputs.mounts)
     return replace(inputs, mounts=mounts)
 
 
-def points_around(inputs: MergeInputs, camera: str) -> FloatArray:
+def map_points_of(inputs: MergeInputs, camera: str) -> FloatArray:
     """Points (P,3) of the map a camera is in, none where it is not known."""
     gauge_name = next(each.gauge for each in inputs.trajectories if each.camera == camera)
     return inputs.map_points.get(gauge_name, np.zeros((0, 3)))
 
 
-def _t_pose(
-    inputs: MergeInputs, options: MergeOptions, bones: Sequence[Bone], cleaned: Cleaned
+def _t_pose_interval(
+    inputs: MergeInputs, options: MergeOptions, bones: Sequence[Bone], cleaned: CalibrationInput
 ) -> tuple[int, int] | None:
     """Where a T-pose stands: where the job says, else where one is seen."""
     if options.t_pose_s is not None:
@@ -240,7 +251,7 @@ def _t_pose(
     return find_t_pose(bones, cleaned.tracks, arm_span(bones, inputs.skeleton) / cleaned.provisional)
 
 
-def early_up(
+def preliminary_vertical(
     skeleton: SkeletonModel,
     bones: Sequence[Bone],
     worn: tuple[CameraTrack, Mount],
@@ -302,7 +313,7 @@ def _sources(
     out = [body]
     if height_m is not None:
         standing = standing_height(inputs.skeleton, bones[0].joint)
-        floor = floor_source(body, height_m, standing)
+        floor = scale_from_floor(body, height_m, standing)
         out.append(
             floor
             if not known

@@ -13,16 +13,21 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.body.bones import JOINT_SLACK_M, Bone, hinges
 from bodycap_batch.merging.body.initial_poses import fill_gaps, pose_bones
 from bodycap_batch.merging.body.t_pose import with_t_pose_prior
-from bodycap_batch.merging.body_calibration.hinge_test import FREE_M, loosened, off_hinges, told
-from bodycap_batch.merging.body_calibration.joint_variability import passing_shares
+from bodycap_batch.merging.body_calibration.hinge_test import (
+    FREE_SIGMA_M,
+    hinge_violation_sigma,
+    observable_hinges,
+    with_hinge_slack,
+)
+from bodycap_batch.merging.body_calibration.joint_variability import transient_variance_shares
 from bodycap_batch.merging.body_calibration.mount_covariance import (
     JOINED,
     MEASURED,
-    Eliminated,
-    SolvedMounts,
-    kinds_of,
+    LinearisedCalibration,
+    ReducedSystem,
+    row_types,
 )
-from bodycap_batch.merging.body_calibration.samples import Samples
+from bodycap_batch.merging.body_calibration.samples import CalibrationSamples
 from bodycap_batch.merging.graph.error_modes import (
     POSTURE_BIAS_SHARE,
     BodyModel,
@@ -52,13 +57,13 @@ from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_RAD
 
-PRIOR_SCALE = 4.0
+JOINT_PRIOR_SCALE = 4.0
 """The pose prior counts once per tick here; its sigmas are widened, or it would outvote the cameras."""
-_FLEETING = float(np.sqrt(1.0 - POSTURE_BIAS_SHARE**2))
+_TRANSIENT_SHARE = float(np.sqrt(1.0 - POSTURE_BIAS_SHARE**2))
 """Of a joint's everyday range, what comes and goes."""
 
 
-class Calibration:
+class CalibrationGraph:
     """The calibration graph at any scale, warm-started from the last one solved.
 
     What is uncertain in map units (camera centres, and with them the joints' gaps) keeps its sigma there:
@@ -77,7 +82,7 @@ class Calibration:
         self,
         skeleton: SkeletonModel,
         bones: Sequence[Bone],
-        samples: Samples,
+        samples: CalibrationSamples,
         priors: Mapping[str, Mount],
         provisional: float,
         step: Callable[[], None],
@@ -93,11 +98,11 @@ class Calibration:
         self.mounts = {name: np.array(priors[name].joint_from_cam) for name in samples.cameras}
 
     @property
-    def samples(self) -> Samples:
+    def samples(self) -> CalibrationSamples:
         """The camera poses in use."""
         return self._samples
 
-    def move(self, samples: Samples) -> None:
+    def move(self, samples: CalibrationSamples) -> None:
         """Use other camera poses of the same cameras and ticks; the last solution stays the start."""
         self._samples = samples
 
@@ -137,14 +142,14 @@ class Calibration:
         Returns:
             Whether any of them gives.
         """
-        tested = told(self._hinges, self._samples.bones)
+        tested = observable_hinges(self._hinges, self._samples.bones)
         if not tested:
             return False
         kept = self._at_ease, self._hinges, self._values, dict(self.mounts)
-        self._use(loosened(self._at_ease, {hinge.lower: FREE_M for hinge in tested}), once=1.0)
+        self._use(with_hinge_slack(self._at_ease, {hinge.lower: FREE_SIGMA_M for hinge in tested}), once=1.0)
         self.solve(self._scale)
         self._use(
-            loosened(self._at_ease, off_hinges(self.solved())),
+            with_hinge_slack(self._at_ease, hinge_violation_sigma(self.solved())),
             once=samples_per_gesture(self._samples.times_ns),
         )
         if not self.off_hinge_m():
@@ -207,26 +212,26 @@ class Calibration:
         ]
         return constant, stack_modes(passing)
 
-    def _passing(self, mounts: SolvedMounts, solved: Eliminated) -> FloatArray:
+    def _passing(self, mounts: LinearisedCalibration, solved: ReducedSystem) -> FloatArray:
         """Share (B,) of each joint's everyday range that comes and goes."""
         usual = np.flatnonzero(~self._samples.posture.t_pose)
         times_ns = self._samples.times_ns[usual]
-        return np.sqrt(passing_shares(mounts, solved, (usual, times_ns), PRIOR_SCALE))
+        return np.sqrt(transient_variance_shares(mounts, solved, (usual, times_ns), JOINT_PRIOR_SCALE))
 
-    def _bent(self, mounts: SolvedMounts, solved: Eliminated) -> float:
+    def _bent(self, mounts: LinearisedCalibration, solved: ReducedSystem) -> float:
         """Variance of the measurements beyond their own noise, as a share of what was believed."""
         white, repeats = self._samples.white_share, self._samples.repeats
         # The map's error was widened by what samples share of it: one sample alone shows the plain one.
         return max(mounts.variance(solved, MEASURED, white + (1.0 - white) / repeats) - white, 0.0)
 
-    def row_variance(self, mounts: SolvedMounts, solved: Eliminated) -> FloatArray:
+    def row_variance(self, mounts: LinearisedCalibration, solved: ReducedSystem) -> FloatArray:
         """Variance factor (5,) of each kind of the graph's rows, from the residuals."""
         repeats = self._samples.repeats
         measured = self._samples.white_share + repeats * self._bent(mounts, solved)
         # What is left of a gap may repeat itself as the map's error does.
         joint_gaps = repeats * mounts.variance(solved, JOINED, 1.0 / repeats)
         # Rotations are weighed at the pose prior's widened sigmas; what comes and goes differs by sample.
-        posed = (_FLEETING / PRIOR_SCALE) ** 2
+        posed = (_TRANSIENT_SHARE / JOINT_PRIOR_SCALE) ** 2
         return np.array([1.0, measured, joint_gaps, posed, (NOMINAL_ERROR_RAD / NOMINAL_SIGMA_RAD) ** 2])
 
     def measurement_shifts(self, linear: LinearisedGraph, directions: FloatArray) -> FloatArray:
@@ -256,7 +261,7 @@ class Calibration:
             first += 4 * len(ticks)
         return out
 
-    def reweigh(self, mounts: SolvedMounts, solved: Eliminated) -> None:
+    def reweigh(self, mounts: LinearisedCalibration, solved: ReducedSystem) -> None:
         """Weigh measurements and gaps by what the last solution left of them, never by less than believed.
 
         Residuals that are smaller than a map's usual error say that this map is better.
@@ -272,7 +277,7 @@ class Calibration:
         )
         self._slack_map *= float(np.sqrt(min(float(factors[JOINED]), 1.0)))
 
-    def unit_shifts(self, mounts: SolvedMounts) -> FloatArray:
+    def unit_shifts(self, mounts: LinearisedCalibration) -> FloatArray:
         """How the residuals (R,) change per unit of log scale because their sigmas do.
 
         Centres and gaps are uncertain in map units: their residuals shrink as the map grows. Without this
@@ -289,7 +294,7 @@ class Calibration:
             first += 4 * len(factors)
         return out
 
-    def solved(self) -> SolvedMounts:
+    def solved(self) -> LinearisedCalibration:
         """The last solution's derivatives, for what depends on it."""
         cameras = self._samples.cameras
         all_points = self._samples.points(self._scale)
@@ -301,7 +306,7 @@ class Calibration:
         each, last = body.factors_per_tick, self._samples.valid.shape[1]
         posed = np.flatnonzero(self._samples.posture.t_pose)
         stated = (self._first_joint + each * posed[:, None] + np.arange(each)).reshape(-1)
-        return SolvedMounts(
+        return LinearisedCalibration(
             linear=linear,
             body=body,
             world_from_bone=self.poses(),
@@ -313,7 +318,7 @@ class Calibration:
                 name: mount_jacobian(self.mounts[name], all_points[camera])
                 for camera, name in enumerate(cameras)
             },
-            kinds=kinds_of(
+            kinds=row_types(
                 linear, (self._first_joint, self._first_joint + each * last), stated, self._named()
             ),
             first_joint=self._first_joint,
@@ -367,7 +372,7 @@ class Calibration:
         slack_m = scale * self.slack_factor * self._slack_map
         once = float(np.sqrt(max(self._samples.posture.t_pose.sum(), 1)))
         return (
-            JointFactors(self._at_ease, self._hinges, prior_scale=PRIOR_SCALE, slack_m=slack_m),
+            JointFactors(self._at_ease, self._hinges, prior_scale=JOINT_PRIOR_SCALE, slack_m=slack_m),
             JointFactors(self._t_posed, self._hinges, prior_scale=once, slack_m=slack_m),
         )
 

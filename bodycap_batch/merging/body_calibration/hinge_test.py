@@ -17,19 +17,19 @@ import numpy as np
 
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.merging.body.bones import JOINT_SLACK_M, Bone, Hinge
-from bodycap_batch.merging.body_calibration.mount_covariance import SolvedMounts
+from bodycap_batch.merging.body_calibration.mount_covariance import LinearisedCalibration
 from bodycap_batch.merging.graph.error_modes import BodyModel
 from bodycap_batch.merging.graph.factors import HINGE_SLACK_RATIO
 
-FREE_M = 0.1
+FREE_SIGMA_M = 0.1
 """Sigma of the distances of a hinge that is let go: ten times that of one that holds."""
-KEPT_M = HINGE_SLACK_RATIO * JOINT_SLACK_M
-_CLEARLY = 1.5
+TIGHT_SIGMA_M = HINGE_SLACK_RATIO * JOINT_SLACK_M
+_MIN_VARIANCE_RATIO = 1.5
 """Times the variance of a hinge that is kept to, beyond which it gives. Let go, distances are off by 3 to 6
 mm where elbows are hinges, by 14 and 24 mm where they turn by 6 and 12 degrees about another axis, too."""
 
 
-def told(hinges: Sequence[Hinge], measured: Collection[int]) -> list[Hinge]:
+def observable_hinges(hinges: Sequence[Hinge], measured: Collection[int]) -> list[Hinge]:
     """Hinges with a camera on the bone above and on one of the two below: only they can be contradicted.
 
     Args:
@@ -43,26 +43,26 @@ def told(hinges: Sequence[Hinge], measured: Collection[int]) -> list[Hinge]:
     ]
 
 
-def off_hinges(mounts: SolvedMounts) -> dict[int, float]:
-    """By lower bone, sigma by which distances leave a hinge that was let go, beyond `KEPT_M`; 0 where not.
+def hinge_violation_sigma(mounts: LinearisedCalibration) -> dict[int, float]:
+    """By lower bone, sigma by which distances leave a hinge that was let go, beyond `TIGHT_SIGMA_M`; 0 where not.
 
     Args:
         mounts: A calibration at its solution.
     """
     out, solved = {}, mounts.eliminated()
     for number, hinge in enumerate(mounts.body.hinges):
-        if hinge.sigma_m < FREE_M:
+        if hinge.sigma_m < FREE_SIGMA_M:
             continue
-        rows = mounts.linear.first_row[_factors(mounts.body, number, mounts)]
+        rows = mounts.linear.first_row[_hinge_factors(mounts.body, number, mounts)]
         residuals = float((mounts.linear.rhs[rows] ** 2).sum())
         redundancy = max(float(solved.redundancy[rows].sum()), 1.0)
         variance = hinge.sigma_m**2 * residuals / redundancy
-        gives = variance > _CLEARLY * KEPT_M**2
-        out[hinge.lower] = float(np.sqrt(variance - KEPT_M**2)) if gives else 0.0
+        gives = variance > _MIN_VARIANCE_RATIO * TIGHT_SIGMA_M**2
+        out[hinge.lower] = float(np.sqrt(variance - TIGHT_SIGMA_M**2)) if gives else 0.0
     return out
 
 
-def loosened(bones: Sequence[Bone], off_hinge_m: Mapping[int, float]) -> tuple[Bone, ...]:
+def with_hinge_slack(bones: Sequence[Bone], off_hinge_m: Mapping[int, float]) -> tuple[Bone, ...]:
     """Bones whose hinges give by so much, the others as they are."""
     return tuple(
         replace(bone, off_hinge_m=off_hinge_m[index]) if index in off_hinge_m else bone
@@ -70,7 +70,7 @@ def loosened(bones: Sequence[Bone], off_hinge_m: Mapping[int, float]) -> tuple[B
     )
 
 
-def _factors(body: BodyModel, number: int, mounts: SolvedMounts) -> IntArray:
+def _hinge_factors(body: BodyModel, number: int, mounts: LinearisedCalibration) -> IntArray:
     """Indices of one hinge's two distances at every tick."""
     ticks = np.arange(len(mounts.world_from_bone))
     first = mounts.first_joint + sum(bone.parent >= 0 for bone in body.bones) + 2 * number

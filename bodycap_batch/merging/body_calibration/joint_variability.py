@@ -9,17 +9,20 @@ from __future__ import annotations
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
-from bodycap_batch.merging.body_calibration.mount_covariance import Eliminated, SolvedMounts
+from bodycap_batch.merging.body_calibration.mount_covariance import LinearisedCalibration, ReducedSystem
 from bodycap_batch.merging.graph.error_modes import POSTURE_BIAS_SHARE
 from bodycap_batch.merging.graph.posture import samples_per_gesture
 
-_BELIEF = 6.0
+_PRIOR_REDUNDANCY = 6.0
 """Redundant rotations, each of a gesture of its own, that the everyday range counts as much as: two gestures
 about three axes. In six captures of walks, reaching and a dance joints used 0.2 to 33 % of its variance."""
 
 
-def passing_shares(
-    mounts: SolvedMounts, solved: Eliminated, samples: tuple[IntArray, IntArray], prior_scale: float
+def transient_variance_shares(
+    mounts: LinearisedCalibration,
+    solved: ReducedSystem,
+    samples: tuple[IntArray, IntArray],
+    prior_scale: float,
 ) -> FloatArray:
     """Share (B,) of each joint's everyday variance that comes and goes within the capture.
 
@@ -44,5 +47,5 @@ def passing_shares(
         off = prior_scale * mounts.linear.rhs[rows]
         varied = float(((off - off.mean(axis=0)) ** 2).sum()) / repeated
         redundancy = float(solved.redundancy[rows].sum()) / repeated
-        out[index] = (_BELIEF * out[index] + varied) / (_BELIEF + redundancy)
+        out[index] = (_PRIOR_REDUNDANCY * out[index] + varied) / (_PRIOR_REDUNDANCY + redundancy)
     return out

@@ -15,7 +15,7 @@ from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.scene import Trajectory
 
 _FIELD = "merge.known_distance"
-_LEAST_SIGMA = 0.003
+_MIN_SIGMA = 0.003
 """Nobody measures the way between two lenses better than to a few millimetres a metre."""
 
 
@@ -37,7 +37,7 @@ def known_distance(
     if options.known_distance is None:
         return None
     first, second, metres = options.known_distance
-    ends = [_frame(inputs, name) for name in (first, second)]
+    ends = [_find_frame(inputs, name) for name in (first, second)]
     if ends[0][0].gauge != ends[1][0].gauge:
         raise JobError(
             f"{first} and {second} are in maps that share no view",
@@ -60,11 +60,11 @@ def known_distance(
             "of their distance is uncertain",
             hint="name two frames that are farther apart",
         )
-    sigma = np.sqrt(variance / apart**2 + 2.0 * (MIN_SIGMA_M / metres) ** 2 + _LEAST_SIGMA**2)
+    sigma = np.sqrt(variance / apart**2 + 2.0 * (MIN_SIGMA_M / metres) ** 2 + _MIN_SIGMA**2)
     return ScaleSource(name="known distance", scale=metres / (unit * apart), sigma_log=float(sigma))
 
 
-def _frame(inputs: MergeInputs, name: str) -> tuple[Trajectory, int]:
+def _find_frame(inputs: MergeInputs, name: str) -> tuple[Trajectory, int]:
     """Trajectory and row of ``camera:frame``."""
     camera, _, number = name.rpartition(":")
     found = next((each for each in inputs.trajectories if each.camera == camera), None)

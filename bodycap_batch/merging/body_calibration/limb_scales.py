@@ -9,17 +9,17 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body.bones import kinematic_chain
-from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
+from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack
 from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.skeleton_presets import split_side
 
-_STEP = 0.1
-_TICKS = 40
+_LOG_SCALE_STEP = 0.1
+_SAMPLES = 40
 _ENOUGH_TOGETHER = 15
-_LIMBS = {
+_LIMB_OF_PART = {
     **dict.fromkeys(("Shoulder", "Arm", "ForeArm", "Hand"), "arm"),
     **dict.fromkeys(("UpLeg", "Leg", "Foot", "ToeBase"), "leg"),
     **dict.fromkeys(("Neck", "Head"), "head"),
@@ -48,21 +48,22 @@ def limb_scales(
     limbs: dict[str, list[CameraTrack]] = {}
     for track in tracks[1:]:
         side, part = split_side(inputs.mount_of(track.camera).role)
-        if part in _LIMBS and _together(tracks[0], track) >= _ENOUGH_TOGETHER:
-            limbs.setdefault(f"{side.lower()} {_LIMBS[part]}".strip(), []).append(track)
+        if part in _LIMB_OF_PART and _common_frames(tracks[0], track) >= _ENOUGH_TOGETHER:
+            limbs.setdefault(f"{side.lower()} {_LIMB_OF_PART[part]}".strip(), []).append(track)
     if len(limbs) < 2:
         return ()
     found = [
-        _alone(name, inputs, [tracks[0], *own], (scale, *known), step) for name, own in sorted(limbs.items())
+        _scale_of_limb(name, inputs, [tracks[0], *own], (scale, *known), step)
+        for name, own in sorted(limbs.items())
     ]
     return tuple(each for each in found if each is not None)
 
 
-def _together(trunk: CameraTrack, track: CameraTrack) -> int:
+def _common_frames(trunk: CameraTrack, track: CameraTrack) -> int:
     return int(track.poses_at(trunk.times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS)[1].sum())
 
 
-def _alone(
+def _scale_of_limb(
     name: str,
     inputs: MergeInputs,
     tracks: Sequence[CameraTrack],
@@ -74,13 +75,15 @@ def _alone(
     bones = kinematic_chain(inputs.skeleton, roles)
     index = {bone.role: position for position, bone in enumerate(bones)}
     own = [replace(track, bone=index[role]) for track, role in zip(tracks, roles, strict=True)]
-    samples = take_samples(own, scale, _TICKS, up, t_pose_ns)
+    samples = take_samples(own, scale, _SAMPLES, up, t_pose_ns)
     priors = {mount.camera: mount for mount in inputs.mounts}
-    calibration = Calibration(inputs.skeleton, bones, samples, priors, scale, step)
+    calibration = CalibrationGraph(inputs.skeleton, bones, samples, priors, scale, step)
     middle = calibration.solve(scale)
-    low, high = (calibration.solve(scale * float(np.exp(sign * _STEP))) for sign in (-1.0, 1.0))
+    low, high = (calibration.solve(scale * float(np.exp(sign * _LOG_SCALE_STEP))) for sign in (-1.0, 1.0))
     bend = low + high - 2.0 * middle
     if bend <= 0.0:
         return None
-    offset = 0.5 * _STEP * (low - high) / bend
-    return ScaleSource(name=name, scale=scale * float(np.exp(offset)), sigma_log=float(_STEP / np.sqrt(bend)))
+    offset = 0.5 * _LOG_SCALE_STEP * (low - high) / bend
+    return ScaleSource(
+        name=name, scale=scale * float(np.exp(offset)), sigma_log=float(_LOG_SCALE_STEP / np.sqrt(bend))
+    )

@@ -12,28 +12,28 @@ import numpy as np
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body_calibration.samples import MAP_ERROR_M, MAP_ERROR_S
+from bodycap_batch.merging.body_calibration.samples import MAP_ERROR_DURATION_S, MAP_ERROR_M
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.merging.world.vertical import VerticalHypothesis
 from bodycap_batch.model.geometry import Similarity, invert, so3_exp, so3_log
 from bodycap_batch.model.merge_data import BoardView, MergeInputs
 
-NAME = "marker board"
-_FEWEST_VIEWS = 3
+SOURCE_NAME = "marker board"
+_MIN_VIEWS = 3
 """Two views always agree on a board's size; the third tells whether they are right."""
-_LEAST_SIGMA = 0.003
+_MIN_SIGMA = 0.003
 """Printers and rulers: a millimetre in 30 cm."""
-_MOST_SIGMA = 0.05
+_MAX_SIGMA = 0.05
 """Beyond this the body's own proportions know the scale as well (a height alone: 4 %)."""
-_FITS = 3
+_REWEIGHTINGS = 3
 """Times the loss's width is taken from the residuals anew: the third changes it by less than a tenth."""
-_FLIP = np.diag([-1.0, -1.0, 1.0])
+_HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 _PLACED_SIGMA_DEG = 1.5
 """A board hung by eye; a level floor or table is off by less."""
 
 
 @dataclass(frozen=True, slots=True)
-class Board:
+class LocatedBoard:
     """The marker board in the room.
 
     Attributes:
@@ -50,11 +50,11 @@ class Board:
             return ()
         edges = [sign * self.axes[:, axis] for axis in (0, 1) for sign in (1.0, -1.0)]
         ups = [self.axes[:, 2]] if placed == "lying" else edges
-        return tuple(VerticalHypothesis(source=NAME, up=up, sigma_deg=_PLACED_SIGMA_DEG) for up in ups)
+        return tuple(VerticalHypothesis(source=SOURCE_NAME, up=up, sigma_deg=_PLACED_SIGMA_DEG) for up in ups)
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
+class _BoardObservations:
     """Views of one board in one map.
 
     Attributes:
@@ -74,9 +74,9 @@ class _Seen:
     group: IntArray
 
 
-def find_board(
+def locate_board(
     inputs: MergeInputs, options: MergeOptions, places: Mapping[str, Similarity] | None = None
-) -> Board | None:
+) -> LocatedBoard | None:
     """The scale and the way up from the job's marker board, None where it names none.
 
     The board's place, orientation and size in the map are fitted to its corners in all keyframes at once, by
@@ -96,11 +96,13 @@ def find_board(
     """
     if options.marker_board is None:
         return None
-    gauge, seen = _gather(inputs, places, turns=options.marker_board.kind == "chessboard")
-    start = _start(seen)
+    gauge, seen = _select_observations(inputs, places, turns=options.marker_board.kind == "chessboard")
+    start = _initial_fit(seen)
     found, weight = _fit(seen, start)
-    sigma = float(np.hypot(max(_spread(seen, found, weight), _bend(seen, found)), _LEAST_SIGMA))
-    if not sigma < _MOST_SIGMA:
+    sigma = float(
+        np.hypot(max(_jackknife_sigma(seen, found, weight), _map_bend_sigma(seen, found)), _MIN_SIGMA)
+    )
+    if not sigma < _MAX_SIGMA:
         raise EstimationError(
             f"the marker board tells the scale to {sigma:.0%} only: its {len(seen.map_from_cam)} views are "
             "from nearly the same place, or their poses contradict each other",
@@ -110,13 +112,13 @@ def find_board(
     axes = so3_exp(found[None, :3])[0]
     # Whichever way the detector's normal points, a board is seen from its front.
     axes[:, 2] *= np.sign((seen.map_from_cam[:, :3, 3] - found[3:6]).mean(axis=0) @ axes[:, 2])
-    scale = ScaleSource(name=NAME, scale=float(np.exp(-found[6])) / unit, sigma_log=sigma)
-    return Board(scale, turn @ axes)
+    scale = ScaleSource(name=SOURCE_NAME, scale=float(np.exp(-found[6])) / unit, sigma_log=sigma)
+    return LocatedBoard(scale, turn @ axes)
 
 
-def _gather(
+def _select_observations(
     inputs: MergeInputs, places: Mapping[str, Similarity] | None, *, turns: bool
-) -> tuple[str, _Seen]:
+) -> tuple[str, _BoardObservations]:
     """The views of the main map; of the map that has most where the main one has too few."""
     paths = {each.camera: each for each in inputs.trajectories}
     by_gauge: dict[str, list[BoardView]] = {}
@@ -126,22 +128,24 @@ def _gather(
             by_gauge.setdefault(path.gauge, []).append(view)
     gauge, views = max(by_gauge.items(), key=lambda item: len(item[1]), default=("", []))
     main = next(iter(places or {}), gauge)
-    if len(by_gauge.get(main, [])) >= _FEWEST_VIEWS:
+    if len(by_gauge.get(main, [])) >= _MIN_VIEWS:
         gauge, views = main, by_gauge[main]  # a joined map's own scale is known less well
-    if len(views) < _FEWEST_VIEWS:
+    if len(views) < _MIN_VIEWS:
         raise EstimationError(
-            f"the marker board was found in {len(views)} keyframes of one map, {_FEWEST_VIEWS} are needed",
+            f"the marker board was found in {len(views)} keyframes of one map, {_MIN_VIEWS} are needed",
             hint="is merge.marker_board the board that was filmed (kind, columns, rows, dictionary, legacy)? "
             "It has to be sharp, whole (a chessboard) and near: its squares 10 px and more",
         )
-    stretch = round(1e9 * MAP_ERROR_S)
+    stretch = round(1e9 * MAP_ERROR_DURATION_S)
     shared = [f"{v.camera} {int(paths[v.camera].times_ns[v.frame]) // stretch}" for v in views]
     _, group = np.unique(shared, return_inverse=True)
     map_from_cam = np.array([paths[v.camera].gauge_from_cam[v.frame] for v in views])
-    return gauge, _upright(views, map_from_cam, group, turns=turns)
+    return gauge, _with_one_orientation(views, map_from_cam, group, turns=turns)
 
 
-def _upright(views: Sequence[BoardView], map_from_cam: FloatArray, group: IntArray, *, turns: bool) -> _Seen:
+def _with_one_orientation(
+    views: Sequence[BoardView], map_from_cam: FloatArray, group: IntArray, *, turns: bool
+) -> _BoardObservations:
     """Views with corners about the board's middle, all the same way round.
 
     Half a turn maps many a chessboard onto itself (`turns`): its detector may begin at either end. A ChArUco
@@ -156,22 +160,22 @@ def _upright(views: Sequence[BoardView], map_from_cam: FloatArray, group: IntArr
         own[:3, 3] += own[:3, :3] @ middle
         flip = np.eye(3)
         if turns and float(np.trace(first[:3, :3].T @ (pose @ own)[:3, :3])) < 1.0:  # more than a right angle
-            flip = _FLIP
+            flip = _HALF_TURN
         own[:3, :3] = own[:3, :3] @ flip
         placed.append(own)
         board.append((view.board_m - middle) @ flip)
     counts = [len(view.rays) for view in views]
-    return _Seen(
+    return _BoardObservations(
         map_from_cam=map_from_cam,
         cam_from_board=np.array(placed),
         view=np.repeat(np.arange(len(views)), counts),
         board_m=np.concatenate(board),
         rays=np.concatenate([view.rays for view in views]),
-        group=group if len(np.unique(group)) >= _FEWEST_VIEWS else np.arange(len(views)),
+        group=group if len(np.unique(group)) >= _MIN_VIEWS else np.arange(len(views)),
     )
 
 
-def _start(seen: _Seen) -> FloatArray:
+def _initial_fit(seen: _BoardObservations) -> FloatArray:
     """Rotation vector, place and log of the size (7,): each view alone has the board's middle in metres."""
     rotation = seen.map_from_cam[:, :3, :3]
     u, _, vt = np.linalg.svd((rotation @ seen.cam_from_board[:, :3, :3]).sum(axis=0))
@@ -188,7 +192,7 @@ def _start(seen: _Seen) -> FloatArray:
     return np.concatenate([so3_log(turn[None])[0], place, [np.log(size)]])
 
 
-def _residuals(seen: _Seen, value: FloatArray) -> FloatArray:
+def _residuals(seen: _BoardObservations, value: FloatArray) -> FloatArray:
     """(2N,) where the corners are seen less where they should be, at depth 1."""
     placed = np.exp(value[6]) * seen.board_m @ so3_exp(value[None, :3])[0].T + value[3:6]
     back = invert(seen.map_from_cam)[seen.view]
@@ -197,18 +201,18 @@ def _residuals(seen: _Seen, value: FloatArray) -> FloatArray:
     return np.asarray((x_in_cam[:, :2] / depth - seen.rays).ravel())
 
 
-def _fit(seen: _Seen, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _fit(seen: _BoardObservations, start: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The fit (7,) under Cauchy's loss at the views' own spread, and each residual's weight (2N,)."""
     from scipy.optimize import least_squares
 
     value, limit = start, 1.0
-    for _ in range(_FITS):
+    for _ in range(_REWEIGHTINGS):
         limit = 2.0 * 1.4826 * float(np.median(np.abs(_residuals(seen, value)))) + 1e-9
         value = least_squares(partial(_residuals, seen), value, loss="cauchy", f_scale=limit, x_scale="jac").x
     return np.asarray(value), 1.0 / (1.0 + (_residuals(seen, value) / limit) ** 2)
 
 
-def _spread(seen: _Seen, value: FloatArray, weight: FloatArray) -> float:
+def _jackknife_sigma(seen: _BoardObservations, value: FloatArray, weight: FloatArray) -> float:
     """Sigma of the log of the size: how far it moves as each group of views is left out."""
     step = 1e-6 * np.maximum(1.0, np.abs(value))
     jacobian = np.stack(
@@ -232,7 +236,7 @@ def _spread(seen: _Seen, value: FloatArray, weight: FloatArray) -> float:
     return float(np.sqrt(variance))
 
 
-def _bend(seen: _Seen, value: FloatArray) -> float:
+def _map_bend_sigma(seen: _BoardObservations, value: FloatArray) -> float:
     """Sigma of the log of the size where the two ends of the way are off, each by as much as maps are."""
     centre = seen.map_from_cam[:, :3, 3]
     along = np.linalg.svd(centre - centre.mean(axis=0), full_matrices=False)[2][0]

@@ -34,12 +34,12 @@ from bodycap_batch.merging.graph.linearisation import LinearisedGraph
 PRIOR, MEASURED, JOINED, POSED, NAMED = range(5)
 """Kinds of rows: what is believed beforehand, camera points, gaps of joints and hinges, joint rotations, and
 how a camera is turned whose name alone says it."""
-_BELIEF = 30.0
+_PRIOR_REDUNDANCY = 30.0
 """Redundant residuals that the variance believed beforehand counts as much as."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SolvedMounts:
+class LinearisedCalibration:
     """A calibration graph at its solution: ticks that are linked through the mounts alone.
 
     Attributes:
@@ -60,7 +60,7 @@ class SolvedMounts:
     kinds: IntArray
     first_joint: int
 
-    def eliminated(self, further: FloatArray | None = None) -> Eliminated:
+    def eliminated(self, further: FloatArray | None = None) -> ReducedSystem:
         """Solve every tick's body for given mounts, and keep what the residuals then say of the mounts.
 
         Args:
@@ -77,7 +77,7 @@ class SolvedMounts:
                 hint="a longer capture with more movement, or fewer cameras, helps",
             ) from error
 
-    def _eliminated(self, further: FloatArray | None) -> Eliminated:
+    def _eliminated(self, further: FloatArray | None) -> ReducedSystem:
         matrix = self.linear.matrix
         mounts = np.concatenate(list(self.mount_columns.values()))
         influence = matrix[:, mounts].toarray()
@@ -96,9 +96,9 @@ class SolvedMounts:
             own[rows] = (half * dense).sum(axis=1)
         covariance = np.linalg.inv(influence.T @ influence)
         taken = own + np.einsum("ri,ij,rj->r", influence, covariance, influence)
-        return Eliminated(influence=influence, covariance=covariance, redundancy=1.0 - taken)
+        return ReducedSystem(influence=influence, covariance=covariance, redundancy=1.0 - taken)
 
-    def variance(self, solved: Eliminated, kind: int, believed: float = 1.0) -> float:
+    def variance(self, solved: ReducedSystem, kind: int, believed: float = 1.0) -> float:
         """Variance factor of a kind of rows, of what they were weighed with.
 
         Args:
@@ -111,14 +111,16 @@ class SolvedMounts:
         # Four points hold twelve coordinates of a pose that has six: the others never disagree.
         idle = 0.5 * mine.sum() if kind == MEASURED else 0.0
         redundancy = max(float(solved.redundancy[mine].sum()) - idle, 0.0)
-        return (_BELIEF * believed + float((self.linear.rhs[mine] ** 2).sum())) / (_BELIEF + redundancy)
+        return (_PRIOR_REDUNDANCY * believed + float((self.linear.rhs[mine] ** 2).sum())) / (
+            _PRIOR_REDUNDANCY + redundancy
+        )
 
     def habit_shifts(self) -> Any:
         """How the residuals change with the wearer's habits: rows (R,M), sparse, one sigma each."""
         bias = posture_bias_modes(self.body.bones, tuple(self.mount_columns), POSTURE_BIAS_SHARE)
         return joint_residual_jacobian(self.linear, self.body, self.first_joint, self.world_from_bone, bias)
 
-    def spread(self, solved: Eliminated, factors: FloatArray, bias: ErrorModes) -> ErrorModes:
+    def spread(self, solved: ReducedSystem, factors: FloatArray, bias: ErrorModes) -> ErrorModes:
         """How far off the mounts may be.
 
         Args:
@@ -141,7 +143,7 @@ class SolvedMounts:
         )
         return stack_modes([noisy, self.followed(solved, bias)])
 
-    def followed(self, solved: Eliminated, bias: ErrorModes) -> ErrorModes:
+    def followed(self, solved: ReducedSystem, bias: ErrorModes) -> ErrorModes:
         """Directions in which the body differs from what was believed, with the mounts that follow it."""
         gain = solved.covariance @ solved.influence.T
         shifts = joint_residual_jacobian(self.linear, self.body, self.first_joint, self.world_from_bone, bias)
@@ -154,7 +156,7 @@ class SolvedMounts:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Eliminated:
+class ReducedSystem:
     """What the rows say of the mounts once every tick's body follows them.
 
     Attributes:
@@ -168,7 +170,9 @@ class Eliminated:
     redundancy: FloatArray
 
 
-def kinds_of(linear: LinearisedGraph, joints: tuple[int, int], stated: IntArray, named: IntArray) -> IntArray:
+def row_types(
+    linear: LinearisedGraph, joints: tuple[int, int], stated: IntArray, named: IntArray
+) -> IntArray:
     """Kind of each row (R,) from what it touches.
 
     Args:

@@ -21,17 +21,17 @@ from bodycap_batch.merging.graph.posture import Posture, find_posture
 
 MAP_ERROR_M = 0.005
 MAP_ERROR_RAD = float(np.radians(0.25))
-MAP_ERROR_S = 1.0
+MAP_ERROR_DURATION_S = 1.0
 """Maps bend: camera paths are off by about this much for about this long, all poses of a stretch together.
 What repeats must not count as often as it was sampled, or the mounts follow the map (one by 10 cm). Maps that
 have settled lie 3 to 6 mm off; at twice these values joints' sigmas were larger, no palm was better."""
-T_POSE_TICKS = 8
-FEWEST_SAMPLES = 10
+T_POSE_SAMPLES = 8
+MIN_SAMPLES = 10
 """Samples each camera gets where it was measured so often, however seldom all were measured together."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Samples:
+class CalibrationSamples:
     """Camera poses at the ticks the calibration uses.
 
     Attributes:
@@ -72,7 +72,7 @@ def take_samples(
     count: int,
     up: FloatArray | None = None,
     t_pose_ns: tuple[int, int] | None = None,
-) -> Samples:
+) -> CalibrationSamples:
     """Pick up to `count` times, evenly among those where most cameras were measured together.
 
     Args:
@@ -88,7 +88,7 @@ def take_samples(
     times_ns = _sample_times(tracks, count, t_pose_ns)
     looks = [track.poses_at(times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS) for track in tracks]
     seconds = 1e-9 * float(times_ns[-1] - times_ns[0])
-    repeats = max(1.0, MAP_ERROR_S * len(times_ns) / max(seconds, 1e-3))
+    repeats = max(1.0, MAP_ERROR_DURATION_S * len(times_ns) / max(seconds, 1e-3))
     white_rad = np.array([max(float(np.median(track.sigma_rad)), MIN_SIGMA_RAD) for track in tracks])
     white_map = np.array(
         [max(float(np.median(track.sigma_map)), MIN_SIGMA_M / provisional) for track in tracks]
@@ -97,7 +97,7 @@ def take_samples(
     bones = np.array([track.bone for track in tracks])
     alike = (bones[:, None] == bones).sum(axis=1)
     sigma_map = np.sqrt(white_map**2 + alike * repeats * (MAP_ERROR_M / provisional) ** 2)
-    return Samples(
+    return CalibrationSamples(
         times_ns=times_ns,
         cameras=tuple(track.camera for track in tracks),
         bones=tuple(track.bone for track in tracks),
@@ -121,20 +121,20 @@ def _sample_times(tracks: Sequence[CameraTrack], count: int, t_pose_ns: tuple[in
     pick = pick_evenly(full if len(full) >= count else shared, count)
     if t_pose_ns is not None:
         inside = np.flatnonzero((times_ns >= t_pose_ns[0]) & (times_ns <= t_pose_ns[1]) & (together >= 2))
-        pick = np.union1d(pick, pick_evenly(inside, T_POSE_TICKS))
+        pick = np.union1d(pick, pick_evenly(inside, T_POSE_SAMPLES))
     further: list[IntArray] = []
     for track, seen in zip(tracks, looks, strict=True):
-        if seen[pick].sum() < min(FEWEST_SAMPLES, count):
+        if seen[pick].sum() < min(MIN_SAMPLES, count):
             beside = np.flatnonzero(seen & (together >= 2))
-            pick = np.union1d(pick, pick_evenly(beside, FEWEST_SAMPLES))
-            if len(beside) < FEWEST_SAMPLES:
+            pick = np.union1d(pick, pick_evenly(beside, MIN_SAMPLES))
+            if len(beside) < MIN_SAMPLES:
                 further.append(_own_times(track, tracks))
     enough = len(shared) + sum(len(own) for own in further)
-    if len(tracks) > 1 and enough < FEWEST_SAMPLES:
+    if len(tracks) > 1 and enough < MIN_SAMPLES:
         raise EstimationError(
             f"camera {tracks[0].camera!r} was localised together with another camera in only "
             f"{len(shared)} frames, and no two others were more often",
-            hint=f"{FEWEST_SAMPLES} are needed to find how the cameras sit on the body; see frames.csv",
+            hint=f"{MIN_SAMPLES} are needed to find how the cameras sit on the body; see frames.csv",
         )
     return np.unique(np.concatenate([times_ns[pick], *further]))
 
@@ -146,4 +146,4 @@ def _own_times(track: CameraTrack, tracks: Sequence[CameraTrack]) -> IntArray:
         for other in tracks
         if other is not track
     ]
-    return track.times_ns[pick_evenly(np.flatnonzero(np.any(beside, axis=0)), FEWEST_SAMPLES)]
+    return track.times_ns[pick_evenly(np.flatnonzero(np.any(beside, axis=0)), MIN_SAMPLES)]

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
+from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
 from bodycap_batch.merging.world.floor import WALKING_HEIGHT_RATIO
 
-_COARSE = 0.16
-_FINE = 0.05
+_COARSE_STEP = 0.16
+_FINE_STEP = 0.05
 """Steps of the log scale. The cost is skewed (an arm cannot stretch, but it can bend), so that the coarse
 parabola leans to small scales; the fine one decides."""
 _MAX_SOLVES = 14
@@ -55,7 +55,7 @@ class ScaleSource:
     used: bool = True
 
 
-def find_scale(calibration: Calibration, provisional: float) -> ScaleEstimate:
+def estimate_scale(calibration: CalibrationGraph, provisional: float) -> ScaleEstimate:
     """Minimise the calibration's cost over the logarithm of the scale, by parabolas of shrinking width.
 
     The calibration is left solved at the returned scale.
@@ -70,7 +70,7 @@ def find_scale(calibration: Calibration, provisional: float) -> ScaleEstimate:
         return costs[log_scale]
 
     centre, curvature = float(np.log(provisional)), 0.0
-    for step in (_COARSE, _FINE):
+    for step in (_COARSE_STEP, _FINE_STEP):
         while len(costs) < _MAX_SOLVES:
             low, middle, high = cost(centre - step), cost(centre), cost(centre + step)
             if middle <= min(low, high):
@@ -79,11 +79,11 @@ def find_scale(calibration: Calibration, provisional: float) -> ScaleEstimate:
                 break
             centre += step if high < low else -step
     cost(centre)
-    for side in (-_FINE, _FINE):
+    for side in (-_FINE_STEP, _FINE_STEP):
         if not any((x - centre) * side > 0.0 for x in costs):
             # The cost fell all the way to here.
             cost(centre + side)
-    before, after = (_mounts_beside(mounts, centre, sign * _FINE) for sign in (-1.0, 1.0))
+    before, after = (_nearest_solution(mounts, centre, sign * _FINE_STEP) for sign in (-1.0, 1.0))
     width = after[0] - before[0]
     slope = {name: (after[1][name] - before[1][name]) / width for name in after[1]}
     costs.pop(centre)
@@ -96,7 +96,7 @@ def find_scale(calibration: Calibration, provisional: float) -> ScaleEstimate:
     )
 
 
-def _mounts_beside(
+def _nearest_solution(
     mounts: Mapping[float, Mapping[str, FloatArray]], centre: float, offset: float
 ) -> tuple[float, Mapping[str, FloatArray]]:
     """The solve nearest to an offset from the centre, and its mounts."""
@@ -104,7 +104,7 @@ def _mounts_beside(
     return nearest, mounts[nearest]
 
 
-def floor_source(body: ScaleSource, height_m: float, standing_m: float) -> ScaleSource:
+def scale_from_floor(body: ScaleSource, height_m: float, standing_m: float) -> ScaleSource:
     """What the height of the trunk over the map's floor says; used within 2 sigma of the body.
 
     Args:
@@ -120,7 +120,7 @@ def floor_source(body: ScaleSource, height_m: float, standing_m: float) -> Scale
     return ScaleSource(name="floor", scale=scale, sigma_log=FLOOR_SIGMA, used=believed)
 
 
-def combine(sources: Sequence[ScaleSource]) -> tuple[float, float]:
+def weighted_mean(sources: Sequence[ScaleSource]) -> tuple[float, float]:
     """Scale and sigma of its logarithm from the sources in use, each by its precision."""
     used = [source for source in sources if source.used]
     weight = np.array([source.sigma_log**-2 for source in used])
@@ -128,8 +128,8 @@ def combine(sources: Sequence[ScaleSource]) -> tuple[float, float]:
     return float(np.exp(mean)), float(1.0 / np.sqrt(weight.sum()))
 
 
-def disagreement(sources: Sequence[ScaleSource]) -> tuple[float, int]:
+def chi_square(sources: Sequence[ScaleSource]) -> tuple[float, int]:
     """Chi-square of all sources about their weighted mean, used or not, and its degrees of freedom."""
-    mean, _ = combine([replace(source, used=True) for source in sources])
+    mean, _ = weighted_mean([replace(source, used=True) for source in sources])
     off = np.array([np.log(source.scale / mean) / source.sigma_log for source in sources])
     return float(off @ off), len(sources) - 1

@@ -16,8 +16,12 @@ import numpy as np
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import Bone, kinematic_chain
-from bodycap_batch.merging.body_calibration.calibrate_body import points_around, rolled_mounts, trunk_way_up
-from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
+from bodycap_batch.merging.body_calibration.calibrate_body import (
+    map_points_of,
+    reference_camera_roll,
+    with_rolls,
+)
+from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.cameras.track import (
     CameraTrack,
@@ -206,9 +210,9 @@ def _initialise(
     """The trunk's camera the way up it sits, where the maps start then, and the vertical if known."""
     start = align_maps_initially(bones, main, others, {mount.camera: mount for mount in inputs.mounts})
     own = _without_outliers(inputs, main, start.metres_per_unit)
-    roll, up = trunk_way_up(inputs, bones, own, start.metres_per_unit, stated.verticals)
+    roll, up = reference_camera_roll(inputs, bones, own, start.metres_per_unit, stated.verticals)
     if roll:
-        inputs = rolled_mounts(inputs, {main[0].camera: roll})
+        inputs = with_rolls(inputs, {main[0].camera: roll})
         start = align_maps_initially(bones, main, others, {mount.camera: mount for mount in inputs.mounts})
     return inputs, start, up
 
@@ -254,7 +258,7 @@ def align_maps(
     together = [*main, *(transform_track(track, starts[gauge]) for gauge, group in others for track in group)]
     together = _without_outliers(inputs, together, provisional)
     samples = take_samples(together, provisional, _MAX_SAMPLES, None if up is None else up.up)
-    calibration = Calibration(inputs.skeleton, bones, samples, mounts, provisional, step)
+    calibration = CalibrationGraph(inputs.skeleton, bones, samples, mounts, provisional, step)
     names = {gauge: tuple(track.camera for track in group) for gauge, group in others}
     known = _REACH_SIGMA if start.one_map_spans_a_limb else _SEPARATE_MAPS_SIGMA
     reach_sigma = known if start.scale_observable else _UNOBSERVABLE_SIGMA
@@ -265,7 +269,7 @@ def align_maps(
     # Reach and movement may disagree on what the job states.
     if not stated.scales:
         _require_one_scale(abs(problem.scale_residual()), reach_sigma)
-        points = points_around(inputs, together[0].camera)
+        points = map_points_of(inputs, together[0].camera)
         floor = scale_from_walked_floor(inputs, (together[0], up), problem.scale(), points)
         problem.add_scale_sources(() if floor is None else (floor,))
     out = []

@@ -9,8 +9,8 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
-from bodycap_batch.merging.body_calibration.mount_covariance import PRIOR, SolvedMounts
+from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
+from bodycap_batch.merging.body_calibration.mount_covariance import PRIOR, LinearisedCalibration
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.model.geometry import Similarity, so3_exp
 
@@ -34,7 +34,7 @@ class MapAlignmentProblem:
 
     def __init__(
         self,
-        calibration: Calibration,
+        calibration: CalibrationGraph,
         groups: Sequence[tuple[str, ...]],
         scale: float,
         *,
@@ -131,7 +131,7 @@ class MapAlignmentProblem:
         change = _solve_normal_equations(normal, influence.T @ right)[-count:]
         return np.asarray(change, dtype=np.float64), np.asarray(covariance[-count:, -count:])
 
-    def _linearised(self) -> tuple[SolvedMounts, FloatArray]:
+    def _linearised(self) -> tuple[LinearisedCalibration, FloatArray]:
         """The graph's derivatives by bones and mounts, and (R,1 + 7 G) those by log scale and maps."""
         mounts = self._calibration.solved()
         shifts = -self._calibration.measurement_shifts(mounts.linear, self._directions())

@@ -10,10 +10,10 @@ import numpy as np
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body_calibration.calibrate_body import ENOUGH_WALKING, stated_up
+from bodycap_batch.merging.body_calibration.calibrate_body import MIN_WALKING_SAMPLES, stated_verticals
 from bodycap_batch.merging.body_calibration.known_distance import known_distance
-from bodycap_batch.merging.body_calibration.marker_board import find_board
-from bodycap_batch.merging.body_calibration.scale import ScaleSource, floor_source
+from bodycap_batch.merging.body_calibration.marker_board import locate_board
+from bodycap_batch.merging.body_calibration.scale import ScaleSource, scale_from_floor
 from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack, pick_evenly
 from bodycap_batch.merging.graph.posture import find_posture
 from bodycap_batch.merging.world.floor import WALKING_HEIGHT_RATIO, floor_beside_path, standing_height
@@ -53,9 +53,11 @@ def stated_constraints(inputs: MergeInputs, options: MergeOptions, gauge: str) -
     with suppress(EstimationError):
         distance = known_distance(inputs, options, here)
     with suppress(EstimationError):
-        board = find_board(inputs, options, here)
+        board = locate_board(inputs, options, here)
     scales = (distance, None if board is None else board.scale)
-    return StatedConstraints(tuple(each for each in scales if each is not None), stated_up(options, board))
+    return StatedConstraints(
+        tuple(each for each in scales if each is not None), stated_verticals(options, board)
+    )
 
 
 def scale_from_walked_floor(
@@ -79,7 +81,7 @@ def scale_from_walked_floor(
     metric = track.scaled(body.scale)
     times_ns = track.times_ns[pick_evenly(np.arange(len(track.times_ns)), _MAX_SAMPLES)]
     walking = find_posture(metric, times_ns, up.up, None).walking
-    if walking.sum() < ENOUGH_WALKING:
+    if walking.sum() < MIN_WALKING_SAMPLES:
         return None
     walked, _ = metric.poses_at(times_ns[walking], max_gap_ns=MAX_SAMPLE_GAP_NS)
     path_m, walked_m = (
@@ -88,5 +90,5 @@ def scale_from_walked_floor(
     height_m, standing_m = float(np.median(walked_m @ up.up)), standing_height(inputs.skeleton, joint)
     expected = height_m - WALKING_HEIGHT_RATIO * standing_m
     floor = floor_beside_path(body.scale * points, path_m, up, expected, standing_m)
-    found = None if floor is None else floor_source(body, height_m - floor.height_m, standing_m)
+    found = None if floor is None else scale_from_floor(body, height_m - floor.height_m, standing_m)
     return found if found is not None and found.used else None

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bodycap_batch.merging.body_calibration.calibrate_body import Calibrated
+from bodycap_batch.merging.body_calibration.calibrate_body import BodyCalibration
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import split_side
 
@@ -29,7 +29,7 @@ _MOVEMENTS = {
 }
 
 
-def clock_sentence(camera: str, doubt: Mapping[str, float], offset_s: float) -> str:
+def describe_clock(camera: str, doubt: Mapping[str, float], offset_s: float) -> str:
     """What a doubted clock looks like, and the offset that would suit it."""
     way = "behind" if doubt["shift_s"] > 0.0 else "ahead"
     return (
@@ -38,7 +38,7 @@ def clock_sentence(camera: str, doubt: Mapping[str, float], offset_s: float) -> 
     )
 
 
-def sides_sentence(exchanged: Mapping[str, float]) -> str:
+def describe_swapped_sides(exchanged: Mapping[str, float]) -> str:
     """What limbs on the wrong side of the body mean."""
     return (
         f"{' and '.join(sorted(exchanged))} stay on the other side of the body: left and right are "
@@ -46,7 +46,7 @@ def sides_sentence(exchanged: Mapping[str, float]) -> str:
     )
 
 
-def mount_sentence(mount: Mount, *, t_pose: bool) -> str:
+def describe_mount(mount: Mount, *, t_pose: bool) -> str:
     """How well a camera's place on its bone is known.
 
     Args:
@@ -63,7 +63,7 @@ def mount_sentence(mount: Mount, *, t_pose: bool) -> str:
     return f"{text}; to know it better, {movement}{stand}"
 
 
-def hinge_sentence(role: str, off_m: float) -> str:
+def describe_hinge(role: str, off_m: float) -> str:
     """What it means that a hinged bone leaves its hinge.
 
     Args:
@@ -79,7 +79,7 @@ def hinge_sentence(role: str, off_m: float) -> str:
     )
 
 
-def scale_sentence(calibrated: Calibrated) -> str:
+def describe_scale(calibrated: BodyCalibration) -> str:
     """How well the metric scale is known."""
     text = f"the metric scale is known to {100.0 * calibrated.sigma_log:.1f} % (1 sigma)"
     used = {source.name for source in calibrated.sources if source.used}
@@ -98,7 +98,7 @@ def scale_sentence(calibrated: Calibrated) -> str:
     return f"{text}; to know it better, {' or '.join(ways)}"
 
 
-def up_sentence(calibrated: Calibrated) -> str:
+def describe_vertical(calibrated: BodyCalibration) -> str:
     """How well the vertical is known."""
     up = calibrated.up
     text = f"up is known to {up.sigma_deg:.1f}° (1 sigma), from the {up.source}"

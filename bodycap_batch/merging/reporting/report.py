@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.body_calibration.calibrate_body import Calibrated
-from bodycap_batch.merging.body_calibration.scale import ScaleSource, disagreement
+from bodycap_batch.merging.body_calibration.calibrate_body import BodyCalibration
+from bodycap_batch.merging.body_calibration.scale import ScaleSource, chi_square
 from bodycap_batch.merging.cameras.clock_check import suspicious_clocks
 from bodycap_batch.merging.cameras.side_check import swapped_sides
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.graph.motion_graph import MotionSolution
 from bodycap_batch.merging.reporting.advice import (
-    clock_sentence,
-    hinge_sentence,
-    mount_sentence,
-    scale_sentence,
-    sides_sentence,
-    up_sentence,
+    describe_clock,
+    describe_hinge,
+    describe_mount,
+    describe_scale,
+    describe_swapped_sides,
+    describe_vertical,
 )
 from bodycap_batch.merging.world.vertical import angle_deg
 from bodycap_batch.model.geometry import rotation_angle_rad
@@ -29,7 +29,7 @@ from bodycap_batch.model.merge_data import MergeInputs
 
 def build_report(
     inputs: MergeInputs,
-    calibrated: Calibrated,
+    calibrated: BodyCalibration,
     solution: MotionSolution,
     tracks: Sequence[CameraTrack],
     notes: Mapping[str, Any],
@@ -73,7 +73,7 @@ def build_report(
         "joint_sigma_m": notes["uncertainty"],
         "hinge_off_plane_m": {role: _percentiles(off) for role, off in notes["hinge_m"].items()},
         "loose_hinges": {
-            role: {"sigma_m": round(off_m, 5), "known_to": hinge_sentence(role, off_m)}
+            role: {"sigma_m": round(off_m, 5), "known_to": describe_hinge(role, off_m)}
             for role, off_m in calibrated.off_hinge_m.items()
         },
         "activity": {
@@ -100,23 +100,23 @@ def _clocks(inputs: MergeInputs, tracks: Sequence[CameraTrack]) -> dict[str, Any
     out: dict[str, Any] = {}
     for camera, doubt in suspicious_clocks(tracks).items():
         offset_s = round(inputs.clocks[camera].offset_s + doubt["shift_s"], 2)
-        out[camera] = {**doubt, "offset_s": offset_s, "says": clock_sentence(camera, doubt, offset_s)}
+        out[camera] = {**doubt, "offset_s": offset_s, "says": describe_clock(camera, doubt, offset_s)}
     return out
 
 
 def _sides(
-    inputs: MergeInputs, calibrated: Calibrated, tracks: Sequence[CameraTrack], joined: Collection[str]
+    inputs: MergeInputs, calibrated: BodyCalibration, tracks: Sequence[CameraTrack], joined: Collection[str]
 ) -> dict[str, Any]:
     """Limbs' cameras on the other side of the body, where all are; nothing of joined maps."""
     own = [each for each in tracks if each.camera not in joined]
     mounts = {mount.camera: mount for mount in (*inputs.mounts, calibrated.trunk)}
     wrong = swapped_sides(own, mounts, calibrated.up.up)
-    return {"cameras": wrong, "says": sides_sentence(wrong)} if wrong else {}
+    return {"cameras": wrong, "says": describe_swapped_sides(wrong)} if wrong else {}
 
 
-def _scale(calibrated: Calibrated) -> dict[str, Any]:
+def _scale(calibrated: BodyCalibration) -> dict[str, Any]:
     """The scale, everything that knows it, and how far all of that disagrees."""
-    chi2, freedom = disagreement(calibrated.sources)
+    chi2, freedom = chi_square(calibrated.sources)
     out: dict[str, Any] = {
         "source": " and ".join(source.name for source in calibrated.sources if source.used),
         "metres_per_map_unit": calibrated.scale,
@@ -130,10 +130,10 @@ def _scale(calibrated: Calibrated) -> dict[str, Any]:
             "costs": [[scale, round(cost, 4)] for scale, cost in calibrated.estimate.costs],
         },
         "trunk_over_floor_m": calibrated.height_over_floor_m,
-        "known_to": scale_sentence(calibrated),
+        "known_to": describe_scale(calibrated),
     }
     if calibrated.limbs:
-        chi2, freedom = disagreement(calibrated.limbs)
+        chi2, freedom = chi_square(calibrated.limbs)
         out["limbs"] = {
             "alone": [_source(limb, calibrated.scale) for limb in calibrated.limbs],
             "chi2": round(chi2, 3),
@@ -142,7 +142,7 @@ def _scale(calibrated: Calibrated) -> dict[str, Any]:
     return out
 
 
-def _up(calibrated: Calibrated) -> dict[str, Any]:
+def _up(calibrated: BodyCalibration) -> dict[str, Any]:
     """What up was taken from, and how far off everything else is."""
     up = calibrated.up
     return {
@@ -159,7 +159,7 @@ def _up(calibrated: Calibrated) -> dict[str, Any]:
             }
             for say in up.alternatives
         ],
-        "known_to": up_sentence(calibrated),
+        "known_to": describe_vertical(calibrated),
     }
 
 
@@ -173,7 +173,7 @@ def _source(source: ScaleSource, scale: float) -> dict[str, Any]:
     }
 
 
-def _t_pose(calibrated: Calibrated, start_ns: int) -> dict[str, float] | None:
+def _t_pose(calibrated: BodyCalibration, start_ns: int) -> dict[str, float] | None:
     """From when to when a T-pose stands, seconds from the first tick."""
     if calibrated.t_pose_ns is None:
         return None
@@ -181,7 +181,7 @@ def _t_pose(calibrated: Calibrated, start_ns: int) -> dict[str, float] | None:
     return {"from_s": first, "to_s": last}
 
 
-def _mount(inputs: MergeInputs, camera: str, calibrated: Calibrated) -> dict[str, Any]:
+def _mount(inputs: MergeInputs, camera: str, calibrated: BodyCalibration) -> dict[str, Any]:
     solved = next(mount for mount in calibrated.mounts if mount.camera == camera)
     prior = inputs.mount_of(camera)
     turned = prior.joint_from_cam[:3, :3].T @ solved.joint_from_cam[:3, :3]
@@ -194,11 +194,11 @@ def _mount(inputs: MergeInputs, camera: str, calibrated: Calibrated) -> dict[str
         "sigma_m": round(solved.sigma_m, 5),
         "from_prior_deg": round(float(np.degrees(rotation_angle_rad(turned))), 3),
         "from_prior_m": round(float(np.linalg.norm(moved)), 5),
-        "known_to": mount_sentence(solved, t_pose=calibrated.t_pose_ns is not None),
+        "known_to": describe_mount(solved, t_pose=calibrated.t_pose_ns is not None),
     }
 
 
-def _roll(calibrated: Calibrated, camera: str) -> dict[str, Any]:
+def _roll(calibrated: BodyCalibration, camera: str) -> dict[str, Any]:
     """Which way up the camera sits, and how much worse the next best way explains its motion."""
     search = next((each for each in calibrated.rolls if each.camera == camera), None)
     if search is None:

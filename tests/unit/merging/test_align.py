@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from bodycap_batch.merging.body.bones import kinematic_chain
-from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
+from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.mount_covariance import JOINED, MEASURED, NAMED
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.cameras.track import make_track
@@ -82,7 +82,7 @@ def test_residuals_follow_moved_cameras_as_predicted(walk, recorded):
     inputs, bones, tracks = _tracks(walk, recorded[:2])
     mounts = {mount.camera: mount for mount in inputs.mounts}
     samples = take_samples(tracks, 1.0, 12)
-    calibration = Calibration(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
+    calibration = CalibrationGraph(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
     calibration.solve(1.0)
     before = calibration.solved().linear
     twist = np.array([0.3, -0.2, 0.5, 0.1, 0.4, -0.3]) * 1e-5
@@ -152,7 +152,7 @@ def test_a_mounts_name_is_believed_better_than_it_is_weighed(arms):
     told = {
         mount.camera: replace(mount, sigma_rad=np.radians(20.0), by_name=False) for mount in inputs.mounts
     }
-    stated = Calibration(inputs.skeleton, mounts.body.bones, samples, told, metric, lambda: None)
+    stated = CalibrationGraph(inputs.skeleton, mounts.body.bones, samples, told, metric, lambda: None)
     stated.solve(metric, iterations=1)
     assert not (stated.solved().kinds == NAMED).any()
 

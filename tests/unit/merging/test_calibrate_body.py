@@ -9,9 +9,9 @@ import pytest
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError, JobError
 from bodycap_batch.merging.body.bones import kinematic_chain
-from bodycap_batch.merging.body_calibration.anthropometry import placements, proportions
+from bodycap_batch.merging.body_calibration.anthropometry import bone_length_modes, joint_placement_modes
 from bodycap_batch.merging.body_calibration.known_distance import known_distance
-from bodycap_batch.merging.reporting.advice import mount_sentence, scale_sentence
+from bodycap_batch.merging.reporting.advice import describe_mount, describe_scale
 from bodycap_batch.model.geometry import Similarity, so3_exp
 from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
 from tests.stages.walker import make_inputs, make_walk, record
@@ -73,15 +73,15 @@ def test_every_mount_has_a_movement_that_tells_more():
     skeleton = load_skeleton("full_body", 1.75)
     for role in filter(None, skeleton.roles):
         mount = nominal_mount("cam", role, skeleton)
-        sentence = mount_sentence(mount, t_pose=False)
+        sentence = describe_mount(mount, t_pose=False)
         assert "15.0° and 2.9 cm" in sentence
         assert "to know it better" in sentence
         assert "T-pose" in sentence
         side = "left" if role.startswith("Left") else "right"
         assert role in ("Hips", "Spine", "Spine1", "Neck", "Head") or side in sentence
-        assert "T-pose" not in mount_sentence(mount, t_pose=True)
+        assert "T-pose" not in describe_mount(mount, t_pose=True)
         known = replace(mount, sigma_rad=0.03, sigma_m=0.01)
-        assert "better" not in mount_sentence(known, t_pose=False)
+        assert "better" not in describe_mount(known, t_pose=False)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_the_scales_advice_follows_from_where_cameras_sit(roles, advice):
         sources=[],
         t_pose_ns=None,
     )
-    sentence = scale_sentence(calibrated)
+    sentence = describe_scale(calibrated)
     assert "known to 27.0 % (1 sigma)" in sentence
     assert advice in sentence
     assert "merge.known_distance" in sentence
@@ -105,7 +105,7 @@ def test_where_rigs_differ_the_rest_of_the_body_stays():
     """A chest's joint that lies higher in its rig leaves shoulders where they were beside the hips."""
     skeleton = load_skeleton("full_body", 1.80)
     bones = kinematic_chain(skeleton, {"Hips", "LeftHand", "RightHand", "Head"})
-    elsewhere = placements(bones, ("torso",), 1.80)
+    elsewhere = joint_placement_modes(bones, ("torso",), 1.80)
     index = {bone.role: position for position, bone in enumerate(bones)}
     moved = np.zeros_like(elsewhere.offsets_m)
     for position, bone in enumerate(bones):
@@ -121,7 +121,7 @@ def test_where_rigs_differ_the_rest_of_the_body_stays():
     assert np.linalg.norm(moved[index["LeftHand"], 0]) == pytest.approx(
         np.hypot(0.02, np.hypot(0.025, 0.03)) * 1.8
     )
-    people = proportions(bones, ("torso",))
+    people = bone_length_modes(bones, ("torso",))
     assert people.offsets_m[index["LeftForeArm"]].sum() == pytest.approx(0.04 * 0.186 * 1.80)
     assert not people.mounts["torso"].any()
     assert not elsewhere.mounts["torso"].any()

@@ -9,10 +9,10 @@ from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body_calibration.camera_roll import (
     ROLLS_DEG,
     RollSearch,
-    is_open,
-    rolled,
+    has_unknown_roll,
+    reference_roll,
     search_rolls,
-    trunk_roll,
+    with_roll,
 )
 from bodycap_batch.merging.cameras.track import make_track
 from bodycap_batch.model.skeleton_presets import STATED_SIGMA_RAD, load_skeleton, nominal_mount
@@ -25,7 +25,7 @@ def _worn(rolls):
     """Inputs and tracks of a walk whose cameras were turned about their optical axes."""
     rng = np.random.default_rng(2)
     walk = make_walk(rng, off_deg=5.0, off_m=0.01)
-    mounts = {name: rolled(mount, rolls.get(name, 0.0)) for name, mount in walk.mounts.items()}
+    mounts = {name: with_roll(mount, rolls.get(name, 0.0)) for name, mount in walk.mounts.items()}
     worn = replace(walk, mounts=mounts)
     inputs = make_inputs(worn, [record(worn, name, rng) for name in ROLES])
     index = {
@@ -48,7 +48,7 @@ def test_a_palm_camera_worn_sideways_is_found_out(camera, roll):
 def test_a_stated_orientation_is_not_tried(sigma_rad):
     inputs, tracks = _worn({})
     stated = tuple(replace(mount, sigma_rad=sigma_rad, by_name=False) for mount in inputs.mounts)
-    assert not any(is_open(mount) for mount in stated)
+    assert not any(has_unknown_roll(mount) for mount in stated)
     assert search_rolls(replace(inputs, mounts=stated), tracks, 1.0, (UP, None), lambda: None) == ()
 
 
@@ -57,7 +57,7 @@ def _own_up(inputs, tracks):
     mount = inputs.mount_of(tracks[0].camera)
 
     def own_up(degrees):
-        tilted = tracks[0].map_from_cam[:, :3, :3] @ rolled(mount, degrees).joint_from_cam[:3, :3].T
+        tilted = tracks[0].map_from_cam[:, :3, :3] @ with_roll(mount, degrees).joint_from_cam[:3, :3].T
         own = tilted[:, :, 2].mean(axis=0)
         return own / np.linalg.norm(own)
 
@@ -68,7 +68,7 @@ def _own_up(inputs, tracks):
 def test_the_trunks_camera_is_above_the_hands(roll):
     inputs, tracks = _worn({"torso": roll})
     # Walls and floor agree with any of the four: each roll's own up is a direction of the room.
-    chosen, up = trunk_roll(inputs, tracks, _own_up(inputs, tracks))
+    chosen, up = reference_roll(inputs, tracks, _own_up(inputs, tracks))
     assert chosen == roll
     assert up @ UP > 0.9
 
@@ -77,10 +77,10 @@ def test_the_trunks_camera_is_above_the_hands(roll):
 def test_hands_tell_the_trunk_which_way_up_it_is_where_nothing_around_does(roll):
     inputs, tracks = _worn({"torso": roll})
     own_up = _own_up(inputs, tracks)
-    assert trunk_roll(inputs, tracks, lambda _: None, own_up) == (roll, None)
+    assert reference_roll(inputs, tracks, lambda _: None, own_up) == (roll, None)
     # One hand alone, or no word of the trunk's own, tells nothing.
-    assert trunk_roll(inputs, tracks[:2], lambda _: None, own_up) == (0.0, None)
-    assert trunk_roll(inputs, tracks, lambda _: None) == (0.0, None)
+    assert reference_roll(inputs, tracks[:2], lambda _: None, own_up) == (0.0, None)
+    assert reference_roll(inputs, tracks, lambda _: None) == (0.0, None)
 
 
 def _beside(roles, over_m=None):
@@ -101,24 +101,24 @@ def _beside(roles, over_m=None):
 def test_hands_at_work_do_not_turn_a_camera_at_the_belt(role):
     inputs, tracks = _beside((role, "LeftHand", "RightHand"), over_m=0.18)
     own_up = _own_up(inputs, tracks)
-    assert trunk_roll(inputs, tracks, lambda _: None, own_up) == (0.0, None)
+    assert reference_roll(inputs, tracks, lambda _: None, own_up) == (0.0, None)
     # Nor where walls and floor agree with any of the four.
-    assert trunk_roll(inputs, tracks, own_up)[0] == 0.0
+    assert reference_roll(inputs, tracks, own_up)[0] == 0.0
 
 
 @pytest.mark.parametrize("part", ["Shoulder", "Arm"])
 def test_shoulders_are_over_the_chest_and_do_not_turn_it(part):
     inputs, tracks = _beside(("Spine1", f"Left{part}", f"Right{part}"), over_m=0.17)
-    assert trunk_roll(inputs, tracks, lambda _: None, _own_up(inputs, tracks)) == (0.0, None)
+    assert reference_roll(inputs, tracks, lambda _: None, _own_up(inputs, tracks)) == (0.0, None)
 
 
 @pytest.mark.parametrize("roll", [90.0, 180.0])
 def test_legs_tell_a_camera_at_the_belt_which_way_up_it_is(roll):
     inputs, tracks = _beside(("Hips", "LeftHand", "RightHand", "LeftLeg", "RightLeg"))
-    turn = rolled(replace(inputs.mounts[0], joint_from_cam=np.eye(4)), roll).joint_from_cam
+    turn = with_roll(replace(inputs.mounts[0], joint_from_cam=np.eye(4)), roll).joint_from_cam
     leading = replace(tracks[0], map_from_cam=tracks[0].map_from_cam @ turn)
     turned = [leading, *tracks[1:]]
-    assert trunk_roll(inputs, turned, lambda _: None, _own_up(inputs, turned)) == (roll, None)
+    assert reference_roll(inputs, turned, lambda _: None, _own_up(inputs, turned)) == (roll, None)
 
 
 def test_hands_that_are_lifted_half_of_the_time_turn_no_trunk():
@@ -132,7 +132,7 @@ def test_hands_that_are_lifted_half_of_the_time_turn_no_trunk():
         below = (trunk[late, :3, 3] - poses[late, :3, 3]) @ UP
         poses[late, :3, 3] += 2.0 * below[:, None] * UP
         lifted.append(replace(track, map_from_cam=poses))
-    assert trunk_roll(inputs, [tracks[0], *lifted], lambda _: None, own_up) == (0.0, None)
+    assert reference_roll(inputs, [tracks[0], *lifted], lambda _: None, own_up) == (0.0, None)
 
 
 def test_the_runner_up_is_the_best_of_the_rest():
@@ -148,4 +148,4 @@ def test_one_hand_alone_does_not_turn_the_trunk():
     def up_of(degrees):
         return None if degrees == 0.0 else aside[:, 0] * (1.0 if degrees == 90.0 else -1.0)
 
-    assert trunk_roll(inputs, tracks[:2], up_of) == (0.0, None)
+    assert reference_roll(inputs, tracks[:2], up_of) == (0.0, None)

@@ -11,9 +11,14 @@ from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging import camera_selection, merge_trajectories
-from bodycap_batch.merging.body_calibration.calibrate_body import early_up
+from bodycap_batch.merging.body_calibration.calibrate_body import preliminary_vertical
 from bodycap_batch.merging.body_calibration.samples import MAP_ERROR_RAD, take_samples
-from bodycap_batch.merging.camera_selection import bring_together, choices, of_no_use, seldom_localised
+from bodycap_batch.merging.camera_selection import (
+    align_usable_cameras,
+    candidate_main_maps,
+    excluded_cameras,
+    rarely_localised,
+)
 from bodycap_batch.merging.cameras.track import MIN_SIGMA_RAD, make_track
 from bodycap_batch.merging.map_alignment import align, gauss_newton
 from bodycap_batch.merging.map_alignment.align import AlignedMap, align_cameras
@@ -67,10 +72,10 @@ def _names(trajectories):
 
 
 def test_the_trunk_leads_then_the_head(capture):
-    assert _names(choices(capture.inputs)[0][0])[:2] == ["torso", "head"]
+    assert _names(candidate_main_maps(capture.inputs)[0][0])[:2] == ["torso", "head"]
     lost = _lose(capture.inputs, "torso", 6)
-    assert _names(choices(lost)[0][0])[0] == "head"
-    assert seldom_localised(lost) == {"torso": f"6 localised frames of {6 * 30}, 15 needed"}
+    assert _names(candidate_main_maps(lost)[0][0])[0] == "head"
+    assert rarely_localised(lost) == {"torso": f"6 localised frames of {6 * 30}, 15 needed"}
 
 
 def _noise(rng, count, sigma_rad=NOISE_RAD, sigma_m=NOISE_M):
@@ -104,8 +109,8 @@ def _lying(poses):
 
 def test_a_camera_that_nobody_wears_is_left_out(capture):
     lying = _with_palm(capture.inputs, _lying)
-    assert list(of_no_use(lying)) == ["left_palm"]
-    together = bring_together(lying, lambda: None)
+    assert list(excluded_cameras(lying)) == ["left_palm"]
+    together = align_usable_cameras(lying, lambda: None)
     assert "left_palm" not in _names(together.trajectories)
     assert "stands still" in together.unused["left_palm"]
 
@@ -124,7 +129,7 @@ def test_a_camera_that_is_worn_stays_however_little_it_moves(capture, sway):
         angle = np.radians(deg) * np.sin(2.0 * np.pi * turns_s * phase)
         return out @ make_transform(so3_exp(np.outer(angle, [0.0, 1.0, 0.0])), np.zeros((len(out), 3)))
 
-    assert of_no_use(_with_palm(capture.inputs, moved)) == of_no_use(capture.inputs) == {}
+    assert excluded_cameras(_with_palm(capture.inputs, moved)) == excluded_cameras(capture.inputs) == {}
 
 
 def test_a_camera_that_was_localised_for_a_second_while_the_person_stood_is_worn(capture):
@@ -134,7 +139,7 @@ def test_a_camera_that_was_localised_for_a_second_while_the_person_stood_is_worn
         out[30:] = np.nan
         return out
 
-    assert of_no_use(_with_palm(capture.inputs, seen_first)) == {}
+    assert excluded_cameras(_with_palm(capture.inputs, seen_first)) == {}
 
 
 def test_a_camera_that_was_lost_when_the_person_set_off_is_worn(capture):
@@ -153,7 +158,7 @@ def test_a_camera_that_was_lost_when_the_person_set_off_is_worn(capture):
 
     whole = _with_palm(capture.inputs, lambda poses: poses)
     stood = replace(whole, trajectories=tuple(standing_first(each) for each in whole.trajectories))
-    assert of_no_use(_with_palm(stood, lost_then)) == {}
+    assert excluded_cameras(_with_palm(stood, lost_then)) == {}
 
 
 def test_cameras_that_all_stand_still_are_worn(capture):
@@ -175,7 +180,7 @@ def test_cameras_that_all_stand_still_are_worn(capture):
                 error_px=np.full(count, 0.5),
             )
         )
-    assert of_no_use(replace(capture.inputs, trajectories=tuple(still))) == {}
+    assert excluded_cameras(replace(capture.inputs, trajectories=tuple(still))) == {}
 
 
 def test_still_cameras_are_looked_for_once(walked, monkeypatch, tmp_path):
@@ -186,7 +191,7 @@ def test_still_cameras_are_looked_for_once(walked, monkeypatch, tmp_path):
 
 
 def test_a_trunk_that_was_hardly_localised_does_not_lead(capture):
-    (main, further), *others = choices(_lose(capture.inputs, "torso", 30))
+    (main, further), *others = candidate_main_maps(_lose(capture.inputs, "torso", 30))
     assert _names(main)[0] == "head"
     assert _names(main)[-1] == "torso"
     assert not further
@@ -195,7 +200,7 @@ def test_a_trunk_that_was_hardly_localised_does_not_lead(capture):
 
 def test_a_trunk_alone_in_a_small_map_is_a_further_map(capture):
     short = _in_maps(_lose(capture.inputs, "torso", 30), {"torso": "small"})
-    first, second = choices(short)
+    first, second = candidate_main_maps(short)
     assert "torso" not in _names(first[0])
     assert _names(first[1]) == ["torso"]
     assert _names(second[0]) == ["torso"]
@@ -206,7 +211,7 @@ def test_a_map_that_makes_no_body_gives_way_to_one_that_does(capture, monkeypatc
     monkeypatch.setattr(
         align, "align_maps", lambda *_: (_ for _ in ()).throw(EstimationError("nowhere to be placed"))
     )
-    together = bring_together(alone, lambda: None)
+    together = align_usable_cameras(alone, lambda: None)
     assert "torso" not in _names(together.trajectories)
     assert len(together.trajectories) == len(CAMERAS) - 1
     assert "nowhere to be placed" in together.unused["torso"]
@@ -224,10 +229,10 @@ def test_hands_alone_make_no_body_and_the_error_says_what_is_missing(capture):
     with pytest.raises(
         EstimationError, match=r"no two cameras .*'left_palm', 'right_palm' can be used; 'torso'"
     ):
-        bring_together(_lose(hands, "torso", 6), lambda: None)
+        align_usable_cameras(_lose(hands, "torso", 6), lambda: None)
     nobody = replace(hands, trajectories=hands.trajectories[:1])
     with pytest.raises(EstimationError, match="none can be used"):
-        bring_together(_lose(nobody, "torso", 6), lambda: None)
+        align_usable_cameras(_lose(nobody, "torso", 6), lambda: None)
 
 
 def test_a_limbs_camera_tells_no_vertical(capture):
@@ -237,7 +242,9 @@ def test_a_limbs_camera_tells_no_vertical(capture):
     place = [bone.role for bone in bones].index(arm.role)
     trajectory = next(each for each in inputs.trajectories if each.camera == arm.camera)
     assert (
-        early_up(inputs.skeleton, bones, (make_track(inputs, trajectory, place), arm), np.zeros((0, 3)))
+        preliminary_vertical(
+            inputs.skeleton, bones, (make_track(inputs, trajectory, place), arm), np.zeros((0, 3))
+        )
         is None
     )
 
@@ -272,7 +279,7 @@ def test_one_bad_map_does_not_take_the_others_with_it(capture, monkeypatch):
         )
 
     monkeypatch.setattr(align, "align_maps", place)
-    main, further = choices(inputs)[0]
+    main, further = candidate_main_maps(inputs)[0]
     together = align_cameras(inputs, main, further, lambda: None)
     assert asked == [("map-0", "good", "bad"), ("map-0", "good"), ("map-0", "bad")]
     assert "left_palm" in _names(together.trajectories)
@@ -300,7 +307,7 @@ def _with_twin(inputs, **changes):
 def test_cameras_at_one_place_know_it_together_no_better_than_one(capture):
     inputs = capture.inputs
     alone = inputs.mount_of("torso")
-    shared = camera_selection.share_priors(_with_twin(inputs))
+    shared = camera_selection.correlate_mount_priors(_with_twin(inputs))
     for camera in ("torso", "torso_2"):
         mount = shared.mount_of(camera)
         assert mount.sigma_m == pytest.approx(np.sqrt(2.0) * alone.sigma_m)
@@ -310,9 +317,12 @@ def test_cameras_at_one_place_know_it_together_no_better_than_one(capture):
     behind = alone.joint_from_cam.copy()
     behind[1, 3] += 0.2
     for other in ({"joint_from_cam": behind}, {"sigma_rad": 0.02, "sigma_m": 0.01, "by_name": False}):
-        assert camera_selection.share_priors(_with_twin(inputs, **other)).mount_of("torso") == alone
-    assert camera_selection.share_priors(_lose(_with_twin(inputs), "torso_2", 6)).mount_of("torso") == alone
-    assert camera_selection.share_priors(inputs).mounts == inputs.mounts
+        assert camera_selection.correlate_mount_priors(_with_twin(inputs, **other)).mount_of("torso") == alone
+    assert (
+        camera_selection.correlate_mount_priors(_lose(_with_twin(inputs), "torso_2", 6)).mount_of("torso")
+        == alone
+    )
+    assert camera_selection.correlate_mount_priors(inputs).mounts == inputs.mounts
 
 
 def test_a_map_that_bends_two_cameras_of_a_bone_alike_counts_once(capture):

@@ -9,7 +9,7 @@ import pytest
 
 from bodycap_batch.merging.cameras.clock_check import best_time_shift, suspicious_clocks
 from bodycap_batch.merging.cameras.track import CameraTrack
-from bodycap_batch.merging.reporting.advice import clock_sentence
+from bodycap_batch.merging.reporting.advice import describe_clock
 from bodycap_batch.model.geometry import make_transform, so3_exp
 
 
@@ -61,7 +61,7 @@ def test_a_clock_that_is_off_is_told_with_what_would_suit_it(late_s: float) -> N
     assert doubt["shift_s"] == pytest.approx(-late_s, abs=0.1)
     assert doubt["scatter_left"] < 0.7
     way = "behind" if late_s < 0.0 else "ahead"
-    assert f"s {way}; with an offset_s of about 2.0 its place" in clock_sentence("palm", doubt, 2.0)
+    assert f"s {way}; with an offset_s of about 2.0 its place" in describe_clock("palm", doubt, 2.0)
 
 
 def test_right_clocks_straight_walks_and_short_clips_are_not_doubted() -> None:

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from bodycap_batch.merging.body.bones import hinges, kinematic_chain
-from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
-from bodycap_batch.merging.body_calibration.hinge_test import FREE_M, told
+from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
+from bodycap_batch.merging.body_calibration.hinge_test import FREE_SIGMA_M, observable_hinges
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.cameras.track import CameraTrack
-from bodycap_batch.merging.reporting.advice import hinge_sentence
+from bodycap_batch.merging.reporting.advice import describe_hinge
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import forward_kinematics
 from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
@@ -22,7 +22,7 @@ ROLES = {
 }
 
 
-def _calibrated(sideways_rad: float) -> Calibration:
+def _calibrated(sideways_rad: float) -> CalibrationGraph:
     """A body whose left elbow swings sideways by so much, seen by cameras that sit where they should."""
     motion = reaching(240)
     skeleton = motion.skeleton
@@ -46,7 +46,7 @@ def _calibrated(sideways_rad: float) -> Calibration:
         )
         for camera, role in ROLES.items()
     ]
-    calibration = Calibration(skeleton, bones, take_samples(tracks, 1.0, 30), mounts, 1.0, lambda: None)
+    calibration = CalibrationGraph(skeleton, bones, take_samples(tracks, 1.0, 30), mounts, 1.0, lambda: None)
     calibration.solve(1.0)
     return calibration
 
@@ -83,13 +83,13 @@ def test_only_cameras_on_both_sides_contradict_a_hinge(cameras, tested):
     skeleton = load_skeleton("upper_body", 1.75)
     bones = kinematic_chain(skeleton, cameras)
     measured = {place for place, bone in enumerate(bones) if bone.role in cameras}
-    assert len(told(hinges(skeleton, bones), measured)) == tested
+    assert len(observable_hinges(hinges(skeleton, bones), measured)) == tested
 
 
 def test_a_loose_hinge_is_told_with_what_to_do():
-    sentence = hinge_sentence("LeftForeArm", FREE_M)
+    sentence = describe_hinge("LeftForeArm", FREE_SIGMA_M)
     assert "left elbow bends 10.0 cm" in sentence
     assert "; to know it better, strap" in sentence
     # A palm's clock 60 ms off looks like a loose hinge, too.
     assert "check their clocks (offset_s)" in sentence
-    assert "right knee" in hinge_sentence("RightLeg", 0.02)
+    assert "right knee" in describe_hinge("RightLeg", 0.02)

@@ -10,7 +10,7 @@ import pytest
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body.initial_poses import provisional_scale
-from bodycap_batch.merging.camera_selection import choices
+from bodycap_batch.merging.camera_selection import candidate_main_maps
 from bodycap_batch.merging.cameras.track import make_track
 from bodycap_batch.merging.map_alignment.initial_alignment import align_maps_initially
 from bodycap_batch.synthetic import SynthOptions
@@ -21,7 +21,7 @@ from tests.bench.posed import posed
 def _groups(maps, seed):
     """Bones, mounts, tracks by map (the trunk's first), and units of its map a metre."""
     capture = posed(SynthOptions(seconds=20.0, cameras=tuple(maps), seed=seed, poses_only=True), maps)
-    inputs, (main, further) = capture.inputs, choices(capture.inputs)[0]
+    inputs, (main, further) = capture.inputs, candidate_main_maps(capture.inputs)[0]
     bones = kinematic_chain(inputs.skeleton, {mount.role for mount in inputs.mounts})
     index = {bone.role: place for place, bone in enumerate(bones)}
     groups = {}

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.merging.body_calibration.calibration_graph import PRIOR_SCALE
-from bodycap_batch.merging.body_calibration.joint_variability import passing_shares
+from bodycap_batch.merging.body_calibration.calibration_graph import JOINT_PRIOR_SCALE
+from bodycap_batch.merging.body_calibration.joint_variability import transient_variance_shares
 from bodycap_batch.synthetic import SynthOptions
 from tests.calibrations import calibration_of
 
@@ -28,7 +28,7 @@ def _shares(mounts, times_ns, redundancy=None):
     found = mounts.eliminated()
     if redundancy is not None:
         found = replace(found, redundancy=np.full_like(found.redundancy, redundancy))
-    return passing_shares(mounts, found, (np.arange(len(times_ns)), times_ns), PRIOR_SCALE)
+    return transient_variance_shares(mounts, found, (np.arange(len(times_ns)), times_ns), JOINT_PRIOR_SCALE)
 
 
 def test_a_calm_walker_uses_a_part_of_the_everyday_range(solved):
@@ -58,6 +58,6 @@ def test_who_moves_more_than_everyday_is_livelier(solved):
 def test_a_t_pose_alone_says_nothing(solved):
     mounts, times_ns = solved
     none = np.zeros(0, dtype=np.int64)
-    assert passing_shares(mounts, mounts.eliminated(), (none, times_ns[:0]), PRIOR_SCALE) == pytest.approx(
-        EVERYDAY
-    )
+    assert transient_variance_shares(
+        mounts, mounts.eliminated(), (none, times_ns[:0]), JOINT_PRIOR_SCALE
+    ) == pytest.approx(EVERYDAY)

@@ -17,7 +17,7 @@ from bodycap_batch.config.job import load_job
 from bodycap_batch.config.options import MarkerBoard, MergeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body_calibration.marker_board import find_board
+from bodycap_batch.merging.body_calibration.marker_board import locate_board
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import Similarity, invert, make_transform, so3_exp, transform_points
@@ -36,7 +36,7 @@ CAMERA = Camera(model="PINHOLE", width_px=320, height_px=240, params=np.array(LE
 
 
 def _scale(*asked: object) -> ScaleSource:
-    return find_board(*asked).scale
+    return locate_board(*asked).scale
 
 
 def _path(count: int, centre_noise_m: float = 0.0, half_way_m: float = 0.7) -> np.ndarray:
@@ -183,7 +183,7 @@ def test_the_main_map_is_asked_before_one_that_was_joined():
 def test_a_board_that_tells_nothing_is_refused():
     rng = np.random.default_rng(0)
     asked = MergeOptions(marker_board=FLAT)
-    assert find_board(_inputs(_path(4)), MergeOptions()) is None
+    assert locate_board(_inputs(_path(4)), MergeOptions()) is None
     with pytest.raises(EstimationError, match="found in 2 keyframes"):
         _scale(_inputs(_path(2), _views(_path(2), rng)), asked)
     still = np.repeat(_path(1), 6, axis=0)
@@ -242,7 +242,7 @@ def test_a_filmed_board_is_found_and_measured(filmed, tmp_path):
 
 def test_a_board_that_lies_or_hangs_tells_up():
     views = _views(_path(12), np.random.default_rng(0))
-    board = find_board(_inputs(_path(12), views), MergeOptions(marker_board=FLAT))
+    board = locate_board(_inputs(_path(12), views), MergeOptions(marker_board=FLAT))
     assert board.ups(None) == ()
     edges = GAUGE.rotation @ WORLD_FROM_BOARD[:3, :3]
     (lying,) = board.ups("lying")
@@ -256,7 +256,7 @@ def test_a_board_that_lies_or_hangs_tells_up():
     for edge in (edges[:, 0], -edges[:, 0], edges[:, 1], -edges[:, 1]):
         assert max(up @ edge for up in hanging) > np.cos(np.radians(0.5))
     turned = Similarity(0.5, so3_exp([0.0, 0.0, 1.0]), np.zeros(3))
-    (placed,) = find_board(_inputs(_path(12), views), MergeOptions(marker_board=FLAT), {"map-0": turned}).ups(
-        "lying"
-    )
+    (placed,) = locate_board(
+        _inputs(_path(12), views), MergeOptions(marker_board=FLAT), {"map-0": turned}
+    ).ups("lying")
     assert np.allclose(placed.up, turned.rotation @ lying.up)

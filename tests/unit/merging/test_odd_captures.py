@@ -13,11 +13,11 @@ from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body.initial_poses import reach_constraint
 from bodycap_batch.merging.body_calibration import calibration_graph
-from bodycap_batch.merging.body_calibration.anthropometry import placements, proportions
-from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
+from bodycap_batch.merging.body_calibration.anthropometry import bone_length_modes, joint_placement_modes
+from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.known_distance import known_distance
 from bodycap_batch.merging.body_calibration.samples import take_samples
-from bodycap_batch.merging.body_calibration.scale import find_scale
+from bodycap_batch.merging.body_calibration.scale import estimate_scale
 from bodycap_batch.merging.cameras.track import inflate_sigmas, make_track
 from bodycap_batch.merging.graph.motion_graph import MotionGraph
 from bodycap_batch.merging.graph.windows import with_overlap
@@ -66,7 +66,7 @@ def test_a_camera_never_seen_with_others_keeps_its_usual_mount_and_weighs_as_lit
     samples = take_samples(tracks, 1.0, 12)
     assert not samples.valid[2].any()
     mounts = {mount.camera: mount for mount in inputs.mounts}
-    calibration = Calibration(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
+    calibration = CalibrationGraph(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
     assert np.isfinite(calibration.solve(1.0))
     usual = mounts["right_palm"].joint_from_cam
     assert np.abs(calibration.mounts["right_palm"] - usual).max() < 1e-3
@@ -85,10 +85,10 @@ def test_bones_of_a_height_alone_may_be_longer_on_both_sides_alike(body):
     inputs, bones, tracks = body
     samples = take_samples(tracks, 1.0, 12)
     mounts = {mount.camera: mount for mount in inputs.mounts}
-    calibration = Calibration(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
+    calibration = CalibrationGraph(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
     calibration.solve(1.0)
     follow = {name: np.zeros((4, 4)) for name in ROLES}
-    bodies = proportions(bones, tuple(ROLES)), placements(bones, tuple(ROLES), 1.75)
+    bodies = bone_length_modes(bones, tuple(ROLES)), joint_placement_modes(bones, tuple(ROLES), 1.75)
     (known, _), (likely, passing) = (calibration.spread(0.01, follow, {}, each) for each in ((), (bodies,)))
     assert not known.offsets_m.any()
     index = {bone.role: place for place, bone in enumerate(bones)}
@@ -135,7 +135,7 @@ def test_a_t_pose_is_no_gesture(body, monkeypatch):
     mounts = {mount.camera: mount for mount in inputs.mounts}
     samples = take_samples(tracks, 1.0, 12, None, (0, 2_000_000_000))
     posed = samples.posture.t_pose
-    calibration = Calibration(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
+    calibration = CalibrationGraph(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
     calibration.solve(1.0, iterations=1)
     asked = []
     monkeypatch.setattr(
@@ -180,7 +180,7 @@ class _Sliding:
 
 
 def test_a_cost_that_falls_without_end_leaves_the_scale_open():
-    estimate = find_scale(_Sliding(), 1.0)
+    estimate = estimate_scale(_Sliding(), 1.0)
     assert estimate.sigma_log == 1.0
     assert np.isfinite(estimate.mount_slope["cam"]).all()
 

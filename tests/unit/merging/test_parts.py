@@ -18,7 +18,12 @@ from bodycap_batch.merging.body.initial_poses import (
     provisional_scale,
     reach_constraint,
 )
-from bodycap_batch.merging.body_calibration.scale import ScaleSource, combine, disagreement, floor_source
+from bodycap_batch.merging.body_calibration.scale import (
+    ScaleSource,
+    chi_square,
+    scale_from_floor,
+    weighted_mean,
+)
 from bodycap_batch.merging.cameras.track import CameraTrack, remove_outliers
 from bodycap_batch.merging.graph.factors import (
     MountPoints,
@@ -350,16 +355,16 @@ def test_one_wall_does_not_fix_the_vertical():
 
 def test_the_floor_corrects_the_scale_by_its_share_and_is_not_believed_when_far_off():
     body = ScaleSource(name="height", scale=2.0, sigma_log=0.06)
-    floor = floor_source(body, 0.97 * 1.2 / 1.06, 1.2)
+    floor = scale_from_floor(body, 0.97 * 1.2 / 1.06, 1.2)
     assert floor.used
     assert floor.scale == pytest.approx(2.0 * 1.06)
     # Equal sigmas: halfway.
-    scale, sigma = combine([body, floor])
+    scale, sigma = weighted_mean([body, floor])
     assert scale == pytest.approx(2.0 * np.sqrt(1.06))
     assert sigma == pytest.approx(0.06 / np.sqrt(2.0))
-    assert not floor_source(body, 0.8, 1.2).used
-    assert not floor_source(body, -0.1, 1.2).used
-    assert combine([body, floor_source(body, 0.8, 1.2)]) == pytest.approx((2.0, 0.06))
+    assert not scale_from_floor(body, 0.8, 1.2).used
+    assert not scale_from_floor(body, -0.1, 1.2).used
+    assert weighted_mean([body, scale_from_floor(body, 0.8, 1.2)]) == pytest.approx((2.0, 0.06))
 
 
 def test_disagreement_counts_sources_that_were_not_believed():
@@ -368,8 +373,8 @@ def test_disagreement_counts_sources_that_were_not_believed():
         ScaleSource(name="floor", scale=float(np.exp(0.12)), sigma_log=0.03, used=False),
     ]
     # Two values 4 sigma of one apart: 0.12² / (2 · 0.03²) = 8 about their mean.
-    assert disagreement(sources) == pytest.approx((8.0, 1))
-    assert disagreement(sources[:1]) == pytest.approx((0.0, 0))
+    assert chi_square(sources) == pytest.approx((8.0, 1))
+    assert chi_square(sources[:1]) == pytest.approx((0.0, 0))
 
 
 def test_world_has_hips_over_the_origin_and_faces_minus_y():

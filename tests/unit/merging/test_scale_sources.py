@@ -10,9 +10,9 @@ import pytest
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import kinematic_chain
-from bodycap_batch.merging.body_calibration.calibrate_body import trunk_way_up
+from bodycap_batch.merging.body_calibration.calibrate_body import reference_camera_roll
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
-from bodycap_batch.merging.camera_selection import choices
+from bodycap_batch.merging.camera_selection import candidate_main_maps
 from bodycap_batch.merging.cameras.track import CameraTrack, make_track
 from bodycap_batch.merging.map_alignment import align
 from bodycap_batch.merging.map_alignment.align import align_cameras
@@ -157,7 +157,7 @@ def test_a_join_is_told_what_the_job_states_of_up_and_how_the_trunks_camera_is_r
     monkeypatch.setattr(align, "stated_constraints", lambda *_: StatedConstraints(verticals=(lying,)))
     monkeypatch.setattr(align, "trunk_way_up", way_up)
     monkeypatch.setattr(align, "Calibration", calibration)
-    main, further = choices(short.inputs)[0]
+    main, further = candidate_main_maps(short.inputs)[0]
     assert "enough" in align_cameras(short.inputs, main, further[:1], lambda: None).unused[further[0].camera]
     assert told[0] == (lying,)
     usual = short.inputs.mount_of("torso").joint_from_cam
@@ -171,7 +171,7 @@ def test_what_is_stated_or_seen_early_says_where_it_is_from(short):
     tracks = [make_track(inputs, trunk, [bone.role for bone in bones].index("Spine1"))]
     unit = short.gauges[trunk.gauge]
     lying = VerticalHypothesis(source="marker board", up=unit.rotation @ UP, sigma_deg=1.5)
-    roll, up = trunk_way_up(inputs, bones, tracks, 1.0 / unit.scale, (lying,))
+    roll, up = reference_camera_roll(inputs, bones, tracks, 1.0 / unit.scale, (lying,))
     assert (roll, up.source) == (0.0, "marker board")
 
 
@@ -187,7 +187,7 @@ class _Strained(MapAlignmentProblem):
 
 def test_a_stated_scale_saves_a_join_on_whose_scale_reach_and_movement_disagree(short, monkeypatch):
     monkeypatch.setattr(align, "MapAlignmentProblem", _Strained)
-    main, further = choices(short.inputs)[0]
+    main, further = candidate_main_maps(short.inputs)[0]
     refused, placed = (
         align_cameras(short.inputs, main, further[:1], lambda: None, options).unused
         for options in (MergeOptions(), _distance(short, "torso"))
@@ -211,7 +211,7 @@ def test_maps_are_placed_at_the_stated_scale():
 @pytest.mark.slow
 def test_palms_lie_where_they_were_once_the_scale_is_known():
     capture = _drawn(1000 / 30)
-    main, further = choices(capture.inputs)[0]
+    main, further = candidate_main_maps(capture.inputs)[0]
     off = []
     for options in (MergeOptions(), _distance(capture, "torso")):
         together = align_cameras(capture.inputs, main, further, lambda: None, options)

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.merging.body_calibration.camera_roll import rolled
+from bodycap_batch.merging.body_calibration.camera_roll import with_roll
 from bodycap_batch.merging.cameras.side_check import swapped_sides
 from bodycap_batch.merging.cameras.track import CameraTrack
-from bodycap_batch.merging.reporting.advice import sides_sentence
+from bodycap_batch.merging.reporting.advice import describe_swapped_sides
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
 
@@ -51,7 +51,7 @@ def _tracks(*sides: tuple[str, float], down_rad: float = 0.0, count: int = 90) -
 def test_exchanged_names_are_told() -> None:
     wrong = swapped_sides(_tracks(("left_palm", 0.3), ("right_palm", -0.3), ("head", 0.0)), MOUNTS, UP)
     assert wrong == {"left_palm": 1.0, "right_palm": 1.0}
-    assert sides_sentence(wrong).startswith("left_palm and right_palm stay on the other side")
+    assert describe_swapped_sides(wrong).startswith("left_palm and right_palm stay on the other side")
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_a_camera_on_its_head_does_not_tell() -> None:
 @pytest.mark.parametrize("roll_deg", [0.0, 180.0])
 def test_a_back_camera_has_the_left_hand_on_its_right(roll_deg: float) -> None:
     own, exchanged = (_tracks(("left_palm", side * 0.3), ("right_palm", side * -0.3)) for side in (1.0, -1.0))
-    mounts = {**MOUNTS, "torso": rolled(BACK, roll_deg)}
+    mounts = {**MOUNTS, "torso": with_roll(BACK, roll_deg)}
     turn = so3_exp(np.array([0.0, 0.0, np.radians(roll_deg)]))
     for tracks in (own, exchanged):
         poses = tracks[0].map_from_cam.copy()

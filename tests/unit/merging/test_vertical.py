@@ -11,7 +11,7 @@ from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body.trunk_lean import TrunkOrientation, trunk_orientation
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.graph.posture import is_mostly_walking
-from bodycap_batch.merging.reporting.advice import up_sentence
+from bodycap_batch.merging.reporting.advice import describe_vertical
 from bodycap_batch.merging.world.vertical import SceneContext, Vertical, VerticalHypothesis, estimate_vertical
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.skeleton_presets import load_skeleton
@@ -108,7 +108,7 @@ def test_a_lean_that_lasts_does_not_show_unless_it_walks(forward_deg, share):
     assert 38.0 < found.sigma_deg < 50.0
     assert _off_deg(found) < 2.5 * found.sigma_deg
     assert not found.is_determined()
-    assert "not for certain: nothing else tells it" in up_sentence(SimpleNamespace(up=found))
+    assert "not for certain: nothing else tells it" in describe_vertical(SimpleNamespace(up=found))
     if share == 1.0:
         walked = _found(axes, path, np.zeros((0, 3)), walks=True)
         assert walked.sigma_deg == pytest.approx(15.0, abs=0.5)
@@ -181,7 +181,7 @@ def test_a_board_on_the_floor_tells_who_is_upside_down():
     assert _off_deg(found) < 0.5
     # However strange it is beside what the job does not say.
     assert found.is_determined()
-    assert up_sentence(SimpleNamespace(up=found)).endswith("from the map")
+    assert describe_vertical(SimpleNamespace(up=found)).endswith("from the map")
 
 
 def test_a_board_hung_at_half_a_right_angle_leaves_two_of_its_edges():
