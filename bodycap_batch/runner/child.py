@@ -272,7 +272,7 @@ class StepReporter:
     def __init__(
         self,
         report: Callable[[int, int, str], None],
-        release: Callable[[], None] = give_back,
+        release: Callable[[], None] = release_memory,
         period_s: float = RELEASE_PERIOD_S,
     ) -> None:
         self._report = report
