@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.merging.projection.project import Projection, project_motion
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
-from bodycap_batch.model.merge_data import CameraClock, MergeResult
+from bodycap_batch.model.merge_data import CameraClock, MergeResult, SolvedBody
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
@@ -98,8 +101,12 @@ def merged(
     noise_m: float = 0.003,
     offset_s: float = 0.0,
     world_from_map: dict[str, Similarity] | None = None,
+    projected: bool = True,
 ) -> tuple[MergeResult, dict[str, CameraClock]]:
-    """What the skeleton stage would return for this motion, with slack in its joints."""
+    """What the skeleton stage would return for this motion, with slack in its joints.
+
+    Without `projected` its rigid motion is the given one, which spares a long motion the solve.
+    """
     rng = np.random.default_rng(8)
     body = motion.skeleton
     solved = np.array([role in ARMS for role in body.roles])
@@ -117,17 +124,35 @@ def merged(
         for mount in mounts
     )
     observed = np.array([role in CAMERAS.values() for role in body.roles])
-    result = MergeResult(
+    solution = SolvedBody(
         skeleton=body,
         fps=motion.fps,
         start_ns=motion.start_ns,
-        world_from_joint=graph,
+        graph_world_from_joint=graph,
         solved=solved,
         observed=np.tile(observed, (shape[0], 1)),
-        world_from_map=world_from_map or {},
         trajectories=paths,
         mounts=mounts,
+    )
+    clocks = {camera: CameraClock(nominal_fps=30.0, offset_s=offset_s) for camera in CAMERAS}
+    projection = (
+        project_motion(solution, clocks)
+        if projected
+        else Projection(motion=replace(motion, observed=solution.observed), gap={})
+    )
+    result = MergeResult(
+        skeleton=solution.skeleton,
+        fps=solution.fps,
+        start_ns=solution.start_ns,
+        graph_world_from_joint=solution.graph_world_from_joint,
+        solved=solution.solved,
+        observed=solution.observed,
+        trajectories=solution.trajectories,
+        mounts=solution.mounts,
+        motion=projection.motion,
+        projection_gap=projection.gap,
+        world_from_map=world_from_map or {},
         unused_cameras={},
         report={"scale": {"source": "height", "value": 1.75}, "floor": float("nan")},
     )
-    return result, {camera: CameraClock(nominal_fps=30.0, offset_s=offset_s) for camera in CAMERAS}
+    return result, clocks

@@ -10,7 +10,6 @@ import numpy as np
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.export.metrics import collect_metrics
-from bodycap_batch.export.projection import project_motion
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import Similarity, invert, transform_points
 from bodycap_batch.model.merge_data import CameraClock
@@ -29,11 +28,11 @@ def report_inputs(frames: int = 60, points: int = 400, *, lost: slice = slice(20
 
     The body walks for the whole length; each registered frame saw up to 40 points of the map.
     """
-    result, clocks = merged(reaching(frames), world_from_map={GAUGE: WORLD})
+    result, clocks = merged(reaching(frames), world_from_map={GAUGE: WORLD}, projected=frames <= 120)
     rng = np.random.default_rng(5)
     low, high = (
-        result.world_from_joint[..., :3, 3].min((0, 1)),
-        result.world_from_joint[..., :3, 3].max((0, 1)),
+        result.graph_world_from_joint[..., :3, 3].min((0, 1)),
+        result.graph_world_from_joint[..., :3, 3].max((0, 1)),
     )
     cloud = rng.uniform(low - 2.0, high + 2.0, size=(points, 3))
     paths = tuple(_with_losses(path, lost) for path in result.trajectories)
@@ -53,8 +52,7 @@ def report_inputs(frames: int = 60, points: int = 400, *, lost: slice = slice(20
         merge=result,
         log={"reach": {"judged": True, "distances": 90, "within_reach": 1.0}},
     )
-    projected = project_motion(result, clocks) if frames <= 120 else None
-    motion, gap = (None, {}) if projected is None else (projected.motion, projected.gap)
+    motion = result.motion if frames <= 120 else None
     return ReportInputs(
         name="a walk <in> the lab",
         cameras=tuple(CAMERAS),
@@ -64,7 +62,7 @@ def report_inputs(frames: int = 60, points: int = 400, *, lost: slice = slice(20
         selections=selections,
         merge=result,
         mounts=result.mounts,
-        metrics=collect_metrics(export, motion, gap),
+        metrics=collect_metrics(export, motion, dict(result.projection_gap)),
     )
 
 

@@ -41,7 +41,7 @@ SUBLAYERS: dict[str, Sequence[set[str]]] = {
     ),
     "registration": ({"tracking"}, {"poses"}, {"recovery"}, {"stage"}),
     "merging": (
-        {"cameras"},
+        {"cameras", "projection"},
         {"body"},
         {"graph"},
         {"world"},

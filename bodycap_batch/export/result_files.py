@@ -22,7 +22,6 @@ from bodycap_batch.export.motion_files import (
     write_verified_glb,
     write_verified_usd,
 )
-from bodycap_batch.export.projection import project_motion
 from bodycap_batch.export.scene_files import write_colmap, write_maps, write_trajectories
 from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.formats.c3d import write_c3d
@@ -109,8 +108,7 @@ def _exported_motion(inputs: ExportInputs, options: ExportOptions) -> tuple[Moti
     """The motion to export and its distance from the graph; None without a body."""
     if inputs.merge is None:
         return None, {}
-    projection = project_motion(inputs.merge, inputs.clocks, inputs.row_fraction)
-    motion = with_file_zero_pose(projection.motion)
+    motion = with_file_zero_pose(inputs.merge.motion)
     if options.hierarchy == "solved":
         motion = without_unsolved_branches(motion, inputs.merge.solved)
-    return motion, dict(projection.gap)
+    return motion, dict(inputs.merge.projection_gap)

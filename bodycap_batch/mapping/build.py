@@ -12,7 +12,12 @@ from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.mapping.inputs import common_times_ns, calibrated_camera_ids, intrinsics_of, make_mapping_context
+from bodycap_batch.mapping.inputs import (
+    common_times_ns,
+    calibrated_camera_ids,
+    intrinsics_of,
+    make_mapping_context,
+)
 from bodycap_batch.mapping.intrinsics.intrinsics_check import update_camera_models, find_misfit_intrinsics
 from bodycap_batch.mapping.intrinsics.recalibration import recalibrate_if_misfit
 from bodycap_batch.mapping.matching.database import (
@@ -123,7 +128,9 @@ def build_map_once(
         if carrying is not chooser:
             placed, log["placed"] = resect_remaining(models, chooser, tried, shop)
         log["unconfirmed_points"] = finalise_models(models, shop, capture, placed)
-    refused = check_coverage(models, len(refs), log.get("initial_candidates", log["initial_pair_ladder"]), options)
+    refused = check_coverage(
+        models, len(refs), log.get("initial_candidates", log["initial_pair_ladder"]), options
+    )
     refused = add_flip_hint(refused, mirror)
     if refused is not None and not models:
         raise refused
@@ -139,7 +146,9 @@ def build_map_once(
 
 def _initial_pairs(shop: MappingContext, options: MapOptions) -> tuple[list[InitialPair], dict[str, object]]:
     """The pair the user named, if it can be used, then the best ranked; what to tell of the first."""
-    ranked = [start for start in rank_initial_pairs(shop.workspace, shop.lenses)[:_INITIAL_PAIRS] if start.usable]
+    ranked = [
+        start for start in rank_initial_pairs(shop.workspace, shop.lenses)[:_INITIAL_PAIRS] if start.usable
+    ]
     if options.init_frames is None:
         return ranked, {}
     start = find_user_pair(shop.workspace, options.init_frames, shop.lenses, shop.frame_numbers)
@@ -158,12 +167,16 @@ def reconstruct_with_intrinsics(
         if not better:
             break
         found |= better
-        models, log = _reconstruct_from_pairs(shop := replace(shop, lenses={**shop.lenses, **found}), options, total)
+        models, log = _reconstruct_from_pairs(
+            shop := replace(shop, lenses={**shop.lenses, **found}), options, total
+        )
         log["better_lenses"] = {name: lens.model for name, (lens, _) in sorted(found.items())}
     return models, log
 
 
-def _reconstruct_from_pairs(shop: MappingContext, options: MapOptions, total: int) -> tuple[list[Any], dict[str, Any]]:
+def _reconstruct_from_pairs(
+    shop: MappingContext, options: MapOptions, total: int
+) -> tuple[list[Any], dict[str, Any]]:
     """Models from the pair the user named or the best ranked, and what each of the pairs gave."""
     starts, named = _initial_pairs(shop, options)
     models, ladder = reconstruct(shop.workspace, shop.settings(), shop.context, total, starts)

@@ -11,7 +11,12 @@ from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping.inputs import common_times_ns, calibrated_camera_ids, intrinsics_of, make_mapping_context
+from bodycap_batch.mapping.inputs import (
+    common_times_ns,
+    calibrated_camera_ids,
+    intrinsics_of,
+    make_mapping_context,
+)
 from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
@@ -73,10 +78,14 @@ def extend_map(
         model = pycolmap.Reconstruction(str(workspace / MODELS_FOLDER / str(number)))
         standing = set(map(int, model.reg_image_ids())) - doubted
         inside = set(map(int, model.reg_image_ids())) & doubted
-        model, names = remove_misregistered(re_register_images(model, inside, shop, len(known) + len(new)), shop)
+        model, names = remove_misregistered(
+            re_register_images(model, inside, shop, len(known) + len(new)), shop
+        )
         models.append(model)
         cut += names
-        placed.append(set(map(int, model.reg_image_ids())) - standing if len(standing) > SKELETAL_ABOVE else None)
+        placed.append(
+            set(map(int, model.reg_image_ids())) - standing if len(standing) > SKELETAL_ABOVE else None
+        )
     dropped = finalise_models(models, shop, capture, placed)
     write_models(workspace, models)
     told = {"placed_again": len(doubted), "cut": cut, "unconfirmed_points": dropped}

@@ -11,7 +11,11 @@ from typing import TYPE_CHECKING
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping.intrinsics.readout_time import RollingShutterModel, estimate_readouts, map_with_readouts
+from bodycap_batch.mapping.intrinsics.readout_time import (
+    RollingShutterModel,
+    estimate_readouts,
+    map_with_readouts,
+)
 from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
 from bodycap_batch.mapping.matching.database import (
     read_camera_ids,

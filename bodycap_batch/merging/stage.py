@@ -1,4 +1,4 @@
-"""The stage, step by step: choose, calibrate, solve, place, complete, report."""
+"""The stage, step by step: select cameras, calibrate, solve, place in the world, complete, project, report."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ from bodycap_batch.merging.graph.joint_limits import soft_limits
 from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution, hinge_deviations, joint_gaps
 from bodycap_batch.merging.graph.motion_noise import scale_motion_noise
 from bodycap_batch.merging.graph.windows import MAX_ITERATIONS, max_window_ticks, solve_windows
+from bodycap_batch.merging.projection.project import project_motion
 from bodycap_batch.merging.reporting.report import build_report
 from bodycap_batch.merging.world.floor import (
     WALKING_HEIGHT_RATIO,
@@ -47,7 +48,7 @@ from bodycap_batch.merging.world.floor import (
     standing_height,
 )
 from bodycap_batch.model.geometry import Similarity
-from bodycap_batch.model.merge_data import MergeInputs, MergeResult
+from bodycap_batch.model.merge_data import MergeInputs, MergeResult, SolvedBody
 from bodycap_batch.model.scene import Trajectory
 
 
@@ -115,17 +116,33 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
     covariance = skeleton_covariance(
         world_from_solved.rotation, bones, solution.joint_covariance, len(solved)
     )
-    step.finish()
-    return MergeResult(
+    body = SolvedBody(
         skeleton=inputs.skeleton,
         fps=fps,
         start_ns=int(tick_times[0]),
-        world_from_joint=joints,
+        graph_world_from_joint=joints,
         solved=solved,
         observed=observed,
-        world_from_map={gauge: place.after(here) for gauge, here in together.main_from_gauge.items()},
         trajectories=paths,
         mounts=calibrated.mounts,
+        standing=standing_joints(contacts, len(tick_times), len(solved)),
+    )
+    step("projecting")
+    projection = project_motion(body, inputs.clocks, inputs.row_fraction)
+    step.finish()
+    return MergeResult(
+        skeleton=body.skeleton,
+        fps=body.fps,
+        start_ns=body.start_ns,
+        graph_world_from_joint=body.graph_world_from_joint,
+        solved=body.solved,
+        observed=body.observed,
+        trajectories=body.trajectories,
+        mounts=body.mounts,
+        standing=body.standing,
+        motion=projection.motion,
+        projection_gap=projection.gap,
+        world_from_map={gauge: place.after(here) for gauge, here in together.main_from_gauge.items()},
         unused_cameras=together.unused,
         report=build_report(
             inputs,
@@ -147,7 +164,6 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
             },
         ),
         joint_covariance_m2=covariance,
-        standing=standing_joints(contacts, len(tick_times), len(solved)),
     )
 
 

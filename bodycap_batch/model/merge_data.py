@@ -12,7 +12,7 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.scene import Trajectory
-from bodycap_batch.model.skeleton import Mount, SkeletonModel
+from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
 
 Activity = Literal["walk", "generic"]
 
@@ -123,60 +123,87 @@ class MergeInputs:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MergeResult:
-    """The body and the cameras in the world (metres, Z up).
+class SolvedBody:
+    """The body as the factor graph solved it, in the world (metres, z up). Its joints have slack.
 
     Attributes:
-        skeleton: The skeleton that was solved.
-        fps: Rate of the timeline.
+        skeleton: The skeleton that was solved, with J joints.
+        fps: Ticks per second.
         start_ns: Common time of tick 0.
-        world_from_joint: (T,J,4,4) a pose for every joint: the graph's where ``solved`` (its joints
-            have millimetres of slack), rest rotations on top of it elsewhere.
-        solved: (J,) True where the joint was a variable of the graph.
-        observed: (T,J) True where cameras measured the joint at that tick.
-        world_from_map: By gauge; a gauge that could not be placed is missing.
-        trajectories: The used cameras' trajectories, gauge "world", the measurements' covariance in metres,
-            centres as solved with the body (`MergeOptions.camera_paths`); poses that proved to be gross
-            errors are gone, with the status POSE_JUMP.
+        graph_world_from_joint: (T,J,4,4) a pose for every joint: the graph's if ``solved`` (its joints have
+            millimetres of slack), else the rest rotation relative to the parent.
+        solved: (J,) True if the joint was a variable of the graph.
+        observed: (T,J) True if cameras measured the joint at that tick.
+        trajectories: The trajectories of the cameras in use, gauge "world", covariance of the measurements in
+            metres, centres as solved with the body (`MergeOptions.camera_paths`). Poses that proved to be
+            gross errors are removed, with the status POSE_JUMP.
         mounts: The solved mounts with their sigmas.
-        unused_cameras: Cameras whose map could not be linked to the body, with the reason.
-        report: Plain JSON values: sources and values of scale, up and floor, residuals, outliers …
-        joint_covariance_m2: (T,J,3,3) of each joint's centre minus the first solved joint's, world axes:
-            measurement noise, mounts and scale together; not the world's own axes. NaN where not solved.
-        standing: (T,J) True where a foot stands on its ankle, this joint; None where that was not looked for.
+        standing: (T,J) True if a foot stands on its ankle, this joint. None if foot contact was not detected.
     """
 
     skeleton: SkeletonModel
     fps: float
     start_ns: int
-    world_from_joint: FloatArray
+    graph_world_from_joint: FloatArray
     solved: BoolArray
     observed: BoolArray
-    world_from_map: Mapping[str, Similarity]
     trajectories: tuple[Trajectory, ...]
     mounts: tuple[Mount, ...]
-    unused_cameras: Mapping[str, str]
-    report: Mapping[str, Any]
-    joint_covariance_m2: FloatArray | None = None
     standing: BoolArray | None = None
 
     def __post_init__(self) -> None:
-        ticks, joints = len(self.world_from_joint), len(self.skeleton.joints)
-        set_array(self, "world_from_joint", (ticks, joints, 4, 4))
+        ticks, joints = len(self.graph_world_from_joint), len(self.skeleton.joints)
+        set_array(self, "graph_world_from_joint", (ticks, joints, 4, 4))
         set_array(self, "solved", (joints,), np.bool_)
         set_array(self, "observed", (ticks, joints), np.bool_)
-        if self.joint_covariance_m2 is not None:
-            set_array(self, "joint_covariance_m2", (ticks, joints, 3, 3), finite=False)
         if self.standing is not None:
             set_array(self, "standing", (ticks, joints), np.bool_)
 
+    def times_ns(self) -> IntArray:
+        """Return the common time (T,) of each tick."""
+        ticks = np.arange(len(self.graph_world_from_joint))
+        return np.asarray(self.start_ns + np.round(ticks * (1e9 / self.fps)), dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MergeResult(SolvedBody):
+    """The body and the cameras in the world (metres, z up).
+
+    Every output shows `motion`: the page, the video and all files. The graph's poses are kept for figures
+    about the solution itself.
+
+    Attributes:
+        motion: The motion of the rigid skeleton that is nearest to the graph's solution.
+        projection_gap: JSON values: how far `motion` is from the graph's joints and from the cameras, and how
+            fast standing feet slide in it.
+        world_from_map: By gauge; a gauge whose place is unknown is missing.
+        unused_cameras: Cameras whose map could not be linked to the body, with the reason.
+        report: Plain JSON values: sources and values of scale, vertical and floor, residuals, outliers.
+        joint_covariance_m2: (T,J,3,3) covariance of each joint's centre minus the centre of the first solved
+            joint, world axes: measurement noise, mounts and scale together; not the world's own axes. NaN if
+            the joint was not solved.
+    """
+
+    motion: Motion
+    projection_gap: Mapping[str, Any]
+    world_from_map: Mapping[str, Similarity]
+    unused_cameras: Mapping[str, str]
+    report: Mapping[str, Any]
+    joint_covariance_m2: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        # With slots, the decorator makes a new class, which super() without arguments does not know.
+        SolvedBody.__post_init__(self)
+        if self.motion.local_rotation.shape[:2] != self.observed.shape:
+            raise ValueError("motion: its ticks and joints are not those of the graph")
+        if self.joint_covariance_m2 is not None:
+            set_array(self, "joint_covariance_m2", (*self.observed.shape, 3, 3), finite=False)
+
     def joint_sigma_m(self) -> FloatArray:
-        """(T,J) sigma per axis of each joint's centre relative to the first solved one's; NaN: not solved."""
+        """Return the sigma (T,J) per axis of each joint's centre relative to the first solved joint's.
+
+        NaN if the joint was not solved.
+        """
         if self.joint_covariance_m2 is None:
             return np.full(self.observed.shape, np.nan)
         return np.asarray(np.sqrt(np.trace(self.joint_covariance_m2, axis1=2, axis2=3) / 3.0))
-
-    def times_ns(self) -> IntArray:
-        """(T,) common time of each tick."""
-        ticks = np.arange(len(self.world_from_joint))
-        return np.asarray(self.start_ns + np.round(ticks * (1e9 / self.fps)), dtype=np.int64)

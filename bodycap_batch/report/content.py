@@ -162,8 +162,9 @@ def _before(inputs: ReportInputs) -> list[dict[str, Any]]:
     if merge is None:
         return []
     rows = []
+    world_from_joint = merge.motion.world_from_joint()
     for each in before_optimisation(inputs):
-        off = each.off_m(merge)
+        off = each.off_m(world_from_joint)
         rows.append(
             {
                 "camera": each.camera,

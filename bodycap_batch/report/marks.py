@@ -79,8 +79,8 @@ def _told(path: Trajectory | None, index: int) -> dict[str, Any]:
 
 
 def solved_body(merge: MergeResult) -> Body:
-    """The bones between solved joints, as the graph has them."""
-    skeleton, poses, solved = merge.skeleton, merge.world_from_joint, merge.solved
+    """The bones between solved joints, in the motion that all outputs show."""
+    skeleton, poses, solved = merge.skeleton, merge.motion.world_from_joint(), merge.solved
     centres = poses[..., :3, 3]
     pairs: list[FloatArray] = []
     turned_by: list[int] = []

@@ -96,7 +96,7 @@ def _body(merge: MergeResult, shown: Shown) -> dict[str, Any]:
     columns = 3 * (joints + extra) + joints // 2 + (0 if sigma is None else joints)
     keep = thinned(len(times), affordable(shown.of(_MOTION_BUDGET), 2 * columns))
     shown.note("ticks of the motion", len(keep), len(times))
-    poses = merge.world_from_joint[keep]
+    poses = merge.motion.world_from_joint()[keep]
     tips = np.einsum("tnij,nj->tni", poses[:, ends][..., :3, :3], skeleton.end_offsets_m[ends])
     centres = np.concatenate([poses[:, :, :3, 3], tips + poses[:, ends][..., :3, 3]], axis=1)
     return {
@@ -121,7 +121,7 @@ def _view(placed: Placed, merge: MergeResult | None, points: FloatArray) -> dict
     """Where to look from the start."""
     centres = _centres(placed)
     if merge is not None:
-        centres = np.concatenate([centres, merge.world_from_joint[:, 0, :3, 3]])
+        centres = np.concatenate([centres, merge.motion.root_in_world_m])
     if len(centres) == 0:
         return {"centre": [0.0, 0.0, 0.0], "radius": 1.0}
     low, high = np.percentile(centres, [2, 98], axis=0)

@@ -54,7 +54,6 @@ def run_preview(task: PreviewTask, context: StageContext, files: Path) -> None:
 def _preview_inputs(task: PreviewTask, path: Path, threads: int) -> PreviewInputs:
     import numpy as np
 
-    from bodycap_batch.export import project_motion
     from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.merge_data import MergeResult
     from bodycap_batch.overlay import body_of, camera_views
@@ -75,9 +74,7 @@ def _preview_inputs(task: PreviewTask, path: Path, threads: int) -> PreviewInput
         frame="world" if merge is not None else scene.maps[0].gauge,
         points=np.concatenate(moved),
         colours=np.concatenate(colours),
-        body=None
-        if merge is None
-        else body_of(project_motion(merge, found.clocks, found.row_fraction).motion),
+        body=None if merge is None else body_of(merge.motion),
         note=task.failure or "",
     )
 
@@ -113,7 +110,6 @@ PREVIEW = Stage(
     libraries=(*VISION_LIBRARIES, "scipy", "pycolmap"),
     modules=(
         *VISION_MODULES,
-        "bodycap_batch.export",
         "bodycap_batch.preview",
         "pycolmap",
         "scipy.spatial.transform",

@@ -129,10 +129,10 @@ def score(folder: Path, result: MergeResult) -> dict[str, float]:
     _, truth = read_bvh(folder / "gt" / "motion.bvh")
     assert truth is not None
     assert abs(int(truth.times_ns()[0]) - result.start_ns) < 1_000_000
-    count = min(len(truth.root_in_world_m), len(result.world_from_joint))
+    count = min(len(truth.root_in_world_m), len(result.graph_world_from_joint))
     place = result.world_from_map[GAUGE]
     true = truth.world_from_joint()[:count]
-    mine = np.array(result.world_from_joint[:count])
+    mine = np.array(result.graph_world_from_joint[:count])
     mine[..., :3, :] = np.einsum("ji,tkjl->tkil", place.rotation, mine[..., :3, :])
     roles = result.skeleton.roles
     # The hips where a camera measures them, else the chest.

@@ -58,7 +58,7 @@ def measure(frames: int, bones: int) -> dict[str, Any]:
         )
         ended = time.process_time()
     return {
-        "frames": len(result.world_from_joint),
+        "frames": len(result.graph_world_from_joint),
         "bones": int(result.solved.sum()),
         "cameras": len(result.trajectories),
         "seconds": ended - started,

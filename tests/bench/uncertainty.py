@@ -44,8 +44,8 @@ def band(seeds: int) -> tuple[float, float]:
 def normalised_errors(capture: Posed, result: MergeResult) -> dict[str, FloatArray]:
     """By role, (T,) squared error over covariance and dimensions; 1 is ideal."""
     assert result.joint_covariance_m2 is not None
-    true = capture.world_from_joint()[: len(result.world_from_joint), :, :3, 3]
-    mine = result.world_from_joint[: len(true), :, :3, 3]
+    true = capture.world_from_joint()[: len(result.graph_world_from_joint), :, :3, 3]
+    mine = result.graph_world_from_joint[: len(true), :, :3, 3]
     # The world's own axes are no part of the claim: both are compared in the axes of the truth.
     turn = capture.gauges[GAUGE].inverse().rotation @ result.world_from_map[GAUGE].inverse().rotation
     root, *others = np.flatnonzero(result.solved).tolist()

@@ -19,7 +19,6 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.export import ExportInputs, export_results
 from bodycap_batch.export.layout import apply_layout
-from bodycap_batch.export.projection import project_motion
 from bodycap_batch.formats.fbx import find_blender, write_fbx
 from bodycap_batch.formats.palette import CAMERA_COLOURS
 from bodycap_batch.model.geometry import Similarity, invert, rotation_angle_rad
@@ -115,7 +114,7 @@ def case(blender: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
         name: look(blender, folder, 30.0, folder / f"motion.{name}", picture=PICTURES / f"{name}.png")
         for name in FORMATS
     }
-    return Case(folder, inputs, project_motion(result, clocks).motion, seen)
+    return Case(folder, inputs, result.motion, seen)
 
 
 @pytest.fixture(params=FORMATS)

@@ -67,7 +67,7 @@ def _errors_m(folder: Path, result: MergeResult) -> dict[str, np.ndarray]:
     for mount in result.mounts:
         path = read_tum(folder / "gt" / f"{mount.camera}.tum")
         true[mount.camera] = path.world_from_cam[:, :3, 3]
-        solved = result.world_from_joint[:, roles.index(mount.role)] @ mount.joint_from_cam
+        solved = result.graph_world_from_joint[:, roles.index(mount.role)] @ mount.joint_from_cam
         found[mount.camera] = solved[: len(path.world_from_cam), :3, 3]
     rigid = align_points(
         np.concatenate(list(found.values())), np.concatenate([true[name] for name in found]), with_scale=False
@@ -107,14 +107,15 @@ def test_with_a_height_alone_joints_are_as_uncertain_as_told(data_root, tmp_path
     roles = result.skeleton.roles
     with np.load(data_root / capture / "gt" / "joints.npz") as truth:
         names, true = truth["names"].tolist(), truth["world"]
-    ticks = min(len(true), len(result.world_from_joint))
+    ticks = min(len(true), len(result.graph_world_from_joint))
     root, chest = roles.index("Spine1"), names.index("torso")
     assert result.joint_covariance_m2 is not None
     for side in ("left", "right"):
         for name, part in (("shoulder", "Arm"), ("elbow", "ForeArm"), ("palm", "Hand")):
             joint = roles.index(side.title() + part)
             mine = (
-                result.world_from_joint[:ticks, joint, :3, 3] - result.world_from_joint[:ticks, root, :3, 3]
+                result.graph_world_from_joint[:ticks, joint, :3, 3]
+                - result.graph_world_from_joint[:ticks, root, :3, 3]
             )
             off = mine - (true[:ticks, names.index(f"{side}_{name}")] - true[:ticks, chest]) @ turn.T
             sigma_m = np.sqrt(np.trace(result.joint_covariance_m2[:ticks, joint], axis1=1, axis2=2))

@@ -16,7 +16,6 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import Cancelled, JobError, StoreError
 from bodycap_batch.export import ExportInputs, export_results
 from bodycap_batch.export.motion_files import motion_difference, without_unsolved_branches
-from bodycap_batch.export.projection import project_motion
 from bodycap_batch.formats.bvh import read_bvh, write_bvh
 from bodycap_batch.formats.c3d import read_c3d
 from bodycap_batch.formats.ply import read_ply
@@ -168,7 +167,7 @@ def test_motion_file_is_the_projected_motion(tmp_path: Path) -> None:
     inputs = inputs_of(tmp_path)
     metrics = run(inputs)
     assert inputs.merge is not None
-    motion = project_motion(inputs.merge, inputs.clocks).motion
+    motion = inputs.merge.motion
     model, back = read_bvh(inputs.out_dir / "motion.bvh")
     assert back is not None
     assert model.joints == motion.skeleton.joints
@@ -228,7 +227,7 @@ def test_further_formats_hold_the_same_joints(tmp_path: Path) -> None:
         *("motion.usd", "joints.c3d", "joints.trc", "joints.npz", "joints.csv", "frames.csv", "metrics.json")
     }
     assert inputs.merge is not None
-    motion = project_motion(inputs.merge, inputs.clocks).motion
+    motion = inputs.merge.motion
     arrays = np.load(inputs.out_dir / "joints.npz", allow_pickle=False)
     # what is measured stays in the world, whatever the files for animation look like
     np.testing.assert_array_equal(arrays["world"], motion.world_from_joint()[..., :3, 3])
@@ -278,7 +277,7 @@ def test_solved_hierarchy_drops_what_hangs_off(tmp_path: Path) -> None:
     assert not {"Head", "LeftUpLeg", "LeftFoot"} & set(model.joints)
     assert {"Hips", "Spine", "LeftShoulder"} <= set(model.joints)
     assert inputs.merge is not None
-    whole = project_motion(inputs.merge, inputs.clocks).motion
+    whole = inputs.merge.motion
     part = without_unsolved_branches(whole, inputs.merge.solved)
     hand, same = whole.skeleton.index_of_role("LeftHand"), part.skeleton.index_of_role("LeftHand")
     np.testing.assert_allclose(

@@ -139,7 +139,9 @@ def test_a_large_map_is_adjusted_in_two_steps(result: MapResult, monkeypatch: py
         return create(options, config, part)
 
     monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", noted)
-    adjust_in_two_steps(model, mapper_options(MapOptions(), sorted(model.cameras), 1.0), sorted(model.cameras))
+    adjust_in_two_steps(
+        model, mapper_options(MapOptions(), sorted(model.cameras), 1.0), sorted(model.cameras)
+    )
     assert adjusted[0] + adjusted[2] == model.num_reg_images()
     assert before > 0.02
     assert _centres_off(model) < 0.005

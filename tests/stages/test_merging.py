@@ -62,7 +62,7 @@ def _relative(result: MergeResult, camera: str) -> np.ndarray:
     mounts = {mount.camera: mount for mount in result.mounts}
     roles = result.skeleton.roles
     torso, palm = (
-        result.world_from_joint[:, roles.index(ROLES[name])] @ mounts[name].joint_from_cam
+        result.graph_world_from_joint[:, roles.index(ROLES[name])] @ mounts[name].joint_from_cam
         for name in ("torso", camera)
     )
     return np.linalg.solve(torso, palm)[:, :3, 3]
@@ -87,7 +87,7 @@ def test_known_mounts_give_scale_and_palms(walk, context):
         assert _palm_error_m(walk, result, camera).mean() < 0.6 * 2.0 * sigma + 0.005
     elbow = result.skeleton.roles.index("LeftForeArm")
     moved = align_points(
-        result.world_from_joint[:, 0, :3, 3],
+        result.graph_world_from_joint[:, 0, :3, 3],
         walk.joints(result.times_ns() * 1e-9)[:, 0, :3, 3],
         with_scale=False,
     )
@@ -109,22 +109,24 @@ def test_nominal_mounts_are_solved_towards_the_truth(walk, base):
 
 
 def test_world_is_upright_on_the_floor_and_faces_the_first_second(base):
-    hips = base.world_from_joint[:, 0]
+    hips = base.graph_world_from_joint[:, 0]
     assert_allclose(hips[0, :2, 3], 0.0, atol=1e-9)
     # Without a map's floor the hips walk at 0.97 of their standing height, 0.53 of 1.75 m.
     assert np.median(hips[:, 2, 3]) == pytest.approx(0.97 * 0.53 * 1.75, abs=1e-6)
     forward = -hips[: int(FPS), :3, 1].mean(axis=0)
     assert forward[1] < -0.9
     head, foot = (base.skeleton.roles.index(role) for role in ("Head", "LeftFoot"))
-    assert (base.world_from_joint[:, head, 2, 3] > 1.3).all()
-    assert (np.abs(base.world_from_joint[:, foot, 2, 3]) < 0.2).all()
+    assert (base.graph_world_from_joint[:, head, 2, 3] > 1.3).all()
+    assert (np.abs(base.graph_world_from_joint[:, foot, 2, 3]) < 0.2).all()
 
 
 def test_another_gauge_gives_the_same_motion(walk, base, context):
     other = Similarity(8.0, Rotation.from_rotvec([-2.0, 0.3, 1.0]).as_matrix(), np.array([-30.0, 5.0, 1.0]))
     result = merge_trajectories(make_inputs(walk, _recorded(walk, gauge=other)), MergeOptions(), context)
     # Only rounding differs; the optimiser stops at a relative decrease of 1e-5.
-    assert_allclose(result.world_from_joint[..., :3, 3], base.world_from_joint[..., :3, 3], atol=2e-3)
+    assert_allclose(
+        result.graph_world_from_joint[..., :3, 3], base.graph_world_from_joint[..., :3, 3], atol=2e-3
+    )
     ratio = result.world_from_map["map-0"].scale / base.world_from_map["map-0"].scale
     assert ratio == pytest.approx(GAUGE.scale / other.scale, rel=2e-3)
 
@@ -143,8 +145,8 @@ def test_a_mirrored_walk_gives_the_mirrored_motion(walk, base, context):
     result = merge_trajectories(make_inputs(walk, mirrored), MergeOptions(), context)
     roles = result.skeleton.roles
     for role, other in TWIN.items():
-        mine = result.world_from_joint[:, roles.index(role), :3, 3]
-        twin = base.world_from_joint[:, roles.index(other), :3, 3]
+        mine = result.graph_world_from_joint[:, roles.index(role), :3, 3]
+        twin = base.graph_world_from_joint[:, roles.index(other), :3, 3]
         # Rounding and the stopping rule again.
         assert_allclose(mine * [-1.0, 1.0, 1.0], twin, atol=3e-3)
 
@@ -275,7 +277,7 @@ def test_a_head_carries_the_body_where_the_torso_is_lost(tmp_path, kept):
     assert result.mounts[0].camera == "head"
     roles = result.skeleton.roles
     true = capture.world_from_joint()[..., :3, 3]
-    mine = result.world_from_joint[: len(true), ..., :3, 3]
+    mine = result.graph_world_from_joint[: len(true), ..., :3, 3]
     joints = [roles.index(role) for role in ("Head", "LeftHand", "RightHand", "LeftArm")]
     placed = align_points(mine[:, joints].reshape(-1, 3), true[:, joints].reshape(-1, 3), with_scale=False)
     off = np.linalg.norm(placed.apply(mine[:, joints]) - true[:, joints], axis=-1)
@@ -305,7 +307,7 @@ def test_stops_between_iterations(walk, tmp_path):
 
 def test_same_inputs_same_result(walk, base, context):
     again = merge_trajectories(make_inputs(walk, _recorded(walk)), MergeOptions(), context)
-    assert (again.world_from_joint == base.world_from_joint).all()
+    assert (again.world_from_joint == base.graph_world_from_joint).all()
     assert again.report == base.report
 
 
@@ -322,7 +324,7 @@ def test_two_cameras_a_hair_apart_share_a_state(walk, context):
     result = merge_trajectories(
         make_inputs(walk, [*recorded, twin], mounts=mounts, clocks=clocks), MergeOptions(), context
     )
-    assert np.isfinite(result.world_from_joint).all()
+    assert np.isfinite(result.graph_world_from_joint).all()
     assert result.report["cameras"]["torso_2"]["residual_m"]["p50"] < 0.01
 
 

@@ -14,7 +14,7 @@ from bodycap_batch.config import KeyframeOptions, MapOptions
 from bodycap_batch.config.job import load_job
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build, build_map
-from bodycap_batch.mapping.matching.flipped_cameras import UNDECIDED_GROUPS, FLIPPED_CAMERAS
+from bodycap_batch.mapping.matching.flipped_cameras import FLIPPED_CAMERAS, UNDECIDED_GROUPS
 from bodycap_batch.model.scene import KeyframeSelection
 from tests.rooms import stroll, write_capture
 from tests.stages.conftest import context

@@ -88,7 +88,8 @@ def find_misfit_intrinsics(
     return {
         given[number]: round(value, 3)
         for number, value in factors.items()
-        if abs(value - 1.0) > _MAX_FOCAL_CHANGE or _principal_point_distance(stated[number], part.camera(number)) > _MAX_CENTRE_CHANGE
+        if abs(value - 1.0) > _MAX_FOCAL_CHANGE
+        or _principal_point_distance(stated[number], part.camera(number)) > _MAX_CENTRE_CHANGE
     }
 
 
@@ -140,7 +141,9 @@ def select_camera_models(
         worth = _MIN_REDUCTION_CENTRE if centre else _MIN_REDUCTION_MODEL
         if best is None or cost is None or cost >= (1.0 - worth) * best:
             continue
-        taken = [number for number in wanted if name != _PIXEL_ASPECT or _has_unequal_focal_lengths(trial, number)]
+        taken = [
+            number for number in wanted if name != _PIXEL_ASPECT or _has_unequal_focal_lengths(trial, number)
+        ]
         out |= {number: pycolmap.Camera(trial.camera(number).todict()) for number in taken}
         best, chosen = cost, trial
         decentred = frozenset(wanted) if centre else decentred
@@ -153,7 +156,9 @@ def _has_unequal_focal_lengths(part: Any, number: int) -> bool:
     mine = (image for image in map(part.image, part.reg_image_ids()) if image.camera_id == number)
     seen = sum(int(image.num_points3D) for image in mine)
     aspect = camera.focal_length_x / camera.focal_length_y
-    return bool(abs(aspect - 1.0) > _MIN_ASPECT_CHANGE and seen >= _OBSERVATIONS_PER_PARAMETER * len(camera.params))
+    return bool(
+        abs(aspect - 1.0) > _MIN_ASPECT_CHANGE and seen >= _OBSERVATIONS_PER_PARAMETER * len(camera.params)
+    )
 
 
 def refine_principal_points(

@@ -57,7 +57,9 @@ def _recalibrate(
     given = {name: capture.camera(name).camera for name in misfits}
     try:
         again = build(
-            with_intrinsics_to_refine(capture, {name: _initial_guess(given[name], misfits[name]) for name in misfits})
+            with_intrinsics_to_refine(
+                capture, {name: _initial_guess(given[name], misfits[name]) for name in misfits}
+            )
         )
     except EstimationError as error:
         return replace(result, log={**result.log, "freeing_failed": error.message})
@@ -85,7 +87,9 @@ def with_map_intrinsics(capture: Capture, previous: MapResult) -> Capture:
     """
     held = previous.maps[0].cameras
     lenses = {
-        name: held[name] if name in held else replace(capture.camera(name).camera, **_camera_params_from_log(told))
+        name: held[name]
+        if name in held
+        else replace(capture.camera(name).camera, **_camera_params_from_log(told))
         for name, told in previous.log.get(_INTRINSICS, {}).items()
     }
     return with_intrinsics_to_refine(capture, lenses)

@@ -12,8 +12,17 @@ import numpy.typing as npt
 
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, rewrite_without_cameras, read_image_ids
-from bodycap_batch.mapping.matching.retrieval import Descriptors, count_ratio_test_matches, largest_descriptors
+from bodycap_batch.mapping.matching.database import (
+    DATABASE_NAME,
+    ImageRef,
+    rewrite_without_cameras,
+    read_image_ids,
+)
+from bodycap_batch.mapping.matching.retrieval import (
+    Descriptors,
+    count_ratio_test_matches,
+    largest_descriptors,
+)
 from bodycap_batch.model.scene import KeyframeSelection
 
 CameraDescriptors = npt.NDArray[np.float32]
@@ -101,7 +110,9 @@ def excluded_camera_note(camera: str) -> str:
 def add_flip_hint(error: EstimationError | None, log: Mapping[str, Any]) -> EstimationError | None:
     """The same error; its hint begins with who sees mirror images of whom, where the log leaves that open."""
     if error is not None and log.get(UNDECIDED_GROUPS):
-        error.hint = "; ".join([*map(_undecided_sentence, log[UNDECIDED_GROUPS]), _MAYBE, _HINT, *filter(None, [error.hint])])
+        error.hint = "; ".join(
+            [*map(_undecided_sentence, log[UNDECIDED_GROUPS]), _MAYBE, _HINT, *filter(None, [error.hint])]
+        )
     return error
 
 
@@ -145,13 +156,17 @@ def _sample_descriptors(
         ids = read_image_ids(database)
         for item in selections:
             count = len(item.frames)
-            some = item.frames[np.unique(np.linspace(0, count - 1, min(count, _KEYFRAMES_PER_CAMERA)).astype(int))]
+            some = item.frames[
+                np.unique(np.linspace(0, count - 1, min(count, _KEYFRAMES_PER_CAMERA)).astype(int))
+            ]
             images = [ids[ImageRef(item.camera, int(frame))] for frame in some]
             points = [np.asarray(database.read_keypoints(image)) for image in images]
             found = [np.asarray(database.read_descriptors(image).data) for image in images]
             pairs = list(zip(found, points, strict=True))
             straight[item.camera] = _stack([largest_descriptors(each, where) for each, where in pairs])
-            mirrored[item.camera] = _stack([largest_descriptors(mirror_descriptors(each), where) for each, where in pairs])
+            mirrored[item.camera] = _stack(
+                [largest_descriptors(mirror_descriptors(each), where) for each, where in pairs]
+            )
     return straight, mirrored
 
 

@@ -202,7 +202,9 @@ def _pixel_error(view: KeyframeFeatures) -> float:
     return _MAX_ERROR_PX if view.calibrated else view.error
 
 
-def _write_matches(database: pycolmap.Database, a: int, b: int, matches: IntArray, *, calibrated: bool) -> None:
+def _write_matches(
+    database: pycolmap.Database, a: int, b: int, matches: IntArray, *, calibrated: bool
+) -> None:
     import pycolmap
 
     geometry: Any = pycolmap.TwoViewGeometry()

@@ -38,7 +38,9 @@ LIKELY_RETRIEVAL_MATCHES = 6
 Descriptors = npt.NDArray[np.uint8]
 
 
-def largest_descriptors(descriptors: Descriptors, keypoints: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+def largest_descriptors(
+    descriptors: Descriptors, keypoints: npt.NDArray[np.float32]
+) -> npt.NDArray[np.float32]:
     """Descriptors (128,128) of an image's largest features, zeros where it has fewer.
 
     Args:

@@ -127,7 +127,9 @@ def bundle_adjust(
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         adjustment.ceres.loss_function_scale = loss_px
         adjustment.ceres.solver_options.function_tolerance = _ROBUST_TOLERANCE
-    iterative = only is not None or (loss_px is not None and _mean_track_length(model) > _MAX_DIRECT_TRACK_LENGTH)
+    iterative = only is not None or (
+        loss_px is not None and _mean_track_length(model) > _MAX_DIRECT_TRACK_LENGTH
+    )
     if iterative:
         # By the least numbers that COLMAP accepts, everything beyond which is solved that way.
         adjustment.ceres.max_num_images_direct_dense_cpu_solver = 1

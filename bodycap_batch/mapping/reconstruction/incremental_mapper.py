@@ -88,7 +88,9 @@ def resect_images(
     return placed
 
 
-def _open_mapper(workspace: Path, settings: pycolmap.IncrementalPipelineOptions) -> pycolmap.IncrementalMapper:
+def _open_mapper(
+    workspace: Path, settings: pycolmap.IncrementalPipelineOptions
+) -> pycolmap.IncrementalMapper:
     import pycolmap
 
     options = pycolmap.DatabaseCacheOptions()

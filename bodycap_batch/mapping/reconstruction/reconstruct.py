@@ -153,7 +153,9 @@ def _reconstruct_from_pair(
 
     settings.init_image_id1, settings.init_image_id2 = start.ids
     first = pycolmap.Reconstruction()
-    if not register_images(workspace, settings, first, progress_counter(context, total, context.check_cancelled)):
+    if not register_images(
+        workspace, settings, first, progress_counter(context, total, context.check_cancelled)
+    ):
         return []
     models = [first]
     if first.num_reg_images() < _MIN_REGISTERED_RATIO * total:
@@ -200,7 +202,9 @@ def register_new_images(
     settings.fix_existing_frames = True
     grown = copy.deepcopy(model)
     few = model.num_reg_frames() <= SKELETAL_ABOVE  # all of very many are adjusted once, at the end
-    register_images(workspace, settings, grown, progress_counter(context, total, context.check_cancelled), whole=few)
+    register_images(
+        workspace, settings, grown, progress_counter(context, total, context.check_cancelled), whole=few
+    )
     return grown
 
 
@@ -236,7 +240,9 @@ def model_order(model: Any) -> tuple[int, int]:
     return -model.num_reg_images(), -model.num_points3D()
 
 
-def progress_counter(context: StageContext, total: int, stop: Callable[[], None], done: int = 0) -> Callable[[], None]:
+def progress_counter(
+    context: StageContext, total: int, stop: Callable[[], None], done: int = 0
+) -> Callable[[], None]:
     """What tells of one more keyframe in the map each time it is called, and calls `stop` once it should."""
 
     def tick() -> None:

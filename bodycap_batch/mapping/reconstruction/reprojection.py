@@ -24,7 +24,9 @@ def image_residuals_px(model: pycolmap.Reconstruction, image: Any, feature: IntA
     seen = [points[index] for index in feature.tolist()]
     x_in_map = np.array([model.point3D(point.point3D_id).xyz for point in seen]).reshape(-1, 3)
     observed = np.array([point.xy for point in seen]).reshape(-1, 2)
-    projected = camera_from_pycolmap(image.camera).project(x_in_map @ cam_from_map[:3, :3].T + cam_from_map[:3, 3])
+    projected = camera_from_pycolmap(image.camera).project(
+        x_in_map @ cam_from_map[:3, :3].T + cam_from_map[:3, 3]
+    )
     return np.nan_to_num(observed - projected, nan=_NO_PROJECTION_PX)
 
 

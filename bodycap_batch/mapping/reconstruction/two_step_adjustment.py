@@ -12,7 +12,11 @@ from scipy import sparse
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.matching.skeletal_set import select_skeletal_keyframes
-from bodycap_batch.mapping.reconstruction.bundle_adjustment import sub_model, adjust_and_filter, adjust_robustly
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import (
+    sub_model,
+    adjust_and_filter,
+    adjust_robustly,
+)
 
 if TYPE_CHECKING:
     import pycolmap
@@ -39,7 +43,11 @@ def adjust_in_two_steps(
     """
     images = np.array(sorted(model.reg_image_ids()), dtype=np.int64)
     carrying = set(
-        images[select_skeletal_keyframes(_count_shared_points(model, images), _time_order(model, images), sure=_MIN_SHARED_POINTS)].tolist()
+        images[
+            select_skeletal_keyframes(
+                _count_shared_points(model, images), _time_order(model, images), sure=_MIN_SHARED_POINTS
+            )
+        ].tolist()
     )
     part = sub_model(model, carrying)
     adjust_and_filter(part, settings, constant_cameras)

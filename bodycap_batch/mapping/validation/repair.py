@@ -10,7 +10,11 @@ from bodycap_batch.mapping.matching.pair_matching import match_pairs
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import sub_model, adjust_and_filter
 from bodycap_batch.mapping.reconstruction.reconstruct import register_new_images
-from bodycap_batch.mapping.validation.epipolar_consistency import inconsistent_match_ratio, find_misregistered_images, evaluate_pairs
+from bodycap_batch.mapping.validation.epipolar_consistency import (
+    inconsistent_match_ratio,
+    find_misregistered_images,
+    evaluate_pairs,
+)
 from bodycap_batch.mapping.workspace import MappingContext
 
 if TYPE_CHECKING:
@@ -91,7 +95,9 @@ def remove_misregistered(model: pycolmap.Reconstruction, shop: MappingContext) -
     return kept, cut
 
 
-def remove_without_adjustment(model: pycolmap.Reconstruction, shop: MappingContext) -> tuple[Any, list[str], float]:
+def remove_without_adjustment(
+    model: pycolmap.Reconstruction, shop: MappingContext
+) -> tuple[Any, list[str], float]:
     """`remove_misregistered` with all poses left as they are, and the share of links that contradicted the model."""
     links = evaluate_pairs(shop.workspace, model)
     return *_remove_images(model, find_misregistered_images(links)), round(inconsistent_match_ratio(links), 4)
@@ -109,7 +115,9 @@ def _untried_pairs(ids: Mapping[ImageRef, int], images: set[int], tried: set[Pai
     return sorted({(min(a, b), max(a, b)) for a in chosen for b in refs if a != b} - tried)
 
 
-def re_register_images(model: pycolmap.Reconstruction, suspects: Collection[int], shop: MappingContext, total: int) -> Any:
+def re_register_images(
+    model: pycolmap.Reconstruction, suspects: Collection[int], shop: MappingContext, total: int
+) -> Any:
     """The model with suspects taken out, they and new keyframes registered against what is left, all refined.
 
     Args:

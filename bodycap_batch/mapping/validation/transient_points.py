@@ -40,7 +40,9 @@ def remove_transient_points(model: pycolmap.Reconstruction, times_ns: Mapping[st
     for point in seen.keys() - set(doubted):
         for image in set(seen[point]):
             carrying[image] += 1
-    dropped = [point for point in doubted if all(carrying[image] >= _MIN_STATIC_POINTS for image in seen[point])]
+    dropped = [
+        point for point in doubted if all(carrying[image] >= _MIN_STATIC_POINTS for image in seen[point])
+    ]
     for point in dropped:
         model.delete_point3D(point)
     return len(dropped)

@@ -34,9 +34,9 @@ class Before:
     ticks: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
     world_from_joint: FloatArray
 
-    def off_m(self, merge: MergeResult) -> FloatArray:
-        """(N,) distance of its joint from the solved one."""
-        solved = merge.world_from_joint[self.ticks, self.joint, :3, 3]
+    def off_m(self, world_from_joint: FloatArray) -> FloatArray:
+        """(N,) distance of its joint from that of the motion, whose joint poses are (T,J,4,4)."""
+        solved = world_from_joint[self.ticks, self.joint, :3, 3]
         return np.asarray(np.linalg.norm(self.world_from_joint[:, :3, 3] - solved, axis=1))
 
 
@@ -83,13 +83,23 @@ def before_and_after(inputs: ReportInputs, tones: dict[str, str]) -> str:
     if len(ticks) == 0:
         return ""
     chosen = ticks[np.linspace(0, len(ticks) - 1, _MOMENTS + 2)[1:-1].round().astype(int)]
-    parts = [_moment(merge, before, int(tick), index, tones) for index, tick in enumerate(chosen)]
+    poses = merge.motion.world_from_joint()[chosen]
+    parts = [
+        _moment(merge, before, int(tick), poses[index], index, tones) for index, tick in enumerate(chosen)
+    ]
     title = "Skeleton before (coloured, dashed) and after optimisation, from the front, at four moments"
     return picture(_MOMENTS * _CELL_W, _CELL_H + 24.0, "".join(parts), title, class_="bodies")
 
 
-def _moment(merge: MergeResult, before: list[Before], tick: int, column: int, tones: dict[str, str]) -> str:
-    root = merge.world_from_joint[tick, 0]
+def _moment(
+    merge: MergeResult,
+    before: list[Before],
+    tick: int,
+    world_from_joint: FloatArray,
+    column: int,
+    tones: dict[str, str],
+) -> str:
+    root = world_from_joint[0]
     left = root[:3, 0] * [1.0, 1.0, 0.0]
     across = left / max(float(np.linalg.norm(left)), 1e-9)
 
@@ -102,12 +112,12 @@ def _moment(merge: MergeResult, before: list[Before], tick: int, column: int, to
     skeleton, parts = merge.skeleton, []
     for joint, parent in enumerate(skeleton.parents):
         if parent >= 0:
-            line = merge.world_from_joint[tick, [parent, joint], :3, 3]
+            line = world_from_joint[[parent, joint], :3, 3]
             kind = "bone" if merge.solved[joint] and merge.solved[parent] else "bone guessed"
             parts.append(element("path", class_=kind, d=polyline(flat(line))))
     for tip in np.flatnonzero(np.isfinite(skeleton.end_offsets_m).all(axis=1)):
         kind = "bone" if merge.solved[tip] else "bone guessed"
-        line = _stub(merge.world_from_joint[tick, tip], skeleton.end_offsets_m[tip])
+        line = _stub(world_from_joint[tip], skeleton.end_offsets_m[tip])
         parts.append(element("path", class_=kind, d=polyline(flat(line))))
     for each in before:
         index = np.flatnonzero(each.ticks == tick)

@@ -25,7 +25,7 @@ from bodycap_batch.model.scene import (
     Registration,
     Trajectory,
 )
-from bodycap_batch.model.skeleton import Mount, SkeletonModel
+from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
 
 
 def same(first: Any, second: Any) -> bool:
@@ -99,9 +99,18 @@ def a_merge(rng: np.random.Generator) -> MergeResult:
         skeleton=a_skeleton(),
         fps=29.97,
         start_ns=12,
-        world_from_joint=np.tile(np.eye(4), (3, 2, 1, 1)),
+        graph_world_from_joint=np.tile(np.eye(4), (3, 2, 1, 1)),
         solved=np.array([True, False]),
         observed=np.zeros((3, 2), dtype=bool),
+        motion=Motion(
+            skeleton=a_skeleton(),
+            fps=29.97,
+            start_ns=12,
+            root_in_world_m=rng.normal(size=(3, 3)),
+            local_rotation=np.tile(np.eye(3), (3, 2, 1, 1)),
+            observed=np.zeros((3, 2), dtype=bool),
+        ),
+        projection_gap={"cameras": {}},
         world_from_map={"g0": Similarity(scale=2.0, rotation=np.eye(3), translation=rng.normal(size=3))},
         trajectories=(a_trajectory(rng),),
         mounts=(Mount(camera="torso", role="Spine1", joint_from_cam=np.eye(4), sigma_rad=0.1, sigma_m=0.02),),

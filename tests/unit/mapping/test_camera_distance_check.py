@@ -8,8 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.mapping.validation.camera_distance_check import find_best_scale, check_distances
-from bodycap_batch.mapping.validation.epipolar_consistency import PairConsistency, inconsistent_match_ratio, check_consistency
+from bodycap_batch.mapping.validation.camera_distance_check import check_distances, find_best_scale
+from bodycap_batch.mapping.validation.epipolar_consistency import (
+    PairConsistency,
+    check_consistency,
+    inconsistent_match_ratio,
+)
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.scene import Map
 from bodycap_batch.model.skeleton_presets import camera_reach, load_skeleton, nominal_mount

@@ -18,16 +18,21 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions, MergeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.mapping.matching.database import DATABASE_NAME, add_keyframes, read_image_ids, read_keypoint_colours
+from bodycap_batch.mapping.matching.database import (
+    DATABASE_NAME,
+    add_keyframes,
+    read_image_ids,
+    read_keypoint_colours,
+)
 from bodycap_batch.mapping.matching.flipped_cameras import (
-    UNDECIDED_GROUPS,
     FLIPPED_CAMERAS,
-    label_cameras,
+    UNDECIDED_GROUPS,
     add_flip_hint,
-    mirror_descriptors,
+    exclude_flipped_cameras,
     excluded_camera_note,
     flip_notes,
-    exclude_flipped_cameras,
+    label_cameras,
+    mirror_descriptors,
 )
 from bodycap_batch.mapping.matching.retrieval import count_ratio_test_matches, largest_descriptors
 from bodycap_batch.model.scene import KeyframeSelection

@@ -6,10 +6,10 @@ import pytest
 
 from bodycap_batch.config import MapOptions
 from bodycap_batch.mapping.intrinsics.intrinsics_check import (
-    select_camera_models,
-    misfit_note,
     find_misfit_intrinsics,
+    misfit_note,
     refine_principal_points,
+    select_camera_models,
 )
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import bundle_adjust
 from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options

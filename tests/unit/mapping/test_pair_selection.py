@@ -13,7 +13,12 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef
 from bodycap_batch.mapping.matching.pair_selection import PairGenerator
-from bodycap_batch.mapping.matching.retrieval import MIN_RETRIEVAL_MATCHES, _count_matches, largest_descriptors, count_preemptive_matches
+from bodycap_batch.mapping.matching.retrieval import (
+    MIN_RETRIEVAL_MATCHES,
+    _count_matches,
+    count_preemptive_matches,
+    largest_descriptors,
+)
 
 
 def _keypoints(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -37,7 +42,9 @@ def test_two_views_of_a_place_are_alike_and_others_not(tmp_path: Path) -> None:
     rows = list(range(0, 80, 7))
     every = np.array(images)
     alike = count_preemptive_matches(every, rows, ["a"] * 80, StageContext(work_dir=tmp_path))
-    assert (count_preemptive_matches(every, rows, ["a"] * 80, StageContext(work_dir=tmp_path, threads=3)) == alike).all()
+    assert (
+        count_preemptive_matches(every, rows, ["a"] * 80, StageContext(work_dir=tmp_path, threads=3)) == alike
+    ).all()
     partner = np.array(rows) ^ 1
     assert (alike[np.arange(len(rows)), partner] >= 50).all()
     alike[np.arange(len(rows)), partner] = 0

@@ -27,13 +27,17 @@ from bodycap_batch.mapping.matching.database import (
     read_image_ids,
     write_image,
 )
-from bodycap_batch.mapping.matching.pair_matching import match_pairs, find_mutual_matches
+from bodycap_batch.mapping.matching.pair_matching import find_mutual_matches, match_pairs
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, adjust_robustly
 from bodycap_batch.mapping.reconstruction.incremental_mapper import register_images
 from bodycap_batch.mapping.reconstruction.initial_pair import find_user_pair, rank_initial_pairs
 from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options, reconstruct
-from bodycap_batch.mapping.validation.epipolar_consistency import PairConsistency, find_misregistered_images, evaluate_pairs
-from bodycap_batch.mapping.validation.repair import remove_misregistered, re_register_images, repair_model
+from bodycap_batch.mapping.validation.epipolar_consistency import (
+    PairConsistency,
+    evaluate_pairs,
+    find_misregistered_images,
+)
+from bodycap_batch.mapping.validation.repair import re_register_images, remove_misregistered, repair_model
 from bodycap_batch.mapping.validation.transient_points import remove_transient_points
 from bodycap_batch.mapping.workspace import MappingContext
 from bodycap_batch.model.camera import Camera
@@ -169,7 +173,9 @@ def test_long_tracks_are_settled_by_conjugate_gradients_to_the_same_map(
 
     monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", noted)
     for limit in (0.0, np.inf):
-        monkeypatch.setattr("bodycap_batch.mapping.reconstruction.bundle_adjustment._MAX_DIRECT_TRACK_LENGTH", limit)
+        monkeypatch.setattr(
+            "bodycap_batch.mapping.reconstruction.bundle_adjustment._MAX_DIRECT_TRACK_LENGTH", limit
+        )
         settled = copy.deepcopy(model)
         adjust_robustly(settled, shop.settings(), shop.constant)
         assert _rms(settled, poses) < 0.01
@@ -198,7 +204,9 @@ def test_a_misplaced_block_is_found_and_put_right(
     ids = {ref.frame: number for ref, number in _ids(shop).items()}
     wrong = _with_moved_block(model, ids)
     assert _rms(wrong, poses) > 0.1
-    assert find_misregistered_images(evaluate_pairs(shop.workspace, wrong)) == {ids[frame] for frame in _MOVED}
+    assert find_misregistered_images(evaluate_pairs(shop.workspace, wrong)) == {
+        ids[frame] for frame in _MOVED
+    }
     mended, log = repair_model(wrong, set(pairs), shop)
     assert log["cut"] == []
     assert mended.num_reg_images() == _KEYFRAMES
@@ -413,7 +421,9 @@ def test_only_a_centre_that_was_found_off_is_found_anew(
         return left * min(0.99, crop) if centre else left
 
     monkeypatch.setattr(intrinsics_check, "_adjustment_cost", cost)
-    _, log = reconstruct_with_intrinsics(shop, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam"}, _KEYFRAMES)
+    _, log = reconstruct_with_intrinsics(
+        shop, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam"}, _KEYFRAMES
+    )
     assert log["better_lenses"] == {"cam": "RADIAL"}
     first_map = [False, False, False, True, False]
     assert freed_centre == first_map + ([False, True] if crop < 0.95 else [])
@@ -430,5 +440,7 @@ def test_the_log_holds_what_both_looks_at_the_lenses_found(
         return {name: (camera, False) for name, camera in found.items()}, decentred
 
     monkeypatch.setattr(build, "change_lenses", change)
-    _, log = reconstruct_with_intrinsics(shop, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam", 2: "hat"}, _KEYFRAMES)
+    _, log = reconstruct_with_intrinsics(
+        shop, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam", 2: "hat"}, _KEYFRAMES
+    )
     assert log["better_lenses"] == {"cam": "RADIAL", "hat": "RADIAL"}

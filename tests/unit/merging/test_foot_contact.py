@@ -10,12 +10,12 @@ import pytest
 
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.export.projection import _standing_joints
 from bodycap_batch.merging import merge_trajectories
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.merging.graph.foot_contact import FootContact, contacts_in_window, find_contacts
+from bodycap_batch.merging.projection.project import _standing_joints
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.skeleton_presets import load_skeleton
 from bodycap_batch.synthetic import SynthOptions
@@ -117,7 +117,7 @@ def test_standing_feet_are_held_in_the_solved_motion(tmp_path):
         told = result.report["foot_contact"]
         assert list(told) == (["Left foot"] if held else [])
         roles = result.skeleton.roles
-        still = result.world_from_joint[10:50, roles.index("LeftFoot"), :3, 3]
+        still = result.graph_world_from_joint[10:50, roles.index("LeftFoot"), :3, 3]
         slides.append(float(np.linalg.norm(np.diff(still, axis=0), axis=1).mean()) * FPS)
     # In the T-pose, two of 2.4 seconds, the foot stands; poses have 5 mm of noise.
     assert slides[0] < 0.7 * slides[1]

@@ -14,7 +14,12 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.export.metrics import observation_errors
-from bodycap_batch.mapping.intrinsics.readout_time import Readout, RollingShutterModel, estimate_readouts, map_with_readouts
+from bodycap_batch.mapping.intrinsics.readout_time import (
+    Readout,
+    RollingShutterModel,
+    estimate_readouts,
+    map_with_readouts,
+)
 from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options
 from bodycap_batch.model import rolling_shutter
 from bodycap_batch.model.camera import Camera
@@ -137,7 +142,9 @@ def rolling_model(film: Film, *, known: bool = False, stated_s: float = 0.0, pos
 
 def readouts_of(film: Film, camera: Any) -> tuple[Any, Any]:
     """The model as `estimate_readouts` leaves it, and what it tells of its camera."""
-    model = RollingShutterModel(the_map(film, range(1, FRAMES, 5)), {"head": film.trajectory()}, {"head": camera})
+    model = RollingShutterModel(
+        the_map(film, range(1, FRAMES, 5)), {"head": film.trajectory()}, {"head": camera}
+    )
     model, told = estimate_readouts(model, {"head": camera}, mapper_options(MapOptions(), [1], 1.0), [1])
     return model, told["head"]
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.export import projection_solver
-from bodycap_batch.export.projection import project_motion
-from bodycap_batch.export.projection_solver import (
+from bodycap_batch.merging.projection import solver
+from bodycap_batch.merging.projection.project import project_motion
+from bodycap_batch.merging.projection.solver import (
     ProjectionProblem,
     RigidMotion,
     StandingJoint,
@@ -40,7 +40,7 @@ def test_slack_is_taken_out_and_the_cameras_pull_towards_the_truth() -> None:
     result, clocks = merged(truth)
     projection = project_motion(result, clocks)
     world, true = projection.motion.world_from_joint(), truth.world_from_joint()
-    loose = joint_error(result.world_from_joint, true)[:, result.solved].mean()
+    loose = joint_error(result.graph_world_from_joint, true)[:, result.solved].mean()
     rigid = joint_error(world, true)[:, result.solved].mean()
     # the graph's joints are off by 4 mm a coordinate, 6.4 mm in all; the cameras know better
     assert rigid < 0.65 * loose
@@ -59,8 +59,8 @@ def test_joints_nothing_measures_keep_their_rotations() -> None:
     for role in ("LeftUpLeg", "RightLeg", "Neck", "Head"):
         joint = truth.skeleton.index_of_role(role)
         assert joint is not None
-        expected = result.world_from_joint[:, truth.skeleton.parents[joint]]
-        local = np.swapaxes(expected[:, :3, :3], -1, -2) @ result.world_from_joint[:, joint, :3, :3]
+        expected = result.graph_world_from_joint[:, truth.skeleton.parents[joint]]
+        local = np.swapaxes(expected[:, :3, :3], -1, -2) @ result.graph_world_from_joint[:, joint, :3, :3]
         np.testing.assert_allclose(motion.local_rotation[:, joint], local, atol=1e-12)
         assert not motion.observed[:, joint].any()
 
@@ -133,7 +133,7 @@ def test_gradient_and_optimum(sigma_m: float | None) -> None:
         assert hand is not None
         held = np.array([True, True, False, False, True])
         problem = replace(problem, planted=(StandingJoint(joint=hand, held=held, sigma_m=sigma_m),))
-    rotation = result.world_from_joint[..., :3, :3]
+    rotation = result.graph_world_from_joint[..., :3, :3]
     local = rotation.copy()
     for joint in range(1, len(truth.skeleton.joints)):
         local[:, joint] = np.swapaxes(rotation[:, truth.skeleton.parents[joint]], -1, -2) @ rotation[:, joint]
@@ -174,11 +174,11 @@ def test_a_finer_timeline_corrects_alike(standing: bool) -> None:
         )
         result, clocks = merged(still, slack_m=0.0, slack_rad=0.0, noise_m=0.0)
         paths = paths or (result.trajectories[:1] if standing else result.trajectories)
-        graph = result.world_from_joint.copy()
+        graph = result.graph_world_from_joint.copy()
         graph[..., 0, 3] += 0.02 * np.sin(4e-9 * (result.times_ns() - result.start_ns))[:, None]
         held = np.zeros(graph.shape[:2], dtype=bool)
         held[:, result.skeleton.index_of_role("LeftHand")] = standing
-        result = replace(result, world_from_joint=graph, trajectories=paths, standing=held)
+        result = replace(result, graph_world_from_joint=graph, trajectories=paths, standing=held)
         centres = project_motion(result, clocks).motion.world_from_joint()[..., :3, 3]
         motions.append(centres[:, result.solved])
     coarse, fine = motions
@@ -222,15 +222,15 @@ def test_a_long_motion_is_corrected_in_stretches_as_of_one_piece(monkeypatch: py
     result = replace(result, standing=standing)
     whole = project_motion(result, clocks).motion.world_from_joint()
     solved: list[int] = []
-    equations = projection_solver._normal_equations
+    equations = solver._normal_equations
 
     def counted(problem, now, reach):  # type: ignore[no-untyped-def]
         solved.append(len(now.root))
         return equations(problem, now, reach)
 
-    monkeypatch.setattr(projection_solver, "_normal_equations", counted)
-    monkeypatch.setattr(projection_solver, "_WINDOW_TICKS", 40)
-    monkeypatch.setattr(projection_solver, "_OVERLAP_S", 25 / 30)
+    monkeypatch.setattr(solver, "_normal_equations", counted)
+    monkeypatch.setattr(solver, "_WINDOW_TICKS", 40)
+    monkeypatch.setattr(solver, "_OVERLAP_S", 25 / 30)
     pieces = project_motion(result, clocks).motion.world_from_joint()
     # A correction is forgotten at a tenth a tick and faster where cameras measure.
     assert np.abs(pieces - whole)[..., :3, 3].max() < 1e-4
@@ -238,13 +238,13 @@ def test_a_long_motion_is_corrected_in_stretches_as_of_one_piece(monkeypatch: py
 
 
 def problem_of(result, clocks) -> ProjectionProblem:  # type: ignore[no-untyped-def]
-    from bodycap_batch.export.projection import _camera_targets
+    from bodycap_batch.merging.projection.project import _camera_targets
 
     return ProjectionProblem(
         fps=result.fps,
         skeleton=result.skeleton,
         solved=np.flatnonzero(result.solved),
-        world_from_joint=result.world_from_joint,
+        world_from_joint=result.graph_world_from_joint,
         cameras=_camera_targets(result, clocks, {}),
     )
 

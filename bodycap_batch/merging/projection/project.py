@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray
-from bodycap_batch.export.projection_solver import (
+from bodycap_batch.merging.projection.solver import (
     CameraTarget,
     ProjectionProblem,
     RigidMotion,
@@ -22,7 +22,7 @@ from bodycap_batch.export.projection_solver import (
     solve_rigid_motion,
 )
 from bodycap_batch.model.geometry import invert, poses_at, rotation_angle_rad
-from bodycap_batch.model.merge_data import CameraClock, MergeResult, standing_sigma_m
+from bodycap_batch.model.merge_data import CameraClock, SolvedBody, standing_sigma_m
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, forward_kinematics
 
 _MAX_GAP_INTERVALS = 1.6
@@ -44,49 +44,49 @@ class Projection:
 
 
 def project_motion(
-    merge: MergeResult,
+    body: SolvedBody,
     clocks: Mapping[str, CameraClock],
     row_fraction: Mapping[str, FloatArray] | None = None,
 ) -> Projection:
-    """Project a merge result onto its own skeleton.
+    """Project the solution of the factor graph onto its own rigid skeleton.
 
     Args:
-        merge: The solved bones.
+        body: The solved bones.
         clocks: By camera name.
         row_fraction: By camera, (N,) mean row behind each pose over the image height (rolling shutter).
 
     Returns:
-        The motion on the merge's timeline. Joints the graph did not solve keep their local rotations.
+        The motion on the body's timeline. Joints the graph did not solve keep their local rotations.
     """
-    cameras = _camera_targets(merge, clocks, row_fraction or {})
-    solved = np.flatnonzero(merge.solved)
-    start = _initial_motion(merge.skeleton, merge.world_from_joint, merge.solved)
+    cameras = _camera_targets(body, clocks, row_fraction or {})
+    solved = np.flatnonzero(body.solved)
+    start = _initial_motion(body.skeleton, body.graph_world_from_joint, body.solved)
     problem = ProjectionProblem(
-        fps=merge.fps,
-        skeleton=merge.skeleton,
+        fps=body.fps,
+        skeleton=body.skeleton,
         solved=solved,
-        world_from_joint=merge.world_from_joint,
+        world_from_joint=body.graph_world_from_joint,
         cameras=cameras,
-        planted=_standing_joints(merge),
+        planted=_standing_joints(body),
     )
     result = solve_rigid_motion(problem, start)
     motion = Motion(
-        skeleton=merge.skeleton,
-        fps=merge.fps,
-        start_ns=merge.start_ns,
+        skeleton=body.skeleton,
+        fps=body.fps,
+        start_ns=body.start_ns,
         root_in_world_m=result.root,
         local_rotation=result.local,
-        observed=merge.observed,
+        observed=body.observed,
     )
-    return Projection(motion=motion, gap=_gap(merge, motion, cameras))
+    return Projection(motion=motion, gap=_gap(body, motion, cameras))
 
 
-def _standing_joints(merge: MergeResult) -> tuple[StandingJoint, ...]:
+def _standing_joints(body: SolvedBody) -> tuple[StandingJoint, ...]:
     """The ankles whose feet stand now and then."""
-    if merge.standing is None:
+    if body.standing is None:
         return ()
-    held = merge.standing[1:] & merge.standing[:-1]
-    sigma_m = standing_sigma_m(merge.fps)
+    held = body.standing[1:] & body.standing[:-1]
+    sigma_m = standing_sigma_m(body.fps)
     return tuple(
         StandingJoint(joint=int(joint), held=held[:, joint], sigma_m=sigma_m)
         for joint in np.flatnonzero(held.any(axis=0))
@@ -106,15 +106,15 @@ def _initial_motion(skeleton: SkeletonModel, world_from_joint: FloatArray, solve
 
 
 def _camera_targets(
-    merge: MergeResult, clocks: Mapping[str, CameraClock], row_fraction: Mapping[str, FloatArray]
+    body: SolvedBody, clocks: Mapping[str, CameraClock], row_fraction: Mapping[str, FloatArray]
 ) -> tuple[CameraTarget, ...]:
     """Each camera's measured poses at the ticks of the motion."""
     out = []
-    mounts = {mount.camera: mount for mount in merge.mounts}
-    for trajectory in merge.trajectories:
+    mounts = {mount.camera: mount for mount in body.mounts}
+    for trajectory in body.trajectories:
         kept = np.flatnonzero(trajectory.localised)
         mount = mounts.get(trajectory.camera)
-        joint = None if mount is None else merge.skeleton.index_of_role(mount.role)
+        joint = None if mount is None else body.skeleton.index_of_role(mount.role)
         if mount is None or joint is None or not len(kept):
             continue
         rows = row_fraction.get(trajectory.camera)
@@ -126,7 +126,7 @@ def _camera_targets(
         poses, found = poses_at(
             times[order],
             trajectory.gauge_from_cam[kept[order]],
-            merge.times_ns(),
+            body.times_ns(),
             max_gap_ns=round(_MAX_GAP_INTERVALS * float(interval)),
             snap_ns=1_000_000,
         )
@@ -142,12 +142,12 @@ def _camera_targets(
     return tuple(out)
 
 
-def _gap(merge: MergeResult, motion: Motion, cameras: tuple[CameraTarget, ...]) -> dict[str, Any]:
+def _gap(body: SolvedBody, motion: Motion, cameras: tuple[CameraTarget, ...]) -> dict[str, Any]:
     """How far the exported motion is from the graph and from the cameras."""
     exported = motion.world_from_joint()
     out: dict[str, Any] = {}
-    if merge.solved.any():
-        graph, rigid = merge.world_from_joint[:, merge.solved], exported[:, merge.solved]
+    if body.solved.any():
+        graph, rigid = body.graph_world_from_joint[:, body.solved], exported[:, body.solved]
         out["joints"] = _pose_difference(graph, rigid)
     out["cameras"] = {
         tracked.camera: _pose_difference(
@@ -157,12 +157,12 @@ def _gap(merge: MergeResult, motion: Motion, cameras: tuple[CameraTarget, ...]) 
         for tracked in cameras
         if tracked.found.any()
     }
-    if merge.standing is not None:
+    if body.standing is not None:
         out["feet"] = {
-            merge.skeleton.joints[planted.joint]: _slide_speed(
-                exported[:, planted.joint, :3, 3], planted, merge.fps
+            body.skeleton.joints[planted.joint]: _slide_speed(
+                exported[:, planted.joint, :3, 3], planted, body.fps
             )
-            for planted in _standing_joints(merge)
+            for planted in _standing_joints(body)
         }
     return out
 

@@ -1,0 +1,1 @@
+"""The motion of the rigid skeleton that is nearest to the solution of the factor graph."""
