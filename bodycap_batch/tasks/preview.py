@@ -32,7 +32,7 @@ def _inputs(arguments: Json, path: Path) -> PreviewInputs:
     from bodycap_batch.export import project_motion
     from bodycap_batch.formats.bundle import read_bundle
     from bodycap_batch.model.merge_data import MergeResult
-    from bodycap_batch.overlay import body_of, camera_views
+    from bodycap_batch.overlay import bones_from_motion, make_camera_views
     from bodycap_batch.preview import PreviewInputs
 
     scene = load_map(arguments["map"])
@@ -46,13 +46,13 @@ def _inputs(arguments: Json, path: Path) -> PreviewInputs:
     return PreviewInputs(
         path=path,
         capture=_trunk_first(load_capture(arguments), merge),
-        views=camera_views(registrations, scene.maps, found.clocks, merge),
-        frame="world" if merge is not None else scene.maps[0].gauge,
+        views=make_camera_views(registrations, scene.maps, found.clocks, merge),
+        reference_frame="world" if merge is not None else scene.maps[0].gauge,
         points=np.concatenate(moved),
         colours=np.concatenate(colours),
-        body=None
+        bone_motion=None
         if merge is None
-        else body_of(project_motion(merge, found.clocks, found.row_fraction).motion),
+        else bones_from_motion(project_motion(merge, found.clocks, found.row_fraction).motion),
         note=arguments["failure"] or "",
     )
 

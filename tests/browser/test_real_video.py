@@ -14,8 +14,8 @@ from bodycap_batch.capture import Capture, open_capture
 from bodycap_batch.config.models import CaptureConfig
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.report import write_report
-from bodycap_batch.report.marks import Marks
-from bodycap_batch.report.serving import LOOPBACK, MARKS_EACH, make_server, what_to_serve
+from bodycap_batch.report.frame_overlays import FrameOverlays
+from bodycap_batch.report.serving import FRAMES_PER_PART, LOOPBACK, make_served_content, make_server
 from tests.browser.conftest import Pages
 from tests.reports import report_inputs
 from tests.videos import textured_frame, write_video
@@ -82,11 +82,11 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     inputs = replace(inputs, capture=filmed(folder, inputs.cameras))
     assert inputs.capture is not None
     write_report(inputs, folder / "report.html", StageContext(work_dir=folder))
-    marks = Marks(inputs)
-    served = what_to_serve(
+    marks = FrameOverlays(inputs)
+    served = make_served_content(
         folder / "report.html",
         inputs.capture,
-        lambda camera, first: marks.part(camera, first, MARKS_EACH),
+        lambda camera, first: marks.describe_part(camera, first, FRAMES_PER_PART),
     )
     server = make_server(served)
     thread = threading.Thread(target=server.serve_forever)

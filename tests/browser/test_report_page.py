@@ -10,7 +10,7 @@ import pytest
 
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.report import ReportInputs, write_report
-from bodycap_batch.report.tables import look_up
+from bodycap_batch.report.metric_tables import metric_at
 from tests.browser.conftest import NO_3D, Pages
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -109,7 +109,7 @@ def test_the_figures_on_the_page_are_those_of_the_metrics(
     )
     assert len(found) > 40
     for place, value in found:
-        assert float(value) == look_up(inputs.metrics, place)
+        assert float(value) == metric_at(inputs.metrics, place)
     registered = inputs.metrics["total"]["frames_registered"]
     assert f"{registered:,}" in page.locator(".figures dd").first.inner_text()
 

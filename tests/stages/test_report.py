@@ -20,17 +20,17 @@ from bodycap_batch.model.geometry import interpolate_pose
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.pipeline.made import Made, report_task
 from bodycap_batch.report import ReportInputs
-from bodycap_batch.report.advice import advise, shared_points
-from bodycap_batch.report.figures.body import before_optimisation
-from bodycap_batch.report.figures.strips import strip
+from bodycap_batch.report.drawn_scene import common_times_s, make_drawn_scene
+from bodycap_batch.report.figures.before_after import find_unoptimised_bones
+from bodycap_batch.report.figures.camera_timeline import draw_camera_timeline
+from bodycap_batch.report.frame_losses import LossCause, find_frame_losses, likely_cause
+from bodycap_batch.report.frame_pictures import FrameAppearance, FramePicture
 from bodycap_batch.report.grades import Criterion, Grade
-from bodycap_batch.report.losses import Cause, cause_of, find_losses
-from bodycap_batch.report.packing import NONE, Shown, pack_scaled, thinned
-from bodycap_batch.report.pictures import Look, Picture
-from bodycap_batch.report.placing import common_times_s, place
-from bodycap_batch.report.solid import solid_data
-from bodycap_batch.report.tables import look_up
+from bodycap_batch.report.metric_tables import metric_at
+from bodycap_batch.report.packing import MISSING_CODE, PageBudget, pack_scaled, thinned
+from bodycap_batch.report.recommendations import count_shared_points, recommend_changes
 from bodycap_batch.report.verdict import judge
+from bodycap_batch.report.viewer_data import make_viewer_data
 from bodycap_batch.tasks.report import load_inputs
 from tests.reports import written
 from tests.videos import textured_frame, write_video
@@ -69,7 +69,7 @@ def test_every_figure_is_that_of_the_metrics_and_nothing_is_fetched(
     assert len(figures.found) > 40
     assert inputs.metrics is not None
     for place_, value in figures.found:
-        assert float(value) == look_up(inputs.metrics, place_), place_
+        assert float(value) == metric_at(inputs.metrics, place_), place_
     assert {"total.frames_registered", "merge.scale.relative_sigma"} <= {name for name, _ in figures.found}
     assert figures.outside == []
 
@@ -122,19 +122,19 @@ def test_the_verdict_takes_the_worst_of_its_criteria(inputs: ReportInputs) -> No
 def test_a_mirrored_camera_is_to_be_flipped_not_to_see_more(inputs: ReportInputs, tmp_path: Path) -> None:
     metrics = json.loads(json.dumps(inputs.metrics))
     metrics["mapping"]["mirrored_cameras"] = ["left_palm"]
-    lost = {"left_palm": Counter({Cause.NO_MAP: 60})}
-    assert any("see the same places" in each.do for each in advise(inputs, lost))
-    first, *others = advise(replace(inputs, metrics=metrics), lost)
-    assert first.do.startswith("Flip the video of left_palm back")
-    assert not any("see the same places" in each.do for each in others)
+    lost = {"left_palm": Counter({LossCause.NO_MAP: 60})}
+    assert any("see the same places" in each.action for each in recommend_changes(inputs, lost))
+    first, *others = recommend_changes(replace(inputs, metrics=metrics), lost)
+    assert first.action.startswith("Flip the video of left_palm back")
+    assert not any("see the same places" in each.action for each in others)
     assert "Flip the video of left_palm back" in written(replace(inputs, metrics=metrics), tmp_path)
 
 
 def test_cameras_that_see_mirror_images_are_to_be_looked_at(inputs: ReportInputs) -> None:
     metrics = json.loads(json.dumps(inputs.metrics))
     metrics["mapping"]["mirror_images"] = [[["left_palm"], ["torso"]]]
-    first, *_ = advise(replace(inputs, metrics=metrics), {})
-    assert first.do.startswith("See whether text reads backwards in the video of left_palm or torso")
+    first, *_ = recommend_changes(replace(inputs, metrics=metrics), {})
+    assert first.action.startswith("See whether text reads backwards in the video of left_palm or torso")
 
 
 def test_a_verdict_names_cameras_that_only_the_body_places_and_a_job_without_any_pose(
@@ -144,7 +144,7 @@ def test_a_verdict_names_cameras_that_only_the_body_places_and_a_job_without_any
     metrics["merge"]["joined_cameras"] = {"left_palm": {"sigma_deg": 2.0, "sigma_m": 0.01}}
     room = next(each for each in judge(metrics, None).criteria if each.name == "One room")
     assert room.grade is Grade.FAIR
-    assert "left_palm" in room.says
+    assert "left_palm" in room.finding
     metrics["total"] |= {"frames_registered": 0, "coverage": 0.0}
     assert judge(metrics, None).headline.startswith("The cameras are not tracked")
 
@@ -154,7 +154,7 @@ def test_a_share_below_one_never_reads_as_all(inputs: ReportInputs, tmp_path: Pa
     for place_ in (metrics["total"], *metrics["cameras"].values()):
         place_["coverage"] = 0.9997
     metrics["mapping"]["reach"]["within_reach"] = 0.99999
-    assert "99.9%" in judge(metrics, None).criteria[0].says
+    assert "99.9%" in judge(metrics, None).criteria[0].finding
     text = written(replace(inputs, metrics=metrics), tmp_path)
     assert "99.9%" in text
     coverage = re.findall(r'data-metric="[^"]*coverage"[^>]*>([^<]*)<', text)
@@ -173,18 +173,18 @@ def test_a_lens_that_the_map_contradicts_is_no_good_result(
     metrics["mapping"]["misfitting_lenses"] = {"left_palm": factor, "torso": 1.0 + 0.9 * (factor - 1.0)}
     (lenses,) = (each for each in judge(metrics, None).criteria if "Lenses" in each.name)
     assert (lenses.grade, lenses.value) == (grade, factor)
-    assert f"left_palm: the pictures fit a focal length {says}" in lenses.says
+    assert f"left_palm: the pictures fit a focal length {says}" in lenses.finding
     told = replace(inputs, metrics=metrics)
     metrics["mapping"]["freed_lenses"] = ["left_palm", "torso"]
     (freed,) = (each for each in judge(metrics, None).criteria if "Lenses" in each.name)
     assert freed.grade is Grade.FAIR
-    assert "what fits was used instead" in freed.says
+    assert "what fits was used instead" in freed.finding
     # Found, but it does not fit either: a wide lens given as a pinhole was 53 cm off with 1.1 px.
     strained = json.loads(json.dumps(metrics))
     strained["total"]["mean_reprojection_error_px"] = 1.1
     (misfit,) = (each for each in judge(strained, None).criteria if "Lenses" in each.name)
     assert misfit.grade is grade
-    assert "calibration: auto" in advise(told, {})[0].do
+    assert "calibration: auto" in recommend_changes(told, {})[0].action
     assert says in written(told, tmp_path)
 
 
@@ -211,16 +211,16 @@ def test_what_cannot_be_a_body_is_told_first(
     assert not any(each.name == name for each in judge(metrics, None).criteria)
     metrics["merge"] |= doubt
     (found,) = (each for each in judge(metrics, None).criteria if each.name == name)
-    assert (found.grade, found.says) == (Grade.POOR, "0.5 s behind")
+    assert (found.grade, found.finding) == (Grade.POOR, "0.5 s behind")
     merge = replace(inputs.merge, report={**inputs.merge.report, **doubt})
     told = replace(inputs, metrics=metrics, merge=merge)
-    assert do in advise(told, {})[0].do
+    assert do in recommend_changes(told, {})[0].action
     assert "0.5 s behind" in written(told, tmp_path)
 
 
 def test_cameras_that_come_late_or_leave_early_are_told_where_to_cut(inputs: ReportInputs) -> None:
     assert inputs.merge is not None
-    assert not any("start_s" in each.do for each in advise(inputs, {}))
+    assert not any("start_s" in each.action for each in recommend_changes(inputs, {}))
 
     def without(path: Trajectory, gone: slice) -> Trajectory:
         kept = path.localised.copy()
@@ -238,18 +238,18 @@ def test_cameras_that_come_late_or_leave_early_are_told_where_to_cut(inputs: Rep
     paths = (torso, without(left, slice(0, 30)), without(right, slice(40, None)))
     (ends,) = (
         each
-        for each in advise(replace(inputs, merge=replace(inputs.merge, trajectories=paths)), {})
-        if "start_s" in each.do
+        for each in recommend_changes(replace(inputs, merge=replace(inputs.merge, trajectories=paths)), {})
+        if "start_s" in each.action
     )
     start = inputs.merge.start_ns * 1e-9
-    assert f"start_s: {start + 1.0:.2f} and end_s: {start + 39 / 30:.2f}" in ends.do
-    assert f"{left.camera} has no measurement before" in ends.because
+    assert f"start_s: {start + 1.0:.2f} and end_s: {start + 39 / 30:.2f}" in ends.action
+    assert f"{left.camera} has no measurement before" in ends.reason
 
     paths = (torso, without(left, slice(0, 40)), without(right, slice(20, None)))
-    never = advise(replace(inputs, merge=replace(inputs.merge, trajectories=paths)), {})
-    (ends,) = (each for each in never if "Start all cameras" in each.do)
-    assert ends.do.endswith("stop them after it.")  # nothing is left between 1.33 and 0.63 s
-    assert f"{right.camera} has no measurement after" in ends.because
+    never = recommend_changes(replace(inputs, merge=replace(inputs.merge, trajectories=paths)), {})
+    (ends,) = (each for each in never if "Start all cameras" in each.action)
+    assert ends.action.endswith("stop them after it.")  # nothing is left between 1.33 and 0.63 s
+    assert f"{right.camera} has no measurement after" in ends.reason
 
 
 def test_a_camera_without_a_clock_stands_where_its_offset_puts_it(
@@ -301,7 +301,7 @@ def test_cameras_on_one_bone_that_move_against_each_other_are_told(
     }
     (found,) = _on_one_bone(inputs, never, {**PAIR, "spread_deg": spread_deg})
     assert found.grade is grade
-    assert "torso and torso_back" in found.says
+    assert "torso and torso_back" in found.finding
     assert not _on_one_bone(inputs, never)
 
 
@@ -320,7 +320,7 @@ def test_what_says_too_little_of_cameras_on_one_bone_is_not_held_against_them(in
     assert [each.grade for each in _on_one_bone(inputs, arm, mounts=mounts)] == [Grade.FAIR]
     (worst,) = _on_one_bone(inputs, arm, loose, mounts=mounts)
     assert worst.grade is Grade.POOR
-    assert "torso_back" in worst.says
+    assert "torso_back" in worst.finding
 
 
 def test_a_lens_off_its_centre_is_never_good(inputs: ReportInputs) -> None:
@@ -328,8 +328,12 @@ def test_a_lens_off_its_centre_is_never_good(inputs: ReportInputs) -> None:
     metrics["mapping"]["misfitting_lenses"] = {"torso": 1.0}
     (found,) = [each for each in judge(metrics, None).criteria if each.name.startswith("Lenses")]
     assert found.grade is Grade.FAIR
-    assert "another lens" in found.says
-    told = [each.because for each in advise(replace(inputs, metrics=metrics), {}) if "calibration" in each.do]
+    assert "another lens" in found.finding
+    told = [
+        each.reason
+        for each in recommend_changes(replace(inputs, metrics=metrics), {})
+        if "calibration" in each.action
+    ]
     assert told == ["by the pictures, torso has another lens than the calibration says"]
 
 
@@ -344,14 +348,14 @@ def test_a_body_that_no_scale_brings_within_reach_is_told(inputs: ReportInputs) 
     }
     (found,) = [each for each in judge(metrics, None).criteria if "reach" in each.name]
     assert found.grade is Grade.POOR
-    assert found.says.startswith("62")
-    assert "do not suit" in found.says
+    assert found.finding.startswith("62")
+    assert "do not suit" in found.finding
     # With a camera that nobody wore nothing else is to be blamed.
     metrics["merge"]["unused_cameras"] = {"left_palm": "it lies on a table"}
     (found,) = [each for each in judge(metrics, None).criteria if "reach" in each.name]
     assert found.grade is Grade.FAIR
-    assert "left_palm" in found.says
-    assert "do not suit" not in found.says
+    assert "left_palm" in found.finding
+    assert "do not suit" not in found.finding
 
 
 @pytest.mark.parametrize("reach", [None, {"judged": False, "reason": "3 distances are too few"}])
@@ -369,7 +373,7 @@ def test_a_camera_that_ended_early_shows_in_the_verdict(inputs: ReportInputs) ->
     metrics["motion"]["joints"]["LeftHand"]["observed_share"] = 0.6
     least = next(c for c in judge(metrics, None).criteria if c.name == "Time measured")
     assert (least.grade, least.value) == (Grade.POOR, 0.6)
-    assert look_up(metrics, least.metric) == 0.6
+    assert metric_at(metrics, least.metric) == 0.6
     assert judge(metrics, None).body is Grade.POOR
 
 
@@ -426,9 +430,9 @@ def test_a_strip_of_any_length_stays_small(inputs: ReportInputs) -> None:
         error_px=np.where(kept, 0.5, np.nan),
     )
     long = replace(inputs, registrations=(replace(found, trajectory=path),), merge=None, selections=())
-    losses = find_losses(long)
+    losses = find_frame_losses(long)
     assert len(losses) == count // 2
-    drawn = strip(long, path.camera, (0.0, count / 30.0), losses, 0.0)
+    drawn = draw_camera_timeline(long, path.camera, (0.0, count / 30.0), losses, 0.0)
     assert len(drawn) < 150_000
     assert f"{count // 2} frames lost: BLUR" in drawn
 
@@ -454,10 +458,10 @@ def test_before_optimisation_means_the_same_for_a_camera_half_a_frame_late(input
 
     merge = replace(inputs.merge, trajectories=tuple(late(path) for path in inputs.merge.trajectories))
     for usual, shifted in zip(
-        before_optimisation(inputs), before_optimisation(replace(inputs, merge=merge)), strict=True
+        find_unoptimised_bones(inputs), find_unoptimised_bones(replace(inputs, merge=merge)), strict=True
     ):
         # 5 mm of noise and slack; half a frame of walking at 1.1 m/s would be 18 mm more
-        assert abs(np.median(shifted.off_m(merge)) - np.median(usual.off_m(merge))) < 0.004
+        assert abs(np.median(shifted.distance_m(merge)) - np.median(usual.distance_m(merge))) < 0.004
 
 
 def test_a_camera_whose_poses_lie_beside_the_motion_breaks_no_page(
@@ -469,7 +473,7 @@ def test_a_camera_whose_poses_lie_beside_the_motion_breaks_no_page(
 
 
 def test_losses_are_found_with_what_was_measured_beside_them(inputs: ReportInputs) -> None:
-    losses = find_losses(inputs)
+    losses = find_frame_losses(inputs)
     assert len(losses) == 3
     for loss in losses:
         assert (loss.first, loss.last, loss.frames) == (20, 24, 5)
@@ -479,27 +483,32 @@ def test_losses_are_found_with_what_was_measured_beside_them(inputs: ReportInput
 
 
 def test_causes_follow_the_measurements(inputs: ReportInputs) -> None:
-    loss = find_losses(inputs)[0]
+    loss = find_frame_losses(inputs)[0]
 
-    def look(grey: float, corners: int) -> Look:
-        return Look(picture=Picture(index=22, jpeg="", width=1, height=1), grey=grey, corners=corners)
+    def look(grey: float, corners: int) -> FrameAppearance:
+        return FrameAppearance(
+            picture=FramePicture(index=22, jpeg="", width=1, height=1), brightness=grey, corners=corners
+        )
 
     calm = replace(loss, turn_deg=1.0)
     tracks = replace(calm, reason=FrameStatus.FEW_TRACKS, sharpness=1.0)
-    assert cause_of(calm, look(10.0, 100), 100.0) is Cause.DARK
-    assert cause_of(replace(loss, turn_deg=20.0), look(90.0, 100), 100.0) is Cause.FAST
-    assert cause_of(calm, look(90.0, 100), 100.0) is Cause.BLUR
-    assert cause_of(tracks, look(90.0, 10), 100.0) is Cause.PLAIN
-    assert cause_of(tracks, look(90.0, 90), 100.0) is Cause.UNKNOWN_PLACE
-    assert cause_of(replace(tracks, sharpness=0.4), None, None) is Cause.BLUR
+    assert likely_cause(calm, look(10.0, 100), 100.0) is LossCause.DARK
+    assert likely_cause(replace(loss, turn_deg=20.0), look(90.0, 100), 100.0) is LossCause.FAST
+    assert likely_cause(calm, look(90.0, 100), 100.0) is LossCause.BLUR
+    assert likely_cause(tracks, look(90.0, 10), 100.0) is LossCause.PLAIN
+    assert likely_cause(tracks, look(90.0, 90), 100.0) is LossCause.UNKNOWN_PLACE
+    assert likely_cause(replace(tracks, sharpness=0.4), None, None) is LossCause.BLUR
 
 
 def test_advice_comes_from_what_was_measured(inputs: ReportInputs) -> None:
-    some = advise(inputs, {"torso": Counter({Cause.PLAIN: 30})})
-    assert "posters" in some[0].do
-    assert "30 of torso" in some[0].because
-    assert not any("posters" in each.do for each in advise(inputs, {"torso": Counter({Cause.PLAIN: 1})}))
-    assert any("skeleton" in each.do for each in some)
+    some = recommend_changes(inputs, {"torso": Counter({LossCause.PLAIN: 30})})
+    assert "posters" in some[0].action
+    assert "30 of torso" in some[0].reason
+    assert not any(
+        "posters" in each.action
+        for each in recommend_changes(inputs, {"torso": Counter({LossCause.PLAIN: 1})})
+    )
+    assert any("skeleton" in each.action for each in some)
 
 
 @pytest.mark.parametrize(
@@ -518,7 +527,7 @@ def test_nobody_is_asked_for_a_skeleton_that_was_given(inputs: ReportInputs, sou
         "sources": [{"name": source}, {"name": "floor"}],
     }
     told = replace(inputs, merge=replace(inputs.merge, report={"scale": scale}))
-    assert [each.do for each in advise(told, {}) if "metric scale" in each.because] == [says]
+    assert [each.action for each in recommend_changes(told, {}) if "metric scale" in each.reason] == [says]
 
 
 def test_an_elbow_that_is_no_hinge_is_advised_about(inputs: ReportInputs) -> None:
@@ -530,8 +539,8 @@ def test_an_elbow_that_is_no_hinge_is_advised_about(inputs: ReportInputs) -> Non
         }
     }
     told = replace(inputs, merge=replace(inputs.merge, report={"loose_hinges": loose}))
-    (advice,) = (each for each in advise(told, {}) if "left elbow" in each.because)
-    assert (advice.do, advice.because) == ("Strap it.", "the left elbow bends 2.1 cm out of its plane")
+    (advice,) = (each for each in recommend_changes(told, {}) if "left elbow" in each.reason)
+    assert (advice.action, advice.reason) == ("Strap it.", "the left elbow bends 2.1 cm out of its plane")
 
 
 def test_a_t_pose_that_helps_several_constants_is_advised_once(inputs: ReportInputs) -> None:
@@ -541,8 +550,8 @@ def test_a_t_pose_that_helps_several_constants_is_advised_once(inputs: ReportInp
     def advised(*cameras: str) -> list[str]:
         text = "known to 11°; to know it better, swing the elbow, or stand in a T-pose for two seconds first"
         report = {"mounts": {name: {"known_to": text, "sigma_deg": 11.0} for name in cameras}}
-        found = advise(replace(inputs, merge=replace(merge, report=report)), {})
-        return [each.do for each in found if "T-pose" in each.do or "elbow" in each.do]
+        found = recommend_changes(replace(inputs, merge=replace(merge, report=report)), {})
+        return [each.action for each in found if "T-pose" in each.action or "elbow" in each.action]
 
     (alone,) = advised("left_palm")
     assert "elbow, or stand in a T-pose" in alone
@@ -552,7 +561,7 @@ def test_a_t_pose_that_helps_several_constants_is_advised_once(inputs: ReportInp
 
 
 def test_shared_points_count_what_both_cameras_see(inputs: ReportInputs) -> None:
-    counts = shared_points(inputs.maps, inputs.cameras)
+    counts = count_shared_points(inputs.maps, inputs.cameras)
     scene = inputs.maps[0]
     for index, name in enumerate(inputs.cameras):
         mine = np.isin(scene.obs_keyframe, scene.keyframes_of(name))
@@ -564,7 +573,7 @@ def test_packed_numbers_come_back_within_a_step() -> None:
     values = np.array([[0.0, -3.0], [20.0, np.nan], [7.3, 5.0]])
     packed = pack_scaled(values)
     codes = np.frombuffer(base64.b64decode(packed["u16"]), "<u2").reshape(3, 2)
-    back = np.where(codes == NONE, np.nan, packed["low"] + codes * np.array(packed["step"]))
+    back = np.where(codes == MISSING_CODE, np.nan, packed["low"] + codes * np.array(packed["step"]))
     np.testing.assert_allclose(back, values, atol=0.51 * max(packed["step"]))
 
 
@@ -576,11 +585,11 @@ def test_thinning_keeps_the_ends() -> None:
 
 def test_joint_uncertainty_is_shown_where_it_is_known(inputs: ReportInputs, tmp_path: Path) -> None:
     assert inputs.merge is not None
-    data = solid_data(inputs, place(inputs), Shown())["body"]
+    data = make_viewer_data(inputs, make_drawn_scene(inputs), PageBudget())["body"]
     codes = np.frombuffer(base64.b64decode(data["sigma"]["u16"]), "<u2").reshape(data["sigma"]["shape"])
-    assert ((codes != NONE) == inputs.merge.solved).all()
+    assert ((codes != MISSING_CODE) == inputs.merge.solved).all()
     # the root of the mean variance of 1, 2 and 3 cm2
     assert data["sigma"]["low"][int(np.argmax(inputs.merge.solved))] == pytest.approx(np.sqrt(2e-4))
     assert "1.4 cm" in written(inputs, tmp_path)
     unknown = replace(inputs, merge=replace(inputs.merge, joint_covariance_m2=None))
-    assert solid_data(unknown, place(unknown), Shown())["body"]["sigma"] is None
+    assert make_viewer_data(unknown, make_drawn_scene(unknown), PageBudget())["body"]["sigma"] is None

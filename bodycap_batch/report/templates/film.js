@@ -1,6 +1,6 @@
-// The real video of a camera, where `bodycap view` serves it. While it plays the page follows its clock:
-// no seek for each frame. What is drawn over it belongs to the frame that is on the screen.
-const SLACK_S = 0.15;
+// The real video of a camera, if `bodycap view` serves it. While it plays, the page follows the video's clock,
+// so there is no seek for each frame. The overlay is that of the displayed frame.
+const SLACK_S = 0.15; // largest difference between video and page without a seek, seconds
 
 class Film {
   constructor(video, onFrame, onFailure) {
@@ -10,7 +10,7 @@ class Film {
     this.part = null;
     this.wanted = null;
     this.unseen = false;
-    // A browser that fetches sparingly may decode nothing before it is asked for a frame.
+    // A browser that saves data may decode nothing before a seek, so each of these events is handled.
     for (const event of ["loadedmetadata", "loadeddata", "seeked"]) video.addEventListener(event, () => this.settle());
     video.addEventListener("error", () => {
       if (!this.part) return;
@@ -24,7 +24,7 @@ class Film {
     return this.parts.length > 0;
   }
 
-  // The chapters of a camera: of each frame the common time and the time in the file.
+  // Load the chapters of a camera; each has the common time and the time in the file of its frames.
   load(parts) {
     this.parts = parts;
     this.part = null;
@@ -69,7 +69,7 @@ class Film {
     }
     this.video.playbackRate = speed;
     if (Math.abs(this.video.currentTime - there) > SLACK_S) this.seek(there);
-    // Refused where a pause or another chapter comes between; the next step asks again.
+    // The browser rejects this if a pause or a new chapter interrupts it; the next step tries again.
     if (this.video.paused && !this.video.ended) this.video.play().catch(() => {});
   }
 
@@ -81,7 +81,7 @@ class Film {
     }
   }
 
-  // A frame can be on the screen before the video says that it has it: what came to rest unseen is looked at.
+  // A frame can be displayed before the video reports it, so it is handled when a seek has ended.
   settle() {
     const { video, part, wanted } = this;
     this.wanted = null;
@@ -89,7 +89,7 @@ class Film {
     if (part && this.unseen && !video.seeking && video.readyState >= 2) this.show(video.currentTime);
   }
 
-  // The common time the video is at; null while it does not play, so that the page goes by its own clock.
+  // Return the common time of the video; null while it does not play, because then the page uses its own clock.
   now() {
     const { video, part } = this;
     if (!part || video.paused || video.ended) return null;

@@ -1,4 +1,4 @@
-// Without WebGL: the same from above and from the side, on a plain canvas.
+// The scene without WebGL: from above and from the side, on a 2D canvas.
 class Flat {
   constructor(holder, data) {
     this.data = data;

@@ -1,4 +1,4 @@
-// What one camera saw at the time, with the points behind its pose and the skeleton drawn over it.
+// The frame of one camera at the current time, with the inlier points of its pose and the skeleton as overlay.
 const SVG = "http://www.w3.org/2000/svg";
 
 class Picture {
@@ -18,7 +18,7 @@ class Picture {
       (index) => this.filmed(index),
       () => {
         delete this.videos.cameras[this.camera];
-        this.noFilm.textContent = `This browser does not play the video of ${this.camera}: small pictures are shown instead.`;
+        this.noFilm.textContent = `This browser does not play the video of ${this.camera}. Small pictures are shown instead.`;
         this.noFilm.hidden = false;
       },
     );
@@ -47,7 +47,7 @@ class Picture {
     this.film.load((this.series && this.videos.cameras[camera]) || []);
   }
 
-  // Real videos, and marks for their frames in parts of so many.
+  // Use real videos; the overlays of their frames come in parts of `videos.each` frames.
   offer(videos) {
     this.videos = videos;
     this.choose(this.camera);
@@ -66,7 +66,7 @@ class Picture {
     this.mark(frame);
   }
 
-  // The video shows a frame: its own marks, else those of the stored picture of the same frame, else none.
+  // Draw the overlay of the video's frame: its own, or that of a stored picture of the same frame, or none.
   filmed(index) {
     if (!this.film.active) return;
     this.index = index;
@@ -96,7 +96,7 @@ class Picture {
     const at = (x, y) => `${x.toFixed(4)} ${(y * this.aspect).toFixed(4)}`;
     const [dots, bones] = [[], []];
     const inliers = frame && frame.inliersAt ? scaled(frame.inliersAt) : [];
-    // A line of no length with round ends is a dot.
+    // A line of length zero with round ends is a dot.
     for (let i = 0; i < inliers.length; i += 2) dots.push(`M${at(inliers[i], inliers[i + 1])}h0`);
     for (const bone of (frame && frame.bones) || []) {
       for (let i = 0; i < bone.length; i += 2) bones.push(`${i ? "L" : "M"}${at(bone[i], bone[i + 1])}`);

@@ -1,8 +1,9 @@
-// The 3D view, drawn by three.js: only when something changed.
+// The 3D view, drawn by three.js only when something has changed.
 const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i;
-// Milliseconds between frames: above the first fewer points are drawn while something moves, below the second more.
+// Milliseconds between frames. Above SLOW_MS fewer points are drawn while something moves, below FAST_MS more.
+// After STILL_MS without a change all points are drawn.
 const [SLOW_MS, FAST_MS, STILL_MS] = [31, 20, 250];
-// Points and their colour, nothing else: three.js's own material costs twice as much without a graphics card.
+// This shader draws only points with a colour. The material of three.js takes twice as long without a graphics card.
 const POINT_SHADER = `
 in vec3 position;
 in vec3 color;
@@ -73,7 +74,7 @@ class Solid {
     requestAnimationFrame(loop);
   }
 
-  // The whole body at all times, and the cameras' paths but for what lies far off: what to show from the start.
+  // Return what the first view must show: the body at all times, and the camera paths except distant parts.
   everything() {
     const { body, paths, solid } = this.data;
     const out = [];
@@ -142,7 +143,7 @@ class Solid {
     });
   }
 
-  // One object for all cameras: software renderers pay for each.
+  // All cameras are one object, because each object takes time in a software renderer.
   addPaths() {
     const { three } = this;
     const [dots, dotTones, axes, axisTones] = [[], [], [], []];
@@ -177,7 +178,7 @@ class Solid {
     return geometry;
   }
 
-  // A pyramid for each camera, moved point by point: its base is the picture.
+  // Add a pyramid for each camera; its base is the image. Its points are moved one by one.
   addFrusta(material) {
     const { three } = this;
     const [w, h, d] = [0.1, 0.07, 0.15].map((each) => each * this.unit);
@@ -306,7 +307,7 @@ class Solid {
     this.doubt.instanceMatrix.needsUpdate = true;
   }
 
-  // The points lie in random order, so the first of them are a thinner cloud of the same shape.
+  // The points are in random order, so the first of them are a thinner cloud of the same shape.
   render(now, moving) {
     const since = now - this.drawn;
     if (moving && since < 2 * STILL_MS) {

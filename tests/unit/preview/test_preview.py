@@ -12,13 +12,13 @@ from bodycap_batch.capture import open_capture
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.formats.mp4 import planes_of
 from bodycap_batch.model.scene import FrameStatus
-from bodycap_batch.overlay import SeenPoints
-from bodycap_batch.preview import room
-from bodycap_batch.preview.layout import HEIGHT, ROOM_WIDTH, WIDTH, Box, place_videos
-from bodycap_batch.preview.room import Cloud
-from bodycap_batch.preview.tiles import resized, status_line
-from bodycap_batch.preview.timeline import MAX_FRAMES, make_timeline
-from bodycap_batch.preview.viewpoint import Viewpoint, follow
+from bodycap_batch.overlay import ObservedPoints
+from bodycap_batch.preview import room_drawing
+from bodycap_batch.preview.layout import HEIGHT, ROOM_WIDTH, WIDTH, Box, lay_out_videos
+from bodycap_batch.preview.preview_timeline import MAX_FRAMES, make_timeline
+from bodycap_batch.preview.room_drawing import ColouredPoints
+from bodycap_batch.preview.tiles import describe_status, resize_image
+from bodycap_batch.preview.viewpoint import Viewpoint, follow_target
 from bodycap_batch.tasks.preview import _trunk_first
 from tests.bodies import merged, reaching
 from tests.videos import textured_frame, write_video
@@ -63,7 +63,7 @@ def test_a_single_instant_is_one_picture() -> None:
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 8, 11, 16])
 @pytest.mark.parametrize("aspect", [16 / 9, 4 / 3, 9 / 16])
 def test_videos_fit_beside_the_room_without_touching_each_other(count: int, aspect: float) -> None:
-    boxes = [box for pair in place_videos([aspect] * count) for box in pair]
+    boxes = [box for pair in lay_out_videos([aspect] * count) for box in pair]
     assert len(boxes) == 2 * count
     taken = np.zeros((HEIGHT, WIDTH), dtype=int)
     for box in boxes:
@@ -90,13 +90,13 @@ def test_the_trunks_video_is_the_first_and_one_that_nobody_wears_the_last(tmp_pa
 
 
 def test_three_videos_are_one_large_over_two() -> None:
-    first, second, third = (picture for picture, _ in place_videos([4 / 3] * 3))
+    first, second, third = (picture for picture, _ in lay_out_videos([4 / 3] * 3))
     assert first.width > 1.9 * second.width
     assert second.y == third.y > first.y + first.height
-    five = [picture for picture, _ in place_videos([4 / 3] * 5)]
+    five = [picture for picture, _ in lay_out_videos([4 / 3] * 5)]
     assert min(picture.width for picture in five) > 200, "none too small to read"
     assert five[0].width > 1.9 * five[1].width, "the first is the largest"
-    assert place_videos([]) == []
+    assert lay_out_videos([]) == []
     assert isinstance(first, Box)
 
 
@@ -110,7 +110,7 @@ def walk(frames: int = 200) -> tuple[np.ndarray, np.ndarray]:
 
 def test_the_view_keeps_the_whole_walking_body_in_the_picture() -> None:
     target, seconds = walk()
-    views = follow(target, seconds, (ROOM_WIDTH, HEIGHT), 1.05, NO_ROOM)
+    views = follow_target(target, seconds, (ROOM_WIDTH, HEIGHT), 1.05, NO_ROOM)
     for at, view in zip(target, views, strict=True):
         # Feet, head and both hands of a person 1.8 m high.
         body = at + np.array([[0, 0, -0.9], [0, 0, 0.9], [0.6, 0, 0.4], [-0.6, 0, 0.4]])
@@ -124,8 +124,8 @@ def test_the_view_keeps_the_whole_walking_body_in_the_picture() -> None:
 def test_the_view_is_calm_while_the_body_bobs() -> None:
     target, seconds = walk()
     bobbing = target + np.stack([0 * seconds, 0 * seconds, 0.03 * np.sin(2 * np.pi * 1.8 * seconds)], axis=1)
-    calm = [view.cam_from_room for view in follow(target, seconds, (640, 640), 1.0, NO_ROOM)]
-    shaken = [view.cam_from_room for view in follow(bobbing, seconds, (640, 640), 1.0, NO_ROOM)]
+    calm = [view.cam_from_room for view in follow_target(target, seconds, (640, 640), 1.0, NO_ROOM)]
+    shaken = [view.cam_from_room for view in follow_target(bobbing, seconds, (640, 640), 1.0, NO_ROOM)]
     middle = slice(60, -60)  # two seconds from the ends, where the Gaussian is whole
     moved = np.linalg.norm(np.array(calm)[middle, :3, 3] - np.array(shaken)[middle, :3, 3], axis=1)
     # A Gaussian of 1 s takes exp(-(2 pi 1.8)^2 / 2) of a step's bob: nothing; the distance may still change.
@@ -135,7 +135,7 @@ def test_the_view_is_calm_while_the_body_bobs() -> None:
 def from_the_front(room_points: np.ndarray) -> bool:
     """Whether the view stands before a body that faces -Y."""
     target, seconds = walk()
-    view = follow(target, seconds, (640, 640), 1.0, room_points)[0]
+    view = follow_target(target, seconds, (640, 640), 1.0, room_points)[0]
     return bool(np.linalg.inv(view.cam_from_room)[1, 3] < target[0, 1])
 
 
@@ -154,17 +154,19 @@ def looking_down_z(distance: float = 4.0) -> Viewpoint:
 
 
 def test_near_points_hide_far_ones_and_those_at_the_lens_are_left_out() -> None:
-    image = room.blank((100, 80))
+    image = room_drawing.blank_image((100, 80))
     points = np.array([[0.0, 0, 0], [0, 0, 3.0], [0, 0, -3.5], [0, 0, -6.0]])
     colours = np.array([[250, 0, 0], [0, 250, 0], [0, 0, 250], [250, 250, 250]], dtype=np.uint8)
-    room.draw_cloud(image, looking_down_z(), Cloud(points=points, colours=colours))
+    room_drawing.draw_points(image, looking_down_z(), ColouredPoints(points=points, colours=colours))
     red, green, blue = image[40, 50].astype(int)
     assert red > 150
     assert max(green, blue) < 60
 
 
 def test_large_clouds_are_thinned_evenly() -> None:
-    cloud = Cloud(points=np.arange(300_000).reshape(-1, 3) * 1.0, colours=np.zeros((100_000, 3), np.uint8))
+    cloud = ColouredPoints(
+        points=np.arange(300_000).reshape(-1, 3) * 1.0, colours=np.zeros((100_000, 3), np.uint8)
+    )
     thin = cloud.thinned()
     assert len(thin.points) == len(thin.colours)
     assert 30_000 < len(thin.points) <= 40_000
@@ -172,7 +174,7 @@ def test_large_clouds_are_thinned_evenly() -> None:
 
 
 def test_the_floor_lies_at_zero_and_reaches_past_the_walk() -> None:
-    grid = room.floor_grid(np.array([[0.0, 0.0, 0.9], [3.0, -4.0, 0.9]]))
+    grid = room_drawing.floor_grid(np.array([[0.0, 0.0, 0.9], [3.0, -4.0, 0.9]]))
     assert (grid[..., 2] == 0).all()
     assert grid[..., :2].min(axis=(0, 1)).tolist() == [-2, -6]
     assert grid[..., :2].max(axis=(0, 1)).tolist() == [5, 2]
@@ -180,10 +182,12 @@ def test_the_floor_lies_at_zero_and_reaches_past_the_walk() -> None:
 
 
 def test_lines_behind_the_viewer_are_not_drawn() -> None:
-    image = room.blank((100, 80))
-    room.draw_lines(image, looking_down_z(), np.array([[[0, 0, -9.0], [1, 0, -9.0]]]), (255, 255, 255))
-    assert (image == room.BACKGROUND).all()
-    room.draw_lines(image, looking_down_z(), np.array([[[-1, 0, 0.0], [1, 0, 0.0]]]), (255, 255, 255))
+    image = room_drawing.blank_image((100, 80))
+    room_drawing.draw_lines(
+        image, looking_down_z(), np.array([[[0, 0, -9.0], [1, 0, -9.0]]]), (255, 255, 255)
+    )
+    assert (image == room_drawing.BACKGROUND).all()
+    room_drawing.draw_lines(image, looking_down_z(), np.array([[[-1, 0, 0.0], [1, 0, 0.0]]]), (255, 255, 255))
     assert image[40, 40:60].min() > 100
 
 
@@ -214,16 +218,16 @@ def test_pictures_get_the_colours_that_ffmpeg_would_give_them() -> None:
 )
 def test_a_frame_says_what_its_pose_rests_on(status: FrameStatus, points: int, says: str) -> None:
     px = np.zeros((points, 2))
-    seen = SeenPoints(
+    seen = ObservedPoints(
         point=np.arange(points), px=px, observed_px=px, depth=np.ones(points), error_px=np.full(points, 0.5)
     )
-    assert status_line(status, seen)[0] == says
+    assert describe_status(status, seen)[0] == says
 
 
 @pytest.mark.parametrize("size", [(572, 429), (286, 214), (641, 480), (90, 67), (600, 30), (2, 2)])
 def test_a_picture_is_shown_whole_at_every_size(size: tuple[int, int]) -> None:
     ramp = np.linspace(0.0, 255.0, 640)[None, :, None] * np.ones((480, 1, 3))
-    image = resized(np.round(ramp).astype(np.uint8), size)
+    image = resize_image(np.round(ramp).astype(np.uint8), size)
     assert image.shape == (size[1], size[0], 3)
     # A pixel shows the middle of its share of the width: rounding, halves of odd widths.
     middle = (np.arange(size[0]) + 0.5) / size[0] * 640 - 0.5
@@ -235,4 +239,4 @@ def test_a_reduced_picture_does_not_flicker_with_single_pixels() -> None:
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 256, (480, 640, 3)).astype(np.uint8)
     # Of 2.24 by 2.24 pixels one is made: their mean scatters 1 / 2.24 as much; 0.6 for what is left out.
-    assert resized(noise, (286, 214)).std() < 0.6 * noise.std()
+    assert resize_image(noise, (286, 214)).std() < 0.6 * noise.std()
