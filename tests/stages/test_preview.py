@@ -1,4 +1,4 @@
-"""``preview.mp4`` of a small capture: players can play it, lost frames are marked, and its bytes are reproducible."""
+"""``preview.mp4`` of a small capture: it can be played, marks lost frames and has reproducible bytes."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def test_a_page_with_many_cameras_fits_into_a_small_limit(
 def test_the_page_stays_under_15_mb_at_any_length(frames: int, tmp_path: Path) -> None:
     long = report_inputs(frames, points=1_000, lost=slice(20, 25))
     text = written(long, tmp_path)
-    # There are no videos in this test. Their pictures have their own budget; a lost frame's picture is about 16 kB.
+    # There are no videos here. Their pictures have their own budget; a lost frame's picture is about 16 kB.
     assert len(text.encode()) + SERIES_BUDGET + 24 * 16_000 <= 15_000_000
     if frames > 5_000:
         assert re.search(r"To keep it small it shows [\d,]+ of [\d,]+ ", text)

@@ -30,7 +30,7 @@ def one_bone(start: list[float], end: list[float], *, observed: bool = True) -> 
 
 
 def registration(scene: Map) -> Registration:
-    """Return the torso's frames of `small_map`. Keyframe 4 was tracked into frame 5, which has the same pose."""
+    """Return the torso's frames of `small_map`; keyframe 4 was tracked into frame 5 with the same pose."""
     rows = scene.keyframes_of("torso")
     poses = np.full((9, 4, 4), np.nan)
     poses[scene.keyframe_frame[rows]] = scene.map_from_cam[rows]
