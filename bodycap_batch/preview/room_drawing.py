@@ -14,6 +14,7 @@ from bodycap_batch.overlay.drawing import SUBPIXEL_BITS, side_colour
 from bodycap_batch.preview.viewpoint import Viewpoint
 
 BACKGROUND = np.array([26, 28, 34], dtype=np.uint8)
+"""RGB of the dark ground; the colours of cameras and limbs are chosen for it."""
 GRID_COLOUR, _SHADOW_COLOUR = (70, 76, 90), (12, 13, 16)
 """RGB of the floor's grid and of the body's shadow on it."""
 _OUTLINE_COLOUR = (15, 16, 19)
@@ -34,6 +35,7 @@ _DASH_PX = 9.0
 _FRUSTUM = np.array([[0, 0, 0], [-0.6, -0.45, 1], [0.6, -0.45, 1], [0.6, 0.45, 1], [-0.6, 0.45, 1.0]])
 """Corners of a camera's symbol: its centre and an image of 4:3 at depth 1."""
 _FRUSTUM_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
+"""Pairs of corners that a line connects."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

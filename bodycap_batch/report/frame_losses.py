@@ -29,7 +29,7 @@ Optical flow loses most tracks above 20 degrees, and motion blur starts at much 
 _PLAIN_RATIO = 0.3
 """Corners relative to the camera's registered frames below which surfaces are plain. Evidence: none."""
 _NEIGHBOURS = 3
-"""Frames before a lost interval from which the speed of rotation next to it is measured. Evidence: none."""
+"""Frame pairs before and after a lost interval in which the rotation is measured. Evidence: none."""
 
 
 class LossCause(StrEnum):

@@ -149,8 +149,8 @@ def _prefer_cheap_frames(camera: CaptureCamera, indices: IntArray) -> IntArray:
     """Replace evenly spaced frames by near frames that are cheaper to read.
 
     If the capture keeps the keyframes' images, these are preferred: little new comes into view between two
-    keyframes. Otherwise frames that decode without their neighbours are preferred. A frame without such a
-    frame near it is not replaced.
+    keyframes. Otherwise frames that decode without their neighbours are preferred. If no cheap frame is near,
+    the original frame is kept.
     """
     cheap = camera.key_indices() if camera.kept is None else camera.kept.frames
     if len(indices) < 3 or len(cheap) == 0:

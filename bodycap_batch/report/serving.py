@@ -26,6 +26,7 @@ FRAMES_PER_PART = 60
 OverlaySource = Callable[[str, int], list[dict[str, Any]]]
 """Returns the overlays of a part of a camera's frames, from a frame index on."""
 _RANGE = re.compile(r"bytes=(\d+)-(\d*)")
+"""A request for a range of bytes; other forms of the header are answered with the whole file."""
 _OVERLAY_ADDRESS = re.compile(r"/marks/(\d{1,4})/(\d{1,7})\.json", re.ASCII)
 _CHUNK_BYTES = 1 << 18
 """Bytes of a file that are read at once. Evidence: none."""

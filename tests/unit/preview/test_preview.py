@@ -250,5 +250,5 @@ def test_a_resized_image_shows_the_whole_image(size: tuple[int, int]) -> None:
 def test_a_reduced_image_does_not_alias() -> None:
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 256, (480, 640, 3)).astype(np.uint8)
-    # One pixel is the mean of 2.24 by 2.24 pixels with 1 / 2.24 of their sigma; 0.6 allows for skipped pixels.
+    # One pixel is the mean of 2.24 by 2.24 pixels with 1 / 2.24 of their sigma; 0.6 allows for skipped ones.
     assert resize_image(noise, (286, 214)).std() < 0.6 * noise.std()
