@@ -1,4 +1,4 @@
-"""A whole job's results for tests of the report: a walking body, three cameras, a map they saw, no videos."""
+"""Results of a job for tests of the report: a walking body, three cameras and their map, without videos."""
 
 from __future__ import annotations
 
@@ -20,13 +20,19 @@ from tests.bodies import CAMERAS, merged, reaching
 LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
 GAUGE = "map-0"
 WORLD = Similarity(1.0, np.eye(3), np.zeros(3))
-_SEEN = 40
+_MAX_OBSERVATIONS = 40
+"""Points that a frame observes at most."""
 
 
 def report_inputs(frames: int = 60, points: int = 400, *, lost: slice = slice(20, 25)) -> ReportInputs:
-    """Results of a job of so many frames a camera, `lost` of each without a pose.
+    """Return the results of a job.
 
-    The body walks for the whole length; each registered frame saw up to 40 points of the map.
+    The body walks all the time. Each registered frame observes up to 40 points of the map.
+
+    Args:
+        frames: Number of frames of each camera.
+        points: Number of points of the map.
+        lost: Frames of each camera without a pose.
     """
     result, clocks = merged(reaching(frames), world_from_map={GAUGE: WORLD}, projected=frames <= 120)
     rng = np.random.default_rng(5)
@@ -36,11 +42,11 @@ def report_inputs(frames: int = 60, points: int = 400, *, lost: slice = slice(20
     )
     cloud = rng.uniform(low - 2.0, high + 2.0, size=(points, 3))
     paths = tuple(_with_losses(path, lost) for path in result.trajectories)
-    report = {**result.report, **_told(paths)}
-    spread = np.where(result.solved[:, None, None], np.diag([1e-4, 2e-4, 3e-4]), np.nan)
-    covariance = np.tile(spread, (frames, 1, 1, 1))
+    report = {**result.report, **_merge_report(paths)}
+    variances = np.where(result.solved[:, None, None], np.diag([1e-4, 2e-4, 3e-4]), np.nan)
+    covariance = np.tile(variances, (frames, 1, 1, 1))
     result = replace(result, trajectories=paths, report=report, joint_covariance_m2=covariance)
-    found = tuple(_registered(path, cloud, rng) for path in paths)
+    registrations = tuple(_registered(path, cloud, rng) for path in paths)
     scene = _map(paths, cloud, rng)
     selections = tuple(_selection(path, rng) for path in paths)
     export = ExportInputs(
@@ -57,7 +63,7 @@ def report_inputs(frames: int = 60, points: int = 400, *, lost: slice = slice(20
         name="a walk <in> the lab",
         cameras=tuple(CAMERAS),
         maps=(scene,),
-        registrations=found,
+        registrations=registrations,
         clocks=clocks,
         selections=selections,
         merge=result,
@@ -92,8 +98,8 @@ def _with_losses(path: Trajectory, lost: slice) -> Trajectory:
     )
 
 
-def _told(paths: tuple[Trajectory, ...]) -> dict[str, object]:
-    """What merging's own report holds, for these paths."""
+def _merge_report(paths: tuple[Trajectory, ...]) -> dict[str, object]:
+    """Return merging's report on camera paths."""
     residual = {"p50": 0.001, "p95": 0.004}
     mount = {"sigma_deg": 3.0, "sigma_m": 0.01, "from_prior_deg": 8.0, "from_prior_m": 0.02, "roll_deg": 90.0}
     return {
@@ -135,20 +141,20 @@ def _told(paths: tuple[Trajectory, ...]) -> dict[str, object]:
     }
 
 
-def _seen_by(pose: np.ndarray, cloud: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Up to 40 points in the picture and their pixels."""
-    near = transform_points(invert(pose), cloud)
-    px = LENS.project(near)
-    inside = np.flatnonzero((near[:, 2] > 0.2) & (np.abs(px / [640, 480] - 0.5) < 0.5).all(axis=1))
-    chosen = np.sort(rng.permutation(inside)[:_SEEN])
+def _observe(pose: np.ndarray, cloud: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return up to 40 points in the image and their pixels."""
+    x_in_cam = transform_points(invert(pose), cloud)
+    px = LENS.project(x_in_cam)
+    inside = np.flatnonzero((x_in_cam[:, 2] > 0.2) & (np.abs(px / [640, 480] - 0.5) < 0.5).all(axis=1))
+    chosen = np.sort(rng.permutation(inside)[:_MAX_OBSERVATIONS])
     return chosen, px[chosen]
 
 
 def _registered(path: Trajectory, cloud: np.ndarray, rng: np.random.Generator) -> Registration:
-    """Tracks name their point as feature of the camera's first keyframe."""
+    """Return a registration; each track starts at a feature of the camera's first keyframe."""
     first = path.status.index(FrameStatus.KEYFRAME)
     rows = [
-        (index, *_seen_by(path.gauge_from_cam[index], cloud, rng)) for index in np.flatnonzero(path.localised)
+        (index, *_observe(path.gauge_from_cam[index], cloud, rng)) for index in np.flatnonzero(path.localised)
     ]
     counts = [len(points) for _, points, _ in rows]
     features = np.concatenate([points for _, points, _ in rows])
@@ -164,12 +170,12 @@ def _registered(path: Trajectory, cloud: np.ndarray, rng: np.random.Generator) -
 
 
 def _map(paths: tuple[Trajectory, ...], cloud: np.ndarray, rng: np.random.Generator) -> Map:
-    """Every keyframe sees its points; a camera's first one sees all, so any track has a feature there."""
+    """Return a map. A camera's first keyframe observes all points, so every track has a feature there."""
     names, frames, poses, keyframe, point, pixels = [], [], [], [], [], []
     for path in paths:
         keys = [index for index, status in enumerate(path.status) if status is FrameStatus.KEYFRAME]
         for order, index in enumerate(keys):
-            chosen, px = _seen_by(path.gauge_from_cam[index], cloud, rng)
+            chosen, px = _observe(path.gauge_from_cam[index], cloud, rng)
             if order == 0:
                 chosen, px = np.arange(len(cloud)), np.zeros((len(cloud), 2))
                 px[:] = np.nan_to_num(
@@ -211,7 +217,7 @@ def _selection(path: Trajectory, rng: np.random.Generator) -> KeyframeSelection:
 
 
 def written(inputs: ReportInputs, folder: Path) -> str:
-    """The text of the page that is written into the folder."""
+    """Write the page into a folder and return its text."""
     path = folder / "report.html"
     write_report(inputs, path, StageContext(work_dir=folder))
     return path.read_text(encoding="utf-8")

@@ -22,8 +22,8 @@ from bodycap_batch.core.errors import BodycapError, JobError
 
 if TYPE_CHECKING:
     from bodycap_batch.config.models import Job
-    from bodycap_batch.report.inputs import ReportInputs
-    from bodycap_batch.report.marks import Marks
+    from bodycap_batch.report.frame_overlays import FrameOverlays
+    from bodycap_batch.report.report_inputs import ReportInputs
 
 _REPORT_FILES = ("report.html", "partial/report.html")
 
@@ -54,7 +54,7 @@ def view(
     from bodycap_batch.capture import open_capture
     from bodycap_batch.config.job import Overrides, load_job
     from bodycap_batch.report.recording import write_recording
-    from bodycap_batch.report.serving import LOOPBACK, make_server, what_to_serve
+    from bodycap_batch.report.serving import LOOPBACK, make_served_content, make_server
 
     file, folder = job_from_path(job)
     resolved = load_job(file, Overrides(out=out or folder))
@@ -68,7 +68,8 @@ def view(
     if page is None:
         raise JobError("there is no report", path=out_dir, hint="run the job, or `bodycap report` it")
     server = make_server(
-        what_to_serve(page, open_capture(resolved.capture), _StoredMarks(resolved, out_dir, store)), port
+        make_served_content(page, open_capture(resolved.capture), _StoredMarks(resolved, out_dir, store)),
+        port,
     )
     address = f"http://{LOOPBACK}:{server.server_port}/report.html?videos"
     typer.echo(f"{address}  (Ctrl-C ends)")
@@ -94,21 +95,21 @@ class _StoredMarks:
     def __init__(self, job: Job, out_dir: Path, store: Path) -> None:
         self._of = (job, out_dir, store)
         self._lock = threading.Lock()
-        self._marks: Marks | None = None
+        self._marks: FrameOverlays | None = None
         self._looked = False
 
     def __call__(self, camera: str, first: int) -> list[dict[str, Any]]:
         """Marks of a part of a camera's frames; none where the store does not hold them."""
-        from bodycap_batch.report.serving import MARKS_EACH
+        from bodycap_batch.report.serving import FRAMES_PER_PART
 
         with self._lock:
             if not self._looked:
                 self._looked = True
                 self._marks = self._stored()
-            return [] if self._marks is None else self._marks.part(camera, first, MARKS_EACH)
+            return [] if self._marks is None else self._marks.describe_part(camera, first, FRAMES_PER_PART)
 
-    def _stored(self) -> Marks | None:
-        from bodycap_batch.report.marks import Marks
+    def _stored(self) -> FrameOverlays | None:
+        from bodycap_batch.report.frame_overlays import FrameOverlays
 
         try:
             inputs = _stored_inputs(*self._of)
@@ -116,7 +117,7 @@ class _StoredMarks:
             lacking = error.message
         else:
             if inputs.registrations:
-                return Marks(inputs)
+                return FrameOverlays(inputs)
             lacking = "the store no longer holds this job's camera paths (run it again)"
         typer.echo(f"points and skeleton are drawn over the stored pictures only: {lacking}", err=True)
         return None

@@ -1,18 +1,20 @@
-"""The solved body and the map's points as a camera sees them, and both drawn into its picture."""
+"""The solved body and the map's points in each camera's images, and their drawing."""
 
-from bodycap_batch.overlay.body import Body, Bones, body_of
-from bodycap_batch.overlay.drawing import draw_overlay
-from bodycap_batch.overlay.projection import BoneLine, bone_lines
-from bodycap_batch.overlay.views import CameraView, SeenPoints, camera_views
+from bodycap_batch.overlay.bone_motion import BoneMotion, Bones, bones_from_motion
+from bodycap_batch.overlay.bone_projection import BoneLine, project_bones
+from bodycap_batch.overlay.camera_views import CameraView, ObservedPoints, make_camera_views
+from bodycap_batch.overlay.drawing import Colour, RgbImage, draw_overlay
 
 __all__ = [
-    "Body",
     "BoneLine",
+    "BoneMotion",
     "Bones",
     "CameraView",
-    "SeenPoints",
-    "body_of",
-    "bone_lines",
-    "camera_views",
+    "Colour",
+    "ObservedPoints",
+    "RgbImage",
+    "bones_from_motion",
     "draw_overlay",
+    "make_camera_views",
+    "project_bones",
 ]

@@ -1,4 +1,4 @@
-"""Overlays drawn into an RGB picture."""
+"""Overlays drawn into RGB images."""
 
 from __future__ import annotations
 
@@ -9,90 +9,104 @@ import numpy.typing as npt
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX
-from bodycap_batch.overlay.projection import BoneLine
-from bodycap_batch.overlay.views import SeenPoints
+from bodycap_batch.overlay.bone_projection import BoneLine
+from bodycap_batch.overlay.camera_views import ObservedPoints
 
-Picture = npt.NDArray[np.uint8]
+RgbImage = npt.NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
-LEFT, RIGHT, MIDDLE = (86, 180, 233), (240, 150, 20), (250, 250, 250)
-"""Sky blue, orange and white: told apart by the colour-blind (M. Okabe, K. Ito, Color Universal Design)."""
-_OUTLINE = (20, 20, 20)
-_GOOD, _BAD = np.array([60.0, 220.0, 120.0]), np.array([235.0, 60.0, 60.0])
-_BAD_PX = 3.0
-"""Error at 640 px width that is drawn fully red."""
-_SHADES = 6
-_SUBPIXEL = 4
+LEFT_COLOUR, RIGHT_COLOUR, MIDDLE_COLOUR = (86, 180, 233), (240, 150, 20), (250, 250, 250)
+"""RGB: sky blue, orange and white.
+
+Colour-blind people can tell them apart.
+Source: M. Okabe, K. Ito, Color Universal Design.
+"""
+_OUTLINE_COLOUR = (20, 20, 20)
+"""RGB of the dark border around bones."""
+_SMALL_ERROR_COLOUR, _LARGE_ERROR_COLOUR = np.array([60.0, 220.0, 120.0]), np.array([235.0, 60.0, 60.0])
+"""RGB of points with no error and with an error of at least `_LARGE_ERROR_PX`: green and red."""
+_LARGE_ERROR_PX = 3.0
+"""Reprojection error that is drawn fully red, pixels at an image width of 640. Evidence: none."""
+_COLOUR_STEPS = 6
+"""Different colours from green to red. OpenCV is called once for each."""
+SUBPIXEL_BITS = 4
+"""Fractional bits of OpenCV's fixed-point coordinates: sixteenths of a pixel."""
 
 
 def side_colour(side: str) -> Colour:
-    """The colour of a bone: left, right, or the middle of the body."""
-    return {"Left": LEFT, "Right": RIGHT}.get(side, MIDDLE)
+    """Return the colour of a bone on the left side, the right side or in the middle of the body."""
+    return {"Left": LEFT_COLOUR, "Right": RIGHT_COLOUR}.get(side, MIDDLE_COLOUR)
 
 
 def draw_overlay(
-    image: Picture,
+    image: RgbImage,
     width_px: int,
-    points: SeenPoints | None,
+    points: ObservedPoints | None,
     lines: Sequence[BoneLine],
     sides: Sequence[str],
-) -> Picture:
-    """Draw into a copy of a picture.
+) -> RgbImage:
+    """Draw points and bones into a copy of an image.
 
-    Points stand where the solved pose projects them, green where that is right and red where it is off,
-    with a hair to where the picture shows them. Measured bones are solid, inferred ones dashed and thinner.
+    A dot marks where the solved pose projects a point. It is green if the error is small and red if the error
+    is large. A thin line leads from it to the observed pixel. Measured bones are solid; inferred bones are
+    thinner and dashed.
 
     Args:
         image: (H,W,3) RGB, any size.
-        width_px: Width of the pictures that `points` and `lines` speak of (the lens's).
-        points: From `CameraView.points_at`.
-        lines: From `bone_lines`.
-        sides: Side of each bone, as `Body.side`.
+        width_px: Width of the images to which the pixels of `points` and `lines` belong (the lens's width).
+        points: From `CameraView.inliers_at`.
+        lines: From `project_bones`.
+        sides: Side of each bone, as `BoneMotion.sides`.
     """
-    out = np.ascontiguousarray(image).copy()
+    drawn = np.ascontiguousarray(image).copy()
     scale = image.shape[1] / width_px
     if points is not None:
-        _draw_points(out, points, scale, _BAD_PX * width_px / 640.0)
-    thin = max(1, round(image.shape[1] / 420))
-    for outline in (True, False):
+        _draw_points(drawn, points, scale, _LARGE_ERROR_PX * width_px / 640.0)
+    thickness = max(1, round(image.shape[1] / 420))
+    for is_outline in (True, False):
         for line in lines:
-            colour = _OUTLINE if outline else side_colour(sides[line.bone])
-            _draw_bone(out, line, scale, colour, thin + (2 if outline else 0))
-    return out
+            colour = _OUTLINE_COLOUR if is_outline else side_colour(sides[line.bone])
+            _draw_bone(drawn, line, scale, colour, thickness + (2 if is_outline else 0))
+    return drawn
 
 
-def _draw_points(image: Picture, points: SeenPoints, scale: float, bad_px: float) -> None:
-    """One call for all points of a shade: a dot is a line of no length, and hides a hair that ends in it."""
+def _draw_points(image: RgbImage, points: ObservedPoints, scale: float, large_error_px: float) -> None:
+    """Draw all points of one colour with one call.
+
+    A dot is a line of length zero. The line to the observed pixel is omitted if the dot covers that pixel.
+    """
     import cv2
 
-    shade = np.round(np.clip(points.error_px / bad_px, 0.0, 1.0) * (_SHADES - 1)).astype(int)
-    there, seen = _fixed(points.px, scale), _fixed(points.observed_px, scale)
-    width = 1 + 2 * max(1, round(image.shape[1] / 480))
-    outside = np.linalg.norm(seen - there, axis=1) > 0.5 * width * (1 << _SUBPIXEL)
-    for step in range(_SHADES):
-        mine = shade == step
-        if not mine.any():
+    error_share = np.clip(points.error_px / large_error_px, 0.0, 1.0)
+    step_of_point = np.round(error_share * (_COLOUR_STEPS - 1)).astype(int)
+    projected, observed = _fixed_point(points.px, scale), _fixed_point(points.observed_px, scale)
+    diameter = 1 + 2 * max(1, round(image.shape[1] / 480))
+    outside_dot = np.linalg.norm(observed - projected, axis=1) > 0.5 * diameter * (1 << SUBPIXEL_BITS)
+    for step in range(_COLOUR_STEPS):
+        in_step = step_of_point == step
+        if not in_step.any():
             continue
-        share = step / (_SHADES - 1)
-        colour = np.round((1.0 - share) * _GOOD + share * _BAD).astype(int).tolist()
-        hairs = np.stack([there, seen], axis=1)[mine & outside]
-        dots = np.stack([there[mine], there[mine]], axis=1)
-        cv2.polylines(image, list(hairs), False, colour, 1, cv2.LINE_AA, _SUBPIXEL)
-        cv2.polylines(image, list(dots), False, colour, width, cv2.LINE_AA, _SUBPIXEL)
+        share = step / (_COLOUR_STEPS - 1)
+        colour = np.round((1.0 - share) * _SMALL_ERROR_COLOUR + share * _LARGE_ERROR_COLOUR)
+        rgb = colour.astype(int).tolist()
+        error_lines = np.stack([projected, observed], axis=1)[in_step & outside_dot]
+        dots = np.stack([projected[in_step], projected[in_step]], axis=1)
+        cv2.polylines(image, list(error_lines), False, rgb, 1, cv2.LINE_AA, SUBPIXEL_BITS)
+        cv2.polylines(image, list(dots), False, rgb, diameter, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
-def _draw_bone(image: Picture, line: BoneLine, scale: float, colour: Colour, thickness: int) -> None:
+def _draw_bone(image: RgbImage, line: BoneLine, scale: float, colour: Colour, thickness: int) -> None:
     import cv2
 
-    at = _fixed(line.px, scale)
-    pieces = [at] if line.observed else [at[start : start + 2] for start in range(0, len(at) - 1, 2)]
+    px = _fixed_point(line.px, scale)
+    pieces = [px] if line.observed else [px[start : start + 2] for start in range(0, len(px) - 1, 2)]
     thickness += int(line.observed)
-    cv2.polylines(image, pieces, False, colour, thickness, cv2.LINE_AA, _SUBPIXEL)
+    cv2.polylines(image, pieces, False, colour, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
     if line.observed:
-        joints = [at[[0, 0]], at[[-1, -1]]]
-        cv2.polylines(image, joints, False, colour, thickness + 2, cv2.LINE_AA, _SUBPIXEL)
+        joints = [px[[0, 0]], px[[-1, -1]]]
+        cv2.polylines(image, joints, False, colour, thickness + 2, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
-def _fixed(px: FloatArray, scale: float) -> npt.NDArray[np.int32]:
-    """COLMAP pixels of another size as OpenCV's fixed-point coordinates."""
-    return np.asarray(np.round((px * scale - CV2_PIXEL_OFFSET_PX) * (1 << _SUBPIXEL)), dtype=np.int32)
+def _fixed_point(px: FloatArray, scale: float) -> npt.NDArray[np.int32]:
+    """Convert COLMAP pixels to OpenCV's fixed-point pixels of an image that is `scale` times as large."""
+    return np.asarray(np.round((px * scale - CV2_PIXEL_OFFSET_PX) * (1 << SUBPIXEL_BITS)), dtype=np.int32)

@@ -1,4 +1,4 @@
-"""One camera's video with everything solved drawn into it, and a line that says how its frame went."""
+"""One camera's video in the preview, with overlays and a line of text about each frame's pose."""
 
 from __future__ import annotations
 
@@ -7,19 +7,24 @@ from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.model.scene import FrameStatus
-from bodycap_batch.overlay import Body, CameraView, SeenPoints, bone_lines, draw_overlay
+from bodycap_batch.overlay import (
+    BoneMotion,
+    CameraView,
+    Colour,
+    ObservedPoints,
+    RgbImage,
+    draw_overlay,
+    project_bones,
+)
+from bodycap_batch.preview.labels import AMBER, GREEN, GREY, RED, draw_text, shorten_to_width, text_width_px
 from bodycap_batch.preview.layout import Box
-from bodycap_batch.preview.text import AMBER, GREEN, GREY, RED, Colour, shortened, width_of, write
-
-Picture = npt.NDArray[np.uint8]
 
 WORLD = "world"
-_REASONS = {
+_LOSS_REASONS = {
     FrameStatus.BLUR: "blurred",
     FrameStatus.FEW_TRACKS: "too little could be followed",
     FrameStatus.FEW_INLIERS: "too few points agree",
@@ -28,50 +33,52 @@ _REASONS = {
     FrameStatus.UNCONFIRMED: "no neighbour confirms it",
     FrameStatus.NO_MAP: "not in the map",
 }
-_DIMMED = 0.45
+_LOST_BRIGHTNESS = 0.45
+"""Factor on the brightness of lost frames. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Tile:
-    """One camera's place in the preview.
+class VideoTile:
+    """One camera's video in the preview.
 
     Attributes:
-        camera: Its video.
-        view: What it saw; None where no map took it.
-        frames: (F,) index of the frame shown in each picture, −1 where the video has none.
-        picture: Where the video stands.
-        bar: Where the text stands.
-        colour: The colour of its path in the room.
+        camera: The camera with its videos.
+        view: Its poses and observations; None if it is in no map.
+        frames: (F,) index of the video frame in each frame of the preview, −1 if the video has none.
+        video_box: Position of the video.
+        label_box: Position of the line of text.
+        colour: Colour of the camera's path in the room.
     """
 
     camera: CaptureCamera
     view: CameraView | None
     frames: IntArray
-    picture: Box
-    bar: Box
+    video_box: Box
+    label_box: Box
     colour: Colour
 
     def poses(self) -> FloatArray:
-        """(N,4,4) the camera's poses, NaN where there is none; nothing where no map took it."""
+        """Return the camera's poses (N,4,4), NaN for lost frames; N is zero if the camera is in no map."""
         return np.zeros((0, 4, 4)) if self.view is None else self.view.frame_from_cam
 
-    def images(self) -> Generator[Picture | None, None, None]:
-        """The video's picture (H,W,3) at the tile's size for each picture of the preview."""
-        size = (self.picture.width, self.picture.height)
-        wanted = np.unique(self.frames[self.frames >= 0])
+    def images(self) -> Generator[RgbImage | None, None, None]:
+        """Yield the video's image (H,W,3) at the tile's size for each frame of the preview, or None."""
+        size = (self.video_box.width, self.video_box.height)
+        shown = np.unique(self.frames[self.frames >= 0])
         index, image = -1, None
-        with closing(self.camera.read(wanted, colour=True)) as stream:
+        with closing(self.camera.read(shown, colour=True)) as stream:
             for frame in self.frames.tolist():
                 while index < frame:
-                    index, full = next(stream)
-                    image = resized(full, size)
+                    index, full_image = next(stream)
+                    image = resize_image(full_image, size)
                 yield image if frame >= 0 else None
 
 
-def resized(image: Picture, size: tuple[int, int]) -> Picture:
-    """A picture (H,W,3) at (width, height): halved while it is twice as large, then interpolated.
+def resize_image(image: RgbImage, size: tuple[int, int]) -> RgbImage:
+    """Return an image (H,W,3) at (width, height).
 
-    Averaging right to the size, which aliases hardly less, takes 3 ms for 640×480, this a fifth of it.
+    It is halved while it is at least twice too large, and then interpolated. Averaging directly to the size
+    has hardly less aliasing and takes five times as long: 3 ms for 640×480.
     """
     import cv2
 
@@ -82,71 +89,96 @@ def resized(image: Picture, size: tuple[int, int]) -> Picture:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
 
 
-def frames_at(camera: CaptureCamera, times_ns: IntArray) -> IntArray:
-    """(F,) the frame nearest to each common time, −1 before the video's first and after its last."""
-    own = camera.common_times_ns()
-    if not len(own):
+def nearest_frames(camera: CaptureCamera, times_ns: IntArray) -> IntArray:
+    """Return the frame (F,) nearest to each common time, −1 before the video starts and after it ends."""
+    frame_times = camera.common_times_ns()
+    if not len(frame_times):
         return np.full(len(times_ns), -1, dtype=np.int64)
-    after = np.clip(np.searchsorted(own, times_ns), 1, max(1, len(own) - 1))
-    after = np.minimum(after, len(own) - 1)
+    after = np.clip(np.searchsorted(frame_times, times_ns), 1, max(1, len(frame_times) - 1))
+    after = np.minimum(after, len(frame_times) - 1)
     before = np.maximum(after - 1, 0)
-    nearest = np.where(np.abs(own[before] - times_ns) <= np.abs(own[after] - times_ns), before, after)
-    interval = np.median(np.diff(own)) if len(own) > 1 else 1e9 / camera.nominal_fps
-    inside = (times_ns >= own[0] - 0.5 * interval) & (times_ns <= own[-1] + 0.5 * interval)
+    nearest = np.where(
+        np.abs(frame_times[before] - times_ns) <= np.abs(frame_times[after] - times_ns), before, after
+    )
+    interval = np.median(np.diff(frame_times)) if len(frame_times) > 1 else 1e9 / camera.nominal_fps
+    inside = (times_ns >= frame_times[0] - 0.5 * interval) & (times_ns <= frame_times[-1] + 0.5 * interval)
     return np.asarray(np.where(inside, nearest, -1), dtype=np.int64)
 
 
-def draw_tile(image: Picture, tile: Tile, shown: Picture | None, frame: int, body: Body | None) -> None:
-    """Draw a camera's picture and its line of text into the preview's picture."""
+def draw_tile(
+    image: RgbImage,
+    tile: VideoTile,
+    video_image: RgbImage | None,
+    frame: int,
+    bone_motion: BoneMotion | None,
+) -> None:
+    """Draw a camera's video frame and its line of text into the preview's image.
+
+    Args:
+        image: The preview's image; it is changed.
+        tile: The camera.
+        video_image: The video frame at the tile's size; None if the video has none at this time.
+        frame: Index of the video frame, −1 if there is none.
+        bone_motion: The body; None if there is none.
+    """
     status = FrameStatus.NO_MAP if tile.view is None or frame < 0 else tile.view.status[frame]
-    points = None if tile.view is None or frame < 0 else tile.view.points_at(frame)
-    box = tile.picture
-    if shown is not None:
-        painted = _painted(shown, tile.view, frame, points, body)
+    points = None if tile.view is None or frame < 0 else tile.view.inliers_at(frame)
+    box = tile.video_box
+    if video_image is not None:
+        painted = _with_overlay(video_image, tile.view, frame, points, bone_motion)
         if not status.localised:
-            painted = (painted * _DIMMED).astype(np.uint8)
+            painted = (painted * _LOST_BRIGHTNESS).astype(np.uint8)
         image[box.y : box.y + box.height, box.x : box.x + box.width] = painted
-    if shown is None:
+    if video_image is None:
         text, colour = "no picture at this time", GREY
     else:
-        text, colour = status_line(status, points)
-    _frame(image, box, colour)
-    base = (tile.bar.x + 2, tile.bar.y + 16)
-    image[base[1] - 9 : base[1], base[0] : base[0] + 9] = tile.colour
-    name = shortened(tile.camera.name, tile.bar.width // 2)
-    start = write(image, name, (base[0] + 14, base[1])) + 10
-    room = tile.bar.x + tile.bar.width - start
+        text, colour = describe_status(status, points)
+    _draw_border(image, box, colour)
+    label_box = tile.label_box
+    x, baseline = label_box.x + 2, label_box.y + 16
+    image[baseline - 9 : baseline, x : x + 9] = tile.colour
+    name = shorten_to_width(tile.camera.name, label_box.width // 2)
+    text_start = draw_text(image, name, (x + 14, baseline)) + 10
+    free_px = label_box.x + label_box.width - text_start
     text = next(
-        (each for each in (text, text.partition(",")[0]) if width_of(each) < room), shortened(text, room)
+        (words for words in (text, text.partition(",")[0]) if text_width_px(words) < free_px),
+        shorten_to_width(text, free_px),
     )
-    write(image, text, (start + room - width_of(text) - 2, base[1]), colour)
+    draw_text(image, text, (text_start + free_px - text_width_px(text) - 2, baseline), colour)
 
 
-def _painted(
-    shown: Picture, view: CameraView | None, frame: int, points: SeenPoints | None, body: Body | None
-) -> Picture:
+def _with_overlay(
+    video_image: RgbImage,
+    view: CameraView | None,
+    frame: int,
+    points: ObservedPoints | None,
+    bone_motion: BoneMotion | None,
+) -> RgbImage:
     if view is None or points is None:
-        return shown
+        return video_image
     cam_from_frame = view.cam_from_frame(frame)
     if cam_from_frame is None:
-        return shown
-    bones = body.at(int(view.times_ns[frame])) if body is not None and view.frame == WORLD else None
-    lines = [] if bones is None else bone_lines(view.lens, cam_from_frame, bones)
-    return draw_overlay(shown, view.lens.width_px, points, lines, () if body is None else body.side)
+        return video_image
+    bones = None
+    if bone_motion is not None and view.reference_frame == WORLD:
+        bones = bone_motion.bones_at(int(view.times_ns[frame]))
+    lines = [] if bones is None else project_bones(view.lens, cam_from_frame, bones)
+    sides = () if bone_motion is None else bone_motion.sides
+    return draw_overlay(video_image, view.lens.width_px, points, lines, sides)
 
 
-def status_line(status: FrameStatus, points: SeenPoints | None) -> tuple[str, Colour]:
-    """What the line below a frame says of its pose."""
+def describe_status(status: FrameStatus, points: ObservedPoints | None) -> tuple[str, Colour]:
+    """Return the text about a frame's pose and its colour."""
     if not status.localised or points is None:
-        return f"lost: {_REASONS.get(status, status.value)}", RED
+        return f"lost: {_LOSS_REASONS.get(status, status.value)}", RED
     name = {FrameStatus.KEYFRAME: "keyframe", FrameStatus.RIG: "carried by the rig"}.get(status, "")
-    if not len(points.px):  # what a second look found is not kept point by point
+    if not len(points.px):  # recovery stores no observations
         return name or "found again", AMBER
     text = f"{len(points.px)} points, {float(points.error_px.mean()):.1f} px"
     return f"{name} · {text}" if name else text, GREEN
 
 
-def _frame(image: Picture, box: Box, colour: Colour) -> None:
+def _draw_border(image: RgbImage, box: Box, colour: Colour) -> None:
     import cv2
 
     corner = (box.x + box.width, box.y + box.height)

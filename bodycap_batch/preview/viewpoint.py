@@ -1,4 +1,4 @@
-"""The camera that looks at the body in its room."""
+"""The virtual camera that shows the body in its room."""
 
 from __future__ import annotations
 
@@ -10,28 +10,37 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import transform_points
 
 _FIELD_RAD = float(np.deg2rad(42.0))
+"""Field of view over the shorter side of the image, radians. Evidence: none."""
 _ELEVATION_RAD = float(np.deg2rad(17.0))
-_SIDES_RAD = tuple(float(np.deg2rad(side)) for side in (35, -35, 75, -75, 110, -110, 145, -145))
-"""Where the view may stand at the middle of its sway: best before the body, which starts out towards −Y."""
-_ENOUGH = 0.6
-"""A side is taken before a better one that shows at most so much more of the room: 1 / 0.6."""
+"""Angle by which the camera looks down, radians. Evidence: none."""
+_AZIMUTHS_RAD = tuple(float(np.deg2rad(side)) for side in (35, -35, 75, -75, 110, -110, 145, -145))
+"""Candidate azimuths, radians, the preferred ones first.
+
+Zero is in front of a body that faces -Y, the direction in which it starts to walk.
+"""
+_MIN_SHARE_OF_BEST = 0.6
+"""Share of the best azimuth's visible points from which an earlier azimuth is preferred. Evidence: none."""
 _SWAY_RAD = float(np.deg2rad(22.0))
-_SWAY_S = 24.0
-_CALM_S = 1.0
-"""The view follows the body as smoothed by a Gaussian of this sigma: steps do not shake it."""
-_TRIED = 8
+"""Amplitude of the camera's slow rotation about the body, radians; it shows depth. Evidence: none."""
+_SWAY_PERIOD_S = 24.0
+"""Period of that rotation, seconds of the preview. Evidence: none."""
+_SMOOTHING_SIGMA_S = 1.0
+"""Sigma of the Gaussian that smooths the target's path, seconds. Steps are shorter and do not shake it."""
+_SAMPLED_TARGETS = 8
+"""Target positions for which an azimuth's visible points are counted. Evidence: none."""
 _MARGIN = 1.1
+"""Factor on the distance; it leaves free space around the body. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Viewpoint:
-    """A pinhole camera over a picture.
+    """A pinhole camera.
 
     Attributes:
-        size: Width and height, pixels.
-        focal_px: Focal length.
+        size: Width and height of its image, pixels.
+        focal_px: Focal length, pixels.
         cam_from_room: (4,4), x right, y down, z forward.
-        distance: From the camera to what it looks at.
+        distance: Distance from the camera to its target, in the room's unit.
     """
 
     size: tuple[int, int]
@@ -40,70 +49,84 @@ class Viewpoint:
     distance: float
 
     def project(self, x_in_room: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixels (...,2) of OpenCV's origin and depths (...); behind the camera pixels mean nothing."""
+        """Return pixels (...,2) with OpenCV's origin, and depths (...).
+
+        The pixels of points behind the camera are meaningless.
+        """
         x_in_cam = transform_points(self.cam_from_room, x_in_room)
         depth = x_in_cam[..., 2]
-        safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
+        divisor = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
         centre = 0.5 * np.array(self.size)
-        return x_in_cam[..., :2] / safe[..., None] * self.focal_px + centre, depth
+        return x_in_cam[..., :2] / divisor[..., None] * self.focal_px + centre, depth
 
 
-def follow(
-    target: FloatArray, seconds: FloatArray, size: tuple[int, int], reach: float, room: FloatArray
+def follow_target(
+    target: FloatArray, seconds: FloatArray, size: tuple[int, int], reach: float, points: FloatArray
 ) -> list[Viewpoint]:
-    """One viewpoint a picture: calm, at a fixed distance that frames the target, swaying to show depth.
+    """Return a smoothly moving viewpoint for each frame of the preview.
+
+    Its distance to the target is constant and shows the whole target. It rotates slowly to show depth.
 
     Args:
-        target: (F,3) what to look at in each picture, Z up.
-        seconds: (F,) when, in the preview's time.
-        size: Width and height of the picture.
-        reach: What has to be seen around the target.
-        room: (P,3) points of the room; the view stands where it sees them behind the target.
+        target: (F,3) position to look at in each frame, Z up.
+        seconds: (F,) time of each frame in the preview.
+        size: Width and height of the image, pixels.
+        reach: Radius around the target that must be visible.
+        points: (P,3) points of the room; the camera stands where it sees them behind the target.
     """
-    calm = _smoothed(target, seconds)
-    focal = 0.5 * min(size) / np.tan(0.5 * _FIELD_RAD)
-    astray = float(np.linalg.norm(target - calm, axis=1).max(initial=0.0))
-    # A body is higher than wide: so much it may stray to the side and still be whole in the picture.
-    distance = _MARGIN * max(reach, 0.6 * reach + astray) / np.tan(0.5 * _FIELD_RAD)
-    phase = 2.0 * np.pi * seconds / _SWAY_S
+    smooth_target = _smooth_path(target, seconds)
+    focal_px = 0.5 * min(size) / np.tan(0.5 * _FIELD_RAD)
+    deviation = float(np.linalg.norm(target - smooth_target, axis=1).max(initial=0.0))
+    # A body is higher than wide. It may deviate sideways by 0.4 of its reach and still be wholly visible.
+    distance = _MARGIN * max(reach, 0.6 * reach + deviation) / np.tan(0.5 * _FIELD_RAD)
+    phase = 2.0 * np.pi * seconds / _SWAY_PERIOD_S
 
-    def view(point: FloatArray, turn_rad: float) -> Viewpoint:
-        pose = _looking(point, turn_rad, distance)
-        return Viewpoint(size=size, focal_px=focal, cam_from_room=pose, distance=distance)
+    def viewpoint(position: FloatArray, azimuth_rad: float) -> Viewpoint:
+        pose = _look_at(position, azimuth_rad, distance)
+        return Viewpoint(size=size, focal_px=focal_px, cam_from_room=pose, distance=distance)
 
-    some = calm[:: max(1, len(calm) // _TRIED)]
-    seen = [sum(_seen_behind(view(point, side), room) for point in some) for side in _SIDES_RAD]
-    side = next(side for side, count in zip(_SIDES_RAD, seen, strict=True) if count >= _ENOUGH * max(seen))
-    turns = side + _SWAY_RAD * np.sin(phase)
-    return [view(point, float(turn)) for point, turn in zip(calm, turns, strict=True)]
+    samples = smooth_target[:: max(1, len(smooth_target) // _SAMPLED_TARGETS)]
+    visible = [
+        sum(_count_points_behind_target(viewpoint(position, azimuth), points) for position in samples)
+        for azimuth in _AZIMUTHS_RAD
+    ]
+    azimuth = next(
+        azimuth
+        for azimuth, count in zip(_AZIMUTHS_RAD, visible, strict=True)
+        if count >= _MIN_SHARE_OF_BEST * max(visible)
+    )
+    azimuths = azimuth + _SWAY_RAD * np.sin(phase)
+    return [
+        viewpoint(position, float(angle)) for position, angle in zip(smooth_target, azimuths, strict=True)
+    ]
 
 
-def _seen_behind(view: Viewpoint, room: FloatArray) -> int:
-    """How many points of the room a view shows behind what it looks at."""
-    px, depth = view.project(room)
+def _count_points_behind_target(view: Viewpoint, points: FloatArray) -> int:
+    """Count the points of the room that are visible and farther away than the target."""
+    px, depth = view.project(points)
     inside = (px > 0.0).all(axis=-1) & (px < np.array(view.size)).all(axis=-1)
     return int((inside & (depth > view.distance)).sum())
 
 
-def _looking(point: FloatArray, turn_rad: float, distance: float) -> FloatArray:
-    """Pose (4,4) of a camera that looks down at a point from −Y, turned about Z."""
+def _look_at(position: FloatArray, azimuth_rad: float, distance: float) -> FloatArray:
+    """Return cam_from_room (4,4) of a camera that looks down at a position, at azimuth zero from -Y."""
     level, lift = np.cos(_ELEVATION_RAD), np.sin(_ELEVATION_RAD)
-    away = np.array([np.sin(turn_rad) * level, -np.cos(turn_rad) * level, lift])
-    forward = -away
+    to_camera = np.array([np.sin(azimuth_rad) * level, -np.cos(azimuth_rad) * level, lift])
+    forward = -to_camera
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
-    out = np.eye(4)
-    out[:3, :3] = rotation
-    out[:3, 3] = -rotation @ (point + distance * away)
-    return out
+    cam_from_room = np.eye(4)
+    cam_from_room[:3, :3] = rotation
+    cam_from_room[:3, 3] = -rotation @ (position + distance * to_camera)
+    return cam_from_room
 
 
-def _smoothed(target: FloatArray, seconds: FloatArray) -> FloatArray:
-    """The target's way (F,3) under a Gaussian in time."""
-    out = np.empty_like(target)
+def _smooth_path(target: FloatArray, seconds: FloatArray) -> FloatArray:
+    """Smooth the target's path (F,3) with a Gaussian in time."""
+    smooth = np.empty_like(target)
     for index, now in enumerate(seconds):
-        first, stop = np.searchsorted(seconds, [now - 4 * _CALM_S, now + 4 * _CALM_S])
-        weight = np.exp(-0.5 * ((seconds[first:stop] - now) / _CALM_S) ** 2)
-        out[index] = weight @ target[first:stop] / weight.sum()
-    return out
+        first, stop = np.searchsorted(seconds, [now - 4 * _SMOOTHING_SIGMA_S, now + 4 * _SMOOTHING_SIGMA_S])
+        weight = np.exp(-0.5 * ((seconds[first:stop] - now) / _SMOOTHING_SIGMA_S) ** 2)
+        smooth[index] = weight @ target[first:stop] / weight.sum()
+    return smooth

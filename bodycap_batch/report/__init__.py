@@ -1,6 +1,6 @@
-"""The page a person reads after a job: verdict, viewer, figures; one file that works offline."""
+"""The page about a job: verdict, 3D viewer, figures and tables in one file that works offline."""
 
-from bodycap_batch.report.inputs import ReportInputs
-from bodycap_batch.report.stage import REPORT_FILE, write_report
+from bodycap_batch.report.report_inputs import ReportInputs
+from bodycap_batch.report.report_writer import REPORT_FILE, write_report
 
 __all__ = ["REPORT_FILE", "ReportInputs", "write_report"]

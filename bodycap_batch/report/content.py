@@ -1,4 +1,4 @@
-"""What stands on the page, section by section; the templates only lay it out."""
+"""The content of the page, section by section; the templates only lay it out."""
 
 from __future__ import annotations
 
@@ -7,41 +7,46 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.report.advice import advise
-from bodycap_batch.report.figures.body import before_and_after, before_optimisation
-from bodycap_batch.report.figures.matrix import matrix
-from bodycap_batch.report.figures.shared import shared
-from bodycap_batch.report.figures.strips import COLUMNS, columns_at, strip
+from bodycap_batch.report.drawn_scene import DrawnScene, common_times_s
+from bodycap_batch.report.figures.before_after import draw_before_and_after, find_unoptimised_bones
+from bodycap_batch.report.figures.camera_landmark_matrix import draw_camera_landmark_matrix
+from bodycap_batch.report.figures.camera_timeline import MAX_COLUMNS, column_count, draw_camera_timeline
+from bodycap_batch.report.figures.shared_landmarks import draw_shared_landmarks
+from bodycap_batch.report.frame_losses import LossCause
 from bodycap_batch.report.grades import Grade
-from bodycap_batch.report.inputs import ReportInputs
-from bodycap_batch.report.losses import Cause
-from bodycap_batch.report.lost import LostFrame, causes_by_camera
-from bodycap_batch.report.packing import Shown
-from bodycap_batch.report.placing import Placed, common_times_s
-from bodycap_batch.report.tables import headline_figures, tables_of
+from bodycap_batch.report.loss_diagnosis import DiagnosedLoss, count_frames_by_cause
+from bodycap_batch.report.metric_tables import headline_figures, make_tables
+from bodycap_batch.report.packing import PageBudget
+from bodycap_batch.report.recommendations import recommend_changes
+from bodycap_batch.report.report_inputs import ReportInputs
 from bodycap_batch.report.verdict import judge
 
-_SHEET = 24
-_DONE = {
+_SHEET_PICTURES = 24
+"""Most pictures of lost frames on the page: six rows of four on a wide screen."""
+_PROGRESS_AT_FAILURE = {
     "check": "no video was read",
-    "keyframes": "the videos were opened, keyframes were being chosen",
-    "map": "keyframes were chosen, the map could not be made",
-    "registration": "the map was made, frames were being registered",
-    "merge": "map and camera paths are done, the body could not be solved",
+    "keyframes": "the videos were opened; the selection of keyframes was not finished",
+    "map": "the keyframes were selected; the map could not be built",
+    "registration": "the map was built; the registration of frames was not finished",
+    "merge": "map and camera paths are finished; the body could not be solved",
 }
 
 
 def page_content(
-    inputs: ReportInputs, placed: Placed, lost: Sequence[LostFrame], tones: dict[str, str], shown: Shown
+    inputs: ReportInputs,
+    scene: DrawnScene,
+    losses: Sequence[DiagnosedLoss],
+    colours: dict[str, str],
+    budget: PageBudget,
 ) -> dict[str, Any]:
-    """Everything the templates need.
+    """Return the variables of the templates.
 
     Args:
         inputs: The results.
-        placed: What is drawn in three dimensions.
-        lost: Stretches of lost frames.
-        tones: Colour of each camera.
-        shown: How much was thinned.
+        scene: Maps and camera paths of the 3D viewer.
+        losses: The lost intervals of all cameras.
+        colours: Colour of each camera, ``#rrggbb``.
+        budget: Share of the budgets; it records what was thinned.
     """
     verdict = judge(inputs.metrics, inputs.failure)
     return {
@@ -49,71 +54,72 @@ def page_content(
         "verdict": verdict,
         "grades": Grade,
         "failure": inputs.failure,
-        "came_to": _came_to(inputs),
+        "progress": _progress_at_failure(inputs),
         "figures": list(headline_figures(inputs.metrics)) if inputs.metrics is not None else [],
-        "advice": advise(inputs, causes_by_camera(lost)),
-        "tables": tables_of(inputs),
-        "placed": placed,
-        "has_solid": placed.drawn,
+        "recommendations": recommend_changes(inputs, count_frames_by_cause(losses)),
+        "tables": make_tables(inputs),
+        "scene": scene,
+        "has_viewer": scene.has_content,
         "has_body": inputs.merge is not None,
-        "cameras": _cameras(inputs, lost, tones, shown),
-        "causes": {cause.value: words for cause, words in _CAUSES.items()},
-        "sheet": _sheet(lost, shown.of(_SHEET)),
-        "sheet_of": len(lost),
-        "matrix": matrix(inputs, tones, shown.share),
-        "shared": shared(inputs),
-        "bodies": before_and_after(inputs, tones),
-        "before": _before(inputs),
-        "thinned": shown.lines(),
+        "cameras": _cameras(inputs, losses, colours, budget),
+        "causes": {cause.value: criterion for cause, criterion in _CAUSE_CRITERIA.items()},
+        "lost_pictures": _lost_pictures(losses, budget.scaled(_SHEET_PICTURES)),
+        "loss_count": len(losses),
+        "matrix": draw_camera_landmark_matrix(inputs, colours, budget.share),
+        "shared": draw_shared_landmarks(inputs),
+        "bodies": draw_before_and_after(inputs, colours),
+        "before": _distances_before_optimisation(inputs),
+        "thinned": budget.thinned_lines(),
     }
 
 
-_CAUSES = {
-    Cause.DARK: "mean brightness of the lost frame below 30 of 255",
-    Cause.FAST: "more than 8° of turn per frame beside the gap",
-    Cause.BLUR: "sharpness below 60 % of the registered frames'",
-    Cause.PLAIN: "under 30 % of the corners of the camera's registered frames",
-    Cause.SHALLOW: "the points in view did not fix the position",
-    Cause.UNKNOWN_PLACE: "sharp and textured, but not matched by the map",
-    Cause.NO_MAP: "no map to register against",
+_CAUSE_CRITERIA = {
+    LossCause.DARK: "the mean brightness of the lost frame is below 30 of 255",
+    LossCause.FAST: "the camera turned more than 8° per frame next to the gap",
+    LossCause.BLUR: "the sharpness is below 60 % of that of the registered frames",
+    LossCause.PLAIN: "the frame has under 30 % of the corners of the camera's registered frames",
+    LossCause.SHALLOW: "the visible points did not determine the position",
+    LossCause.UNKNOWN_PLACE: "the frame is sharp and textured, but it does not match the map",
+    LossCause.NO_MAP: "there is no map for this camera",
 }
 
 
-def _came_to(inputs: ReportInputs) -> str:
+def _progress_at_failure(inputs: ReportInputs) -> str:
     stage = str((inputs.failure or {}).get("stage", ""))
-    return _DONE.get(stage, "")
+    return _PROGRESS_AT_FAILURE.get(stage, "")
 
 
 def _cameras(
-    inputs: ReportInputs, lost: Sequence[LostFrame], tones: dict[str, str], shown: Shown
+    inputs: ReportInputs, losses: Sequence[DiagnosedLoss], colours: dict[str, str], budget: PageBudget
 ) -> list[dict[str, Any]]:
-    span = _span(inputs)
-    causes = causes_by_camera(lost)
+    """Return the section of each camera."""
+    span = _time_span(inputs)
+    causes = count_frames_by_cause(losses)
     used = set() if inputs.merge is None else {path.camera for path in inputs.merge.trajectories}
-    out = []
-    if shown.share < 1.0:
-        shown.note("points of each curve over time", columns_at(shown.share), COLUMNS)
+    sections = []
+    if budget.share < 1.0:
+        budget.record("points of each curve over time", column_count(budget.share), MAX_COLUMNS)
     for name in inputs.cameras:
-        losses = [each.loss for each in lost if each.loss.camera == name]
+        camera_losses = [diagnosed.loss for diagnosed in losses if diagnosed.loss.camera == name]
         path = inputs.path(name)
-        out.append(
+        sections.append(
             {
                 "name": name,
-                "tone": tones[name],
-                "strip": strip(
-                    inputs, name, span, losses, inputs.max_gap_s if name in used else 0.0, shown.share
+                "tone": colours[name],
+                "timeline": draw_camera_timeline(
+                    inputs, name, span, camera_losses, inputs.max_gap_s if name in used else 0.0, budget.share
                 ),
                 "frames": 0 if path is None else len(path.status),
                 "registered": 0 if path is None else int(path.localised.sum()),
-                "stretches": len(losses),
+                "losses": len(camera_losses),
                 "causes": [(cause.value, frames) for cause, frames in causes.get(name, {}).items()],
             }
         )
-    return out
+    return sections
 
 
-def _span(inputs: ReportInputs) -> tuple[float, float]:
-    """First and last common time of all cameras."""
+def _time_span(inputs: ReportInputs) -> tuple[float, float]:
+    """Return the first and the last common time of all cameras, seconds."""
     ends: list[float] = []
     for name in inputs.cameras:
         path = inputs.path(name)
@@ -126,51 +132,56 @@ def _span(inputs: ReportInputs) -> tuple[float, float]:
     return (min(ends), max(ends)) if ends else (0.0, 1.0)
 
 
-def _sheet(lost: Sequence[LostFrame], most: int) -> list[dict[str, Any]]:
-    """The longest losses with a picture, in the order they happened."""
-    seen = sorted((each for each in lost if each.look is not None), key=lambda each: -each.loss.frames)
-    chosen = sorted(seen[:most], key=lambda each: (each.loss.start_s, each.loss.camera))
+def _lost_pictures(losses: Sequence[DiagnosedLoss], most: int) -> list[dict[str, Any]]:
+    """Return the longest losses that have a picture, in the order of time."""
+    with_picture = sorted(
+        (diagnosed for diagnosed in losses if diagnosed.appearance is not None),
+        key=lambda diagnosed: -diagnosed.loss.frame_count,
+    )
+    chosen = sorted(
+        with_picture[:most], key=lambda diagnosed: (diagnosed.loss.start_s, diagnosed.loss.camera)
+    )
     return [
         {
-            "camera": each.loss.camera,
-            "start": each.loss.start_s,
-            "frames": each.loss.frames,
-            "reason": each.loss.reason.value,
-            "cause": each.cause.value,
-            "facts": _facts(each),
-            "picture": each.look.picture,
+            "camera": diagnosed.loss.camera,
+            "start": diagnosed.loss.start_s,
+            "frames": diagnosed.loss.frame_count,
+            "reason": diagnosed.loss.reason.value,
+            "cause": diagnosed.cause.value,
+            "facts": _facts(diagnosed),
+            "picture": diagnosed.appearance.picture,
         }
-        for each in chosen
-        if each.look is not None
+        for diagnosed in chosen
+        if diagnosed.appearance is not None
     ]
 
 
-def _facts(each: LostFrame) -> str:
+def _facts(diagnosed: DiagnosedLoss) -> str:
     parts = []
-    if np.isfinite(each.loss.sharpness):
-        parts.append(f"sharpness {each.loss.sharpness:.0%}")
-    if np.isfinite(each.loss.turn_deg):
-        parts.append(f"turn {each.loss.turn_deg:.0f}° a frame")
-    if each.look is not None:
-        parts.append(f"{each.look.corners} corners")
+    if np.isfinite(diagnosed.loss.sharpness):
+        parts.append(f"sharpness {diagnosed.loss.sharpness:.0%}")
+    if np.isfinite(diagnosed.loss.turn_deg):
+        parts.append(f"turn {diagnosed.loss.turn_deg:.0f}° per frame")
+    if diagnosed.appearance is not None:
+        parts.append(f"{diagnosed.appearance.corners} corners")
     return ", ".join(parts)
 
 
-def _before(inputs: ReportInputs) -> list[dict[str, Any]]:
-    """How far each camera alone would put its joint from where it was solved."""
+def _distances_before_optimisation(inputs: ReportInputs) -> list[dict[str, Any]]:
+    """Return the distance of each joint from the place where one camera alone would put it."""
     merge = inputs.merge
     if merge is None:
         return []
     rows = []
     world_from_joint = merge.motion.world_from_joint()
-    for each in before_optimisation(inputs):
-        off = each.off_m(world_from_joint)
+    for bone in find_unoptimised_bones(inputs):
+        distances = bone.distance_m(world_from_joint)
         rows.append(
             {
-                "camera": each.camera,
-                "joint": merge.skeleton.joints[each.joint],
-                "median": float(np.median(off)),
-                "high": float(np.percentile(off, 95)),
+                "camera": bone.camera,
+                "joint": merge.skeleton.joints[bone.joint],
+                "median": float(np.median(distances)),
+                "high": float(np.percentile(distances, 95)),
             }
         )
     return rows

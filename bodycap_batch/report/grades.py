@@ -1,4 +1,4 @@
-"""How good a figure is."""
+"""Grades of results."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import IntEnum
 
 
 class Grade(IntEnum):
-    """How far a result can be relied on; the worst of its criteria counts."""
+    """Reliability of a result. The worst grade of its criteria is the grade of the result."""
 
     GOOD = 0
     FAIR = 1
@@ -16,7 +16,7 @@ class Grade(IntEnum):
 
     @property
     def word(self) -> str:
-        """For a person."""
+        """The grade in words."""
         return ("good", "usable with care", "poor", "no result")[self]
 
 
@@ -25,26 +25,26 @@ class Criterion:
     """One graded figure.
 
     Attributes:
-        about: ``cameras`` or ``body``: which half of the verdict it belongs to.
+        subject: ``cameras`` or ``body``: the half of the verdict to which the criterion belongs.
         name: What is judged.
-        grade: How it is.
-        says: The figure in words.
-        why: Where the thresholds stand and for what reason.
-        metric: Where ``metrics.json`` holds the figure, dotted; "" for what is derived from several.
-        value: The figure itself.
+        grade: Its grade.
+        finding: The figure in words.
+        rationale: The bounds of the grades and the reason for them.
+        metric: Dotted path of the figure in ``metrics.json``; "" if it is derived from several figures.
+        value: The figure.
     """
 
-    about: str
+    subject: str
     name: str
     grade: Grade
-    says: str
-    why: str
+    finding: str
+    rationale: str
     metric: str = ""
     value: float | None = None
 
 
-def graded(value: float, good: float, fair: float, *, more_is_better: bool = False) -> Grade:
-    """Where a value stands between two bounds."""
+def grade_value(value: float, good: float, fair: float, *, more_is_better: bool = False) -> Grade:
+    """Grade a value by the bounds of the grades "good" and "usable with care"."""
     if more_is_better:
         value, good, fair = -value, -good, -fair
     return Grade.GOOD if value <= good else Grade.FAIR if value <= fair else Grade.POOR

@@ -1,4 +1,4 @@
-"""Arrays inside the page: quantised to 16 bits or less, base64, thinned to a budget that is stated."""
+"""Arrays in the page: quantised to at most 16 bits, base64, thinned to a budget; the thinning is recorded."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.arrays import FloatArray
 
-NONE = 65535
-"""The 16-bit code of a value that is not there."""
-_LEVELS = NONE - 1
-_TEXT = 4.0 / 3.0
+MISSING_CODE = 65535
+"""The 16-bit code of a missing value."""
+_LEVELS = MISSING_CODE - 1
+"""Steps between the smallest and the largest value of a column."""
+_CHARACTERS_PER_BYTE = 4.0 / 3.0
 """Characters of base64 for each byte."""
 
 
 def pack_scaled(values: FloatArray) -> dict[str, Any]:
-    """Numbers (N,C) as 16 bits between each column's least and largest value; NaN stays NaN.
+    """Pack numbers (N,C) as 16-bit codes between the smallest and the largest value of each column.
 
-    The step is the range over 65,534: a third of a millimetre in a room 20 m across.
+    NaN remains NaN. A step is the range over 65,534: a third of a millimetre in a room of 20 m.
     """
     values = np.asarray(values, dtype=np.float64)
     finite = np.where(np.isfinite(values), values, np.nan)
@@ -31,64 +32,59 @@ def pack_scaled(values: FloatArray) -> dict[str, Any]:
     low, high = np.where(low <= high, low, 0.0), np.where(low <= high, high, 0.0)
     span = np.where(high > low, high - low, 1.0)
     scaled = np.round((np.nan_to_num(finite) - low) / span * _LEVELS)
-    codes = np.where(np.isfinite(finite), np.clip(scaled, 0, _LEVELS), NONE).astype("<u2")
+    codes = np.where(np.isfinite(finite), np.clip(scaled, 0, _LEVELS), MISSING_CODE).astype("<u2")
     return {
         "low": [float(f"{value:.9g}") for value in low],
         "step": [float(f"{value:.9g}") for value in span / _LEVELS],
         "shape": list(values.shape),
-        "u16": text_of(codes),
+        "u16": base64_text(codes),
     }
 
 
 def pack_bytes(values: npt.NDArray[np.uint8]) -> dict[str, Any]:
-    """Bytes of any shape."""
-    return {"shape": list(values.shape), "u8": text_of(values)}
+    """Pack bytes of any shape."""
+    return {"shape": list(values.shape), "u8": base64_text(values)}
 
 
-def text_of(values: npt.NDArray[Any]) -> str:
-    """Base64 of an array's bytes."""
+def base64_text(values: npt.NDArray[Any]) -> str:
+    """Return the bytes of an array as base64."""
     return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")
 
 
-def thinned(count: int, most: int) -> IntArray:
-    """At most `most` of `count` indices, evenly spread, first and last among them."""
-    if count <= most:
-        return np.arange(count)
-    return np.unique(np.round(np.linspace(0, count - 1, max(most, 2))).astype(np.int64))
-
-
-def affordable(budget: int, bytes_each: float) -> int:
-    """How many items of so many bytes fit into a budget of characters."""
-    return max(2, int(budget / (bytes_each * _TEXT)))
+def affordable_count(characters: int, bytes_per_item: float) -> int:
+    """Return how many items fit into a budget of characters; at least two."""
+    return max(2, int(characters / (bytes_per_item * _CHARACTERS_PER_BYTE)))
 
 
 @dataclass(slots=True)
-class Shown:
-    """What the page shows of what there is.
+class PageBudget:
+    """The share of the page's budgets that may be used, and a record of what was thinned.
 
     Attributes:
-        share: Part of every budget that may be used; below 1 where the page would be too large.
-        counts: By what is counted, how many are shown of how many.
+        share: Factor on every budget; below 1 if the page would be too large otherwise.
+        counts: Numbers of shown and of available items, by the name of the items.
     """
 
     share: float = 1.0
     counts: dict[str, tuple[int, int]] = field(default_factory=dict)
 
-    def of(self, budget: float) -> int:
-        """What is left of a budget."""
+    def scaled(self, budget: float) -> int:
+        """Return the usable part of a budget."""
         return int(budget * self.share)
 
-    def note(self, what: str, shown: int, total: int) -> None:
-        """Add to the account."""
-        before = self.counts.get(what, (0, 0))
-        self.counts[what] = (before[0] + int(shown), before[1] + int(total))
+    def record(self, items: str, shown: int, available: int) -> None:
+        """Add the numbers of shown and of available items."""
+        earlier = self.counts.get(items, (0, 0))
+        self.counts[items] = (earlier[0] + int(shown), earlier[1] + int(available))
 
-    def lines(self) -> list[str]:
-        """The account as sentences: only what was thinned."""
+    def thinned_lines(self) -> list[str]:
+        """Return a phrase for each kind of items that was thinned."""
         return [
-            f"{shown:,} of {total:,} {what}" for what, (shown, total) in self.counts.items() if shown < total
+            f"{shown:,} of {available:,} {items}"
+            for items, (shown, available) in self.counts.items()
+            if shown < available
         ]
 
-    def document(self) -> Mapping[str, Any]:
-        """The account as JSON values."""
-        return {what: {"shown": shown, "of": total} for what, (shown, total) in self.counts.items()}
+    def to_dict(self) -> Mapping[str, Any]:
+        """Return the record as JSON values."""
+        return {items: {"shown": shown, "of": available} for items, (shown, available) in self.counts.items()}

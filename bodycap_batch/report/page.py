@@ -1,4 +1,4 @@
-"""The page itself: templates filled in, styles, glue and the 3D library written into one file."""
+"""The page itself: templates, styles, scripts and the 3D library combined into one file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 from bodycap_batch.core.errors import StoreError
 
 LIBRARY = "k3d"
-"""The package whose browser bundle, with all of three.js in it, is written into the page."""
+"""The package that contains the 3D library: its bundle for browsers includes all of three.js."""
 _BUNDLE = "k3d/static/standalone.js"
 _SCRIPTS = (
     "packing.js",
@@ -28,15 +28,15 @@ _SCRIPTS = (
 )
 
 
-def render(context: Mapping[str, Any], data: Mapping[str, Any]) -> str:
-    """Fill in the page.
+def render_page(context: Mapping[str, Any], data: Mapping[str, Any]) -> str:
+    """Render the page.
 
     Args:
-        context: What the templates show.
-        data: What the viewer draws; JSON values.
+        context: Variables of the templates.
+        data: Data of the viewer; JSON values.
 
     Returns:
-        A whole HTML document that asks nothing of the network.
+        A complete HTML document that loads nothing from the network.
 
     Raises:
         StoreError: The 3D library's file is missing from its package.
@@ -51,19 +51,23 @@ def render(context: Mapping[str, Any], data: Mapping[str, Any]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    body = environment.get_template("page.html").render(
+    text = environment.get_template("page.html").render(
         **context,
         style=(folder / "style.css").read_text(encoding="utf-8"),
         script="\n".join((folder / name).read_text(encoding="utf-8") for name in _SCRIPTS),
-        library=library() if context["has_solid"] else "",
+        library=viewer_library() if context["has_viewer"] else "",
         library_name=f"{LIBRARY} {metadata.version(LIBRARY)}",
         data=json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
     )
-    return body if body.endswith("\n") else f"{body}\n"
+    return text if text.endswith("\n") else f"{text}\n"
 
 
-def library() -> str:
-    """The 3D library's JavaScript, fit to stand inside a script element."""
+def viewer_library() -> str:
+    """Return the 3D library's JavaScript, escaped for a script element.
+
+    Raises:
+        StoreError: The file is missing from its package.
+    """
     path = Path(str(metadata.distribution(LIBRARY).locate_file(_BUNDLE)))
     try:
         text = path.read_text(encoding="utf-8")
@@ -73,5 +77,5 @@ def library() -> str:
             path=path,
             hint=f"install it again: pip install --force-reinstall {LIBRARY}",
         ) from error
-    # In its strings these would end the script element, or begin a comment.
+    # These character sequences in the library's strings would end the script element or start a comment.
     return re.sub("</(script)", r"<\\/\1", text, flags=re.IGNORECASE).replace("<!--", r"<\!--")

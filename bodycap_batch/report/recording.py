@@ -7,29 +7,30 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray, runs
 from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.palette import Colour, camera_colours
 from bodycap_batch.model.geometry import quat_xyzw_from_rotation
 from bodycap_batch.model.merge_data import MergeResult
-from bodycap_batch.report.inputs import ReportInputs
-from bodycap_batch.report.marks import solved_body
-from bodycap_batch.report.placing import Placed, PlacedPath, place
+from bodycap_batch.report.drawn_scene import DrawnPath, DrawnScene, make_drawn_scene
+from bodycap_batch.report.frame_overlays import bones_from_merge
+from bodycap_batch.report.report_inputs import ReportInputs
 
 if TYPE_CHECKING:
     import rerun as rr
 
-_AXES_M = 0.1
+_AXIS_LENGTH_M = 0.1
+"""Length of the axes that mark a camera's pose, metres. Evidence: none."""
 
 
 def write_recording(inputs: ReportInputs, target: Path) -> None:
-    """Write a job's results as one recording: points, camera paths, the solved skeleton.
+    """Write points, camera paths and the solved skeleton of a job as one recording.
 
-    All of it is in the world (without a body: in the largest map, set upright) and on the common clock. The
-    motion is the one that was solved, whatever root, rate or names the files of the motion have.
+    The frame of reference is the world, or the largest map turned upright if there is no body. Times are
+    common times. The motion is the solved one; the export's options about root, rate and names do not apply.
 
     Args:
-        inputs: The results, as far as the job came.
+        inputs: The results.
         target: The ``.rrd`` file.
 
     Raises:
@@ -42,16 +43,16 @@ def write_recording(inputs: ReportInputs, target: Path) -> None:
         raise JobError(
             "rerun-sdk is not installed", hint="install the extra: pip install 'bodycap_batch[viewer]'"
         ) from error
-    placed = place(inputs)
-    if not placed.drawn:
+    scene = make_drawn_scene(inputs)
+    if not scene.has_content:
         failure = inputs.failure or {}
-        lacking = failure.get("message", f"the store holds neither map nor camera paths of {inputs.name}")
-        raise JobError(lacking, hint=failure.get("hint") or "run the job again")
+        message = failure.get("message", f"the store holds neither map nor camera paths of {inputs.name}")
+        raise JobError(message, hint=failure.get("hint") or "run the job again")
     stream = rr.RecordingStream("bodycap", recording_id=inputs.name)
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    _log_maps(stream, placed)
+    _log_maps(stream, scene)
     colours = camera_colours(inputs.cameras)
-    for path in placed.paths:
+    for path in scene.paths:
         _log_path(stream, path, colours[path.camera])
     if inputs.merge is not None:
         _log_body(stream, inputs.merge)
@@ -64,40 +65,40 @@ def write_recording(inputs: ReportInputs, target: Path) -> None:
         ) from error
 
 
-def _log_maps(stream: rr.RecordingStream, placed: Placed) -> None:
+def _log_maps(stream: rr.RecordingStream, scene: DrawnScene) -> None:
     import rerun as rr
 
-    for number, scene in enumerate(placed.maps):
-        points = placed.drawn_from_map[scene.gauge].apply(scene.points)
-        cloud = rr.Points3D(points, colors=scene.colors, radii=rr.Radius.ui_points(1.5))
+    for number, one_map in enumerate(scene.maps):
+        points = scene.drawn_from_map[one_map.gauge].apply(one_map.points)
+        cloud = rr.Points3D(points, colors=one_map.colors, radii=rr.Radius.ui_points(1.5))
         stream.log(f"world/map_{number}", cloud, static=True)
 
 
-def _log_path(stream: rr.RecordingStream, path: PlacedPath, colour: Colour) -> None:
-    """The stretches of a path between its gaps, and the camera moving along it."""
+def _log_path(stream: rr.RecordingStream, path: DrawnPath, colour: Colour) -> None:
+    """Log the line of a path, interrupted at its gaps, and the camera that moves along it."""
     import rerun as rr
 
-    posed = np.isfinite(path.poses).all(axis=(1, 2))
-    if not posed.any():
+    localised = np.asarray(np.isfinite(path.poses).all(axis=(1, 2)))
+    if not localised.any():
         return
-    centres, name = path.poses[posed, :3, 3], f"world/cameras/{path.camera}"
-    gaps = np.flatnonzero(np.diff(np.flatnonzero(posed)) > 1) + 1
-    stretches = [each for each in np.split(centres, gaps) if len(each)]
-    stream.log(f"{name}/path", rr.LineStrips3D(stretches, colors=[colour]), static=True)
+    entity = f"world/cameras/{path.camera}"
+    lines = [path.poses[start:stop, :3, 3] for start, stop in runs(localised)]
+    stream.log(f"{entity}/path", rr.LineStrips3D(lines, colors=[colour]), static=True)
     stream.send_columns(
-        f"{name}/now",
-        indexes=[rr.TimeColumn("time", duration=path.times_s[posed])],
+        f"{entity}/now",
+        indexes=[rr.TimeColumn("time", duration=path.times_s[localised])],
         columns=rr.Transform3D.columns(
-            translation=centres, quaternion=quat_xyzw_from_rotation(path.poses[posed, :3, :3])
+            translation=path.poses[localised, :3, 3],
+            quaternion=quat_xyzw_from_rotation(path.poses[localised, :3, :3]),
         ),
     )
-    stream.log(f"{name}/now", rr.TransformAxes3D(_AXES_M), static=True)
+    stream.log(f"{entity}/now", rr.TransformAxes3D(_AXIS_LENGTH_M), static=True)
 
 
 def _log_body(stream: rr.RecordingStream, merge: MergeResult) -> None:
     import rerun as rr
 
-    body = solved_body(merge)
-    for time_ns, ends in zip(body.times_ns.tolist(), body.ends_in_world, strict=True):
+    bones = bones_from_merge(merge)
+    for time_ns, ends in zip(bones.times_ns.tolist(), bones.ends_in_world, strict=True):
         stream.set_time("time", duration=1e-9 * time_ns)
         stream.log("world/body", rr.LineStrips3D(list[FloatArray](ends)))

@@ -1,4 +1,4 @@
-"""The report with the job's real videos, served on this machine alone."""
+"""A local server for the report with the job's real videos."""
 
 from __future__ import annotations
 
@@ -19,40 +19,45 @@ from bodycap_batch.capture.cameras import CaptureCamera
 from bodycap_batch.core.errors import StoreError
 
 LOOPBACK = "127.0.0.1"
-_TYPES = {".mp4": "video/mp4", ".m4v": "video/mp4", ".mov": "video/mp4", ".mkv": "video/x-matroska"}
-_TYPES |= {".webm": "video/webm", ".avi": "video/x-msvideo", ".html": "text/html; charset=utf-8"}
-MARKS_EACH = 60
-"""Frames in each ``/marks/<camera>/<part>.json``: one or two seconds, loaded ahead of what plays."""
-MarksOf = Callable[[str, int], list[dict[str, Any]]]
+_CONTENT_TYPES = {".mp4": "video/mp4", ".m4v": "video/mp4", ".mov": "video/mp4", ".mkv": "video/x-matroska"}
+_CONTENT_TYPES |= {".webm": "video/webm", ".avi": "video/x-msvideo", ".html": "text/html; charset=utf-8"}
+FRAMES_PER_PART = 60
+"""Frames in each ``/marks/<camera>/<part>.json``: one or two seconds, loaded before they are shown."""
+OverlaySource = Callable[[str, int], list[dict[str, Any]]]
+"""Returns the overlays of a part of a camera's frames, from a frame index on."""
 _RANGE = re.compile(r"bytes=(\d+)-(\d*)")
-_MARKS = re.compile(r"/marks/(\d{1,4})/(\d{1,7})\.json", re.ASCII)
+"""A request for a range of bytes; other forms of the header are answered with the whole file."""
+_OVERLAY_ADDRESS = re.compile(r"/marks/(\d{1,4})/(\d{1,7})\.json", re.ASCII)
+_CHUNK_BYTES = 1 << 18
+"""Bytes of a file that are read at once. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Served:
-    """What may be asked for, and nothing else.
+class ServedContent:
+    """Everything that the server answers to.
 
     Attributes:
-        files: File by address, ``/report.html`` among them.
-        videos: What ``/videos.json`` answers: by camera, each chapter's address, the index of its first
-            frame in the camera, half a frame's time, and of every frame the common time and the time in
-            the file, at the middle of what a player shows it for.
-        marks: What is known of frames of a camera, from the first index on, and what is drawn over them;
-            None where that is not to be had. Asked in parts of `MARKS_EACH` frames.
+        files: Files by address, including ``/report.html``.
+        videos: The answer to ``/videos.json``: the chapters of each camera. A chapter has its address, the
+            index of its first frame in the camera and half a frame's duration. For each frame it has the
+            common time and the time in the file, at the middle of the frame's duration.
+        overlays: Returns status and overlays of `FRAMES_PER_PART` frames; None if they are not available.
     """
 
     files: dict[str, Path]
     videos: dict[str, list[dict[str, Any]]]
-    marks: MarksOf | None = None
+    overlays: OverlaySource | None = None
 
 
-def what_to_serve(report: Path, capture: Capture, marks: MarksOf | None = None) -> Served:
-    """The report and the videos of a capture, each under an address of its own.
+def make_served_content(
+    report: Path, capture: Capture, overlays: OverlaySource | None = None
+) -> ServedContent:
+    """Give the report and each video of a capture an address.
 
     Args:
         report: The page.
-        capture: Whose videos.
-        marks: As `Served.marks`.
+        capture: The videos.
+        overlays: As `ServedContent.overlays`.
     """
     files, videos = {"/report.html": report}, {}
     for number, camera in enumerate(capture.cameras):
@@ -61,18 +66,18 @@ def what_to_serve(report: Path, capture: Capture, marks: MarksOf | None = None) 
             chapter["url"] = f"video/{number}/{index}"
             files[f"/{chapter['url']}"] = camera.chapters[index]
         videos[camera.name] = [chapter for chapter in chapters if chapter["common"]]
-    return Served(files=files, videos=videos, marks=marks)
+    return ServedContent(files=files, videos=videos, overlays=overlays)
 
 
-def make_server(served: Served, port: int = 0) -> ThreadingHTTPServer:
-    """A server on the loopback address; port 0 takes a free one.
+def make_server(content: ServedContent, port: int = 0) -> ThreadingHTTPServer:
+    """Return a server on the loopback address; with port 0 it takes a free port.
 
     Raises:
-        StoreError: The port is taken.
+        StoreError: The port is in use.
     """
 
     class Handler(_Handler):
-        content = served
+        served = content
 
     try:
         return ThreadingHTTPServer((LOOPBACK, port), Handler)
@@ -83,83 +88,83 @@ def make_server(served: Served, port: int = 0) -> ThreadingHTTPServer:
 
 
 def _chapters(camera: CaptureCamera) -> list[dict[str, Any]]:
-    """By chapter, common time and time in the file of each used frame, seconds."""
+    """Return common time and time in the file of each used frame, seconds, for each chapter."""
     common = camera.common_times_ns() * 1e-9
-    out, first = [], 0
+    chapters, chapter_start = [], 0
     for video in camera.videos:
-        numbers = camera.frame_numbers - first
-        mine = (numbers >= 0) & (numbers < len(video.pts))
-        seconds = (video.pts[numbers[mine]] - video.pts[0]) * float(video.time_base)
-        # The middle of a frame's time: at its very start a player may still show the one before.
+        numbers = camera.frame_numbers - chapter_start
+        in_chapter = (numbers >= 0) & (numbers < len(video.pts))
+        seconds = (video.pts[numbers[in_chapter]] - video.pts[0]) * float(video.time_base)
+        # At the very start of a frame a player may still show the frame before it, so its middle is used.
         half = 0.5 / video.fps if video.fps else 0.0
-        out.append(
+        chapters.append(
             {
-                "first": int(np.argmax(mine)),
+                "first": int(np.argmax(in_chapter)),
                 "half": half,
-                "common": np.round(common[mine], 5).tolist(),
+                "common": np.round(common[in_chapter], 5).tolist(),
                 "container": np.round(seconds + half, 5).tolist(),
             }
         )
-        first += len(video.pts)
-    return out
+        chapter_start += len(video.pts)
+    return chapters
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers GET and HEAD for known addresses, with byte ranges: players seek by them."""
+    """Answers GET and HEAD for known addresses, with byte ranges, which players need to seek."""
 
-    content: Served
+    served: ServedContent
     protocol_version = "HTTP/1.1"
 
     def do_GET(self) -> None:
         """Answer with the content."""
-        self._answer_patiently(body=True)
+        self._answer_until_closed(with_body=True)
 
     def do_HEAD(self) -> None:
-        """Answer without it."""
-        self._answer_patiently(body=False)
+        """Answer without the content."""
+        self._answer_until_closed(with_body=False)
 
-    def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the name the base class gives it
-        """Keep quiet."""
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the base class's name
+        """Log nothing."""
 
-    def _answer_patiently(self, *, body: bool) -> None:
-        # Players break off what they are being sent whenever they seek.
+    def _answer_until_closed(self, *, with_body: bool) -> None:
+        # Players close the connection whenever they seek, so a broken connection is not an error.
         try:
-            self._answer(body=body)
+            self._answer(with_body=with_body)
         except ConnectionError:
             self.close_connection = True
 
-    def _answer(self, *, body: bool) -> None:
-        # Another page's name can be made to point at this machine: only the machine's own names are served.
+    def _answer(self, *, with_body: bool) -> None:
+        # A foreign web page can give this computer another host name (DNS rebinding), so that is refused.
         host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
         if host not in (LOOPBACK, "localhost"):
             self.send_error(HTTPStatus.FORBIDDEN)
             return
         address = self.path.partition("?")[0]
         if address == "/videos.json":
-            videos = {"each": MARKS_EACH, "cameras": self.content.videos}
-            self._send_text(json.dumps(videos), body=body)
-        elif address in self.content.files:
-            self._send_file(self.content.files[address], body=body)
-        elif (part := _MARKS.fullmatch(address)) and self.content.marks is not None:
-            self._send_marks(self.content.marks, int(part[1]), int(part[2]), body=body)
+            videos = {"each": FRAMES_PER_PART, "cameras": self.served.videos}
+            self._send_json(json.dumps(videos), with_body=with_body)
+        elif address in self.served.files:
+            self._send_file(self.served.files[address], with_body=with_body)
+        elif (part := _OVERLAY_ADDRESS.fullmatch(address)) and self.served.overlays is not None:
+            self._send_overlays(self.served.overlays, int(part[1]), int(part[2]), with_body=with_body)
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
 
-    def _send_marks(self, marks: MarksOf, camera: int, part: int, *, body: bool) -> None:
-        names = list(self.content.videos)
-        found = marks(names[camera], part * MARKS_EACH) if camera < len(names) else []
+    def _send_overlays(self, overlays: OverlaySource, camera: int, part: int, *, with_body: bool) -> None:
+        names = list(self.served.videos)
+        found = overlays(names[camera], part * FRAMES_PER_PART) if camera < len(names) else []
         if found:
-            self._send_text(json.dumps(found, allow_nan=False), body=body)
+            self._send_json(json.dumps(found, allow_nan=False), with_body=with_body)
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
 
-    def _send_text(self, text: str, *, body: bool) -> None:
+    def _send_json(self, text: str, *, with_body: bool) -> None:
         data = text.encode()
-        self._begin(HTTPStatus.OK, "application/json", len(data))
-        if body:
+        self._send_headers(HTTPStatus.OK, "application/json", len(data))
+        if with_body:
             self.wfile.write(data)
 
-    def _send_file(self, path: Path, *, body: bool) -> None:
+    def _send_file(self, path: Path, *, with_body: bool) -> None:
         try:
             stream = path.open("rb")
         except OSError:
@@ -167,28 +172,31 @@ class _Handler(BaseHTTPRequestHandler):
             return
         with stream:
             size = path.stat().st_size
-            kind = _TYPES.get(path.suffix.lower(), "application/octet-stream")
-            wanted = _RANGE.fullmatch(self.headers.get("Range", ""))
-            if wanted is None:
-                self._begin(HTTPStatus.OK, kind, size)
-                if body:
+            content_type = _CONTENT_TYPES.get(path.suffix.lower(), "application/octet-stream")
+            requested = _RANGE.fullmatch(self.headers.get("Range", ""))
+            if requested is None:
+                self._send_headers(HTTPStatus.OK, content_type, size)
+                if with_body:
                     shutil.copyfileobj(stream, self.wfile)
                 return
-            start = int(wanted[1])
-            stop = min(int(wanted[2] or size - 1), size - 1) + 1
+            start = int(requested[1])
+            stop = min(int(requested[2] or size - 1), size - 1) + 1
             if start >= stop:
                 self.send_error(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE)
                 return
-            self._begin(HTTPStatus.PARTIAL_CONTENT, kind, stop - start, f"bytes {start}-{stop - 1}/{size}")
+            content_range = f"bytes {start}-{stop - 1}/{size}"
+            self._send_headers(HTTPStatus.PARTIAL_CONTENT, content_type, stop - start, content_range)
             stream.seek(start)
-            left = stop - start if body else 0
-            while left and (part := stream.read(min(left, 1 << 18))):
-                self.wfile.write(part)
-                left -= len(part)
+            left = stop - start if with_body else 0
+            while left and (chunk := stream.read(min(left, _CHUNK_BYTES))):
+                self.wfile.write(chunk)
+                left -= len(chunk)
 
-    def _begin(self, status: HTTPStatus, kind: str, length: int, content_range: str = "") -> None:
+    def _send_headers(
+        self, status: HTTPStatus, content_type: str, length: int, content_range: str = ""
+    ) -> None:
         self.send_response(status)
-        self.send_header("Content-Type", kind)
+        self.send_header("Content-Type", content_type)
         self.send_header("Content-Length", str(length))
         self.send_header("Accept-Ranges", "bytes")
         self.send_header("X-Content-Type-Options", "nosniff")

@@ -1,4 +1,4 @@
-"""Is it good? Each criterion graded against thresholds that say why they stand where they do."""
+"""The verdict on a job: each criterion is graded by bounds, and the page states the reason for the bounds."""
 
 from __future__ import annotations
 
@@ -7,23 +7,39 @@ from dataclasses import dataclass
 from typing import Any
 
 from bodycap_batch.core.percent import format_percent
-from bodycap_batch.report.beside import of_reach, of_shared_segments
-from bodycap_batch.report.grades import Criterion, Grade, graded
+from bodycap_batch.report.camera_pairs import distance_criteria, shared_segment_criteria
+from bodycap_batch.report.grades import Criterion, Grade, grade_value
 
-_SHARP_PX = 1.0
-"""Mean reprojection error that sharp corners and a lens that fits stay below."""
+_GOOD_ERROR_PX, _FAIR_ERROR_PX = 1.0, 2.0
+"""Mean reprojection error, pixels: with sharp corners and correct intrinsics it is less than one."""
+_GOOD_COVERAGE, _FAIR_COVERAGE = 0.98, 0.85
+"""Share of registered frames of all cameras; the criterion's text states the reason."""
+_GOOD_CAMERA_COVERAGE, _FAIR_CAMERA_COVERAGE = 0.95, 0.75
+"""Share of registered frames of the worst camera. Evidence: none."""
+_FAIR_FOCAL_ERROR = 0.1
+"""Relative error of a focal length. Evidence: docs/decisions/report.md."""
+_GOOD_SCALE_SIGMA, _FAIR_SCALE_SIGMA = 0.025, 0.10
+"""Relative sigma of the metric scale; the criterion's text states the reason."""
+_GOOD_RESIDUAL_M, _FAIR_RESIDUAL_M = 0.01, 0.03
+"""Metres, of residuals and of distances at joints; the criteria's texts state the reason."""
+_GOOD_GAP_S, FAIR_GAP_S = 0.2, 0.6
+"""Seconds without a measurement; the criterion's text states the reason."""
+GOOD_MOUNT_DEG, _FAIR_MOUNT_DEG = 4.0, 12.0
+"""Sigma of a mount's rotation, degrees; the criterion's text states the reason."""
+_GOOD_OBSERVED_SHARE, _FAIR_OBSERVED_SHARE = 0.95, 0.8
+"""Share of the time in which a joint is measured. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """What a person reads first.
+    """The result in a few words, at the top of the page.
 
     Attributes:
         headline: One sentence.
-        grade: The worse of the two halves.
-        cameras: Cameras and room.
-        body: The motion; None where the job asks for none.
-        criteria: All that was judged.
+        grade: The worse grade of the two halves.
+        cameras: Grade of cameras and room.
+        body: Grade of the motion; None if the job asks for none.
+        criteria: All graded figures.
     """
 
     headline: str
@@ -37,12 +53,12 @@ def judge(metrics: Mapping[str, Any] | None, failure: Mapping[str, Any] | None) 
     """Grade a job by its own figures.
 
     Args:
-        metrics: The content of ``metrics.json``; None where the job did not come that far.
-        failure: What stopped it, as the error tells.
+        metrics: The content of ``metrics.json``; None if the job has none.
+        failure: The error that stopped the job; None if it finished.
     """
-    criteria = () if metrics is None else tuple(_all(metrics))
-    cameras = _worst(criteria, "cameras") if metrics is not None else Grade.NONE
-    body = _worst(criteria, "body") if metrics is not None and "merge" in metrics else None
+    criteria = () if metrics is None else tuple(_criteria(metrics))
+    cameras = _worst_grade(criteria, "cameras") if metrics is not None else Grade.NONE
+    body = _worst_grade(criteria, "body") if metrics is not None and "merge" in metrics else None
     if failure is not None and body is None:
         body = Grade.NONE
     grade = max(cameras, Grade.GOOD if body is None else body)
@@ -55,8 +71,10 @@ def judge(metrics: Mapping[str, Any] | None, failure: Mapping[str, Any] | None) 
     )
 
 
-def _worst(criteria: tuple[Criterion, ...], about: str) -> Grade:
-    return max((each.grade for each in criteria if each.about == about), default=Grade.NONE)
+def _worst_grade(criteria: tuple[Criterion, ...], subject: str) -> Grade:
+    return max(
+        (criterion.grade for criterion in criteria if criterion.subject == subject), default=Grade.NONE
+    )
 
 
 def _headline(
@@ -64,40 +82,47 @@ def _headline(
 ) -> str:
     if metrics is None:
         return "The job stopped before there was a result."
-    words = ("are tracked well", "are tracked, with gaps or doubts", "are tracked poorly", "are not tracked")
-    first = f"The cameras {words[cameras]}"
+    camera_phrases = (
+        "are tracked well",
+        "are tracked, with gaps or doubts",
+        "are tracked poorly",
+        "are not tracked",
+    )
+    first = f"The cameras {camera_phrases[cameras]}"
     if failure is not None:
         return f"{first}; the body could not be solved."
     if body is None:
-        return f"{first}. No body was asked for."
-    joint = "and" if (body == Grade.GOOD) == (cameras == Grade.GOOD) else "but"
-    ends = (
+        return f"{first}. The job asked for no body."
+    conjunction = "and" if (body == Grade.GOOD) == (cameras == Grade.GOOD) else "but"
+    body_phrases = (
         "the motion is good",
         "the motion is usable with care",
         "the motion is poor",
         "there is no motion",
     )
-    return f"{first}, {joint} {ends[body]}."
+    return f"{first}, {conjunction} {body_phrases[body]}."
 
 
-def _all(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
-    yield from _of_frames(metrics)
-    yield from _of_map(metrics)
+def _criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
+    yield from _frame_criteria(metrics)
+    yield from _map_criteria(metrics)
     if "merge" in metrics:
-        yield from _of_body(metrics["merge"])
-        yield from _of_measured(metrics.get("motion", {}).get("joints", {}))
+        yield from _body_criteria(metrics["merge"])
+        yield from _observed_time_criteria(metrics.get("motion", {}).get("joints", {}))
 
 
-def _of_frames(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
+def _frame_criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
     total = metrics["total"]
     share = float(total["coverage"])
     yield Criterion(
-        about="cameras",
+        subject="cameras",
         name="Frames registered",
-        grade=graded(share, 0.98, 0.85, more_is_better=True) if share > 0.0 else Grade.NONE,
-        says=f"{total['frames_registered']:,} of {total['frames']:,} frames ({format_percent(share, 1)})",
-        why="From 98 % on only moments are missing, and the body's smoothness carries over them; below 85 % "
-        "more than one frame in seven rests on nothing that was seen.",
+        grade=grade_value(share, _GOOD_COVERAGE, _FAIR_COVERAGE, more_is_better=True)
+        if share > 0.0
+        else Grade.NONE,
+        finding=f"{total['frames_registered']:,} of {total['frames']:,} frames ({format_percent(share, 1)})",
+        rationale="From 98 % on only short moments are missing, and the body's smoothness bridges them. "
+        "Below 85 % more than one frame in seven has no measurement.",
         metric="total.coverage",
         value=share,
     )
@@ -105,204 +130,228 @@ def _of_frames(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
     if worst is not None and len(metrics["cameras"]) > 1:
         share = float(worst["coverage"])
         yield Criterion(
-            about="cameras",
+            subject="cameras",
             name="The worst camera",
-            grade=graded(share, 0.95, 0.75, more_is_better=True),
-            says=f"{name}: {worst['frames_registered']:,} of {worst['frames']:,} frames "
+            grade=grade_value(share, _GOOD_CAMERA_COVERAGE, _FAIR_CAMERA_COVERAGE, more_is_better=True),
+            finding=f"{name}: {worst['frames_registered']:,} of {worst['frames']:,} frames "
             f"({format_percent(share, 1)})",
-            why="An average hides one bad camera, and a limb is as good as the camera on it.",
+            rationale="An average hides one bad camera, and a limb is only as good as the camera on it.",
             metric=f"cameras.{name}.coverage",
             value=share,
         )
 
 
-def _of_map(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
+def _map_criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
     error = metrics["total"]["mean_reprojection_error_px"]
     if error is not None:
         yield Criterion(
-            about="cameras",
+            subject="cameras",
             name="Map error",
-            grade=graded(float(error), _SHARP_PX, 2.0),
-            says=f"{error:.2f} px mean reprojection error",
-            why="Sharp corners are found to about half a pixel; above one the lens, the shutter or blur is "
-            "at work, above two the map is strained. A low value alone does not prove a right map.",
+            grade=grade_value(float(error), _GOOD_ERROR_PX, _FAIR_ERROR_PX),
+            finding=f"{error:.2f} px mean reprojection error",
+            rationale="Sharp corners are located to about half a pixel. An error above one pixel comes from "
+            "the lens, the shutter or blur; above two pixels the map does not fit the pictures. A low value "
+            "alone does not prove that the map is right.",
             metric="total.mean_reprojection_error_px",
             value=float(error),
         )
-    apart = sorted(name for name, each in metrics["cameras"].items() if each["frame"] != metrics["frame"])
-    lost = sorted(name for name, each in metrics["cameras"].items() if not each["frames_registered"])
-    joined = sorted(metrics.get("merge", {}).get("joined_cameras", {}))
-    if apart or lost:
-        grade, says = Grade.POOR, f"apart from the main map: {', '.join(sorted({*apart, *lost}))}"
-    elif joined:
-        grade = Grade.FAIR
-        says = f"placed by the body alone, for no view is shared with the main map: {', '.join(joined)}"
-    else:
-        grade, says = Grade.GOOD, "all cameras are placed in one map"
-    yield Criterion(
-        about="cameras",
-        name="One room",
-        grade=grade,
-        says=says,
-        why="A camera outside the main map has no known place in the room; nothing of it reaches the body, "
-        "unless the body itself tells where it was, and then less exactly.",
-    )
+    yield _one_map_criterion(metrics)
     mapping, merge = metrics.get("mapping", {}), metrics.get("merge", {})
     unused = merge.get("unused_cameras", {})
-    yield from of_reach(mapping.get("reach"), unused)
-    yield from of_shared_segments(metrics.get("relative_poses", ()), merge.get("mounts", {}), unused)
+    yield from distance_criteria(mapping.get("reach"), unused)
+    yield from shared_segment_criteria(metrics.get("relative_poses", ()), merge.get("mounts", {}), unused)
     misfits, freed = mapping.get("misfitting_lenses", {}), mapping.get("freed_lenses", ())
-    # A lens of the wrong kind, a wide one given as a pinhole, leaves more than sharp corners do.
-    yield from _of_lenses(misfits, freed if error is not None and float(error) <= _SHARP_PX else ())
+    # A wrong camera model, such as a pinhole for a wide lens, leaves a larger error than sharp corners have.
+    # Then the lenses that were estimated together with the map do not count as corrected.
+    yield from _lens_criteria(misfits, freed if error is not None and float(error) <= _GOOD_ERROR_PX else ())
 
 
-def _of_lenses(misfits: Mapping[str, float], freed: Collection[str]) -> Iterator[Criterion]:
-    """Given focal lengths that the map contradicts: by camera, what fits over what was given.
+def _one_map_criterion(metrics: Mapping[str, Any]) -> Criterion:
+    separate = {name for name, camera in metrics["cameras"].items() if camera["frame"] != metrics["frame"]}
+    lost = {name for name, camera in metrics["cameras"].items() if not camera["frames_registered"]}
+    joined = sorted(metrics.get("merge", {}).get("joined_cameras", {}))
+    if separate or lost:
+        grade, finding = Grade.POOR, f"not in the main map: {', '.join(sorted(separate | lost))}"
+    elif joined:
+        grade = Grade.FAIR
+        finding = (
+            f"placed by the body alone, because they share no view with the main map: {', '.join(joined)}"
+        )
+    else:
+        grade, finding = Grade.GOOD, "all cameras are in one map"
+    return Criterion(
+        subject="cameras",
+        name="One room",
+        grade=grade,
+        finding=finding,
+        rationale="A camera outside the main map has no known position in the room. The body gets nothing "
+        "from it, unless the body itself determines its position; that is less accurate.",
+    )
 
-    Freed ones were found along with the map, and fit.
+
+def _lens_criteria(misfits: Mapping[str, float], freed: Collection[str]) -> Iterator[Criterion]:
+    """Yield the criterion about calibrations that the map contradicts.
+
+    Args:
+        misfits: Fitting over given focal length, by camera.
+        freed: Cameras for which the intrinsics were estimated together with the map, and fit.
     """
-    held = {name: factor for name, factor in misfits.items() if name not in freed}
-    misfits = held or misfits
+    not_corrected = {name: factor for name, factor in misfits.items() if name not in freed}
+    misfits = not_corrected or misfits
     name, worst = max(misfits.items(), key=lambda item: abs(item[1] - 1.0), default=("", None))
     if worst is not None:
+        # The map can contradict a lens although its focal length fits, so the grade is never "good".
+        grade = (
+            max(Grade.FAIR, grade_value(abs(worst - 1.0), 0.0, _FAIR_FOCAL_ERROR))
+            if not_corrected
+            else Grade.FAIR
+        )
         yield Criterion(
-            about="cameras",
+            subject="cameras",
             name="Lenses fit the pictures",
-            # A lens may be contradicted although its focal length fits.
-            grade=max(Grade.FAIR, graded(abs(worst - 1.0), 0.0, 0.1)) if held else Grade.FAIR,
-            says=f"{name}: the pictures fit {other_lens(worst)} than the calibration says"
-            f"{'' if held else '; what fits was used instead'}",
-            why="A wrong lens bends the whole map although its error in pixels is small: on a walk of 2 m, "
-            "25 % of focal length put every camera 9 cm off, a centre 9 % off its place 16 cm.",
+            grade=grade,
+            finding=f"{name}: the pictures fit {describe_lens_misfit(worst)} than the calibration says"
+            f"{'' if not_corrected else '; what fits was used instead'}",
+            rationale="A wrong lens bends the whole map although its error in pixels is small. On a walk of "
+            "2 m, an error of 25 % in the focal length moved every camera by 9 cm; an image centre that was "
+            "wrong by 9 % moved them by 16 cm.",
             metric="" if "." in name else f"mapping.misfitting_lenses.{name}",
             value=float(worst),
         )
 
 
-def other_lens(factor: float) -> str:
-    """What fits over what was given; a wrong centre alone can leave the focal length as it was."""
-    percent = round(100 * abs(factor - 1.0))
-    return (
-        f"a focal length {percent} % {'longer' if factor > 1.0 else 'shorter'}" if percent else "another lens"
-    )
+def describe_lens_misfit(factor: float) -> str:
+    """Describe the fitting lens relative to the given one.
+
+    Args:
+        factor: Fitting over given focal length. If only the principal point is wrong, it can be one.
+    """
+    rounded_percent = round(100 * abs(factor - 1.0))
+    if not rounded_percent:
+        return "another lens"
+    return f"a focal length {rounded_percent} % {'longer' if factor > 1.0 else 'shorter'}"
 
 
-def _of_body(merge: Mapping[str, Any]) -> Iterator[Criterion]:
+def _body_criteria(merge: Mapping[str, Any]) -> Iterator[Criterion]:
     scale = merge.get("scale", {}).get("relative_sigma")
     if scale is not None:
         yield Criterion(
-            about="body",
+            subject="body",
             name="Metric scale",
-            grade=graded(float(scale), 0.025, 0.10),
-            says=f"known to {scale:.1%} (one standard deviation)",
-            why="It stretches everything alike. 2.5 % is 1.5 cm on the length of an arm, about what the rest "
-            "of the chain leaves; 10 % is a short adult taken for a tall one.",
+            grade=grade_value(float(scale), _GOOD_SCALE_SIGMA, _FAIR_SCALE_SIGMA),
+            finding=f"known to {scale:.1%} (one standard deviation)",
+            rationale="An error of the scale stretches everything by the same factor. 2.5 % is 1.5 cm on the "
+            "length of an arm, about as much as the other errors of the chain. 10 % is the difference "
+            "between a short and a tall adult.",
             metric="merge.scale.relative_sigma",
             value=float(scale),
         )
     cameras = merge.get("cameras", {})
-    yield from _of_gaps(cameras)
-    residuals = [float(each["residual_m"]["p95"]) for each in cameras.values()]
+    yield from _gap_criteria(cameras)
+    residuals = [float(camera["residual_m"]["p95"]) for camera in cameras.values()]
     if residuals:
         yield Criterion(
-            about="body",
+            subject="body",
             name="Body against cameras",
-            grade=graded(max(residuals), 0.01, 0.03),
-            says=f"{100 * max(residuals):.1f} cm at the 95th percentile of the worst camera",
-            why="How far the solved body moves the cameras away from where the map saw them. 1 cm is a few "
-            "times a camera's own error; 3 cm can be seen as a hand that slides on what it holds.",
+            grade=grade_value(max(residuals), _GOOD_RESIDUAL_M, _FAIR_RESIDUAL_M),
+            finding=f"{100 * max(residuals):.1f} cm at the 95th percentile of the worst camera",
+            rationale="This is the distance between the cameras of the solved body and their positions in "
+            "the map. 1 cm is a few times a camera's own error. 3 cm is visible as a hand that slides on the "
+            "object it holds.",
         )
-    gaps = [float(each["p95"]) for each in merge.get("joint_gap_m", {}).values()]
-    if gaps:
+    distances = [float(joint["p95"]) for joint in merge.get("joint_gap_m", {}).values()]
+    if distances:
         yield Criterion(
-            about="body",
+            subject="body",
             name="Joints hold together",
-            grade=graded(max(gaps), 0.01, 0.03),
-            says=f"{1000 * max(gaps):.1f} mm at the 95th percentile of the worst joint",
-            why="Bones that do not meet at their joint tell of a wrong bone length, mount or scale.",
+            grade=grade_value(max(distances), _GOOD_RESIDUAL_M, _FAIR_RESIDUAL_M),
+            finding=f"{1000 * max(distances):.1f} mm at the 95th percentile of the worst joint",
+            rationale="If bones do not meet at their joint, a bone length, a mount or the scale is wrong.",
         )
-    yield from _of_clocks(merge.get("doubted_clocks", {}))
+    yield from _clock_criteria(merge.get("doubted_clocks", {}))
     if merge.get("exchanged_sides"):
         yield Criterion(
-            about="body",
+            subject="body",
             name="Left and right",
             grade=Grade.POOR,
-            says=str(merge["exchanged_sides"]["says"]),
-            why="No body fits arms that have changed sides: the metric scale was 62 % off on such a walk.",
+            finding=str(merge["exchanged_sides"]["says"]),
+            rationale="No body fits arms with exchanged sides: on one such walk the metric scale was wrong "
+            "by 62 %.",
         )
-    yield from _of_mounts(merge.get("mounts", {}))
-    yield from _of_unused(merge.get("unused_cameras", {}))
+    yield from _mount_criteria(merge.get("mounts", {}))
+    yield from _unused_camera_criteria(merge.get("unused_cameras", {}))
 
 
-def _of_gaps(cameras: Mapping[str, Any]) -> Iterator[Criterion]:
+def _gap_criteria(cameras: Mapping[str, Any]) -> Iterator[Criterion]:
     name, worst = max(cameras.items(), key=lambda item: item[1]["longest_gap_s"], default=("", None))
     if worst is None:
         return
-    gap = float(worst["longest_gap_s"])
+    gap_s = float(worst["longest_gap_s"])
     yield Criterion(
-        about="body",
+        subject="body",
         name="Longest gap",
-        grade=graded(gap, 0.2, 0.6),
-        says=f"{gap:.2f} s without a measurement ({name})",
-        why="An arm swings there and back in about a second: over a fifth of it smoothness guesses right, "
-        "over more than half of it a whole swing can be missing. The time before a camera's first "
-        "measurement and after its last one counts.",
+        grade=grade_value(gap_s, _GOOD_GAP_S, FAIR_GAP_S),
+        finding=f"{gap_s:.2f} s without a measurement ({name})",
+        rationale="An arm swings forward and back in about a second. Smoothness bridges a fifth of that time "
+        "well; in more than half of it a whole swing can be missing. The time before a camera's first "
+        "measurement and after its last one also counts.",
         metric=f"merge.cameras.{name}.longest_gap_s",
-        value=gap,
+        value=gap_s,
     )
 
 
-def _of_clocks(doubted: Mapping[str, Any]) -> Iterator[Criterion]:
+def _clock_criteria(doubted: Mapping[str, Any]) -> Iterator[Criterion]:
     if doubted:
         yield Criterion(
-            about="body",
+            subject="body",
             name="One clock",
             grade=Grade.POOR,
-            says="; ".join(str(doubt["says"]) for _, doubt in sorted(doubted.items())),
-            why="Half a second is half a step: with a clock that far off, limbs are where they were before, "
-            "and the metric scale follows them (28 % off on a walk with two clocks 0.5 and 0.2 s off).",
+            finding="; ".join(str(doubt["says"]) for _, doubt in sorted(doubted.items())),
+            rationale="Half a second is half a step. If a clock is wrong by that much, limbs are where they "
+            "were half a step earlier, and the metric scale is wrong too: by 28 % on a walk with two clocks "
+            "that were wrong by 0.5 and 0.2 s.",
         )
 
 
-def _of_mounts(mounts: Mapping[str, Any]) -> Iterator[Criterion]:
+def _mount_criteria(mounts: Mapping[str, Any]) -> Iterator[Criterion]:
     name, worst = max(mounts.items(), key=lambda item: item[1]["sigma_deg"], default=("", None))
     if worst is None:
         return
     sigma = float(worst["sigma_deg"])
     yield Criterion(
-        about="body",
+        subject="body",
         name="Mounts",
-        grade=graded(sigma, 4.0, 12.0),
-        says=f"known to {sigma:.1f}° and {100 * worst['sigma_m']:.1f} cm at worst ({name})",
-        why="The mount is a constant error of the bone that carries the camera. 4° is about how well a hand "
-        "is aimed by eye in animation; over 12° a palm visibly faces the wrong way.",
+        grade=grade_value(sigma, GOOD_MOUNT_DEG, _FAIR_MOUNT_DEG),
+        finding=f"the worst mount is known to {sigma:.1f}° and {100 * worst['sigma_m']:.1f} cm ({name})",
+        rationale="An error of the mount is a constant error of the bone that carries the camera. An "
+        "animator aims a hand by eye to about 4°. Above 12° a palm visibly faces the wrong way.",
         metric=f"merge.mounts.{name}.sigma_deg",
         value=sigma,
     )
 
 
-def _of_unused(unused: Mapping[str, Any]) -> Iterator[Criterion]:
+def _unused_camera_criteria(unused: Mapping[str, Any]) -> Iterator[Criterion]:
     if unused:
         yield Criterion(
-            about="body",
+            subject="body",
             name="Unused cameras",
             grade=Grade.POOR,
-            says="; ".join(f"{name}: {reason}" for name, reason in sorted(unused.items())),
-            why="Their limbs are inferred, not measured.",
+            finding="; ".join(f"{name}: {reason}" for name, reason in sorted(unused.items())),
+            rationale="Their limbs are inferred, not measured.",
         )
 
 
-def _of_measured(joints: Mapping[str, Any]) -> Iterator[Criterion]:
-    shares = {name: float(each["observed_share"]) for name, each in joints.items() if each["observed"]}
+def _observed_time_criteria(joints: Mapping[str, Any]) -> Iterator[Criterion]:
+    shares = {name: float(joint["observed_share"]) for name, joint in joints.items() if joint["observed"]}
     name, share = min(shares.items(), key=lambda item: item[1], default=("", None))
     if share is not None:
         yield Criterion(
-            about="body",
+            subject="body",
             name="Time measured",
-            grade=graded(share, 0.95, 0.8, more_is_better=True),
-            says=f"{format_percent(share, 1)} of the motion at the joint that was measured least ({name})",
-            why="A camera that starts late, ends early or is lost for long leaves its limb inferred, "
-            "and an average over all joints would hide it.",
+            grade=grade_value(share, _GOOD_OBSERVED_SHARE, _FAIR_OBSERVED_SHARE, more_is_better=True),
+            finding=f"{format_percent(share, 1)} of the motion at the joint that was measured least ({name})",
+            rationale="If a camera starts late, ends early or is lost for a long time, its limb is inferred. "
+            "An average over all joints would hide that.",
             metric="" if "." in name else f"motion.joints.{name}.observed_share",
             value=share,
         )

@@ -56,7 +56,7 @@ def _preview_inputs(task: PreviewTask, path: Path, threads: int) -> PreviewInput
 
     from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.merge_data import MergeResult
-    from bodycap_batch.overlay import body_of, camera_views
+    from bodycap_batch.overlay import bones_from_motion, make_camera_views
     from bodycap_batch.preview import PreviewInputs
 
     scene = load_map(task.map.path)
@@ -70,11 +70,11 @@ def _preview_inputs(task: PreviewTask, path: Path, threads: int) -> PreviewInput
     return PreviewInputs(
         path=path,
         capture=_trunk_first(load_capture(task.capture, task.keyframes, threads=threads), merge),
-        views=camera_views(registrations, scene.maps, found.clocks, merge),
-        frame="world" if merge is not None else scene.maps[0].gauge,
+        views=make_camera_views(registrations, scene.maps, found.clocks, merge),
+        reference_frame="world" if merge is not None else scene.maps[0].gauge,
         points=np.concatenate(moved),
         colours=np.concatenate(colours),
-        body=None if merge is None else body_of(merge.motion),
+        bone_motion=None if merge is None else bones_from_motion(merge.motion),
         note=task.failure or "",
     )
 

@@ -1,4 +1,4 @@
-"""A real browser: Debian's Chromium, driven headless; tests are skipped where there is none."""
+"""A real browser: Debian's Chromium without a window. The tests are skipped if it is not installed."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from tests.reports import report_inputs
 
 NO_3D = ("--no-sandbox", "--disable-3d-apis")
 _HARMLESS = ("GL Driver Message",)
-"""What Chromium's software renderer says about reading pixels back; nothing the page could change."""
+"""A message of Chromium's software renderer about reading pixels; the page cannot avoid it."""
 
 
 class Pages:
-    """Opens files in one browser and keeps what their consoles say and what they fetch."""
+    """Opens addresses in one browser and records messages of their consoles and their requests."""
 
     def __init__(self, browser: Any) -> None:
         self.browser = browser
-        self.said: list[str] = []
-        self.fetched: list[str] = []
+        self.messages: list[str] = []
+        self.requested_urls: list[str] = []
 
     def open(self, address: str, **options: Any) -> Any:
-        """A new page; options as Playwright's `new_context`."""
+        """Open a new page; the options are those of Playwright's `new_context`."""
         page = self.browser.new_context(**{"viewport": {"width": 1100, "height": 800}, **options}).new_page()
-        page.on("console", lambda line: self._hear(line.type, line.text))
-        page.on("pageerror", lambda error: self._hear("error", str(error)))
-        page.on("request", lambda request: self.fetched.append(request.url))
+        page.on("console", lambda line: self._record(line.type, line.text))
+        page.on("pageerror", lambda error: self._record("error", str(error)))
+        page.on("request", lambda request: self.requested_urls.append(request.url))
         page.goto(address)
         return page
 
-    def _hear(self, kind: str, text: str) -> None:
+    def _record(self, kind: str, text: str) -> None:
         if kind in ("error", "warning") and not any(words in text for words in _HARMLESS):
-            self.said.append(f"{kind}: {text}")
+            self.messages.append(f"{kind}: {text}")
 
 
-def launched(flags: tuple[str, ...]) -> Iterator[Any]:
+def launch(flags: tuple[str, ...]) -> Iterator[Any]:
     path = chromium()
     if path is None:
         pytest.skip("no Chromium is installed (Debian: apt install chromium)")
@@ -54,8 +54,8 @@ def launched(flags: tuple[str, ...]) -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def browser(request: pytest.FixtureRequest) -> Iterator[Any]:
-    """A browser with software WebGL, or with the flags a module asks for by parametrising."""
-    yield from launched(getattr(request, "param", FLAGS))
+    """Start a browser with software WebGL, or with the flags of a parametrised test."""
+    yield from launch(getattr(request, "param", FLAGS))
 
 
 @pytest.fixture

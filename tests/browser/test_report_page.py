@@ -1,4 +1,4 @@
-"""The report in a real browser: it draws, moves, says what is true, and needs no network."""
+"""The report in a real browser: it draws, plays, shows the right figures and needs no network."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.report import ReportInputs, write_report
-from bodycap_batch.report.tables import look_up
+from bodycap_batch.report.metric_tables import metric_at
 from tests.browser.conftest import NO_3D, Pages
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -18,24 +18,24 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 WEBGL = "Boolean(document.createElement('canvas').getContext('webgl2'))"
 
 
-def solid_pixels(page: Any) -> bytes:
-    """The 3D view as drawn, once the pending frame is through."""
+def viewer_pixels(page: Any) -> bytes:
+    """Return a screenshot of the 3D view after the pending frame is drawn."""
     page.wait_for_timeout(400)
     return bytes(page.locator(".solid").screenshot())
 
 
-def test_it_draws_in_3d_without_a_word_of_complaint_or_the_network(pages: Pages, report: Path) -> None:
+def test_it_draws_in_3d_without_messages_or_requests(pages: Pages, report: Path) -> None:
     page = pages.open(report.as_uri())
     assert page.evaluate(WEBGL), "the browser has no WebGL: the test would prove nothing"
     page.wait_for_selector("section.viewer[data-mode=webgl]")
     assert page.locator(".nogl").is_hidden()
-    assert len(set(solid_pixels(page))) > 100
-    assert pages.said == []
-    assert [url for url in pages.fetched if not url.startswith(("file:", "data:", "blob:"))] == []
-    assert [url for url in pages.fetched if url.startswith("file:")] == [report.as_uri()]
+    assert len(set(viewer_pixels(page))) > 100
+    assert pages.messages == []
+    assert [url for url in pages.requested_urls if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert [url for url in pages.requested_urls if url.startswith("file:")] == [report.as_uri()]
 
 
-SEEN = """() => {
+SCREEN_EXTENT = """() => {
   const { view } = bodycap;
   const p = new view.three.Vector3();
   const ends = [0, 0];
@@ -56,18 +56,18 @@ def test_it_starts_with_the_whole_body_and_all_paths_in_view(pages: Pages, repor
     page.set_viewport_size({"width": width, "height": 900})
     page.wait_for_selector("section.viewer[data-mode=webgl]")
     page.wait_for_timeout(400)
-    across, up = page.evaluate(SEEN)
-    # In the picture, and not lost in it.
+    across, up = page.evaluate(SCREEN_EXTENT)
+    # Everything is visible, and not too small.
     assert max(across, up) < 1.0
     assert max(across, up) > 0.8
     page.evaluate("bodycap.view.orbit.zoom(0.5)")
     near = page.evaluate("bodycap.view.orbit.distance")
     page.set_viewport_size({"width": width + 100, "height": 900})
     page.wait_for_timeout(400)
-    assert page.evaluate("bodycap.view.orbit.distance") == near, "who looked around is left there"
+    assert page.evaluate("bodycap.view.orbit.distance") == near, "a view that the user has changed is kept"
 
 
-def test_what_is_followed_stays_in_the_middle_when_the_window_changes(pages: Pages, report: Path) -> None:
+def test_a_followed_body_stays_in_the_middle_when_the_window_changes(pages: Pages, report: Path) -> None:
     page = pages.open(report.as_uri())
     page.wait_for_selector("section.viewer[data-mode=webgl]")
     page.check("[data-layer=follow]")
@@ -86,16 +86,16 @@ def test_the_slider_moves_the_skeleton(pages: Pages, report: Path) -> None:
     page.wait_for_selector("section.viewer[data-mode=webgl]")
     for layer in ("points", "paths", "keyframes", "cameras"):
         page.uncheck(f"[data-layer={layer}]")
-    first = solid_pixels(page)
-    assert solid_pixels(page) == first
+    first = viewer_pixels(page)
+    assert viewer_pixels(page) == first
     page.locator("#time").focus()
     page.keyboard.press("End")
-    last = solid_pixels(page)
+    last = viewer_pixels(page)
     assert last != first
     page.keyboard.press("Home")
-    assert solid_pixels(page) == first
+    assert viewer_pixels(page) == first
     page.uncheck("[data-layer=body]")
-    assert solid_pixels(page) != first
+    assert viewer_pixels(page) != first
     assert page.locator("#clock").inner_text() == "5.00 s"
 
 
@@ -109,12 +109,12 @@ def test_the_figures_on_the_page_are_those_of_the_metrics(
     )
     assert len(found) > 40
     for place, value in found:
-        assert float(value) == look_up(inputs.metrics, place)
+        assert float(value) == metric_at(inputs.metrics, place)
     registered = inputs.metrics["total"]["frames_registered"]
     assert f"{registered:,}" in page.locator(".figures dd").first.inner_text()
 
 
-def test_it_plays_and_obeys_the_keyboard(pages: Pages, report: Path) -> None:
+def test_it_plays_and_reacts_to_the_keyboard(pages: Pages, report: Path) -> None:
     from playwright.sync_api import expect
 
     page = pages.open(report.as_uri())
@@ -139,7 +139,7 @@ def test_it_plays_and_obeys_the_keyboard(pages: Pages, report: Path) -> None:
     assert page.evaluate("bodycap.view.orbit.azimuth") < before
 
 
-def test_everything_can_be_reached_and_has_a_name(pages: Pages, report: Path) -> None:
+def test_every_control_can_be_reached_with_tab_and_has_a_name(pages: Pages, report: Path) -> None:
     page = pages.open(report.as_uri())
     nameless = page.evaluate(
         """[...document.querySelectorAll('button, input, select, svg[role=img], img, [role=application]')]
@@ -157,9 +157,9 @@ def test_everything_can_be_reached_and_has_a_name(pages: Pages, report: Path) ->
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_words_stand_out_from_the_page_in_both_schemes(pages: Pages, report: Path, scheme: str) -> None:
+def test_text_has_enough_contrast_in_both_schemes(pages: Pages, report: Path, scheme: str) -> None:
     page = pages.open(report.as_uri(), color_scheme=scheme)
-    # WCAG 2 relative luminance; 4.5 is its bound for text
+    # Contrast by the relative luminance of WCAG 2, which requires 4.5 for text.
     contrast = page.evaluate(
         """() => {
           const pen = document.createElement('canvas').getContext('2d', {willReadFrequently: true});
@@ -180,7 +180,7 @@ def test_words_stand_out_from_the_page_in_both_schemes(pages: Pages, report: Pat
     assert min(contrast) >= 4.5
 
 
-def test_it_fits_a_phone(pages: Pages, report: Path) -> None:
+def test_it_fits_the_screen_of_a_phone(pages: Pages, report: Path) -> None:
     page = pages.open(report.as_uri(), viewport={"width": 360, "height": 740})
     page.wait_for_selector("section.viewer[data-mode=webgl]")
     assert page.evaluate("document.documentElement.scrollWidth") <= 360
@@ -194,7 +194,7 @@ def test_it_prints_without_its_controls(pages: Pages, report: Path) -> None:
     assert page.pdf()[:4] == b"%PDF"
 
 
-def test_a_failed_job_says_what_stopped_it(pages: Pages, inputs: ReportInputs, tmp_path: Path) -> None:
+def test_the_page_of_a_failed_job_shows_its_error(pages: Pages, inputs: ReportInputs, tmp_path: Path) -> None:
     failure = {"stage": "map", "type": "EstimationError", "message": "no pair to start from", "hint": "walk"}
     failed = ReportInputs(name="x", cameras=inputs.cameras, selections=inputs.selections, failure=failure)
     write_report(failed, tmp_path / "report.html", StageContext(work_dir=tmp_path))
@@ -202,37 +202,37 @@ def test_a_failed_job_says_what_stopped_it(pages: Pages, inputs: ReportInputs, t
     assert "no pair to start from" in page.locator(".failure").inner_text()
     assert page.locator("section.viewer").count() == 0
     assert page.locator(".badge.good").count() == 0
-    assert pages.said == []
+    assert pages.messages == []
 
 
 @pytest.mark.parametrize("browser", [NO_3D], indirect=True)
-def test_without_webgl_it_says_so_and_draws_flat(pages: Pages, report: Path) -> None:
+def test_without_webgl_it_shows_a_message_and_a_2d_drawing(pages: Pages, report: Path) -> None:
     page = pages.open(report.as_uri())
     assert not page.evaluate(WEBGL)
     page.wait_for_selector("section.viewer[data-mode=flat]")
     assert "no WebGL" in page.locator(".nogl").inner_text()
     for layer in ("points", "paths", "keyframes", "cameras"):
         page.uncheck(f"[data-layer={layer}]")
-    first = solid_pixels(page)
+    first = viewer_pixels(page)
     page.locator("#time").focus()
     page.keyboard.press("End")
-    assert solid_pixels(page) != first
-    assert pages.said == []
+    assert viewer_pixels(page) != first
+    assert pages.messages == []
 
 
-def test_uncertainty_is_drawn_where_it_is_known(pages: Pages, inputs: ReportInputs, tmp_path: Path) -> None:
+def test_known_uncertainty_is_drawn(pages: Pages, inputs: ReportInputs, tmp_path: Path) -> None:
     write_report(replace(inputs, name="y"), tmp_path / "report.html", StageContext(work_dir=tmp_path))
     page = pages.open((tmp_path / "report.html").as_uri())
     known = page.evaluate("Boolean(bodycap.data.body.sigma)")
     assert page.locator("[data-layer=sigma]").count() == int(known)
 
 
-def test_without_a_graphics_card_points_stand_where_the_renderer_would_put_them(
+def test_without_a_graphics_card_points_have_the_positions_of_the_renderer(
     pages: Pages, report: Path
 ) -> None:
     page = pages.open(report.as_uri())
     page.wait_for_selector("section.viewer[data-mode=webgl]")
-    with_points = solid_pixels(page)
+    with_points = viewer_pixels(page)
     inside, drawn = page.evaluate(
         """() => {
           const { three, camera, splat, data } = bodycap.view, { width, height } = splat.canvas;
@@ -248,17 +248,17 @@ def test_without_a_graphics_card_points_stand_where_the_renderer_would_put_them(
         }"""
     )
     assert inside > 50
-    # rounding may put a point on the edge of a pixel into the next one
+    # Rounding may move a point at the edge of a pixel into the next one.
     assert drawn >= 0.97 * inside
     page.uncheck("[data-layer=points]")
-    assert solid_pixels(page) != with_points
+    assert viewer_pixels(page) != with_points
     assert page.evaluate("bodycap.view.splat.pixels.every((pixel) => pixel === 0)")
     page.check("[data-layer=points]")
     page.wait_for_timeout(400)
     assert page.evaluate("bodycap.view.splat.pixels.some(Boolean)")
 
 
-def test_without_a_graphics_card_a_view_that_has_no_size_at_first_is_drawn_when_it_has(
+def test_without_a_graphics_card_a_view_without_size_is_drawn_when_it_gets_one(
     pages: Pages, report: Path, tmp_path: Path
 ) -> None:
     hidden = tmp_path / "hidden.html"
@@ -270,4 +270,4 @@ def test_without_a_graphics_card_a_view_that_has_no_size_at_first_is_drawn_when_
     page.add_style_tag(content=".solid { display: block !important; }")
     page.wait_for_timeout(400)
     assert page.evaluate("bodycap.view.splat.pixels.some(Boolean)")
-    assert pages.said == []
+    assert pages.messages == []

@@ -21,11 +21,11 @@ from bodycap_batch.formats.c3d import read_c3d
 from bodycap_batch.formats.gltf import read_glb
 from bodycap_batch.formats.usd import read_usd
 from bodycap_batch.model.skeleton import Motion
-from bodycap_batch.overlay import body_of
-from bodycap_batch.report.marks import solved_body
-from bodycap_batch.report.packing import Shown
-from bodycap_batch.report.placing import place
-from bodycap_batch.report.solid import solid_data
+from bodycap_batch.overlay import bones_from_motion
+from bodycap_batch.report.drawn_scene import make_drawn_scene
+from bodycap_batch.report.frame_overlays import bones_from_merge
+from bodycap_batch.report.packing import PageBudget
+from bodycap_batch.report.viewer_data import make_viewer_data
 from tests.reports import report_inputs
 from tests.stages.test_export import inputs_of, run
 
@@ -136,7 +136,7 @@ def test_the_page_shows_the_motion() -> None:
     inputs = report_inputs()
     merge = inputs.merge
     assert merge is not None
-    body = solid_data(inputs, place(inputs), Shown())["body"]
+    body = make_viewer_data(inputs, make_drawn_scene(inputs), PageBudget())["body"]
     centres = unpacked(body["centres"])[:, : len(body["joints"])]
     shown = {name: centres[:, joint] for joint, name in enumerate(body["joints"])}
     assert difference_m(shown, merge.motion) < TOLERANCE_M
@@ -147,6 +147,6 @@ def test_pictures_and_video_show_the_motion() -> None:
     merge = report_inputs().merge
     assert merge is not None
     poses = merge.motion.world_from_joint()
-    for body in (solved_body(merge), body_of(merge.motion)):
-        off = body.ends_in_world[:, :, 0] - poses[..., :3, 3][:, body.joint]
+    for body in (bones_from_merge(merge), bones_from_motion(merge.motion)):
+        off = body.ends_in_world[:, :, 0] - poses[..., :3, 3][:, body.joints]
         assert np.linalg.norm(off, axis=-1).max() < TOLERANCE_M

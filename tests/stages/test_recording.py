@@ -1,4 +1,4 @@
-"""The recording for the Rerun viewer: the solved motion, in the world and on the common clock."""
+"""The recording for the Rerun viewer: the solved motion, in the world and in common time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import rerun as rr
 from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.palette import Colour, camera_colours
 from bodycap_batch.report import ReportInputs
-from bodycap_batch.report.marks import solved_body
+from bodycap_batch.report.frame_overlays import bones_from_merge
 from bodycap_batch.report.recording import write_recording
 from bodycap_batch.runner import NotStored
 from tests.reports import report_inputs
@@ -24,8 +24,8 @@ def inputs() -> ReportInputs:
     return report_inputs(40)
 
 
-class Told:
-    """What is logged, by entity."""
+class LogSpy:
+    """Records what is logged, by entity."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.strips: dict[str, list[list[np.ndarray]]] = {}
@@ -71,46 +71,46 @@ def test_a_recording_is_written(inputs: ReportInputs, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "walk.rrd").read_bytes()[:3] == b"RRF"
 
 
-def test_the_body_is_the_one_that_was_solved(
+def test_the_body_is_the_solved_one(
     inputs: ReportInputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told = Told(monkeypatch)
+    log = LogSpy(monkeypatch)
     write_recording(inputs, tmp_path / "walk.rrd")
     assert inputs.merge is not None
-    np.testing.assert_allclose(told.times, inputs.merge.times_ns() * 1e-9)
-    np.testing.assert_array_equal(told.strips["world/body"], solved_body(inputs.merge).ends_in_world)
-    # 1.1 m/s ahead for 39 ticks of a thirtieth: an animation in place would stay where it is
-    bones = np.array(told.strips["world/body"])
+    np.testing.assert_allclose(log.times, inputs.merge.times_ns() * 1e-9)
+    np.testing.assert_array_equal(log.strips["world/body"], bones_from_merge(inputs.merge).ends_in_world)
+    # The body walks at 1.1 m/s for 39 ticks of 1/30 s; an in-place animation would not move.
+    bones = np.array(log.strips["world/body"])
     assert np.linalg.norm(bones[-1] - bones[0], axis=-1).min() > 1.0
 
 
-def test_camera_paths_are_on_the_common_clock_and_broken_at_their_gaps(
+def test_camera_paths_use_common_time_and_are_interrupted_at_gaps(
     inputs: ReportInputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told = Told(monkeypatch)
+    log = LogSpy(monkeypatch)
     clocks = {name: replace(clock, offset_s=2.5) for name, clock in inputs.clocks.items()}
     write_recording(replace(inputs, clocks=clocks, merge=None), tmp_path / "walk.rrd")
-    for registration, times in zip(inputs.registrations, told.columns, strict=True):
+    for registration, times in zip(inputs.registrations, log.columns, strict=True):
         path = registration.trajectory
         np.testing.assert_allclose(times, path.times_ns[path.localised] * 1e-9 + 2.5)
     # frames 20 to 24 are lost
-    (stretches,) = told.strips["world/cameras/torso/path"]
-    assert [len(each) for each in stretches] == [20, 15]
-    assert told.colours["world/cameras/torso/path"] == (camera_colours(inputs.cameras)["torso"],)
-    assert "world/body" not in told.strips
+    (lines,) = log.strips["world/cameras/torso/path"]
+    assert [len(line) for line in lines] == [20, 15]
+    assert log.colours["world/cameras/torso/path"] == (camera_colours(inputs.cameras)["torso"],)
+    assert "world/body" not in log.strips
 
 
-def test_nothing_stored_is_no_recording(tmp_path: Path) -> None:
+def test_a_job_without_stored_results_has_no_recording(tmp_path: Path) -> None:
     with pytest.raises(JobError, match="neither map nor camera paths"):
         write_recording(ReportInputs(name="x"), tmp_path / "x.rrd")
-    # Stages that are stored may be of another version; the report says so likewise.
+    # If stored results come from another version, the error states it, as the report does.
     failure = NotStored([], tmp_path).to_dict()
     with pytest.raises(JobError, match="not computed yet") as caught:
         write_recording(ReportInputs(name="x", failure=failure), tmp_path / "x.rrd")
     assert "bodycap why" in str(caught.value.hint)
 
 
-def test_a_place_that_takes_no_file_is_told(inputs: ReportInputs, tmp_path: Path) -> None:
+def test_a_target_that_cannot_be_written_is_an_error(inputs: ReportInputs, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match="cannot be written"):
         write_recording(inputs, tmp_path / "file" / "x.rrd")

@@ -1,4 +1,4 @@
-"""The report's content: figures, verdict, causes, what a broken-off job gets, and the size."""
+"""The content of the report: figures, verdict, recommendations, causes of losses, and stopped jobs."""
 
 from __future__ import annotations
 
@@ -20,59 +20,59 @@ from bodycap_batch.model.geometry import interpolate_pose
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.pipeline.stage_results import StageResults, report_task
 from bodycap_batch.report import ReportInputs
-from bodycap_batch.report.advice import advise, shared_points
-from bodycap_batch.report.figures.body import before_optimisation
-from bodycap_batch.report.figures.strips import strip
+from bodycap_batch.report.drawn_scene import common_times_s, make_drawn_scene
+from bodycap_batch.report.figures.before_after import find_unoptimised_bones
+from bodycap_batch.report.figures.camera_timeline import draw_camera_timeline
+from bodycap_batch.report.frame_losses import LossCause, find_frame_losses, likely_cause
+from bodycap_batch.report.frame_pictures import FrameAppearance, FramePicture
 from bodycap_batch.report.grades import Criterion, Grade
-from bodycap_batch.report.losses import Cause, cause_of, find_losses
-from bodycap_batch.report.packing import NONE, Shown, pack_scaled, thinned
-from bodycap_batch.report.pictures import Look, Picture
-from bodycap_batch.report.placing import common_times_s, place
-from bodycap_batch.report.solid import solid_data
-from bodycap_batch.report.tables import look_up
+from bodycap_batch.report.metric_tables import metric_at
+from bodycap_batch.report.packing import MISSING_CODE, PageBudget, pack_scaled
+from bodycap_batch.report.recommendations import count_shared_points, recommend_changes
 from bodycap_batch.report.verdict import judge
+from bodycap_batch.report.viewer_data import make_viewer_data
 from bodycap_batch.store.digests import FileDigests
 from bodycap_batch.tasks.report import load_inputs
 from tests.reports import written
 from tests.videos import textured_frame, write_video
 
 
-class Figures(HTMLParser):
-    """Every figure that names its place in metrics.json, and all links to elsewhere."""
+class PageParser(HTMLParser):
+    """Collects the figures that name their path in metrics.json, and the links to other documents."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.found: list[tuple[str, str]] = []
-        self.outside: list[str] = []
+        self.figures: list[tuple[str, str]] = []
+        self.external_links: list[str] = []
         self.tags: Counter[str] = Counter()
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         values = dict(attrs)
         self.tags[tag] += 1
         if "data-metric" in values:
-            self.found.append((values["data-metric"] or "", values["data-value"] or ""))
+            self.figures.append((values["data-metric"] or "", values["data-value"] or ""))
         for name in ("src", "href"):
             link = values.get(name) or ""
             if link and not link.startswith(("data:", "#")):
-                self.outside.append(link)
+                self.external_links.append(link)
 
 
-def read(text: str) -> Figures:
-    figures = Figures()
-    figures.feed(text)
-    return figures
+def parse(text: str) -> PageParser:
+    page = PageParser()
+    page.feed(text)
+    return page
 
 
-def test_every_figure_is_that_of_the_metrics_and_nothing_is_fetched(
+def test_every_figure_is_that_of_the_metrics_and_nothing_is_loaded(
     inputs: ReportInputs, tmp_path: Path
 ) -> None:
-    figures = read(written(inputs, tmp_path))
-    assert len(figures.found) > 40
+    page = parse(written(inputs, tmp_path))
+    assert len(page.figures) > 40
     assert inputs.metrics is not None
-    for place_, value in figures.found:
-        assert float(value) == look_up(inputs.metrics, place_), place_
-    assert {"total.frames_registered", "merge.scale.relative_sigma"} <= {name for name, _ in figures.found}
-    assert figures.outside == []
+    for path, value in page.figures:
+        assert float(value) == metric_at(inputs.metrics, path), path
+    assert {"total.frames_registered", "merge.scale.relative_sigma"} <= {path for path, _ in page.figures}
+    assert page.external_links == []
 
 
 def test_the_same_results_give_the_same_bytes(inputs: ReportInputs, tmp_path: Path) -> None:
@@ -93,9 +93,7 @@ def test_a_name_cannot_break_the_page(inputs: ReportInputs, tmp_path: Path) -> N
         ("check", set()),
     ],
 )
-def test_a_job_that_broke_off_gets_a_page_too(
-    inputs: ReportInputs, tmp_path: Path, stage: str, keeps: set[str]
-) -> None:
+def test_a_stopped_job_has_a_page(inputs: ReportInputs, tmp_path: Path, stage: str, keeps: set[str]) -> None:
     failure = {"stage": stage, "type": "EstimationError", "message": "too little <parallax>", "hint": "walk"}
     kept = {name: getattr(inputs, name) for name in keeps}
     if "metrics" in kept:
@@ -111,7 +109,7 @@ def test_the_verdict_takes_the_worst_of_its_criteria(inputs: ReportInputs) -> No
     assert inputs.metrics is not None
     metrics = json.loads(json.dumps(inputs.metrics))
     verdict = judge(metrics, None)
-    # 5 of 60 frames are lost and the scale is known to 4.5 %: both between their bounds.
+    # 5 of 60 frames are lost and the scale is known to 4.5 %: both are between the bounds.
     assert (verdict.cameras, verdict.body) == (Grade.FAIR, Grade.FAIR)
     metrics["total"]["mean_reprojection_error_px"] = 2.5
     assert judge(metrics, None).cameras is Grade.POOR
@@ -120,42 +118,42 @@ def test_the_verdict_takes_the_worst_of_its_criteria(inputs: ReportInputs) -> No
     assert judge(None, {"message": "x"}).grade is Grade.NONE
 
 
-def test_a_mirrored_camera_is_to_be_flipped_not_to_see_more(inputs: ReportInputs, tmp_path: Path) -> None:
+def test_a_mirrored_camera_gets_the_advice_to_flip_its_video(inputs: ReportInputs, tmp_path: Path) -> None:
     metrics = json.loads(json.dumps(inputs.metrics))
     metrics["mapping"]["mirrored_cameras"] = ["left_palm"]
-    lost = {"left_palm": Counter({Cause.NO_MAP: 60})}
-    assert any("see the same places" in each.do for each in advise(inputs, lost))
-    first, *others = advise(replace(inputs, metrics=metrics), lost)
-    assert first.do.startswith("Flip the video of left_palm back")
-    assert not any("see the same places" in each.do for each in others)
+    lost = {"left_palm": Counter({LossCause.NO_MAP: 60})}
+    assert any("see the same places" in each.action for each in recommend_changes(inputs, lost))
+    first, *others = recommend_changes(replace(inputs, metrics=metrics), lost)
+    assert first.action.startswith("Flip the video of left_palm back")
+    assert not any("see the same places" in each.action for each in others)
     assert "Flip the video of left_palm back" in written(replace(inputs, metrics=metrics), tmp_path)
 
 
-def test_cameras_that_see_mirror_images_are_to_be_looked_at(inputs: ReportInputs) -> None:
+def test_cameras_that_see_mirror_images_get_the_advice_to_check_them(inputs: ReportInputs) -> None:
     metrics = json.loads(json.dumps(inputs.metrics))
     metrics["mapping"]["mirror_images"] = [[["left_palm"], ["torso"]]]
-    first, *_ = advise(replace(inputs, metrics=metrics), {})
-    assert first.do.startswith("See whether text reads backwards in the video of left_palm or torso")
+    first, *_ = recommend_changes(replace(inputs, metrics=metrics), {})
+    assert first.action.startswith("See whether text reads backwards in the video of left_palm or torso")
 
 
-def test_a_verdict_names_cameras_that_only_the_body_places_and_a_job_without_any_pose(
+def test_the_verdict_names_cameras_placed_by_the_body_alone_and_a_job_without_poses(
     inputs: ReportInputs,
 ) -> None:
     metrics = json.loads(json.dumps(inputs.metrics))
     metrics["merge"]["joined_cameras"] = {"left_palm": {"sigma_deg": 2.0, "sigma_m": 0.01}}
-    room = next(each for each in judge(metrics, None).criteria if each.name == "One room")
-    assert room.grade is Grade.FAIR
-    assert "left_palm" in room.says
+    one_room = next(each for each in judge(metrics, None).criteria if each.name == "One room")
+    assert one_room.grade is Grade.FAIR
+    assert "left_palm" in one_room.finding
     metrics["total"] |= {"frames_registered": 0, "coverage": 0.0}
     assert judge(metrics, None).headline.startswith("The cameras are not tracked")
 
 
-def test_a_share_below_one_never_reads_as_all(inputs: ReportInputs, tmp_path: Path) -> None:
+def test_a_share_below_one_is_never_shown_as_100_percent(inputs: ReportInputs, tmp_path: Path) -> None:
     metrics = json.loads(json.dumps(inputs.metrics))
-    for place_ in (metrics["total"], *metrics["cameras"].values()):
-        place_["coverage"] = 0.9997
+    for entry in (metrics["total"], *metrics["cameras"].values()):
+        entry["coverage"] = 0.9997
     metrics["mapping"]["reach"]["within_reach"] = 0.99999
-    assert "99.9%" in judge(metrics, None).criteria[0].says
+    assert "99.9%" in judge(metrics, None).criteria[0].finding
     text = written(replace(inputs, metrics=metrics), tmp_path)
     assert "99.9%" in text
     coverage = re.findall(r'data-metric="[^"]*coverage"[^>]*>([^<]*)<', text)
@@ -166,7 +164,7 @@ def test_a_share_below_one_never_reads_as_all(inputs: ReportInputs, tmp_path: Pa
 @pytest.mark.parametrize(
     ("factor", "grade", "says"), [(0.81, Grade.POOR, "19 % shorter"), (1.08, Grade.FAIR, "8 % longer")]
 )
-def test_a_lens_that_the_map_contradicts_is_no_good_result(
+def test_a_lens_that_the_map_contradicts_is_not_graded_good(
     inputs: ReportInputs, tmp_path: Path, factor: float, grade: Grade, says: str
 ) -> None:
     metrics = json.loads(json.dumps(inputs.metrics))
@@ -174,23 +172,23 @@ def test_a_lens_that_the_map_contradicts_is_no_good_result(
     metrics["mapping"]["misfitting_lenses"] = {"left_palm": factor, "torso": 1.0 + 0.9 * (factor - 1.0)}
     (lenses,) = (each for each in judge(metrics, None).criteria if "Lenses" in each.name)
     assert (lenses.grade, lenses.value) == (grade, factor)
-    assert f"left_palm: the pictures fit a focal length {says}" in lenses.says
-    told = replace(inputs, metrics=metrics)
+    assert f"left_palm: the pictures fit a focal length {says}" in lenses.finding
+    contradicted = replace(inputs, metrics=metrics)
     metrics["mapping"]["freed_lenses"] = ["left_palm", "torso"]
     (freed,) = (each for each in judge(metrics, None).criteria if "Lenses" in each.name)
     assert freed.grade is Grade.FAIR
-    assert "what fits was used instead" in freed.says
-    # Found, but it does not fit either: a wide lens given as a pinhole was 53 cm off with 1.1 px.
+    assert "what fits was used instead" in freed.finding
+    # With a larger error the estimated lens does not fit either, as a pinhole for a wide lens does not.
     strained = json.loads(json.dumps(metrics))
     strained["total"]["mean_reprojection_error_px"] = 1.1
     (misfit,) = (each for each in judge(strained, None).criteria if "Lenses" in each.name)
     assert misfit.grade is grade
-    assert "calibration: auto" in advise(told, {})[0].do
-    assert says in written(told, tmp_path)
+    assert "calibration: auto" in recommend_changes(contradicted, {})[0].action
+    assert says in written(contradicted, tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("doubt", "name", "do"),
+    ("doubt", "name", "action"),
     [
         (
             {"doubted_clocks": {"left_palm": {"offset_s": 0.47, "says": "0.5 s behind"}}},
@@ -204,28 +202,28 @@ def test_a_lens_that_the_map_contradicts_is_no_good_result(
         ),
     ],
 )
-def test_what_cannot_be_a_body_is_told_first(
-    inputs: ReportInputs, tmp_path: Path, doubt: dict[str, Any], name: str, do: str
+def test_contradictions_of_the_body_are_recommended_first(
+    inputs: ReportInputs, tmp_path: Path, doubt: dict[str, Any], name: str, action: str
 ) -> None:
     assert inputs.merge is not None
     metrics = json.loads(json.dumps(inputs.metrics))
     assert not any(each.name == name for each in judge(metrics, None).criteria)
     metrics["merge"] |= doubt
     (found,) = (each for each in judge(metrics, None).criteria if each.name == name)
-    assert (found.grade, found.says) == (Grade.POOR, "0.5 s behind")
+    assert (found.grade, found.finding) == (Grade.POOR, "0.5 s behind")
     merge = replace(inputs.merge, report={**inputs.merge.report, **doubt})
-    told = replace(inputs, metrics=metrics, merge=merge)
-    assert do in advise(told, {})[0].do
-    assert "0.5 s behind" in written(told, tmp_path)
+    contradicted = replace(inputs, metrics=metrics, merge=merge)
+    assert action in recommend_changes(contradicted, {})[0].action
+    assert "0.5 s behind" in written(contradicted, tmp_path)
 
 
-def test_cameras_that_come_late_or_leave_early_are_told_where_to_cut(inputs: ReportInputs) -> None:
+def test_cameras_that_start_late_or_end_early_get_the_advice_to_cut(inputs: ReportInputs) -> None:
     assert inputs.merge is not None
-    assert not any("start_s" in each.do for each in advise(inputs, {}))
+    assert not any("start_s" in each.action for each in recommend_changes(inputs, {}))
 
-    def without(path: Trajectory, gone: slice) -> Trajectory:
+    def without_poses(path: Trajectory, lost: slice) -> Trajectory:
         kept = path.localised.copy()
-        kept[gone] = False
+        kept[lost] = False
         return replace(
             path,
             gauge_from_cam=np.where(kept[:, None, None], path.gauge_from_cam, np.nan),
@@ -236,37 +234,35 @@ def test_cameras_that_come_late_or_leave_early_are_told_where_to_cut(inputs: Rep
         )
 
     torso, left, right = inputs.merge.trajectories
-    paths = (torso, without(left, slice(0, 30)), without(right, slice(40, None)))
+    paths = (torso, without_poses(left, slice(0, 30)), without_poses(right, slice(40, None)))
     (ends,) = (
         each
-        for each in advise(replace(inputs, merge=replace(inputs.merge, trajectories=paths)), {})
-        if "start_s" in each.do
+        for each in recommend_changes(replace(inputs, merge=replace(inputs.merge, trajectories=paths)), {})
+        if "start_s" in each.action
     )
     start = inputs.merge.start_ns * 1e-9
-    assert f"start_s: {start + 1.0:.2f} and end_s: {start + 39 / 30:.2f}" in ends.do
-    assert f"{left.camera} has no measurement before" in ends.because
+    assert f"start_s: {start + 1.0:.2f} and end_s: {start + 39 / 30:.2f}" in ends.action
+    assert f"{left.camera} has no measurement before" in ends.reason
 
-    paths = (torso, without(left, slice(0, 40)), without(right, slice(20, None)))
-    never = advise(replace(inputs, merge=replace(inputs.merge, trajectories=paths)), {})
-    (ends,) = (each for each in never if "Start all cameras" in each.do)
-    assert ends.do.endswith("stop them after it.")  # nothing is left between 1.33 and 0.63 s
-    assert f"{right.camera} has no measurement after" in ends.because
+    paths = (torso, without_poses(left, slice(0, 40)), without_poses(right, slice(20, None)))
+    without_cut = recommend_changes(replace(inputs, merge=replace(inputs.merge, trajectories=paths)), {})
+    (ends,) = (each for each in without_cut if "Start all cameras" in each.action)
+    assert ends.action.endswith("stop them after it.")  # no time remains between 1.33 and 0.63 s
+    assert f"{right.camera} has no measurement after" in ends.reason
 
 
-def test_a_camera_without_a_clock_stands_where_its_offset_puts_it(
-    inputs: ReportInputs, tmp_path: Path
-) -> None:
+def test_a_camera_without_a_clock_uses_its_stated_offset(inputs: ReportInputs, tmp_path: Path) -> None:
     write_video(tmp_path / "torso.mp4", [textured_frame(index) for index in range(12)])
     lens = {"model": "PINHOLE", "params": [60.0, 60.0, 32.0, 24.0], "width": 64, "height": 48}
     camera = {"name": "torso", "video": [str(tmp_path / "torso.mp4")], "calibration": lens, "offset_s": 2.5}
     capture = open_capture(CaptureConfig.model_validate({"cameras": [camera]}))
-    early = ReportInputs(name="x", cameras=("torso",), capture=capture, failure={"stage": "map"})
-    times = common_times_s(early, "torso", capture.camera("torso").times_ns)
+    stopped = ReportInputs(name="x", cameras=("torso",), capture=capture, failure={"stage": "map"})
+    times = common_times_s(stopped, "torso", capture.camera("torso").times_ns)
     np.testing.assert_allclose(times, capture.camera("torso").common_times_ns() * 1e-9)
     assert times[0] == pytest.approx(2.5)
 
 
-def test_every_link_of_the_page_leads_somewhere(inputs: ReportInputs, tmp_path: Path) -> None:
+def test_every_link_of_the_page_has_a_target(inputs: ReportInputs, tmp_path: Path) -> None:
     kept = {name: getattr(inputs, name) for name in ("cameras", "maps", "registrations", "clocks")}
     failure = {"stage": "merge", "type": "EstimationError", "message": "stopped", "hint": ""}
     for each in (inputs, ReportInputs(name="x", failure=failure, **kept), ReportInputs(name="x")):
@@ -282,7 +278,7 @@ def test_every_link_of_the_page_leads_somewhere(inputs: ReportInputs, tmp_path: 
 PAIR = {"cameras": ["torso", "torso_back"], "instants": 130, "rigid": False, "explained_deg": 1.0}
 
 
-def _on_one_bone(inputs: ReportInputs, *pairs: dict[str, Any], **merge: Any) -> list[Criterion]:
+def criteria_on_one_bone(inputs: ReportInputs, *pairs: dict[str, Any], **merge: Any) -> list[Criterion]:
     metrics = json.loads(json.dumps(inputs.metrics))
     metrics["relative_poses"] = pairs
     metrics["merge"] |= merge
@@ -290,51 +286,55 @@ def _on_one_bone(inputs: ReportInputs, *pairs: dict[str, Any], **merge: Any) -> 
 
 
 @pytest.mark.parametrize(("spread_deg", "grade"), [(0.3, Grade.GOOD), (4.8, Grade.FAIR), (15.0, Grade.POOR)])
-def test_cameras_on_one_bone_that_move_against_each_other_are_told(
+def test_relative_rotation_of_cameras_on_one_bone_is_graded(
     inputs: ReportInputs, spread_deg: float, grade: Grade
 ) -> None:
-    never = {
+    without_instants = {
         **PAIR,
         "cameras": ["torso", "torso_2"],
         "instants": 0,
         "spread_deg": None,
         "explained_deg": None,
     }
-    (found,) = _on_one_bone(inputs, never, {**PAIR, "spread_deg": spread_deg})
+    (found,) = criteria_on_one_bone(inputs, without_instants, {**PAIR, "spread_deg": spread_deg})
     assert found.grade is grade
-    assert "torso and torso_back" in found.says
-    assert not _on_one_bone(inputs, never)
+    assert "torso and torso_back" in found.finding
+    assert not criteria_on_one_bone(inputs, without_instants)
 
 
-def test_what_says_too_little_of_cameras_on_one_bone_is_not_held_against_them(inputs: ReportInputs) -> None:
+def test_weak_evidence_about_cameras_on_one_bone_is_ignored(inputs: ReportInputs) -> None:
     loose = {**PAIR, "spread_deg": 15.0}
-    assert not _on_one_bone(inputs, {**loose, "instants": 29})
-    assert not _on_one_bone(inputs, loose, unused_cameras={"torso_back": "no link"})
+    assert not criteria_on_one_bone(inputs, {**loose, "instants": 29})
+    assert not criteria_on_one_bone(inputs, loose, unused_cameras={"torso_back": "no link"})
     noisy = {**PAIR, "spread_deg": 8.1, "explained_deg": 8.0}
-    assert [each.grade for each in _on_one_bone(inputs, noisy)] == [Grade.GOOD]
+    assert [each.grade for each in criteria_on_one_bone(inputs, noisy)] == [Grade.GOOD]
     in_step = {**PAIR, "spread_deg": 10.0, "explained_deg": 8.0, "rigid": True}
-    assert [each.grade for each in _on_one_bone(inputs, in_step)] == [Grade.GOOD]
-    # A forearm's two ends turn against each other; what is loose elsewhere is worse.
+    assert [each.grade for each in criteria_on_one_bone(inputs, in_step)] == [Grade.GOOD]
+    # The two ends of a forearm turn relative to each other; a loose camera on another bone is worse.
     arm = {**loose, "cameras": ["left_palm", "left_wrist"], "spread_deg": 30.0}
     mounts = {**inputs.metrics["merge"]["mounts"]}
     mounts["left_palm"] = {**mounts["left_palm"], "role": "LeftForeArm"}
-    assert [each.grade for each in _on_one_bone(inputs, arm, mounts=mounts)] == [Grade.FAIR]
-    (worst,) = _on_one_bone(inputs, arm, loose, mounts=mounts)
+    assert [each.grade for each in criteria_on_one_bone(inputs, arm, mounts=mounts)] == [Grade.FAIR]
+    (worst,) = criteria_on_one_bone(inputs, arm, loose, mounts=mounts)
     assert worst.grade is Grade.POOR
-    assert "torso_back" in worst.says
+    assert "torso_back" in worst.finding
 
 
-def test_a_lens_off_its_centre_is_never_good(inputs: ReportInputs) -> None:
+def test_a_lens_with_a_wrong_principal_point_is_never_graded_good(inputs: ReportInputs) -> None:
     metrics = json.loads(json.dumps(inputs.metrics))
     metrics["mapping"]["misfitting_lenses"] = {"torso": 1.0}
     (found,) = [each for each in judge(metrics, None).criteria if each.name.startswith("Lenses")]
     assert found.grade is Grade.FAIR
-    assert "another lens" in found.says
-    told = [each.because for each in advise(replace(inputs, metrics=metrics), {}) if "calibration" in each.do]
-    assert told == ["by the pictures, torso has another lens than the calibration says"]
+    assert "another lens" in found.finding
+    reasons = [
+        each.reason
+        for each in recommend_changes(replace(inputs, metrics=metrics), {})
+        if "calibration" in each.action
+    ]
+    assert reasons == ["according to the pictures, torso has another lens than the calibration says"]
 
 
-def test_a_body_that_no_scale_brings_within_reach_is_told(inputs: ReportInputs) -> None:
+def test_distances_beyond_the_reach_at_any_scale_are_graded_poor(inputs: ReportInputs) -> None:
     metrics = json.loads(json.dumps(inputs.metrics))
     metrics["mapping"]["reach"] = {
         "judged": False,
@@ -345,18 +345,18 @@ def test_a_body_that_no_scale_brings_within_reach_is_told(inputs: ReportInputs) 
     }
     (found,) = [each for each in judge(metrics, None).criteria if "reach" in each.name]
     assert found.grade is Grade.POOR
-    assert found.says.startswith("62")
-    assert "do not suit" in found.says
-    # With a camera that nobody wore nothing else is to be blamed.
+    assert found.finding.startswith("62")
+    assert "do not suit" in found.finding
+    # If a camera is not part of the body, the finding names it as the reason.
     metrics["merge"]["unused_cameras"] = {"left_palm": "it lies on a table"}
     (found,) = [each for each in judge(metrics, None).criteria if "reach" in each.name]
     assert found.grade is Grade.FAIR
-    assert "left_palm" in found.says
-    assert "do not suit" not in found.says
+    assert "left_palm" in found.finding
+    assert "do not suit" not in found.finding
 
 
 @pytest.mark.parametrize("reach", [None, {"judged": False, "reason": "3 distances are too few"}])
-def test_a_map_that_no_body_was_held_against_has_no_reach_to_judge(
+def test_a_map_without_distance_check_has_no_criterion_about_reach(
     inputs: ReportInputs, reach: dict[str, Any] | None
 ) -> None:
     metrics = json.loads(json.dumps(inputs.metrics))
@@ -364,23 +364,23 @@ def test_a_map_that_no_body_was_held_against_has_no_reach_to_judge(
     assert not [each for each in judge(metrics, None).criteria if "reach" in each.name]
 
 
-def test_a_camera_that_ended_early_shows_in_the_verdict(inputs: ReportInputs) -> None:
+def test_the_verdict_shows_a_camera_that_ended_early(inputs: ReportInputs) -> None:
     metrics = json.loads(json.dumps(inputs.metrics))
     assert next(c for c in judge(metrics, None).criteria if c.name == "Time measured").grade is Grade.GOOD
     metrics["motion"]["joints"]["LeftHand"]["observed_share"] = 0.6
     least = next(c for c in judge(metrics, None).criteria if c.name == "Time measured")
     assert (least.grade, least.value) == (Grade.POOR, 0.6)
-    assert look_up(metrics, least.metric) == 0.6
+    assert metric_at(metrics, least.metric) == 0.6
     assert judge(metrics, None).body is Grade.POOR
 
 
-def test_what_the_solver_tells_of_scale_hinges_rules_and_joined_maps_is_on_the_page(
+def test_the_page_shows_scale_hinges_soft_limits_and_joined_maps(
     inputs: ReportInputs, tmp_path: Path
 ) -> None:
     metrics = json.loads(json.dumps(inputs.metrics))
     metrics["merge"]["joined_cameras"] = {"left_palm": {"sigma_deg": 2.0, "sigma_m": 0.013}}
     text = written(replace(inputs, metrics=metrics), tmp_path)
-    shown = {name for name, _ in read(text).found}
+    shown = {name for name, _ in parse(text).figures}
     assert {
         "merge.scale.sources.0.off",
         "merge.scale.limbs.alone.1.relative_sigma",
@@ -394,16 +394,16 @@ def test_what_the_solver_tells_of_scale_hinges_rules_and_joined_maps_is_on_the_p
 
 
 @pytest.mark.parametrize(("max_gap_s", "bridged"), [(0.21, True), (0.19, False)])
-def test_a_gap_counts_as_bridged_by_the_jobs_own_limit(
+def test_a_gap_is_bridged_up_to_the_limit_of_the_job(
     inputs: ReportInputs, tmp_path: Path, max_gap_s: float, bridged: bool
 ) -> None:
-    # 5 frames of 30 a second are lost: 0.2 s from the measurement before to the one after
+    # Five frames at 30 fps are lost: 0.2 s from the measurement before to the one after.
     text = written(replace(inputs, max_gap_s=max_gap_s), tmp_path)
     assert ("5 frames lost: BLUR, bridged" in text) == bridged
     assert ("<title>5 frames lost: BLUR</title>" in text) != bridged
 
 
-def test_the_jobs_own_limit_is_handed_to_the_report(tmp_path: Path) -> None:
+def test_the_report_gets_the_limit_of_the_job(tmp_path: Path) -> None:
     camera = {"name": "torso", "video": ["torso.mp4"]}
     job = Job.model_validate({"capture": {"cameras": [camera]}, "merge": {"max_gap_s": 0.4}})
     failure = {"stage": "check", "message": "no video"}
@@ -411,8 +411,8 @@ def test_the_jobs_own_limit_is_handed_to_the_report(tmp_path: Path) -> None:
     assert load_inputs(task).max_gap_s == 0.4
 
 
-def test_a_strip_of_any_length_stays_small(inputs: ReportInputs) -> None:
-    # every other frame is lost: drawn one by one, the stretches alone would take 2 MB
+def test_a_camera_timeline_of_any_length_stays_small(inputs: ReportInputs) -> None:
+    # Every second frame is lost. Drawn one by one, the lost intervals alone would take 2 MB.
     count = 20_000
     statuses = (FrameStatus.KEYFRAME, FrameStatus.BLUR) * (count // 2)
     found = inputs.registrations[0]
@@ -428,17 +428,17 @@ def test_a_strip_of_any_length_stays_small(inputs: ReportInputs) -> None:
         error_px=np.where(kept, 0.5, np.nan),
     )
     long = replace(inputs, registrations=(replace(found, trajectory=path),), merge=None, selections=())
-    losses = find_losses(long)
+    losses = find_frame_losses(long)
     assert len(losses) == count // 2
-    drawn = strip(long, path.camera, (0.0, count / 30.0), losses, 0.0)
+    drawn = draw_camera_timeline(long, path.camera, (0.0, count / 30.0), losses, 0.0)
     assert len(drawn) < 150_000
     assert f"{count // 2} frames lost: BLUR" in drawn
 
 
-def test_before_optimisation_means_the_same_for_a_camera_half_a_frame_late(inputs: ReportInputs) -> None:
+def test_unoptimised_bones_of_a_camera_half_a_frame_late_are_the_same(inputs: ReportInputs) -> None:
     assert inputs.merge is not None
 
-    def late(path: Trajectory) -> Trajectory:
+    def half_a_frame_later(path: Trajectory) -> Trajectory:
         poses = path.gauge_from_cam
         kept = path.localised[:-1] & path.localised[1:]
         between = np.full_like(poses[:-1], np.nan)
@@ -454,17 +454,19 @@ def test_before_optimisation_means_the_same_for_a_camera_half_a_frame_late(input
             ),
         )
 
-    merge = replace(inputs.merge, trajectories=tuple(late(path) for path in inputs.merge.trajectories))
+    merge = replace(
+        inputs.merge, trajectories=tuple(half_a_frame_later(path) for path in inputs.merge.trajectories)
+    )
     poses = merge.motion.world_from_joint()
     for usual, shifted in zip(
-        before_optimisation(inputs), before_optimisation(replace(inputs, merge=merge)), strict=True
+        find_unoptimised_bones(inputs), find_unoptimised_bones(replace(inputs, merge=merge)), strict=True
     ):
-        # 5 mm of noise and slack; half a frame of walking at 1.1 m/s would be 18 mm more
-        medians = [np.median(camera.off_m(poses)) for camera in (shifted, usual)]
+        # There are 5 mm of noise and slack; half a frame of walking at 1.1 m/s would add 18 mm.
+        medians = [np.median(bone.distance_m(poses)) for bone in (shifted, usual)]
         assert abs(medians[0] - medians[1]) < 0.004
 
 
-def test_a_camera_whose_poses_lie_beside_the_motion_breaks_no_page(
+def test_a_camera_with_poses_outside_the_motion_does_not_break_the_page(
     inputs: ReportInputs, tmp_path: Path
 ) -> None:
     clocks = {name: replace(clock, offset_s=1000.0) for name, clock in inputs.clocks.items()}
@@ -472,38 +474,43 @@ def test_a_camera_whose_poses_lie_beside_the_motion_breaks_no_page(
     assert "Before and after" not in text
 
 
-def test_losses_are_found_with_what_was_measured_beside_them(inputs: ReportInputs) -> None:
-    losses = find_losses(inputs)
+def test_losses_are_found_with_measurements_next_to_them(inputs: ReportInputs) -> None:
+    losses = find_frame_losses(inputs)
     assert len(losses) == 3
     for loss in losses:
-        assert (loss.first, loss.last, loss.frames) == (20, 24, 5)
+        assert (loss.first, loss.last, loss.frame_count) == (20, 24, 5)
         assert loss.reason is FrameStatus.BLUR
-        # sharpness 3 to 4 in lost frames, 10 to 11 in the others
+        # The sharpness is 3 to 4 in lost frames and 10 to 11 in the others.
         assert 0.27 < loss.sharpness < 0.4
 
 
-def test_causes_follow_the_measurements(inputs: ReportInputs) -> None:
-    loss = find_losses(inputs)[0]
+def test_likely_causes_follow_the_measurements(inputs: ReportInputs) -> None:
+    loss = find_frame_losses(inputs)[0]
 
-    def look(grey: float, corners: int) -> Look:
-        return Look(picture=Picture(index=22, jpeg="", width=1, height=1), grey=grey, corners=corners)
+    def appearance(grey: float, corners: int) -> FrameAppearance:
+        return FrameAppearance(
+            picture=FramePicture(index=22, jpeg="", width=1, height=1), brightness=grey, corners=corners
+        )
 
     calm = replace(loss, turn_deg=1.0)
     tracks = replace(calm, reason=FrameStatus.FEW_TRACKS, sharpness=1.0)
-    assert cause_of(calm, look(10.0, 100), 100.0) is Cause.DARK
-    assert cause_of(replace(loss, turn_deg=20.0), look(90.0, 100), 100.0) is Cause.FAST
-    assert cause_of(calm, look(90.0, 100), 100.0) is Cause.BLUR
-    assert cause_of(tracks, look(90.0, 10), 100.0) is Cause.PLAIN
-    assert cause_of(tracks, look(90.0, 90), 100.0) is Cause.UNKNOWN_PLACE
-    assert cause_of(replace(tracks, sharpness=0.4), None, None) is Cause.BLUR
+    assert likely_cause(calm, appearance(10.0, 100), 100.0) is LossCause.DARK
+    assert likely_cause(replace(loss, turn_deg=20.0), appearance(90.0, 100), 100.0) is LossCause.FAST
+    assert likely_cause(calm, appearance(90.0, 100), 100.0) is LossCause.BLUR
+    assert likely_cause(tracks, appearance(90.0, 10), 100.0) is LossCause.PLAIN
+    assert likely_cause(tracks, appearance(90.0, 90), 100.0) is LossCause.UNKNOWN_PLACE
+    assert likely_cause(replace(tracks, sharpness=0.4), None, None) is LossCause.BLUR
 
 
-def test_advice_comes_from_what_was_measured(inputs: ReportInputs) -> None:
-    some = advise(inputs, {"torso": Counter({Cause.PLAIN: 30})})
-    assert "posters" in some[0].do
-    assert "30 of torso" in some[0].because
-    assert not any("posters" in each.do for each in advise(inputs, {"torso": Counter({Cause.PLAIN: 1})}))
-    assert any("skeleton" in each.do for each in some)
+def test_recommendations_follow_from_measurements(inputs: ReportInputs) -> None:
+    recommendations = recommend_changes(inputs, {"torso": Counter({LossCause.PLAIN: 30})})
+    assert "posters" in recommendations[0].action
+    assert "30 of torso" in recommendations[0].reason
+    assert not any(
+        "posters" in each.action
+        for each in recommend_changes(inputs, {"torso": Counter({LossCause.PLAIN: 1})})
+    )
+    assert any("skeleton" in each.action for each in recommendations)
 
 
 @pytest.mark.parametrize(
@@ -513,7 +520,7 @@ def test_advice_comes_from_what_was_measured(inputs: ReportInputs) -> None:
         ("skeleton", "Name a known distance."),
     ],
 )
-def test_nobody_is_asked_for_a_skeleton_that_was_given(inputs: ReportInputs, source: str, says: str) -> None:
+def test_a_given_skeleton_is_not_recommended_again(inputs: ReportInputs, source: str, says: str) -> None:
     assert inputs.merge is not None
     scale = {
         "source": f"{source} and floor",
@@ -521,11 +528,11 @@ def test_nobody_is_asked_for_a_skeleton_that_was_given(inputs: ReportInputs, sou
         "known_to": "the metric scale is known to 3.0 % (1 sigma); to know it better, name a known distance",
         "sources": [{"name": source}, {"name": "floor"}],
     }
-    told = replace(inputs, merge=replace(inputs.merge, report={"scale": scale}))
-    assert [each.do for each in advise(told, {}) if "metric scale" in each.because] == [says]
+    changed = replace(inputs, merge=replace(inputs.merge, report={"scale": scale}))
+    assert [each.action for each in recommend_changes(changed, {}) if "metric scale" in each.reason] == [says]
 
 
-def test_an_elbow_that_is_no_hinge_is_advised_about(inputs: ReportInputs) -> None:
+def test_an_elbow_that_violates_its_hinge_model_gets_a_recommendation(inputs: ReportInputs) -> None:
     assert inputs.merge is not None
     loose = {
         "LeftForeArm": {
@@ -533,58 +540,52 @@ def test_an_elbow_that_is_no_hinge_is_advised_about(inputs: ReportInputs) -> Non
             "known_to": "the left elbow bends 2.1 cm out of its plane; to know it better, strap it",
         }
     }
-    told = replace(inputs, merge=replace(inputs.merge, report={"loose_hinges": loose}))
-    (advice,) = (each for each in advise(told, {}) if "left elbow" in each.because)
-    assert (advice.do, advice.because) == ("Strap it.", "the left elbow bends 2.1 cm out of its plane")
+    changed = replace(inputs, merge=replace(inputs.merge, report={"loose_hinges": loose}))
+    (advice,) = (each for each in recommend_changes(changed, {}) if "left elbow" in each.reason)
+    assert (advice.action, advice.reason) == ("Strap it.", "the left elbow bends 2.1 cm out of its plane")
 
 
-def test_a_t_pose_that_helps_several_constants_is_advised_once(inputs: ReportInputs) -> None:
+def test_a_t_pose_that_improves_several_constants_is_recommended_once(inputs: ReportInputs) -> None:
     merge = inputs.merge
     assert merge is not None
 
-    def advised(*cameras: str) -> list[str]:
+    def recommended_actions(*cameras: str) -> list[str]:
         text = "known to 11°; to know it better, swing the elbow, or stand in a T-pose for two seconds first"
         report = {"mounts": {name: {"known_to": text, "sigma_deg": 11.0} for name in cameras}}
-        found = advise(replace(inputs, merge=replace(merge, report=report)), {})
-        return [each.do for each in found if "T-pose" in each.do or "elbow" in each.do]
+        found = recommend_changes(replace(inputs, merge=replace(merge, report=report)), {})
+        return [each.action for each in found if "T-pose" in each.action or "elbow" in each.action]
 
-    (alone,) = advised("left_palm")
-    assert "elbow, or stand in a T-pose" in alone
-    first, *others = advised("left_palm", "right_palm")
+    (single,) = recommended_actions("left_palm")
+    assert "elbow, or stand in a T-pose" in single
+    first, *others = recommended_actions("left_palm", "right_palm")
     assert first.startswith("Stand still for two seconds")
     assert [each.split(";")[0] for each in others] == ["Swing the elbow", "Swing the elbow"]
 
 
 def test_shared_points_count_what_both_cameras_see(inputs: ReportInputs) -> None:
-    counts = shared_points(inputs.maps, inputs.cameras)
+    counts = count_shared_points(inputs.maps, inputs.cameras)
     scene = inputs.maps[0]
     for index, name in enumerate(inputs.cameras):
-        mine = np.isin(scene.obs_keyframe, scene.keyframes_of(name))
-        assert counts[index, index] == len(np.unique(scene.obs_point[mine]))
+        of_camera = np.isin(scene.obs_keyframe, scene.keyframes_of(name))
+        assert counts[index, index] == len(np.unique(scene.obs_point[of_camera]))
     assert (counts == counts.T).all()
 
 
-def test_packed_numbers_come_back_within_a_step() -> None:
+def test_packed_numbers_are_restored_within_a_step() -> None:
     values = np.array([[0.0, -3.0], [20.0, np.nan], [7.3, 5.0]])
     packed = pack_scaled(values)
     codes = np.frombuffer(base64.b64decode(packed["u16"]), "<u2").reshape(3, 2)
-    back = np.where(codes == NONE, np.nan, packed["low"] + codes * np.array(packed["step"]))
+    back = np.where(codes == MISSING_CODE, np.nan, packed["low"] + codes * np.array(packed["step"]))
     np.testing.assert_allclose(back, values, atol=0.51 * max(packed["step"]))
 
 
-def test_thinning_keeps_the_ends() -> None:
-    assert thinned(5, 10).tolist() == [0, 1, 2, 3, 4]
-    kept = thinned(1001, 11)
-    assert kept.tolist() == list(range(0, 1001, 100))
-
-
-def test_joint_uncertainty_is_shown_where_it_is_known(inputs: ReportInputs, tmp_path: Path) -> None:
+def test_known_joint_uncertainty_is_shown(inputs: ReportInputs, tmp_path: Path) -> None:
     assert inputs.merge is not None
-    data = solid_data(inputs, place(inputs), Shown())["body"]
+    data = make_viewer_data(inputs, make_drawn_scene(inputs), PageBudget())["body"]
     codes = np.frombuffer(base64.b64decode(data["sigma"]["u16"]), "<u2").reshape(data["sigma"]["shape"])
-    assert ((codes != NONE) == inputs.merge.solved).all()
-    # the root of the mean variance of 1, 2 and 3 cm2
+    assert ((codes != MISSING_CODE) == inputs.merge.solved).all()
+    # The root of the mean of the variances 1, 2 and 3 cm2.
     assert data["sigma"]["low"][int(np.argmax(inputs.merge.solved))] == pytest.approx(np.sqrt(2e-4))
     assert "1.4 cm" in written(inputs, tmp_path)
     unknown = replace(inputs, merge=replace(inputs.merge, joint_covariance_m2=None))
-    assert solid_data(unknown, place(unknown), Shown())["body"]["sigma"] is None
+    assert make_viewer_data(unknown, make_drawn_scene(unknown), PageBudget())["body"]["sigma"] is None

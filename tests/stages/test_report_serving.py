@@ -1,4 +1,4 @@
-"""`bodycap view`: the report, the real videos and their marks, on this machine alone."""
+"""`bodycap view`: the report, the real videos and their overlays, served on this computer only."""
 
 from __future__ import annotations
 
@@ -13,8 +13,14 @@ import pytest
 
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config.models import CaptureConfig
-from bodycap_batch.report.marks import Marks
-from bodycap_batch.report.serving import LOOPBACK, MARKS_EACH, Served, make_server, what_to_serve
+from bodycap_batch.report.frame_overlays import FrameOverlays
+from bodycap_batch.report.serving import (
+    FRAMES_PER_PART,
+    LOOPBACK,
+    ServedContent,
+    make_served_content,
+    make_server,
+)
 from tests.reports import report_inputs
 from tests.videos import textured_frame, write_video
 
@@ -35,7 +41,7 @@ def port(tmp_path: Path) -> Iterator[int]:
         "offset_s": OFFSET_S,
     }
     capture = open_capture(CaptureConfig.model_validate({"cameras": [camera]}))
-    server = make_server(what_to_serve(tmp_path / "report.html", capture))
+    server = make_server(make_served_content(tmp_path / "report.html", capture))
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     yield server.server_port
@@ -44,100 +50,102 @@ def port(tmp_path: Path) -> Iterator[int]:
     server.server_close()
 
 
-def ask(port: int, path: str, headers: dict[str, str] | None = None) -> http.client.HTTPResponse:
+def get(port: int, path: str, headers: dict[str, str] | None = None) -> http.client.HTTPResponse:
     connection = http.client.HTTPConnection(LOOPBACK, port, timeout=10)
     connection.request("GET", path, headers=headers or {})
     return connection.getresponse()
 
 
 def test_report_and_videos_are_served_with_ranges(port: int, tmp_path: Path) -> None:
-    assert ask(port, "/report.html?videos").read() == b"<p>the report</p>"
-    (chapters,) = json.loads(ask(port, "/videos.json").read())["cameras"].values()
+    assert get(port, "/report.html?videos").read() == b"<p>the report</p>"
+    (chapters,) = json.loads(get(port, "/videos.json").read())["cameras"].values()
     assert [chapter["url"] for chapter in chapters] == ["video/0/0", "video/0/1"]
     whole = (tmp_path / "a.mp4").read_bytes()
-    answer = ask(port, "/video/0/0")
+    answer = get(port, "/video/0/0")
     assert (answer.status, answer.headers["Content-Type"], answer.read()) == (200, "video/mp4", whole)
-    answer = ask(port, "/video/0/0", {"Range": "bytes=10-19"})
+    answer = get(port, "/video/0/0", {"Range": "bytes=10-19"})
     assert (answer.status, answer.read()) == (206, whole[10:20])
     assert answer.headers["Content-Range"] == f"bytes 10-19/{len(whole)}"
-    assert ask(port, "/video/0/0", {"Range": f"bytes={len(whole)}-"}).status == 416
+    assert get(port, "/video/0/0", {"Range": f"bytes={len(whole)}-"}).status == 416
 
 
-def test_a_player_that_breaks_off_is_no_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_player_that_closes_the_connection_causes_no_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     large = tmp_path / "torso.mts"
     large.write_bytes(bytes(30_000_000))
-    server = make_server(Served(files={"/video/0/0": large}, videos={}))
+    server = make_server(ServedContent(files={"/video/0/0": large}, videos={}))
     server.daemon_threads = False
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     connection = http.client.HTTPConnection(LOOPBACK, server.server_port, timeout=10)
     connection.request("GET", "/video/0/0")
     answer = connection.getresponse()
-    # What no browser plays is at least not shown to it as a page.
+    # A video that no browser plays must not be served as a page.
     assert answer.headers["Content-Type"] == "application/octet-stream"
     answer.read(1000)
     answer.close()
     connection.close()
     server.shutdown()
     thread.join()
-    server.server_close()  # waits for the answer's thread
+    server.server_close()  # waits for the thread that answers
     assert "Traceback" not in capsys.readouterr().err
 
 
-def test_times_of_both_chapters_are_on_the_common_clock(port: int) -> None:
-    (chapters,) = json.loads(ask(port, "/videos.json").read())["cameras"].values()
+def test_times_of_both_chapters_are_common_times(port: int) -> None:
+    (chapters,) = json.loads(get(port, "/videos.json").read())["cameras"].values()
     assert [chapter["first"] for chapter in chapters] == [0, 12]
     for index, chapter in enumerate(chapters):
-        # 12 frames at 30 fps a chapter; the file's own time starts anew, in the middle of the first frame
+        # Each chapter has 12 frames at 30 fps. The time in the file starts at the middle of its first frame.
         np.testing.assert_allclose(chapter["common"][0], OFFSET_S + index * 0.4, atol=1e-4)
         np.testing.assert_allclose(chapter["container"], (np.arange(12) + 0.5) / 30, atol=1e-4)
 
 
 @pytest.mark.parametrize("path", ["/", "/a.mp4", "/video/0/2", "/../report.html", "/etc/passwd"])
 def test_nothing_else_is_served(port: int, path: str) -> None:
-    assert ask(port, path).status == 404
+    assert get(port, path).status == 404
 
 
-def test_another_name_for_this_machine_is_refused(port: int) -> None:
-    assert ask(port, "/report.html", {"Host": f"evil.example:{port}"}).status == 403
+def test_another_host_name_is_refused(port: int) -> None:
+    assert get(port, "/report.html", {"Host": f"evil.example:{port}"}).status == 403
 
 
-def test_marks_of_every_frame_are_served_in_parts(tmp_path: Path) -> None:
-    asked: list[tuple[str, int]] = []
+def test_overlays_of_every_frame_are_served_in_parts(tmp_path: Path) -> None:
+    requested: list[tuple[str, int]] = []
 
-    def marks(camera: str, first: int) -> list[dict[str, object]]:
-        asked.append((camera, first))
-        return [{"i": first}] if first < 2 * MARKS_EACH else []
+    def overlays(camera: str, first: int) -> list[dict[str, object]]:
+        requested.append((camera, first))
+        return [{"i": first}] if first < 2 * FRAMES_PER_PART else []
 
-    served = Served(files={}, videos={"torso": [], "head": []}, marks=marks)
+    served = ServedContent(files={}, videos={"torso": [], "head": []}, overlays=overlays)
     server = make_server(served)
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     try:
-        answer = ask(server.server_port, "/marks/1/1.json")
-        assert (answer.status, json.loads(answer.read())) == (200, [{"i": MARKS_EACH}])
-        assert ask(server.server_port, "/marks/1/2.json").status == 404
-        assert ask(server.server_port, "/marks/2/0.json").status == 404
-        assert ask(server.server_port, "/marks/x/0.json").status == 404
-        assert json.loads(ask(server.server_port, "/videos.json").read())["each"] == MARKS_EACH
+        answer = get(server.server_port, "/marks/1/1.json")
+        assert (answer.status, json.loads(answer.read())) == (200, [{"i": FRAMES_PER_PART}])
+        assert get(server.server_port, "/marks/1/2.json").status == 404
+        assert get(server.server_port, "/marks/2/0.json").status == 404
+        assert get(server.server_port, "/marks/x/0.json").status == 404
+        assert json.loads(get(server.server_port, "/videos.json").read())["each"] == FRAMES_PER_PART
     finally:
         server.shutdown()
         thread.join()
         server.server_close()
-    assert asked == [("head", MARKS_EACH), ("head", 2 * MARKS_EACH)]
+    assert requested == [("head", FRAMES_PER_PART), ("head", 2 * FRAMES_PER_PART)]
 
 
-def test_no_marks_are_served_where_the_store_holds_none(port: int) -> None:
-    assert ask(port, "/marks/0/0.json").status == 404
+def test_no_overlays_are_served_if_the_store_has_none(port: int) -> None:
+    assert get(port, "/marks/0/0.json").status == 404
 
 
-def test_marks_of_a_part_are_those_of_its_frames() -> None:
+def test_overlays_of_a_part_are_those_of_its_frames() -> None:
     inputs = report_inputs(70)
-    marks = Marks(inputs)
-    part = marks.part("torso", 60, 60)
+    overlays = FrameOverlays(inputs)
+    part = overlays.describe_part("torso", 60, 60)
     assert [each["i"] for each in part] == list(range(60, 70))
-    assert part == marks.over("torso", range(60, 70))
-    assert marks.part("torso", 120, 60) == []
+    assert part == overlays.describe("torso", range(60, 70))
+    assert overlays.describe_part("torso", 120, 60) == []
     path = inputs.path("torso")
     assert path is not None
     assert [each["inliers"] for each in part] == path.inliers[60:].tolist()

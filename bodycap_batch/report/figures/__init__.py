@@ -1,1 +1,1 @@
-"""Drawings as SVG and PNG, coloured by the page's style sheet so that they follow light and dark."""
+"""Drawings as SVG and PNG; the page's style sheet colours them for its light and dark schemes."""

@@ -1,4 +1,4 @@
-"""SVG by hand: a few elements, escaped, with short numbers."""
+"""SVG elements as text: escaped, with short numbers."""
 
 from __future__ import annotations
 
@@ -11,14 +11,18 @@ from bodycap_batch.core.arrays import FloatArray
 
 
 def number(value: float) -> str:
-    """A coordinate with no more digits than a screen shows."""
+    """Return a coordinate with one decimal, which is as exact as a screen."""
     return f"{value:.1f}".removesuffix(".0")
 
 
 def element(tag: str, content: str = "", /, **attributes: object) -> str:
-    """An element; underscores in attribute names become hyphens, None leaves one out."""
+    """Return an element.
+
+    Underscores in attribute names become hyphens, and a trailing underscore is removed. An attribute with the
+    value None is omitted.
+    """
     pairs = [
-        f' {name.rstrip("_").replace("_", "-")}="{html.escape(_text(value), quote=True)}"'
+        f' {name.rstrip("_").replace("_", "-")}="{html.escape(_attribute_text(value), quote=True)}"'
         for name, value in attributes.items()
         if value is not None
     ]
@@ -26,12 +30,12 @@ def element(tag: str, content: str = "", /, **attributes: object) -> str:
 
 
 def text(x: float, y: float, words: str, **attributes: object) -> str:
-    """A line of text."""
+    """Return a line of text."""
     return element("text", html.escape(words), x=x, y=y, **attributes)
 
 
-def picture(width: float, height: float, content: str, title: str, **attributes: object) -> str:
-    """A whole drawing with a name for those who cannot see it."""
+def svg_image(width: float, height: float, content: str, title: str, **attributes: object) -> str:
+    """Return a complete drawing with a title for screen readers."""
     named = element("title", html.escape(title)) + content
     return element(
         "svg",
@@ -44,8 +48,8 @@ def picture(width: float, height: float, content: str, title: str, **attributes:
     )
 
 
-def polyline(points: Iterable[tuple[float, float]]) -> str:
-    """Path data through points; a point that is not finite breaks the line."""
+def path_through(points: Iterable[tuple[float, float]]) -> str:
+    """Return path data of a line through points; the line is interrupted at a point that is not finite."""
     out, pen_up = [], True
     for x, y in points:
         if not (np.isfinite(x) and np.isfinite(y)):
@@ -56,17 +60,17 @@ def polyline(points: Iterable[tuple[float, float]]) -> str:
     return "".join(out)
 
 
-def bins(values: FloatArray, count: int) -> FloatArray:
-    """(count, 3) least, median and largest value of `count` equal parts; NaN where a part has none."""
+def bin_statistics(values: FloatArray, count: int) -> FloatArray:
+    """Return minimum, median and maximum (count,3) of equal parts of values (N,), NaN for empty parts."""
     edges = np.linspace(0, len(values), count + 1).round().astype(int)
-    out = np.full((count, 3), np.nan)
+    statistics = np.full((count, 3), np.nan)
     for index in range(count):
         part = values[edges[index] : max(edges[index + 1], edges[index] + 1)]
         part = part[np.isfinite(part)]
         if len(part):
-            out[index] = part.min(), np.median(part), part.max()
-    return out
+            statistics[index] = part.min(), np.median(part), part.max()
+    return statistics
 
 
-def _text(value: object) -> str:
+def _attribute_text(value: object) -> str:
     return number(float(value)) if isinstance(value, float | np.floating) else str(value)

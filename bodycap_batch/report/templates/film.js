@@ -1,6 +1,6 @@
-// The real video of a camera, where `bodycap view` serves it. While it plays the page follows its clock:
-// no seek for each frame. What is drawn over it belongs to the frame that is on the screen.
-const SLACK_S = 0.15;
+// The real video of a camera, if `bodycap view` serves it. While it plays, the page follows the video's clock,
+// so there is no seek for each frame. The overlay is that of the displayed frame.
+const SLACK_S = 0.15; // largest difference between video and page without a seek, seconds
 
 class Film {
   constructor(video, onFrame, onFailure) {
@@ -9,9 +9,9 @@ class Film {
     this.parts = [];
     this.part = null;
     this.wanted = null;
-    this.unseen = false;
-    // A browser that fetches sparingly may decode nothing before it is asked for a frame.
-    for (const event of ["loadedmetadata", "loadeddata", "seeked"]) video.addEventListener(event, () => this.settle());
+    this.frameIsPending = false;
+    // A browser that saves data may decode nothing before a seek, so each of these events is handled.
+    for (const event of ["loadedmetadata", "loadeddata", "seeked"]) video.addEventListener(event, () => this.afterSeek());
     video.addEventListener("error", () => {
       if (!this.part) return;
       this.load([]);
@@ -24,7 +24,7 @@ class Film {
     return this.parts.length > 0;
   }
 
-  // The chapters of a camera: of each frame the common time and the time in the file.
+  // Load the chapters of a camera; each has the common time and the time in the file of its frames.
   load(parts) {
     this.parts = parts;
     this.part = null;
@@ -36,16 +36,16 @@ class Film {
 
   watch() {
     const { video } = this;
-    const look = (seconds) => {
+    const report = (seconds) => {
       if (this.part && video.readyState >= 2) {
-        this.unseen = false;
+        this.frameIsPending = false;
         this.show(seconds);
       }
       this.watch();
     };
     if (video.requestVideoFrameCallback) {
-      video.requestVideoFrameCallback((_, frame) => look(frame.mediaTime + (this.part ? this.part.half : 0)));
-    } else requestAnimationFrame(() => look(video.currentTime));
+      video.requestVideoFrameCallback((_, frame) => report(frame.mediaTime + (this.part ? this.part.half : 0)));
+    } else requestAnimationFrame(() => report(video.currentTime));
   }
 
   show(seconds) {
@@ -58,38 +58,38 @@ class Film {
     if (part !== this.part) {
       this.part = part;
       this.video.src = part.url;
-      this.unseen = true;
+      this.frameIsPending = true;
     }
-    const there = between(part.common, part.container, time);
+    const videoTime = between(part.common, part.container, time);
     const inside = time >= part.common[0] && time <= part.common.at(-1) + 2 * part.half;
     if (!playing || !inside) {
       this.video.pause();
-      this.seek(there);
+      this.seek(videoTime);
       return;
     }
     this.video.playbackRate = speed;
-    if (Math.abs(this.video.currentTime - there) > SLACK_S) this.seek(there);
-    // Refused where a pause or another chapter comes between; the next step asks again.
+    if (Math.abs(this.video.currentTime - videoTime) > SLACK_S) this.seek(videoTime);
+    // The browser rejects this if a pause or a new chapter interrupts it; the next step tries again.
     if (this.video.paused && !this.video.ended) this.video.play().catch(() => {});
   }
 
   seek(seconds) {
     if (this.video.seeking || this.video.readyState < 1) this.wanted = seconds;
     else if (Math.abs(this.video.currentTime - seconds) > 1e-4) {
-      this.unseen = true;
+      this.frameIsPending = true;
       this.video.currentTime = seconds;
     }
   }
 
-  // A frame can be on the screen before the video says that it has it: what came to rest unseen is looked at.
-  settle() {
+  // A frame can be displayed before the video reports it, so it is handled when a seek has ended.
+  afterSeek() {
     const { video, part, wanted } = this;
     this.wanted = null;
     if (wanted !== null) this.seek(wanted);
-    if (part && this.unseen && !video.seeking && video.readyState >= 2) this.show(video.currentTime);
+    if (part && this.frameIsPending && !video.seeking && video.readyState >= 2) this.show(video.currentTime);
   }
 
-  // The common time the video is at; null while it does not play, so that the page goes by its own clock.
+  // Return the common time of the video; null while it does not play, because then the page uses its own clock.
   now() {
     const { video, part } = this;
     if (!part || video.paused || video.ended) return null;

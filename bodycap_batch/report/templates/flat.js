@@ -1,4 +1,4 @@
-// Without WebGL: the same from above and from the side, on a plain canvas.
+// The scene without WebGL: from above and from the side, on a 2D canvas.
 class Flat {
   constructor(holder, data) {
     this.data = data;
@@ -55,11 +55,11 @@ class Flat {
     this.ratio = ratio;
     this.canvas.width = Math.max(2, Math.round(this.holder.clientWidth * ratio));
     this.canvas.height = Math.max(2, Math.round(this.holder.clientHeight * ratio));
-    this.still = document.createElement("canvas");
-    this.still.width = this.canvas.width;
-    this.still.height = this.canvas.height;
-    const pen = this.still.getContext("2d");
-    for (const view of this.views()) this.clipped(pen, view, () => this.drawStill(pen, view));
+    this.background = document.createElement("canvas");
+    this.background.width = this.canvas.width;
+    this.background.height = this.canvas.height;
+    const pen = this.background.getContext("2d");
+    for (const view of this.views()) this.clipped(pen, view, () => this.drawBackground(pen, view));
     this.draw();
   }
 
@@ -72,7 +72,7 @@ class Flat {
     pen.restore();
   }
 
-  drawStill(pen, view) {
+  drawBackground(pen, view) {
     const { points, colours, paths } = this.data;
     const dot = 1.6 * this.ratio;
     if (!this.hidden.has("points")) {
@@ -100,7 +100,7 @@ class Flat {
   draw() {
     const pen = this.canvas.getContext("2d");
     pen.clearRect(0, 0, this.canvas.width, this.canvas.height);
-    pen.drawImage(this.still, 0, 0);
+    pen.drawImage(this.background, 0, 0);
     pen.fillStyle = styleColour("--line");
     pen.fillRect(this.canvas.width / 2, 0, this.ratio, this.canvas.height);
     const { body, paths } = this.data;
@@ -125,13 +125,13 @@ class Flat {
   }
 
   drawBody(pen, view, body) {
-    const known = (joint) => (joint < body.solved.length ? body.solved[joint] : body.solved[body.parents[joint]]);
+    const jointIsSolved = (joint) => (joint < body.solved.length ? body.solved[joint] : body.solved[body.parents[joint]]);
     pen.lineCap = "round";
     body.parents.forEach((parent, child) => {
       if (parent < 0) return;
-      const sure = known(parent) && known(child);
-      pen.strokeStyle = styleColour(sure ? "--ink" : "--soft");
-      pen.lineWidth = (sure ? 4 : 2) * this.ratio;
+      const isSolved = jointIsSolved(parent) && jointIsSolved(child);
+      pen.strokeStyle = styleColour(isSolved ? "--ink" : "--soft");
+      pen.lineWidth = (isSolved ? 4 : 2) * this.ratio;
       pen.beginPath();
       pen.moveTo(...view.at(this.centres, 3 * parent));
       pen.lineTo(...view.at(this.centres, 3 * child));

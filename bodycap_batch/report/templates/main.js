@@ -7,22 +7,22 @@ function webgl() {
   return Boolean(gl);
 }
 
-// The library is text until it is known that it can draw: parsing it takes longer than all the rest.
-// It would add style sheets of its own, for formulas and menus that are not used here: they go nowhere.
+// The library is stored as text and parsed only if WebGL is available: parsing takes longer than all the rest.
+// It would add its own style sheets for formulas and menus, which this page does not use; they are discarded.
 function loadThree() {
   let made = null;
-  const nowhere = document.createElement("div");
-  const quiet = new Proxy(document, {
+  const discarded = document.createElement("div");
+  const isolated = new Proxy(document, {
     get(real, key) {
-      if (key === "head") return nowhere;
-      if (key === "querySelector") return () => nowhere;
+      if (key === "head") return discarded;
+      if (key === "querySelector") return () => discarded;
       return typeof real[key] === "function" ? real[key].bind(real) : real[key];
     },
   });
-  window.bodycapLibrary = { quiet, define: (_name, _needs, make) => (made = make()) };
+  window.bodycapLibrary = { isolated, define: (_name, _needs, make) => (made = make()) };
   const script = document.createElement("script");
   const text = document.getElementById("library").textContent;
-  script.textContent = `((document, define) => {${text}\n})(bodycapLibrary.quiet, bodycapLibrary.define);`;
+  script.textContent = `((document, define) => {${text}\n})(bodycapLibrary.isolated, bodycapLibrary.define);`;
   document.head.append(script);
   delete window.bodycapLibrary;
   return made.ThreeJsProvider.THREE;
@@ -42,10 +42,10 @@ function makeView(data) {
     section.dataset.mode = "webgl";
     return view;
   }
-  const says = section.querySelector(".nogl");
-  says.textContent = "This browser offers no WebGL, so the scene is shown from above and from the side instead of in 3D. "
-    + "Open the page in a browser with hardware acceleration to turn it.";
-  says.hidden = false;
+  const message = section.querySelector(".nogl");
+  message.textContent = "This browser has no WebGL, so the scene is shown from above and from the side instead of in 3D. "
+    + "To turn it, open the page in a browser with hardware acceleration.";
+  message.hidden = false;
   section.dataset.mode = "flat";
   return new Flat(holder, data);
 }
@@ -107,7 +107,7 @@ function wirePicture(data, timeline) {
   picture.choose(chooser.value);
   timeline.pace = () => picture.film.now();
   timeline.onChange(() => {
-    // Read out when it stands still; a running commentary would be noise.
+    // Screen readers read the text only while the film is paused; otherwise they would speak all the time.
     now.setAttribute("aria-live", timeline.playing ? "off" : "polite");
     picture.go(timeline.time, timeline.playing, timeline.speed);
   });
@@ -133,7 +133,7 @@ function wireStrips(timeline) {
   });
 }
 
-// Frames drawn a second while turning and playing; for the benchmark.
+// Return the frames per second while the scene turns and plays; the benchmark uses it.
 function measure(view, timeline, seconds) {
   return new Promise((resolve) => {
     const start = performance.now();
@@ -170,7 +170,7 @@ if (section) {
   timeline.go(0);
   if (location.protocol !== "file:" && new URLSearchParams(location.search).has("videos")) {
     fetch("videos.json").then((answer) => answer.json()).then((videos) => {
-      picture.offer(videos);
+      picture.useVideos(videos);
       timeline.go(timeline.step);
     });
   }

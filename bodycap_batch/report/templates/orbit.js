@@ -1,5 +1,6 @@
-// Looking around a point, Z up: drag turns, shift-drag or two fingers move, wheel or pinch comes nearer.
-const FILLED = 0.92;
+// A camera that orbits a point, Z up. Dragging turns it, shift-dragging or two fingers move it, and the wheel or a
+// pinch zooms.
+const FILLED = 0.92; // share of the picture that the first view fills
 
 class Orbit {
   constructor(view, onChange) {
@@ -9,7 +10,7 @@ class Orbit {
     this.reset();
   }
 
-  // Start where all of these points (x, y, z one after the other) are in the picture, unless somebody looked around.
+  // Set the first view so that all points (x, y, z in sequence) are visible, unless the user has changed the view.
   frame(points, aspect, view) {
     const high = Math.tan((0.5 * view * Math.PI) / 180) * FILLED;
     const [low, top] = [[Infinity, Infinity, Infinity], [-Infinity, -Infinity, -Infinity]];

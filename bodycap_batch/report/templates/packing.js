@@ -1,4 +1,4 @@
-// Arrays out of the page's data: base64 to numbers.
+// Unpacks the arrays in the page's data: base64 to numbers.
 const NONE = 65535;
 
 function bytesOf(text) {
@@ -8,7 +8,7 @@ function bytesOf(text) {
   return out;
 }
 
-// 16-bit codes between each column's least and largest value; NaN where there is none.
+// Return the numbers of 16-bit codes between the smallest and largest value of each column; NaN if missing.
 function scaled(block) {
   const codes = new Uint16Array(bytesOf(block.u16).buffer);
   const columns = block.low.length;
@@ -20,7 +20,7 @@ function scaled(block) {
   return out;
 }
 
-// Index of the last of increasing times that is not after t (0 where all are).
+// Return the index of the last of increasing times that is not after t, or 0 if all of them are.
 function before(times, t) {
   let low = 0;
   let high = times.length - 1;
@@ -37,7 +37,7 @@ function nearest(times, t) {
   return i + 1 < times.length && times[i + 1] - t < t - times[i] ? i + 1 : i;
 }
 
-// The value at t of a curve through (xs, ys), xs increasing; straight on beyond its ends.
+// Return the value at t of a line through points (xs, ys), xs increasing; it is extrapolated at both ends.
 function between(xs, ys, t) {
   const i = Math.min(before(xs, t), Math.max(xs.length - 2, 0));
   const j = Math.min(i + 1, xs.length - 1);
@@ -70,7 +70,7 @@ function unpack(data) {
   };
 }
 
-// Joint centres at a time, between the two ticks beside it; out is reused.
+// Interpolate the joint centres at a time into `out`, and return the nearer tick.
 function bodyAt(body, t, out) {
   const i = before(body.time, t);
   const j = Math.min(i + 1, body.time.length - 1);
@@ -83,7 +83,7 @@ function bodyAt(body, t, out) {
   return share < 0.5 ? i : j;
 }
 
-// A camera's pose index at a time, −1 where it has none there.
+// Return the index of a camera's pose at a time, −1 if it has none.
 function poseAt(path, t) {
   if (!path.times.length) return -1;
   const i = nearest(path.times, t);

@@ -1,10 +1,10 @@
-// What one camera saw at the time, with the points behind its pose and the skeleton drawn over it.
+// The frame of one camera at the current time, with the inlier points of its pose and the skeleton as overlay.
 const SVG = "http://www.w3.org/2000/svg";
 
 class Picture {
-  constructor(figure, data, say) {
+  constructor(figure, data, showText) {
     this.data = data;
-    this.say = say;
+    this.showText = showText;
     this.frame = figure.querySelector(".frame");
     this.image = figure.querySelector("img");
     this.overlay = figure.querySelector("svg");
@@ -15,10 +15,10 @@ class Picture {
     this.shown = null;
     this.film = new Film(
       figure.querySelector("video"),
-      (index) => this.filmed(index),
+      (index) => this.onVideoFrame(index),
       () => {
         delete this.videos.cameras[this.camera];
-        this.noFilm.textContent = `This browser does not play the video of ${this.camera}: small pictures are shown instead.`;
+        this.noFilm.textContent = `This browser does not play the video of ${this.camera}. Small pictures are shown instead.`;
         this.noFilm.hidden = false;
       },
     );
@@ -41,14 +41,14 @@ class Picture {
     this.overlay.setAttribute("preserveAspectRatio", "none");
     this.image.hidden = !this.series;
     this.missing.hidden = Boolean(this.series);
-    this.mark(null);
+    this.drawOverlay(null);
     this.noFilm.hidden = true;
-    this.marks = new Map();
+    this.overlays = new Map();
     this.film.load((this.series && this.videos.cameras[camera]) || []);
   }
 
-  // Real videos, and marks for their frames in parts of so many.
-  offer(videos) {
+  // Use real videos; the overlays of their frames come in parts of `videos.each` frames.
+  useVideos(videos) {
     this.videos = videos;
     this.choose(this.camera);
   }
@@ -63,40 +63,40 @@ class Picture {
     if (frame === this.shown) return;
     this.image.src = `data:image/jpeg;base64,${frame.jpeg}`;
     this.image.alt = `${this.camera}, frame ${frame.i}`;
-    this.mark(frame);
+    this.drawOverlay(frame);
   }
 
-  // The video shows a frame: its own marks, else those of the stored picture of the same frame, else none.
-  filmed(index) {
+  // Draw the overlay of the video's frame: its own, or that of a stored picture of the same frame, or none.
+  onVideoFrame(index) {
     if (!this.film.active) return;
     this.index = index;
     const part = Math.floor(index / this.videos.each);
-    for (const each of [part, part + 1]) this.fetchMarks(each);
-    const found = this.marks.get(part);
+    for (const each of [part, part + 1]) this.fetchOverlays(each);
+    const found = this.overlays.get(part);
     const known = Array.isArray(found) ? found[index - part * this.videos.each] : null;
-    this.mark(known || this.series.frames.find((frame) => frame.i === index) || { i: index });
+    this.drawOverlay(known || this.series.frames.find((frame) => frame.i === index) || { i: index });
   }
 
-  fetchMarks(part) {
-    const { marks, camera } = this;
-    if (marks.has(part) || part * this.videos.each >= this.series.count) return;
-    marks.set(part, null);
+  fetchOverlays(part) {
+    const { overlays, camera } = this;
+    if (overlays.has(part) || part * this.videos.each >= this.series.count) return;
+    overlays.set(part, null);
     const number = Object.keys(this.videos.cameras).indexOf(camera);
     fetch(`marks/${number}/${part}.json`)
       .then((answer) => (answer.ok ? answer.json() : null))
       .then((found) => {
-        marks.set(part, found);
-        if (found && this.marks === marks && Math.floor(this.index / this.videos.each) === part) this.filmed(this.index);
+        overlays.set(part, found);
+        if (found && this.overlays === overlays && Math.floor(this.index / this.videos.each) === part) this.onVideoFrame(this.index);
       });
   }
 
-  mark(frame) {
+  drawOverlay(frame) {
     if (frame === this.shown) return;
     this.shown = frame;
     const at = (x, y) => `${x.toFixed(4)} ${(y * this.aspect).toFixed(4)}`;
     const [dots, bones] = [[], []];
     const inliers = frame && frame.inliersAt ? scaled(frame.inliersAt) : [];
-    // A line of no length with round ends is a dot.
+    // A line of length zero with round ends is a dot.
     for (let i = 0; i < inliers.length; i += 2) dots.push(`M${at(inliers[i], inliers[i + 1])}h0`);
     for (const bone of (frame && frame.bones) || []) {
       for (let i = 0; i < bone.length; i += 2) bones.push(`${i ? "L" : "M"}${at(bone[i], bone[i + 1])}`);
@@ -104,10 +104,10 @@ class Picture {
     for (const name of ["edge", "inlier"]) this.lines[name].setAttribute("d", dots.join(""));
     this.lines.bone.setAttribute("d", bones.join(""));
     if (frame) this.frame.dataset.index = frame.i;
-    if (frame) this.say(this.words(frame));
+    if (frame) this.showText(this.describe(frame));
   }
 
-  words(frame) {
+  describe(frame) {
     const what = this.film.active ? "frame" : "picture of frame";
     const when = frame.t === undefined ? "" : ` at ${frame.t.toFixed(2)} s`;
     const pose = frame.status ? `, ${frame.status.toLowerCase().replaceAll("_", " ")}` : "";

@@ -1,8 +1,9 @@
-// The 3D view, drawn by three.js: only when something changed.
+// The 3D view, drawn by three.js only when something has changed.
 const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i;
-// Milliseconds between frames: above the first fewer points are drawn while something moves, below the second more.
+// Milliseconds between frames. Above SLOW_MS fewer points are drawn while something moves, below FAST_MS more.
+// After STILL_MS without a change all points are drawn.
 const [SLOW_MS, FAST_MS, STILL_MS] = [31, 20, 250];
-// Points and their colour, nothing else: three.js's own material costs twice as much without a graphics card.
+// This shader draws only points with a colour. The material of three.js takes twice as long without a graphics card.
 const POINT_SHADER = `
 in vec3 position;
 in vec3 color;
@@ -53,14 +54,14 @@ class Solid {
     this.scene.add(sun);
     this.orbit = new Orbit(data.solid.view, () => (this.dirty = true));
     this.orbit.listen(holder);
-    this.whole = this.everything();
+    this.firstViewPoints = this.pointsInFirstView();
     this.unit = data.solid.metric ? 1 : data.solid.view.radius / 2.5;
     this.addPoints();
     this.addPaths();
     if (data.body) this.addBody();
     new ResizeObserver(() => this.resize()).observe(holder);
-    window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.dress());
-    this.dress();
+    window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.applyColours());
+    this.applyColours();
     this.resize();
     this.share = 1;
     this.adapts = true;
@@ -73,8 +74,8 @@ class Solid {
     requestAnimationFrame(loop);
   }
 
-  // The whole body at all times, and the cameras' paths but for what lies far off: what to show from the start.
-  everything() {
+  // Return what the first view must show: the body at all times, and the camera paths except distant parts.
+  pointsInFirstView() {
     const { body, paths, solid } = this.data;
     const out = [];
     if (body) {
@@ -142,7 +143,7 @@ class Solid {
     });
   }
 
-  // One object for all cameras: software renderers pay for each.
+  // All cameras are one object, because each object takes time in a software renderer.
   addPaths() {
     const { three } = this;
     const [dots, dotTones, axes, axisTones] = [[], [], [], []];
@@ -177,7 +178,7 @@ class Solid {
     return geometry;
   }
 
-  // A pyramid for each camera, moved point by point: its base is the picture.
+  // Add a pyramid for each camera; its base is the image. Its points are moved one by one.
   addFrusta(material) {
     const { three } = this;
     const [w, h, d] = [0.1, 0.07, 0.15].map((each) => each * this.unit);
@@ -216,35 +217,35 @@ class Solid {
     const { parents, solved, sigma, joints } = data.body;
     this.centres = new Float32Array(3 * data.body.count);
     this.bones = parents.map((parent, child) => [parent, child]).filter(([parent]) => parent >= 0);
-    const known = (joint) => (joint < solved.length ? solved[joint] : solved[parents[joint]]);
+    const jointIsSolved = (joint) => (joint < solved.length ? solved[joint] : solved[parents[joint]]);
     const bone = new three.CylinderGeometry(0.022, 0.038, 1, 6, 1, true);
     bone.translate(0, 0.5, 0);
     const balls = parents.map((_, joint) => joint).filter((joint) => joint < joints.length);
     const material = new three.MeshLambertMaterial();
-    this.skin = {
+    this.meshes = {
       material,
       balls,
-      bonesSure: this.bones.map(([parent, child]) => known(parent) && known(child)),
-      ballsSure: balls.map(known),
+      boneIsSolved: this.bones.map(([parent, child]) => jointIsSolved(parent) && jointIsSolved(child)),
+      ballIsSolved: balls.map(jointIsSolved),
       boneMesh: this.layer("body", new three.InstancedMesh(bone, material, this.bones.length)),
       ballMesh: this.layer("body", new three.InstancedMesh(new three.SphereGeometry(0.045, 8, 6), material, balls.length)),
     };
-    this.skin.boneMesh.frustumCulled = this.skin.ballMesh.frustumCulled = false;
+    this.meshes.boneMesh.frustumCulled = this.meshes.ballMesh.frustumCulled = false;
     if (sigma) {
       const material = new three.MeshLambertMaterial({ color: 0xd08a1a, transparent: true, opacity: 0.28, depthWrite: false });
-      this.doubt = this.layer("sigma", new three.InstancedMesh(new three.SphereGeometry(1, 14, 10), material, joints.length));
-      this.doubt.frustumCulled = false;
+      this.sigmaMesh = this.layer("sigma", new three.InstancedMesh(new three.SphereGeometry(1, 14, 10), material, joints.length));
+      this.sigmaMesh.frustumCulled = false;
     }
   }
 
-  dress() {
+  applyColours() {
     this.renderer.setClearColor(styleColour("--view"), this.splat ? 0 : 1);
-    if (this.skin) {
+    if (this.meshes) {
       const read = (name) => new this.three.Color().setStyle(styleColour(name), this.three.LinearSRGBColorSpace);
-      const [ink, guess] = [read("--bone"), read("--guess")];
-      this.skin.bonesSure.forEach((sure, index) => this.skin.boneMesh.setColorAt(index, sure ? ink : guess));
-      this.skin.ballsSure.forEach((sure, index) => this.skin.ballMesh.setColorAt(index, sure ? ink : guess));
-      this.skin.boneMesh.instanceColor.needsUpdate = this.skin.ballMesh.instanceColor.needsUpdate = true;
+      const [solvedColour, unsolvedColour] = [read("--bone"), read("--guess")];
+      this.meshes.boneIsSolved.forEach((isSolved, index) => this.meshes.boneMesh.setColorAt(index, isSolved ? solvedColour : unsolvedColour));
+      this.meshes.ballIsSolved.forEach((isSolved, index) => this.meshes.ballMesh.setColorAt(index, isSolved ? solvedColour : unsolvedColour));
+      this.meshes.boneMesh.instanceColor.needsUpdate = this.meshes.ballMesh.instanceColor.needsUpdate = true;
     }
     this.dirty = true;
   }
@@ -257,7 +258,7 @@ class Solid {
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
     const { target } = this.orbit;
-    this.orbit.frame(this.whole, width / height, this.camera.fov);
+    this.orbit.frame(this.firstViewPoints, width / height, this.camera.fov);
     if (this.follow) this.orbit.target = target;
     this.dirty = true;
   }
@@ -280,33 +281,33 @@ class Solid {
     const tick = bodyAt(data.body, time, centres);
     const [up, along, start, matrix] = [new three.Vector3(0, 1, 0), new three.Vector3(), new three.Vector3(), new three.Matrix4()];
     const [turn, size] = [new three.Quaternion(), new three.Vector3()];
-    const { skin } = this;
+    const { meshes } = this;
     this.bones.forEach(([parent, child], index) => {
       start.fromArray(centres, 3 * parent);
       along.fromArray(centres, 3 * child).sub(start);
       const length = Math.max(along.length(), 1e-6);
       turn.setFromUnitVectors(up, along.divideScalar(length));
-      const thick = skin.bonesSure[index] ? 1 : 0.5;
-      skin.boneMesh.setMatrixAt(index, matrix.compose(start, turn, size.set(thick, length, thick)));
+      const thick = meshes.boneIsSolved[index] ? 1 : 0.5;
+      meshes.boneMesh.setMatrixAt(index, matrix.compose(start, turn, size.set(thick, length, thick)));
     });
-    skin.balls.forEach((joint, index) => {
+    meshes.balls.forEach((joint, index) => {
       start.fromArray(centres, 3 * joint);
-      size.setScalar(skin.ballsSure[index] ? 1 : 0.5);
-      skin.ballMesh.setMatrixAt(index, matrix.compose(start, turn.identity(), size));
+      size.setScalar(meshes.ballIsSolved[index] ? 1 : 0.5);
+      meshes.ballMesh.setMatrixAt(index, matrix.compose(start, turn.identity(), size));
     });
-    skin.boneMesh.instanceMatrix.needsUpdate = skin.ballMesh.instanceMatrix.needsUpdate = true;
-    if (!this.doubt) return;
+    meshes.boneMesh.instanceMatrix.needsUpdate = meshes.ballMesh.instanceMatrix.needsUpdate = true;
+    if (!this.sigmaMesh) return;
     const count = data.body.joints.length;
     for (let joint = 0; joint < count; joint++) {
       const radius = data.body.sigma[tick * count + joint];
       start.fromArray(centres, 3 * joint);
       size.setScalar(Number.isFinite(radius) ? Math.max(radius, 1e-6) : 1e-6);
-      this.doubt.setMatrixAt(joint, matrix.compose(start, turn.identity(), size));
+      this.sigmaMesh.setMatrixAt(joint, matrix.compose(start, turn.identity(), size));
     }
-    this.doubt.instanceMatrix.needsUpdate = true;
+    this.sigmaMesh.instanceMatrix.needsUpdate = true;
   }
 
-  // The points lie in random order, so the first of them are a thinner cloud of the same shape.
+  // The points are in random order, so the first of them are a thinner cloud of the same shape.
   render(now, moving) {
     const since = now - this.drawn;
     if (moving && since < 2 * STILL_MS) {

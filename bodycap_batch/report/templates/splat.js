@@ -1,5 +1,5 @@
-// The points of the map without a graphics card: software renderers take over a microsecond for each,
-// plain arithmetic into a picture a tenth of that. The picture lies behind the rest of the scene.
+// The points of the map without a graphics card. A software renderer needs more than a microsecond for each
+// point; plain arithmetic on pixels needs a tenth of that. Its canvas is behind the rest of the scene.
 class Splat {
   constructor(holder, points, colours) {
     this.points = points;
@@ -11,7 +11,7 @@ class Splat {
     this.canvas = document.createElement("canvas");
     this.pen = this.canvas.getContext("2d");
     holder.append(this.canvas);
-    // Its holder may have no size yet.
+    // The element that contains it may have no size yet.
     this.resize(1, 1);
   }
 
@@ -23,7 +23,7 @@ class Splat {
     this.depths = new Float32Array(width * height);
   }
 
-  // The first `count` points, two pixels wide, the nearer before the farther. Matrix: world to clip space.
+  // Draw the first `count` points, two pixels wide; nearer points hide farther ones. Matrix: world to clip space.
   draw(matrix, count) {
     const { points, tones, pixels, depths } = this;
     const { width, height } = this.canvas;

@@ -1,4 +1,4 @@
-// One clock for viewer, picture and strips.
+// The common clock of viewer, picture and camera timelines.
 class Timeline {
   constructor(start, end, fps) {
     this.start = start;
@@ -43,7 +43,7 @@ class Timeline {
     if (!this.playing) return;
     if (this.last !== null) this.carry += ((now - this.last) / 1000) * this.fps * this.speed;
     this.last = now;
-    // Where a video plays, its clock is the one that counts.
+    // If a video plays, its clock sets the time.
     const paced = this.pace();
     if (paced !== null) this.carry = Math.max(0, (paced - this.start) * this.fps - this.step);
     const whole = Math.floor(this.carry);

@@ -16,9 +16,9 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.formats.palette import CAMERA_COLOURS, camera_colours, hex_from_colour
 from bodycap_batch.formats.ply import PointCloud, add_camera_paths
 from bodycap_batch.preview import PreviewInputs
-from bodycap_batch.preview.room import BACKGROUND
-from bodycap_batch.preview.stage import film_tiles
-from bodycap_batch.preview.timeline import make_timeline
+from bodycap_batch.preview.preview_film import make_tiles
+from bodycap_batch.preview.preview_timeline import make_timeline
+from bodycap_batch.preview.room_drawing import BACKGROUND
 from tests.reports import report_inputs, written
 from tests.videos import textured_frame, write_video
 
@@ -90,9 +90,9 @@ def test_page_and_film_have_it_from_there(tmp_path: Path) -> None:
         path=tmp_path / "preview.mp4",
         capture=capture,
         views=(),
-        frame="map-0",
+        reference_frame="map-0",
         points=np.zeros((0, 3)),
         colours=np.zeros((0, 3), np.uint8),
     )
-    tiles = film_tiles(film, make_timeline(0, 250_000_000, 30.0))
+    tiles = make_tiles(film, make_timeline(0, 250_000_000, 30.0))
     assert {tile.camera.name: tile.colour for tile in tiles} == camera_colours(["torso", "left_palm"])

@@ -1,4 +1,4 @@
-"""The longest time without a measurement: between two, before the first and after the last."""
+"""The longest time without a measurement: between two of them, before the first or after the last."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def track(seconds: list[float]) -> CameraTrack:
         ([3.2, 4.0, 5.0], 3.2),
         ([0.0, 1.0, 1.5], 3.5),
         ([], 5.0),
-        # a frame beside the ticks by half a frame does not make the clip longer
+        # a measurement half a frame outside the ticks does not make the clip longer
         ([-0.01, 2.0, 5.01], 3.0),
     ],
 )

@@ -1,4 +1,4 @@
-"""What a report is made of: whatever a job left behind, whole or broken off."""
+"""The results that a report shows, of a finished job or of one that stopped."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from bodycap_batch.model.skeleton import Mount
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReportInputs:
-    """Results of a job as far as it came; what is missing is left empty.
+    """The results of a job. If the job stopped, the results of later stages are empty.
 
     Attributes:
         name: The job's name.
         cameras: Names of the job's cameras, in its order.
-        maps: The models, largest first, each in its own gauge.
-        registrations: One per camera, in the gauge of the map it was solved in.
-        clocks: By camera name; of every registered camera.
+        maps: The maps, largest first, each in its own gauge.
+        registrations: One for each camera, in the gauge of its map.
+        clocks: Clock of each registered camera, by camera name.
         selections: Keyframe selections.
         merge: The body in the world.
-        mounts: The mounts as they were assumed before the body was solved.
+        mounts: The mounts that were assumed before the body was solved.
         metrics: The content of ``metrics.json``.
-        capture: The videos; None where they cannot be opened.
-        failure: What stopped the job: ``type``, ``message``, ``hint`` and more, as the error tells them.
-        max_gap_s: Holes between two measurements up to this long were bridged (``merge.max_gap_s``).
+        capture: The videos; None if they cannot be opened.
+        failure: The error that stopped the job: ``type``, ``message``, ``hint`` and its other fields.
+        max_gap_s: Longest time between two measurements that the body's motion bridges (``merge.max_gap_s``).
     """
 
     name: str
@@ -45,16 +45,16 @@ class ReportInputs:
     max_gap_s: float = 1.0
 
     def registration(self, camera: str) -> Registration | None:
-        """One camera's frames, None where registration did not come that far."""
-        return next((each for each in self.registrations if each.trajectory.camera == camera), None)
+        """Return a camera's registration, or None if it was not registered."""
+        return next((found for found in self.registrations if found.trajectory.camera == camera), None)
 
     def selection(self, camera: str) -> KeyframeSelection | None:
-        """One camera's keyframes."""
-        return next((each for each in self.selections if each.camera == camera), None)
+        """Return a camera's keyframe selection, or None if there is none."""
+        return next((found for found in self.selections if found.camera == camera), None)
 
     def path(self, camera: str) -> Trajectory | None:
-        """One camera's poses: in the world where merging placed them, else in its map's gauge."""
+        """Return a camera's poses: in the world if merging placed the camera, else in its map's gauge."""
         merged = () if self.merge is None else self.merge.trajectories
-        found = self.registration(camera)
-        placed = next((each for each in merged if each.camera == camera), None)
-        return placed if placed is not None or found is None else found.trajectory
+        registration = self.registration(camera)
+        in_world = next((path for path in merged if path.camera == camera), None)
+        return in_world if in_world is not None or registration is None else registration.trajectory

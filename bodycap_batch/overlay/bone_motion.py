@@ -1,0 +1,96 @@
+"""A moving skeleton as straight bones at any time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
+from bodycap_batch.model.skeleton import Motion
+from bodycap_batch.model.skeleton_presets import split_side
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bones:
+    """All bones at one time.
+
+    Attributes:
+        ends_in_world: (B,2,3) near and far end of each bone, metres.
+        observed: (B,) True if cameras measured the joint that turns the bone.
+    """
+
+    ends_in_world: FloatArray
+    observed: BoolArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoneMotion:
+    """The bones of a motion at each tick.
+
+    Attributes:
+        joints: (B,) index of the joint that turns each bone.
+        sides: (B,) "Left", "Right" or "" of each bone.
+        times_ns: (T,) common time of each tick.
+        ends_in_world: (T,B,2,3) near and far end of each bone, metres.
+        observed: (T,B) True if cameras measured the joint.
+    """
+
+    joints: IntArray
+    sides: tuple[str, ...]
+    times_ns: IntArray
+    ends_in_world: FloatArray
+    observed: BoolArray
+
+    def __post_init__(self) -> None:
+        bones, ticks = len(self.sides), len(self.times_ns)
+        set_array(self, "joints", (bones,), np.int64)
+        set_array(self, "times_ns", (ticks,), np.int64)
+        set_array(self, "ends_in_world", (ticks, bones, 2, 3))
+        set_array(self, "observed", (ticks, bones), np.bool_)
+
+    def bones_at(self, common_ns: int) -> Bones | None:
+        """Return the bones at a common time, or None outside the motion.
+
+        Between two ticks the ends are interpolated. A bone is observed only if it is observed at both ticks.
+        """
+        ticks = len(self.times_ns)
+        if not ticks or not self.times_ns[0] <= common_ns <= self.times_ns[-1]:
+            return None
+        after = min(int(np.searchsorted(self.times_ns, common_ns)), ticks - 1)
+        before = max(after - 1, 0)
+        interval_ns = int(self.times_ns[after] - self.times_ns[before])
+        alpha = (common_ns - int(self.times_ns[before])) / interval_ns if interval_ns else 1.0
+        ends = (1.0 - alpha) * self.ends_in_world[before] + alpha * self.ends_in_world[after]
+        return Bones(ends_in_world=ends, observed=self.observed[before] & self.observed[after])
+
+
+def bones_from_motion(motion: Motion) -> BoneMotion:
+    """Return the bones of a motion.
+
+    There is one bone from a joint to each of its children, and one to the tip of a joint without children.
+    """
+    skeleton = motion.skeleton
+    world_from_joint = motion.world_from_joint()
+    centres = world_from_joint[..., :3, 3]
+    children = [joint for joint in range(1, len(skeleton.joints)) if np.any(skeleton.offsets_m[joint])]
+    parents = [int(skeleton.parents[joint]) for joint in children]
+    end_joints = np.flatnonzero(np.isfinite(skeleton.end_offsets_m).all(axis=1)).tolist()
+    ends = [
+        np.stack([centres[:, parent], centres[:, child]], axis=1)
+        for parent, child in zip(parents, children, strict=True)
+    ]
+    for joint in end_joints:
+        tip = world_from_joint[:, joint, :3, :3] @ skeleton.end_offsets_m[joint] + centres[:, joint]
+        ends.append(np.stack([centres[:, joint], tip], axis=1))
+    joints = np.array([*parents, *end_joints], dtype=np.int64)
+    return BoneMotion(
+        joints=joints,
+        sides=tuple(
+            split_side(skeleton.roles[joint] or skeleton.joints[joint])[0]
+            for joint in [*children, *end_joints]
+        ),
+        times_ns=motion.times_ns(),
+        ends_in_world=np.stack(ends, axis=1) if ends else np.zeros((len(centres), 0, 2, 3)),
+        observed=motion.observed[:, joints],
+    )

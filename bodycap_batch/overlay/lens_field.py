@@ -1,0 +1,49 @@
+"""The field of view in which a lens model is valid."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.camera import Camera
+
+_ANGLE_COUNT, _AZIMUTH_COUNT = 178, 16
+"""Sampled angles off the axis, one in half a degree, and directions around the axis. Evidence: none."""
+_MAX_ANGLE_RAD = float(np.deg2rad(89.0))
+"""Largest sampled angle off the axis, radians: the tangent is infinite at 90 degrees."""
+
+
+def max_field_angle_rad(lens: Camera) -> float:
+    """Return the largest angle off the optical axis up to which the image radius grows, in radians.
+
+    A polynomial lens model is not monotonic outside the image to which it was fitted. Beyond that angle it
+    would project a point into the image, on the wrong side.
+    """
+    return _max_angle_rad(lens.model, lens.width_px, lens.height_px, tuple(lens.params.tolist()))
+
+
+@lru_cache(maxsize=64)
+def _max_angle_rad(model: str, width_px: int, height_px: int, params: tuple[float, ...]) -> float:
+    lens = Camera(model=model, width_px=width_px, height_px=height_px, params=np.array(params))
+    angle = np.linspace(0.0, _MAX_ANGLE_RAD, _ANGLE_COUNT)
+    azimuth = np.linspace(0.0, 2 * np.pi, _AZIMUTH_COUNT, endpoint=False)
+    tangent = np.tan(angle)[:, None]
+    rays = np.stack(
+        [tangent * np.cos(azimuth), tangent * np.sin(azimuth), np.ones((_ANGLE_COUNT, _AZIMUTH_COUNT))],
+        axis=-1,
+    ).reshape(-1, 3)
+    px = lens.project(rays).reshape(_ANGLE_COUNT, _AZIMUTH_COUNT, 2)
+    radius = np.linalg.norm(px - np.array(lens.principal_point_px), axis=-1)
+    grows = np.nan_to_num(np.diff(radius, axis=0), nan=-1.0).min(axis=1) > 0.0
+    return float(angle[-1] if grows.all() else angle[int(np.argmin(grows))])
+
+
+def field_margin(x_in_cam: FloatArray, max_angle_rad: float, near: float) -> FloatArray:
+    """Return a measure (N,) of how far points (N,3) are inside the field of view.
+
+    It is negative if the depth is less than `near` or the angle off the axis is greater than `max_angle_rad`.
+    """
+    angle = np.arctan2(np.linalg.norm(x_in_cam[:, :2], axis=1), x_in_cam[:, 2])
+    return np.asarray(np.minimum(x_in_cam[:, 2] - near, max_angle_rad - angle))

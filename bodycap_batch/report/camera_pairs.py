@@ -1,0 +1,98 @@
+"""Criteria about pairs of cameras: their distance on one body, and their relative rotation on one bone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Any
+
+from bodycap_batch.core.percent import format_percent
+from bodycap_batch.model.relative_pose import MIN_INSTANTS
+from bodycap_batch.model.skeleton_presets import split_side
+from bodycap_batch.report.grades import Criterion, Grade, grade_value
+
+_TWISTING_SEGMENT = "ForeArm"
+"""Segment that twists along its length: a camera at the wrist turns relative to one near the elbow."""
+_GOOD_REACH_SHARE, _FAIR_REACH_SHARE = 0.98, 0.9
+"""Shares of distances within the body's reach. Evidence: none."""
+_GOOD_UNEXPLAINED_DEG, _FAIR_UNEXPLAINED_DEG = 2.0, 6.0
+"""Degrees of relative rotation beyond the poses' noise. Evidence: docs/decisions/report.md."""
+
+
+def distance_criteria(reach: Mapping[str, Any] | None, unused: Collection[str]) -> Iterator[Criterion]:
+    """Yield the criterion about distances between cameras compared with the body's reach.
+
+    There is none without a body, because its reach is unknown, and none with too few distances. If the share
+    is too small to judge single keyframes by it, that is a finding as well.
+
+    Args:
+        reach: Result of the map's distance check.
+        unused: Cameras that are not part of the body; the share includes their distances.
+    """
+    if not reach or "within_reach" not in reach:
+        return
+    share = float(reach["within_reach"])
+    grade = grade_value(share, _GOOD_REACH_SHARE, _FAIR_REACH_SHARE, more_is_better=True)
+    doubt = "" if reach["judged"] else " at most, whatever the scale is"
+    if unused and grade is not Grade.GOOD:
+        grade = Grade.FAIR
+        doubt += f", including those of {' and '.join(sorted(unused))}, which the body does not carry"
+    elif not reach["judged"]:
+        doubt += ": body, clocks or map do not suit each other"
+    yield Criterion(
+        subject="cameras",
+        name="Cameras within the body's reach",
+        grade=grade,
+        finding=f"{format_percent(share, 1)} of {reach['distances']:,} distances between cameras{doubt}",
+        rationale="Cameras on one body cannot be farther apart than the body reaches. This shows a map that "
+        "merges two similar places, although its error in pixels is small.",
+        metric="mapping.reach.within_reach",
+        value=share,
+    )
+
+
+def shared_segment_criteria(
+    relative_poses: Sequence[Mapping[str, Any]],
+    mounts: Mapping[str, Mapping[str, Any]],
+    unused: Collection[str],
+) -> Iterator[Criterion]:
+    """Yield the criterion about cameras on one bone; there is none with too few common frames.
+
+    Args:
+        relative_poses: One entry for each pair, as ``relative_poses`` of ``metrics.json``.
+        mounts: By camera, with the ``role`` of the bone.
+        unused: Cameras that are not part of the body.
+    """
+    found = []
+    for pair in relative_poses:
+        if pair["instants"] < MIN_INSTANTS or pair["spread_deg"] is None or {*pair["cameras"]} & {*unused}:
+            continue
+        unexplained_deg = _unexplained_spread_deg(pair)
+        roles = {split_side(mounts[name]["role"])[1] for name in pair["cameras"] if name in mounts}
+        grade = grade_value(unexplained_deg, _GOOD_UNEXPLAINED_DEG, _FAIR_UNEXPLAINED_DEG)
+        if _TWISTING_SEGMENT in roles:
+            grade = min(grade, Grade.FAIR)
+        found.append((grade, unexplained_deg, pair))
+    grade, unexplained_deg, worst = max(found, key=lambda entry: entry[:2], default=(Grade.GOOD, 0.0, None))
+    if worst is not None:
+        noise = float(worst["explained_deg"] or 0.0)
+        yield Criterion(
+            subject="cameras",
+            name="Cameras on one bone",
+            grade=grade,
+            finding=f"{' and '.join(worst['cameras'])} are turned by {worst['spread_deg']:.1f}° relative to "
+            f"their usual positions (median of {worst['instants']:,} frames); the noise of their poses "
+            f"explains {noise:.1f}°",
+            rationale="Cameras on one bone keep their relative position, except for soft straps and the "
+            "forearm's twist. If they turn by more than the noise, one of them is loose or a clock is wrong "
+            "(offset_s): a clock error of 0.4 s turned a slowly moving camera by 5°. Up to 2° beyond the "
+            "noise is good; more than 6° is poor.",
+            value=unexplained_deg,
+        )
+
+
+def _unexplained_spread_deg(pair: Mapping[str, Any]) -> float:
+    """Return the part of a pair's spread that the poses' noise does not explain; zero for a rig."""
+    if pair["rigid"]:
+        return 0.0
+    return math.sqrt(max(0.0, pair["spread_deg"] ** 2 - (pair["explained_deg"] or 0.0) ** 2))

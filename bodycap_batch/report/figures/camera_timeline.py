@@ -1,0 +1,266 @@
+"""One camera over time: status, inliers, error, sharpness and speed, on the time axis of all cameras."""
+
+from __future__ import annotations
+
+import html
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodycap_batch.core.arrays import FloatArray, runs
+from bodycap_batch.model.geometry import rotation_angle_rad
+from bodycap_batch.model.scene import FrameStatus, Trajectory
+from bodycap_batch.report.drawn_scene import common_times_s
+from bodycap_batch.report.figures.svg import bin_statistics, element, number, path_through, svg_image, text
+from bodycap_batch.report.frame_losses import FrameLoss
+from bodycap_batch.report.report_inputs import ReportInputs
+
+WIDTH, LEFT, RIGHT = 960.0, 92.0, 12.0
+"""Width of the figure and its margins, SVG units."""
+_STATUS_HEIGHT, _CURVE_HEIGHT, _MARGIN = 18.0, 44.0, 10.0
+"""Heights of the status bar, of a curve and of the space between them, SVG units."""
+MAX_COLUMNS = 480
+"""Points of each curve: two of them are two pixels apart on a wide screen."""
+_MIN_COLUMNS = 12
+"""Points of each curve on the smallest page. Evidence: none."""
+_MIN_BAR_WIDTH = 0.8
+"""Width of a bar, SVG units: a single lost frame must remain visible."""
+_MIN_RANGE_HEIGHT = 0.6
+"""Height of a range, SVG units, from which it is visible behind its curve."""
+_TICK_INTERVALS_S = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60, 120, 300, 600, 1800)
+"""Possible intervals between the labels of the time axis, seconds."""
+_MAX_TICKS = 12
+"""Labels of the time axis; more would overlap."""
+_DEFAULT_INTERVAL_S = 0.03
+"""Assumed frame interval of a video with one frame, seconds: 30 fps."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Curve:
+    """One curve: its name with the unit, and a value for each frame."""
+
+    name: str
+    values: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _StatusBar:
+    """An interval of one kind ("reg", "bridged" or "lost"), or several that a screen cannot separate."""
+
+    kind: str
+    start_s: float
+    end_s: float
+    frames: int = 0
+    reasons: tuple[str, ...] = ()
+
+
+def draw_camera_timeline(
+    inputs: ReportInputs,
+    camera: str,
+    span_s: tuple[float, float],
+    losses: list[FrameLoss],
+    bridged_s: float,
+    detail: float = 1.0,
+) -> str:
+    """Draw one camera.
+
+    Args:
+        inputs: The results.
+        camera: Camera name.
+        span_s: First and last common time of the axis.
+        losses: The camera's lost intervals.
+        bridged_s: Longest time between two measurements that the body bridges; 0 if it bridges none.
+        detail: Share of the columns that are drawn.
+    """
+    columns = column_count(detail)
+    selection, path = inputs.selection(camera), inputs.path(camera)
+    curves = [] if path is None else _make_curves(path)
+    times = np.zeros(0) if path is None else common_times_s(inputs, camera, path.times_ns)
+    if selection is not None:
+        usual = float(np.median(selection.sharpness)) if len(selection.sharpness) else 0.0
+        curves.insert(2 if curves else 0, _Curve("sharpness", selection.sharpness / max(usual, 1e-12)))
+        if path is None:
+            times = np.linspace(*span_s, len(selection.sharpness)) if len(selection.sharpness) else times
+    if len(times) == 0:
+        return ""
+    parts, top = [], 4.0
+    if path is not None:
+        lost_bars = [_lost_bar(loss, times, bridged_s) for loss in losses]
+        parts.append(_draw_status(path, times, span_s, lost_bars, columns))
+        top += _STATUS_HEIGHT + _MARGIN
+    for curve in curves:
+        parts.append(_draw_curve(curve, times, span_s, top, columns))
+        top += _CURVE_HEIGHT + _MARGIN
+    parts.append(_draw_axis(span_s, top))
+    parts.append(element("line", class_="now", x1=LEFT, x2=LEFT, y1=2.0, y2=top))
+    return svg_image(
+        WIDTH,
+        top + 18.0,
+        "".join(parts),
+        f"{camera} over time: {_summary(path)}",
+        class_="strip",
+        data_left=LEFT,
+        data_width=WIDTH - LEFT - RIGHT,
+        data_start=f"{span_s[0]:.6f}",
+        data_end=f"{span_s[1]:.6f}",
+    )
+
+
+def column_count(detail: float) -> int:
+    """Return the number of points of each curve at a share of the detail."""
+    return max(_MIN_COLUMNS, int(MAX_COLUMNS * detail))
+
+
+def x_from_time(time_s: float | FloatArray, span_s: tuple[float, float]) -> FloatArray:
+    """Return the horizontal position of common times, SVG units."""
+    share = (np.asarray(time_s) - span_s[0]) / max(span_s[1] - span_s[0], 1e-9)
+    return np.asarray(LEFT + share * (WIDTH - LEFT - RIGHT))
+
+
+def _summary(path: Trajectory | None) -> str:
+    if path is None:
+        return "keyframes and sharpness"
+    localised = path.localised
+    return f"{int(localised.sum())} of {len(localised)} frames registered"
+
+
+def _make_curves(path: Trajectory) -> list[_Curve]:
+    localised = path.localised
+    turn = np.full(len(localised), np.nan)
+    seconds = np.diff(path.times_ns) * 1e-9
+    both = np.flatnonzero(localised[:-1] & localised[1:])
+    rotation = path.gauge_from_cam[:, :3, :3]
+    angle = rotation_angle_rad(np.swapaxes(rotation[both], -1, -2) @ rotation[both + 1]) if len(both) else 0.0
+    turn[both + 1] = np.degrees(angle) / np.maximum(seconds[both], 1e-6)
+    speed = np.full(len(localised), np.nan)
+    distance = np.linalg.norm(np.diff(path.gauge_from_cam[:, :3, 3], axis=0), axis=1)
+    speed[both + 1] = distance[both] / np.maximum(seconds[both], 1e-6)
+    unit = "m/s" if path.gauge == "world" else "units/s"
+    return [
+        _Curve("inliers", np.where(localised, path.inliers.astype(np.float64), np.nan)),
+        _Curve("error, px", path.error_px),
+        _Curve(f"speed, {unit}", speed),
+        _Curve("turn, °/s", turn),
+    ]
+
+
+def _draw_status(
+    path: Trajectory,
+    times: FloatArray,
+    span_s: tuple[float, float],
+    lost_bars: list[_StatusBar],
+    columns: int,
+) -> str:
+    """Draw bars of registered and lost intervals, and a line for each keyframe.
+
+    A lost bar has a title with the reason and whether the body bridges the interval.
+    """
+    interval = _frame_interval_s(times)
+    resolution_s = (span_s[1] - span_s[0]) / (2 * columns)
+    parts = [text(LEFT - 8.0, 17.0, "status", class_="label", text_anchor="end")]
+    registered = [
+        _StatusBar("reg", float(times[first]), float(times[stop - 1] + interval))
+        for first, stop in runs(path.localised)
+    ]
+    parts += [_draw_bar(bar, span_s, "registered") for bar in _merge_close_bars(registered, resolution_s)]
+    is_keyframe = np.array([status is FrameStatus.KEYFRAME for status in path.status], dtype=bool)
+    if is_keyframe.any():
+        resolution = (WIDTH - LEFT - RIGHT) / (2 * columns)
+        positions = np.unique((x_from_time(times[is_keyframe], span_s) / resolution).round()) * resolution
+        lines = "".join(f"M{number(x)} 4V{number(4.0 + _STATUS_HEIGHT / 3)}" for x in positions)
+        parts.append(element("path", class_="key", d=lines))
+    for bar in _merge_close_bars(lost_bars, resolution_s):
+        title = f"{bar.frames} frames lost: {', '.join(bar.reasons)}"
+        if bar.kind == "bridged":
+            title += ", bridged by the body"
+        parts.append(_draw_bar(bar, span_s, title))
+    return "".join(parts)
+
+
+def _frame_interval_s(times: FloatArray) -> float:
+    return float(np.median(np.diff(times))) if len(times) > 1 else _DEFAULT_INTERVAL_S
+
+
+def _lost_bar(loss: FrameLoss, times: FloatArray, bridged_s: float) -> _StatusBar:
+    # Smoothness bridges a gap between two measurements, but not the time before the first or after the last.
+    is_between = loss.first > 0 and loss.last < len(times) - 1
+    gap_s = float(times[loss.last + 1] - times[loss.first - 1]) if is_between else np.inf
+    kind = "bridged" if gap_s <= bridged_s else "lost"
+    end_s = loss.end_s + _frame_interval_s(times)
+    return _StatusBar(kind, loss.start_s, end_s, loss.frame_count, (loss.reason.value,))
+
+
+def _merge_close_bars(bars: list[_StatusBar], resolution_s: float) -> list[_StatusBar]:
+    """Merge neighbouring bars of one kind that a screen cannot separate, so that long videos stay small."""
+    merged: list[_StatusBar] = []
+    for bar in bars:
+        last = merged[-1] if merged else None
+        if last is not None and last.kind == bar.kind and bar.start_s - last.end_s < resolution_s:
+            reasons = tuple(dict.fromkeys((*last.reasons, *bar.reasons)))
+            merged[-1] = _StatusBar(bar.kind, last.start_s, bar.end_s, last.frames + bar.frames, reasons)
+        else:
+            merged.append(bar)
+    return merged
+
+
+def _draw_bar(bar: _StatusBar, span_s: tuple[float, float], title: str) -> str:
+    left, right = float(x_from_time(bar.start_s, span_s)), float(x_from_time(bar.end_s, span_s))
+    return element(
+        "rect",
+        element("title", html.escape(title)),
+        class_=bar.kind,
+        x=left,
+        y=4.0,
+        width=max(right - left, _MIN_BAR_WIDTH),
+        height=_STATUS_HEIGHT,
+    )
+
+
+def _draw_curve(
+    curve: _Curve, times: FloatArray, span_s: tuple[float, float], top: float, max_columns: int
+) -> str:
+    """Draw the median of each column as a line over the range of its values.
+
+    In a short video a column is one frame.
+    """
+    columns = bin_statistics(curve.values, min(max_columns, len(curve.values)))
+    column_times = np.interp(
+        np.linspace(0, len(times) - 1, len(columns)) if len(columns) > 1 else [0.0],
+        np.arange(len(times)),
+        times,
+    )
+    x = x_from_time(column_times, span_s)
+    finite = columns[np.isfinite(columns[:, 1])]
+    high = float(np.percentile(finite[:, 2], 99)) * 1.1 if len(finite) else 1.0
+    high = high if high > 0 else 1.0
+    y = top + _CURVE_HEIGHT - np.clip(columns / high, 0.0, 1.0) * _CURVE_HEIGHT
+    bottom = top + _CURVE_HEIGHT
+    parts = [
+        element("rect", class_="plate", x=LEFT, y=top, width=WIDTH - LEFT - RIGHT, height=_CURVE_HEIGHT),
+        text(LEFT - 8.0, top + 16.0, curve.name, class_="label", text_anchor="end"),
+        text(LEFT - 8.0, top + 32.0, f"to {_short_number(high)}", class_="tick", text_anchor="end"),
+        element("path", class_="range", d=_range_path(x, y)),
+        element("path", class_="curve", d=path_through(zip(x, y[:, 1], strict=True))),
+        element("line", class_="base", x1=LEFT, x2=WIDTH - RIGHT, y1=bottom, y2=bottom),
+    ]
+    return "".join(parts)
+
+
+def _range_path(x: FloatArray, y: FloatArray) -> str:
+    """Return vertical lines from the smallest to the largest value, where they differ visibly."""
+    visible = np.isfinite(y[:, 0]) & (np.abs(y[:, 0] - y[:, 2]) > _MIN_RANGE_HEIGHT)
+    return "".join(f"M{number(x[i])} {number(y[i, 0])}V{number(y[i, 2])}" for i in np.flatnonzero(visible))
+
+
+def _draw_axis(span_s: tuple[float, float], top: float) -> str:
+    length = max(span_s[1] - span_s[0], 1e-6)
+    interval = next((each for each in _TICK_INTERVALS_S if length / each <= _MAX_TICKS), 3600)
+    first, last = np.ceil(span_s[0] / interval), np.floor(span_s[1] / interval + 1e-9)
+    return "".join(
+        text(float(x_from_time(time, span_s)), top + 12.0, f"{time:g} s", class_="tick", text_anchor="middle")
+        for time in np.arange(first, last + 1) * interval
+    )
+
+
+def _short_number(value: float) -> str:
+    return f"{value:.0f}" if value >= 20 else f"{value:.1f}" if value >= 2 else f"{value:.2f}"

@@ -1,0 +1,86 @@
+"""The number of landmarks that each pair of cameras shares."""
+
+from __future__ import annotations
+
+import html
+
+from bodycap_batch.core.percent import format_percent
+from bodycap_batch.report.figures.svg import element, svg_image, text
+from bodycap_batch.report.recommendations import count_shared_points
+from bodycap_batch.report.report_inputs import ReportInputs
+
+_CELL, _LEFT, _TOP = 74.0, 130.0, 26.0
+"""Width of a cell, and space for the names at the left and at the top, SVG units."""
+_ASPECT = 0.6
+"""Height over width of a cell."""
+_MAX_CAMERAS = 24
+"""Cameras in the figure. With more it would be unreadable, and its size grows with their square."""
+_FULL_SHADE_SHARE, _STRONG_TEXT_SHARE = 0.5, 0.3
+"""Shares of common points from which a cell has the darkest shade, and light text."""
+
+
+def draw_shared_landmarks(inputs: ReportInputs) -> str:
+    """Draw a matrix of cameras; the shade is the share of the points that the camera of the row sees."""
+    names = inputs.cameras[:_MAX_CAMERAS]
+    if len(names) < 2 or not inputs.maps:
+        return ""
+    counts = count_shared_points(inputs.maps, names)
+    parts = []
+    for column, name in enumerate(names):
+        x = _LEFT + (column + 0.5) * _CELL
+        parts.append(text(x, 16.0, _short_name(name), class_="label", text_anchor="middle"))
+    for row, name in enumerate(names):
+        y = _TOP + row * _CELL * _ASPECT
+        parts.append(text(_LEFT - 8.0, y + 0.36 * _CELL, name, class_="label", text_anchor="end"))
+        for column, other in enumerate(names):
+            own = max(int(counts[row, row]), 1)
+            share = counts[row, column] / own
+            description = (
+                f"{name} sees {counts[row, row]:,} points"
+                if row == column
+                else f"{name} and {other} share {counts[row, column]:,} points, {format_percent(share)} of {name}'s"
+            )
+            x = _LEFT + column * _CELL
+            opacity = 0.06 + 0.9 * min(share / _FULL_SHADE_SHARE, 1.0)
+            parts.append(
+                element(
+                    "rect",
+                    element("title", html.escape(description)),
+                    class_="own" if row == column else "cell",
+                    style=None if row == column else f"fill-opacity:{opacity:.3f}",
+                    x=x + 1.0,
+                    y=y + 1.0,
+                    width=_CELL - 2.0,
+                    height=_ASPECT * _CELL - 2.0,
+                )
+            )
+            middle = x + 0.5 * _CELL
+            is_strong = row != column and share > _STRONG_TEXT_SHARE
+            text_class = "cellnumber strong" if is_strong else "cellnumber"
+            count_text = f"{counts[row, column]:,}"
+            parts.append(text(middle, y + 0.3 * _CELL, count_text, class_=text_class, text_anchor="middle"))
+            if row != column:
+                parts.append(
+                    text(
+                        middle,
+                        y + 0.3 * _CELL + 13.0,
+                        f"{format_percent(share)}",
+                        class_=f"{text_class} small",
+                        text_anchor="middle",
+                    )
+                )
+    size = len(names)
+    omission = (
+        f" (the first {_MAX_CAMERAS} of {len(inputs.cameras)})" if len(inputs.cameras) > _MAX_CAMERAS else ""
+    )
+    return svg_image(
+        _LEFT + size * _CELL + 8.0,
+        _TOP + size * _ASPECT * _CELL + 6.0,
+        "".join(parts),
+        f"Landmarks shared between cameras{omission}",
+        class_="shared",
+    )
+
+
+def _short_name(name: str) -> str:
+    return name if len(name) <= 11 else f"{name[:10]}…"

@@ -1,0 +1,114 @@
+"""The overlays of a camera's frames: the inlier points of each pose, and the visible bones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.merge_data import MergeResult
+from bodycap_batch.model.scene import Trajectory
+from bodycap_batch.overlay import BoneMotion, CameraView, make_camera_views, project_bones
+from bodycap_batch.report.packing import pack_scaled
+from bodycap_batch.report.report_inputs import ReportInputs
+
+_MAX_INLIERS = 120
+"""Points drawn over each picture; more would hide it. Evidence: none."""
+_LINE_POINTS = 6
+"""Points of a bone's line that are stored. A lens bends the line, but not much within an image."""
+
+
+class FrameOverlays:
+    """Status and overlays of every camera's frames.
+
+    Args:
+        inputs: The results.
+    """
+
+    def __init__(self, inputs: ReportInputs) -> None:
+        self._inputs = inputs
+        views = make_camera_views(inputs.registrations, inputs.maps, inputs.clocks, inputs.merge)
+        self._views = {view.camera: view for view in views}
+        self._bone_motion = None if inputs.merge is None else bones_from_merge(inputs.merge)
+
+    def describe(self, camera: str, frames: Iterable[int]) -> list[dict[str, Any]]:
+        """Return index, status, number of inliers, error and overlays of frames, as JSON values.
+
+        Positions are fractions of the image's width and height.
+        """
+        view, path = self._views.get(camera), self._inputs.path(camera)
+        return [
+            {
+                **_pose_facts(path, index),
+                "inliersAt": pack_scaled(_inlier_positions(view, index)),
+                "bones": [] if view is None else self._bone_positions(view, index),
+            }
+            for index in frames
+        ]
+
+    def describe_part(self, camera: str, first: int, count: int) -> list[dict[str, Any]]:
+        """Describe at most `count` frames from `first` on; after the camera's last frame there are none."""
+        path = self._inputs.path(camera)
+        if path is None:
+            return []
+        return self.describe(camera, range(first, min(first + count, len(path.status))))
+
+    def _bone_positions(self, view: CameraView, index: int) -> list[list[float]]:
+        pose = view.cam_from_frame(index)
+        bones = None if self._bone_motion is None else self._bone_motion.bones_at(int(view.times_ns[index]))
+        if pose is None or bones is None or view.reference_frame != "world":
+            return []
+        size = np.array([view.lens.width_px, view.lens.height_px], dtype=np.float64)
+        lines = []
+        for line in project_bones(view.lens, pose, bones):
+            points = line.px[np.linspace(0, len(line.px) - 1, _LINE_POINTS).round().astype(int)] / size
+            lines.append([round(float(value), 4) for value in points.ravel()])
+        return lines
+
+
+def _pose_facts(path: Trajectory | None, index: int) -> dict[str, Any]:
+    """Return status, number of inliers and error of a frame."""
+    if path is None:
+        return {"i": index, "status": "", "inliers": 0, "error": None}
+    error = float(path.error_px[index])
+    return {
+        "i": index,
+        "status": path.status[index].value,
+        "inliers": int(path.inliers[index]),
+        "error": round(error, 3) if np.isfinite(error) else None,
+    }
+
+
+def bones_from_merge(merge: MergeResult) -> BoneMotion:
+    """Return the bones between solved joints, in the motion that all outputs show."""
+    skeleton, poses, solved = merge.skeleton, merge.motion.world_from_joint(), merge.solved
+    centres = poses[..., :3, 3]
+    ends: list[FloatArray] = []
+    turning_joints: list[int] = []
+    for joint, parent in enumerate(skeleton.parents.tolist()):
+        if parent >= 0 and solved[joint] and solved[parent]:
+            ends.append(np.stack([centres[:, parent], centres[:, joint]], axis=1))
+            turning_joints.append(parent)
+        if solved[joint] and np.isfinite(skeleton.end_offsets_m[joint]).all():
+            tip = poses[:, joint, :3, :3] @ skeleton.end_offsets_m[joint] + centres[:, joint]
+            ends.append(np.stack([centres[:, joint], tip], axis=1))
+            turning_joints.append(joint)
+    joints = np.array(turning_joints, dtype=np.int64)
+    return BoneMotion(
+        joints=joints,
+        sides=("",) * len(ends),
+        times_ns=merge.times_ns(),
+        ends_in_world=np.stack(ends, axis=1) if ends else np.zeros((len(poses), 0, 2, 3)),
+        observed=merge.observed[:, joints],
+    )
+
+
+def _inlier_positions(view: CameraView | None, index: int) -> FloatArray:
+    """Return the observed positions (N,2) of at most `_MAX_INLIERS` inliers of a frame, evenly selected."""
+    if view is None:
+        return np.zeros((0, 2))
+    observed_px = view.inliers_at(index).observed_px
+    stride = max(1, -(-len(observed_px) // _MAX_INLIERS))
+    return np.asarray(observed_px[::stride] / np.array([view.lens.width_px, view.lens.height_px]))

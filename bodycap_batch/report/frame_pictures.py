@@ -1,0 +1,205 @@
+"""Small pictures of video frames: a series for the time slider, and pictures of lost frames."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.core.arrays import FloatArray, IntArray, evenly_spaced
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import CaptureError
+
+SERIES_BUDGET = 6_000_000
+"""Characters of all series together; some tenths of them are for the overlays. Less than half of the page."""
+_OVERLAY_CHARACTERS = 1_300
+"""Characters of one picture's overlays: points and bones. Evidence: none."""
+_SERIES_SIDE_PX = 320
+"""Longer side of a series' pictures, pixels. Evidence: none."""
+MAX_JPEG_CHARACTERS = 50_000
+"""Characters of a picture of 320×240 that contains only noise, the largest possible one.
+
+If pictures of this size fit into the budget, no frame is decoded to measure the size.
+"""
+_LOST_SIDE_PX = 240
+"""Longer side of a lost frame's picture, pixels. Evidence: none."""
+_JPEG_QUALITY = 60
+"""JPEG quality of 100. Evidence: none."""
+_PROBED_FRAMES = 6
+"""Frames that are encoded to estimate the size of a picture. Evidence: none."""
+_MAX_PICTURES_PER_S = 5.0
+"""Pictures per second. More would only enlarge the page, because the motion itself is drawn at every tick."""
+_MAX_SHIFT_S = 1.0
+"""Largest time from an evenly spaced frame to the kept frame that replaces it, seconds.
+
+Keyframes are at most half a second apart.
+"""
+_DARK_BRIGHTNESS = 30.0
+"""Mean brightness of 255 below which hardly any light reached the camera. Evidence: none."""
+MAX_CORNERS = 300
+"""Corners that are counted at most. Evidence: none."""
+_CORNER_QUALITY = 0.02
+"""Strength of a corner relative to the strongest one (`goodFeaturesToTrack`). Evidence: none."""
+_MIN_CORNER_CONTRAST = 20
+"""Range of grey levels around a corner, of 255; the range of sensor noise is smaller. Evidence: none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FramePicture:
+    """A video frame as a small JPEG.
+
+    Attributes:
+        index: Frame index in its camera.
+        jpeg: The file's content, base64.
+        width: Pixels.
+        height: Pixels.
+    """
+
+    index: int
+    jpeg: str
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameAppearance:
+    """Measurements of a video frame's image.
+
+    Attributes:
+        picture: The frame.
+        brightness: Mean brightness, 0 to 255.
+        corners: Number of distinct corners, at most `MAX_CORNERS`.
+    """
+
+    picture: FramePicture
+    brightness: float
+    corners: int
+
+    @property
+    def is_dark(self) -> bool:
+        """True if hardly any light reached the camera."""
+        return self.brightness < _DARK_BRIGHTNESS
+
+
+def picture_series(
+    camera: CaptureCamera, times_s: FloatArray, budget: int, context: StageContext
+) -> tuple[FramePicture, ...]:
+    """Return evenly spaced pictures of a camera's video, as many as the budget allows.
+
+    Args:
+        camera: The camera with its videos.
+        times_s: (N,) common time of each frame.
+        budget: Characters of base64 and overlays.
+        context: Cancelling.
+    """
+    count = len(camera.frame_numbers)
+    if count == 0:
+        return ()
+    length_s = float(times_s[-1] - times_s[0])
+    most = 1 + int(_MAX_PICTURES_PER_S * length_s)
+    if most * (MAX_JPEG_CHARACTERS + _OVERLAY_CHARACTERS) > budget:
+        probes = _read_pictures(
+            camera, _prefer_cheap_frames(camera, evenly_spaced(count, _PROBED_FRAMES)), context
+        )
+        if not probes:
+            return ()
+        characters = float(np.mean([len(picture.jpeg) for picture in probes])) + _OVERLAY_CHARACTERS
+        most = min(int(0.95 * budget / characters), most)
+    indices = _prefer_cheap_frames(camera, evenly_spaced(count, max(most, 2)))
+    return tuple(_thin_to_budget(_read_pictures(camera, indices, context), budget))
+
+
+def measure_appearance(
+    camera: CaptureCamera, indices: Sequence[int], context: StageContext
+) -> dict[int, FrameAppearance]:
+    """Return picture, brightness and number of corners of frames, by frame index."""
+    import cv2
+
+    measured = {}
+    unique_indices = np.unique(np.asarray(indices, dtype=np.int64))
+    for index, image in _decode_frames(camera, unique_indices, context):
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        half_size = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        found = cv2.goodFeaturesToTrack(half_size, MAX_CORNERS, _CORNER_QUALITY, 5.0)
+        corners = 0 if found is None else len(_corners_above_noise(half_size, found.reshape(-1, 2)))
+        picture = _encode_picture(index, image, _LOST_SIDE_PX)
+        measured[index] = FrameAppearance(picture=picture, brightness=float(grey.mean()), corners=corners)
+    return measured
+
+
+def _corners_above_noise(grey: Any, corners: FloatArray) -> FloatArray:
+    """Return the corners with more contrast than sensor noise.
+
+    The threshold of `goodFeaturesToTrack` is relative to the best corner, so it finds corners in pure noise.
+    """
+    import cv2
+
+    contrast = cv2.dilate(grey, np.ones((5, 5), np.uint8)).astype(int) - cv2.erode(
+        grey, np.ones((5, 5), np.uint8)
+    )
+    column, row = corners.astype(int).T
+    return np.asarray(corners[contrast[row, column] > _MIN_CORNER_CONTRAST])
+
+
+def _prefer_cheap_frames(camera: CaptureCamera, indices: IntArray) -> IntArray:
+    """Replace evenly spaced frames by near frames that are cheaper to read.
+
+    If the capture keeps the keyframes' images, these are preferred: little new comes into view between two
+    keyframes. Otherwise frames that decode without their neighbours are preferred. If no cheap frame is near,
+    the original frame is kept.
+    """
+    cheap = camera.key_indices() if camera.kept is None else camera.kept.frames
+    if len(indices) < 3 or len(cheap) == 0:
+        return indices
+    max_shift = 0.5 * float(np.median(np.diff(indices)))
+    if camera.kept is not None:
+        max_shift = max(max_shift, _MAX_SHIFT_S * camera.nominal_fps)
+    right = np.clip(np.searchsorted(cheap, indices), 0, len(cheap) - 1)
+    left = np.maximum(right - 1, 0)
+    left_is_nearer = np.abs(cheap[left] - indices) <= np.abs(cheap[right] - indices)
+    nearest = np.where(left_is_nearer, cheap[left], cheap[right])
+    return np.unique(np.where(np.abs(nearest - indices) < max_shift, nearest, indices))
+
+
+def _thin_to_budget(pictures: list[FramePicture], budget: int) -> list[FramePicture]:
+    """Omit every second picture until the rest fits into the budget."""
+    while len(pictures) > 2 and sum(len(each.jpeg) + _OVERLAY_CHARACTERS for each in pictures) > budget:
+        pictures = pictures[::2]
+    return pictures
+
+
+def _read_pictures(camera: CaptureCamera, indices: IntArray, context: StageContext) -> list[FramePicture]:
+    return [
+        _encode_picture(index, image, _SERIES_SIDE_PX)
+        for index, image in _decode_frames(camera, indices, context)
+    ]
+
+
+def _decode_frames(camera: CaptureCamera, indices: IntArray, context: StageContext) -> list[tuple[int, Any]]:
+    """Return colour frames up to the first one that cannot be decoded.
+
+    The frames after it are missing on the page, but the report does not fail.
+    """
+    frames = []
+    try:
+        for index, image in camera.read(indices, colour=True):
+            context.check_cancelled()
+            frames.append((index, image))
+    except CaptureError:
+        return frames
+    return frames
+
+
+def _encode_picture(index: int, image: Any, side_px: int) -> FramePicture:
+    import cv2
+
+    factor = min(1.0, side_px / max(image.shape[:2]))
+    size = (max(1, round(image.shape[1] * factor)), max(1, round(image.shape[0] * factor)))
+    small = cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR)
+    _, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    text = base64.b64encode(encoded.tobytes()).decode("ascii")
+    return FramePicture(index=index, jpeg=text, width=size[0], height=size[1])

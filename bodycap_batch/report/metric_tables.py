@@ -1,0 +1,355 @@
+"""Tables of a job's figures; each cell names its place in ``metrics.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from bodycap_batch.core.percent import format_percent
+from bodycap_batch.report.report_inputs import ReportInputs
+from bodycap_batch.report.viewer_data import known_joint_sigma_m
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cell:
+    """One cell.
+
+    Attributes:
+        text: The displayed text.
+        metric: Dotted path in ``metrics.json``, "" if the cell is not one of its figures.
+        value: The figure, not rounded.
+        share: Length of a bar behind the text, 0 to 1; None for no bar.
+    """
+
+    text: str
+    metric: str = ""
+    value: float | None = None
+    share: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """A table with a caption. The first cell of a row is the row's head."""
+
+    caption: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    note: str = ""
+
+
+def metric_at(metrics: Mapping[str, Any], dotted: str) -> Any:
+    """Return the value at a dotted path, or None if there is none. Camera names must not contain a dot."""
+    value: Any = metrics
+    for part in dotted.split("."):
+        if isinstance(value, list):
+            value = value[int(part)] if int(part) < len(value) else None
+        else:
+            value = value.get(part) if isinstance(value, Mapping) else None
+    return value
+
+
+def make_tables(inputs: ReportInputs) -> dict[str, Table]:
+    """Return the tables of the page by name, except those without rows."""
+    metrics = inputs.metrics
+    if metrics is None:
+        return {}
+    tables = {"frames": _frames_table(metrics), "map": _map_table(metrics)}
+    if "merge" in metrics:
+        merge = metrics["merge"]
+        tables |= {
+            "residuals": _residuals_table(merge),
+            "joints": _joint_distance_table(merge, "joint_gap_m", "Distance between bones at each joint"),
+            "hinges": _joint_distance_table(
+                merge, "hinge_off_plane_m", "Distance of each hinge from its plane"
+            ),
+            "mounts": _mounts_table(merge),
+            "joined": _joined_cameras_table(merge),
+            "scale": _scale_table(merge),
+            "limbs": _limb_scales_table(merge),
+            "rules": _soft_limits_table(merge),
+            "sigma": _joint_sigma_table(inputs),
+        }
+    return {name: table for name, table in tables.items() if table.rows}
+
+
+def metric_cell(
+    metrics: Mapping[str, Any],
+    dotted: str,
+    form: str | Callable[[float], str] = "{:,}",
+    factor: float = 1.0,
+) -> Cell:
+    """Return a figure of ``metrics.json`` as a cell; an unknown figure is shown as a dash.
+
+    Args:
+        metrics: The content of ``metrics.json``.
+        dotted: Path of the figure.
+        form: Format string, or function that returns the text.
+        factor: Factor from the figure to the displayed unit.
+    """
+    value = metric_at(metrics, dotted)
+    if value is None:
+        return Cell(text="–", metric=dotted)
+    shown = value if factor == 1.0 else factor * value
+    text = form.format(shown) if isinstance(form, str) else form(shown)
+    return Cell(text=text, metric=dotted, value=value)
+
+
+def _percent(value: float) -> str:
+    return format_percent(value, 1)
+
+
+def _frames_table(metrics: Mapping[str, Any]) -> Table:
+    rows = []
+    for path in (*(f"cameras.{name}" for name in metrics["cameras"]), "total"):
+        name = path.partition(".")[2] or "all cameras"
+        rows.append(
+            (
+                Cell(text=name),
+                metric_cell(metrics, f"{path}.frames"),
+                metric_cell(metrics, f"{path}.frames_registered"),
+                metric_cell(metrics, f"{path}.coverage", _percent),
+                metric_cell(metrics, f"{path}.keyframes"),
+                metric_cell(metrics, f"{path}.registration.median_inliers", "{:.0f}")
+                if path != "total"
+                else Cell(text=""),
+            )
+        )
+    heads = ("Camera", "Frames", "Registered", "Share", "Keyframes", "Median inliers")
+    return Table(caption="Table 1. Frames registered", heads=heads, rows=tuple(rows))
+
+
+def _map_table(metrics: Mapping[str, Any]) -> Table:
+    paths = [f"cameras.{name}" for name in metrics["cameras"]]
+    paths += [f"models.{index}" for index in range(len(metrics["models"]))] + ["total"]
+    rows = []
+    for path in paths:
+        kind, _, name = path.partition(".")
+        head = {"cameras": name, "models": f"map {name}", "total": "all"}[kind]
+        rows.append(
+            (
+                Cell(text=head),
+                metric_cell(metrics, f"{path}.points"),
+                metric_cell(metrics, f"{path}.measurements"),
+                metric_cell(metrics, f"{path}.mean_reprojection_error_px", "{:.2f} px"),
+            )
+        )
+    return Table(
+        caption="Table 2. The map",
+        heads=("Seen by", "Points", "Measurements", "Mean reprojection error"),
+        rows=tuple(rows),
+        note="Pixels are those of the frames at their work size.",
+    )
+
+
+def _residuals_table(merge: Mapping[str, Any]) -> Table:
+    metrics = {"merge": merge}
+    cameras = merge.get("cameras", {})
+    largest = max((camera["residual_m"]["p95"] for camera in cameras.values()), default=0.0)
+    rows = []
+    for name, camera in cameras.items():
+        path = f"merge.cameras.{name}"
+        p95 = metric_cell(metrics, f"{path}.residual_m.p95", "{:.2f} cm", 100.0)
+        rows.append(
+            (
+                Cell(text=name),
+                metric_cell(metrics, f"{path}.measurements"),
+                metric_cell(metrics, f"{path}.dropped_as_gross_errors"),
+                metric_cell(metrics, f"{path}.down_weighted"),
+                metric_cell(metrics, f"{path}.longest_gap_s", "{:.2f} s"),
+                metric_cell(metrics, f"{path}.residual_m.p50", "{:.2f} cm", 100.0),
+                replace(p95, share=camera["residual_m"]["p95"] / largest if largest else 0.0),
+                metric_cell(metrics, f"{path}.residual_deg.p95", "{:.2f}°"),
+            )
+        )
+    heads = (
+        "Camera",
+        "Poses",
+        "Excluded",
+        "Down-weighted",
+        "Longest gap",
+        "Distance, median",
+        "Distance, 95 %",
+        "Rotation, 95 %",
+    )
+    return Table(caption="Residual of each camera against the solved body", heads=heads, rows=tuple(rows))
+
+
+def _joint_distance_table(merge: Mapping[str, Any], key: str, caption: str) -> Table:
+    """Return a table of a distance at each joint: the median, and the 95th percentile with a bar."""
+    metrics, distances = {"merge": merge}, merge.get(key, {})
+    largest = max((distance["p95"] for distance in distances.values()), default=0.0)
+    rows = []
+    for role in distances:
+        p95 = metric_cell(metrics, f"merge.{key}.{role}.p95", "{:.2f} mm", 1000.0)
+        share = distances[role]["p95"] / largest if largest else 0.0
+        rows.append(
+            (
+                Cell(text=role),
+                metric_cell(metrics, f"merge.{key}.{role}.p50", "{:.2f} mm", 1000.0),
+                replace(p95, share=share),
+            )
+        )
+    return Table(caption=caption, heads=("Joint", "Distance, median", "Distance, 95 %"), rows=tuple(rows))
+
+
+def _mounts_table(merge: Mapping[str, Any]) -> Table:
+    metrics = {"merge": merge}
+    rows = []
+    for name, mount in merge.get("mounts", {}).items():
+        path = f"merge.mounts.{name}"
+        rows.append(
+            (
+                Cell(text=name),
+                Cell(text=str(mount["role"])),
+                metric_cell(metrics, f"{path}.roll_deg", "{:.0f}°"),
+                metric_cell(metrics, f"{path}.from_prior_deg", "{:.1f}°"),
+                metric_cell(metrics, f"{path}.from_prior_m", "{:.1f} cm", 100.0),
+                metric_cell(metrics, f"{path}.sigma_deg", "± {:.1f}°"),
+                metric_cell(metrics, f"{path}.sigma_m", "± {:.1f} cm", 100.0),
+            )
+        )
+    heads = (
+        "Camera",
+        "Bone",
+        "Roll",
+        "Turned from assumed",
+        "Moved from assumed",
+        "Rotation uncertainty",
+        "Position uncertainty",
+    )
+    return Table(caption="Estimated mounts", heads=heads, rows=tuple(rows))
+
+
+def _joined_cameras_table(merge: Mapping[str, Any]) -> Table:
+    metrics = {"merge": merge}
+    rows = tuple(
+        (
+            Cell(text=name),
+            metric_cell(metrics, f"merge.joined_cameras.{name}.sigma_deg", "± {:.1f}°"),
+            metric_cell(metrics, f"merge.joined_cameras.{name}.sigma_m", "± {:.1f} cm", 100.0),
+        )
+        for name in merge.get("joined_cameras", {})
+    )
+    return Table(
+        caption="Cameras placed by the body alone",
+        heads=("Camera", "Rotation uncertainty", "Position uncertainty"),
+        rows=rows,
+        note="Their map shares no view with the main map.",
+    )
+
+
+def _scale_table(merge: Mapping[str, Any]) -> Table:
+    scale = merge.get("scale", {})
+    rows = tuple(
+        (
+            *_scale_source_cells(merge, f"merge.scale.sources.{index}"),
+            Cell(text="used" if source["used"] else "not used"),
+        )
+        for index, source in enumerate(scale.get("sources", ()))
+    )
+    return Table(
+        caption="Sources of the metric scale",
+        heads=("Source", "Uncertainty", "Difference from the used scale", ""),
+        rows=rows,
+        note=_chi_square_note(scale),
+    )
+
+
+def _limb_scales_table(merge: Mapping[str, Any]) -> Table:
+    limbs = merge.get("scale", {}).get("limbs", {})
+    rows = tuple(
+        _scale_source_cells(merge, f"merge.scale.limbs.alone.{index}")
+        for index in range(len(limbs.get("alone", ())))
+    )
+    return Table(
+        caption="The scale that each limb alone would give",
+        heads=("Limb", "Uncertainty", "Difference from the used scale"),
+        rows=rows,
+        note=_chi_square_note(limbs),
+    )
+
+
+def _scale_source_cells(merge: Mapping[str, Any], path: str) -> tuple[Cell, ...]:
+    metrics = {"merge": merge}
+    return (
+        Cell(text=str(metric_at(metrics, f"{path}.name"))),
+        metric_cell(metrics, f"{path}.relative_sigma", "± {:.1%}"),
+        metric_cell(metrics, f"{path}.off", "{:+.1%}"),
+    )
+
+
+def _chi_square_note(agreement: Mapping[str, Any]) -> str:
+    """Return how far sources disagree, compared with what their uncertainties let expect."""
+    degrees_of_freedom = agreement.get("degrees_of_freedom")
+    if not degrees_of_freedom:
+        return ""
+    return f"χ² {agreement['chi2']:.1f}; about {degrees_of_freedom} is expected if all of them are right."
+
+
+def _soft_limits_table(merge: Mapping[str, Any]) -> Table:
+    metrics, activity = {"merge": merge}, merge.get("activity", {})
+    rows = []
+    for name, share in activity.get("rules_active", {}).items():
+        active = metric_cell(metrics, f"merge.activity.rules_active.{name}", _percent)
+        has_excess = name in activity.get("rules_pressed_m", {})
+        path = f"merge.activity.rules_pressed_m.{name}"
+        excess = [metric_cell(metrics, f"{path}.{key}", "{:.1f} cm", 100.0) for key in ("p50", "p95")]
+        rows.append(
+            (
+                Cell(text=str(name)),
+                replace(active, share=float(share)),
+                *(excess if has_excess else (Cell(text="–"), Cell(text="–"))),
+            )
+        )
+    return Table(
+        caption="Soft limits: how often each one was active, and by how much it was exceeded then",
+        heads=("Limit", "Share of the time", "Median", "95 %"),
+        rows=tuple(rows),
+        note="A limit that is active all the time contradicts the measurements: check the mount and the "
+        "activity.",
+    )
+
+
+def _joint_sigma_table(inputs: ReportInputs) -> Table:
+    sigma = None if inputs.merge is None else known_joint_sigma_m(inputs.merge)
+    if inputs.merge is None or sigma is None:
+        return Table(caption="", heads=(), rows=())
+    rows = []
+    known = np.isfinite(sigma).any(axis=0)
+    largest = float(np.nanpercentile(sigma[:, known], 95, axis=0).max()) if known.any() else 0.0
+    for joint in np.flatnonzero(known):
+        median, p95 = np.nanpercentile(sigma[:, joint], [50, 95])
+        share = float(p95) / largest if largest else 0.0
+        rows.append(
+            (
+                Cell(text=inputs.merge.skeleton.joints[joint]),
+                Cell(text=f"{100 * median:.1f} cm"),
+                Cell(text=f"{100 * p95:.1f} cm", share=share),
+            )
+        )
+    return Table(
+        caption="Uncertainty of each joint's position (one standard deviation)",
+        heads=("Joint", "Median", "95 %"),
+        rows=tuple(rows),
+    )
+
+
+def headline_figures(metrics: Mapping[str, Any]) -> Iterable[tuple[str, Cell]]:
+    """Yield name and value of the few figures at the top of the page."""
+    yield "frames registered", metric_cell(metrics, "total.frames_registered")
+    yield "of all frames", metric_cell(metrics, "total.coverage", _percent)
+    yield "map error", metric_cell(metrics, "total.mean_reprojection_error_px", "{:.2f} px")
+    yield "points in the map", metric_cell(metrics, "total.points")
+    if "merge" in metrics:
+        worst = max(
+            metrics["merge"].get("cameras", {}).items(),
+            key=lambda item: item[1]["longest_gap_s"],
+            default=None,
+        )
+        if worst is not None:
+            path = f"merge.cameras.{worst[0]}.longest_gap_s"
+            yield "longest gap", metric_cell(metrics, path, "{:.2f} s")
+        yield "metric scale", metric_cell(metrics, "merge.scale.relative_sigma", "± {:.1%}")

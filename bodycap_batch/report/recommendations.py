@@ -1,0 +1,348 @@
+"""What to change in the next capture: each recommendation follows from a measurement of this job."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.core.percent import format_percent
+from bodycap_batch.model.scene import Map
+from bodycap_batch.report.drawn_scene import common_times_s
+from bodycap_batch.report.frame_losses import LossCause
+from bodycap_batch.report.report_inputs import ReportInputs
+from bodycap_batch.report.verdict import FAIR_GAP_S, GOOD_MOUNT_DEG, describe_lens_misfit
+
+_MIN_LOST_SHARE = 0.02
+"""Share of all frames from which a cause of losses is worth a recommendation. Evidence: none."""
+_FORWARD_DEG = 25.0
+"""Angle between motion and optical axis of a camera that moves along its line of sight. Evidence: none."""
+_MAX_FORWARD_SHARE = 0.6
+"""Share of the motion along the line of sight above which depth is poorly known. Evidence: none."""
+_MIN_SHARED_SHARE = 0.03
+"""Share of a camera's points that another camera should see as well. Evidence: none."""
+_NARROW_DEG = 3.0
+"""Median triangulation angle below which depth is poorly known, degrees. Evidence: none."""
+_SUFFICIENT_SCALE_SIGMA = 0.02
+"""Relative sigma of the metric scale that needs no recommendation. Evidence: none."""
+_ARM_LENGTH_M = 0.6
+"""Metres; it makes an error of the scale tangible."""
+_T_POSE = re.compile(r",? or stand in a T-pose for two seconds first")
+"""The part of merging's advice about a T-pose."""
+_ADVICE_SEPARATOR = "; to know it better, "
+"""Separates the finding from the advice in merging's sentences."""
+
+_ACTIONS = {
+    LossCause.DARK: "Switch lights on or film by day, and keep sleeves and straps away from the lens.",
+    LossCause.FAST: "Turn and swing more slowly, or film at 60 frames per second or more.",
+    LossCause.BLUR: "Use more light and a shutter of 1/240 s or shorter: sharp frames with high gain are "
+    "better than smooth ones.",
+    LossCause.PLAIN: "Put up posters or patterned cloth where the cameras look, or turn the cameras away "
+    "from plain walls and ceilings.",
+    LossCause.SHALLOW: "Turn the camera so that it sees both near and far objects, spread over the whole "
+    "picture.",
+    LossCause.UNKNOWN_PLACE: "Turn the camera so that it sees less of the wearer's body, keep other people "
+    "out of the picture, and walk past each place more than once.",
+    LossCause.NO_MAP: "Let every camera see the same places as the others: walk a loop and look around "
+    "in each place.",
+}
+_OBSERVATIONS = {
+    LossCause.DARK: "hardly any light reached the camera",
+    LossCause.FAST: "the camera turned more than 8° from one frame to the next",
+    LossCause.BLUR: "the picture was blurred (sharpness below 60 % of the frames near it)",
+    LossCause.PLAIN: "the camera looked at plain surfaces (under 30 % of its usual corners)",
+    LossCause.SHALLOW: "the visible points did not determine the position (too far away, or close together)",
+    LossCause.UNKNOWN_PLACE: "the picture was sharp and textured, but its content is not in the map",
+    LossCause.NO_MAP: "the camera has no map",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recommendation:
+    """One change for the next capture.
+
+    Attributes:
+        action: What to do.
+        reason: What was measured.
+        priority: Recommendations with a larger value are shown first.
+    """
+
+    action: str
+    reason: str
+    priority: float
+
+
+def recommend_changes(inputs: ReportInputs, lost: Mapping[str, Counter[LossCause]]) -> list[Recommendation]:
+    """Return recommendations, the most helpful one first.
+
+    Args:
+        inputs: The results.
+        lost: Number of lost frames by camera and cause.
+    """
+    mirrored = _mirrored_cameras(inputs)
+    found = [
+        *_about_losses(inputs, {name: causes for name, causes in lost.items() if name not in mirrored}),
+        *_about_mirrored_cameras(inputs),
+        *_about_lenses(inputs),
+        *_about_overlap(inputs),
+        *_about_parallax(inputs),
+        *_about_start_and_end(inputs),
+        *_about_body(inputs),
+    ]
+    return sorted(_combine_t_poses(found), key=lambda recommendation: -recommendation.priority)
+
+
+def _combine_t_poses(found: Sequence[Recommendation]) -> list[Recommendation]:
+    """Recommend a T-pose once if it would improve several constants.
+
+    It comes before the other ways to improve each of them.
+    """
+    improved = [recommendation for recommendation in found if _T_POSE.search(recommendation.action)]
+    if len(improved) < 2:
+        return list(found)
+    others = [
+        replace(recommendation, action=_T_POSE.sub("", recommendation.action))
+        if recommendation in improved
+        else recommendation
+        for recommendation in found
+    ]
+    combined = Recommendation(
+        action="Stand still for two seconds before you start, with the arms stretched out to the sides (a "
+        "T-pose). This improves every constant below that is not well known.",
+        reason=f"no T-pose was seen, and {len(improved)} of the body's constants are not well known",
+        priority=max(recommendation.priority for recommendation in improved) + 1e-3,
+    )
+    return [*others, combined]
+
+
+def _mirrored_cameras(inputs: ReportInputs) -> Sequence[str]:
+    """Return the cameras that the map excludes because their videos are mirrored."""
+    return list((inputs.metrics or {}).get("mapping", {}).get("mirrored_cameras", ()))
+
+
+def _about_mirrored_cameras(inputs: ReportInputs) -> Iterator[Recommendation]:
+    """Recommend to flip mirrored videos; no other way of filming would help."""
+    if names := _mirrored_cameras(inputs):
+        yield Recommendation(
+            action=f"Flip the video of {', '.join(names)} back (ffmpeg -i in -vf hflip out.mp4), and switch "
+            "off the mirroring in the front camera or the app.",
+            reason="it shows what the other cameras see with left and right exchanged, and was excluded",
+            priority=3.0,
+        )
+    for one, other in (inputs.metrics or {}).get("mapping", {}).get("mirror_images", ()):
+        yield Recommendation(
+            action=f"See whether text reads backwards in the video of {', '.join(one)} or "
+            f"{', '.join(other)}: flip that one back (ffmpeg -i in -vf hflip out.mp4). "
+            "If it does in neither, cover wall mirrors.",
+            reason="they see mirror images of each other, and it is unknown which one is right",
+            priority=3.0,
+        )
+
+
+def _about_lenses(inputs: ReportInputs) -> Iterator[Recommendation]:
+    """Recommend to correct calibrations that the map contradicts; all other results depend on them."""
+    misfits = (inputs.metrics or {}).get("mapping", {}).get("misfitting_lenses", {})
+    if misfits:
+        fits = "; ".join(
+            f"{name} has {describe_lens_misfit(factor)}" for name, factor in sorted(misfits.items())
+        )
+        yield Recommendation(
+            action="Run again with `calibration: auto`, or calibrate the camera in the video mode of this "
+            "capture, with stabilisation and digital zoom off.",
+            reason=f"according to the pictures, {fits} than the calibration says",
+            priority=3.0,
+        )
+
+
+def _as_sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}{'' if text.endswith(('.', '!', '?')) else '.'}"
+
+
+def _about_losses(inputs: ReportInputs, lost: Mapping[str, Counter[LossCause]]) -> Iterator[Recommendation]:
+    total = sum(len(registration.trajectory.status) for registration in inputs.registrations)
+    if not total:
+        return
+    all_cameras: Counter[LossCause] = sum(lost.values(), Counter())
+    for cause, frames in all_cameras.most_common():
+        if frames < _MIN_LOST_SHARE * total:
+            continue
+        by_camera = [f"{counts[cause]} of {name}" for name, counts in sorted(lost.items()) if counts[cause]]
+        yield Recommendation(
+            action=_ACTIONS[cause],
+            reason=f"{frames} frames were lost where {_OBSERVATIONS[cause]} ({', '.join(by_camera)})",
+            priority=1.0 + frames / total,
+        )
+
+
+def count_shared_points(maps: tuple[Map, ...], cameras: tuple[str, ...]) -> IntArray:
+    """Return how many points two cameras both see (C,C); the diagonal counts each camera's points."""
+    shared = np.zeros((len(cameras), len(cameras)), dtype=np.int64)
+    number = {name: index for index, name in enumerate(cameras)}
+    for scene in maps:
+        camera_of_keyframe = np.array(
+            [number.get(name, -1) for name in scene.keyframe_camera], dtype=np.int64
+        )
+        seen = np.zeros((len(scene.points), len(cameras)), dtype=np.int64)
+        camera_of_observation = camera_of_keyframe[scene.obs_keyframe]
+        known = camera_of_observation >= 0
+        seen[scene.obs_point[known], camera_of_observation[known]] = 1
+        shared += seen.T @ seen
+    return shared
+
+
+def _about_overlap(inputs: ReportInputs) -> Iterator[Recommendation]:
+    """Recommend to film common places with cameras that share few points with the others."""
+    if len(inputs.cameras) < 2 or not inputs.maps:
+        return
+    shared = count_shared_points(inputs.maps, inputs.cameras)
+    for index, name in enumerate(inputs.cameras):
+        own = int(shared[index, index])
+        best = int(np.delete(shared[index], index).max(initial=0))
+        if own and best < _MIN_SHARED_SHARE * own:
+            yield Recommendation(
+                action=f"Let {name} see what the other cameras see: hold it forward for a few steps, and "
+                "walk past the same places twice.",
+                reason=f"it shares only {best:,} of its {own:,} points with any other camera",
+                priority=1.5,
+            )
+
+
+def _about_parallax(inputs: ReportInputs) -> Iterator[Recommendation]:
+    """Recommend sideways movement if cameras only moved forward or triangulation angles are small."""
+    forward_shares = []
+    for registration in inputs.registrations:
+        poses = registration.trajectory.gauge_from_cam[registration.trajectory.localised]
+        # One of forty steps of the path is long enough for a direction despite the noise of single poses.
+        stride = max(1, len(poses) // 40)
+        step = poses[stride::stride, :3, 3] - poses[:-stride:stride, :3, 3][: len(poses[stride::stride])]
+        length = np.linalg.norm(step, axis=1)
+        axis = poses[:-stride:stride, :3, 2][: len(step)]
+        cosine = np.abs((step * axis).sum(axis=1)) / np.maximum(length, 1e-12)
+        moving = length > 0.2 * np.median(length) if len(length) else np.zeros(0, dtype=bool)
+        if moving.sum() >= 5:
+            forward_shares.append(float((cosine[moving] > np.cos(np.radians(_FORWARD_DEG))).mean()))
+    angle_deg = _median_triangulation_deg(inputs.maps[0]) if inputs.maps else None
+    only_forward = bool(forward_shares) and min(forward_shares) > _MAX_FORWARD_SHARE
+    if only_forward or (angle_deg is not None and angle_deg < _NARROW_DEG):
+        angle = (
+            "" if angle_deg is None else f"half of the map's points are seen at angles below {angle_deg:.1f}°"
+        )
+        forward = (
+            f"every camera moved along its line of sight for {format_percent(min(forward_shares))} of its path"
+            if only_forward
+            else ""
+        )
+        yield Recommendation(
+            action="Start with a few steps to the side and an arc around a near object: only sideways "
+            "movement shows depth.",
+            reason=" and ".join(part for part in (forward, angle) if part),
+            priority=1.2,
+        )
+
+
+def _about_start_and_end(inputs: ReportInputs) -> Iterator[Recommendation]:
+    """Recommend to cut the capture if cameras have no measurement at the motion's start or end."""
+    merge = inputs.merge
+    if merge is None or not merge.trajectories:
+        return
+    start_s, end_s = merge.times_ns()[[0, -1]] * 1e-9
+    measured = {}
+    for path in merge.trajectories:
+        times = common_times_s(inputs, path.camera, path.times_ns)[path.localised]
+        if len(times):
+            measured[path.camera] = (float(times[0]), float(times[-1]))
+    late = {name: first for name, (first, _) in measured.items() if first - start_s > FAIR_GAP_S}
+    early = {name: last for name, (_, last) in measured.items() if end_s - last > FAIR_GAP_S}
+    cuts = [f"start_s: {max(late.values()):.2f}"] if late else []
+    cuts += [f"end_s: {min(early.values()):.2f}"] if early else []
+    missing = [f"{name} has no measurement before {time:.2f} s" for name, time in late.items()]
+    missing += [f"{name} has no measurement after {time:.2f} s" for name, time in early.items()]
+    # If one camera ended before another started, no cut helps.
+    remaining_s = min(early.values(), default=end_s) - max(late.values(), default=start_s)
+    cut = f"; this capture can be cut with {' and '.join(cuts)} under `capture`" if remaining_s > 0.0 else ""
+    if missing:
+        yield Recommendation(
+            action=f"Start all cameras before the movement and stop them after it{cut}.",
+            reason=f"the motion runs from {start_s:.2f} s to {end_s:.2f} s, but {', '.join(missing)}",
+            priority=1.4,
+        )
+
+
+def _median_triangulation_deg(scene: Map) -> float | None:
+    """Return the median triangulation angle of the points, degrees; None without observations.
+
+    A point's angle is the largest one between the ray of its first and that of any other observation.
+    """
+    if len(scene.obs_point) == 0:
+        return None
+    rays = scene.map_from_cam[scene.obs_keyframe, :3, 3] - scene.points[scene.obs_point]
+    rays = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+    order = np.argsort(scene.obs_point, kind="stable")
+    point = scene.obs_point[order]
+    first = order[np.searchsorted(point, point)]
+    cosine = np.clip((rays[order] * rays[first]).sum(axis=1), -1.0, 1.0)
+    smallest_cosine = np.full(len(scene.points), 1.0)
+    np.minimum.at(smallest_cosine, point, cosine)
+    return float(np.degrees(np.arccos(np.median(smallest_cosine[np.unique(point)]))))
+
+
+def _about_body(inputs: ReportInputs) -> Iterator[Recommendation]:
+    """Yield merging's advice on constants of the body that are not well known."""
+    if inputs.merge is None:
+        return
+    report: Mapping[str, Any] = inputs.merge.report
+    sides = report.get("exchanged_sides", {})
+    if sides:
+        yield Recommendation(
+            action="Exchange the names (or mounts) of the left and the right cameras, and run again.",
+            reason=str(sides["says"]),
+            priority=2.8,
+        )
+    clocks = report.get("doubted_clocks", {})
+    if clocks:
+        offsets = ", ".join(
+            f"about {doubt['offset_s']:.1f} for {name}" for name, doubt in sorted(clocks.items())
+        )
+        yield Recommendation(
+            action="Clap once in view of all cameras and state each one's `offset_s` (the time of the clap "
+            f"in the first video minus its time in this video), or try {offsets}.",
+            reason="; ".join(str(doubt["says"]) for _, doubt in sorted(clocks.items())),
+            priority=2.5,
+        )
+    yield from _about_scale(report.get("scale", {}))
+    for hinge in report.get("loose_hinges", {}).values():
+        finding, _, advice = str(hinge["known_to"]).partition(_ADVICE_SEPARATOR)
+        yield Recommendation(action=_as_sentence(advice), reason=finding, priority=1.1 + hinge["sigma_m"])
+    for name, mount in report.get("mounts", {}).items():
+        finding, _, advice = str(mount.get("known_to", "")).partition(_ADVICE_SEPARATOR)
+        if advice or mount["sigma_deg"] > GOOD_MOUNT_DEG:
+            measure = f"measure how {name} is mounted and state it (joint_from_cam)"
+            yield Recommendation(
+                action=_as_sentence(f"{advice}; or {measure}" if advice else measure),
+                reason=finding
+                if advice
+                else f"the mount of {name} is known to {mount['sigma_deg']:.0f}° only",
+                priority=1.0 + mount["sigma_deg"] / 1000.0,
+            )
+
+
+def _about_scale(scale: Mapping[str, Any]) -> Iterator[Recommendation]:
+    sigma = scale.get("relative_sigma")
+    if sigma is None or sigma <= _SUFFICIENT_SCALE_SIGMA:
+        return
+    _, _, advice = str(scale.get("known_to", "")).partition(_ADVICE_SEPARATOR)
+    ways = [advice] if advice else []
+    if all(source["name"] != "skeleton" for source in scale.get("sources", ())):
+        ways.append("give the subject's own skeleton (--skeleton subject.bvh)")
+    if ways:
+        yield Recommendation(
+            action=_as_sentence(", or ".join(ways)),
+            reason=f"the metric scale comes from {scale.get('source')} and is known to {sigma:.1%}: "
+            f"{100 * _ARM_LENGTH_M * sigma:.1f} cm on the length of an arm",
+            priority=1.1 + sigma,
+        )
