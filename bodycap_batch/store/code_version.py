@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import re
+import threading
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -20,6 +21,8 @@ _NOT_COMPUTING = frozenset(
 )
 """Modules that decide nothing about a result: options are part of the key by their values."""
 _SKIPPED_SUFFIXES = (".pyc", ".pyo")
+_reading = threading.Lock()
+"""Held while sources are read, so that several jobs of one process parse no file twice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +53,10 @@ def algorithm_version(module: str) -> str:
         module: Below this package: the stage's task (``tasks.keyframes``), which imports the algorithm.
     """
     digest = hashlib.sha256()
-    for path in sorted(_closure(module)):
-        digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")
-        digest.update(_source(path).content + b"\0")
+    with _reading:
+        for path in sorted(_closure(module)):
+            digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")
+            digest.update(_source(path).content + b"\0")
     return digest.hexdigest()[:16]
 
 
