@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from bodycap_batch.runner import CHILD
+from bodycap_batch.runner import CHILD_COMMAND
 from bodycap_batch.watch.intake import Terms
 
 _BEAT_S = 5.0
@@ -37,7 +37,7 @@ class WatchOptions:
     stale_s: float = 60.0
     poll: bool | None = None
     once: bool = False
-    command: Sequence[str] = CHILD
+    command: Sequence[str] = CHILD_COMMAND
 
     @property
     def beat_s(self) -> float:

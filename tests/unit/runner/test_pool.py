@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from bodycap_batch.core.errors import Cancelled
-from bodycap_batch.runner import Making, Task
+from bodycap_batch.runner import Task, TaskEnvironment
 from bodycap_batch.runner.pool import Slots, machine_memory_mb
-from bodycap_batch.runner.turns import TakingTurns, Turns
+from bodycap_batch.runner.turns import Turns, TurnTakingExecutor
 from bodycap_batch.store.artefacts import ArtefactKey, Store
 
 
@@ -109,8 +109,8 @@ def test_this_machine_has_memory() -> None:
     assert machine_memory_mb() > 256
 
 
-def making_in(store: Store, cancelled: threading.Event | None = None) -> Making:
-    return Making(
+def making_in(store: Store, cancelled: threading.Event | None = None) -> TaskEnvironment:
+    return TaskEnvironment(
         store=store,
         logs=store.root,
         progress=lambda *_: None,
@@ -149,12 +149,12 @@ class Counting:
     def __init__(self) -> None:
         self.made = self.closed = 0
 
-    def make(self, task: Task, making: Making) -> None:
+    def execute(self, task: Task, environment: TaskEnvironment) -> None:
         self.made += 1
         time.sleep(0.05)
-        with making.store.draft(task.key) as draft:
+        with environment.store.draft(task.key) as draft:
             (draft.files / "made_by").write_text("somebody")
-            making.store.commit(draft, task.key, {})
+            environment.store.commit(draft, task.key, {})
 
     def close(self, logs: Path) -> None:
         self.closed += 1
@@ -162,7 +162,7 @@ class Counting:
 
 def test_jobs_side_by_side_leave_to_each_other_what_is_being_made(tmp_path: Path) -> None:
     store, turns, each = Store(tmp_path), Turns(), [Counting() for _ in range(3)]
-    jobs = [TakingTurns(own, turns) for own in each]
+    jobs = [TurnTakingExecutor(own, turns) for own in each]
     threads = [threading.Thread(target=job.make, args=[a_task(), making_in(store)]) for job in jobs]
     for thread in threads:
         thread.start()
