@@ -132,7 +132,7 @@ class Batch:
 
 
 def _outcome(job: BatchJob, future: Future[RunSummary], seconds: float) -> Outcome:
-    """Return the outcome of a job that has ended; an unexpected exception becomes an error with exit code 70."""
+    """Return the outcome of a job that has ended; an unexpected exception gets exit code 70."""
     failure = future.exception()
     if failure is None:
         return Outcome(job=job, seconds=seconds, summary=future.result())

@@ -238,7 +238,7 @@ def _reset_peak_memory() -> None:
 
 
 def peak_memory_mb() -> float:
-    """Return the peak of resident memory, MB, since `_reset_peak_memory` or else since the process started."""
+    """Return the peak of resident memory since `_reset_peak_memory` or else since the start, MB."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
             if line.startswith("VmHWM:"):
