@@ -3,7 +3,8 @@
 An artefact is a folder. Its key names the stage, the version of its algorithm, its options, the content of
 its inputs, and the libraries. The folder is written to a temporary place in the store and synced. A manifest
 is written last, and then the folder is renamed to its final name in one step. Every folder with the name of a
-key is therefore complete, and a process may be killed at any moment."""
+key is therefore complete, and a process may be killed at any moment.
+"""
 
 from __future__ import annotations
 
