@@ -138,7 +138,7 @@ def _description(location: Location, model: type[BaseModel]) -> str:
         if text:
             return f"{location[-1]}: {text}"
         location = location[:-1]
-    return "jobs/cpl_lab.yaml is a commented example"
+    return "the folder jobs/ has a commented example"
 
 
 def _unknown_key(location: Location, model: type[BaseModel]) -> Problem:

@@ -26,7 +26,7 @@ from bodycap_batch.model.skeleton_presets import (
 from bodycap_batch.pipeline.inputs import body_input, camera_digest
 from bodycap_batch.store.digests import FileDigests
 from bodycap_batch.tasks.body import mount_prior
-from bodycap_batch.tasks.registered import row_fraction
+from bodycap_batch.tasks.registered_cameras import row_fraction
 
 QUARTER_TURN = {"translation_m": [0.1, 0.2, 0.3], "quat_xyzw": [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]}
 
