@@ -1,4 +1,4 @@
-"""Job files and options."""
+"""Job files and the options of the stages."""
 
 from bodycap_batch.config.options import (
     ExportOptions,

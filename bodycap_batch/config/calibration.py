@@ -14,18 +14,21 @@ from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import CAMERA_MODELS, CV2_PIXEL_OFFSET_PX, Camera, parameter_count
 
 _MAX_BYTES = 1 << 20
+"""Largest calibration file, bytes; real ones have a few kilobytes. Evidence: none."""
 _MAX_SECONDS = 1e10
-_FIRST_CENTRE = {
+"""Largest absolute time in a file, seconds: above any Unix time. Evidence: none."""
+_CENTRE_INDEX = {
     "SIMPLE_PINHOLE": 1,
     "SIMPLE_RADIAL": 1,
     "RADIAL": 1,
     "SIMPLE_RADIAL_FISHEYE": 1,
     "RADIAL_FISHEYE": 1,
 }
+"""By camera model with one focal length, the index of the principal point's x; 2 for the other models."""
 
 
 class Calibration(BaseModel):
-    """Intrinsics of one lens at the size it was calibrated at (upright, as a player shows it)."""
+    """Intrinsics of a camera at the image size of its calibration (upright, as a player shows it)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -39,42 +42,48 @@ class Calibration(BaseModel):
 
     @field_validator("model")
     @classmethod
-    def _known_model(cls, value: str) -> str:
+    def _check_model(cls, value: str) -> str:
         name = value.upper()
         if name in CAMERA_MODELS:
             return name
         near = difflib.get_close_matches(name, CAMERA_MODELS, n=1)
-        also = f"did you mean {near[0]}?" if near else f"known: {', '.join(CAMERA_MODELS)}"
-        raise ValueError(f"unknown camera model {value!r}; {also}")
+        hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(CAMERA_MODELS)}"
+        raise ValueError(f"unknown camera model {value!r}; {hint}")
 
     @field_validator("pixel_origin", mode="before")
     @classmethod
-    def _origin_word(cls, value: object) -> object:
+    def _first_word(cls, value: object) -> object:
         """Accept the sentence of a calib.json: ``OpenCV (centre of the first pixel = 0, 0)``."""
         return value.split(maxsplit=1)[0].lower() if isinstance(value, str) and value.strip() else value
 
     @model_validator(mode="after")
-    def _fits_model(self) -> Calibration:
-        want = parameter_count(self.model)
-        if len(self.params) != want:
-            raise ValueError(f"{self.model} takes {want} params, got {len(self.params)}")
-        if self.params[0] <= 0 or (self.model not in _FIRST_CENTRE and self.params[1] <= 0):
+    def _check_params(self) -> Calibration:
+        count = parameter_count(self.model)
+        if len(self.params) != count:
+            raise ValueError(f"{self.model} takes {count} params, got {len(self.params)}")
+        if self.params[0] <= 0 or (self.model not in _CENTRE_INDEX and self.params[1] <= 0):
             raise ValueError("the focal length must be positive")
         return self
 
     def camera(self) -> Camera:
-        """The lens at its calibrated size, in COLMAP's pixel origin."""
+        """Return the camera at its calibrated size, with COLMAP's pixel origin."""
         params = list(self.params)
         if self.pixel_origin == "opencv":
-            first = _FIRST_CENTRE.get(self.model, 2)
-            params[first] += CV2_PIXEL_OFFSET_PX
-            params[first + 1] += CV2_PIXEL_OFFSET_PX
+            index = _CENTRE_INDEX.get(self.model, 2)
+            params[index] += CV2_PIXEL_OFFSET_PX
+            params[index + 1] += CV2_PIXEL_OFFSET_PX
         return Camera(model=self.model, width_px=self.width, height_px=self.height, params=params)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationEntry:
-    """What a calibration file says of one camera."""
+    """The entry of one camera in a calibration file.
+
+    Attributes:
+        calibration: Its intrinsics.
+        offset_s: Common time = camera time + offset.
+        rolling_shutter_s: Time from the first row's exposure to the last row's; None if not stated.
+    """
 
     calibration: Calibration
     offset_s: float
@@ -84,12 +93,13 @@ class CalibrationEntry:
 def read_calibration(path: Path, camera: str) -> CalibrationEntry:
     """Read one camera's entry of a calibration file.
 
-    The file holds one calibration for all cameras, or ``{"cameras": {name: {...}}}`` (what stands
-    beside ``cameras`` holds for all). Keys: model, params, width, height, pixel_origin; offsets_s
-    (by camera name) or offset_s; rolling_shutter_s. Others are left alone.
+    The file holds one calibration for all cameras, or ``{"cameras": {name: {...}}}``; values beside
+    ``cameras`` apply to all of them. Keys: model, params, width, height, pixel_origin; offsets_s (by camera
+    name) or offset_s; rolling_shutter_s. Other keys are ignored.
 
     Raises:
-        CaptureError: Unreadable, no such camera in it, or values that do not fit; names the field.
+        CaptureError: The file is unreadable, it has no such camera, or a value is wrong. The error names the
+            field.
     """
     data = _read_object(path)
     field = ""
@@ -107,7 +117,7 @@ def read_calibration(path: Path, camera: str) -> CalibrationEntry:
         first = error.errors(include_url=False)[0]
         name = field + ".".join(str(part) for part in first["loc"])
         raise CaptureError(
-            f"the calibration does not hold: {first['msg'].removeprefix('Value error, ')}",
+            f"the calibration is not valid: {first['msg'].removeprefix('Value error, ')}",
             path=path,
             field=name or None,
             hint='{"model": "PINHOLE", "params": [fx, fy, cx, cy], "width": 1920, "height": 1080}',
@@ -126,14 +136,14 @@ def read_calibration(path: Path, camera: str) -> CalibrationEntry:
 def _read_object(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise CaptureError("far too large for a calibration", path=path, hint="give a calib.json")
+            raise CaptureError("too large for a calibration", path=path, hint="give a calib.json")
         data = json.loads(path.read_text(encoding="utf-8"))
     except json.JSONDecodeError as error:
         raise CaptureError(
             f"not JSON: {error.msg}",
             path=path,
             line=error.lineno,
-            hint="mend the file, or use calibration: auto",
+            hint="correct the file, or use calibration: auto",
         ) from error
     except (OSError, ValueError, RecursionError) as error:
         raise CaptureError(
@@ -143,7 +153,7 @@ def _read_object(path: Path) -> dict[str, Any]:
         ) from error
     if not isinstance(data, dict):
         raise CaptureError(
-            "the calibration is no JSON object", path=path, hint='it starts with {"model": ...'
+            "the calibration is not a JSON object", path=path, hint='it starts with {"model": ...'
         )
     return data
 
@@ -155,7 +165,7 @@ def _no_such_camera(path: Path, camera: str, cameras: object) -> CaptureError:
         f"no calibration of a camera named {camera!r}",
         path=path,
         field="cameras",
-        hint=f"did you mean {near[0]!r}?" if near else f"it knows: {', '.join(names) or 'none'}",
+        hint=f"did you mean {near[0]!r}?" if near else f"it holds: {', '.join(names) or 'none'}",
     )
 
 
@@ -163,5 +173,5 @@ def _seconds(value: object, path: Path, field: str) -> float:
     if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _MAX_SECONDS:
         return float(value)
     raise CaptureError(
-        f"{value!r:.40} is no time in seconds", path=path, field=field, hint="a number, e.g. 0.12"
+        f"{value!r:.40} is not a time in seconds", path=path, field=field, hint="a number, e.g. 0.12"
     )

@@ -1,4 +1,4 @@
-"""Turn a validation error into a line, a field, a sentence and a remedy."""
+"""Turn validation errors of a job into messages with line, field and advice."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from pydantic.fields import FieldInfo
 from bodycap_batch.config.yaml_source import Location, YamlSource, dotted
 from bodycap_batch.core.errors import JobError
 
-_ALSO = 5
+_MAX_FURTHER = 5
+"""How many problems are listed after the first. Evidence: none."""
 _MISSING = "this is missing"
-_MEANT = "did you mean "
-_WANTED = {
+_DID_YOU_MEAN = "did you mean "
+_EXPECTED = {
     "string_type": "text",
     "int_type": "a whole number",
     "int_from_float": "a whole number",
@@ -29,10 +30,17 @@ _WANTED = {
     "model_type": "a block of `key: value` lines",
     "path_type": "a path",
 }
+"""What a value should be, by the type of pydantic's error."""
 
 
 class Problem(typing.NamedTuple):
-    """One thing wrong with a job: where, what, and what to do."""
+    """One problem of a job.
+
+    Attributes:
+        location: Where it is.
+        message: What is wrong.
+        hint: What to do.
+    """
 
     location: Location
     message: str
@@ -40,10 +48,10 @@ class Problem(typing.NamedTuple):
 
 
 def job_error(problems: Sequence[Problem], path: Path, source: YamlSource | None = None) -> JobError:
-    """Make one error of all problems: the first in full, the others briefly."""
+    """Return one error for all problems: the first one in full, the others briefly."""
     ordered = sorted(problems, key=lambda p: (source.line_of(p.location) or 0) if source else 0)
-    first, others = ordered[0], ordered[1 : 1 + _ALSO]
-    also = "".join(f"\n  also {_where(p, source)}: {p.message}" for p in others)
+    first, further = ordered[0], ordered[1 : 1 + _MAX_FURTHER]
+    also = "".join(f"\n  also {_place(p, source)}: {p.message}" for p in further)
     return JobError(
         first.message + also,
         path=path,
@@ -53,28 +61,34 @@ def job_error(problems: Sequence[Problem], path: Path, source: YamlSource | None
     )
 
 
-def _where(problem: Problem, source: YamlSource | None) -> str:
+def _place(problem: Problem, source: YamlSource | None) -> str:
     line = source.line_of(problem.location) if source else None
     return " ".join(part for part in (f"line {line}" if line else "", dotted(problem.location)) if part)
 
 
 def problems_of(error: ValidationError, model: type[BaseModel], data: object) -> list[Problem]:
-    """Translate pydantic's errors."""
+    """Return the problems that pydantic's errors describe.
+
+    Args:
+        error: The errors.
+        model: The model that refused the data.
+        data: The data.
+    """
     errors = error.errors(include_url=False)
-    # A list whose items are all wrong is also called too short: the items' errors say it better.
-    told = [e for e in errors if e["type"] != "too_short" or not _has_deeper(e, errors)]
-    problems = _without_misspelt([_problem(details, model, data) for details in told])
-    return [p if p.hint else p._replace(hint=_meaning(p.location, model)) for p in problems]
+    # pydantic also calls a list too short if all its items are wrong. The errors of the items are clearer.
+    reported = [e for e in errors if e["type"] != "too_short" or not _has_deeper(e, errors)]
+    problems = _without_misspelt([_problem_of(details, model, data) for details in reported])
+    return [p if p.hint else p._replace(hint=_description(p.location, model)) for p in problems]
 
 
 def _without_misspelt(problems: list[Problem]) -> list[Problem]:
-    """A key that is missing because it was misspelt is told once, as the misspelling."""
-    meant = {
-        (*problem.location[:-1], problem.hint.removeprefix(_MEANT).strip("'?"))
+    """Drop the missing keys that were misspelt: the misspelling is reported already."""
+    intended = {
+        (*problem.location[:-1], problem.hint.removeprefix(_DID_YOU_MEAN).strip("'?"))
         for problem in problems
-        if problem.hint is not None and problem.hint.startswith(_MEANT)
+        if problem.hint is not None and problem.hint.startswith(_DID_YOU_MEAN)
     }
-    return [p for p in problems if p.message != _MISSING or p.location not in meant]
+    return [p for p in problems if p.message != _MISSING or p.location not in intended]
 
 
 def _has_deeper(error: Any, errors: Sequence[Any]) -> bool:
@@ -82,15 +96,15 @@ def _has_deeper(error: Any, errors: Sequence[Any]) -> bool:
     return any(len(other["loc"]) > len(loc) and other["loc"][: len(loc)] == loc for other in errors)
 
 
-def _problem(details: Any, model: type[BaseModel], data: object) -> Problem:
+def _problem_of(details: Any, model: type[BaseModel], data: object) -> Problem:
     kind = details["type"]
-    location = _present(details["loc"], data, missing=kind == "missing")
+    location = _location_in(details["loc"], data, missing=kind == "missing")
     if kind == "extra_forbidden":
         return _unknown_key(location, model)
     if kind == "missing":
         return Problem(location, _MISSING, f"add `{location[-1]}:`")
-    if kind in _WANTED:
-        return Problem(location, f"{_short(details['input'])} should be {_WANTED[kind]}", None)
+    if kind in _EXPECTED:
+        return Problem(location, f"{_short(details['input'])} should be {_EXPECTED[kind]}", None)
     if kind == "literal_error":
         return _not_among(location, details)
     if kind == "too_short" and not details["input"]:
@@ -101,8 +115,8 @@ def _problem(details: Any, model: type[BaseModel], data: object) -> Problem:
     return Problem(location, f"{_short(details['input'])}: {text[0].lower()}{text[1:]}", None)
 
 
-def _present(loc: Sequence[str | int], data: object, *, missing: bool) -> Location:
-    """Drop what pydantic adds to a location (names of union members)."""
+def _location_in(loc: Sequence[str | int], data: object, *, missing: bool) -> Location:
+    """Return a location without the parts that pydantic adds (names of union members)."""
     kept: list[str | int] = []
     for position, part in enumerate(loc):
         inside = (isinstance(data, dict) and part in data) or (
@@ -116,21 +130,21 @@ def _present(loc: Sequence[str | int], data: object, *, missing: bool) -> Locati
     return tuple(kept)
 
 
-def _meaning(location: Location, model: type[BaseModel]) -> str:
-    """What the field at a location, or the nearest one around it, is for."""
+def _description(location: Location, model: type[BaseModel]) -> str:
+    """Return the description of the field at a location, or of the nearest field around it."""
     while location:
         fields = _fields_at(location[:-1], model)
-        about = fields[str(location[-1])].description if str(location[-1]) in fields else None
-        if about:
-            return f"{location[-1]}: {about}"
+        text = fields[str(location[-1])].description if str(location[-1]) in fields else None
+        if text:
+            return f"{location[-1]}: {text}"
         location = location[:-1]
-    return "jobs/cpl_lab.yaml is a commented example"
+    return "the folder jobs/ has a commented example"
 
 
 def _unknown_key(location: Location, model: type[BaseModel]) -> Problem:
     known = known_keys(model, location[:-1])
     near = difflib.get_close_matches(str(location[-1]), known, n=1)
-    hint = f"{_MEANT}{near[0]!r}?" if near else f"known here: {', '.join(known)}"
+    hint = f"{_DID_YOU_MEAN}{near[0]!r}?" if near else f"known here: {', '.join(known)}"
     return Problem(location, f"unknown key {str(location[-1])[:60]!r}", hint)
 
 
@@ -140,13 +154,13 @@ def _not_among(location: Location, details: Any) -> Problem:
     near = difflib.get_close_matches(str(details["input"]), words, n=1)
     return Problem(
         location,
-        f"{_short(details['input'])} is none of {', '.join(words)}",
+        f"{_short(details['input'])} is not one of {', '.join(words)}",
         f"did you mean {near[0]!r}?" if near else None,
     )
 
 
 def known_keys(model: type[BaseModel], location: Location) -> list[str]:
-    """Keys allowed at a location of a model (empty where it is no model)."""
+    """Return the keys allowed at a location of a model; empty if there is no model at it."""
     return list(_fields_at(location, model))
 
 

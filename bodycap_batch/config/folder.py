@@ -1,4 +1,4 @@
-"""A folder of videos as a capture: file stems name the cameras."""
+"""A folder of videos as a capture: the names of the files name the cameras."""
 
 from __future__ import annotations
 
@@ -27,16 +27,17 @@ VIDEO_SUFFIXES = frozenset(
     }
 )
 JOB_FILES = ("job.yaml", "job.yml")
-"""What a folder's job file is called."""
+"""Names of the job file of a folder."""
 RUN_FILE = "run.json"
-"""Beside it, a ``job.yaml`` belongs to results."""
+"""The record of a run. A folder with it holds results, and so does a ``job.yaml`` in it."""
 _GOPRO = re.compile(r"^(G[HXPSLOT])(PR|[0-9]{2})([0-9]{4})$", re.IGNORECASE)
 
 
 def natural_key(path: Path) -> tuple[tuple[int, int | str], ...]:
-    """Sort key of chapters: numbers by value; GoPro's ``GX020123`` is chapter 2 of video 0123.
+    """Return the sort key of a chapter: numbers count by value, and GoPro's names are understood.
 
-    The first chapter of older GoPros is ``GOPR0123``, the next ``GP010123``.
+    ``GX020123`` is chapter 2 of video 0123. The first chapter of older GoPros is ``GOPR0123``, the next one
+    ``GP010123``.
     """
     gopro = _GOPRO.match(path.stem)
     if gopro:
@@ -47,12 +48,12 @@ def natural_key(path: Path) -> tuple[tuple[int, int | str], ...]:
 
 
 def is_video(path: Path) -> bool:
-    """True for a visible file with a video's suffix."""
+    """Return True for a visible file with the suffix of a video."""
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
 def chapters_in(folder: Path) -> tuple[Path, ...]:
-    """Videos of one camera's folder in recording order.
+    """Return the videos of a camera's folder in the order of their recording.
 
     Raises:
         CaptureError: There are none, or the folder cannot be read.
@@ -71,14 +72,14 @@ def chapters_in(folder: Path) -> tuple[Path, ...]:
 
 
 def videos_in(folder: Path) -> list[Path]:
-    """Videos and folders of chapters in a folder, by name. A folder of results is none, preview and all.
+    """Return the videos and folders of chapters in a folder by name; folders of results do not count.
 
     Raises:
         CaptureError: There are none, or the folder cannot be read.
     """
     try:
         entries = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
-        videos = [path for path in entries if is_video(path) or (path.is_dir() and _holds_chapters(path))]
+        videos = [path for path in entries if is_video(path) or (path.is_dir() and _has_chapters(path))]
     except OSError as error:
         raise CaptureError(f"cannot read the folder ({error})", path=folder, hint="check the path") from error
     if not videos:
@@ -90,12 +91,12 @@ def videos_in(folder: Path) -> list[Path]:
     return videos
 
 
-def _holds_chapters(folder: Path) -> bool:
+def _has_chapters(folder: Path) -> bool:
     return any(map(is_video, folder.iterdir())) and not (folder / RUN_FILE).is_file()
 
 
 def recordings_in(folder: Path) -> list[tuple[str, tuple[Path, ...]]]:
-    """The recordings of a folder by name: a file, a folder of chapters, or a GoPro's chapters side by side.
+    """Return the recordings of a folder by name: files, folders of chapters, and chapters of a GoPro.
 
     Raises:
         CaptureError: There are none, or a folder cannot be read.
@@ -109,25 +110,26 @@ def recordings_in(folder: Path) -> list[tuple[str, tuple[Path, ...]]]:
 
 
 def job_file_in(folder: Path) -> Path | None:
-    """The job file that decides for a folder of videos, None where there is none; results' own is none."""
+    """Return the job file of a folder of videos, if there is one; that of results does not count."""
     if (folder / RUN_FILE).is_file():
         return None
     return next((folder / name for name in JOB_FILES if (folder / name).is_file()), None)
 
 
 def folder_capture(folder: Path) -> dict[str, object]:
-    """Describe a folder as the raw ``capture`` block of a job.
+    """Return the raw ``capture`` block of a job for a folder of videos.
 
     Raises:
-        CaptureError: No videos in it, or unreadable.
-        JobError: Several cameras, and one whose name says no place on the body; two of one name.
+        CaptureError: It has no videos, or is unreadable.
+        JobError: Two cameras have one name, or one of several cameras has a name that is no place on the
+            body.
     """
     videos = videos_in(folder)
-    _refuse_missing(folder)
+    _refuse_missing_videos(folder)
     named = [(path.name if path.is_dir() else path.stem, path) for path in videos]
-    _refuse_doubles(named)
+    _refuse_equal_names(named)
     if len(named) > 1:
-        _refuse_nameless(named)
+        _refuse_unknown_mounts(named)
     cameras = [_camera_block(folder, name, path) for name, path in named]
     calibration = folder / "calib.json"
     block: dict[str, object] = {"cameras": cameras}
@@ -149,8 +151,8 @@ def _camera_block(folder: Path, name: str, path: Path) -> dict[str, object]:
     return block
 
 
-def _refuse_missing(folder: Path) -> None:
-    """A camera whose videos are not there yet is missed now, not when the body has come out without it."""
+def _refuse_missing_videos(folder: Path) -> None:
+    """Refuse a folder that lacks a camera's videos, before a body is solved without that camera."""
     for path in sorted(folder.iterdir()):
         if path.is_symlink() and not path.exists() and path.suffix.lower() in VIDEO_SUFFIXES:
             raise CaptureError(
@@ -160,7 +162,7 @@ def _refuse_missing(folder: Path) -> None:
             chapters_in(path)
 
 
-def _refuse_doubles(named: list[tuple[str, Path]]) -> None:
+def _refuse_equal_names(named: list[tuple[str, Path]]) -> None:
     seen: dict[str, Path] = {}
     for name, path in named:
         if name.lower() in seen:
@@ -172,11 +174,11 @@ def _refuse_doubles(named: list[tuple[str, Path]]) -> None:
         seen[name.lower()] = path
 
 
-def _refuse_nameless(named: list[tuple[str, Path]]) -> None:
-    nameless = [path.name for name, path in named if mount_of(name) is None]
-    if nameless:
+def _refuse_unknown_mounts(named: list[tuple[str, Path]]) -> None:
+    unknown = [path.name for name, path in named if mount_of(name) is None]
+    if unknown:
         raise JobError(
-            f"where on the body was {', '.join(nameless)}? The name does not say",
+            f"where on the body was {', '.join(unknown)}? The name does not say",
             path=named[0][1].parent,
             hint=f"rename to one of {', '.join(MOUNT_NAMES)}; put the chapters of one camera into a folder "
             "of that name; or write a job file that gives each camera its `mount:`",

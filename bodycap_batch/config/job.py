@@ -30,17 +30,19 @@ from bodycap_batch.config.yaml_source import YamlSource, read_yaml
 from bodycap_batch.core.errors import CaptureError, JobError
 
 _HEIGHT_M = (0.4, 2.6)
+"""Smallest and largest stature, metres, as for ``height_m`` in a job file. Evidence: none."""
 _LISTS = ("video", "timestamps")
+"""Fields that may hold one path instead of a list."""
 _NAME_LENGTH = 100
-"""What a job's name may have; a folder's may be longer."""
+"""Characters of a job's name; the name of a folder may be longer. Evidence: none."""
 
 Prepare = Callable[[Mapping[str, Any], Path], None]
-"""Called with the options of `capture.synthetic` and the folder its videos belong into."""
+"""Called with the options of `capture.synthetic` and the folder for its videos."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Overrides:
-    """What the command line says over the job; relative paths are relative to the working folder."""
+    """Values of the command line that replace those of the job; paths are relative to the working folder."""
 
     out: Path | None = None
     skeleton: str | None = None
@@ -58,27 +60,28 @@ def load_job(
     """Load a job and resolve it: absolute paths, chapters and sidecars listed, calibrations read.
 
     Args:
-        path: A YAML file (paths in it are relative to it, or to the file a link leads to), or a folder of
-            videos: its ``job.yaml`` decides, where there is one, and paths in it are relative to the folder.
+        path: A YAML file or a folder of videos. Paths in a YAML file are relative to it, or to the file that
+            a link leads to. If a folder has a ``job.yaml``, that is loaded, with paths relative to the
+            folder.
         overrides: Values of the command line.
-        prepare: Makes the videos of a job with `capture.synthetic` before they are looked for.
-        policy: Which files the job may name; any, where it is the user's own.
+        prepare: Renders the videos of a job with `capture.synthetic` before they are searched for.
+        policy: Which files the job may name; None for the user's own job, which may name any.
         limits: How large the YAML file may be.
 
     Returns:
         The job; `Job.model_validate(job.model_dump(mode="json"))` gives it back.
 
     Raises:
-        JobError: The file is no valid job; names file, line, field and a remedy.
+        JobError: The file is not a valid job. The error names file, line, field and a remedy.
         CaptureError: A calibration or a folder of videos cannot be used.
     """
     full = path.resolve()
-    # Beside a file that came alone lies what others dropped.
+    # The files beside a job file that was dropped alone belong to others.
     alone = policy is not None and policy.folder is None and not full.is_dir()
     try:
-        full = _deciding(full, policy)
-        source = _source(full, limits or Limits())
-        return _loaded(full, source, overrides or Overrides(), prepare, policy, alone=alone)
+        full = _job_source(full, policy)
+        source = _read_source(full, limits or Limits())
+        return _load(full, source, overrides or Overrides(), prepare, policy, alone=alone)
     except PermissionError as error:
         kind = JobError if error.filename == str(full) else CaptureError
         raise kind(
@@ -88,8 +91,8 @@ def load_job(
         ) from error
 
 
-def _deciding(full: Path, policy: PathPolicy | None) -> Path:
-    """The job file: of a folder that one that decides for it, link or not, or the folder itself."""
+def _job_source(full: Path, policy: PathPolicy | None) -> Path:
+    """Return the job file of a folder, which may be a link, or the path itself."""
     found = job_file_in(full) if full.is_dir() else None
     if found is None:
         return full
@@ -98,16 +101,18 @@ def _deciding(full: Path, policy: PathPolicy | None) -> Path:
     return found
 
 
-def _source(full: Path, limits: Limits) -> YamlSource | None:
-    """The job's YAML, None for a folder of videos."""
+def _read_source(full: Path, limits: Limits) -> YamlSource | None:
+    """Return the YAML of a job; None for a folder of videos."""
     if full.is_dir():
         return None
     if full.suffix.lower() in VIDEO_SUFFIXES:
-        raise JobError("a video is no job", path=full, hint=f"give the folder that it lies in: {full.parent}")
+        raise JobError(
+            "a video is not a job", path=full, hint=f"give the folder that it lies in: {full.parent}"
+        )
     return read_yaml(full, max_bytes=int(1024 * limits.yaml_kb), max_depth=int(limits.yaml_depth))
 
 
-def _loaded(
+def _load(
     full: Path,
     source: YamlSource | None,
     overrides: Overrides,
@@ -120,7 +125,7 @@ def _loaded(
         data, base, name = {"capture": folder_capture(full)}, full, full.name
     else:
         base = full.parent
-        data = _mapping(source)
+        data = _top_mapping(source)
         if not alone:
             data = _with_videos_beside(data, base)
         name = base.name if full.name in JOB_FILES else full.stem
@@ -135,13 +140,17 @@ def _loaded(
     resolved = _resolved(job, base, safe_name(name), full, source)
     if policy is None:
         _require_apart(resolved, full)
-    else:  # whose results go where the operator says
+    else:  # the operator chooses the folder of the results
         policy.require_resolved(resolved)
     return resolved
 
 
 def synthetic_folder(job: Job, base: Path) -> Path:
-    """Folder the videos of a synthetic capture belong into: the one that holds them all."""
+    """Return the folder for the videos of a synthetic capture, which must be the same for all.
+
+    Raises:
+        JobError: The videos lie in several folders.
+    """
     folders = {(base / video).resolve().parent for camera in job.capture.cameras for video in camera.video}
     if len(folders) > 1:
         raise JobError(
@@ -152,20 +161,20 @@ def synthetic_folder(job: Job, base: Path) -> Path:
     return folders.pop()
 
 
-def _mapping(source: YamlSource) -> dict[str, Any]:
+def _top_mapping(source: YamlSource) -> dict[str, Any]:
     if source.data is None:
         raise JobError("the job is empty", path=source.path, hint="it needs at least `capture:`")
     if not isinstance(source.data, dict):
         raise JobError(
-            "the job is no block of `key: value` lines", path=source.path, hint="start with `capture:`"
+            "the job is not a block of `key: value` lines", path=source.path, hint="start with `capture:`"
         )
     return source.data
 
 
 def _with_videos_beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Where a job names no cameras they are the videos beside it, as for a folder without a job file.
+    """Add the videos beside a job file that names no cameras, as for a folder without a job file.
 
-    A key that nobody knows goes first: it may be the one that is missed.
+    A job with an unknown key is returned unchanged: the key may be a misspelt ``cameras``.
     """
     capture = data.get("capture", {})
     if not isinstance(capture, dict) or "cameras" in capture:
@@ -174,13 +183,13 @@ def _with_videos_beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:
         return data
     try:
         videos_in(folder)
-    except CaptureError:  # none are there: what is missing is told
+    except CaptureError:  # no videos: the validation reports that the cameras are missing
         return data
     return {**data, "capture": {**folder_capture(folder), **capture}}
 
 
 def _validated(data: dict[str, Any], path: Path, source: YamlSource | None) -> Job:
-    """Check types strictly: by way of JSON, where a list may become a tuple but "5" no number."""
+    """Check the types strictly, through JSON: a list may become a tuple, but "5" is not a number."""
     try:
         return Job.model_validate_json(json.dumps(_with_lists(data)), strict=True)
     except ValidationError as error:
@@ -188,7 +197,7 @@ def _validated(data: dict[str, Any], path: Path, source: YamlSource | None) -> J
 
 
 def _with_lists(data: dict[str, Any]) -> dict[str, Any]:
-    """Write a single video or sidecar as a list of one (strict checks see no converted values)."""
+    """Replace a single video or sidecar by a list of one, because the strict check converts nothing."""
     capture = data.get("capture")
     if not isinstance(capture, dict) or not isinstance(capture.get("cameras"), list):
         return data
@@ -254,12 +263,15 @@ def _resolved(job: Job, base: Path, name: str, path: Path, source: YamlSource | 
 
 
 def _require_apart(job: Job, full: Path) -> None:
-    """Results have a folder of their own: no job file is lost, and no preview is taken for a video."""
+    """Refuse a folder of results that holds the videos or the job file.
+
+    Otherwise a later run could take the preview for a video, or the resolved job would replace the job file.
+    """
     videos = {video.parent for camera in job.capture.cameras for video in camera.video}
     kept = full.name == JOB_FILES[0] and full.parent == job.out and not (full.parent / RUN_FILE).is_file()
     if job.out in videos or kept:
         raise JobError(
-            f"the results would lie among what they are made from, in {job.out}",
+            f"the results would go to the folder of the job's own files, {job.out}",
             path=full,
             field="out",
             hint=f"a folder of their own, for example {Path(str(job.out)) / 'results'}",
@@ -293,9 +305,9 @@ def _resolved_camera(camera: CameraConfig, index: int, capture: CaptureConfig, b
 
 
 def _chapters(camera: CameraConfig, base: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
-    """Video files in order, and the sidecars that lie beside them.
+    """Return the video files of a camera in order, and the sidecars beside them.
 
-    ``<video>.timestamps.txt`` (of every chapter, or of the folder of chapters) goes before
+    ``<video>.timestamps.txt``, of every chapter or of the folder of chapters, precedes
     ``<camera>.timestamps.txt``.
     """
     videos: list[Path] = []
@@ -310,7 +322,7 @@ def _chapters(camera: CameraConfig, base: Path) -> tuple[tuple[Path, ...], tuple
 
 
 def sidecars_of(video: Path) -> list[Path]:
-    """The sidecar beside a video or folder: ``torso.timestamps.txt`` or ``torso.mp4.timestamps.txt``."""
+    """Return the sidecar of a video or folder: ``torso.timestamps.txt`` or ``torso.mp4.timestamps.txt``."""
     names = (f"{video.stem}.timestamps.txt", f"{video.name}.timestamps.txt")
     return [found for name in names for found in _existing(video.with_name(name))][:1]
 
@@ -320,5 +332,5 @@ def _existing(path: Path) -> list[Path]:
 
 
 def safe_name(text: str) -> str:
-    """A text as a name for files: letters, digits, ``.``, ``_`` and ``-``."""
+    """Return a text as a name for files: letters, digits, ``.``, ``_`` and ``-``."""
     return re.sub(r"[^A-Za-z0-9._\-]+", "_", text)[:_NAME_LENGTH].strip("._-") or "job"

@@ -1,4 +1,4 @@
-"""How large a job may be that somebody else hands in; what the user runs by hand is not limited."""
+"""Limits for jobs that others submit; jobs that the user runs have none."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from dataclasses import dataclass
 from bodycap_batch.config.yaml_source import MAX_BYTES, MAX_DEPTH
 from bodycap_batch.core.errors import JobError
 
-_DEEPEST = 100
-"""Blocks are read by recursion: far below Python's own limit."""
+_MAX_YAML_DEPTH = 100
+"""Largest value of ``yaml_depth``, levels: blocks are read recursively, and Python's own limit is 1,000."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Bounds of one job.
+    """Limits of one job.
 
     Attributes:
         yaml_kb: Size of the job file, kilobytes (1024 bytes).
-        yaml_depth: How deep its blocks may be nested.
-        files: Files in one dropped folder.
+        yaml_depth: Levels to which its blocks may be nested.
+        files: Number of files in one dropped folder.
         video_gb: Size of one video file, 10⁹ bytes.
         video_hours: Duration of one video file.
-        video_px: Long side of a video's pictures.
+        video_px: Long side of a video's frames, pixels.
     """
 
     yaml_kb: float = MAX_BYTES / 1024
@@ -38,18 +38,18 @@ class Limits:
         for field in dataclasses.fields(self):
             if not (math.isfinite(value := getattr(self, field.name)) and value > 0):
                 raise JobError(
-                    f"{field.name}={value:g} is no limit", field="--limit", hint="a number above 0"
+                    f"{field.name}={value:g} is not a limit", field="--limit", hint="a number above 0"
                 )
-        if self.yaml_depth > _DEEPEST:
-            hint = f"at most {_DEEPEST}; the shipped limit is {MAX_DEPTH}"
+        if self.yaml_depth > _MAX_YAML_DEPTH:
+            hint = f"at most {_MAX_YAML_DEPTH}; the shipped limit is {MAX_DEPTH}"
             raise JobError(f"yaml_depth={self.yaml_depth:g} is too deep", field="--limit", hint=hint)
 
 
 def limits_from(settings: Iterable[str]) -> Limits:
-    """Limits from ``name=value`` texts.
+    """Return the limits that ``name=value`` texts state.
 
     Raises:
-        JobError: An unknown name, or a value that is no positive number.
+        JobError: An unknown name, or a value that is not a positive number.
     """
     known = [field.name for field in dataclasses.fields(Limits)]
     values: dict[str, float] = {}

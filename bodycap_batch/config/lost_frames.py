@@ -1,7 +1,10 @@
-"""When a camera's lost frames are looked for once more: what runs it and what computes have to agree."""
+"""Conditions for the recovery of lost frames, shared by the pipeline and registration."""
 
 from __future__ import annotations
 
-LEAST_LOST, LEAST_POSED = 3, 20
-"""They are where there are so many, among so many with poses: fewer are not worth decoding the keyframes of
-all cameras again; from fewer poses nobody knows how it moves."""
+LEAST_LOST = 3
+"""Lost frames from which recovery runs for a camera. Fewer do not justify decoding all keyframes again.
+Evidence: none."""
+LEAST_POSED = 20
+"""Localised frames from which recovery runs for a camera. Fewer do not determine the motion prior.
+Evidence: none."""

@@ -1,4 +1,4 @@
-"""The job, typed: what to read, what body wears it, and one options block per stage."""
+"""The typed job: the capture, the body, and one block of options per stage."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import make_transform, rotation_from_quat_xyzw
 
 NO_SKELETON = "none"
+"""Value of ``skeleton`` for camera paths and a map without a body."""
 SKELETON_PRESETS = (NO_SKELETON, "upper_body", "full_body")
-# A Unix time in seconds fits; sums in nanoseconds stay inside int64.
 _MAX_SECONDS = 4e9
+"""Largest absolute time, seconds. A Unix time is below it, and sums of two in nanoseconds fit into int64."""
 
 
 class _Block(BaseModel):
-    """Base of the job's blocks: frozen, unknown keys refused, no NaN."""
+    """Base of the job's blocks: frozen, without unknown keys or NaN."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -73,8 +74,8 @@ class CameraConfig(_Block):
     video: tuple[Path, ...] = Field(
         min_length=1, description="video file, folder of chapters, or list of chapters"
     )
-    mount: str | None = Field(None, description="where it sits on the body; default: what its name says")
-    segment: str | None = Field(None, description="bone that carries it, where no mount's name fits")
+    mount: str | None = Field(None, description="place on the body; default: the place that its name says")
+    segment: str | None = Field(None, description="bone that carries it, if no mount's name fits")
     joint_from_cam: AnyPose | None = Field(
         None, description="measured mount: 4x4 matrix, or translation_m and quat_xyzw"
     )
@@ -102,21 +103,21 @@ class CameraConfig(_Block):
 
     @property
     def role(self) -> str | None:
-        """Anatomical name of the bone that carries the camera (``LeftHand``), None where unknown."""
+        """Role of the bone that carries the camera (``LeftHand``); None if unknown."""
         if self.segment is not None:
             return role_of_segment(self.segment)
         found = mount_of(self.mount or self.name)
         return None if found is None else found[1]
 
     def mount_matrix(self) -> FloatArray | None:
-        """`joint_from_cam` as a (4,4) transform, None where the job does not give it."""
+        """Return `joint_from_cam` as a (4,4) transform; None if the job does not state it."""
         pose = self.joint_from_cam
         if isinstance(pose, MountPose):
             return make_transform(rotation_from_quat_xyzw(pose.quat_xyzw), pose.translation_m)
         return None if pose is None else np.array(pose, dtype=np.float64)
 
     def input_files(self) -> tuple[Path, ...]:
-        """Files whose content the camera's frames and times depend on."""
+        """Return the files that the camera's frames and times depend on."""
         return (*self.video, *self.timestamps, *(() if self.mask is None else (self.mask,)))
 
 
@@ -143,7 +144,7 @@ class CaptureConfig(_Block):
     )
 
     def segments(self) -> list[list[CameraConfig]]:
-        """Cameras that share a segment of the body, two and more."""
+        """Return the cameras of each segment that carries two or more."""
         by_role: dict[str, list[CameraConfig]] = {}
         for camera in self.cameras:
             if camera.role is not None:
@@ -152,7 +153,7 @@ class CaptureConfig(_Block):
 
 
 class Job(_Block):
-    """Everything a run needs. A job file without cameras means the videos beside it."""
+    """Everything that a run needs. If a job file names no cameras, the videos beside it are used."""
 
     capture: CaptureConfig
     name: str = Field("", max_length=100, description="names the results; default: the file's or folder's")

@@ -1,17 +1,17 @@
-"""Names people give to body cameras, and the bone each one rides on."""
+"""Usual names of body cameras, and the bone that carries each of them."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
 
-_CENTRE = {
+_CENTRAL_SPELLINGS = {
     "Spine1": ("torso", "chest", "sternum", "spine1", "upper_body"),
     "Head": ("head", "forehead", "helmet", "cap"),
     "Hips": ("hips", "hip", "pelvis", "waist", "belt"),
     "Spine": ("spine", "belly", "abdomen"),
 }
-_SIDED = {
+_SIDED_SPELLINGS = {
     "Hand": ("palm", "hand"),
     "Arm": ("upper_arm", "upperarm", "arm"),
     "ForeArm": ("forearm", "fore_arm", "lower_arm", "wrist"),
@@ -20,7 +20,7 @@ _SIDED = {
     "Foot": ("foot", "shoe"),
     "Shoulder": ("shoulder", "clavicle"),
 }
-_CANONICAL = {
+_MOUNT_NAME = {
     "Spine1": "torso",
     "Head": "head",
     "Hips": "hips",
@@ -37,37 +37,37 @@ _SIDES = {"left": "Left", "right": "Right", "l": "Left", "r": "Right"}
 
 
 def _names() -> Iterator[tuple[str, tuple[str, str]]]:
-    """Every known spelling with its (canonical mount, role)."""
-    for role, spellings in _CENTRE.items():
+    """Yield every known spelling with its (mount, role)."""
+    for role, spellings in _CENTRAL_SPELLINGS.items():
         for spelling in spellings:
-            yield spelling, (_CANONICAL[role], role)
-    for part, spellings in _SIDED.items():
+            yield spelling, (_MOUNT_NAME[role], role)
+    for part, spellings in _SIDED_SPELLINGS.items():
         for side, prefix in _SIDES.items():
             for spelling in spellings:
-                found = (f"{prefix.lower()}_{_CANONICAL[part]}", prefix + part)
+                found = (f"{prefix.lower()}_{_MOUNT_NAME[part]}", prefix + part)
                 yield f"{side}_{spelling}", found
                 yield f"{spelling}_{side}", found
 
 
-_TABLE = {name.replace("_", ""): found for name, found in _names()}
-ROLES = tuple(dict.fromkeys(role for _, role in _TABLE.values()))
-MOUNT_NAMES = tuple(dict.fromkeys(mount for mount, _ in _TABLE.values()))
-"""One name for each place a camera can sit, for messages and help texts."""
+_MOUNT_BY_SPELLING = {name.replace("_", ""): found for name, found in _names()}
+ROLES = tuple(dict.fromkeys(role for _, role in _MOUNT_BY_SPELLING.values()))
+MOUNT_NAMES = tuple(dict.fromkeys(mount for mount, _ in _MOUNT_BY_SPELLING.values()))
+"""One name for each place that a camera can be mounted on, for messages and help texts."""
 
 _QUALIFIER = re.compile(r"[_\- ]?(back|front|top|bottom|upper|lower|inner|outer|[0-9]+|[a-c])$")
 
 
 def _key(name: str) -> str:
-    """Spelling without case, separators or camel case: ``LeftPalm``, ``left-palm`` -> ``leftpalm``."""
+    """Return a name without case and separators: ``LeftPalm`` and ``left-palm`` give ``leftpalm``."""
     return re.sub(r"[_\-. ]+", "", name).lower()
 
 
 def mount_of(name: str) -> tuple[str, str] | None:
-    """Map a camera's name to its (mount, role), or None where it names no place on the body.
+    """Return the (mount, role) that a camera's name means; None if it names no place on the body.
 
-    A qualifier at the end tells cameras on one segment apart: ``torso_back``, ``torso_2``.
+    A qualifier at the end distinguishes cameras on one segment: ``torso_back``, ``torso_2``.
     """
-    known = _TABLE.get(_key(name))
+    known = _MOUNT_BY_SPELLING.get(_key(name))
     if known is not None:
         return known
     bare = _QUALIFIER.sub("", name.lower())
@@ -75,6 +75,6 @@ def mount_of(name: str) -> tuple[str, str] | None:
 
 
 def role_of_segment(segment: str) -> str | None:
-    """Map ``segment:`` (a role such as ``LeftHand`` or any mount's name) to the role, or None."""
+    """Return the role that ``segment:`` means: a role (``LeftHand``) or a mount's name; None if unknown."""
     roles = {_key(role): role for role in ROLES}
-    return roles.get(_key(segment)) or _TABLE.get(_key(segment), ("", None))[1]
+    return roles.get(_key(segment)) or _MOUNT_BY_SPELLING.get(_key(segment), ("", None))[1]

@@ -1,4 +1,4 @@
-"""The knobs of each stage, typed. A stage's artefact key holds its own options only."""
+"""The typed options of each stage. The key of a stage's artefact holds only its own options."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 FrameName = Annotated[str, StringConstraints(pattern=r"^.+:\d{1,9}$")]
-"""One frame of one camera, ``camera:frame``, counted from 0 in its joined video whatever ``start_s`` says."""
+"""One frame of a camera, ``camera:frame``, counted from 0 in its joined video regardless of ``start_s``."""
 
 FileFormat = Literal["ply", "bvh", "glb", "fbx", "usd", "c3d", "trc", "tum", "csv", "npz", "colmap"]
 NamePreset = Literal["hik", "mixamo", "biped", "unreal"]
@@ -15,7 +15,7 @@ RootMode = Literal["hips", "ground", "in_place"]
 
 
 class Options(BaseModel):
-    """Base of all option blocks: frozen, unknown keys refused."""
+    """Base of all blocks of options: frozen, without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -24,13 +24,13 @@ class KeyframeOptions(Options):
     """Stage 1, keyframe selection."""
 
     parallax_px: float = Field(
-        15.0, gt=0, description="rotation-free parallax that asks for a keyframe, at 640 px width"
+        15.0, gt=0, description="parallax without rotation that causes a keyframe, at 640 px width"
     )
-    min_survival: float = Field(0.5, gt=0, lt=1, description="share of tracks left that asks for a keyframe")
+    min_survival: float = Field(0.5, gt=0, lt=1, description="share of tracks left that causes a keyframe")
     max_gap_s: float = Field(0.5, gt=0, description="largest time between two keyframes")
     min_gap_s: float = Field(0.05, ge=0, description="smallest time between two keyframes")
     max_per_min: float | None = Field(
-        None, gt=0, description="most keyframes a minute; those that show least new are left out"
+        None, gt=0, description="most keyframes a minute; those that add least are left out"
     )
     window: int = Field(4, ge=1, description="frames among which the sharpest becomes the keyframe")
 
@@ -40,7 +40,7 @@ class MapOptions(Options):
 
     features: int = Field(512, ge=128, description="SIFT features a keyframe, the strongest")
     pairs: Literal["retrieval", "exhaustive"] = Field(
-        "retrieval", description="keyframe pairs to match: neighbours and look-alikes, or all"
+        "retrieval", description="keyframe pairs to match: neighbours and similar ones, or all"
     )
     init_frames: tuple[FrameName, FrameName] | None = Field(
         None, description="two frames to start from, each camera:frame; default: found"
@@ -54,7 +54,7 @@ class MapOptions(Options):
 class RegistrationOptions(Options):
     """Stage 3, every frame."""
 
-    rounds: int = Field(3, ge=0, description="how often the map may grow where frames were lost")
+    rounds: int = Field(3, ge=0, description="how often the map may be extended where frames were lost")
     min_inliers: int = Field(15, ge=4, description="PnP inliers below which a frame is refused")
     max_sigma_depth: float = Field(
         0.015, gt=0, description="largest centre sigma as a share of the median depth"
@@ -70,11 +70,11 @@ MARKER_COUNTS = {
     "APRILTAG_36H10": 2320,
     "APRILTAG_36H11": 587,
 }
-"""Markers in each of OpenCV's families."""
+"""Number of markers in each of OpenCV's families."""
 
 
 class MarkerBoard(Options):
-    """A flat board of known squares that lies or hangs in the room."""
+    """A flat board with squares of known size in the room."""
 
     square_m: float = Field(gt=0, le=2, description="side of one square, metres, as measured on the print")
     columns: int = Field(ge=3, description="chessboard: inner corners in a row; ChArUco: squares in a row")
@@ -86,7 +86,7 @@ class MarkerBoard(Options):
     placed: Literal["lying", "hanging"] | None = Field(
         None,
         description="lying on a level floor or table, or hanging on a wall with its edges level and upright: "
-        "then it tells the vertical as well",
+        "then it gives the vertical as well",
     )
 
 
@@ -96,13 +96,13 @@ class MergeOptions(Options):
     fps: float | None = Field(None, gt=0, description="rate of the motion; default the torso camera's")
     max_gap_s: float = Field(1.0, gt=0, description="longest gap that is filled without a mark")
     t_pose_s: float | None = Field(
-        None, ge=0, description="how long a T-pose stands at the start; default: looked for; 0: none"
+        None, ge=0, description="how long a T-pose is held at the start; default: detected; 0: none"
     )
     camera_paths: Literal["joint", "measured"] = Field(
         "joint", description="every frame's camera as solved together with the body, or as measured alone"
     )
     foot_contact: bool = Field(
-        True, description="standing feet do not slide, where cameras on shins or feet show that they stand"
+        True, description="standing feet do not slide, if cameras on shins or feet show that they stand"
     )
     known_distance: tuple[FrameName, FrameName, Annotated[float, Field(gt=0)]] | None = Field(
         None, description="two frames, each camera:frame, and the metres between their lenses; sets the scale"

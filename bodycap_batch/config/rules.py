@@ -1,4 +1,4 @@
-"""What a job must hold beyond its types: names, mounts, skeleton, times."""
+"""Rules for a job beyond its types: names, mounts, skeleton, times."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from bodycap_batch.config.options import MARKER_COUNTS
 from bodycap_batch.model.skeleton_presets import split_side
 
 _FREE_LIMB = {"Arm": "arm", "ForeArm": "arm", "Hand": "arm", "Leg": "leg", "Foot": "leg"}
-"""Bones whose joint is not held to the trunk, and the limb that they belong to."""
+"""Bones that move freely relative to the trunk, and the limb that they belong to."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._\-]*")
 _UNFILLED = re.compile(r"<[^<>]*>")
 _MAX_NAME_BYTES = 255
-# Rounding a rotation to three decimals leaves it this close to orthonormal.
+"""Longest name of a file on common file systems, bytes."""
 _ROTATION_TOLERANCE = 5e-3
+"""Largest deviation of a stated rotation from an orthonormal one: rounding to three decimals stays below."""
 
 
 def problems_in(job: Job) -> list[Problem]:
-    """Everything wrong with a job that its types let pass (no file is opened)."""
+    """Return the problems of a job that its types do not show; no file is opened."""
     problems: list[Problem] = []
     for index, camera in enumerate(job.capture.cameras):
         for found in (*_camera_names(job, index), *_mount(job, camera), *_pose(camera), *_paths(camera)):
@@ -35,7 +36,7 @@ def problems_in(job: Job) -> list[Problem]:
 
 
 def skeleton_of(job: Job) -> str:
-    """The skeleton a job means: what it says; else none where all cameras ride on one bone."""
+    """Return the skeleton of a job: the stated one, else none if all cameras are on one bone."""
     if job.skeleton is not None:
         return job.skeleton
     roles = {camera.role for camera in job.capture.cameras}
@@ -46,7 +47,7 @@ def skeleton_of(job: Job) -> str:
 def _camera_names(job: Job, index: int) -> Iterator[Problem]:
     name = job.capture.cameras[index].name
     if not _NAME.fullmatch(name):
-        yield Problem(("name",), f"{name!r} is no name for files", "letters, digits, _ and - only")
+        yield Problem(("name",), f"{name!r} cannot be a file's name", "letters, digits, _ and - only")
     for other in job.capture.cameras[:index]:
         if other.name.lower() == name.lower():
             yield Problem(
@@ -88,7 +89,7 @@ def _pose(camera: CameraConfig) -> Iterator[Problem]:
     rotation = matrix[:3, :3]
     off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if off > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        yield Problem(where, "the upper left 3×3 is no rotation", "rows of an orthonormal matrix, det +1")
+        yield Problem(where, "the upper left 3×3 is not a rotation", "rows of an orthonormal matrix, det +1")
     if not np.array_equal(matrix[3], [0, 0, 0, 1]):
         yield Problem(where, "the last row is not 0, 0, 0, 1", "four rows, translation in the last column")
 
@@ -109,9 +110,9 @@ def _paths(camera: CameraConfig) -> Iterator[Problem]:
 
 
 def _unusable(field: str, path: Path) -> Iterator[Problem]:
-    """Texts that no file system takes as a path."""
+    """Yield a problem if no file system accepts a text as a path."""
     if "\0" in str(path) or any(len(part.encode(errors="replace")) > _MAX_NAME_BYTES for part in path.parts):
-        yield Problem((field,), f"{str(path)[:40]!r} is no path", "check the path")
+        yield Problem((field,), f"{str(path)[:40]!r} cannot be a path", "check the path")
 
 
 def _job_names(job: Job) -> Iterator[Problem]:
@@ -121,7 +122,9 @@ def _job_names(job: Job) -> Iterator[Problem]:
         for found in _unusable("calibration", job.capture.calibration):
             yield found._replace(location=("capture", *found.location))
     if job.name and not _NAME.fullmatch(job.name):
-        yield Problem(("name",), f"{job.name!r} is no name for a folder", "letters, digits, ., _ and - only")
+        yield Problem(
+            ("name",), f"{job.name!r} cannot be a folder's name", "letters, digits, ., _ and - only"
+        )
 
 
 def _skeleton(job: Job) -> Iterator[Problem]:
@@ -135,20 +138,20 @@ def _skeleton(job: Job) -> Iterator[Problem]:
     if skeleton_of(job) != NO_SKELETON and len(roles) == 1 and None not in roles:
         yield Problem(
             ("skeleton",),
-            f"every camera rides on {roles.pop()}; a body's motion takes cameras on two bones or more",
+            f"every camera is on {roles.pop()}; the motion of a body needs cameras on two bones or more",
             "`skeleton: none` gives the cameras' path and the map",
         )
 
 
 def _size(job: Job) -> Iterator[Problem]:
-    """Two cameras on limbs that hang free of each other are any distance apart, whatever the body's size."""
+    """Yield a problem if every camera is on another limb, since no distance then shows the body's size."""
     parts = [split_side(camera.role) for camera in job.capture.cameras if camera.role is not None]
     limbs = [(side, _FREE_LIMB.get(part)) for side, part in parts]
-    lone = len(limbs) == len(set(limbs)) == len(job.capture.cameras) > 1
-    if skeleton_of(job) != NO_SKELETON and lone and all(limb is not None for _, limb in limbs):
+    all_differ = len(limbs) == len(set(limbs)) == len(job.capture.cameras) > 1
+    if skeleton_of(job) != NO_SKELETON and all_differ and all(limb is not None for _, limb in limbs):
         yield Problem(
             ("skeleton",),
-            "no two of these cameras tell how large the body is: each rides on a limb of its own",
+            "these cameras do not determine the size of the body: each is on a limb of its own",
             "add one on the trunk or the head (torso), or a second one on the same limb; "
             "`skeleton: none` gives the cameras' paths and the map",
         )
@@ -161,14 +164,14 @@ def _times(job: Job) -> Iterator[Problem]:
 
 
 def _rig(job: Job) -> Iterator[Problem]:
-    """A rig is made of cameras on one segment."""
+    """Yield a problem if a rig has no two cameras on one segment."""
     if job.capture.rig == "synced" and not job.capture.segments():
-        message = "`synced` speaks of cameras on one segment, and no two share one"
+        message = "`synced` needs cameras on one segment, and no two share one"
         yield Problem(("capture", "rig"), message, "give them one `mount` or `segment`, or leave it out")
 
 
 def named_frames(job: Job) -> Iterator[tuple[tuple[str, str, int], str, int]]:
-    """Where a job names single frames: the field, the camera's name and the frame's number."""
+    """Yield the frames that a job names: the field, the camera's name and the frame's number."""
     distance = job.merge.known_distance
     for block, field, frames in (
         ("map", "init_frames", job.map.init_frames or ()),
@@ -180,7 +183,7 @@ def named_frames(job: Job) -> Iterator[tuple[tuple[str, str, int], str, int]]:
 
 
 def _named_frames(job: Job) -> Iterator[Problem]:
-    """Frames are named after cameras of the job."""
+    """Yield a problem for each named frame whose camera the job does not have."""
     names = tuple(camera.name for camera in job.capture.cameras)
     for where, camera, _ in named_frames(job):
         if camera not in names:
@@ -188,7 +191,7 @@ def _named_frames(job: Job) -> Iterator[Problem]:
 
 
 def _board(job: Job) -> Iterator[Problem]:
-    """The marker board is one that can be found, and cannot be taken for itself turned by a right angle."""
+    """Yield a problem if a marker board cannot be found, or looks the same after a quarter turn."""
     board, where = job.merge.marker_board, ("merge", "marker_board")
     if board is None:
         return
@@ -201,11 +204,11 @@ def _board(job: Job) -> Iterator[Problem]:
     if min(board.columns, board.rows) < 4:
         small = f"a ChArUco board of {size} squares has too few corners"
         yield Problem(where, small, "four squares and more each way, for example 7 columns and 5 rows")
-    held = MARKER_COUNTS.get(board.dictionary.upper().removeprefix("DICT_"))
-    if held is None:
+    count = MARKER_COUNTS.get(board.dictionary.upper().removeprefix("DICT_"))
+    if count is None:
         nearest = _nearest(board.dictionary, tuple(MARKER_COUNTS))
         yield Problem((*where, "dictionary"), f"unknown markers {board.dictionary[:40]!r}", nearest)
-    elif board.columns * board.rows // 2 > held:
+    elif board.columns * board.rows // 2 > count:
         many = f"a ChArUco board of {size} squares takes more markers than {board.dictionary} has"
         yield Problem((*where, "dictionary"), many, "name the family that was printed, a larger one")
 

@@ -1,8 +1,8 @@
-"""Which files a job may name that somebody else hands in.
+"""Which files a job may name that others submit.
 
-A file the user runs is the user's own: any path that can be read. A job that was dropped into a watched
-folder, or sent to the live page, may name what came with it and what lies below the folders that the
-operator opened to all jobs; it cannot open more of them.
+The user's own job may name any path that can be read. A job that was dropped into a watched folder, or sent
+to the live page, may name the files that came with it. It may also name files below the folders that the
+operator opened to all jobs, but it cannot open further folders.
 """
 
 from __future__ import annotations
@@ -17,42 +17,42 @@ from bodycap_batch.core.errors import JobError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathPolicy:
-    """Folders a job's paths have to lie in.
+    """The folders in which a job's paths must lie.
 
     Attributes:
         folder: The dropped folder; None for a job file that came alone.
-        roots: Folders the operator opened to all jobs.
+        roots: Folders that the operator opened to all jobs.
     """
 
     folder: Path | None
     roots: tuple[Path, ...] = ()
 
     def require_named(self, job: Job, base: Path) -> None:
-        """Check the paths as the job states them, before any of them is read.
+        """Check the paths that a job states, before any file is read.
 
         Args:
-            job: A validated job, its paths as they stand in the file.
-            base: Folder that relative paths start from.
+            job: A validated job with the paths of its file.
+            base: Folder of relative paths.
 
         Raises:
-            JobError: A path with ``..``, or one that lies or leads outside.
+            JobError: A path has ``..``, or lies or leads outside.
         """
-        for field, path in _named(job):
+        for field, path in _paths_of(job):
             if ".." in path.parts:
-                raise JobError(f"{path} climbs out of its folder", field=field, hint=self._hint())
+                raise JobError(f"{path} leads out of its folder", field=field, hint=self._hint())
             self.require(base / path, field)
 
     def require_resolved(self, job: Job) -> None:
-        """Check every file of a resolved job: chapters and sidecars that were found beside the videos.
+        """Check every file of a resolved job, also the chapters and sidecars found beside its videos.
 
         Raises:
             JobError: One of them leads outside by a symbolic link.
         """
-        for field, path in _named(job):
+        for field, path in _paths_of(job):
             self.require(path, field)
 
     def require(self, path: Path, field: str | None = None) -> None:
-        """Check one path, symbolic links followed.
+        """Check one path; symbolic links are followed.
 
         Raises:
             JobError: It lies outside.
@@ -61,7 +61,10 @@ class PathPolicy:
             target = path.resolve()
         except (OSError, RuntimeError) as error:  # a loop of links
             raise JobError(
-                "leads nowhere", path=path, field=field, hint="put the file itself there"
+                "cannot be followed: it is a loop of links",
+                path=path,
+                field=field,
+                hint="put the file itself there",
             ) from error
         allowed = [folder.resolve() for folder in (self.folder, *self.roots) if folder is not None]
         if not any(target == folder or target.is_relative_to(folder) for folder in allowed):
@@ -79,14 +82,14 @@ class PathPolicy:
         return f"{where}; {also}"
 
 
-def _named(job: Job) -> Iterator[tuple[str, Path]]:
-    """Every path a job reads, with the field that names it."""
+def _paths_of(job: Job) -> Iterator[tuple[str, Path]]:
+    """Yield every path that a job reads, with its field."""
     if job.skeleton is not None and job.skeleton not in SKELETON_PRESETS:
         yield "skeleton", Path(job.skeleton)
-    yield from _of_capture(job.capture)
+    yield from _paths_of_capture(job.capture)
 
 
-def _of_capture(capture: CaptureConfig) -> Iterator[tuple[str, Path]]:
+def _paths_of_capture(capture: CaptureConfig) -> Iterator[tuple[str, Path]]:
     if isinstance(capture.calibration, Path):
         yield "capture.calibration", capture.calibration
     for index, camera in enumerate(capture.cameras):

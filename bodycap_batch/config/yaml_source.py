@@ -1,6 +1,6 @@
-"""Read YAML as plain values that remember their lines.
+"""Read YAML as plain values, with the line of each value.
 
-Scalars follow YAML 1.2's core schema: ``no``, ``1:30`` and dates stay text, ``1e-3`` is a number.
+Scalars follow the core schema of YAML 1.2: ``no``, ``1:30`` and dates stay text, ``1e-3`` is a number.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ import yaml
 from bodycap_batch.core.errors import JobError
 
 MAX_BYTES = 1 << 20
+"""Largest job file, bytes. Evidence: none."""
 MAX_DEPTH = 20
+"""Deepest nesting of a job file, levels; a job needs six. Evidence: none."""
 
 Location = tuple[str | int, ...]
 """Keys and list positions from the top of the file: ``("capture", "cameras", 0, "video")``."""
@@ -26,6 +28,7 @@ _WORDS: dict[str, bool | None] = {"": None, "~": None, "null": None, "Null": Non
 _WORDS |= {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
 _TAB_INDENT = re.compile(r" *\t")
 _MAX_INT = 1 << 63
+"""Numbers from here on do not fit into int64."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +46,7 @@ class YamlSource:
     lines: dict[Location, int]
 
     def line_of(self, location: Location) -> int | None:
-        """Line of a location, or of the nearest thing around it."""
+        """Return the line of a location, or of the nearest value around it."""
         while location not in self.lines:
             if not location:
                 return None
@@ -55,11 +58,12 @@ def read_yaml(path: Path, *, max_bytes: int = MAX_BYTES, max_depth: int = MAX_DE
     """Read a YAML file of at most `max_bytes`, nested at most `max_depth` levels deep.
 
     Raises:
-        JobError: Unreadable, no YAML, a key twice, anchors, or too large or deep; names the line.
+        JobError: The file is unreadable, no YAML, too large or too deep, or it has a key twice or anchors.
+            The error names the line.
     """
     try:
         if path.stat().st_size > max_bytes:
-            raise JobError("far too large for a job", path=path, hint="give the job's YAML file")
+            raise JobError("too large for a job", path=path, hint="give the job's YAML file")
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
         raise JobError(
@@ -70,7 +74,7 @@ def read_yaml(path: Path, *, max_bytes: int = MAX_BYTES, max_depth: int = MAX_DE
             f"cannot read the job ({error})", path=path, hint="a YAML file, saved as UTF-8"
         ) from error
     try:
-        _refuse_traps(text, path, max_depth)
+        _refuse_unsupported(text, path, max_depth)
         node = yaml.compose(text, Loader=yaml.SafeLoader)
     except yaml.MarkedYAMLError as error:
         raise _syntax_error(error, text, path) from error
@@ -83,8 +87,8 @@ def read_yaml(path: Path, *, max_bytes: int = MAX_BYTES, max_depth: int = MAX_DE
     return YamlSource(path=path, data=data, lines=lines)
 
 
-def _refuse_traps(text: str, path: Path, max_depth: int) -> None:
-    """Bound the depth before anything recurses, and refuse anchors, aliases and tags."""
+def _refuse_unsupported(text: str, path: Path, max_depth: int) -> None:
+    """Refuse deep nesting before anything recurses, and anchors, aliases and tags."""
     depth = 0
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         line = 0 if event.start_mark is None else event.start_mark.line + 1
@@ -92,13 +96,13 @@ def _refuse_traps(text: str, path: Path, max_depth: int) -> None:
             depth += 1
             if depth > max_depth:
                 message = f"nested deeper than {max_depth} levels"
-                raise JobError(message, path=path, line=line, hint="no job is that deep")
+                raise JobError(message, path=path, line=line, hint="jobs need fewer levels")
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
-        for trap, mark in (("anchor", "& or *"), ("tag", "!")):
-            if getattr(event, trap, None) is not None:
+        for feature, mark in (("anchor", "& or *"), ("tag", "!")):
+            if getattr(event, feature, None) is not None:
                 raise JobError(
-                    f"{trap}s are not for jobs ({getattr(event, trap)})",
+                    f"{feature}s are not allowed in jobs ({getattr(event, feature)})",
                     path=path,
                     line=line,
                     hint=f'write the value out; put text that starts with {mark} in quotes "..."',
@@ -111,7 +115,7 @@ def _syntax_error(error: yaml.MarkedYAMLError, text: str, path: Path) -> JobErro
     tabbed = next((n for n, row in enumerate(text.splitlines(), 1) if _TAB_INDENT.match(row)), None)
     if tabbed is not None or "'\\t'" in str(error.problem):
         return JobError(
-            "a tab where YAML wants spaces",
+            "a tab where YAML needs spaces",
             path=path,
             line=tabbed or line,
             hint="indent with spaces, not tabs",
@@ -122,7 +126,7 @@ def _syntax_error(error: yaml.MarkedYAMLError, text: str, path: Path) -> JobErro
 
 
 def _value(node: yaml.Node, location: Location, lines: dict[Location, int], path: Path) -> object:
-    """Turn a node into plain values and note the lines of everything below it."""
+    """Return a node as plain values, and record the lines of everything in it."""
     lines.setdefault(location, node.start_mark.line + 1)
     if isinstance(node, yaml.MappingNode):
         return _mapping(node, location, lines, path)
@@ -155,7 +159,7 @@ def _mapping(
 
 
 def _scalar(node: yaml.Node, path: Path) -> object:
-    """A scalar by YAML 1.2's core schema; quoted text stays text."""
+    """Return a scalar by the core schema of YAML 1.2; quoted text stays text."""
     text = str(node.value)
     if getattr(node, "style", None) is not None:
         return text
@@ -179,5 +183,5 @@ def _scalar(node: yaml.Node, path: Path) -> object:
 
 
 def dotted(location: Location) -> str:
-    """A location as users read it: ``capture.cameras.0.video``."""
+    """Return a location as messages show it: ``capture.cameras.0.video``."""
     return ".".join(str(part) for part in location)

@@ -1,4 +1,4 @@
-"""Many jobs at once: each in a thread that only waits, while an executor makes their tasks."""
+"""Run many jobs at once: each job in a thread that only waits, while an executor runs their tasks."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class BatchJob:
 
     Attributes:
         path: A job file or a folder of videos.
-        priority: Higher goes first.
+        priority: Jobs of a higher priority run first.
     """
 
     path: Path
@@ -39,9 +39,9 @@ class Outcome:
 
     Attributes:
         job: The job.
-        seconds: From its start to its end.
-        summary: What it left behind; None where it failed.
-        error: Why it failed.
+        seconds: Time from its start to its end.
+        summary: Its results; None if it failed.
+        error: Why it failed; None if it did not.
     """
 
     job: BatchJob
@@ -51,11 +51,11 @@ class Outcome:
 
     @property
     def exit_code(self) -> int:
-        """0, or that of the error."""
+        """Exit code: 0, or that of the error."""
         return 0 if self.error is None else self.error.exit_code
 
     def to_dict(self) -> dict[str, Any]:
-        """The outcome as plain JSON values."""
+        """Return the outcome as plain JSON values."""
         return {
             "job": str(self.job.path),
             "exit_code": self.exit_code,
@@ -67,13 +67,13 @@ class Outcome:
 
 
 class Batch:
-    """Jobs that run side by side and do not stop one another.
+    """Jobs that run side by side; the failure of one does not stop the others.
 
     Args:
-        settings: Called with a job and its folder of results (or None before that is known); all settings
-            share one executor.
-        results: Folder of a resolved job's results.
-        max_jobs: How many are at work at once.
+        settings: Called with a job and its folder of results, or None before the folder is known. All
+            settings share one executor.
+        results: Returns the folder of a resolved job's results.
+        max_jobs: Number of jobs that run at once.
     """
 
     def __init__(
@@ -85,16 +85,17 @@ class Batch:
         self._settings = settings
         self._results = results
         self._max_jobs = max_jobs
-        self._taken: dict[Path, Path] = {}
+        self._owners: dict[Path, Path] = {}
+        """By folder of results, the job that writes into it."""
         self._lock = threading.Lock()
 
     def run(self, jobs: Sequence[BatchJob]) -> Iterator[Outcome]:
-        """Run the jobs, those of high priority first; yields each as it ends."""
+        """Run the jobs, those of high priority first; yield the outcome of each job when it ends."""
         ordered = sorted(jobs, key=lambda job: -job.priority)
-        began: dict[BatchJob, float] = {}
+        started: dict[BatchJob, float] = {}
 
         def run(job: BatchJob) -> RunSummary:
-            began[job] = time.monotonic()
+            started[job] = time.monotonic()
             return self._run_one(job)
 
         with ThreadPoolExecutor(max_workers=self._max_jobs) as pool:
@@ -102,25 +103,25 @@ class Batch:
             while waiting:
                 for future in wait(waiting, return_when=FIRST_COMPLETED).done:
                     job = waiting.pop(future)
-                    yield _outcome(job, future, time.monotonic() - began[job])
+                    yield _outcome(job, future, time.monotonic() - started[job])
 
     def _run_one(self, job: BatchJob) -> RunSummary:
         if self._settings(job, None).cancelled():
-            raise Cancelled("stopped before it began", hint="run it again to go on")
+            raise Cancelled("stopped before it started", hint="run it again to go on")
 
         def prepare(options: Mapping[str, Any], folder: Path) -> None:
             prepare_capture(options, folder, self._settings(job, None))
 
         resolved = load_job(job.path, Overrides(), prepare=prepare)
         out_dir = self._results(resolved)
-        self._take(out_dir, job.path)
+        self._claim_folder(out_dir, job.path)
         resolved = resolved.model_copy(update={"out": out_dir})
         return run_job(resolved, out_dir=out_dir, settings=self._settings(job, out_dir))
 
-    def _take(self, out_dir: Path, path: Path) -> None:
-        """Two jobs of one batch must not write into the same folder."""
+    def _claim_folder(self, out_dir: Path, path: Path) -> None:
+        """Refuse a job that would write into the folder of another job of the batch."""
         with self._lock:
-            other = self._taken.setdefault(out_dir.resolve(), path)
+            other = self._owners.setdefault(out_dir.resolve(), path)
         if other != path:
             raise JobError(
                 f"its results would go to {out_dir}, where those of {other} go",
@@ -131,6 +132,7 @@ class Batch:
 
 
 def _outcome(job: BatchJob, future: Future[RunSummary], seconds: float) -> Outcome:
+    """Return the outcome of a job that has ended; an unexpected exception gets exit code 70."""
     failure = future.exception()
     if failure is None:
         return Outcome(job=job, seconds=seconds, summary=future.result())

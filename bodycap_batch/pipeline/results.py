@@ -1,4 +1,4 @@
-"""Results on their way from the store to the user's folder."""
+"""Copy results from the store to the user's folder."""
 
 from __future__ import annotations
 
@@ -14,42 +14,43 @@ from bodycap_batch.store.artefacts import disk_errors, sync_folder
 from bodycap_batch.store.digests import remove_abandoned, temporary_beside, write_atomically
 
 PARTIAL = "partial"
+"""Folder below the results for those of a job that has no skeleton, or no results at all."""
 
 
 def publish(files: Mapping[str, Path], folder: Path) -> None:
-    """Bring files to a folder one by one, each whole or not at all; by hard link where possible.
+    """Put files into a folder, each one completely or not at all, by hard link if possible.
 
     Args:
-        files: Relative name in the folder -> file in the store.
-        folder: Made when absent.
+        files: File in the store by its relative name in the folder.
+        folder: The folder; created if it does not exist.
 
     Raises:
         StoreError: The folder cannot be written.
     """
-    placed, folders = set[Path](), {folder}
+    changed, folders = set[Path](), {folder}
     with disk_errors(folder):
         for name, source in files.items():
             target = folder / name
             target.parent.mkdir(parents=True, exist_ok=True)
             folders.add(target.parent)
             if not (target.exists() and target.samefile(source)):
-                _place(source, target)
-                placed.add(target.parent)
-        for changed in placed:
-            sync_folder(changed)
-        for each in folders:
-            remove_abandoned(each)
+                _link_or_copy(source, target)
+                changed.add(target.parent)
+        for parent in changed:
+            sync_folder(parent)
+        for parent in folders:
+            remove_abandoned(parent)
 
 
 def write_results_file(folder: Path, name: str, text: str) -> None:
-    """Write a small file that belongs to the results. Raises `StoreError`."""
+    """Write a small file of the results. Raises `StoreError`."""
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(folder / name, text.encode())
 
 
 def remove_outdated(folder: Path, keep: Iterable[str]) -> None:
-    """Remove the files that the run before left here and this one did not renew."""
+    """Remove the files of the last run that this run has not written again."""
     kept = set(keep)
     for name in _files_of_last_run(folder):
         path = folder / name
@@ -59,11 +60,11 @@ def remove_outdated(folder: Path, keep: Iterable[str]) -> None:
 
 
 def clear_partial(folder: Path) -> None:
-    """Remove what an earlier, incomplete run left; complete results have taken its place."""
+    """Remove the partial results of an earlier run; complete results replace them."""
     shutil.rmtree(folder / PARTIAL, ignore_errors=True)
 
 
-def _place(source: Path, target: Path) -> None:
+def _link_or_copy(source: Path, target: Path) -> None:
     temporary = temporary_beside(target)
     try:
         try:

@@ -1,4 +1,4 @@
-"""How a job is run, and what a run tells of each stage."""
+"""How a job runs, and the record of each of its tasks."""
 
 from __future__ import annotations
 
@@ -9,40 +9,40 @@ from pathlib import Path
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.core.progress import Listener
-from bodycap_batch.runner import CHILD, Children, Executor, Rules, Runner, Task
+from bodycap_batch.runner import CHILD_COMMAND, Children, Executor, Rules, Runner, Task
 from bodycap_batch.runner.parent import allow, always
-from bodycap_batch.runner.turns import TakingTurns, Turns
+from bodycap_batch.runner.turns import Turns, TurnTakingExecutor
 from bodycap_batch.store.artefacts import Store
 
 
-def _no() -> bool:
+def _never() -> bool:
     return False
 
 
-def _tell_nobody(_: Path) -> None:
-    """Whoever asked for the results waits for all of them."""
+def _ignore(_: Path) -> None:
+    """Ignore early results: the caller waits for all of them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """How a job is run; nothing here changes a result.
+    """How a job runs; nothing here changes a result.
 
     Attributes:
-        store: Where artefacts are kept.
-        threads: Cores the job may keep busy; with an `executor`, those of each of its tasks.
-        listener: Told what happens.
-        cancelled: Asked several times a second whether to stop.
-        may_commit: Asked before each artefact is committed and before results are published; False stops
-            the job (it belongs to another process now).
-        command: The children's command line.
-        executor: Makes the tasks of several jobs, here or elsewhere; default: this job's own children.
-        compute: False: only what is stored is used, `NotStored` raised where something is not.
-        redo: Stages that are computed anew although they are stored.
-        until: Last stage to run; no results are written before the last. "" runs all.
-        priority: Higher goes first where several jobs wait.
-        results_ready: Called with the folder of the results where they are there before their video.
-        limits: How large the videos may be; None where they are the user's own.
-        turns: What other jobs of this process are making; None where there are none.
+        store: Where artefacts are stored.
+        threads: Number of cores that the job may keep busy; with an `executor`, each of its tasks.
+        listener: Receives the events of the job.
+        cancelled: Called several times a second; True stops the job.
+        may_commit: Called before each artefact is committed and before results are published. False stops the
+            job, because it belongs to another process now.
+        command: Command line of the children.
+        executor: Runs the tasks of several jobs, here or elsewhere; default: this job's own children.
+        compute: If False, only stored artefacts are used, and `NotStored` is raised for others.
+        redo: Stages that are computed again although they are stored.
+        until: Last stage to run; results are written only after the last stage of all. "" runs all stages.
+        priority: Of waiting jobs, those of a higher priority come first.
+        results_ready: Called with the folder of results that are published before their video.
+        limits: How large the videos may be; None for the user's own videos.
+        turns: Artefacts that other jobs of this process are computing; None if there are no other jobs.
     """
 
     store: Store
@@ -50,34 +50,34 @@ class Settings:
     listener: Listener
     cancelled: Callable[[], bool]
     may_commit: Callable[[], bool] = always
-    command: Sequence[str] = CHILD
+    command: Sequence[str] = CHILD_COMMAND
     executor: Executor | None = None
     compute: bool = True
     redo: frozenset[str] = frozenset()
     until: str = ""
     priority: int = 0
-    results_ready: Callable[[Path], None] = _tell_nobody
+    results_ready: Callable[[Path], None] = _ignore
     limits: Limits | None = None
     turns: Turns | None = None
 
     def runner(
-        self, logs: Path, also: Callable[[], bool] = _no, before: Callable[[Task], None] = allow
+        self, logs: Path, stop_also: Callable[[], bool] = _never, before: Callable[[Task], None] = allow
     ) -> Runner:
-        """A runner that stops when the user asks for it, or when `also` says so.
+        """Return a runner that stops if the user asks for it, or if `stop_also` returns True.
 
         Args:
             logs: Folder of the children's logs.
-            also: Another reason to stop.
-            before: Called before a task is made; may raise to forbid it.
+            stop_also: Another reason to stop.
+            before: Called before a task runs; may raise to forbid it.
         """
         executor = self.executor or Children(self.command)
         return Runner(
             self.store,
-            executor if self.turns is None else TakingTurns(executor, self.turns),
+            executor if self.turns is None else TurnTakingExecutor(executor, self.turns),
             logs=logs,
             listener=self.listener,
             rules=Rules(
-                cancelled=lambda: self.cancelled() or also(),
+                cancelled=lambda: self.cancelled() or stop_also(),
                 may_commit=self.may_commit,
                 before=before,
                 compute=self.compute,
@@ -86,18 +86,24 @@ class Settings:
         )
 
     def require_owner(self) -> None:
-        """Raise `Cancelled` where the job belongs to another process now."""
+        """Raise `Cancelled` if the job belongs to another process now."""
         if not self.may_commit():
             raise Cancelled("the job was stopped or taken over; finished stages are kept")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageRecord:
-    """One stage of a run: what it cost when it was computed, and whether that was now.
+    """One task of a run, and what it cost when it was computed.
 
     Attributes:
-        cpu_seconds: Processor seconds of all its threads; None where an earlier version did not count them.
-        artefact: Its folder in the store, relative to the store.
+        stage: Stage name.
+        camera: Camera name, or "".
+        round: Round of the map, from 0.
+        reused: True if it was computed in an earlier run.
+        seconds: Its duration.
+        cpu_seconds: Processor time of all its threads; None if it was computed by a version without it.
+        peak_memory_mb: Peak memory of its process.
+        artefact: Folder of its artefact, relative to the store.
     """
 
     stage: str

@@ -1,4 +1,4 @@
-"""The child's side: run one stage, commit its artefact, tell the parent."""
+"""The child process: run one stage, commit its artefact, report to the parent."""
 
 from __future__ import annotations
 
@@ -34,76 +34,88 @@ from bodycap_batch.runner.task import Task, TaskFunction, task_from_json
 from bodycap_batch.store.artefacts import DISK_ERRORS, Store, store_error
 
 _PROGRESS_PERIOD_S = 0.2
+"""Least time between two reports of progress, seconds: a display changes too fast to read otherwise.
+Evidence: none."""
 _GRACE_S = 3.0
+"""Time for a stage to stop by itself after the parent has closed standard input, seconds. The parent waits as
+long (`process.KILL_AFTER_S`). Evidence: none."""
 RELEASE_PERIOD_S = 0.5
 """Least time between two releases of freed memory. One takes some 50 ms in a large process.
 Evidence: docs/decisions/pipeline.md."""
 FULL_DISK_BYTES = 8 << 20
-"""Below this much free space a failure is put down to the full disk: libraries hide ENOSPC."""
+"""Free space below which the full disk counts as the cause of any failure, bytes: libraries hide ENOSPC.
+Evidence: none."""
 
 
 def main(arguments: Sequence[str], stages: Mapping[str, TaskFunction]) -> int:
-    """Run the task file named on the command line; without one, take orders until standard input closes.
+    """Run the task file named on the command line; without one, follow orders until standard input closes.
 
-    An order is one JSON line: ``{"task": file, "log": file}`` runs a task and sends its prints to the log;
-    ``{"import": [modules]}`` loads libraries while there is nothing else to do. Taking orders saves every
-    task but the first the seconds in which libraries load.
+    An order is one JSON line. ``{"task": file, "log": file}`` runs a task and writes its prints to the log.
+    ``{"import": [modules]}`` loads libraries while the child has no task. Only the first task of such a child
+    waits until its libraries are loaded.
 
     Args:
-        arguments: The path of the task file, or nothing.
+        arguments: The path of the task file, or empty.
         stages: By stage name, the function that runs its tasks.
 
     Returns:
         The exit code: 0, that of a typed error, or 70.
     """
-    speak = _Speaker()
-    orders = _Orders()
+    writer = _MessageWriter()
+    orders = _OrderReader()
     if arguments:
-        return _perform(Path(arguments[0]), stages, _Link(speak, orders, asks=False))
+        return _run_task_file(Path(arguments[0]), stages, _Parent(writer, orders, asks=False))
     for order in iter(orders.next, None):
         if "import" in order:
-            _import(order["import"])
+            import_ahead(order["import"])
             continue
-        _send_prints_to(Path(order["log"]))
-        speak.say("begun")
-        if _perform(Path(order["task"]), stages, _Link(speak, orders, asks=True)) == EXIT_BUG:
+        _redirect_prints(Path(order["log"]))
+        writer.send("started")
+        if _run_task_file(Path(order["task"]), stages, _Parent(writer, orders, asks=True)) == EXIT_BUG:
             return EXIT_BUG
     return 0
 
 
 @dataclass(frozen=True, slots=True)
-class _Link:
-    """The parent, as one task talks to it; `asks`: whether it wants to be asked before a commit."""
+class _Parent:
+    """The connection of one task to the parent process.
 
-    speak: _Speaker
-    orders: _Orders
+    Attributes:
+        messages: Messages to the parent.
+        orders: Orders of the parent.
+        asks: Whether the parent is asked before a commit.
+    """
+
+    messages: _MessageWriter
+    orders: _OrderReader
     asks: bool
 
     def before_commit(self) -> None:
-        """Wait until the parent lets the artefact be committed; raise `Cancelled` if it does not."""
+        """Ask the parent whether the artefact may be committed; raise `Cancelled` if not."""
         if not self.asks:
             return
-        self.speak.say("ready")
+        self.messages.send("ready")
         answer = self.orders.next()
         if answer is None or not answer["commit"]:
             raise Cancelled("not committed: the job was stopped or taken over", hint="run it again to go on")
 
 
-def _perform(order: Path, stages: Mapping[str, TaskFunction], link: _Link) -> int:
-    task, root = task_from_json(json.loads(order.read_text(encoding="utf-8")))
+def _run_task_file(file: Path, stages: Mapping[str, TaskFunction], parent: _Parent) -> int:
+    """Run a task, report how it ended, and return the exit code."""
+    task, root = task_from_json(json.loads(file.read_text(encoding="utf-8")))
     try:
         store = Store(root)
-        _run(task, store, stages[task.key.stage], link)
+        _run(task, store, stages[task.key.stage], parent)
     except BodycapError as error:
-        link.speak.say("error", error=error.to_dict())
+        parent.messages.send("error", error=error.to_dict())
         return error.exit_code
-    except Exception as error:  # noqa: BLE001 - the one place where a task's bugs are caught
-        return _report_unexpected(error, root, link.speak)
+    except Exception as error:  # noqa: BLE001 - the one place that catches the bugs of a task
+        return _report_unexpected(error, root, parent.messages)
     return 0
 
 
-def _import(modules: Sequence[str]) -> None:
-    """Load libraries ahead of their use; what is missing is told by the stage that needs it."""
+def import_ahead(modules: Sequence[str]) -> None:
+    """Load modules before they are needed; the stage that needs a missing one reports it."""
     for name in modules:
         try:
             importlib.import_module(name)
@@ -111,26 +123,27 @@ def _import(modules: Sequence[str]) -> None:
             sys.stderr.write(f"{name}: {error}\n")
 
 
-def _send_prints_to(log: Path) -> None:
-    """Let standard output and error, the native libraries' too, go to a file from here on."""
+def _redirect_prints(log: Path) -> None:
+    """Append standard output and error, also those of native libraries, to a file from now on."""
     with log.open("ab") as stream:
         for number in (1, 2):
             os.dup2(stream.fileno(), number)
 
 
-def _run(task: Task, store: Store, function: TaskFunction, link: _Link) -> None:
+def _run(task: Task, store: Store, function: TaskFunction, parent: _Parent) -> None:
+    """Run a stage's function on verified inputs and commit what it writes."""
     started, cpu_before = time.monotonic(), time.process_time()
     _pin_threads(task.threads)
     release_memory()
-    _forget_peak_memory()
+    _reset_peak_memory()
     for artefact in dict.fromkeys(store.artefacts_in(task.arguments)):
         store.verify(artefact)
-    with store.draft(task.key) as draft, _DiskWatch(store):
+    with store.draft(task.key) as draft, DiskFailures(store):
         context = StageContext(
             work_dir=draft.work,
             threads=task.threads,
-            progress=StepReporter(link.speak.progress),
-            cancelled=link.orders.closed.is_set,
+            progress=StepReporter(parent.messages.send_progress),
+            cancelled=parent.orders.closed.is_set,
         )
         function(task.arguments, context, draft.files)
         made = {
@@ -139,12 +152,12 @@ def _run(task: Task, store: Store, function: TaskFunction, link: _Link) -> None:
             "peak_memory_mb": round(peak_memory_mb(), 1),
             "threads": task.threads,
         }
-        store.commit(draft, task.key, made, before=link.before_commit, replace=task.replaces)
-    link.speak.say("done", **made)
+        store.commit(draft, task.key, made, before=parent.before_commit, replace=task.replaces)
+    parent.messages.send("done", **made)
 
 
-class _DiskWatch:
-    """Turns what a stage raises when a disk fails into `StoreError`, before the draft is removed."""
+class DiskFailures:
+    """Turns the errors of a stage whose disk fails into `StoreError`, before the draft is removed."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -155,31 +168,31 @@ class _DiskWatch:
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         if isinstance(error, OSError) and error.errno in DISK_ERRORS:
             raise store_error(error, self._store.root) from error
-        if isinstance(error, CaptureError | JobError) and (away := _away(error)) is not None:
+        if isinstance(error, CaptureError | JobError) and (away := _disk_away(error)) is not None:
             raise away from error
-        # A writer that met the full disk knows its own file, but not that the folder is the store's.
+        # A writer that finds the disk full knows its own file, but not that the folder belongs to the store.
         other = isinstance(error, Exception) and not isinstance(error, BodycapError)
         if (other or isinstance(error, StoreError)) and self._store.free_bytes() < FULL_DISK_BYTES:
             raise disk_full(self._store.root) from error
 
 
-def _away(error: BodycapError) -> DiskAway | None:
-    """What is wrong where the file that an error names is not to blame: its disk does not answer.
+def _disk_away(error: BodycapError) -> DiskAway | None:
+    """Return the error of a disk that does not answer, if that is why the file named by `error` failed.
 
-    FFmpeg says EIO of broken files, too, and takes a file whose disk goes away for one that ends early: then
-    the file is asked.
+    FFmpeg reports EIO for broken files too. It takes a file that becomes unreachable for one that ends early.
+    In both cases the file is read here to find out.
     """
     if error.path is None:
         return None
     path, failed = Path(error.path), error.__cause__
     if not isinstance(failed, OSError) or failed.errno in (None, errno.EIO):
-        failed = _failure_to_read(path)
+        failed = _read_failure(path)
     found = store_error(failed, path) if isinstance(failed, OSError) else None
     return found if isinstance(found, DiskAway) else None
 
 
-def _failure_to_read(path: Path) -> OSError | None:
-    """What the first or the last byte of a file cannot be read for; None where it is no plain file."""
+def _read_failure(path: Path) -> OSError | None:
+    """Return why a plain file cannot be read at its start or end; None if it can, or for other files."""
     try:
         if path.is_file():
             with path.open("rb") as stream:
@@ -192,38 +205,39 @@ def _failure_to_read(path: Path) -> OSError | None:
 
 
 def disk_full(root: Path) -> StoreError:
-    """The disk has no room left."""
+    """Return the error of a store whose disk is full."""
     hint = "free some space, or name a folder on another disk with --store; finished stages are kept"
     return StoreError("No space left on device", path=root, hint=hint)
 
 
-def _report_unexpected(error: Exception, root: Path, speak: _Speaker) -> int:
+def _report_unexpected(error: Exception, root: Path, messages: _MessageWriter) -> int:
+    """Report a bug, or a lack of memory, after which the child ends; return the exit code."""
     if isinstance(error, MemoryError):
         full = BodycapError("out of memory", hint="close other programs, or lower work_px in the job")
-        speak.say("error", error=full.to_dict(), ends=True)
+        messages.send("error", error=full.to_dict(), ends=True)
         return EXIT_BUG
     text = traceback.format_exc()
     sys.stderr.write(text)
     bug = BodycapError(f"{type(error).__name__}: {error}", path=root if isinstance(error, OSError) else None)
-    speak.say("error", error=bug.to_dict(), traceback=text, ends=True)
+    messages.send("error", error=bug.to_dict(), traceback=text, ends=True)
     return EXIT_BUG
 
 
 def _pin_threads(threads: int) -> None:
-    """OpenCV's pool follows the task; the other libraries' pools are off, their threads are a stage's own."""
+    """Give the task's threads to OpenCV. The pools of other libraries are off: stages start own threads."""
     os.environ["OPENCV_FOR_THREADS_NUM"] = str(threads)
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(threads)
 
 
-def _forget_peak_memory() -> None:
-    """Count a task's peak memory from its own beginning, where the system can (Linux)."""
+def _reset_peak_memory() -> None:
+    """Start to count the peak memory of a task, if the system can (Linux)."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 
 def peak_memory_mb() -> float:
-    """Largest resident memory of this process since `_forget_peak_memory`, or ever."""
+    """Return the peak of resident memory since `_reset_peak_memory` or else since the start, MB."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
             if line.startswith("VmHWM:"):
@@ -232,8 +246,8 @@ def peak_memory_mb() -> float:
     return peak / (1 << 20) if sys.platform == "darwin" else peak / (1 << 10)
 
 
-class _Speaker:
-    """JSON lines to the parent; the libraries' own prints go to the log instead."""
+class _MessageWriter:
+    """Sends JSON lines to the parent; the prints of libraries go to the log instead."""
 
     def __init__(self) -> None:
         self._stream: TextIO = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
@@ -242,19 +256,19 @@ class _Speaker:
         self._lock = threading.Lock()
         self._last = 0.0
 
-    def say(self, event: str, **values: Any) -> None:
-        """Write one line."""
+    def send(self, event: str, **values: Any) -> None:
+        """Send one message."""
         with self._lock:
             self._stream.write(json.dumps({"event": event, **values}) + "\n")
             self._stream.flush()
 
-    def progress(self, done: int, total: int, what: str = "") -> None:
-        """Tell the progress, not more often than anyone can see."""
+    def send_progress(self, done: int, total: int, what: str = "") -> None:
+        """Send the progress, except if the last message is very recent."""
         now = time.monotonic()
         if done < total and now - self._last < _PROGRESS_PERIOD_S:
             return
         self._last = now
-        self.say("progress", done=int(done), total=int(total), what=what)
+        self.send("progress", done=int(done), total=int(total), what=what)
 
 
 class StepReporter:
@@ -291,8 +305,8 @@ class StepReporter:
         self._report(done, total, what)
 
 
-class _Orders:
-    """The lines of standard input; when it closes the parent asks to stop, or is gone."""
+class _OrderReader:
+    """Reads the orders from standard input. If it closes, the parent asks to stop, or has ended."""
 
     def __init__(self) -> None:
         self.closed = threading.Event()
@@ -300,7 +314,7 @@ class _Orders:
         threading.Thread(target=self._read, daemon=True).start()
 
     def next(self) -> dict[str, Any] | None:
-        """Wait for the next order; None when there are no more."""
+        """Wait for the next order; return None after the last one."""
         return self._queue.get()
 
     def _read(self) -> None:

@@ -1,4 +1,4 @@
-"""Tasks made in child processes of this machine."""
+"""Run tasks in child processes of this machine."""
 
 from __future__ import annotations
 
@@ -12,25 +12,26 @@ from typing import Any, Protocol
 
 from bodycap_batch.core.errors import BodycapError, Cancelled, error_from_dict
 from bodycap_batch.runner.child import FULL_DISK_BYTES, disk_full
-from bodycap_batch.runner.process import CHILD, Child, crash_hint, death
+from bodycap_batch.runner.process import CHILD_COMMAND, Child, crash_hint, describe_end
 from bodycap_batch.runner.task import Task
 from bodycap_batch.store.artefacts import Store, disk_errors
 
 CHILDREN_LOG = "children.log"
+"""Log of what children print while they have no task."""
 STOPPED = "stopped on request; finished stages are kept"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Making:
-    """The surroundings in which a task is made; nothing here changes its result.
+class TaskEnvironment:
+    """The environment in which a task runs; nothing here changes its result.
 
     Attributes:
         store: Where the artefact is committed.
         logs: Folder for one log file and one task file per task.
         progress: Called as ``progress(done, total, what)``.
-        cancelled: Asked several times a second whether to stop.
-        may_commit: Asked before the artefact is committed.
-        meanwhile: What other children load at the same time: names of modules, one list a child.
+        cancelled: Called several times a second; True stops the task.
+        may_commit: Called before the artefact is committed; False stops the task.
+        preload: Names of modules that other children load at the same time, one list a child.
     """
 
     store: Store
@@ -38,35 +39,36 @@ class Making:
     progress: Callable[[int, int, str], None]
     cancelled: Callable[[], bool]
     may_commit: Callable[[], bool]
-    meanwhile: Sequence[Sequence[str]] = ()
+    preload: Sequence[Sequence[str]] = ()
 
 
 class Executor(Protocol):
-    """Makes artefacts: here, or on other machines. Used from several threads."""
+    """Runs tasks here or on other machines. Used from several threads."""
 
-    def make(self, task: Task, making: Making) -> None:
-        """Make and commit the task's artefact. Raises `BodycapError`; `Cancelled` when stopped."""
+    def execute(self, task: Task, environment: TaskEnvironment) -> None:
+        """Compute and commit the task's artefact. Raises `BodycapError`, and `Cancelled` if stopped."""
 
     def close(self, logs: Path) -> None:
-        """The job with these logs has ended."""
+        """End what the job with these logs needed; the job has ended."""
 
 
 class Children:
-    """Child processes, each of which does one task after another.
+    """Child processes, each of which runs one task after another.
 
-    Libraries are loaded once; a child ends with `close`, after a crash or a bug, and with its parent.
+    Libraries are therefore loaded once a child. A child ends with `close`, after a crash or a bug, and with
+    its parent.
 
     Args:
         command: The child's command line, without the task file.
     """
 
-    def __init__(self, command: Sequence[str] = CHILD) -> None:
+    def __init__(self, command: Sequence[str] = CHILD_COMMAND) -> None:
         self._command = tuple(command)
         self._idle: list[Child] = []
         self._lock = threading.Lock()
 
     def close(self, logs: Path) -> None:
-        """End the children that wait for work."""
+        """End the idle children."""
         with self._lock:
             waiting, self._idle = self._idle, []
         for child in waiting:
@@ -76,9 +78,13 @@ class Children:
             log.unlink()
 
     def prepare(self, logs: Path, work: Sequence[Sequence[str]]) -> None:
-        """Let one waiting child for each item load modules, starting children where none waits.
+        """Let idle children load modules, one child for each list; start children if too few are idle.
 
-        A child is used next by the task that needs most of what it has loaded.
+        A task prefers the child that has loaded most of its modules.
+
+        Args:
+            logs: Folder of the children's logs.
+            work: Names of modules, one list a child.
         """
         taken = []
         for modules in work:
@@ -89,20 +95,20 @@ class Children:
         with self._lock:
             self._idle += taken
 
-    def make(self, task: Task, making: Making) -> None:
-        """Make and commit the task's artefact in a child.
+    def execute(self, task: Task, environment: TaskEnvironment) -> None:
+        """Compute and commit the task's artefact in a child.
 
         Raises:
-            BodycapError: What the child reported, `StoreError` for the disk, `Cancelled` when stopped.
+            BodycapError: The error of the child, `StoreError` if the disk fails, `Cancelled` if stopped.
         """
-        log = making.logs / f"{task.file_stem}.log"
-        with disk_errors(making.logs):
-            making.logs.mkdir(parents=True, exist_ok=True)
+        log = environment.logs / f"{task.file_stem}.log"
+        with disk_errors(environment.logs):
+            environment.logs.mkdir(parents=True, exist_ok=True)
             order = log.with_suffix(".task.json")
-            order.write_text(json.dumps(task.to_json(making.store.root), indent=1), encoding="utf-8")
+            order.write_text(json.dumps(task.to_json(environment.store.root), indent=1), encoding="utf-8")
             log.write_bytes(b"")
-        child, last = self._done_by(task, making, {"task": str(order), "log": str(log)})
-        stopped = making.cancelled()
+        child, last = self._run_in_child(task, environment, {"task": str(order), "log": str(log)})
+        stopped = environment.cancelled()
         if last is not None and "ends" not in last and not stopped:
             with self._lock:
                 self._idle.append(child)
@@ -111,35 +117,39 @@ class Children:
         if stopped:
             raise Cancelled(STOPPED, hint="run it again to go on")
         if last is None or last["event"] == "error":
-            raise _explained(task, last, child.returncode, (log, making.store))
+            raise _task_error(task, last, child.returncode, log, environment.store)
 
-    def _done_by(
-        self, task: Task, making: Making, order: Mapping[str, str]
+    def _run_in_child(
+        self, task: Task, environment: TaskEnvironment, order: Mapping[str, str]
     ) -> tuple[Child, dict[str, Any] | None]:
-        """Let a child do a task; one that had died while it waited for work is replaced."""
-        ahead = making.meanwhile
+        """Run a task in a child and return the child and its last message.
+
+        A child that died while it was idle is replaced.
+        """
+        preload = environment.preload
         while True:
-            child, is_new = self._take(task.modules, making.logs)
+            child, is_new = self._take(task.modules, environment.logs)
             child.loaded |= set(task.modules)
-            heard: list[str] = []
+            events: list[str] = []
 
-            def hear(message: dict[str, Any], child: Child = child, heard: list[str] = heard) -> None:
-                heard.append(message["event"])
-                _answer(child, message, making)
+            def receive(message: dict[str, Any], child: Child = child, events: list[str] = events) -> None:
+                events.append(message["event"])
+                _answer(child, message, environment)
 
-            with ExitStack() as failing:  # whoever listens to the progress may: a full disk, a closed pipe
-                failing.callback(child.end, at_once=True)
-                self.prepare(making.logs, ahead)
+            # The listener of the progress may raise: the disk is full, or its pipe is closed.
+            with ExitStack() as on_error:
+                on_error.callback(child.end, at_once=True)
+                self.prepare(environment.logs, preload)
                 child.order(order)
-                last = child.follow(making.cancelled, hear)
-                failing.pop_all()
-            if is_new or heard or last is not None or making.cancelled():
+                last = child.follow(environment.cancelled, receive)
+                on_error.pop_all()
+            if is_new or events or last is not None or environment.cancelled():
                 return child, last
             child.end(at_once=False)
-            ahead = ()
+            preload = ()
 
     def _take(self, modules: Collection[str], logs: Path) -> tuple[Child, bool]:
-        """The waiting child that has loaded most of `modules` and least else, or a new one (True)."""
+        """Return the idle child with most of `modules` and fewest others loaded, or a new child and True."""
         with self._lock:
             if self._idle:
                 wanted = set(modules)
@@ -154,17 +164,18 @@ class Children:
                 return Child(self._command, log), True
 
 
-def _answer(child: Child, message: dict[str, Any], making: Making) -> None:
+def _answer(child: Child, message: dict[str, Any], environment: TaskEnvironment) -> None:
+    """Answer a child's question, or pass its progress on."""
     if message["event"] == "ready":
-        child.order({"commit": making.may_commit()})
+        child.order({"commit": environment.may_commit()})
     elif message["event"] == "progress":
-        making.progress(message["done"], message["total"], message.get("what", ""))
+        environment.progress(message["done"], message["total"], message.get("what", ""))
 
 
-def _explained(
-    task: Task, last: dict[str, Any] | None, returncode: int, where: tuple[Path, Store]
+def _task_error(
+    task: Task, last: dict[str, Any] | None, returncode: int, log: Path, store: Store
 ) -> BodycapError:
-    log, store = where
+    """Return the error of a task that failed, from the child's last message or from how the child ended."""
     if last is not None:
         error = error_from_dict(last["error"])
         if "traceback" in last:
@@ -174,4 +185,4 @@ def _explained(
         return error
     if store.free_bytes() < FULL_DISK_BYTES:
         return disk_full(store.root)
-    return BodycapError(f"{task.label}: {death(returncode)}", path=log, hint=crash_hint(returncode))
+    return BodycapError(f"{task.label}: {describe_end(returncode)}", path=log, hint=crash_hint(returncode))

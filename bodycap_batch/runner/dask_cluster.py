@@ -1,7 +1,7 @@
-"""Tasks on many machines: Dask workers that start the same child processes.
+"""Run tasks on many machines: Dask workers start the same child processes there.
 
-A worker gets paths, digests and options; videos and artefacts lie on a disk that all machines share. The
-scheduler hands a dead worker's task to another one.
+A worker receives paths, digests and options. Videos and artefacts lie on a disk that all machines share. If a
+worker dies, the scheduler gives its task to another one.
 
 Source: the Dask distributed documentation (resources, priorities, allowed failures).
 """
@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bodycap_batch.core.errors import BodycapError, Cancelled, JobError, error_from_dict
-from bodycap_batch.runner import CHILD, Making, Task
+from bodycap_batch.runner import CHILD_COMMAND, Task, TaskEnvironment
 from bodycap_batch.runner.children import STOPPED
-from bodycap_batch.runner.remote import order_of, perform
+from bodycap_batch.runner.remote import remote_order, run_order
 from bodycap_batch.runner.turns import Turns
 
 if TYPE_CHECKING:
@@ -29,41 +29,46 @@ if TYPE_CHECKING:
 SCHEMES = ("tcp://", "tls://")
 QUEUES = ("slurm", "pbs")
 MEMORY = "memory"
-"""Name of the resource (MB) by which a worker says what tasks may use together."""
+"""Name of the resource (MB) by which a worker declares the memory that its tasks may use together."""
 _POLL_S = 0.2
-_TELL_EVERY_S = 1.0
-"""A line of progress passes through worker, scheduler and client: a few milliseconds of each."""
-_ASK_AGAIN_S = 2.0
-"""Workers come and go; asking the scheduler for each task takes longer than handing it over."""
-_LEFT = ("closing", "closed")
-_ENDING = ("closing", "closed", "failed")
+"""Time after which a waiting job checks whether it was stopped, seconds. Evidence: none."""
+_PROGRESS_PERIOD_S = 1.0
+"""Least time between two reports of a task's progress, seconds. Each costs worker, scheduler and client a few
+milliseconds. Evidence: none."""
+_WORKERS_PERIOD_S = 2.0
+"""Time after which the scheduler is asked again for its workers, seconds. They come and go, but a question
+for each task would take longer than to submit it. Evidence: none."""
+_CLIENT_LEFT = ("closing", "closed")
+_WORKER_ENDS = ("closing", "closed", "failed")
 _ALLOWED_FAILURES = 1
-"""A task whose worker dies is done once more elsewhere; one that kills two workers is given up."""
+"""How often a task is tried again after its worker died. A task that kills two workers is given up.
+Evidence: none."""
 
 
 class Cluster:
-    """Makes the tasks of several jobs on Dask workers. A context manager.
+    """Runs the tasks of several jobs on Dask workers; a context manager.
 
     Args:
         address: The scheduler, ``tcp://host:8786`` or ``tls://host:8786``.
-        command: The children's command line, on the workers.
+        command: Command line of the children on the workers.
 
     Raises:
         BodycapError: The scheduler does not answer, or the extra is not installed.
     """
 
-    def __init__(self, address: str, command: Sequence[str] = CHILD) -> None:
+    def __init__(self, address: str, command: Sequence[str] = CHILD_COMMAND) -> None:
         self._client = _connect(address)
         self._command = tuple(command)
         self._topic = f"bodycap-{uuid.uuid4().hex}"
         self._progress: dict[str, Callable[[int, int, str], None]] = {}
         self._lock = threading.Lock()
         self._turns = Turns()
-        # Not the lock above: Dask's own thread waits for that one in `_hear`, and has to answer meanwhile.
+        # Another lock than the one above, for which Dask's thread waits in `_receive_progress`: while the
+        # scheduler is asked, that thread must go on to receive the answer.
         self._asking = threading.Lock()
-        self._largest: float | None = None
-        self._asked = -math.inf
-        self._client.subscribe_topic(self._topic, self._hear)
+        self._largest_memory: float | None = None
+        self._last_asked = -math.inf
+        self._client.subscribe_topic(self._topic, self._receive_progress)
         self._client.run_on_scheduler(_allow_failures, _ALLOWED_FAILURES)
 
     def __enter__(self) -> Cluster:
@@ -74,91 +79,91 @@ class Cluster:
         self._client.close()
 
     def workers(self) -> dict[str, Mapping[str, float]]:
-        """Address of every worker and the resources it declares."""
-        known = self._client.scheduler_info()["workers"]
-        return {str(name): dict(info.get("resources") or {}) for name, info in known.items()}
+        """Return the resources that each worker declares, by its address."""
+        workers = self._client.scheduler_info()["workers"]
+        return {str(name): dict(info.get("resources") or {}) for name, info in workers.items()}
 
-    def make(self, task: Task, making: Making) -> None:
-        """Make and commit the task's artefact on some worker.
+    def execute(self, task: Task, environment: TaskEnvironment) -> None:
+        """Compute and commit the task's artefact on some worker.
 
         Raises:
-            BodycapError: What the child reported; `Cancelled` when stopped; the scheduler was lost.
+            BodycapError: The error of the child; `Cancelled` if stopped; the scheduler was lost.
         """
-        with self._turns.taken(task, making) as made:
-            if not made:
-                self._hand_over(task, making)
+        with self._turns.taken(task, environment) as is_stored:
+            if not is_stored:
+                self._submit(task, environment)
 
-    def _hand_over(self, task: Task, making: Making) -> None:
-        if not making.may_commit():
+    def _submit(self, task: Task, environment: TaskEnvironment) -> None:
+        if not environment.may_commit():
             raise Cancelled("the job was stopped or taken over; finished stages are kept")
         key = f"{task.file_stem}-{uuid.uuid4().hex}"
         with self._lock:
-            self._progress[key] = making.progress
+            self._progress[key] = environment.progress
         try:
             future = self._client.submit(
                 _on_worker,
-                order_of(task, making, self._command),
+                remote_order(task, environment, self._command),
                 self._topic,
                 key=key,
                 pure=False,
                 priority=task.priority,
-                resources=self._resources(task, making),
+                resources=self._resources(task, environment),
             )
-            _raise_error_in(self._wait(future, task, making))
+            _raise_error_in(self._wait(future, task, environment))
         finally:
             with self._lock:
                 del self._progress[key]
 
     def close(self, logs: Path) -> None:
-        """A job has ended; the workers' children wait for those of other jobs."""
+        """Do nothing: the children of the workers stay for the other jobs."""
 
-    def _resources(self, task: Task, making: Making) -> dict[str, float] | None:
-        """What a task takes of a worker; one that wants more than any worker has takes all of one.
+    def _resources(self, task: Task, environment: TaskEnvironment) -> dict[str, float] | None:
+        """Return the resources that a task takes; a task that needs too much takes all of the largest worker.
 
-        Waits for the first worker: what is handed over before knows no limits, and large tasks would meet.
+        This waits for the first worker: a task that is submitted before would have no limits, and large tasks
+        would run together.
         """
         while (largest := self._largest_worker(task)) is None:
-            if making.cancelled():
+            if environment.cancelled():
                 raise Cancelled(STOPPED, hint="run it again to go on")
-            making.progress(0, 0, "waiting for a worker")
+            environment.progress(0, 0, "waiting for a worker")
             time.sleep(_POLL_S)
         return {MEMORY: min(float(task.memory_mb), largest)} if largest else None
 
     def _largest_worker(self, task: Task) -> float | None:
-        """Memory (MB) that the largest worker declares, 0 where none does; None while there is no worker."""
+        """Return the memory (MB) that the largest worker declares; 0 if none does; None without a worker."""
         with self._asking:
-            if self._largest is None or time.monotonic() - self._asked > _ASK_AGAIN_S:
-                if self._client.status in _LEFT:
+            if self._largest_memory is None or time.monotonic() - self._last_asked > _WORKERS_PERIOD_S:
+                if self._client.status in _CLIENT_LEFT:
                     raise _lost(task)
                 try:
-                    known = self.workers()
+                    workers = self.workers().values()
                 except OSError as error:
                     raise _lost(task) from error
-                self._largest = max((found.get(MEMORY, 0.0) for found in known.values()), default=None)
-                self._asked = time.monotonic()
-            return self._largest
+                memories = (resources.get(MEMORY, 0.0) for resources in workers)
+                self._largest_memory = max(memories, default=None)
+                self._last_asked = time.monotonic()
+            return self._largest_memory
 
-    def _wait(self, future: Any, task: Task, making: Making) -> dict[str, Any]:
+    def _wait(self, future: Any, task: Task, environment: TaskEnvironment) -> dict[str, Any]:
         ended = threading.Event()
         future.add_done_callback(lambda _: ended.set())
         while not ended.wait(_POLL_S):
-            if making.cancelled():
+            if environment.cancelled():
                 future.cancel()
                 raise Cancelled(STOPPED, hint="run it again to go on")
-            if self._client.status in _LEFT:
+            if self._client.status in _CLIENT_LEFT:
                 raise _lost(task)
         if future.status == "finished":
             try:
                 return dict(future.result())
-            except (
-                OSError
-            ) as error:  # the task's own errors come as answers: this is the way to the scheduler
+            except OSError as error:  # from the connection: errors of the task are part of the answer
                 raise _lost(task) from error
         if future.status == "error":
-            raise _explained(future.exception(), task, making)
+            raise _dask_error(future.exception(), task, environment)
         raise _lost(task)
 
-    def _hear(self, event: Any) -> None:
+    def _receive_progress(self, event: Any) -> None:
         message = event[1]
         with self._lock:
             progress = self._progress.get(str(message["key"]))
@@ -167,12 +172,12 @@ class Cluster:
 
 
 def start_queue(kind: str, workers: int, cores: int, memory_mb: int) -> Any:
-    """Start workers through a machine room's queue.
+    """Start workers through the job queue of a computing centre.
 
     Args:
         kind: ``slurm`` or ``pbs``. Queue, account and times come from Dask's configuration
             (``~/.config/dask/jobqueue.yaml``).
-        workers: How many.
+        workers: Number of workers.
         cores: Threads of each task, and so of each worker.
         memory_mb: Memory of each worker.
 
@@ -207,6 +212,7 @@ def start_queue(kind: str, workers: int, cores: int, memory_mb: int) -> Any:
 
 
 def _connect(address: str) -> Client:
+    """Connect to a scheduler. Raises `JobError`."""
     try:
         from distributed import Client
     except ImportError as error:
@@ -214,9 +220,9 @@ def _connect(address: str) -> Client:
     try:
         # TLS certificates come from Dask's configuration, as does the time to wait for an answer (30 s).
         return Client(address, set_as_default=False)
-    except TypeError as error:  # Dask has no SSL context to give
+    except TypeError as error:  # Dask has no SSL context
         raise JobError(
-            f"no certificates to talk to {address} with",
+            f"no certificates for the connection to {address}",
             field="--executor",
             hint="name them below distributed.comm.tls in ~/.config/dask/distributed.yaml",
         ) from error
@@ -234,35 +240,36 @@ def _not_installed() -> JobError:
 
 
 def _allow_failures(count: int, dask_scheduler: Any = None) -> None:
-    """Run on the scheduler."""
+    """Set the number of allowed failures; this runs on the scheduler."""
     dask_scheduler.allowed_failures = count
 
 
 def _on_worker(order: Mapping[str, Any], topic: str) -> dict[str, Any]:
-    """Run in a thread of a worker."""
+    """Run an order; this runs in a thread of a worker."""
     from distributed import get_worker
 
     worker = get_worker()
     key = worker.get_current_task()
-
-    told = [-math.inf]
+    last_report = -math.inf
 
     def progress(done: int, total: int, what: str) -> None:
-        if (now := time.monotonic()) - told[0] >= _TELL_EVERY_S:
-            told[0] = now
+        nonlocal last_report
+        if (now := time.monotonic()) - last_report >= _PROGRESS_PERIOD_S:
+            last_report = now
             worker.log_event(topic, {"key": key, "done": done, "total": total, "what": what})
 
     def cancelled() -> bool:
-        # A task nobody waits for any more: its client is gone or has cancelled it, or the scheduler is gone.
-        known = worker.state.tasks.get(key)
-        return known is None or known.state == "cancelled" or worker.status.name in _ENDING
+        # The client has ended or cancelled the task, or the scheduler has ended.
+        state = worker.state.tasks.get(key)
+        return state is None or state.state == "cancelled" or worker.status.name in _WORKER_ENDS
 
-    # Threads of all tasks of this worker together: no more than it has cores.
+    # All tasks of this worker together use no more threads than it has cores.
     threads = min(order["task"]["threads"], max(1, (os.cpu_count() or 1) // worker.state.nthreads))
-    return perform({**order, "task": {**order["task"], "threads": threads}}, progress, cancelled)
+    return run_order({**order, "task": {**order["task"], "threads": threads}}, progress, cancelled)
 
 
 def _raise_error_in(answer: Mapping[str, Any]) -> None:
+    """Raise the error that a worker's answer holds, if any."""
     if "error" in answer:
         error = error_from_dict(answer["error"])
         for note in answer.get("notes", []):
@@ -270,14 +277,14 @@ def _raise_error_in(answer: Mapping[str, Any]) -> None:
         raise error
 
 
-def _explained(failure: BaseException, task: Task, making: Making) -> BodycapError:
-    """What Dask itself has to say of a task; what the task says comes as an answer."""
+def _dask_error(failure: BaseException, task: Task, environment: TaskEnvironment) -> BodycapError:
+    """Return the error that Dask itself reports; errors of the task are part of its answer."""
     from distributed import KilledWorker
 
-    log = making.logs / f"{task.file_stem}.log"
+    log = environment.logs / f"{task.file_stem}.log"
     if isinstance(failure, KilledWorker):
         return BodycapError(
-            f"{task.label}: {_ALLOWED_FAILURES + 1} workers died while they worked on it",
+            f"{task.label}: {_ALLOWED_FAILURES + 1} workers died while they ran it",
             path=log,
             hint="probably out of memory: give workers more, or lower work_px in the job",
         )
@@ -286,6 +293,7 @@ def _explained(failure: BaseException, task: Task, making: Making) -> BodycapErr
 
 
 def _lost(task: Task) -> BodycapError:
+    """Return the error of a task whose scheduler cannot be reached any more."""
     return BodycapError(
         f"{task.label}: the scheduler was lost",
         hint="start it again, and the same batch: finished stages are kept",

@@ -1,4 +1,4 @@
-"""The parent's side: look a task's artefact up, else have it made."""
+"""The parent process: look a task's artefact up in the store, else have it computed."""
 
 from __future__ import annotations
 
@@ -9,20 +9,18 @@ from typing import Any
 
 from bodycap_batch.core.errors import BodycapError, Cancelled, StoreError
 from bodycap_batch.core.progress import Event, Listener
-from bodycap_batch.runner.children import Executor, Making
+from bodycap_batch.runner.children import Executor, TaskEnvironment
 from bodycap_batch.runner.task import Task
 from bodycap_batch.store.artefacts import Artefact, Store
 
-_HINT = (
-    "run the job first (`bodycap run`); where it was run before, `bodycap why` tells what has changed since"
-)
+_HINT = "run the job first (`bodycap run`); if it was run before, `bodycap why` shows what has changed since"
 
 
 class NotStored(StoreError):
-    """An artefact would have to be made, which was not wanted.
+    """An artefact is not stored, and nothing may be computed.
 
     Attributes:
-        tasks: What would have to be run.
+        tasks: The tasks that would have to run.
     """
 
     def __init__(self, tasks: Sequence[Task], path: Path) -> None:
@@ -32,24 +30,24 @@ class NotStored(StoreError):
 
 
 def always() -> bool:
-    """Forbid nothing."""
+    """Return True."""
     return True
 
 
 def allow(task: Task) -> None:
-    """Let every task be made."""
+    """Allow every task."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rules:
-    """What a runner may do, and when it asks.
+    """What a runner may do, and the functions that it asks.
 
     Attributes:
-        cancelled: Asked several times a second whether to stop.
-        may_commit: Asked before an artefact is committed; False stops the work.
-        before: Called before a task is made; may raise to forbid it.
-        compute: False: only what is stored is given, `NotStored` raised for the rest.
-        redo: Stages that are made anew although they are stored.
+        cancelled: Called several times a second; True stops the tasks.
+        may_commit: Called before an artefact is committed; False stops the tasks.
+        before: Called before a task runs; may raise to forbid it.
+        compute: If False, only stored artefacts are returned, and `NotStored` is raised for others.
+        redo: Stages that are computed again although they are stored.
     """
 
     cancelled: Callable[[], bool]
@@ -60,14 +58,14 @@ class Rules:
 
 
 class Runner:
-    """Finds or makes the artefacts of one job; safe to be used from several threads.
+    """Finds or computes the artefacts of one job; may be used from several threads.
 
     Args:
-        store: Where artefacts are kept.
-        executor: Makes what is not there.
+        store: Where artefacts are stored.
+        executor: Computes the artefacts that are not stored.
         logs: Folder for one log file and one task file per task.
-        listener: Told what happens.
-        rules: What may be done.
+        listener: Receives the events.
+        rules: What the runner may do.
     """
 
     def __init__(
@@ -87,52 +85,52 @@ class Runner:
         self.close()
 
     def close(self) -> None:
-        """End the children that wait for work."""
+        """End the idle children."""
         self._executor.close(self._logs)
 
-    def run(self, task: Task, meanwhile: Sequence[Sequence[str]] = ()) -> tuple[Artefact, bool]:
-        """Return the task's artefact and whether it had to be made.
+    def run(self, task: Task, preload: Sequence[Sequence[str]] = ()) -> tuple[Artefact, bool]:
+        """Return the task's artefact and whether it had to be computed.
 
         Args:
-            task: What to make.
-            meanwhile: If it has to be made, what other children load at the same time (see `Making`).
+            task: The task.
+            preload: Modules that other children load while it is computed (see `TaskEnvironment`).
 
         Raises:
-            BodycapError: What the child reported, `StoreError` for the disk, `Cancelled` when stopped,
-                `NotStored` where nothing may be computed.
+            BodycapError: The error of the child, `StoreError` if the disk fails, `Cancelled` if stopped,
+                `NotStored` if nothing may be computed.
         """
-        again = task.key.stage in self._rules.redo
-        if not again and (found := self.store.find(task.key)) is not None:
-            self._tell(task, "reused")
+        redo = task.key.stage in self._rules.redo
+        if not redo and (found := self.store.find(task.key)) is not None:
+            self._notify(task, "reused")
             return found, False
         if not self._rules.compute:
             raise NotStored([task], self.store.root)
         self._rules.before(task)
-        self._tell(task, "started")
+        self._notify(task, "started")
         try:
-            artefact = self._make(task, meanwhile)
+            artefact = self._compute(task, preload)
         except BodycapError as error:
             self.store.sweep()
-            self._tell(task, "stopped" if isinstance(error, Cancelled) else "failed")
+            self._notify(task, "stopped" if isinstance(error, Cancelled) else "failed")
             raise
-        self._tell(task, "finished", seconds=float(artefact.made["seconds"]))
+        self._notify(task, "finished", seconds=float(artefact.made["seconds"]))
         return artefact, True
 
-    def _make(self, task: Task, meanwhile: Sequence[Sequence[str]]) -> Artefact:
-        making = Making(
+    def _compute(self, task: Task, preload: Sequence[Sequence[str]]) -> Artefact:
+        environment = TaskEnvironment(
             store=self.store,
             logs=self._logs,
-            progress=lambda done, total, what: self._tell(
+            progress=lambda done, total, what: self._notify(
                 task, "progress", done=done, total=total, what=what
             ),
             cancelled=self._rules.cancelled,
             may_commit=self._rules.may_commit,
-            meanwhile=meanwhile,
+            preload=preload,
         )
-        self._executor.make(replace(task, replaces=task.key.stage in self._rules.redo), making)
+        self._executor.execute(replace(task, replaces=task.key.stage in self._rules.redo), environment)
         if (artefact := self.store.find(task.key)) is None:
             raise StoreError(f"{task.label}: its result is gone", path=self.store.root, hint="run it again")
         return artefact
 
-    def _tell(self, task: Task, kind: Any, **values: Any) -> None:
+    def _notify(self, task: Task, kind: Any, **values: Any) -> None:
         self._listener(Event(kind=kind, stage=task.key.stage, camera=task.camera, round=task.round, **values))

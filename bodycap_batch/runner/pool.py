@@ -1,4 +1,4 @@
-"""The children of one machine, shared by several jobs: as many tasks at once as it has cores and memory."""
+"""The children of one machine, shared by several jobs: its cores and memory limit the tasks at once."""
 
 from __future__ import annotations
 
@@ -12,22 +12,23 @@ from dataclasses import replace
 from pathlib import Path
 
 from bodycap_batch.core.errors import Cancelled
-from bodycap_batch.runner.children import STOPPED, Children, Making
-from bodycap_batch.runner.process import CHILD
+from bodycap_batch.runner.children import STOPPED, Children, TaskEnvironment
+from bodycap_batch.runner.process import CHILD_COMMAND
 from bodycap_batch.runner.task import Task
 from bodycap_batch.runner.turns import Turns
 
 _POLL_S = 0.1
+"""Time after which a waiting task checks whether it was stopped, seconds. Evidence: none."""
 
 
 class Slots:
-    """Cores and memory that tasks take and give back; the task of highest priority first.
+    """Cores and memory that tasks take and return; the task of the highest priority comes first.
 
-    A task that wants more than there is gets all there is, and so runs alone.
+    A task that needs more than the machine has takes everything, so it runs alone.
 
     Args:
-        cores: Threads that may be busy at once.
-        memory_mb: Memory that tasks may declare at once.
+        cores: Number of threads that may be busy at once.
+        memory_mb: Memory that the running tasks may declare together.
     """
 
     def __init__(self, cores: int, memory_mb: int) -> None:
@@ -40,7 +41,7 @@ class Slots:
 
     @contextmanager
     def taken(self, task: Task, cancelled: Callable[[], bool]) -> Iterator[None]:
-        """Hold what a task needs; waits for it. Raises `Cancelled` when stopped while waiting."""
+        """Wait for the cores and memory of a task and hold them. Raises `Cancelled` if stopped meanwhile."""
         need = (min(max(1, task.threads), self.cores), min(task.memory_mb, self.memory_mb))
         self._take(need, task.priority, cancelled)
         try:
@@ -51,18 +52,18 @@ class Slots:
                 self._changed.notify_all()
 
     def _take(self, need: tuple[int, int], priority: int, cancelled: Callable[[], bool]) -> None:
-        place = (-priority, next(self._count))
+        position = (-priority, next(self._count))
         with self._changed:
-            heapq.heappush(self._waiting, place)
+            heapq.heappush(self._waiting, position)
             try:
-                # Strictly in order: a large task that waits is not passed by small ones for ever.
-                while self._waiting[0] != place or not self._fits(need):
+                # Strictly in order: otherwise small tasks could overtake a large one for ever.
+                while self._waiting[0] != position or not self._fits(need):
                     self._changed.wait(_POLL_S)
                     if cancelled():
                         raise Cancelled(STOPPED, hint="run it again to go on")
                 self._free = (self._free[0] - need[0], self._free[1] - need[1])
             finally:
-                self._waiting.remove(place)
+                self._waiting.remove(position)
                 heapq.heapify(self._waiting)
                 self._changed.notify_all()
 
@@ -71,31 +72,33 @@ class Slots:
 
 
 class LocalPool:
-    """Makes the tasks of several jobs in children of this machine.
+    """Runs the tasks of several jobs in children of this machine.
 
     Args:
-        cores: Threads that may be busy at once.
-        memory_mb: Memory the tasks may declare together; default: four fifths of the machine's.
-        command: The children's command line.
+        cores: Number of threads that may be busy at once.
+        memory_mb: Memory that the running tasks may declare together; default: four fifths of the machine's.
+        command: Command line of the children.
     """
 
-    def __init__(self, cores: int, memory_mb: int | None = None, command: Sequence[str] = CHILD) -> None:
+    def __init__(
+        self, cores: int, memory_mb: int | None = None, command: Sequence[str] = CHILD_COMMAND
+    ) -> None:
         self.slots = Slots(cores, memory_mb or machine_memory_mb() * 4 // 5)
         self._children = Children(command)
         self._logs: set[Path] = set()
         self._turns = Turns()
 
-    def make(self, task: Task, making: Making) -> None:
-        """Make and commit the task's artefact when there is room for it. Raises `BodycapError`."""
-        with self._turns.taken(task, making) as made:
-            if made:
+    def execute(self, task: Task, environment: TaskEnvironment) -> None:
+        """Compute and commit the task's artefact when cores and memory are free. Raises `BodycapError`."""
+        with self._turns.taken(task, environment) as is_stored:
+            if is_stored:
                 return
-            with self.slots.taken(task, making.cancelled):
-                self._logs.add(making.logs)
-                self._children.make(task, replace(making, meanwhile=()))
+            with self.slots.taken(task, environment.cancelled):
+                self._logs.add(environment.logs)
+                self._children.execute(task, replace(environment, preload=()))
 
     def close(self, logs: Path) -> None:
-        """A job has ended; its children wait for those of other jobs."""
+        """Do nothing: the children stay for the other jobs."""
 
     def shutdown(self) -> None:
         """End all children."""
@@ -104,5 +107,5 @@ class LocalPool:
 
 
 def machine_memory_mb() -> int:
-    """Memory of this machine."""
+    """Return the memory of this machine, MB."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") >> 20

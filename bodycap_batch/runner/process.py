@@ -1,4 +1,4 @@
-"""A child process: started, given orders, followed, ended."""
+"""A child process: start it, send it orders, read its messages, end it."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ from typing import Any, BinaryIO
 
 import bodycap_batch
 
-CHILD = (sys.executable, "-P", "-m", "bodycap_batch.tasks")
+CHILD_COMMAND = (sys.executable, "-P", "-m", "bodycap_batch.tasks")
 """Command line of a child, without the task file. It names the package of the stages, which lies in a layer
 above and is not imported here."""
 KILL_AFTER_S = 3.0
+"""Time that a child has to end by itself before it is killed, seconds. Evidence: none."""
 _POLL_S = 0.2
+"""Time after which the parent checks whether the job was stopped, seconds. Evidence: none."""
 _THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -32,7 +34,7 @@ class Child:
     """One child process in its own process group.
 
     Attributes:
-        loaded: Modules it was asked to load.
+        loaded: Modules that it was asked to load.
     """
 
     def __init__(self, command: Sequence[str], log: BinaryIO) -> None:
@@ -45,15 +47,15 @@ class Child:
             env=_environment(),
             start_new_session=True,
         )
-        self._rest = b""
+        self._incomplete = b""
 
     @property
     def returncode(self) -> int:
-        """Exit code once it has ended; negative for a signal."""
+        """Exit code of a child that has ended; negative for a signal."""
         return self._process.returncode
 
     def order(self, order: Mapping[str, Any]) -> None:
-        """Send one order; a child that is gone is noticed by `follow`."""
+        """Send one order; `follow` notices a child that has ended."""
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.write(json.dumps(order).encode() + b"\n")
@@ -62,11 +64,14 @@ class Child:
     def follow(
         self, cancelled: Callable[[], bool], on_message: Callable[[dict[str, Any]], None]
     ) -> dict[str, Any] | None:
-        """Read the child's lines until its task ends: its last message, None if it died or was cancelled.
+        """Read the child's messages until its task ends.
 
         Args:
-            cancelled: Asked several times a second whether to stop.
-            on_message: Called with every other message.
+            cancelled: Called several times a second; True stops the wait.
+            on_message: Called with every message but the last.
+
+        Returns:
+            The last message; None if the child died or the task was cancelled.
         """
         assert self._process.stdout is not None
         pipe = self._process.stdout.fileno()
@@ -75,7 +80,7 @@ class Child:
                 continue
             if not (data := os.read(pipe, 1 << 16)):
                 return None
-            *lines, self._rest = (self._rest + data).split(b"\n")
+            *lines, self._incomplete = (self._incomplete + data).split(b"\n")
             for message in map(json.loads, lines):
                 if message["event"] in ("done", "error"):
                     return dict(message)
@@ -83,7 +88,7 @@ class Child:
         return None
 
     def end(self, *, at_once: bool) -> None:
-        """Wait for the child, or stop its process group: SIGTERM, and SIGKILL after 3 s."""
+        """End the child: close its input, with `at_once` send SIGTERM too, and after a while SIGKILL."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):
@@ -98,7 +103,7 @@ class Child:
         self._process.stdout.close()
 
     def kill(self) -> None:
-        """End a child that waits, or loads libraries: there is nothing to lose."""
+        """Kill a child that has no task; nothing can be lost."""
         self._signal(signal.SIGKILL)
         self.end(at_once=False)
 
@@ -110,9 +115,10 @@ class Child:
 
 
 def _environment() -> dict[str, str]:
-    """The child's environment: the libraries' own pools off before they load, this package found.
+    """Return the child's environment variables: this package is found, and thread pools of libraries are off.
 
-    A stage's threads are its own: a pool's sums would depend on the machine's cores.
+    The pools must be off before the libraries load. Sums of a pool would depend on the machine's cores;
+    stages start their own threads instead.
     """
     package = str(Path(bodycap_batch.__file__).parent.parent)
     path = os.pathsep.join(part for part in (package, os.environ.get("PYTHONPATH")) if part)
@@ -120,8 +126,8 @@ def _environment() -> dict[str, str]:
     return {**os.environ, **pinned, "PYTHONPATH": path, "PYTHONUNBUFFERED": "1"}
 
 
-def death(returncode: int) -> str:
-    """How a child ended that said nothing."""
+def describe_end(returncode: int) -> str:
+    """Describe how a child ended that sent no last message."""
     if returncode >= 0:
         return f"the stage's process ended with code {returncode} and no message"
     try:
@@ -132,7 +138,7 @@ def death(returncode: int) -> str:
 
 
 def crash_hint(returncode: int) -> str:
-    """What to do about it."""
+    """Advise the user what to do about a child that ended without a message."""
     if returncode == -signal.SIGKILL:
         return (
             "probably out of memory: close other programs, or lower work_px in the job; run it again to go on"

@@ -1,4 +1,4 @@
-"""A task on another machine: the same child, started there."""
+"""Run a task on another machine, in the same child as here."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.core.errors import BodycapError, StoreError
-from bodycap_batch.runner.children import Children, Making
+from bodycap_batch.runner.children import Children, TaskEnvironment
 from bodycap_batch.runner.task import Task, task_from_json
 from bodycap_batch.store.artefacts import Store
 
@@ -17,23 +17,27 @@ _children: dict[tuple[str, ...], Children] = {}
 _lock = threading.Lock()
 
 
-def order_of(task: Task, making: Making, command: tuple[str, ...]) -> dict[str, Any]:
-    """All that another machine has to be told: paths on the shared disk, options, digests."""
-    return {"task": task.to_json(making.store.root), "logs": str(making.logs), "command": list(command)}
+def remote_order(task: Task, environment: TaskEnvironment, command: tuple[str, ...]) -> dict[str, Any]:
+    """Return what another machine needs to run a task, as JSON values; paths lie on the shared disk."""
+    return {
+        "task": task.to_json(environment.store.root),
+        "logs": str(environment.logs),
+        "command": list(command),
+    }
 
 
-def perform(
+def run_order(
     order: Mapping[str, Any], progress: Callable[[int, int, str], None], cancelled: Callable[[], bool]
 ) -> dict[str, Any]:
-    """Make and commit a task's artefact in a child of this machine.
+    """Compute and commit a task's artefact in a child of this machine.
 
     Args:
-        order: What `order_of` gave.
+        order: An order of `remote_order`.
         progress: Called as ``progress(done, total, what)``.
-        cancelled: Asked several times a second whether to stop.
+        cancelled: Called several times a second; True stops the task.
 
     Returns:
-        Nothing, or ``error`` and ``notes`` of the `BodycapError` that ended it.
+        An empty dict, or ``error`` and ``notes`` of the `BodycapError` that ended the task.
     """
     task, root = task_from_json(order["task"])
     try:
@@ -41,22 +45,22 @@ def perform(
         _require_same_program(task)
         store = Store(root)
         if not task.replaces and store.find(task.key) is not None:
-            return {}  # a worker that died committed it before it could say so
-        making = Making(
+            return {}  # a worker committed it and died before it could report
+        environment = TaskEnvironment(
             store=store,
             logs=Path(order["logs"]),
             progress=progress,
             cancelled=cancelled,
             may_commit=lambda: not cancelled(),
         )
-        _children_of(tuple(order["command"])).make(task, making)
+        _children_of(tuple(order["command"])).execute(task, environment)
     except BodycapError as error:
         return {"error": error.to_dict(), "notes": list(getattr(error, "__notes__", []))}
     return {}
 
 
 def _children_of(command: tuple[str, ...]) -> Children:
-    """This process's children; they end with it."""
+    """Return the children of this process; they end with it."""
     with _lock:
         return _children.setdefault(command, Children(command))
 

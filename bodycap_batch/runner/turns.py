@@ -1,4 +1,4 @@
-"""What several jobs need is made once: whoever comes second waits for it, and keeps no worker busy."""
+"""Compute a task that several jobs need only once: the second job waits, and keeps no worker busy."""
 
 from __future__ import annotations
 
@@ -8,46 +8,47 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from bodycap_batch.core.errors import Cancelled
-from bodycap_batch.runner.children import STOPPED, Executor, Making
+from bodycap_batch.runner.children import STOPPED, Executor, TaskEnvironment
 from bodycap_batch.runner.task import Task
 
 _POLL_S = 0.1
+"""Time after which a waiting job checks whether it was stopped, seconds. Evidence: none."""
 
 
 class Turns:
-    """The artefacts that are being made for the jobs of this process."""
+    """The artefacts that are being computed for the jobs of this process."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._under_way: set[tuple[Path, str]] = set()
 
     @contextmanager
-    def taken(self, task: Task, making: Making) -> Iterator[bool]:
-        """Wait until no other job makes the task's artefact; yields whether one has.
+    def taken(self, task: Task, environment: TaskEnvironment) -> Iterator[bool]:
+        """Wait until no other job computes the task's artefact; yield True if it is stored then.
 
         Raises:
             Cancelled: The job was stopped while it waited.
         """
-        place = (making.store.root, task.key.name)
+        artefact = (environment.store.root, task.key.name)
         with self._changed:
-            while place in self._under_way:
+            while artefact in self._under_way:
                 self._changed.wait(_POLL_S)
-                if making.cancelled():
+                if environment.cancelled():
                     raise Cancelled(STOPPED, hint="run it again to go on")
-            self._under_way.add(place)
+            self._under_way.add(artefact)
         try:
-            yield not task.replaces and making.store.find(task.key) is not None
+            yield not task.replaces and environment.store.find(task.key) is not None
         finally:
             with self._changed:
-                self._under_way.remove(place)
+                self._under_way.remove(artefact)
                 self._changed.notify_all()
 
 
-class TakingTurns:
-    """An executor of one job that leaves to others of this process what they are making already.
+class TurnTakingExecutor:
+    """An executor of one job that waits for artefacts which other jobs of this process already compute.
 
     Args:
-        executor: Makes what nobody else does.
+        executor: Runs the other tasks.
         turns: Shared by the jobs.
     """
 
@@ -55,12 +56,12 @@ class TakingTurns:
         self._executor = executor
         self._turns = turns
 
-    def make(self, task: Task, making: Making) -> None:
-        """Make and commit the task's artefact, or wait until another job has. Raises `BodycapError`."""
-        with self._turns.taken(task, making) as made:
-            if not made:
-                self._executor.make(task, making)
+    def execute(self, task: Task, environment: TaskEnvironment) -> None:
+        """Compute and commit the task's artefact, or wait until another job has. Raises `BodycapError`."""
+        with self._turns.taken(task, environment) as is_stored:
+            if not is_stored:
+                self._executor.execute(task, environment)
 
     def close(self, logs: Path) -> None:
-        """The job with these logs has ended."""
+        """End what the job with these logs needed; the job has ended."""
         self._executor.close(logs)

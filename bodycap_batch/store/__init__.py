@@ -1,4 +1,4 @@
-"""Stored results of finished stages, found again by what they were computed from."""
+"""Stored results of finished tasks, found again by what they were computed from."""
 
 from bodycap_batch.store.artefacts import Artefact, ArtefactKey, Store
 

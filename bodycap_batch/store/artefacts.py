@@ -1,9 +1,9 @@
-"""The artefact store: results of stages, found by what they were made from.
+"""The artefact store: results of tasks, found by what they were computed from.
 
-An artefact is a folder. Its key names the stage, the stage's algorithm, its options, the content of
-its inputs and the libraries; it is written to a temporary folder of the store, synced, described by a
-manifest that comes last, and renamed into place in one step. So whatever carries a key is complete,
-and a process may be killed at any moment.
+An artefact is a folder. Its key names the stage, the version of its algorithm, its options, the content of
+its inputs, and the libraries. The folder is written to a temporary place in the store and synced. A manifest
+is written last, and then the folder is renamed to its final name in one step. Every folder with the name of a
+key is therefore complete, and a process may be killed at any moment.
 """
 
 from __future__ import annotations
@@ -33,33 +33,40 @@ from bodycap_batch.store.digests import (
 )
 
 MANIFEST = "manifest.json"
+"""File that describes an artefact: its key, the digest of each file, and what it cost."""
 _AWAY = frozenset({
     errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.ECONNRESET, errno.ECONNABORTED,
     errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENETDOWN, errno.ENETUNREACH, errno.ENODEV, errno.ENXIO,
 })  # fmt: skip
-"""What a network disk answers while its server is away, and a disk that fails."""
+"""Errors of a network disk whose server does not answer, and of a disk that fails."""
 DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG}) | _AWAY
+"""Errors that a disk causes, not the file."""
 _VOLATILE_SUFFIXES = (".db",)
-"""A database differs from run to run although what it holds is the same: no part of the content."""
+"""Endings of files that are no part of the content: equal databases differ in their bytes from run to run."""
 _REMEMBER_BYTES = 1 << 20
-"""When an artefact is looked up, files above this are hashed again only if their inode, size or times
-changed: a finished job of any length is found finished in a moment. What a task reads is hashed whole."""
+"""Size above which a file is hashed again at a look-up only if its inode, size or times have changed, bytes.
+So a finished job of any length is found in a moment. What a task reads is always hashed. Evidence: none."""
 _Found = TypeVar("_Found")
 _LOCK = "lock"
+"""File of a draft that its process holds locked."""
 _SETTING_ASIDE = "setting-aside"
+"""Lock of the process that moves artefacts away from their final names."""
 _UNLOCKED = "new-"
-"""Name of a draft between its making and its locking; swept only when it is older than a minute."""
+"""Prefix of a draft's name until the draft is locked."""
 _STALE_S = 60.0
+"""Age from which a draft that was never locked is removed, seconds: creating and locking one takes
+milliseconds. Evidence: none."""
 _KEY_LENGTH = 32
+"""Hexadecimal digits of a key's name: 128 bits, too many for two keys ever to have the same name."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArtefactKey:
-    """What an artefact is made from; two equal keys stand for the same result.
+    """What an artefact is computed from; equal keys mean equal results.
 
     Attributes:
         stage: Stage name.
-        algorithm: Version of the stage's algorithm.
+        algorithm: Version of the stage's algorithm, see `code_version`.
         options: The stage's own options, JSON values.
         inputs: Digest (or small JSON value) of each input.
         libraries: Version of each library the stage computes with.
@@ -72,7 +79,7 @@ class ArtefactKey:
     libraries: Mapping[str, str]
 
     def document(self) -> dict[str, Any]:
-        """All of the key as JSON values."""
+        """Return the whole key as JSON values."""
         return asdict(self)
 
     @property
@@ -87,8 +94,8 @@ class Artefact:
 
     Attributes:
         path: Its folder.
-        digest: Digest of its content; equal content, equal digest, whatever it was made from.
-        made: How it was made (seconds, peak memory, threads); no part of its content.
+        digest: Digest of its content. Equal content has an equal digest, whatever it was computed from.
+        made: What it cost (seconds, peak memory, threads); no part of its content.
         files: Relative path of each file and its SHA-256.
     """
 
@@ -100,11 +107,11 @@ class Artefact:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Draft:
-    """An artefact being made.
+    """An artefact that is being written.
 
     Attributes:
         files: Folder whose content becomes the artefact.
-        work: Scratch folder on the same file system; vanishes with the draft.
+        work: Scratch folder on the same file system; removed with the draft.
     """
 
     files: Path
@@ -112,13 +119,13 @@ class Draft:
 
 
 class Store:
-    """Artefacts below one folder.
+    """The artefacts below one folder.
 
     Args:
-        root: The folder; made when absent.
+        root: The folder; created if it does not exist.
 
     Raises:
-        StoreError: The folder cannot be made or written.
+        StoreError: The folder cannot be created or written.
     """
 
     def __init__(self, root: Path) -> None:
@@ -134,7 +141,7 @@ class Store:
         self.digests = FileDigests(self.root / "digests")
 
     def find(self, key: ArtefactKey) -> Artefact | None:
-        """Look an artefact up; one whose digests do not hold is set aside and counts as absent."""
+        """Look an artefact up; a damaged one is set aside and counts as missing."""
         path = self._path(key)
         with disk_errors(self.root):
             if not path.is_dir():
@@ -143,21 +150,21 @@ class Store:
             return artefact or self._set_aside(path, lambda: self._verified(path, key))
 
     def verify(self, path: Path) -> None:
-        """Hash all of an artefact that is about to be read; what does not hold is set aside.
+        """Hash all files of an artefact that will be read; set it aside if it is damaged.
 
         Args:
             path: The artefact's folder.
 
         Raises:
-            StoreError: It is damaged, although nothing has written to it: the disk fails.
+            StoreError: It is damaged. Nothing writes to artefacts, so the disk fails.
         """
         with disk_errors(self.root):
             if not _is_sound(path) and not self._set_aside(path, lambda: _is_sound(path)):
-                hint = "check the disk; run the job again, what was damaged is made anew"
+                hint = "check the disk; run the job again, damaged results are computed again"
                 raise StoreError("a stored artefact is damaged", path=path, hint=hint)
 
     def artefacts_in(self, value: Any) -> Iterator[Path]:
-        """Folders of artefacts that the arguments of a task name."""
+        """Yield the folders of artefacts that occur in the arguments of a task."""
         if isinstance(value, Mapping):
             value = list(value.values())
         if isinstance(value, list | tuple):
@@ -168,10 +175,10 @@ class Store:
 
     @contextmanager
     def draft(self, key: ArtefactKey) -> Iterator[Draft]:
-        """Temporary folder for making an artefact; locked while in use, removed afterwards."""
+        """Yield a temporary folder for an artefact; it is locked while in use and removed afterwards."""
         with disk_errors(self.root):
             unlocked = Path(tempfile.mkdtemp(dir=self._temporary, prefix=_UNLOCKED))
-            # A file, opened for writing: network file systems lock nothing else across machines.
+            # Network file systems lock only files opened for writing across machines.
             lock = os.open(unlocked / _LOCK, os.O_RDWR | os.O_CREAT)
             fcntl.flock(lock, fcntl.LOCK_EX)
             folder = unlocked.with_name(f"{key.stage}-{unlocked.name.removeprefix(_UNLOCKED)}")
@@ -194,14 +201,14 @@ class Store:
         before: Callable[[], None] = lambda: None,
         replace: bool = False,
     ) -> Artefact:
-        """Make a draft's files the artefact of `key`, or return the one somebody else committed first.
+        """Make a draft's files the artefact of `key`, or return the artefact that was committed earlier.
 
         Args:
-            draft: Its files are synced to the disk.
-            key: What they were made from.
-            made: How they were made.
-            before: Called when nothing but the last, atomic step is left; may raise to prevent it.
-            replace: The draft takes the place of an artefact that is there already.
+            draft: The draft; its files are synced to the disk.
+            key: What they were computed from.
+            made: What they cost.
+            before: Called before the last, atomic step; may raise to prevent it.
+            replace: Replace an artefact that is stored already.
 
         Raises:
             StoreError: The disk is full or fails.
@@ -225,17 +232,17 @@ class Store:
             return self._move_in(draft.files, key)
 
     def sweep(self) -> int:
-        """Remove what killed processes left in the temporary folder; returns how many folders."""
+        """Remove the drafts of killed processes, and return their number."""
         try:
             folders = list(self._temporary.iterdir())
             for folder in (self.root / "digests", self.root / "references"):
                 remove_abandoned(folder)
-        except OSError:  # the next draft says what is wrong with the folder
+        except OSError:  # the next draft reports what is wrong with the folder
             return 0
         return sum(_remove_if_abandoned(folder) for folder in folders)
 
     def free_bytes(self) -> int:
-        """Room left on the store's disk."""
+        """Return the free space on the store's disk, bytes."""
         return shutil.disk_usage(self.root).free
 
     def _path(self, key: ArtefactKey) -> Path:
@@ -265,28 +272,30 @@ class Store:
             manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
             seal = manifest.pop("seal")
             sound = seal == json_digest(manifest) and manifest["key"] == _as_json(key.document())
-            sound = sound and all(self._holds(path / name, want) for name, want in manifest["files"].items())
+            sound = sound and all(
+                self._has_digest(path / name, expected) for name, expected in manifest["files"].items()
+            )
         except (FileNotFoundError, NotADirectoryError, ValueError, KeyError, AttributeError, TypeError):
-            return None  # damaged, or just being set aside by another process
+            return None  # damaged, or moved away at this moment by another process
         if not sound:
             return None
         return Artefact(path=path, digest=manifest["digest"], made=manifest["made"], files=manifest["files"])
 
-    def _holds(self, path: Path, want: str) -> bool:
+    def _has_digest(self, path: Path, expected: str) -> bool:
         if not path.is_file():
             return False
         large = path.stat().st_size > _REMEMBER_BYTES
-        return (self.digests.sha256(path) if large else file_sha256(path)) == want
+        return (self.digests.sha256(path) if large else file_sha256(path)) == expected
 
     def _set_aside(self, path: Path, look: Callable[[], _Found]) -> _Found:
-        """Move a damaged artefact away, unless a last look finds a sound one: another process was quicker.
+        """Move a damaged artefact away, unless `look` finds a sound one, because another process was faster.
 
-        Nobody else moves it between that look and the move, so what was made anew is never taken away. Where
-        nothing lies before the look, something made anew may lie there after it.
+        No other process moves it between `look` and the move, so a new artefact is never moved away. If there
+        was nothing before `look`, a new artefact may have been committed after it.
         """
         with self._setting_aside():
-            there = os.path.lexists(path)
-            if not (found := look()) and there:
+            existed = os.path.lexists(path)
+            if not (found := look()) and existed:
                 target = self._corrupt / f"{path.parent.name}-{path.name}-{time.time_ns()}"
                 with contextlib.suppress(FileNotFoundError):
                     os.replace(path, target)
@@ -294,7 +303,7 @@ class Store:
 
     @contextmanager
     def _setting_aside(self) -> Iterator[None]:
-        """Be the only process that takes artefacts from their places."""
+        """Be the only process that moves artefacts away from their final names."""
         handle = os.open(self.root / _SETTING_ASIDE, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX)
@@ -305,7 +314,7 @@ class Store:
 
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
-    """Turn operating system errors on the store's disk into `StoreError` with a remedy."""
+    """Turn operating system errors of a disk into `StoreError` with a remedy."""
     try:
         yield
     except OSError as error:
@@ -313,7 +322,7 @@ def disk_errors(path: Path) -> Iterator[None]:
 
 
 def store_error(error: OSError, path: Path) -> StoreError:
-    """Describe an operating system error with what to do about it."""
+    """Return the `StoreError` for an operating system error, with advice what to do about it."""
     hints = {
         errno.ENOSPC: "free some space, or name another disk with --store; finished stages are kept",
         errno.EDQUOT: "your disk quota is used up; name a folder on another disk with --store",
@@ -332,10 +341,10 @@ def store_error(error: OSError, path: Path) -> StoreError:
 
 
 def _is_sound(path: Path) -> bool:
-    """True where every file of an artefact holds what its manifest says."""
+    """Return True if every file of an artefact has the digest that its manifest states."""
     try:
         files = json.loads((path / MANIFEST).read_text(encoding="utf-8"))["files"]
-        return all(file_sha256(path / name) == want for name, want in files.items())
+        return all(file_sha256(path / name) == expected for name, expected in files.items())
     except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
         return False
 
@@ -349,7 +358,7 @@ def _content_digest(files: Mapping[str, str]) -> str:
 
 
 def _sync_files(folder: Path) -> dict[str, str]:
-    """Sync every file below a folder to the disk; returns relative path -> SHA-256."""
+    """Sync every file below a folder to the disk; return their SHA-256 by relative path."""
     digests: dict[str, str] = {}
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         with path.open("rb") as stream:
@@ -364,7 +373,7 @@ def _sync_folders(folder: Path) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Make sure that the names in a folder survive a power cut."""
+    """Sync the names in a folder to the disk, so that they survive a power failure."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -373,7 +382,7 @@ def sync_folder(path: Path) -> None:
 
 
 def _remove_if_abandoned(folder: Path) -> bool:
-    """Remove a draft whose process is gone: nobody holds its lock."""
+    """Remove a draft whose process has ended, which shows in its free lock."""
     try:
         if folder.name.startswith(_UNLOCKED) and time.time() - folder.stat().st_mtime < _STALE_S:
             return False

@@ -1,10 +1,11 @@
-"""Versions of algorithms and libraries, so that a stored result is never taken for another's."""
+"""Versions of algorithms and libraries: a stored result is reused only if both are the same."""
 
 from __future__ import annotations
 
 import ast
 import hashlib
 import re
+import threading
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -14,12 +15,14 @@ from typing import NamedTuple
 
 _PACKAGE = Path(__file__).parent.parent
 _NAMED = re.compile(r"bodycap_batch\.(\w+(?:\.\w+)*)")
-"""A string that names a module: one that a child loads ahead, or a package whose data files are read."""
+"""A string that names a module of this package, or one of its packages whose data files are read."""
 _NOT_COMPUTING = frozenset(
     {"core.errors", "core.context", "core.progress", "config", "config.options", "config.models"}
 )
-"""Modules that decide nothing about a result: options are part of the key by their values."""
+"""Modules that do not affect a result. The values of options are part of the key."""
 _SKIPPED_SUFFIXES = (".pyc", ".pyo")
+_reading = threading.Lock()
+"""Held while sources are read, so that several jobs of one process parse no file twice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,24 +44,26 @@ class Program:
 
 @cache
 def algorithm_version(module: str) -> str:
-    """Version of a stage's algorithm: a digest of a module's code and of all it imports from this package.
+    """Return the version of a stage's algorithm: a digest of a module's code and of all that it imports.
 
-    The version is derived, not counted by hand, so that changed code never reuses a stored result. Comments,
-    docstrings and the layout of the source are not part of it: rewording a sentence changes no version.
+    The version is computed, not counted by hand, so changed code never reuses a stored result. Comments,
+    docstrings and the layout of the source are not part of it.
 
     Args:
-        module: Below this package: the stage's task (``tasks.keyframes``), which imports the algorithm.
+        module: Module below this package: the stage's task (``tasks.keyframes``), which imports the
+            algorithm. Only imports from this package count.
     """
     digest = hashlib.sha256()
-    for path in sorted(_closure(module)):
-        digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")
-        digest.update(_source(path).content + b"\0")
+    with _reading:
+        for path in sorted(_closure(module)):
+            digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")
+            digest.update(_source(path).content + b"\0")
     return digest.hexdigest()[:16]
 
 
 @cache
 def library_versions(names: tuple[str, ...]) -> dict[str, str]:
-    """Installed version of each distribution; of alternatives (``a|b``) the one that is installed."""
+    """Return the installed version of each distribution; one of several alternatives (``a|b``) counts."""
     return {name.split("|")[0]: _installed(name.split("|")) for name in names}
 
 
@@ -72,7 +77,7 @@ def _installed(alternatives: Iterable[str]) -> str:
 
 
 def _closure(module: str) -> set[Path]:
-    """Files of the module and of what it imports from here."""
+    """Return the files of a module and of all that it imports from this package."""
     waiting, found = [module], set[Path]()
     while waiting:
         new = set(_files(waiting.pop())) - found
@@ -82,7 +87,7 @@ def _closure(module: str) -> set[Path]:
 
 
 class _Source(NamedTuple):
-    """What a file contributes to the digest, and the modules of this package that it names."""
+    """The part of a file that counts in the digest, and the modules of this package that it names."""
 
     content: bytes
     mentions: frozenset[str]
@@ -90,7 +95,7 @@ class _Source(NamedTuple):
 
 @cache
 def _source(path: Path) -> _Source:
-    """Read a file once, however many stages it is part of."""
+    """Read and parse a file; the result is kept, since many stages share files."""
     content = path.read_bytes()
     if path.suffix != ".py":
         return _Source(content, frozenset())
@@ -99,7 +104,7 @@ def _source(path: Path) -> _Source:
 
 
 def _mentions(tree: ast.AST) -> Iterator[str]:
-    """Modules below this package that are imported, or named by a string."""
+    """Yield the modules of this package that a file imports or names in a string."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("bodycap_batch."):
             yield str(node.module).partition(".")[2]
@@ -113,10 +118,10 @@ def _mentions(tree: ast.AST) -> Iterator[str]:
 
 
 def code_text(tree: ast.AST) -> str:
-    """The syntax tree as text, equal on all supported versions of Python.
+    """Return a syntax tree as text that is equal on all supported versions of Python.
 
-    Left out: positions, docstrings and other bare strings, and empty fields. Python 3.12 added the field
-    ``type_params``, Python 3.13 prints trees without empty lists; neither may change a digest.
+    Positions, docstrings, other bare strings and empty fields are left out. Python 3.12 added the field
+    ``type_params``, and Python 3.13 prints trees without empty lists. Neither may change a digest.
     """
     fields = []
     for name, value in ast.iter_fields(tree):
@@ -127,11 +132,11 @@ def code_text(tree: ast.AST) -> str:
 
 
 _IGNORED_FIELDS = frozenset({"ctx", "kind", "type_comment", "type_ignores"})
-"""Fields of syntax nodes that say nothing about what the code does."""
+"""Fields of syntax nodes that do not affect what the code does."""
 
 
 def _field_text(value: object) -> str:
-    """A field of a syntax node; empty where the field is."""
+    """Return a field of a syntax node as text; an empty field gives an empty text."""
     if isinstance(value, ast.Constant):
         return f"{type(value.value).__name__}:{value.value!r}"
     if isinstance(value, ast.JoinedStr):
@@ -147,7 +152,7 @@ def _field_text(value: object) -> str:
 
 
 def _is_bare_string(node: object) -> bool:
-    """A docstring, or the note on an assignment."""
+    """Return True for a docstring or the note on an assignment."""
     return (
         isinstance(node, ast.Expr)
         and isinstance(node.value, ast.Constant)
@@ -157,7 +162,7 @@ def _is_bare_string(node: object) -> bool:
 
 @cache
 def _files(name: str) -> tuple[Path, ...]:
-    """Files of a module; a package's are all files in it, data included."""
+    """Return the file of a module, or all files of a package, data included."""
     return tuple(_files_of(name))
 
 

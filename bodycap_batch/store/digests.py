@@ -1,4 +1,4 @@
-"""Content digests of files, remembered by what the file system says about them."""
+"""Digests of files, remembered by the files' identity in the file system."""
 
 from __future__ import annotations
 
@@ -15,26 +15,29 @@ from typing import Any
 from bodycap_batch.core.errors import CaptureError
 
 _BLOCK_BYTES = 1 << 20
+"""Bytes that are read and hashed at once. Evidence: none."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _TEMPORARY = re.compile(r"\.([0-9a-f]{8})\.(\d+)\.\d+\.part$")
-"""Ends with the machine, the process and a moment: machines may share the folder."""
-_SETTLED_S = 1.0
-"""A file changed this recently may change again within one tick of the file system's clock."""
+"""Name of a temporary file: it ends with the machine, the process and a time, since machines may share
+folders."""
+_MIN_AGE_S = 1.0
+"""Age from which the digest of a file is remembered, seconds. A younger file may change again within one tick
+of the file system's clock. Evidence: none."""
 
 
 def json_digest(value: Any) -> str:
-    """SHA-256 of a JSON value in its canonical form (sorted keys, no spaces)."""
+    """Return the SHA-256 of a JSON value in its canonical form (sorted keys, no spaces)."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def set_digest(files: Mapping[str, str]) -> str:
-    """SHA-256 of a set of named files from their own digests."""
+    """Return the SHA-256 of a set of named files, from the digest of each."""
     return json_digest(dict(sorted(files.items())))
 
 
 def file_sha256(path: Path, on_bytes: Callable[[int], None] | None = None) -> str:
-    """SHA-256 of a file's bytes; `on_bytes` is called with the size of each block read."""
+    """Return the SHA-256 of a file's bytes; `on_bytes` is called with the size of each block read."""
     digest = hashlib.sha256()
     with path.open("rb") as stream:
         while block := stream.read(_BLOCK_BYTES):
@@ -45,7 +48,7 @@ def file_sha256(path: Path, on_bytes: Callable[[int], None] | None = None) -> st
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file so that a reader sees the old bytes or the new ones, also after a power cut."""
+    """Write a file so that readers see either the old or the new bytes, also after a power failure."""
     temporary = temporary_beside(path)
     try:
         with temporary.open("wb") as stream:
@@ -58,12 +61,12 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def temporary_beside(path: Path) -> Path:
-    """A name in the same folder for a file that will be renamed to `path` when it is complete."""
+    """Return a name in the same folder for a file that is renamed to `path` once it is complete."""
     return path.with_name(f".{path.name}.{_machine()}.{os.getpid()}.{time.monotonic_ns()}.part")
 
 
 def remove_abandoned(folder: Path) -> None:
-    """Remove what killed processes of this machine left beside the files they were writing."""
+    """Remove the temporary files that killed processes of this machine left in a folder."""
     for path in folder.glob(".*.part"):
         named = _TEMPORARY.search(path.name)
         if named is not None and named.group(1) == _machine() and not _is_alive(int(named.group(2))):
@@ -87,33 +90,33 @@ def _is_alive(pid: int) -> bool:
 class FileDigests:
     """Digests of large files, kept by device, inode, size, mtime and ctime.
 
-    A file whose bytes change gets another ctime, which no program can set back; so an entry that is
-    found is right, and a finished job need not read its videos again.
+    If the bytes of a file change, its ctime changes, and no program can set that back. So an entry that is
+    found is correct, and a finished job does not read its videos again.
 
     Args:
-        folder: Where the entries are kept, one small file each.
+        folder: Folder of the entries, one small file each.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def sha256(self, path: Path, on_bytes: Callable[[int], None] | None = None) -> str:
-        """Digest of a file, from the cache where nothing about the file has changed.
+        """Return the SHA-256 of a file, from the stored entry if the file has not changed.
 
         Raises:
             CaptureError: The file changes while it is read.
         """
         before = _identity(path)
         entry = self._folder / hashlib.sha256(json.dumps(before).encode()).hexdigest()
-        known = entry.read_text() if entry.is_file() else ""
-        if _SHA256.fullmatch(known):
-            return known
+        stored = entry.read_text() if entry.is_file() else ""
+        if _SHA256.fullmatch(stored):
+            return stored
         digest = file_sha256(path, on_bytes)
         if _identity(path) != before:
             raise CaptureError(
                 "the file changes while it is read", path=path, hint="wait until it is copied completely"
             )
-        if time.time() - max(before[3], before[4]) / 1e9 > _SETTLED_S:
+        if time.time() - max(before[3], before[4]) / 1e9 > _MIN_AGE_S:
             self._folder.mkdir(parents=True, exist_ok=True)
             write_atomically(entry, digest.encode())
         return digest

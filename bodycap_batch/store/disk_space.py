@@ -1,4 +1,4 @@
-"""Room on the disk."""
+"""Check the free space on a disk before it is needed."""
 
 from __future__ import annotations
 
@@ -8,28 +8,31 @@ from pathlib import Path
 
 from bodycap_batch.core.errors import StoreError
 
-# A job of 354 frames kept 24 MB of intermediate files and results: 68 kB a frame, a third of it keyframes'
-# pictures. Hard captures have four times the keyframes.
 _BYTES_PER_FRAME = 70_000
-# Of large videos every frame is kept at the work size: noisy ones took 150 kB each at 960×720.
+"""Intermediate files and results per frame, bytes. Evidence: docs/decisions/pipeline.md."""
 _BYTES_PER_LARGE_FRAME = 150_000
-_HARD_TIMES = 4
-_BYTES_AT_LEAST = 50_000_000
+"""Further bytes per frame of a large video, all of whose frames are stored at the size that is processed.
+Evidence: docs/decisions/pipeline.md."""
+_HARD_CAPTURE_FACTOR = 4
+"""How much more a difficult capture may need: it has about four times the keyframes.
+Evidence: docs/decisions/pipeline.md."""
+_MIN_BYTES = 50_000_000
+"""Space that even the shortest job needs, bytes. Evidence: none."""
 
 
 def require_room(folder: Path, frames: int, large: int = 0) -> list[str]:
-    """See that a job's results and intermediate files fit into a folder that may be written.
+    """Check that a job's results and intermediate files fit into a folder, and that it may be written.
 
     Args:
-        folder: Where they go; it need not exist yet.
+        folder: Folder of the files; it need not exist yet.
         frames: Frames of all cameras.
-        large: How many of them are much larger than they are worked at.
+        large: How many of them are much larger than the size they are processed at.
 
     Returns:
-        What is worth telling.
+        Notes for the user.
 
     Raises:
-        StoreError: There is no room, or no right to write.
+        StoreError: The space is too small, or the folder may not be written.
     """
     while not folder.exists():
         folder = folder.parent
@@ -37,7 +40,7 @@ def require_room(folder: Path, frames: int, large: int = 0) -> list[str]:
         raise StoreError(
             "results cannot be written here", path=folder, hint="choose another folder with --out"
         )
-    need = _BYTES_AT_LEAST + _BYTES_PER_FRAME * frames + _BYTES_PER_LARGE_FRAME * large
+    need = _MIN_BYTES + _BYTES_PER_FRAME * frames + _BYTES_PER_LARGE_FRAME * large
     free = shutil.disk_usage(folder).free
     if free < need:
         raise StoreError(
@@ -45,6 +48,6 @@ def require_room(folder: Path, frames: int, large: int = 0) -> list[str]:
             path=folder,
             hint="make room, or choose another disk with --out",
         )
-    if free < _HARD_TIMES * need:
+    if free < _HARD_CAPTURE_FACTOR * need:
         return [f"{free / 1e6:.0f} MB free on the disk of {folder}: enough for an easy capture only"]
     return []

@@ -1,4 +1,4 @@
-"""Which artefacts the jobs still refer to, and the removal of the others."""
+"""The artefacts that jobs still refer to, and the removal of all others."""
 
 from __future__ import annotations
 
@@ -17,20 +17,23 @@ from bodycap_batch.store.artefacts import Store, disk_errors
 from bodycap_batch.store.digests import json_digest, write_atomically
 
 _FOLDER = "references"
+"""Folder of the store with one list of artefacts per folder of results."""
 _LOCK = "in-use"
+"""File that is locked while jobs use the store, and while it is cleaned."""
 
 
 class StoreBusy(StoreError):
-    """The store is in use in a way that leaves no room for this; trying again later helps."""
+    """The store is in use by a job, or is being cleaned; try again later."""
 
 
 class References:
-    """The artefacts one folder of results was made from.
+    """The artefacts that one folder of results was made from. They are kept as long as the folder exists.
 
     Args:
-        store: Where the artefacts are.
-        owner: The folder of results. When it is gone, so is its claim.
-        also: Where else it may lie, as it is being moved: its claim lasts while something is at one of them.
+        store: The store of the artefacts.
+        owner: The folder of results.
+        also: Other places of the folder while it is being moved. The artefacts are kept as long as one of the
+            places exists.
     """
 
     def __init__(self, store: Store, owner: Path, also: Iterable[Path] = ()) -> None:
@@ -44,7 +47,7 @@ class References:
         return self._root / _FOLDER / f"{json_digest(self._places[0])[:32]}.json"
 
     def add(self, artefact: Path) -> None:
-        """Keep one artefact more. Raises `StoreError`."""
+        """Refer to one more artefact. Raises `StoreError`."""
         name = artefact.relative_to(self._root).as_posix()
         with self._lock:
             if name not in self.named:
@@ -52,20 +55,20 @@ class References:
                 self._write()
 
     def keep_only(self, artefacts: Iterable[str]) -> None:
-        """Keep these (folders relative to the store) and no other. Raises `StoreError`."""
+        """Refer to these artefacts (folders relative to the store) and no others. Raises `StoreError`."""
         with self._lock:
             before, self.named = self.named, set(artefacts)
             if before != self.named:
                 self._write()
 
     def take_over(self, artefacts: Iterable[str]) -> None:
-        """Keep these, too, and say anew where the folder may lie. Raises `StoreError`."""
+        """Refer to these artefacts too, and write the places of the folder again. Raises `StoreError`."""
         with self._lock:
             self.named |= set(artefacts)
             self._write()
 
     def forget(self) -> None:
-        """Keep nothing. Raises `StoreError`."""
+        """Refer to no artefact. Raises `StoreError`."""
         with disk_errors(self._root):
             self._path.unlink(missing_ok=True)
 
@@ -78,45 +81,46 @@ class References:
 
 @contextlib.contextmanager
 def moving(store: Store, before: Path, *, wait: bool = True) -> Iterator[Callable[..., None]]:
-    """Keep what a folder of results was made from while its job is moved, also if this process is killed.
+    """Keep the artefacts of a folder of results while its job is moved, also if this process is killed.
 
     Args:
-        store: Where the artefacts are.
-        before: Where the folder is.
-        wait: Wait while the store is being cleaned, or raise `StoreBusy`.
+        store: The store of the artefacts.
+        before: The folder's present place.
+        wait: If the store is being cleaned, wait; if False, raise `StoreBusy`.
 
     Yields:
-        To be called as ``to(after, *others)`` just before the move: where the folder (or what it will be made
-        from again) will lie, and where else it may lie after that.
+        A function to call as ``to(after, *others)`` just before the move. `after` is the folder's new place,
+        or the place where it will be computed again; `others` are places where it may lie afterwards.
 
     Raises:
         StoreError: The disk fails.
     """
     with in_use(store, wait=wait):
         old = References(store, before)
-        bound: list[tuple[Path, ...]] = []
+        moves: list[tuple[Path, ...]] = []
 
         def to(after: Path, *others: Path) -> None:
             if old.named:
                 References(store, after, (*others, before)).take_over(old.named)
-                bound.append((after, *others))
+                moves.append((after, *others))
 
         yield to
-        for after, *others in bound[-1:]:
+        for after, *others in moves[-1:]:
             References(store, after, others).take_over(())
             old.forget()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Garbage:
-    """What no job refers to.
+    """The artefacts that no job refers to.
 
     Attributes:
         artefacts: Folders relative to the store.
         corrupt: Damaged artefacts that were set aside.
         gone: Folders of results that no longer exist.
-        kept: How many artefacts are referred to.
-        freed_bytes: What removing frees; a file that is also linked from a folder of results frees nothing.
+        kept: Number of artefacts that jobs refer to.
+        freed_bytes: Space that their removal frees. A file that is also linked from a folder of results frees
+            nothing.
     """
 
     artefacts: tuple[str, ...]
@@ -128,14 +132,14 @@ class Garbage:
 
 @contextlib.contextmanager
 def in_use(store: Store, *, wait: bool = False) -> Iterator[None]:
-    """Keep `collect_garbage` from this store meanwhile; while it is at work, wait or raise `StoreBusy`."""
+    """Use the store, so that it is not cleaned; while it is being cleaned, wait or raise `StoreBusy`."""
     kind = fcntl.LOCK_SH if wait else fcntl.LOCK_SH | fcntl.LOCK_NB
     with _locked(store, kind, "the store is being cleaned", "start again when `bodycap gc` has ended"):
         yield
 
 
 def collect_garbage(store: Store, *, delete: bool) -> Garbage:
-    """Find, and on request remove, what no job refers to.
+    """Find the artefacts that no job refers to, and remove them if `delete` is True.
 
     Raises:
         StoreError: A job is using the store, or the disk fails.
@@ -143,10 +147,10 @@ def collect_garbage(store: Store, *, delete: bool) -> Garbage:
     busy = "a job is running on this store", "wait until it has ended"
     with _locked(store, fcntl.LOCK_EX | fcntl.LOCK_NB, *busy), disk_errors(store.root):
         lists = {path: _read(path) for path in sorted((store.root / _FOLDER).glob("*.json"))}
-        gone = {path: places[0] for path, (places, _) in lists.items() if not any(map(_is_there, places))}
-        wanted = {name for path, (_, names) in lists.items() if path not in gone for name in names}
+        gone = {path: places[0] for path, (places, _) in lists.items() if not any(map(_exists, places))}
+        used = {name for path, (_, names) in lists.items() if path not in gone for name in names}
         found = [path for path in sorted((store.root / "artefacts").glob("*/*")) if path.is_dir()]
-        unused = [path for path in found if path.relative_to(store.root).as_posix() not in wanted]
+        unused = [path for path in found if path.relative_to(store.root).as_posix() not in used]
         corrupt = sorted((store.root / "corrupt").iterdir())
         garbage = Garbage(
             artefacts=tuple(path.relative_to(store.root).as_posix() for path in unused),
@@ -178,7 +182,7 @@ def _locked(store: Store, kind: int, refusal: str, hint: str) -> Iterator[None]:
 
 
 def _read(path: Path) -> tuple[list[str], list[str]]:
-    """Places and artefacts of a list; a list that cannot be read claims nothing."""
+    """Return the places and the artefacts of a list; an unreadable list refers to nothing."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         places = [content["owner"], *content.get("also", ())]
@@ -187,8 +191,8 @@ def _read(path: Path) -> tuple[list[str], list[str]]:
         return [""], []
 
 
-def _is_there(place: str) -> bool:
-    """Whether something lies there; a disk that does not answer raises `OSError`: nothing is removed then."""
+def _exists(place: str) -> bool:
+    """Return True if a place exists. `OSError` of a disk that does not answer prevents any removal."""
     return bool(place) and Path(place).exists()
 
 
@@ -198,7 +202,7 @@ def _freed_bytes(folder: Path) -> int:
 
 
 def _remove(folders: Iterable[Path], trash: Path) -> None:
-    """Out of sight in one step each, so that a kill leaves no half artefact, then away."""
+    """Remove folders: first rename each in one step, so that a killed process leaves no half artefact."""
     for folder in folders:
         moved = trash / f"removed-{folder.name}"
         os.replace(folder, moved)

@@ -10,7 +10,7 @@ from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, paths_of
 from bodycap_batch.tasks.loading import load_keyframes, load_map
-from bodycap_batch.tasks.registered import Registered
+from bodycap_batch.tasks.registered_cameras import RegisteredCameras
 from bodycap_batch.tasks.stage import RESULTS_FOLDER, Stage
 from bodycap_batch.tasks.typed_json import omitted_from_key
 
@@ -46,7 +46,7 @@ def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
 
     scene = load_map(task.map.path)
     paths = paths_of(task.registrations.values())
-    found = Registered.load(paths, scene.maps)
+    found = RegisteredCameras.load(paths, scene.maps)
     inputs = ExportInputs(
         out_dir=files / RESULTS_FOLDER,
         maps=scene.maps,

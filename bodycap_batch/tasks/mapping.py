@@ -155,8 +155,8 @@ def _save_map(result: MapResult, files: Path) -> None:
 
 _LIBRARIES = (*VISION_LIBRARIES, "pycolmap")
 _MODULES = (*VISION_MODULES, "pycolmap")
-# 1,080 frames of an easy walk took 341 MB, a violent one has four times the keyframes.
 _MEMORY_MB = 1500
+"""Memory to reserve for a task of the mapper, MB. Evidence: docs/decisions/pipeline.md."""
 MAP = Stage(
     name="map",
     task=MapTask,

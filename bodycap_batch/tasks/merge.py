@@ -1,4 +1,4 @@
-"""The task that solves the skeleton's motion."""
+"""The task that solves the motion of the skeleton."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.tasks.body import load_body
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_map
-from bodycap_batch.tasks.registered import Registered
+from bodycap_batch.tasks.registered_cameras import RegisteredCameras
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, Stage, write_summary
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def _merge_inputs(task: MergeTask) -> MergeInputs:
     from bodycap_batch.model.merge_data import MergeInputs
 
     scene = load_map(task.map.path)
-    found = Registered.load(paths_of(task.registrations.values()), scene.maps)
+    found = RegisteredCameras.load(paths_of(task.registrations.values()), scene.maps)
     skeleton, mounts = load_body(task.body)
     return MergeInputs(
         trajectories=found.trajectories,

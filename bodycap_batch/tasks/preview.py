@@ -1,4 +1,4 @@
-"""The task that films the results."""
+"""The task that renders the results as a video."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_map, load_registration
-from bodycap_batch.tasks.registered import Registered
+from bodycap_batch.tasks.registered_cameras import RegisteredCameras
 from bodycap_batch.tasks.stage import RESULTS_FOLDER, VISION_LIBRARIES, VISION_MODULES, Stage
 
 if TYPE_CHECKING:
@@ -61,26 +61,26 @@ def _preview_inputs(task: PreviewTask, path: Path, threads: int) -> PreviewInput
 
     scene = load_map(task.map.path)
     paths = paths_of(task.registrations.values())
-    found = Registered.load(paths, scene.maps)
+    found = RegisteredCameras.load(paths, scene.maps)
     merge = None if task.merge is None else read_dataclass(MergeResult, task.merge.path, "merge")
     registrations = [load_registration(artefact) for artefact in paths]
-    shown = _shown(scene.maps, merge)
-    moved = [shown[item.gauge].apply(item.points) for item in scene.maps if item.gauge in shown]
-    colours = [item.colors for item in scene.maps if item.gauge in shown]
+    transforms = _transforms_of(scene.maps, merge)
+    points = [transforms[item.gauge].apply(item.points) for item in scene.maps if item.gauge in transforms]
+    colours = [item.colors for item in scene.maps if item.gauge in transforms]
     return PreviewInputs(
         path=path,
         capture=_trunk_first(load_capture(task.capture, task.keyframes, threads=threads), merge),
         views=make_camera_views(registrations, scene.maps, found.clocks, merge),
         reference_frame="world" if merge is not None else scene.maps[0].gauge,
-        points=np.concatenate(moved),
+        points=np.concatenate(points),
         colours=np.concatenate(colours),
         bone_motion=None if merge is None else bones_from_motion(merge.motion),
         note=task.failure or "",
     )
 
 
-def _shown(maps: Sequence[Map], merge: MergeResult | None) -> dict[str, Similarity]:
-    """Where the maps stand that are in the room: those that merging placed, else the largest alone."""
+def _transforms_of(maps: Sequence[Map], merge: MergeResult | None) -> dict[str, Similarity]:
+    """Return the transform of each map to show: all that merging placed, else only the largest map."""
     import numpy as np
 
     from bodycap_batch.model.geometry import Similarity
@@ -91,7 +91,7 @@ def _shown(maps: Sequence[Map], merge: MergeResult | None) -> dict[str, Similari
 
 
 def _trunk_first(capture: Capture, merge: MergeResult | None) -> Capture:
-    """The trunk's cameras, which see the arms, come first and are shown largest; those of nobody last."""
+    """Sort the cameras: those on the trunk, which are shown largest, then on limbs, then the unused ones."""
     from dataclasses import replace
 
     from bodycap_batch.model.skeleton_presets import split_side

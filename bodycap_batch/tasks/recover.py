@@ -10,12 +10,12 @@ from bodycap_batch.config.options import RegistrationOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
-from bodycap_batch.tasks.registered import RIG_POSES
+from bodycap_batch.tasks.registered_cameras import RIG_POSES
 from bodycap_batch.tasks.registration import NOT_ROUNDS, save_registration
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, read_summary
 
 _MEMORY_MB = 900
-"""With as many keyframes and frames held as recovery allows, at half a megabyte each."""
+"""Memory to reserve, MB: as many keyframes and frames as recovery holds at most, at half a megabyte each."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

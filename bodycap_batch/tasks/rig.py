@@ -10,7 +10,7 @@ from bodycap_batch.config.options import RegistrationOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
-from bodycap_batch.tasks.registered import RIG_POSES
+from bodycap_batch.tasks.registered_cameras import RIG_POSES
 from bodycap_batch.tasks.registration import NOT_ROUNDS, save_registration
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage
 

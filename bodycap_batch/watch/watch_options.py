@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from bodycap_batch.runner import CHILD
+from bodycap_batch.runner import CHILD_COMMAND
 from bodycap_batch.watch.dropped_job import JobPermissions
 
 _MAX_HEARTBEAT_S = 5.0
@@ -40,7 +40,7 @@ class WatchOptions:
     stale_s: float = 60.0
     poll: bool | None = None
     once: bool = False
-    command: Sequence[str] = CHILD
+    command: Sequence[str] = CHILD_COMMAND
 
     @property
     def heartbeat_period_s(self) -> float:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.cli import main
-from bodycap_batch.runner import Children, Executor, Making, Task
+from bodycap_batch.runner import Children, Executor, Task, TaskEnvironment
 from bodycap_batch.store.artefacts import ArtefactKey, Store
 from tests.cluster.site import REAL, Site
 from tests.unit.runner.test_runner import FAKE
@@ -129,11 +129,11 @@ def _ms(executor: Executor, store: Store, folder: Path, name: str) -> float:
 
 def _make(executor: Executor, store: Store, folder: Path, value: str) -> None:
     key = ArtefactKey(stage="work", algorithm="1", options={"value": value}, inputs={}, libraries={})
-    making = Making(
+    environment = TaskEnvironment(
         store=store,
         logs=folder / "logs",
         progress=lambda done, total, what: None,
         cancelled=lambda: False,
         may_commit=lambda: True,
     )
-    executor.make(Task(key=key, arguments={"value": value}), making)
+    executor.execute(Task(key=key, arguments={"value": value}), environment)

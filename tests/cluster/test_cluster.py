@@ -78,7 +78,7 @@ def test_a_task_that_kills_two_workers_is_given_up_and_the_other_jobs_are_done(s
     out, err = process.communicate(timeout=200)
     assert process.returncode == 70, err
     rows = {line.split()[0]: line for line in out.splitlines()}
-    assert "2 workers died while they worked on it" in rows["tuesday"]
+    assert "2 workers died while they ran it" in rows["tuesday"]
     assert out.splitlines()[-1] == "2 of 3 jobs done"
 
 
@@ -189,8 +189,8 @@ def test_the_link_can_be_encrypted(site: Site) -> None:
     assert out.splitlines()[-1] == "1 of 1 jobs done"
     site.environment = plain
     code, _, err = site.run("monday", "--executor", address)
-    assert code == 2, "without the certificates nobody gets in"
-    assert "no certificates to talk to tls://" in err
+    assert code == 2, "a client without certificates is refused"
+    assert "no certificates for the connection to tls://" in err
 
 
 def test_real_stages_with_a_worker_killed_give_the_bytes_of_one_machine(tmp_path: Path) -> None:

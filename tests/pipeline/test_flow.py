@@ -11,7 +11,7 @@ import pytest
 from bodycap_batch.config.models import Job
 from bodycap_batch.pipeline import Settings, run_job
 from bodycap_batch.pipeline.flow import Flow
-from bodycap_batch.runner import Children, Making, Task
+from bodycap_batch.runner import Children, Task, TaskEnvironment
 from bodycap_batch.store.artefacts import Store
 from bodycap_batch.tasks.stages import STAGES
 from tests.pipeline.test_run import CHILD, Bench, bench
@@ -44,17 +44,17 @@ def test_the_last_cameras_share_all_threads(
 
 
 class Watched(Children):
-    """Children that note what others were to load meanwhile, by stage."""
+    """Children that note what others were to load preload, by stage."""
 
     def __init__(self) -> None:
         super().__init__(CHILD)
-        self.meanwhile: dict[str, set[str]] = {}
+        self.preload: dict[str, set[str]] = {}
         self.arguments: dict[str, Mapping[str, Any]] = {}
 
-    def make(self, task: Task, making: Making) -> None:
-        self.meanwhile[task.key.stage] = {name for modules in making.meanwhile for name in modules}
+    def execute(self, task: Task, environment: TaskEnvironment) -> None:
+        self.preload[task.key.stage] = {name for modules in environment.preload for name in modules}
         self.arguments[task.key.stage] = task.arguments
-        super().make(task, making)
+        super().execute(task, environment)
 
 
 @pytest.mark.parametrize(("threads", "skeleton"), [(2, "upper_body"), (2, "none"), (1, "upper_body")])
@@ -70,9 +70,9 @@ def test_what_comes_later_is_loaded_while_a_core_is_idle(bench: Bench, threads: 
     run_job(bench.job(skeleton=skeleton), out_dir=bench.out, settings=settings)
     later = {"export", "report"} | ({"merge"} if skeleton != "none" else set())
     wanted = {name for stage in later for name in STAGES[stage].modules}
-    assert children.meanwhile["map"] == (wanted if threads > 1 else set())
+    assert children.preload["map"] == (wanted if threads > 1 else set())
     if skeleton != "none":
-        assert children.meanwhile["merge"] == (set(STAGES["preview"].modules) if threads > 1 else set())
+        assert children.preload["merge"] == (set(STAGES["preview"].modules) if threads > 1 else set())
 
 
 @pytest.mark.parametrize("board", [None, {"square_m": 0.1, "columns": 7, "rows": 5}])

@@ -110,8 +110,8 @@ ONE = "capture: {{cameras: [{{name: torso, video: {}}}]}}"
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (ONE.format("../secret.mp4"), "climbs out"),
-        (ONE.format("torso/../../secret.mp4"), "climbs out"),
+        (ONE.format("../secret.mp4"), "leads out"),
+        (ONE.format("torso/../../secret.mp4"), "leads out"),
         (ONE.format("/etc/passwd"), "outside"),
         (ONE.format("link.mp4"), "link"),
         (ONE.format("torso.mp4, calibration: /etc/passwd"), "outside"),
@@ -120,7 +120,7 @@ ONE = "capture: {{cameras: [{{name: torso, video: {}}}]}}"
         (ONE.format("loop.mp4"), ""),
         (
             "skeleton: ../secret.bvh\n" + ONE.format("torso.mp4}, {name: head, video: left_palm.mp4"),
-            "climbs out",
+            "leads out",
         ),
         (
             "skeleton: /etc/secret.bvh\n" + ONE.format("torso.mp4}, {name: head, video: left_palm.mp4"),

@@ -151,12 +151,12 @@ def test_results_beside_the_videos_are_no_camera(tmp_path: Path) -> None:
 
 def test_results_do_not_lie_among_what_they_are_made_from(tmp_path: Path) -> None:
     root = folder(tmp_path / "walk", "torso.mp4", "left_palm.mp4")
-    with pytest.raises(JobError, match="among what they are made from") as caught:
+    with pytest.raises(JobError, match="folder of the job's own files") as caught:
         load_job(root, Overrides(out=root))
     assert str(root / "results") in str(caught.value.hint)
     own = folder(tmp_path, "jobs/job.yaml") / "jobs" / "job.yaml"
     own.write_text("out: .\ncapture: {cameras: [{name: torso, video: ../walk/torso.mp4}]}\n")
-    with pytest.raises(JobError, match="among what they are made from"):
+    with pytest.raises(JobError, match="folder of the job's own files"):
         load_job(own)
     folder(tmp_path, "jobs/run.json")
     assert load_job(own).out == own.parent, "the resolved job of results runs again as it is"
@@ -177,7 +177,7 @@ def test_a_camera_whose_videos_did_not_come_along(tmp_path: Path) -> None:
 
 
 def test_a_video_is_no_job(tmp_path: Path) -> None:
-    with pytest.raises(JobError, match="a video is no job") as caught:
+    with pytest.raises(JobError, match="a video is not a job") as caught:
         load_job(folder(tmp_path, "torso.mp4") / "torso.mp4")
     assert str(tmp_path) in str(caught.value.hint)
 
@@ -194,8 +194,8 @@ def test_cameras_that_cannot_tell_the_size_are_refused_beforehand() -> None:
         )
         cameras = [{"name": f"c{n}", "video": [f"{n}.mp4"], "segment": role} for n, role in enumerate(roles)]
         problems = problems_in(Job.model_validate({"capture": {"cameras": cameras}}))
-        told = any("how large the body is" in problem.message for problem in problems)
-        if told == known:
+        refused = any("size of the body" in problem.message for problem in problems)
+        if refused == known:
             wrong.append(roles)
     assert not wrong
 

@@ -22,7 +22,7 @@ from bodycap_batch.registration import RegisteredCamera, register_in_rig
 from bodycap_batch.registration.poses.batched_pnp import Observations, linearise, make_observations
 from bodycap_batch.tasks import recover
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
-from bodycap_batch.tasks.registered import RIG_POSES
+from bodycap_batch.tasks.registered_cameras import RIG_POSES
 from bodycap_batch.tasks.registration import save_registration
 from bodycap_batch.tasks.stage import read_summary
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from bodycap_batch.core.errors import BodycapError, Cancelled
-from bodycap_batch.runner import Making, Task, dask_cluster
+from bodycap_batch.runner import Task, TaskEnvironment, dask_cluster
 from bodycap_batch.store.artefacts import ArtefactKey, Store
 
 
@@ -45,14 +45,14 @@ class Client:
 def make(client: Client, folder: Path, told: list[str], *, cancelled: bool = False) -> None:
     """Hand a map, which declares 1,500 MB, over."""
     key = ArtefactKey(stage="map", algorithm="1", options={}, inputs={}, libraries={})
-    making = Making(
+    environment = TaskEnvironment(
         store=Store(folder),
         logs=folder,
         progress=lambda done, total, what: told.append(what),
         cancelled=lambda: cancelled,
         may_commit=lambda: True,
     )
-    dask_cluster.Cluster("tcp://nowhere:1").make(Task(key=key, memory_mb=1500), making)
+    dask_cluster.Cluster("tcp://nowhere:1").execute(Task(key=key, memory_mb=1500), environment)
 
 
 def test_a_task_waits_for_the_first_worker_so_that_its_limits_are_known(
@@ -117,7 +117,7 @@ def test_the_tasks_of_a_worker_share_its_cores(
     )
     monkeypatch.setattr("distributed.get_worker", lambda: worker)
     monkeypatch.setattr(dask_cluster.os, "cpu_count", lambda: 8)
-    monkeypatch.setattr(dask_cluster, "perform", lambda order, *_: order["task"])
+    monkeypatch.setattr(dask_cluster, "run_order", lambda order, *_: order["task"])
     answer = dask_cluster._on_worker({"task": {"threads": threads}}, "topic")
     assert answer["threads"] == want
     assert answer["threads"] * tasks_at_once <= max(8, tasks_at_once)
@@ -142,7 +142,7 @@ def test_a_worker_tells_its_progress_not_more_often_than_once_a_second(
             now[0] += 0.2
         return {}
 
-    monkeypatch.setattr(dask_cluster, "perform", perform)
+    monkeypatch.setattr(dask_cluster, "run_order", perform)
     dask_cluster._on_worker({"task": {"threads": 1}}, "topic")
     assert told[0] == 0
     # 2 s, rounding of the clock's steps aside.

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from bodycap_batch.core.errors import Cancelled
-from bodycap_batch.runner import Making, Task
+from bodycap_batch.runner import Task, TaskEnvironment
 from bodycap_batch.runner.pool import Slots, machine_memory_mb
-from bodycap_batch.runner.turns import TakingTurns, Turns
+from bodycap_batch.runner.turns import Turns, TurnTakingExecutor
 from bodycap_batch.store.artefacts import ArtefactKey, Store
 
 
@@ -109,8 +109,8 @@ def test_this_machine_has_memory() -> None:
     assert machine_memory_mb() > 256
 
 
-def making_in(store: Store, cancelled: threading.Event | None = None) -> Making:
-    return Making(
+def environment_in(store: Store, cancelled: threading.Event | None = None) -> TaskEnvironment:
+    return TaskEnvironment(
         store=store,
         logs=store.root,
         progress=lambda *_: None,
@@ -125,7 +125,7 @@ def test_what_two_jobs_need_is_made_once_unless_it_is_to_be_made_again(tmp_path:
     made: list[int] = []
 
     def work(number: int) -> None:
-        with turns.taken(task, making_in(store)) as there:
+        with turns.taken(task, environment_in(store)) as there:
             if there:
                 return
             made.append(number)
@@ -149,29 +149,29 @@ class Counting:
     def __init__(self) -> None:
         self.made = self.closed = 0
 
-    def make(self, task: Task, making: Making) -> None:
+    def execute(self, task: Task, environment: TaskEnvironment) -> None:
         self.made += 1
         time.sleep(0.05)
-        with making.store.draft(task.key) as draft:
+        with environment.store.draft(task.key) as draft:
             (draft.files / "made_by").write_text("somebody")
-            making.store.commit(draft, task.key, {})
+            environment.store.commit(draft, task.key, {})
 
     def close(self, logs: Path) -> None:
         self.closed += 1
 
 
 def test_jobs_side_by_side_leave_to_each_other_what_is_being_made(tmp_path: Path) -> None:
-    store, turns, each = Store(tmp_path), Turns(), [Counting() for _ in range(3)]
-    jobs = [TakingTurns(own, turns) for own in each]
-    threads = [threading.Thread(target=job.make, args=[a_task(), making_in(store)]) for job in jobs]
+    store, turns, executors = Store(tmp_path), Turns(), [Counting() for _ in range(3)]
+    jobs = [TurnTakingExecutor(own, turns) for own in executors]
+    threads = [threading.Thread(target=job.execute, args=[a_task(), environment_in(store)]) for job in jobs]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join(10)
     for job in jobs:
         job.close(tmp_path)
-    assert sum(own.made for own in each) == 1
-    assert [own.closed for own in each] == [1, 1, 1]
+    assert sum(own.made for own in executors) == 1
+    assert [own.closed for own in executors] == [1, 1, 1]
 
 
 def test_who_waits_for_another_job_can_be_stopped_or_takes_over_where_that_failed(tmp_path: Path) -> None:
@@ -179,14 +179,16 @@ def test_who_waits_for_another_job_can_be_stopped_or_takes_over_where_that_faile
     stop.set()
 
     def fail_while_another_is_stopped() -> None:
-        with turns.taken(a_task(), making_in(store)) as there:
+        with turns.taken(a_task(), environment_in(store)) as there:
             assert not there
-            with pytest.raises(Cancelled), turns.taken(a_task(), making_in(store, stop)):
+            with pytest.raises(Cancelled), turns.taken(a_task(), environment_in(store, stop)):
                 pytest.fail("two at once")
-            with turns.taken(replace(a_task(), key=replace(a_task().key, stage="merge")), making_in(store)):
+            with turns.taken(
+                replace(a_task(), key=replace(a_task().key, stage="merge")), environment_in(store)
+            ):
                 raise RuntimeError("no map")
 
     with pytest.raises(RuntimeError, match="no map"):
         fail_while_another_is_stopped()
-    with turns.taken(a_task(), making_in(store)) as there:
+    with turns.taken(a_task(), environment_in(store)) as there:
         assert not there

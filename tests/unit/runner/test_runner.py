@@ -27,7 +27,7 @@ from bodycap_batch.core.errors import (
 )
 from bodycap_batch.core.progress import Event
 from bodycap_batch.runner import Children, NotStored, Rules, Runner, Task
-from bodycap_batch.runner.child import _DiskWatch
+from bodycap_batch.runner.child import DiskFailures
 from bodycap_batch.store.artefacts import ArtefactKey, Store
 
 ROOT = Path(__file__).parents[3]
@@ -392,7 +392,7 @@ def test_a_video_is_not_to_blame_where_its_disk_does_not_answer(
 
     if asked:
         monkeypatch.setattr(Path, "open", fail)
-    with pytest.raises(BodycapError) as caught, _DiskWatch(store):
+    with pytest.raises(BodycapError) as caught, DiskFailures(store):
         raise CaptureError("decoding fails", path=video) from (OSError(said, "x") if said else None)
     assert isinstance(caught.value, DiskAway if away else CaptureError)
     assert caught.value.path == str(video)
@@ -402,5 +402,5 @@ def test_what_is_no_plain_file_is_not_asked(tmp_path: Path) -> None:
     pipe = tmp_path / "torso.mp4"
     os.mkfifo(pipe)  # opening it would wait for somebody to write
     for path in (pipe, tmp_path, tmp_path / "none"):
-        with pytest.raises(CaptureError, match="no such video"), _DiskWatch(Store(tmp_path / "store")):
+        with pytest.raises(CaptureError, match="no such video"), DiskFailures(Store(tmp_path / "store")):
             raise CaptureError("no such video", path=path)

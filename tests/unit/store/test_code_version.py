@@ -5,7 +5,9 @@ from __future__ import annotations
 import ast
 import hashlib
 import shutil
+from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -56,6 +58,26 @@ def imported_rooms(path: Path) -> Iterator[str]:
 def test_the_same_sources_have_the_same_version(copied: Path) -> None:
     assert versions() == versions()
     assert len(set(versions().values())) == len({stage.module for stage in STAGES.values()})
+
+
+def test_each_file_is_parsed_once_and_only_when_a_stage_needs_it(
+    copied: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parse, parsed = ast.parse, Counter[str]()
+
+    def counting(source: bytes, filename: str) -> ast.AST:
+        parsed[filename] += 1
+        return parse(source, filename)
+
+    monkeypatch.setattr(ast, "parse", counting)
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(code_version.algorithm_version, [STAGES["check"].module] * 4))
+    assert str(copied / "check" / "__init__.py") in parsed
+    assert str(copied / "mapping" / "build.py") not in parsed
+    for stage in STAGES.values():
+        code_version.algorithm_version(stage.module)
+    assert str(copied / "mapping" / "build.py") in parsed
+    assert set(parsed.values()) == {1}
 
 
 @pytest.mark.parametrize("stage", sorted(STAGES))

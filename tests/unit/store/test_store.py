@@ -344,7 +344,7 @@ def test_a_digest_is_remembered_until_the_file_changes(tmp_path: Path) -> None:
 def test_a_remembered_digest_is_not_computed_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     video = tmp_path / "video.mp4"
     video.write_bytes(b"frames")
-    monkeypatch.setattr("bodycap_batch.store.digests._SETTLED_S", -1.0)
+    monkeypatch.setattr("bodycap_batch.store.digests._MIN_AGE_S", -1.0)
     digests = FileDigests(tmp_path / "digests")
     first, read = digests.sha256(video), []
     assert digests.sha256(video, read.append) == first
@@ -356,7 +356,7 @@ def test_a_broken_entry_of_the_digests_is_not_believed(
 ) -> None:
     video = tmp_path / "video.mp4"
     video.write_bytes(b"frames")
-    monkeypatch.setattr("bodycap_batch.store.digests._SETTLED_S", -1.0)
+    monkeypatch.setattr("bodycap_batch.store.digests._MIN_AGE_S", -1.0)
     digests = FileDigests(tmp_path / "digests")
     first = digests.sha256(video)
     for entry in (tmp_path / "digests").iterdir():
