@@ -25,8 +25,8 @@ _PERCENTILE, _PERCENTILE_SIGMAS = 90.0, 2.5
 """Deviations are judged by this percentile. For Gaussian noise with one sigma on three axes, the 90th
 percentile of the norm is 2.5 sigmas (chi distribution with three degrees of freedom)."""
 _MIN_DURATION_RATIO = 0.5
-"""Smallest localised time of a stationary camera, as a ratio of that of the camera localised longest: a person
-who stands still for a second shows nothing about the rest. Evidence: none."""
+"""Smallest localised time of a stationary camera, as a ratio of that of the camera localised longest: a
+person who stands still for a second shows nothing about the rest. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +101,9 @@ def _keeps_position(path: _CameraPath, others: Iterable[_CameraPath]) -> bool:
     """Return whether a camera keeps its position while another one of its map moves."""
     span = int(path.times_ns.min()), int(path.times_ns.max())
     deviations = [other.deviations_during(*span) for other in others if other.gauge == path.gauge]
-    largest = max(float(np.percentile(each, _PERCENTILE)) for each in deviations if len(each) >= _WINDOW_FRAMES)
+    largest = max(
+        float(np.percentile(each, _PERCENTILE)) for each in deviations if len(each) >= _WINDOW_FRAMES
+    )
     centred = path.centres - np.median(path.centres, axis=0)
     return _deviates_little(centred, _MAX_DEVIATION_RATIO * largest, path.sigma_map)
 

@@ -11,7 +11,7 @@ import pytest
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import kinematic_chain
-from bodycap_batch.merging.body.initial_poses import reach_constraint
+from bodycap_batch.merging.body.provisional_scale import reach_constraint
 from bodycap_batch.merging.body_calibration import calibration_graph
 from bodycap_batch.merging.body_calibration.anthropometry import placements, proportions
 from bodycap_batch.merging.body_calibration.calibration_graph import Calibration
@@ -138,7 +138,9 @@ def test_a_t_pose_is_no_gesture(body, monkeypatch):
     calibration = Calibration(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
     calibration.solve(1.0, iterations=1)
     asked = []
-    monkeypatch.setattr(calibration_graph, "widen_joint_priors", lambda *args: asked.append(args[2:]) or bones)
+    monkeypatch.setattr(
+        calibration_graph, "widen_joint_priors", lambda *args: asked.append(args[2:]) or bones
+    )
     calibration.widen_postures()
     ((poses, times_ns),) = asked
     assert 0 < len(times_ns) < len(posed)
