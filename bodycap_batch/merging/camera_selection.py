@@ -10,7 +10,7 @@ import numpy as np
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import kinematic_chain
-from bodycap_batch.merging.body.initial_poses import reach_constraint
+from bodycap_batch.merging.body.provisional_scale import reach_constraint
 from bodycap_batch.merging.body_calibration.camera_roll import has_unknown_roll
 from bodycap_batch.merging.cameras.stationary import stationary_cameras
 from bodycap_batch.merging.map_alignment.align import UsableCameras, align_cameras

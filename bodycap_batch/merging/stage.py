@@ -13,7 +13,7 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.merging.body.bones import Bone, kinematic_chain
 from bodycap_batch.merging.body.completion import complete_skeleton, observed_joints
-from bodycap_batch.merging.body.initial_poses import provisional_scale
+from bodycap_batch.merging.body.provisional_scale import provisional_scale
 from bodycap_batch.merging.body_calibration.calibrate_body import (
     BodyCalibration,
     CalibrationInput,
@@ -42,11 +42,9 @@ from bodycap_batch.merging.world.floor import (
     floor_beside_path,
     floor_from_feet,
     floor_from_points,
-    initial_heading,
-    place,
-    rotation_to_z_up,
     standing_height,
 )
+from bodycap_batch.merging.world.world_frame import initial_heading, rotation_to_z_up, world_from_solved_frame
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs, MergeResult, SolvedBody
 from bodycap_batch.model.scene import Trajectory
@@ -105,7 +103,7 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         [inflate_sigmas(track, mount) for track, mount in zip(metric, calibrated.mounts, strict=True)],
         step,
         window_ticks=max_window_ticks(len(bones), tracks, tick_times),
-        spread=calibrated.spread,
+        error_modes=calibrated.spread,
     )
     world_from_solved, joints, solved, floor = _place_in_world(inputs, bones, solution, calibrated, fps)
     place = Similarity(calibrated.scale, world_from_solved.rotation, world_from_solved.translation)
@@ -218,7 +216,7 @@ def _place_in_world(
     if floor.source != "map":
         floor = floor_from_feet(inputs.skeleton, joints, solved) or floor
     forward = -joints[:, 0, :3, 1]
-    placed = place(rotation, hips[0], floor.height_m, initial_heading(forward, hips, fps))
+    placed = world_from_solved_frame(rotation, hips[0], floor.height_m, initial_heading(forward, hips, fps))
     to_world = Similarity(1.0, placed.rotation @ rotation.T, placed.translation)
     return placed, to_world.apply_to_poses(joints), solved, floor
 

@@ -1,1 +1,1 @@
-"""The kinematic chain, and first poses of its bones."""
+"""The body as the graph sees it: bones and joint priors, initial poses, T-pose, trunk lean, completion."""

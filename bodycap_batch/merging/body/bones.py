@@ -1,9 +1,10 @@
-"""The bones that become variables of the graph, with what is known about each joint beforehand."""
+"""The bones that are variables of the graph, with the prior of each joint."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,15 +14,23 @@ from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions, segment_axes, split_side
 
 JOINT_SLACK_M = 0.005
-"""How far a bone's end may leave its parent's joint: soft tissue, and room for the optimiser to move."""
+"""Sigma per axis, in metres, of the gap between a bone's joint and its place on the parent: soft tissue, and
+room for the optimiser. Evidence: none."""
 
 HINGE_ARM_M = 0.3
-"""Where the two ranges that make a hinge are anchored, either side of it along its axis."""
+"""Distance in metres of a hinge's two anchors from the joint, along its axis. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
 class _JointPrior:
-    """Rest rotation and spread of a joint, about its along, forward and flexion axes."""
+    """Prior of a joint.
+
+    Attributes:
+        relaxed_flexion_deg: Flexion of a person who stands relaxed.
+        sigma_deg: Sigmas about the along, forward and flexion axes.
+        psd_rotation: Power spectral density of the rotational acceleration, rad²/s³.
+        psd_translation: The same of the acceleration, m²/s³.
+    """
 
     relaxed_flexion_deg: float
     sigma_deg: tuple[float, float, float]
@@ -29,9 +38,6 @@ class _JointPrior:
     psd_translation: float
 
 
-# Spreads: the everyday range of each joint (half of the range of motion in D. A. Neumann, "Kinesiology of the
-# Musculoskeletal System", is about two sigmas). Power spectral densities (rad²/s³, m²/s³) were measured on
-# walking with reaching.
 _PRIORS = {
     "Hips": _JointPrior(0.0, (30.0, 15.0, 15.0), 2.4, 1.5),
     "Spine": _JointPrior(0.0, (8.0, 8.0, 10.0), 2.4, 1.5),
@@ -47,29 +53,47 @@ _PRIORS = {
     "Foot": _JointPrior(0.0, (10.0, 10.0, 20.0), 18.0, 24.0),
     "ToeBase": _JointPrior(0.0, (5.0, 5.0, 20.0), 18.0, 24.0),
 }
+"""By part of the body. Sigmas: the everyday range of each joint; two sigmas are about half of the range of
+motion in D. A. Neumann, "Kinesiology of the Musculoskeletal System". Power spectral densities: measured on
+walking with reaching."""
 _BONE_AFTER_HINGE = {"ForeArm": "Hand", "Leg": "Foot"}
-LIMB_CHAINS: dict[str, tuple[str | None, str]] = {
-    "Arm": ("ForeArm", "Hand"),
-    "ForeArm": (None, "Hand"),
-    "UpLeg": ("Leg", "Foot"),
-    "Leg": (None, "Foot"),
+"""Bones that start at a hinge, with the bone that follows."""
+
+
+class LimbChain(NamedTuple):
+    """The parts of a limb below one of its bones.
+
+    Attributes:
+        following: The bone that follows; None if that is the end of the limb.
+        end: The end of the limb.
+    """
+
+    following: str | None
+    end: str
+
+
+LIMB_CHAINS = {
+    "Arm": LimbChain("ForeArm", "Hand"),
+    "ForeArm": LimbChain(None, "Hand"),
+    "UpLeg": LimbChain("Leg", "Foot"),
+    "Leg": LimbChain(None, "Foot"),
 }
-"""Limb bones: the bone that follows (None: the next is the end) and the limb's end."""
+"""By limb bone."""
 _REST_ABDUCTION_DEG = {"Arm": 10.0, "UpLeg": 0.0}
-"""Limbs that hang at ease, with their abduction in degrees."""
+"""Abduction, in degrees, of limbs that hang in the rest pose. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hinge:
-    """A hinge joint: equal distances from two points beside it keep the next joint in its plane.
+    """A hinge joint: equal distances from two points on its axis keep the following joint in its plane.
 
     Attributes:
         upper: Index of the bone above the hinge.
         lower: Index of the bone that starts at it.
         following: Index of the bone that starts at the lower bone's far end.
         anchors_m: (2,3) the two points in the upper bone's frame.
-        range_m: Their distance to the following bone's joint.
-        sigma_m: How far that distance may be off beyond a joint's slack: the lower bone's `off_hinge_m`.
+        range_m: Their distance from the following bone's joint.
+        sigma_m: Sigma of that distance in addition to the joint's slack: the lower bone's `off_hinge_m`.
     """
 
     upper: int
@@ -88,11 +112,11 @@ class Bone:
         joint: Index of its joint in the skeleton.
         role: Anatomical name.
         parent: Index of its parent among the bones, −1 for the first.
-        offset_m: (3,) its joint's centre in the parent's frame.
-        mean_rotation: (3,3) parent_from_bone at ease.
+        offset_m: (3,) centre of its joint in the parent's frame.
+        mean_rotation: (3,3) parent_from_bone in the rest pose.
         rotation_covariance: (3,3) rad², in the bone's own axes.
         psd: (6,) power spectral density of its acceleration, rotation first.
-        off_hinge_m: Sigma by which its far end leaves the plane of its hinge, beyond a joint's slack.
+        off_hinge_m: Sigma of its far end's distance from the hinge's plane, in addition to a joint's slack.
     """
 
     joint: int
@@ -106,11 +130,11 @@ class Bone:
 
 
 def kinematic_chain(skeleton: SkeletonModel, mounted_roles: Iterable[str]) -> tuple[Bone, ...]:
-    """Pick the bones between the mounted ones; a parent stands before its children.
+    """Return the bones that carry cameras and those between them, parents before their children.
 
     Args:
         skeleton: The body.
-        mounted_roles: Roles that carry a camera; each is a joint of the skeleton.
+        mounted_roles: Roles of the bones that carry a camera; each is a joint of the skeleton.
     """
     joints = [skeleton.roles.index(role) for role in set(mounted_roles)]
     chains = [joints_to_root(skeleton, joint) for joint in joints]
@@ -123,6 +147,7 @@ def kinematic_chain(skeleton: SkeletonModel, mounted_roles: Iterable[str]) -> tu
 
 
 def joints_to_root(skeleton: SkeletonModel, joint: int) -> list[int]:
+    """Return the joint and its ancestors, the root last."""
     chain = [joint]
     while skeleton.parents[chain[-1]] >= 0:
         chain.append(int(skeleton.parents[chain[-1]]))
@@ -134,26 +159,29 @@ def _make_bone(skeleton: SkeletonModel, joint: int, order: dict[int, int], rest:
     role = skeleton.roles[joint]
     prior = _PRIORS[split_side(role)[1]] if role else _PRIORS["Spine"]
     axes = anatomical_axes(skeleton, role)
-    spread = np.diag(np.radians(prior.sigma_deg) ** 2)
+    covariance = np.diag(np.radians(prior.sigma_deg) ** 2)
     return Bone(
         joint=joint,
         role=role,
         parent=-1 if above is None else order[above],
         offset_m=rest[joint] - (rest[above] if above is not None else 0.0),
         mean_rotation=_rest_rotation(skeleton, role, prior),
-        rotation_covariance=axes @ spread @ axes.T,
+        rotation_covariance=axes @ covariance @ axes.T,
         psd=np.repeat([prior.psd_rotation, prior.psd_translation], 3),
     )
 
 
 def anatomical_axes(skeleton: SkeletonModel, role: str) -> FloatArray:
-    """Along, forward and flexion axis (along × forward) as columns: a rotation on either side."""
+    """Return a bone's along, forward and flexion axes as columns (3,3), in the bone's frame.
+
+    The flexion axis is along × forward, so that the matrix is a rotation on both sides of the body.
+    """
     axes = segment_axes(skeleton, role)
     return np.column_stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])])
 
 
 def _rest_rotation(skeleton: SkeletonModel, role: str, prior: _JointPrior) -> FloatArray:
-    """parent_from_bone of a person standing at ease."""
+    """Return parent_from_bone (3,3) of a person who stands relaxed with the arms hanging."""
     side, part = split_side(role)
     flexion = so3_exp([0.0, 0.0, np.radians(prior.relaxed_flexion_deg)])
     axes = anatomical_axes(skeleton, role)
@@ -171,7 +199,7 @@ def _rest_rotation(skeleton: SkeletonModel, role: str, prior: _JointPrior) -> Fl
 
 
 def hinges(skeleton: SkeletonModel, bones: tuple[Bone, ...]) -> tuple[Hinge, ...]:
-    """Elbows and knees whose next bone is in the graph too."""
+    """Return the elbows and knees whose following bone is in the graph too."""
     index = {bone.role: position for position, bone in enumerate(bones)}
     out = []
     for bone in bones:

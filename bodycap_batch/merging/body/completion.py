@@ -1,4 +1,4 @@
-"""Every joint of the skeleton from the solved bones: trunk upright above the legs, the rest at rest."""
+"""The poses of all joints from the solved bones: an upright pelvis, and zero rotations below solved bones."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.merging.body.bones import Bone
+from bodycap_batch.merging.body.bones import Bone, joints_to_root
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.model.geometry import interpolate_pose, make_transform
 from bodycap_batch.model.skeleton import SkeletonModel
@@ -16,18 +16,19 @@ from bodycap_batch.model.skeleton import SkeletonModel
 def complete_skeleton(
     skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Pose all joints.
+    """Return poses of all joints.
 
-    Above the first solved bone the trunk straightens joint by joint to an upright pelvis that faces where the
-    bone faces, so that legs nobody measured stand; below the solved bones joints keep their zero rotation.
+    From the first solved bone towards the root, the trunk straightens joint by joint to an upright pelvis
+    with the same heading, so that legs without cameras stand. Below the solved bones, joints keep their zero
+    rotation.
 
     Args:
         skeleton: The body.
         bones: The solved bones.
-        world_from_bone: (T,B,4,4), Z up.
+        world_from_bone: (T,B,4,4), z up.
 
     Returns:
-        (T,J,4,4) and (J,) which joints were solved.
+        world_from_joint (T,J,4,4), and (J,) whether each joint was solved.
     """
     ticks, count = len(world_from_bone), len(skeleton.joints)
     out = np.tile(np.eye(4), (ticks, count, 1, 1))
@@ -35,41 +36,40 @@ def complete_skeleton(
     for position, bone in enumerate(bones):
         out[:, bone.joint] = world_from_bone[:, position]
         solved[bone.joint] = True
-    placed = solved.copy()
-    _straighten_trunk_above(skeleton, bones[0], out, placed)
+    posed = solved.copy()
+    _straighten_trunk_above(skeleton, bones[0], out, posed)
     for joint in range(count):
-        if not placed[joint]:
+        if not posed[joint]:
             parent = out[:, skeleton.parents[joint]]
             out[:, joint] = parent @ make_transform(np.eye(3), skeleton.offsets_m[joint])
     return out, solved
 
 
-def _straighten_trunk_above(skeleton: SkeletonModel, first: Bone, out: FloatArray, placed: BoolArray) -> None:
-    chain = [first.joint]
-    while skeleton.parents[chain[-1]] >= 0:
-        chain.append(int(skeleton.parents[chain[-1]]))
+def _straighten_trunk_above(skeleton: SkeletonModel, first: Bone, out: FloatArray, posed: BoolArray) -> None:
+    """Write the poses of the first bone's ancestors into `out` (T,J,4,4), and mark them in `posed` (J,)."""
+    chain = joints_to_root(skeleton, first.joint)
     trunk = out[:, first.joint].copy()
     trunk[:, :3, :3] = trunk[:, :3, :3] @ first.mean_rotation.T
     pelvis = make_transform(_yaw_only(trunk[:, :3, :3]), np.zeros(3))
-    # Joints that play no role (helpers, mostly without length) stay at zero: they turn with their parent.
+    # Joints without a role are helpers, most of them without length. They rotate with their parent.
     last = len(chain) - 1
     bending = [step for step in range(1, len(chain)) if skeleton.roles[chain[step]] or step == last]
     for step in range(1, len(chain)):
         child, joint = chain[step - 1], chain[step]
-        share = np.full(len(out), (np.searchsorted(bending, step) + 1) / len(bending))
-        rotation = interpolate_pose(trunk, pelvis, share)[:, :3, :3]
+        fraction = np.full(len(out), (np.searchsorted(bending, step) + 1) / len(bending))
+        rotation = interpolate_pose(trunk, pelvis, fraction)[:, :3, :3]
         centre = out[:, child, :3, 3] - rotation @ skeleton.offsets_m[child]
         out[:, joint] = make_transform(rotation, centre)
-        placed[joint] = True
+        posed[joint] = True
 
 
 def _yaw_only(rotation: FloatArray) -> FloatArray:
-    """Rotations (T,3,3) about Z alone that face where the given ones face (zero pose faces −Y)."""
+    """Return rotations (T,3,3) about z with the heading of the given ones; the zero pose faces −y."""
     forward, left = -rotation[:, :, 1], rotation[:, :, 0]
-    # A body bent over far has its forward pointing down: then its left tells more.
+    # If the body bends far forward, its forward axis points down. The left axis then gives the heading.
     level = forward + 0.0
-    lying = np.hypot(forward[:, 0], forward[:, 1]) < 0.3
-    level[lying] = np.cross(left[lying], [0.0, 0.0, 1.0])
+    bent = np.hypot(forward[:, 0], forward[:, 1]) < 0.3
+    level[bent] = np.cross(left[bent], [0.0, 0.0, 1.0])
     yaw = np.arctan2(level[:, 1], level[:, 0]) + 0.5 * np.pi
     out = np.tile(np.eye(3), (len(rotation), 1, 1))
     out[:, 0, 0] = out[:, 1, 1] = np.cos(yaw)
@@ -85,49 +85,58 @@ def observed_joints(
     tick_times_ns: IntArray,
     max_gap_s: float,
 ) -> BoolArray:
-    """Which joints cameras measured, per tick (T,J).
+    """Return (T,J) which joints the cameras measured at each tick.
 
-    A bone with a camera counts while the hole in its measurements is at most `max_gap_s`; a bone without one
-    while bones above and below it do.
+    A bone with a camera is measured at a tick on a frame, and in gaps of at most `max_gap_s`. A bone without
+    a camera is measured if bones on both sides of it are.
     """
-    seen: dict[int, BoolArray] = {}
+    measured: dict[int, BoolArray] = {}
     for track in tracks:
         _, valid = track.poses_at(tick_times_ns, max_gap_ns=round(max_gap_s * 1e9))
         half_step = np.median(np.diff(tick_times_ns)) / 2 if len(tick_times_ns) > 1 else 0
         near = np.abs(_nearest_times(track.times_ns, tick_times_ns) - tick_times_ns) <= half_step
-        seen[track.bone] = seen.get(track.bone, np.zeros(len(tick_times_ns), dtype=bool)) | valid | near
-    below = {bone: mask.copy() for bone, mask in seen.items()}
-    none = np.zeros(len(tick_times_ns), dtype=bool)
+        own = measured.get(track.bone, np.zeros(len(tick_times_ns), dtype=bool))
+        measured[track.bone] = own | valid | near
+    below = {bone: mask.copy() for bone, mask in measured.items()}
+    never = np.zeros(len(tick_times_ns), dtype=bool)
     for index in range(len(bones) - 1, 0, -1):
         parent = bones[index].parent
-        below[parent] = below.get(parent, none) | below.get(index, none)
+        below[parent] = below.get(parent, never) | below.get(index, never)
     out = np.zeros((len(tick_times_ns), len(skeleton.joints)), dtype=bool)
-    above: Mapping[int, BoolArray] = _observed_above(bones, seen, below, none)
+    above: Mapping[int, BoolArray] = _measured_above(bones, measured, below, never)
     for index, bone in enumerate(bones):
-        out[:, bone.joint] = seen.get(index, none) | (above[index] & below.get(index, none))
+        out[:, bone.joint] = measured.get(index, never) | (above[index] & below.get(index, never))
     return out
 
 
-def _observed_above(
+def _measured_above(
     bones: Sequence[Bone],
-    seen: Mapping[int, BoolArray],
+    measured: Mapping[int, BoolArray],
     below: Mapping[int, BoolArray],
-    none: BoolArray,
+    never: BoolArray,
 ) -> dict[int, BoolArray]:
-    """Per bone: is a camera measured outside the part of the body that hangs on it?"""
-    above: dict[int, BoolArray] = {0: none}
+    """Return by bone the ticks (T,) at which a bone is measured that is neither this one nor below it.
+
+    Args:
+        bones: The graph's bones.
+        measured: By bone, the ticks at which its own cameras measure it.
+        below: By bone, the ticks at which it or a bone below it is measured.
+        never: (T,) False.
+    """
+    above: dict[int, BoolArray] = {0: never}
     for index, bone in enumerate(bones[1:], start=1):
         siblings = [
             other for other in range(1, len(bones)) if bones[other].parent == bone.parent and other != index
         ]
-        mask = above[bone.parent] | seen.get(bone.parent, none)
+        mask = above[bone.parent] | measured.get(bone.parent, never)
         for other in siblings:
-            mask = mask | below.get(other, none)
+            mask = mask | below.get(other, never)
         above[index] = mask
     return above
 
 
 def _nearest_times(sorted_ns: IntArray, times_ns: IntArray) -> IntArray:
+    """Return for each of `times_ns` (T,) the nearest of the sorted times (N,)."""
     after = np.clip(np.searchsorted(sorted_ns, times_ns), 0, len(sorted_ns) - 1)
     before = np.maximum(after - 1, 0)
     closer = np.abs(sorted_ns[before] - times_ns) <= np.abs(sorted_ns[after] - times_ns)

@@ -1,4 +1,4 @@
-"""A T-pose in the capture: found without axes or scale, then a strong prior of the joints while it stands."""
+"""Detection of a T-pose without axes or scale, and the joint priors that hold during it."""
 
 from __future__ import annotations
 
@@ -7,80 +7,97 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, runs
 from bodycap_batch.merging.body.bones import Bone, anatomical_axes
-from bodycap_batch.merging.cameras.track import CameraTrack
+from bodycap_batch.merging.cameras.track import MAX_COARSE_GAP_NS, CameraTrack
 from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.model.skeleton_presets import split_side
 
 _MIN_ARM_ANGLE_RAD = float(np.radians(140.0))
+"""Smallest angle between the two hands, seen from the trunk's camera. Evidence: none."""
 _MIN_SPAN_RATIO = 0.93
+"""Smallest distance of the hands as a ratio of the largest one in the capture. Evidence: none."""
+_MIN_ARM_SPAN_RATIO = 0.75
+"""Smallest distance of the hands as a ratio of the expected one; the scale is provisional. Evidence: none."""
 _MAX_SPEED = 0.15
+"""Largest speed of the trunk and of the hands relative to it, in largest hand distances per second. Evidence:
+none."""
 _MIN_DURATION_S = 0.5
-"""A T-pose, without axes or scale: the two hands seen from the trunk's camera are this far apart in angle,
-about as far from each other as they ever come, and hardly move (spans per second) for at least so long."""
+"""Shortest T-pose in seconds: stretched arms in passing are not one. Evidence: none."""
+_SPEED_HALF_WINDOW_NS = 1.5e8
+"""Half of the time, in nanoseconds, over which a speed is taken: noise averages out over 0.3 s."""
+_SHOULDER_WIDTH_M = 0.2
+"""Distance of the shoulders that is added to the arms' lengths, metres: less than any adult's."""
 
-# What people who stand in a T-pose are off: the arms' twist most, since palms may face down or forward.
 _SIGMA_DEG = {
     "Shoulder": (4.0, 4.0, 4.0), "Arm": (15.0, 6.0, 6.0), "ForeArm": (20.0, 6.0, 6.0),
     "Hand": (8.0, 8.0, 8.0), "Neck": (6.0, 6.0, 6.0), "Head": (8.0, 8.0, 8.0), "UpLeg": (8.0, 5.0, 5.0),
     "Leg": (6.0, 5.0, 6.0), "Foot": (8.0, 8.0, 8.0), "ToeBase": (5.0, 5.0, 8.0),
 }  # fmt: skip
+"""Sigmas of a person's T-pose in degrees, by part of the body, about the along, forward and flexion axes. The
+twist of the arms is largest: palms may face down or forward. Evidence: none."""
 _TRUNK_SIGMA_DEG = (4.0, 4.0, 4.0)
+"""The same for the other bones."""
 
 
 def find_t_pose(
     bones: Sequence[Bone], tracks: Sequence[CameraTrack], span_map: float
 ) -> tuple[int, int] | None:
-    """Find the longest T-pose on the common clock (ns), or None.
+    """Find the longest T-pose.
+
+    In a T-pose, the hands lie on opposite sides of the trunk's camera. Their distance is about the largest
+    in the capture, and they hardly move.
 
     Args:
         bones: The graph's bones.
-        tracks: Cleaned tracks, the trunk's first.
-        span_map: Distance of the two cameras with the arms stretched out, map units, roughly.
+        tracks: Tracks without outliers, the trunk's first.
+        span_map: Rough distance of the two hands with the arms stretched out, map units.
+
+    Returns:
+        Its first and last common time in nanoseconds, or None.
     """
-    parts = {split_side(bones[track.bone].role): track for track in reversed(tracks)}
-    ends = [parts.get((side, "Hand")) or parts.get((side, "ForeArm")) for side in ("Left", "Right")]
+    by_role = {split_side(bones[track.bone].role): track for track in reversed(tracks)}
+    hands = [by_role.get((side, "Hand")) or by_role.get((side, "ForeArm")) for side in ("Left", "Right")]
     trunk = tracks[0]
-    if ends[0] is None or ends[1] is None or split_side(bones[trunk.bone].role)[0] or len(trunk.times_ns) < 3:
+    on_limb = bool(split_side(bones[trunk.bone].role)[0])
+    if hands[0] is None or hands[1] is None or on_limb or len(trunk.times_ns) < 3:
         return None
-    looks = [end.poses_at(trunk.times_ns, max_gap_ns=200_000_000) for end in ends if end is not None]
-    arms = [poses[:, :3, 3] - trunk.map_from_cam[:, :3, 3] for poses, _ in looks]
-    valid = looks[0][1] & looks[1][1]
-    apart = np.linalg.norm(arms[0] - arms[1], axis=1)
+    sampled = [
+        hand.poses_at(trunk.times_ns, max_gap_ns=MAX_COARSE_GAP_NS) for hand in hands if hand is not None
+    ]
+    arms = [poses[:, :3, 3] - trunk.map_from_cam[:, :3, 3] for poses, _ in sampled]
+    valid = sampled[0][1] & sampled[1][1]
+    span = np.linalg.norm(arms[0] - arms[1], axis=1)
     if valid.sum() < 3:
         return None
-    widest = float(np.percentile(apart[valid], 99.0))
+    widest = float(np.percentile(span[valid], 99.0))
     lengths = np.linalg.norm(arms[0], axis=1) * np.linalg.norm(arms[1], axis=1)
     angle = np.arccos(np.clip((arms[0] * arms[1]).sum(axis=1) / np.maximum(lengths, 1e-12), -1.0, 1.0))
-    good = (
-        valid & (angle > _MIN_ARM_ANGLE_RAD) & (apart > _MIN_SPAN_RATIO * widest) & (apart > 0.75 * span_map)
-    )
+    posed = valid & (angle > _MIN_ARM_ANGLE_RAD)
+    posed &= (span > _MIN_SPAN_RATIO * widest) & (span > _MIN_ARM_SPAN_RATIO * span_map)
     for points in (trunk.map_from_cam[:, :3, 3], arms[0], arms[1]):
-        good &= _speed(points, trunk.times_ns) < _MAX_SPEED * widest
-    return _longest_run(good, trunk.times_ns)
+        posed &= _speed(points, trunk.times_ns) < _MAX_SPEED * widest
+    return _longest_run(posed, trunk.times_ns)
 
 
 def _speed(points: FloatArray, times_ns: IntArray) -> FloatArray:
-    """Speed (T,) over about a third of a second, so that noise does not count."""
-    reach = max(1, round(1.5e8 / max(float(np.median(np.diff(times_ns))), 1.0)))
+    """Return the speed (T,), units per second, of points (T,3) over about 0.3 s."""
+    half = max(1, round(_SPEED_HALF_WINDOW_NS / max(float(np.median(np.diff(times_ns))), 1.0)))
     index = np.arange(len(points))
-    low, high = np.maximum(index - reach, 0), np.minimum(index + reach, len(points) - 1)
+    low, high = np.maximum(index - half, 0), np.minimum(index + half, len(points) - 1)
     seconds = np.maximum(times_ns[high] - times_ns[low], 1) * 1e-9
     return np.asarray(np.linalg.norm(points[high] - points[low], axis=1) / seconds)
 
 
 def _longest_run(mask: BoolArray, times_ns: IntArray) -> tuple[int, int] | None:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
-    stretches = [
-        (int(times_ns[a]), int(times_ns[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)
-    ]
-    best = max(stretches, key=lambda span: span[1] - span[0], default=(0, 0))
+    """Return the first and last time of the longest run of a mask (T,), None if it is too short."""
+    spans = [(int(times_ns[start]), int(times_ns[stop - 1])) for start, stop in runs(mask)]
+    best = max(spans, key=lambda span: span[1] - span[0], default=(0, 0))
     return best if best[1] - best[0] >= _MIN_DURATION_S * 1e9 else None
 
 
 def arm_span(bones: Sequence[Bone], skeleton: SkeletonModel) -> float:
-    """Distance of the two wrists in a T-pose (m), 0 where the graph lacks an arm."""
+    """Return the distance (m) of the wrists in a T-pose; an arm that the graph lacks counts nothing."""
     index = {bone.role: bone for bone in bones}
     total = 0.0
     for side in ("Left", "Right"):
@@ -88,36 +105,36 @@ def arm_span(bones: Sequence[Bone], skeleton: SkeletonModel) -> float:
             if side + part in index:
                 total += float(np.linalg.norm(index[side + part].offset_m))
     shoulders = [skeleton.index_of_role(side + "Arm") for side in ("Left", "Right")]
-    return total + (0.2 if None not in shoulders else 0.0)
+    return total + (_SHOULDER_WIDTH_M if None not in shoulders else 0.0)
 
 
 def with_t_pose_prior(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[Bone, ...]:
-    """The bones with the T-pose as their joints' prior."""
+    """Return the bones with the T-pose as the prior of their joints."""
     out = []
     for bone in bones:
         part = split_side(bone.role)[1]
         axes = anatomical_axes(skeleton, bone.role)
-        spread = np.diag(np.radians(_SIGMA_DEG.get(part, _TRUNK_SIGMA_DEG)) ** 2)
+        covariance = np.diag(np.radians(_SIGMA_DEG.get(part, _TRUNK_SIGMA_DEG)) ** 2)
         out.append(
             replace(
                 bone,
                 mean_rotation=_t_pose_rotation(skeleton, bone, bones),
-                rotation_covariance=axes @ spread @ axes.T,
+                rotation_covariance=axes @ covariance @ axes.T,
             )
         )
     return tuple(out)
 
 
 def _t_pose_rotation(skeleton: SkeletonModel, bone: Bone, bones: Sequence[Bone]) -> FloatArray:
-    """parent_from_bone in a T-pose, whatever the rig's zero pose is."""
+    """Return parent_from_bone (3,3) in a T-pose. The rig's zero pose may be another one."""
     if bone.parent < 0:
         return np.eye(3)
-    above, own = (_t_pose_axes(skeleton, each.role) for each in (bones[bone.parent], bone))
+    above, own = (_t_pose_orientation(skeleton, each.role) for each in (bones[bone.parent], bone))
     return np.asarray(above.T @ own)
 
 
-def _t_pose_axes(skeleton: SkeletonModel, role: str) -> FloatArray:
-    """world_from_bone (3,3) of someone in a T-pose who faces −Y."""
+def _t_pose_orientation(skeleton: SkeletonModel, role: str) -> FloatArray:
+    """Return world_from_bone (3,3) of a person in a T-pose who faces −y."""
     side, part = split_side(role)
     axes = anatomical_axes(skeleton, role)
     if part in ("Arm", "ForeArm", "Hand"):

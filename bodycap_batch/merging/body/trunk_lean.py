@@ -1,4 +1,8 @@
-"""How a body's trunk leans over time: people bend forwards, which tells up from ahead."""
+"""The likelihood of a vertical from how the trunk leans over time.
+
+People bend forward, seldom backward or sideways. So the distribution of the trunk's orientation shows which
+direction is up.
+"""
 
 from __future__ import annotations
 
@@ -14,108 +18,117 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import split_side
 
 _MODE_RADIUS_RAD = float(np.radians(15.0))
-"""A trunk sways by less than this about its usual direction in walking and standing."""
+"""Directions within this angle, in radians, belong to one mode: a trunk sways less about its usual direction
+in walking and standing. Evidence: none."""
 _MAX_SAMPLES, _SPHERE_DIRECTIONS = 300, 1000
+"""Instants of a capture, and directions of the sphere, that are evaluated at most; they bound the time."""
 _UPRIGHT_SIGMA_DEG = 12.0
-"""Spread of a standing or walking trunk's lean: 5 degrees of habit, the rest its camera's mount."""
+"""Sigma of the lean of a person who stands or walks, in degrees: 5 degrees of systematic bias, the rest is
+the mount of the camera. Evidence: none."""
 _LATERAL_SIGMA_DEG = 12.0
+"""The same for leaning sideways."""
 _UPRIGHT_SHARE, _FORWARD_SHARE, _BACKWARD_SHARE, _OUTLIER_SHARE = 0.57, 0.35, 0.07, 0.01
+"""Assumed ratios of the time that a trunk is upright, bends forward, reclines, or does anything else.
+Evidence: none."""
 _FORWARD_SCALE_DEG, _BACKWARD_SCALE_DEG, _OUTLIER_HALF_RANGE_DEG = 60.0, 15.0, 180.0
-"""Shares of a day, and how far a trunk leans then: picking things up bends it forwards by a right angle and
-more, a chair lets it recline by 30 degrees; and one moment in a hundred is none of this."""
+"""Scales of the exponential densities of the lean, degrees, and half of the range of the uniform one. Picking
+things up bends a trunk by a right angle and more; a chair lets it recline by 30 degrees. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrunkOrientation:
-    """Where a body's trunk pointed over time.
+    """The orientation of a body's trunk over time.
 
     Attributes:
-        axes: (N,3,3) its left, back and up as columns; only up counts where `front_known` is false.
-        front_known: Whether its front is known.
+        axes: (N,3,3) its left, back and up directions as columns.
+        front_known: Whether left and back are known; otherwise only up counts.
     """
 
     axes: FloatArray
     front_known: bool = True
 
     def modal_up(self) -> FloatArray:
-        """Near which (3,) it is most of the time: who bends now and then is upright in between."""
+        """Return the trunk's most frequent up direction (3,): upright, if the person bends now and then."""
         return modal_direction(self.axes[:, :, 2])
 
     def mean_up(self) -> FloatArray:
-        """Of all the time (3,): who is bent most of the time leans less in the mean."""
+        """Return the trunk's mean up direction (3,). It leans less than the mode if the person mostly bends."""
         return _normalised(self.axes[:, :, 2].mean(axis=0))
 
     def upright_up(self) -> FloatArray:
-        """Where it points (3,) when it stands: bending leads away from there forwards, nothing backwards."""
+        """Return the trunk's up direction (3,) when it is upright: leans from there lead forward."""
         axes = _subsample(self.axes)
-        known = np.vstack([axes[:, :, 2], self.modal_up(), self.mean_up()])
-        best = known[int(np.argmin(self.negative_log_likelihood(known)))]
+        candidates = np.vstack([axes[:, :, 2], self.modal_up(), self.mean_up()])
+        best = candidates[int(np.argmin(self.negative_log_likelihood(candidates)))]
         near = axes[:, :, 2] @ best > np.cos(_MODE_RADIUS_RAD)
         return _normalised(axes[near, :, 2].mean(axis=0)) if near.any() else best
 
     def negative_log_likelihood(self, ups: FloatArray) -> FloatArray:
-        """How strange (C,) the leaning would be, were `ups` (C,3) up: mean −log of its density, nats.
+        """Return the mean negative log-likelihood (C,), in nats, of the lean for verticals `ups` (C,3).
 
-        Only differences count: a trunk that is erect all the time has about 0.
+        It is relative to that of a trunk without lean, which has about 0.
         """
-        return self._strangeness(ups, _OUTLIER_SHARE)
+        return self._mean_nll(ups, _OUTLIER_SHARE)
 
     def posterior_spread_deg(self, up: FloatArray) -> float:
-        """How far `up` (3,) is off in the mean square, degrees, where nothing but the leaning tells it.
+        """Return the RMS error of `up` (3,), in degrees, if only the lean determines it.
 
-        A lean that lasts does not show: however many moments there are, together they tell as much as one
-        does. What one moment in a hundred is counts for nothing here: it may be any direction.
+        A constant lean does not show. All instants together are therefore worth one observation. Outliers are
+        ignored here, because they may be in any direction.
         """
         ups = _fibonacci_sphere(_SPHERE_DIRECTIONS)
-        nats = self._strangeness(ups, 0.0)
-        likely = np.exp(nats.min() - nats)
+        nll = self._mean_nll(ups, 0.0)
+        likelihood = np.exp(nll.min() - nll)
         off = np.degrees(np.arccos(np.clip(ups @ up, -1.0, 1.0)))
-        return float(np.sqrt(np.average(off**2, weights=likely)))
+        return float(np.sqrt(np.average(off**2, weights=likelihood)))
 
-    def _strangeness(self, ups: FloatArray, anyhow: float) -> FloatArray:
-        seen = np.einsum("nji,cj->cni", _subsample(self.axes), ups)
+    def _mean_nll(self, ups: FloatArray, outlier_share: float) -> FloatArray:
+        in_trunk = np.einsum("nji,cj->cni", _subsample(self.axes), ups)
         if not self.front_known:
-            angle = np.degrees(np.arccos(np.clip(seen[..., 2], -1.0, 1.0)))
-            return np.asarray(_pitch_nll(angle, anyhow).mean(axis=1))
-        pitch = np.degrees(np.arctan2(seen[..., 1], seen[..., 2]))
-        side = np.degrees(np.arcsin(np.clip(seen[..., 0], -1.0, 1.0)))
-        return np.asarray((_pitch_nll(pitch, anyhow) + _lateral_nll(side, anyhow)).mean(axis=1))
+            angle = np.degrees(np.arccos(np.clip(in_trunk[..., 2], -1.0, 1.0)))
+            return np.asarray(_pitch_nll(angle, outlier_share).mean(axis=1))
+        pitch = np.degrees(np.arctan2(in_trunk[..., 1], in_trunk[..., 2]))
+        side = np.degrees(np.arcsin(np.clip(in_trunk[..., 0], -1.0, 1.0)))
+        return np.asarray((_pitch_nll(pitch, outlier_share) + _lateral_nll(side, outlier_share)).mean(axis=1))
 
 
-def _pitch_nll(pitch_deg: FloatArray, anyhow: float) -> FloatArray:
-    """−log of the density of a lean, forwards positive, over that of none."""
+def _pitch_nll(pitch_deg: FloatArray, outlier_share: float) -> FloatArray:
+    """Return the negative log-likelihood of leans, forward positive, relative to that of no lean."""
 
     def density(pitch: FloatArray) -> FloatArray:
         forward, backward = np.maximum(pitch, 0.0), np.maximum(-pitch, 0.0)
+        height = _UPRIGHT_SHARE / (_UPRIGHT_SIGMA_DEG * np.sqrt(2.0 * np.pi))
         return np.asarray(
-            _UPRIGHT_SHARE
-            / (_UPRIGHT_SIGMA_DEG * np.sqrt(2.0 * np.pi))
-            * np.exp(-0.5 * (pitch / _UPRIGHT_SIGMA_DEG) ** 2)
+            height * np.exp(-0.5 * (pitch / _UPRIGHT_SIGMA_DEG) ** 2)
             + (pitch > 0.0) * _FORWARD_SHARE / _FORWARD_SCALE_DEG * np.exp(-forward / _FORWARD_SCALE_DEG)
             + (pitch <= 0.0) * _BACKWARD_SHARE / _BACKWARD_SCALE_DEG * np.exp(-backward / _BACKWARD_SCALE_DEG)
-            + anyhow / (2.0 * _OUTLIER_HALF_RANGE_DEG)
+            + outlier_share / (2.0 * _OUTLIER_HALF_RANGE_DEG)
         )
 
     return np.asarray(-np.log(density(pitch_deg) / density(np.zeros(1))))
 
 
-def _lateral_nll(side_deg: FloatArray, anyhow: float) -> FloatArray:
-    """The same of a lean to a side."""
-    density = (1.0 - anyhow) * np.exp(-0.5 * (side_deg / _LATERAL_SIGMA_DEG) ** 2) + anyhow
+def _lateral_nll(side_deg: FloatArray, outlier_share: float) -> FloatArray:
+    """Return the negative log-likelihood of sideways leans relative to that of none."""
+    density = (1.0 - outlier_share) * np.exp(-0.5 * (side_deg / _LATERAL_SIGMA_DEG) ** 2) + outlier_share
     return np.asarray(-np.log(density))
 
 
 def _fibonacci_sphere(count: int) -> FloatArray:
-    """Directions (C,3) spread evenly: a spiral whose turns are the golden angle apart."""
-    place = np.arange(count) + 0.5
-    polar, turn = np.arccos(1.0 - 2.0 * place / count), np.pi * (1.0 + np.sqrt(5.0)) * place
-    return np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
+    """Return evenly distributed directions (C,3): points of a spiral, a golden angle apart."""
+    number = np.arange(count) + 0.5
+    polar, azimuth = np.arccos(1.0 - 2.0 * number / count), np.pi * (1.0 + np.sqrt(5.0)) * number
+    return np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=1)
 
 
 def trunk_orientation(
     skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray
 ) -> TrunkOrientation:
-    """Where a body's trunk points, by solved bones (T,B,4,4); without a trunk, where its limbs hang from."""
+    """Return the trunk's orientation from solved bones (T,B,4,4).
+
+    If the graph has no bone of the trunk, up is the direction against which the limbs hang on average, and
+    the front is unknown.
+    """
     trunk = [i for i, bone in enumerate(bones) if not split_side(bone.role)[0]]
     limbs = [
         i for i, bone in enumerate(bones) if split_side(bone.role)[1] in ("Arm", "UpLeg", "Leg", "ForeArm")
@@ -125,14 +138,15 @@ def trunk_orientation(
         return TrunkOrientation(_orthogonal_axes(left, up))
     chosen = limbs or list(range(len(bones)))
     along = [world_from_bone[:, i, :3, :3] @ anatomical_axes(skeleton, bones[i].role)[:, 0] for i in chosen]
-    hanging = _normalised(-np.mean(along, axis=(0, 1)))
-    return TrunkOrientation(
-        _orthogonal_axes(np.linalg.svd(hanging[None])[2][1:2], hanging[None]), front_known=False
-    )
+    up = _normalised(-np.mean(along, axis=(0, 1)))[None]
+    return TrunkOrientation(_orthogonal_axes(np.linalg.svd(up)[2][1:2], up), front_known=False)
 
 
 def trunk_orientation_from_prior(bones: Sequence[Bone], trunk: CameraTrack, mount: Mount) -> TrunkOrientation:
-    """Where the trunk points in the map, as a camera's path and its mount's prior promise."""
+    """Return the trunk's orientation in the map from a camera's path and its mount prior.
+
+    Joints between the camera's bone and the first bone are taken to be in the rest pose.
+    """
     rest = np.eye(3)
     index = trunk.bone
     while bones[index].parent >= 0:
@@ -143,23 +157,24 @@ def trunk_orientation_from_prior(bones: Sequence[Bone], trunk: CameraTrack, moun
 
 
 def modal_direction(directions: FloatArray) -> FloatArray:
-    """The direction (3,) near which most of (N,3) lie: who bends down is upright in between.
+    """Return the mean (3,) of the largest group of similar directions among (N,3).
 
-    The mean of a lifter's trunk leans by half of its bends.
+    It shows the upright trunk of a person who bends in between; the mean of all would lean half as far as the
+    bends.
     """
-    some = _subsample(directions)
-    some = some / np.linalg.norm(some, axis=1, keepdims=True)
-    near = some @ some.T > np.cos(_MODE_RADIUS_RAD)
-    return _normalised(some[near[int(np.argmax(near.sum(axis=1)))]].mean(axis=0))
+    sample = _subsample(directions)
+    sample = sample / np.linalg.norm(sample, axis=1, keepdims=True)
+    near = sample @ sample.T > np.cos(_MODE_RADIUS_RAD)
+    return _normalised(sample[near[int(np.argmax(near.sum(axis=1)))]].mean(axis=0))
 
 
-def _subsample(moments: FloatArray) -> FloatArray:
-    """About 300 of (N,...), evenly."""
-    return np.asarray(moments[np.unique(np.linspace(0, len(moments) - 1, _MAX_SAMPLES).astype(np.int64))])
+def _subsample(items: FloatArray) -> FloatArray:
+    """Return up to 300 of the items (N,...), evenly spaced."""
+    return np.asarray(items[np.unique(np.linspace(0, len(items) - 1, _MAX_SAMPLES).astype(np.int64))])
 
 
 def _orthogonal_axes(left: FloatArray, up: FloatArray) -> FloatArray:
-    """Left, back and up (N,3,3) from left and up that are about at right angles."""
+    """Return left, back and up as columns (N,3,3) from approximately orthogonal left and up (N,3)."""
     up = up / np.linalg.norm(up, axis=1, keepdims=True)
     back = np.cross(up, left)
     back /= np.linalg.norm(back, axis=1, keepdims=True)

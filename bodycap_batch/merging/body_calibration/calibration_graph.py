@@ -28,6 +28,7 @@ from bodycap_batch.merging.body_calibration.mount_covariance import (
     row_types,
 )
 from bodycap_batch.merging.body_calibration.samples import CalibrationSamples
+from bodycap_batch.merging.graph.attitude_factors import AttitudeFactors
 from bodycap_batch.merging.graph.error_modes import (
     POSTURE_BIAS_SHARE,
     BodyModel,
@@ -45,14 +46,14 @@ from bodycap_batch.merging.graph.factors import (
     add_mount_prior,
     bone_key,
     insert_mount_points,
-    levenberg_marquardt,
     mount_from_points,
     mount_jacobian,
     mount_keys,
     values_from_poses,
 )
+from bodycap_batch.merging.graph.joint_priors import samples_per_gesture, widen_joint_priors
 from bodycap_batch.merging.graph.linearisation import LinearisedGraph, linearise
-from bodycap_batch.merging.graph.posture import AttitudeFactors, samples_per_gesture, widen_joint_priors
+from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_RAD
@@ -354,7 +355,9 @@ class CalibrationGraph:
         all_points = samples.points(scale)
         for camera, name in enumerate(samples.cameras):
             prior, points = self._priors[name], all_points[camera]
-            add_mount_prior(graph, camera, prior.joint_from_cam, points, (prior.sigma_rad, prior.sigma_m))
+            add_mount_prior(
+                graph, camera, prior.joint_from_cam, points, sigma_rad=prior.sigma_rad, sigma_m=prior.sigma_m
+            )
             ticks = np.flatnonzero(samples.valid[camera])
             measured = [bone_key(tick, samples.bones[camera]) for tick in ticks.tolist()]
             add_mount_measurements(graph, measured, camera, world_from_cam[camera, ticks], points)

@@ -11,7 +11,7 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.body_calibration.mount_covariance import LinearisedCalibration, ReducedSystem
 from bodycap_batch.merging.graph.error_modes import POSTURE_BIAS_SHARE
-from bodycap_batch.merging.graph.posture import samples_per_gesture
+from bodycap_batch.merging.graph.joint_priors import samples_per_gesture
 
 _PRIOR_REDUNDANCY = 6.0
 """Redundant rotations, each of a gesture of its own, that the everyday range counts as much as: two gestures

@@ -25,8 +25,8 @@ _PERCENTILE, _PERCENTILE_SIGMAS = 90.0, 2.5
 """Deviations are judged by this percentile. For Gaussian noise with one sigma on three axes, the 90th
 percentile of the norm is 2.5 sigmas (chi distribution with three degrees of freedom)."""
 _MIN_DURATION_RATIO = 0.5
-"""Smallest localised time of a stationary camera, as a ratio of that of the camera localised longest: a person
-who stands still for a second shows nothing about the rest. Evidence: none."""
+"""Smallest localised time of a stationary camera, as a ratio of that of the camera localised longest: a
+person who stands still for a second shows nothing about the rest. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,8 @@ from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_M
 
 OUTLIER_HALF_WINDOW = 6
-"""Frames on either side that a frame is compared with, 0.2 s at 30 fps. A quadratic follows a swinging hand to
-a few centimetres over that time. Evidence: none."""
+"""Frames on either side that a frame is compared with, 0.2 s at 30 fps. A quadratic follows a swinging hand
+to a few centimetres over that time. Evidence: none."""
 OUTLIER_LIMIT_M = 0.12
 """Distance from the quadratic, in metres, above which a pose is wrong: several times a swing's deviation from
 it. Evidence: none."""
@@ -33,9 +33,9 @@ rotation sigma."""
 
 MAX_SAMPLE_GAP_NS = 100_000_000
 """Longest time between two frames, in nanoseconds, over which a pose is interpolated for the calibration and
-the checks: three frames at 30 fps."""
+the checks: three intervals of frames at 30 fps. Evidence: none."""
 MAX_COARSE_GAP_NS = 200_000_000
-"""The same for initial values and for the search for a T-pose, where centimetres of error do no harm."""
+"""The same for initial values and for the search for a T-pose, which need less accuracy. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -194,7 +194,7 @@ def _runs_with_jumps(bad: BoolArray, centre_m: FloatArray) -> BoolArray:
 
 
 def _robust_quadratic(time: FloatArray, centre: FloatArray, valid: BoolArray) -> FloatArray:
-    """Fit quadratics with Cauchy weights to centres (N,W,3) at times (N,W); return their values (N,3) at 0."""
+    """Fit quadratics with Cauchy weights to centres (N,W,3) at times (N,W); return values (N,3) at time 0."""
     basis = np.stack([np.ones_like(time), time, time**2], axis=-1)
     weight = valid.astype(np.float64)
     for _ in range(8):

@@ -1,1 +1,1 @@
-"""The factor graph of the body in motion, and the covariance of its solution."""
+"""The motion as a factor graph: factors, optimisers, windows of a long timeline, covariance of the joints."""

@@ -1,4 +1,4 @@
-"""What the calibration does not know, as directions of one sigma each, and how the mounts follow them."""
+"""The uncertainty of the calibration as independent error modes: its square-root covariance."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body.bones import Bone, Hinge
 from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.merging.graph.linearisation import LinearisedGraph
-from bodycap_batch.model.geometry import invert, make_transform
+from bodycap_batch.model.geometry import invert, make_transform, se3_adjoint
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,19 +25,19 @@ class BodyModel:
 
     @property
     def factors_per_tick(self) -> int:
-        """How many factors hold the body together at one tick."""
+        """Number of joint and hinge factors at one tick."""
         return sum(bone.parent >= 0 for bone in self.bones) + 2 * len(self.hinges)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorModes:
-    """Independent directions in which what the motion is solved with may be off, each by one sigma.
+    """M independent modes in which the calibration may be wrong, each scaled to one sigma.
 
     Attributes:
-        mounts: By camera, (6,M) change of joint_from_cam, right perturbation, rotation first.
-        log_scale: (M,) change of the metric scale's logarithm.
-        rest: (B,3,M) turn of each bone's pose at ease, in the bone's own frame.
-        offsets_m: (B,3,M) change of each joint's centre in its parent's frame.
+        mounts: By camera, (6,M) change of joint_from_cam: right perturbation, rotation first.
+        log_scale: (M,) change of the logarithm of the metric scale.
+        rest: (B,3,M) rotation (rad) of each bone's rest pose, in the bone's own frame.
+        offsets_m: (B,3,M) change of each joint's centre in the parent's frame.
     """
 
     mounts: Mapping[str, FloatArray]
@@ -46,12 +46,12 @@ class ErrorModes:
     offsets_m: FloatArray
 
     def joint_modes(self, bone: Bone, index: int) -> FloatArray:
-        """(6,M) change of where a joint rests, right perturbation of its resting pose."""
+        """Return the change (6,M) of a bone's rest pose on its parent: right perturbation, rotation first."""
         return np.concatenate([self.rest[index], bone.mean_rotation.T @ self.offsets_m[index]])
 
 
 def stack_modes(parts: Sequence[ErrorModes]) -> ErrorModes:
-    """All directions of several, which are independent of each other."""
+    """Return the modes of several parts together, which are independent of each other."""
     return ErrorModes(
         mounts={
             camera: np.concatenate([part.mounts[camera] for part in parts], axis=1)
@@ -63,85 +63,75 @@ def stack_modes(parts: Sequence[ErrorModes]) -> ErrorModes:
     )
 
 
-def adjoint(poses: FloatArray) -> FloatArray:
-    """(...,6,6) that carries right perturbations, rotation first, through poses (...,4,4)."""
-    rotation, shift = poses[..., :3, :3], poses[..., :3, 3]
-    cross = np.zeros_like(rotation)
-    cross[..., 0, 1], cross[..., 0, 2], cross[..., 1, 2] = -shift[..., 2], shift[..., 1], -shift[..., 0]
-    cross -= np.swapaxes(cross, -1, -2)
-    out = np.zeros((*poses.shape[:-2], 6, 6))
-    out[..., :3, :3] = out[..., 3:, 3:] = rotation
-    out[..., 3:, :3] = cross @ rotation
-    return out
-
-
 def joint_residual_jacobian(
     linear: LinearisedGraph,
     body: BodyModel,
     first_factor: int,
     world_from_bone: FloatArray,
-    spread: ErrorModes,
+    modes: ErrorModes,
 ) -> Any:
-    """How the residuals of joints and hinges change along each direction: rows (R,M), sparse.
+    """Return the change (R,M), sparse, of the residuals of joints and hinges along each mode.
 
-    The sign is that of the right-hand side: the movement that would make up for the change.
+    It has the sign of the right-hand side: the movement that compensates the change.
 
     Args:
         linear: Derivatives at the solution.
         body: Bones and hinges.
-        first_factor: Index of the first tick's first joint factor; a tick adds its bones', then its hinges'.
+        first_factor: Index of the first tick's first joint factor. Each tick adds its joints, then its
+            hinges.
         world_from_bone: (T,B,4,4) the solution.
-        spread: The directions.
+        modes: Of the calibration.
     """
     ticks = np.arange(len(world_from_bone))
     children = [index for index, bone in enumerate(body.bones) if bone.parent >= 0]
-    each = body.factors_per_tick
-    out = sparse.csr_matrix((linear.matrix.shape[0], len(spread.log_scale)))
-    for place, child in enumerate(children):
-        bone, factors = body.bones[child], first_factor + place + each * ticks
+    stride = body.factors_per_tick
+    out = sparse.csr_matrix((linear.matrix.shape[0], len(modes.log_scale)))
+    for number, child in enumerate(children):
+        bone, factors = body.bones[child], first_factor + number + stride * ticks
         at_rest = make_transform(bone.mean_rotation, bone.offset_m)
-        turned = invert(world_from_bone[:, child]) @ world_from_bone[:, bone.parent] @ at_rest
-        moved = adjoint(turned) @ spread.joint_modes(bone, child)
+        bone_from_rest = invert(world_from_bone[:, child]) @ world_from_bone[:, bone.parent] @ at_rest
+        change = se3_adjoint(bone_from_rest) @ modes.joint_modes(bone, child)
         derivative = linear.pose_jacobians(factors, 6, [bone_key(tick, child) for tick in ticks.tolist()])
-        out = out + linear.sparse_rows(factors, derivative @ moved)
-    for number, hinge in enumerate(body.hinges if spread.offsets_m.any() else ()):
-        anchor = spread.offsets_m[hinge.lower]
-        along = (
+        out = out + linear.sparse_rows(factors, derivative @ change)
+    for number, hinge in enumerate(body.hinges if modes.offsets_m.any() else ()):
+        anchor = modes.offsets_m[hinge.lower]
+        following_from_upper = (
             world_from_bone[:, hinge.following, :3, :3].swapaxes(1, 2)
             @ world_from_bone[:, hinge.upper, :3, :3]
         )
         offset = body.bones[hinge.following].offset_m
-        longer = offset @ spread.offsets_m[hinge.following] / hinge.range_m
+        longer = offset @ modes.offsets_m[hinge.following] / hinge.range_m
         for side in range(2):
-            factors = first_factor + len(children) + 2 * number + side + each * ticks
+            factors = first_factor + len(children) + 2 * number + side + stride * ticks
             keys = [bone_key(tick, hinge.following) for tick in ticks.tolist()]
             derivative = linear.pose_jacobians(factors, 1, keys)[..., 3:]
             stiffness = np.linalg.norm(derivative, axis=-1, keepdims=True)
-            out = out + linear.sparse_rows(factors, derivative @ (along @ anchor) + stiffness * longer)
+            change = derivative @ (following_from_upper @ anchor) + stiffness * longer
+            out = out + linear.sparse_rows(factors, change)
     return out
 
 
 POSTURE_BIAS_SHARE = 0.5
-"""Of a joint's everyday range that is a person's habit over the whole capture; the rest comes and goes within
-seconds. Both shares count at any one tick, only the habit bends the mounts."""
+"""Ratio of a joint's everyday range that is a systematic bias over the whole capture; the rest varies within
+seconds. At one tick both parts count, but only the bias moves the mounts. Evidence: none."""
 
 
 def posture_bias_modes(
     bones: Sequence[Bone], cameras: Sequence[str], share: float | FloatArray
 ) -> ErrorModes:
-    """The ways in which joints may be held other than at ease, as a share of their everyday range.
+    """Return the modes in which joints may be held away from the rest pose.
 
     Args:
         bones: The graph's bones.
-        cameras: Names of the cameras, whose mounts stay.
-        share: Of the range, one for all or (B,) by bone.
+        cameras: Names of the cameras, whose mounts do not change.
+        share: Ratio of the joint's everyday range, one for all or (B,) by bone.
     """
     shares = np.broadcast_to(share, len(bones))
     jointed = [index for index, bone in enumerate(bones) if bone.parent >= 0]
     rest = np.zeros((len(bones), 3, 3 * len(jointed)))
-    for place, index in enumerate(jointed):
+    for number, index in enumerate(jointed):
         half = np.linalg.cholesky(bones[index].rotation_covariance)
-        rest[index, :, 3 * place : 3 * place + 3] = shares[index] * half
+        rest[index, :, 3 * number : 3 * number + 3] = shares[index] * half
     return ErrorModes(
         mounts={camera: np.zeros((6, rest.shape[-1])) for camera in cameras},
         log_scale=np.zeros(rest.shape[-1]),
@@ -151,29 +141,32 @@ def posture_bias_modes(
 
 
 def map_error_modes(bones: Sequence[Bone], sigmas: Mapping[str, FloatArray]) -> ErrorModes:
-    """A camera's measured poses off together, for a stretch of its path: to the body, as if its mount were.
+    """Return the modes of an error that all poses of a camera share for some time, as the error of a map is.
+
+    To the body, such an error is the same as a change of the camera's mount.
 
     Args:
         bones: The graph's bones.
-        sigmas: By camera, rotation (rad) and position (m) per axis.
+        sigmas: By camera, (2,) sigmas of rotation (rad) and position (m) per axis.
     """
     count = 6 * len(sigmas)
     mounts = {camera: np.zeros((6, count)) for camera in sigmas}
-    for index, (camera, (turn, shift)) in enumerate(sigmas.items()):
-        mounts[camera][:, 6 * index : 6 * index + 6] = np.diag(np.repeat([turn, shift], 3))
-    nothing = np.zeros((len(bones), 3, count))
-    return ErrorModes(mounts=mounts, log_scale=np.zeros(count), rest=nothing, offsets_m=nothing)
+    for index, (camera, (rotation_rad, position_m)) in enumerate(sigmas.items()):
+        mounts[camera][:, 6 * index : 6 * index + 6] = np.diag(np.repeat([rotation_rad, position_m], 3))
+    unchanged = np.zeros((len(bones), 3, count))
+    return ErrorModes(mounts=mounts, log_scale=np.zeros(count), rest=unchanged, offsets_m=unchanged)
 
 
 def mount_perturbation(joint_from_cam: FloatArray, change: FloatArray) -> FloatArray:
-    """Change (4,4) of a mount as its right perturbation (6,), rotation first."""
-    turn = joint_from_cam[:3, :3].T @ change[:3, :3]
-    turn = 0.5 * (turn - turn.T)
-    return np.array([turn[2, 1], turn[0, 2], turn[1, 0], *(joint_from_cam[:3, :3].T @ change[:3, 3])])
+    """Return a change (4,4) of a mount as a right perturbation (6,), rotation first."""
+    rotation = joint_from_cam[:3, :3].T @ change[:3, :3]
+    rotation = 0.5 * (rotation - rotation.T)
+    translation = joint_from_cam[:3, :3].T @ change[:3, 3]
+    return np.array([rotation[2, 1], rotation[0, 2], rotation[1, 0], *translation])
 
 
 def scale_modes(bones: Sequence[Bone], sigma_log: float, slope: Mapping[str, FloatArray]) -> ErrorModes:
-    """The metric scale off by a sigma, and the mounts with it.
+    """Return the mode of the metric scale, with the mounts that follow it.
 
     Args:
         bones: The graph's bones.

@@ -1,10 +1,10 @@
-"""How well each joint's centre is known relative to the root: measurement noise and calibration together."""
+"""The covariance of each joint's centre relative to the root, from measurement noise and calibration."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -12,13 +12,14 @@ from scipy import sparse
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.cameras.track import CameraTrack
-from bodycap_batch.merging.graph.error_modes import BodyModel, ErrorModes, adjoint, joint_residual_jacobian
-from bodycap_batch.merging.graph.factors import bone_key
+from bodycap_batch.merging.graph.error_modes import BodyModel, ErrorModes, joint_residual_jacobian
+from bodycap_batch.merging.graph.factors import MotionState, bone_key
 from bodycap_batch.merging.graph.linearisation import LinearisedGraph, linearise
 from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
-from bodycap_batch.model.geometry import invert
+from bodycap_batch.model.geometry import invert, se3_adjoint
 
 _MODES_PER_SOLVE = 48
+"""Error modes that are propagated at once: those of eleven cameras together would take gigabytes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,14 +27,14 @@ class SolvedGraph:
     """A motion graph at its solution.
 
     Attributes:
-        graph: The factors: first each track's measurements, one after the other.
+        graph: The factors. The measurements come first, track by track.
         values: The solution.
         body: Bones and hinges.
         tick_times_ns: (T,) the timeline.
-        chains: Per bone (time, pose key, velocity key) of each state.
+        chains: The states of each bone, in the order of time.
         tracks: The measurements, poses in metres.
-        measured_keys: By camera, the key of the pose each measurement is of.
-        mounts: joint_from_cam (4,4) by camera, as they were held.
+        measured_keys: By camera, the key of the bone's pose at each measurement.
+        mounts: joint_from_cam (4,4) by camera, which were held fixed.
         first_joint: Index of the first joint factor.
     """
 
@@ -41,7 +42,7 @@ class SolvedGraph:
     values: Any
     body: BodyModel
     tick_times_ns: IntArray
-    chains: Sequence[Sequence[tuple[int, int, int]]]
+    chains: Sequence[Sequence[MotionState]]
     tracks: Sequence[CameraTrack]
     measured_keys: Mapping[str, Sequence[int]]
     mounts: Mapping[str, FloatArray]
@@ -51,46 +52,48 @@ class SolvedGraph:
 def joint_covariance(
     solved: SolvedGraph,
     world_from_bone: FloatArray,
-    spread: ErrorModes,
+    error_modes: ErrorModes,
     begin: Callable[[str], None] = lambda _: None,
 ) -> FloatArray:
-    """Covariance (T,B,3,3) of each bone's joint centre minus the first bone's, m², in the solution's axes.
+    """Return the covariance (T,B,3,3), m², of each bone's joint centre minus the first bone's.
 
-    The marginal of the graph knows the noise of the measurements; what was held while it was solved moves
-    the solution along with it and is added: J Σ Jᵀ, one direction of one sigma after the other.
+    It is the sum of two parts. The marginal covariance of the graph contains the noise of the measurements.
+    The calibration, which was held fixed, adds J Σ Jᵀ: Σ is given by its error modes, each propagated to the
+    joints.
 
     Args:
         solved: The graph.
         world_from_bone: (T,B,4,4) its solution.
-        spread: How far off the calibration may be.
+        error_modes: Of the calibration.
         begin: Called with the name of each part of the computation, before which freed memory is released.
 
     Returns:
-        NaN throughout where the graph's equations are singular.
+        In the axes of the solution. NaN if the equations of the graph are singular.
     """
     begin("joint covariances")
     linear = linearise(solved.graph, solved.values)
     begin("normal equations")
-    order, bounds = _tick_blocks(solved, linear)
+    columns = _columns_by_tick(solved, linear)
+    order, bounds = columns.order, columns.bounds
     try:
-        chain = BlockTridiagonal((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
+        normal = BlockTridiagonal((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
     except np.linalg.LinAlgError:
-        # A state that nothing holds: the solution stands, how well it is known cannot be told.
+        # Some state is not observable. The solution exists, but its covariance does not.
         return np.full((*world_from_bone.shape[:2], 3, 3), np.nan)
     begin("covariances of the measurements")
-    shifts = _measurement_residual_jacobian(solved, linear, spread)
-    shifts = shifts + joint_residual_jacobian(
-        linear, solved.body, solved.first_joint, world_from_bone, spread
+    changes = _measurement_residual_jacobian(solved, linear, error_modes)
+    changes = changes + joint_residual_jacobian(
+        linear, solved.body, solved.first_joint, world_from_bone, error_modes
     )
-    shifts = shifts.tocsc()
-    place = np.argsort(order)
+    changes = changes.tocsc()
+    position = np.argsort(order)
     ticks, count = world_from_bone.shape[:2]
     out = np.zeros((ticks, count, 3, 3))
 
-    def readers(tick: int) -> FloatArray:
-        """(B-1,3,n) from a tick's states to each joint's centre relative to the first bone's."""
+    def reader_at(tick: int) -> FloatArray:
+        """Return the derivatives (B-1,3,n) of joint centres minus the first bone's by the tick's states."""
         first = [
-            int(place[linear.columns[bone_key(tick, bone)]]) - int(bounds[tick]) for bone in range(count)
+            int(position[linear.columns[bone_key(tick, bone)]]) - int(bounds[tick]) for bone in range(count)
         ]
         reader = np.zeros((count - 1, 3, int(bounds[tick + 1] - bounds[tick])))
         reader[:, :, first[0] + 3 : first[0] + 6] = -world_from_bone[tick, 0, :3, :3]
@@ -98,52 +101,64 @@ def joint_covariance(
             reader[bone - 1, :, first[bone] + 3 : first[bone] + 6] = world_from_bone[tick, bone, :3, :3]
         return reader
 
-    def read(tick: int, covariance: FloatArray) -> None:
-        reader = readers(tick)
+    def add_marginal(tick: int, covariance: FloatArray) -> None:
+        reader = reader_at(tick)
         out[tick, 1:] += reader @ covariance @ reader.swapaxes(1, 2)
 
-    chain.marginals(read)
+    normal.marginals(add_marginal)
     begin("covariances of the calibration")
-    for first in range(0, shifts.shape[1], _MODES_PER_SOLVE):
-        # A few directions at a time: all of eleven cameras' at once take gigabytes.
-        right = (linear.matrix.T @ shifts[:, first : first + _MODES_PER_SOLVE]).toarray()
-        moved = chain.solve(right)
-        for tick, each in enumerate(moved):
-            shift = readers(tick) @ each
-            out[tick, 1:] += shift @ shift.swapaxes(1, 2)
+    for first in range(0, changes.shape[1], _MODES_PER_SOLVE):
+        rhs = (linear.matrix.T @ changes[:, first : first + _MODES_PER_SOLVE]).toarray()
+        for tick, states in enumerate(normal.solve(rhs)):
+            moved = reader_at(tick) @ states
+            out[tick, 1:] += moved @ moved.swapaxes(1, 2)
     return out
 
 
-def _tick_blocks(solved: SolvedGraph, linear: LinearisedGraph) -> tuple[IntArray, IntArray]:
-    """Columns tick by tick, states between two ticks with the earlier one, and where each tick begins."""
+class _TickColumns(NamedTuple):
+    """The columns of the graph in the order of the ticks.
+
+    Attributes:
+        order: (C,) columns tick by tick. A state between two ticks belongs to the earlier one.
+        bounds: (T+1,) where each tick begins in `order`.
+    """
+
+    order: IntArray
+    bounds: IntArray
+
+
+def _columns_by_tick(solved: SolvedGraph, linear: LinearisedGraph) -> _TickColumns:
     keys, ticks = [], []
     for chain in solved.chains:
-        times = np.array([time for time, _, _ in chain])
+        times = np.array([state.time_ns for state in chain])
         tick = np.clip(np.searchsorted(solved.tick_times_ns, times, side="right") - 1, 0, None)
-        keys += [key for _, *both in chain for key in both]
+        keys += [key for state in chain for key in (state.pose_key, state.velocity_key)]
         ticks.append(np.repeat(tick, 2))
     tick = np.concatenate(ticks)
     by_tick = np.argsort(tick, kind="stable")
     start = np.array([linear.columns[key] for key in keys], dtype=np.int64)[by_tick]
     order = (start[:, None] + np.arange(6)).ravel()
     bounds = 6 * np.searchsorted(tick[by_tick], np.arange(len(solved.tick_times_ns) + 1))
-    return np.asarray(order), np.asarray(bounds, dtype=np.int64)
+    return _TickColumns(np.asarray(order), np.asarray(bounds, dtype=np.int64))
 
 
-def _measurement_residual_jacobian(solved: SolvedGraph, linear: LinearisedGraph, spread: ErrorModes) -> Any:
-    """How the residuals of the measurements change when mounts and scale do: rows (R,M), sparse."""
-    out = sparse.csr_matrix((linear.matrix.shape[0], len(spread.log_scale)))
+def _measurement_residual_jacobian(
+    solved: SolvedGraph, linear: LinearisedGraph, error_modes: ErrorModes
+) -> Any:
+    """Return the change (R,M), sparse, of the measurements' residuals along each mode of mounts and scale."""
+    out = sparse.csr_matrix((linear.matrix.shape[0], len(error_modes.log_scale)))
     middle = np.concatenate([track.map_from_cam[:, :3, 3] for track in solved.tracks]).mean(axis=0)
     first = 0
     for track in solved.tracks:
         mount, keys = solved.mounts[track.camera], solved.measured_keys[track.camera]
         factors = first + np.arange(len(keys))
-        moved = np.repeat(-(adjoint(mount) @ spread.mounts[track.camera])[None], len(keys), axis=0)
+        by_mount = -(se3_adjoint(mount) @ error_modes.mounts[track.camera])
+        change = np.repeat(by_mount[None], len(keys), axis=0)
         bones = track.map_from_cam @ invert(mount)
-        away = track.map_from_cam[:, :3, 3] - middle
-        stretched = np.einsum("nji,nj->ni", bones[:, :3, :3], away)
-        moved[:, 3:] += stretched[:, :, None] * spread.log_scale
-        out = out + linear.sparse_rows(factors, linear.pose_jacobians(factors, 6, keys) @ moved)
+        from_middle = track.map_from_cam[:, :3, 3] - middle
+        by_scale = np.einsum("nji,nj->ni", bones[:, :3, :3], from_middle)
+        change[:, 3:] += by_scale[:, :, None] * error_modes.log_scale
+        out = out + linear.sparse_rows(factors, linear.pose_jacobians(factors, 6, keys) @ change)
         first += len(keys)
     return out
 
@@ -151,7 +166,17 @@ def _measurement_residual_jacobian(solved: SolvedGraph, linear: LinearisedGraph,
 def skeleton_covariance(
     rotation: FloatArray, bones: Sequence[Bone], covariance: FloatArray | None, joints: int
 ) -> FloatArray | None:
-    """Covariance (T,J,3,3) in turned axes, NaN for joints that are no bones, from the bones' (T,B,3,3)."""
+    """Return the covariance of all joints of the skeleton in rotated axes.
+
+    Args:
+        rotation: (3,3) to the new axes.
+        bones: The graph's bones.
+        covariance: (T,B,3,3) of the bones; None if it was not computed.
+        joints: Number J of joints of the skeleton.
+
+    Returns:
+        (T,J,3,3), NaN for joints without a bone in the graph; None without a covariance.
+    """
     if covariance is None:
         return None
     out = np.full((len(covariance), joints, 3, 3), np.nan)
@@ -162,12 +187,12 @@ def skeleton_covariance(
 def sigma_percentiles(
     roles: Sequence[str], covariance: FloatArray | None, observed: BoolArray
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """Percentiles of the joints' sigmas per axis by role, for measured and for filled ticks apart.
+    """Return percentiles of the joints' sigmas per axis by role, separately for observed and filled ticks.
 
     Args:
-        roles: (J,) of the joints.
-        covariance: (T,J,3,3), NaN where not solved.
-        observed: (T,J) where cameras measured the joint.
+        roles: J roles of the joints.
+        covariance: (T,J,3,3), NaN for joints that were not solved; None if it was not computed.
+        observed: (T,J) whether cameras measured the joint.
     """
     out: dict[str, dict[str, dict[str, float]]] = {}
     if covariance is None:

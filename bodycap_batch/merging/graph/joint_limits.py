@@ -1,4 +1,4 @@
-"""Soft rules: limits of joints and the reach of arms; when walking, palms hang on their own side."""
+"""Soft limits of distances: elbows and knees, the reach of arms, and where the palms of a walker hang."""
 
 from __future__ import annotations
 
@@ -17,27 +17,29 @@ from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions, split_side
 
 _REACH_SIGMA_M = 0.05
+"""Sigma in metres of a distance outside its bounds. Evidence: none."""
 _HINGE_SIGMA_M = 0.02
+"""The same for elbows and knees, whose bones are rigid. Evidence: none."""
 _SHOULDER_MOTION_M = 0.05
-"""How far a shoulder's centre moves on the trunk when the clavicle turns by 15 to 20°."""
+"""Distance in metres that a shoulder's centre moves on the trunk when the clavicle rotates by 15 to 20°."""
 _ANCHOR_DISTANCE_M = 1.0
-"""Distance of the points from which height and side are judged: far enough that spheres are nearly planes."""
+"""Distance in metres of the points that bound height and side: far enough that spheres are nearly planes."""
 _MAX_CROSSING_M = 0.1
-"""How far a walking palm may cross the body's middle before it is pulled back."""
+"""Distance in metres by which a walking palm may cross the middle of the body. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
 class DistanceLimit:
-    """A bone's joint keeps a distance within bounds from a point of another bone.
+    """Bounds of the distance of a bone's joint from a point of another bone.
 
     Attributes:
         name: For the report.
         base: Index of the bone that carries the point.
-        bone: Index of the bone whose joint is bounded.
-        anchor_m: (3,) the point, in the base's frame.
+        bone: Index of the bone with the joint.
+        anchor_m: (3,) the point, in the frame of the base bone.
         low_m: Smallest distance.
         high_m: Largest distance.
-        sigma_m: Stiffness outside the bounds.
+        sigma_m: Sigma of the distance outside the bounds.
     """
 
     name: str
@@ -49,7 +51,7 @@ class DistanceLimit:
     sigma_m: float = _REACH_SIGMA_M
 
     def add(self, graph: Any, tick: int) -> None:
-        """Add the soft factor of one tick: no force inside the bounds, a spring outside."""
+        """Add the factor of one tick: no cost inside the bounds, a quadratic one outside."""
         middle, half = 0.5 * (self.low_m + self.high_m), 0.5 * (self.high_m - self.low_m)
         dead_zone = gtsam.noiseModel.mEstimator.L2WithDeadZone.Create(half / self.sigma_m)
         noise = gtsam.noiseModel.Robust.Create(dead_zone, gtsam.noiseModel.Isotropic.Sigma(1, self.sigma_m))
@@ -58,7 +60,7 @@ class DistanceLimit:
         graph.add(gtsam.RangeFactorWithTransformPose3(*keys, middle, noise, anchor))
 
     def violation_m(self, world_from_bone: FloatArray) -> FloatArray:
-        """How far solved poses (T,B,4,4) press beyond the bounds (T,), 0 inside."""
+        """Return how far (T,) solved poses (T,B,4,4) are outside the bounds, in metres."""
         base = world_from_bone[:, self.base]
         anchor = np.einsum("tij,j->ti", base[:, :3, :3], self.anchor_m) + base[:, :3, 3]
         distance = np.linalg.norm(world_from_bone[:, self.bone, :3, 3] - anchor, axis=1)
@@ -68,7 +70,7 @@ class DistanceLimit:
 def soft_limits(
     skeleton: SkeletonModel, bones: Sequence[Bone], activity: Activity
 ) -> tuple[DistanceLimit, ...]:
-    """All rules that apply to the bones of the graph."""
+    """Return all limits that apply to the bones of the graph."""
     return (
         *hinge_limits(skeleton, bones),
         *arm_reach_limits(skeleton, bones),
@@ -77,30 +79,32 @@ def soft_limits(
 
 
 def hinge_limits(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[DistanceLimit, ...]:
-    """Elbows and knees do not bend backwards.
+    """Return limits that keep elbows and knees from bending backward.
 
-    The lower bone's far end keeps to the half space of a point on the side the joint closes to; the hinge
-    keeps it in the plane.
+    The far end of the lower bone must be near enough to a point on the side to which the joint bends. The
+    hinge keeps it in the plane of bending.
     """
-    rules = []
+    limits = []
     for hinge in hinges(skeleton, tuple(bones)):
         side, part = split_side(bones[hinge.upper].role)
         forward = anatomical_axes(skeleton, bones[hinge.upper].role)[:, 1] * (1.0 if part == "Arm" else -1.0)
         joint = hinge.anchors_m.mean(axis=0)
         length = float(np.linalg.norm(bones[hinge.following].offset_m))
         name = f"{side} {'elbow' if part == 'Arm' else 'knee'} not overstretched"
-        # At right angles to the point the limb is straight; nearer is bent.
-        furthest = float(np.hypot(HINGE_ARM_M, length))
+        # A straight limb has this distance from the point; a bent one is nearer.
+        straight_m = float(np.hypot(HINGE_ARM_M, length))
         anchor = joint + HINGE_ARM_M * forward
-        rules.append(DistanceLimit(name, hinge.upper, hinge.following, anchor, 0.0, furthest, _HINGE_SIGMA_M))
-    return tuple(rules)
+        limits.append(
+            DistanceLimit(name, hinge.upper, hinge.following, anchor, 0.0, straight_m, _HINGE_SIGMA_M)
+        )
+    return tuple(limits)
 
 
 def arm_reach_limits(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[DistanceLimit, ...]:
-    """Palms stay within an arm's length of the shoulder, where the chest alone says where that is."""
+    """Return limits that keep palms within an arm's length of the shoulder, as the chest's pose places it."""
     index = {bone.role: position for position, bone in enumerate(bones)}
     chest = index.get("Spine1")
-    rest, rules = rest_positions(skeleton), []
+    rest, limits = rest_positions(skeleton), []
     for side in ("Left", "Right"):
         hand, arm = index.get(side + "Hand"), index.get(side + "Arm")
         if chest is None or hand is None or arm is None:
@@ -108,20 +112,20 @@ def arm_reach_limits(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[Di
         shoulder = rest[bones[arm].joint] - rest[bones[chest].joint]
         links = [bones[index[side + part]].offset_m for part in ("ForeArm", "Hand")]
         reach = float(sum(np.linalg.norm(link) for link in links)) + _SHOULDER_MOTION_M
-        rules.append(DistanceLimit(f"{side} palm within reach", chest, hand, shoulder, 0.0, reach))
-    return tuple(rules)
+        limits.append(DistanceLimit(f"{side} palm within reach", chest, hand, shoulder, 0.0, reach))
+    return tuple(limits)
 
 
 def activity_limits(
     skeleton: SkeletonModel, bones: Sequence[Bone], activity: Activity
 ) -> tuple[DistanceLimit, ...]:
-    """The rules of an activity; ``generic`` has none beyond the limits and the reach."""
+    """Return the further limits of an activity; ``generic`` has none."""
     index = {bone.role: position for position, bone in enumerate(bones)}
     chest = index.get("Spine1")
     if activity != "walk" or chest is None:
         return ()
     rest = rest_positions(skeleton)
-    rules = []
+    limits = []
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
         hand, arm = index.get(side + "Hand"), skeleton.index_of_role(side + "Arm")
         if hand is None or arm is None:
@@ -130,7 +134,7 @@ def activity_limits(
         above = shoulder + np.array([0.0, 0.0, _ANCHOR_DISTANCE_M])
         beside = shoulder + np.array([sign * _ANCHOR_DISTANCE_M, 0.0, 0.0])
         across = _ANCHOR_DISTANCE_M + abs(float(shoulder[0])) + _MAX_CROSSING_M
-        rules.append(
+        limits.append(
             DistanceLimit(
                 f"{side} palm below the shoulder",
                 chest,
@@ -140,5 +144,5 @@ def activity_limits(
                 3.0 * _ANCHOR_DISTANCE_M,
             )
         )
-        rules.append(DistanceLimit(f"{side} palm on its side", chest, hand, beside, 0.0, across))
-    return tuple(rules)
+        limits.append(DistanceLimit(f"{side} palm on its side", chest, hand, beside, 0.0, across))
+    return tuple(limits)

@@ -1,4 +1,4 @@
-"""Least squares around a solution: Jacobians out of GTSAM, and a chain of blocks solved tick by tick."""
+"""The linearised factor graph: the Jacobian and residuals of GTSAM at a solution, as sparse arrays."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class LinearisedGraph:
     """A graph's whitened Jacobian at a solution, robust weights included.
 
     Attributes:
-        matrix: (R,C) sparse rows, C-contiguous by row (CSR).
+        matrix: (R,C) sparse, by row (CSR).
         columns: First column of each key.
-        first_row: (F+1,) first row of each factor, the number of rows last.
-        right: (R,) right-hand side: what the residuals lack to zero.
+        first_row: (F+1,) first row of each factor, and the number of rows last.
+        rhs: (R,) right-hand side: the negative residuals.
     """
 
     matrix: Any
@@ -29,28 +29,39 @@ class LinearisedGraph:
     rhs: FloatArray
 
     def pose_jacobians(self, factors: IntArray, height: int, keys: Sequence[int]) -> FloatArray:
-        """Dense (N,height,6) derivatives of the factors (N,), each of that height, by one pose each."""
-        wanted = (self.first_row[factors][:, None] + np.arange(height)).ravel()
+        """Return the derivatives (N,height,6) of factors by one pose each.
+
+        Args:
+            factors: (N,) indices of factors.
+            height: Number of rows of each factor.
+            keys: N keys of poses.
+        """
+        rows = (self.first_row[factors][:, None] + np.arange(height)).ravel()
         start = np.array([self.columns[key] for key in keys], dtype=np.int64)
-        picked = self.matrix[wanted].tocoo()
-        which, line = np.divmod(picked.row, height)
-        column = picked.col - start[which]
+        entries = self.matrix[rows].tocoo()
+        number, line = np.divmod(entries.row, height)
+        column = entries.col - start[number]
         inside = (column >= 0) & (column < 6)
         out = np.zeros((len(factors), height, 6))
-        out[which[inside], line[inside], column[inside]] = picked.data[inside]
+        out[number[inside], line[inside], column[inside]] = entries.data[inside]
         return out
 
-    def sparse_rows(self, factors: IntArray, moved: FloatArray) -> Any:
-        """Rows (R,M), sparse, that are `moved` (N,height,M) at the factors (N,) and zero elsewhere."""
-        count, height, width = moved.shape
+    def sparse_rows(self, factors: IntArray, values: FloatArray) -> Any:
+        """Return rows (R,M), sparse, that have values at some factors and are zero elsewhere.
+
+        Args:
+            factors: (N,) indices of factors.
+            values: (N,height,M) the rows of these factors.
+        """
+        count, height, width = values.shape
         row = np.repeat((self.first_row[factors][:, None] + np.arange(height)).ravel(), width)
         column = np.tile(np.arange(width), count * height)
         shape = (self.matrix.shape[0], width)
-        return sparse.csr_matrix((moved.ravel(), (row, column)), shape=shape)
+        return sparse.csr_matrix((values.ravel(), (row, column)), shape=shape)
 
 
 def linearise(graph: Any, values: Any) -> LinearisedGraph:
-    """Take the derivatives of all factors at `values`."""
+    """Linearise all factors of a graph at the given values."""
     first_row = np.cumsum([0, *(graph.at(index).dim() for index in range(graph.size()))])
     sizes = values.zeroVectors()
     columns, count = {}, 0
@@ -58,9 +69,9 @@ def linearise(graph: Any, values: Any) -> LinearisedGraph:
         columns[key] = count
         count += len(sizes.at(key))
     row, column, entry = graph.linearize(values).sparseJacobian_()
-    kept = column <= count
-    place = (row[kept].astype(np.int64) - 1, column[kept].astype(np.int64) - 1)
-    matrix = sparse.csr_matrix((entry[kept], place), shape=(int(first_row[-1]), count))
-    right = np.zeros(matrix.shape[0])
-    right[row[~kept].astype(np.int64) - 1] = entry[~kept]
-    return LinearisedGraph(matrix, columns, np.asarray(first_row, dtype=np.int64), right)
+    in_matrix = column <= count
+    position = (row[in_matrix].astype(np.int64) - 1, column[in_matrix].astype(np.int64) - 1)
+    matrix = sparse.csr_matrix((entry[in_matrix], position), shape=(int(first_row[-1]), count))
+    rhs = np.zeros(matrix.shape[0])
+    rhs[row[~in_matrix].astype(np.int64) - 1] = entry[~in_matrix]
+    return LinearisedGraph(matrix, columns, np.asarray(first_row, dtype=np.int64), rhs)

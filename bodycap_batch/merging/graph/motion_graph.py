@@ -1,4 +1,4 @@
-"""All ticks at once: bones in continuous time, every measurement at its own timestamp, mounts held."""
+"""The motion graph of a timeline: bones in continuous time, measurements at their own times, fixed mounts."""
 
 from __future__ import annotations
 
@@ -13,48 +13,74 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.body.bones import Bone, hinges
 from bodycap_batch.merging.body.initial_poses import fill_gaps, pose_bones
-from bodycap_batch.merging.cameras.track import MIN_SIGMA_M, MIN_SIGMA_RAD, CameraTrack
+from bodycap_batch.merging.cameras.track import (
+    MAX_COARSE_GAP_NS,
+    MIN_SIGMA_M,
+    MIN_SIGMA_RAD,
+    CameraTrack,
+)
 from bodycap_batch.merging.graph.error_modes import BodyModel, ErrorModes
 from bodycap_batch.merging.graph.factors import (
     GEMAN_MCCLURE_C,
     MAX_BONES,
     JointFactors,
+    MotionState,
     bone_key,
-    gauss_newton_then_lm,
     geman_mcclure,
     velocity_key,
 )
 from bodycap_batch.merging.graph.foot_contact import FootContact
 from bodycap_batch.merging.graph.joint_covariance import SolvedGraph, joint_covariance
 from bodycap_batch.merging.graph.joint_limits import DistanceLimit
+from bodycap_batch.merging.graph.optimiser import gauss_newton_then_lm
 from bodycap_batch.model.geometry import interpolate_pose, invert, so3_log
 from bodycap_batch.model.skeleton import SkeletonModel
 
 ON_TICK_TOLERANCE_NS = 1_000_000
-"""A measurement this close to a tick counts there: at 3 m/s the hand moves 3 mm in a millisecond."""
+"""Largest distance of a measurement from a tick, in nanoseconds, at which it measures the state of the tick:
+in a millisecond, a hand at 3 m/s moves 3 mm."""
 
 _TOLERANCE = 1e-4
-"""Convergence is quadratic: after a step that lowers the error by 1e-4, joints move by less than 0.1 mm."""
+"""Relative decrease of the error below which the solver stops. Convergence is quadratic: after a step that
+lowers the error by less, joints move by less than 0.1 mm."""
 
 _VELOCITY_SIGMA = np.array([8.0, 8.0, 8.0, 3.0, 3.0, 3.0])
-"""Weak prior on the first and last velocity, where the motion model has one neighbour only (rad/s, m/s)."""
+"""Sigmas (rad/s, m/s) of a weak prior on a bone's first and last velocity, where the motion prior has only
+one neighbour. Evidence: none."""
 _REST_VELOCITY_SIGMA = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
-"""Before the first and after the last measurement of all cameras the body rests instead of flying on."""
+"""The same before the first and after the last measurement of all cameras. It makes the body rest there,
+which would otherwise keep its last velocity. Evidence: none."""
+
+
+@dataclass(frozen=True, slots=True)
+class MeasurementResiduals:
+    """The differences between the measured and the solved poses of one camera.
+
+    Attributes:
+        distance_m: (N,) between the centres.
+        angle_rad: (N,) between the orientations.
+        weights: (N,) robust weights.
+    """
+
+    distance_m: FloatArray
+    angle_rad: FloatArray
+    weights: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionSolution:
-    """Bones at every tick.
+    """The solved motion.
 
     Attributes:
-        world_from_bone: (T,B,4,4).
-        residual_m: By camera, (N,) distance of the measured centre from the solved one.
-        residual_rad: By camera, (N,) angle between them.
-        weights: By camera, (N,) robust weight of each measurement, 1 = kept whole.
-        world_from_cam: By camera, (N,4,4) where its bone and mount have it at each measurement.
-        iterations: Steps the optimiser took.
+        world_from_bone: (T,B,4,4) at each tick.
+        residual_m: By camera, (N,) distance of each measured centre from the solved one.
+        residual_rad: By camera, (N,) angle between the measured and the solved orientation.
+        weights: By camera, (N,) robust weight of each measurement, 1 if it has its full weight.
+        world_from_cam: By camera, (N,4,4) solved pose at each measurement, from bone and mount.
+        iterations: Number of iterations of the optimiser.
         errors: Half the sum of squares by kind of factor.
-        joint_covariance: (T,B,3,3) of each bone's joint centre minus the first bone's, m²; None if not asked.
+        joint_covariance: (T,B,3,3), m², of each bone's joint centre minus the first bone's; None if it was
+            not computed.
     """
 
     world_from_bone: FloatArray
@@ -75,18 +101,18 @@ class SolverProgress(Protocol):
 
 
 class MotionGraph:
-    """The graph over the whole timeline.
+    """The factor graph of a timeline, or of a window of one.
 
-    A measurement off the ticks gets a state of its own in the bone's motion chain. GTSAM's
-    ``WnoaInterpFactorPose3`` would interpolate without the extra state, but crashes when its noise is robust.
+    A measurement that is not on a tick gets a state of its own in the chain of its bone. GTSAM's
+    ``WnoaInterpFactorPose3`` would interpolate without that state, but it crashes with robust noise.
 
     Args:
         skeleton: The body.
         bones: The graph's bones.
         tick_times_ns: (T,) the timeline.
-        tracks: Cleaned tracks, poses in metres.
+        tracks: Tracks without outliers, poses in metres.
         mounts: joint_from_cam (4,4) by camera.
-        rules: Soft rules of the activity, and feet that stand.
+        limits: Soft limits of distances, and foot contacts.
     """
 
     def __init__(
@@ -96,33 +122,39 @@ class MotionGraph:
         tick_times_ns: IntArray,
         tracks: Sequence[CameraTrack],
         mounts: Mapping[str, FloatArray],
-        rules: Sequence[DistanceLimit | FootContact] = (),
+        limits: Sequence[DistanceLimit | FootContact] = (),
     ) -> None:
         self._skeleton, self._bones, self._times = skeleton, bones, tick_times_ns
-        self._tracks, self._mounts, self._rules = tracks, mounts, rules
+        self._tracks, self._mounts, self._limits = tracks, mounts, limits
         self._graph = gtsam.NonlinearFactorGraph()
-        self._sizes: dict[str, int] = {}
+        self._factor_counts: dict[str, int] = {}
         self._measured_keys: dict[str, list[int]] = {}
-        self._chains: list[list[tuple[int, int, int]]] = []
+        self._chains: list[list[MotionState]] = []
         self._add_measurements()
         self._add_motion()
         self._add_joints()
-        self._add_rules()
+        self._add_limits()
+
+    @property
+    def graph(self) -> Any:
+        """The factors: measurements, smoothness, joints, limits."""
+        return self._graph
 
     def solve(
-        self, iterations: int, step: SolverProgress, spread: ErrorModes | None = None
+        self, iterations: int, step: SolverProgress, error_modes: ErrorModes | None = None
     ) -> MotionSolution:
-        """Optimise and read the result off.
+        """Optimise the graph.
 
         Args:
-            iterations: Most steps.
-            step: Called after each, and with the name of each part of the computation; may raise to stop.
-            spread: How far off the calibration may be; None leaves the joints' covariance out.
+            iterations: Maximum number of iterations.
+            step: Called after each iteration, and with the name of each part of the computation; may raise to
+                stop.
+            error_modes: Of the calibration. Without them, the covariance of the joints is not computed.
         """
-        if spread is not None:
+        if error_modes is not None:
             step("solving")
         values, count = gauss_newton_then_lm(
-            self._graph, self._start(), iterations=iterations, step=step, tolerance=_TOLERANCE
+            self._graph, self.initial_values(), iterations=iterations, step=step, tolerance=_TOLERANCE
         )
         poses = np.array(
             [
@@ -131,12 +163,17 @@ class MotionGraph:
             ]
         )
         solution = self._read(values, poses, count)
-        if spread is None:
+        if error_modes is None:
             return solution
-        covariance = joint_covariance(self._solved(values), poses, spread, step)
+        covariance = joint_covariance(self.solved_graph(values), poses, error_modes, step)
         return replace(solution, joint_covariance=covariance)
 
-    def _solved(self, values: Any) -> SolvedGraph:
+    def solved_graph(self, values: Any) -> SolvedGraph:
+        """Return what the covariance needs of the graph.
+
+        Args:
+            values: A solution.
+        """
         return SolvedGraph(
             graph=self._graph,
             values=values,
@@ -146,11 +183,11 @@ class MotionGraph:
             tracks=self._tracks,
             measured_keys=self._measured_keys,
             mounts=self._mounts,
-            first_joint=self._sizes["measurements"] + self._sizes["smoothness"],
+            first_joint=self._factor_counts["measurements"] + self._factor_counts["smoothness"],
         )
 
     def _node_keys(self) -> list[dict[int, tuple[int, int]]]:
-        """Per bone: time of each state -> its pose and velocity keys, ticks first."""
+        """Return for each bone the pose and velocity keys of its states at the ticks, by time."""
         ticks = self._times.tolist()
         return [
             {time: (bone_key(tick, bone), velocity_key(tick, bone)) for tick, time in enumerate(ticks)}
@@ -159,30 +196,30 @@ class MotionGraph:
 
     def _add_measurements(self) -> None:
         nodes = self._node_keys()
-        extra = [0] * len(self._bones)
-        taken: list[dict[int, int]] = [{} for _ in self._bones]
+        count_off_ticks = [0] * len(self._bones)
+        times_off_ticks: list[dict[int, int]] = [{} for _ in self._bones]
         for track in self._tracks:
             keys = []
             noises = _measurement_noises(track, self._mounts[track.camera])
             poses = track.map_from_cam @ invert(self._mounts[track.camera])
             for time, pose, noise in zip(track.times_ns.tolist(), poses, noises, strict=True):
-                node = self._nearest_tick(time)
-                if abs(node - time) > ON_TICK_TOLERANCE_NS:
-                    # Cameras of one bone share a state: two states closer than this are singular.
-                    node = _merge_state_time(taken[track.bone], time)
-                    if node not in nodes[track.bone]:
-                        index = extra[track.bone] * MAX_BONES + track.bone
-                        nodes[track.bone][node] = (
+                state_time = self._nearest_tick(time)
+                if abs(state_time - time) > ON_TICK_TOLERANCE_NS:
+                    # Cameras of one bone share a state: the equations of two very close states are singular.
+                    state_time = _merge_state_time(times_off_ticks[track.bone], time)
+                    if state_time not in nodes[track.bone]:
+                        index = count_off_ticks[track.bone] * MAX_BONES + track.bone
+                        nodes[track.bone][state_time] = (
                             int(gtsam.symbol("e", index)),
                             int(gtsam.symbol("w", index)),
                         )
-                        extra[track.bone] += 1
-                key = nodes[track.bone][node][0]
+                        count_off_ticks[track.bone] += 1
+                key = nodes[track.bone][state_time][0]
                 self._graph.add(gtsam.PriorFactorPose3(key, gtsam.Pose3(pose), geman_mcclure(noise)))
                 keys.append(key)
             self._measured_keys[track.camera] = keys
-        self._chains = [sorted((time, *keys) for time, keys in chain.items()) for chain in nodes]
-        self._sizes["measurements"] = int(self._graph.size())
+        self._chains = [sorted(MotionState(time, *keys) for time, keys in chain.items()) for chain in nodes]
+        self._factor_counts["measurements"] = int(self._graph.size())
 
     def _nearest_tick(self, time_ns: int) -> int:
         after = int(np.clip(np.searchsorted(self._times, time_ns), 1, max(len(self._times) - 1, 1)))
@@ -193,99 +230,111 @@ class MotionGraph:
         before = self._graph.size()
         start = int(self._times[0])
         weak = gtsam.noiseModel.Diagonal.Sigmas(_VELOCITY_SIGMA)
-        calm = gtsam.noiseModel.Diagonal.Sigmas(_REST_VELOCITY_SIGMA)
-        seen_from = min(int(track.times_ns[0]) for track in self._tracks)
-        seen_to = max(int(track.times_ns[-1]) for track in self._tracks)
+        at_rest = gtsam.noiseModel.Diagonal.Sigmas(_REST_VELOCITY_SIGMA)
+        measured_from = min(int(track.times_ns[0]) for track in self._tracks)
+        measured_to = max(int(track.times_ns[-1]) for track in self._tracks)
         for bone, chain in zip(self._bones, self._chains, strict=True):
             states = [
-                gtsam.StateData(pose, velocity, 1e-9 * (time - start)) for time, pose, velocity in chain
+                gtsam.StateData(state.pose_key, state.velocity_key, 1e-9 * (state.time_ns - start))
+                for state in chain
             ]
             for first, second in pairwise(states):
                 self._graph.add(gtsam.WnoaMotionFactorPose3(first, second, bone.psd))
-            for time, _, velocity in chain:
-                outside = time < seen_from or time > seen_to
-                if outside or time in (chain[0][0], chain[-1][0]):
-                    noise = calm if outside else weak
-                    self._graph.add(gtsam.PriorFactorVector(velocity, np.zeros(6), noise))
-        self._sizes["smoothness"] = int(self._graph.size() - before)
+            for state in chain:
+                outside = state.time_ns < measured_from or state.time_ns > measured_to
+                if outside or state.time_ns in (chain[0].time_ns, chain[-1].time_ns):
+                    noise = at_rest if outside else weak
+                    self._graph.add(gtsam.PriorFactorVector(state.velocity_key, np.zeros(6), noise))
+        self._factor_counts["smoothness"] = int(self._graph.size() - before)
 
     def _add_joints(self) -> None:
         before = self._graph.size()
         joints = JointFactors(self._bones, hinges(self._skeleton, tuple(self._bones)))
         for tick in range(len(self._times)):
             joints.add(self._graph, tick)
-        self._sizes["joints"] = int(self._graph.size() - before)
+        self._factor_counts["joints"] = int(self._graph.size() - before)
 
-    def _add_rules(self) -> None:
+    def _add_limits(self) -> None:
         before = self._graph.size()
         for tick in range(len(self._times)):
-            for rule in self._rules:
-                rule.add(self._graph, tick)
-        self._sizes["rules"] = int(self._graph.size() - before)
+            for limit in self._limits:
+                limit.add(self._graph, tick)
+        self._factor_counts["rules"] = int(self._graph.size() - before)
 
-    def _start(self) -> Any:
+    def initial_values(self) -> Any:
+        """Return initial values of all states, from the measurements and inverse kinematics."""
         measured = {}
         for track in reversed(self._tracks):
-            poses, valid = track.poses_at(self._times, max_gap_ns=200_000_000)
-            # Frames that are all far apart are joined as they are.
-            whole = fill_gaps(poses, valid) if valid.any() else poses
-            measured[track.bone] = whole @ invert(self._mounts[track.camera])
+            poses, valid = track.poses_at(self._times, max_gap_ns=MAX_COARSE_GAP_NS)
+            # If all frames are far apart, the poses between them are interpolated nevertheless.
+            filled = fill_gaps(poses, valid) if valid.any() else poses
+            measured[track.bone] = filled @ invert(self._mounts[track.camera])
         poses = pose_bones(self._skeleton, self._bones, measured)
-        seconds = 1e-9 * (self._times - self._times[0])
+        tick_s = 1e-9 * (self._times - self._times[0])
         values = gtsam.Values()
         for bone, chain in enumerate(self._chains):
-            times = 1e-9 * (np.array([time for time, _, _ in chain]) - self._times[0])
-            at_states, velocities = _initial_states(poses[:, bone], seconds, times)
-            for (_, pose_key, speed_key), pose, velocity in zip(chain, at_states, velocities, strict=True):
-                values.insert(pose_key, gtsam.Pose3(pose))
-                values.insert(speed_key, velocity)
+            state_s = 1e-9 * (np.array([state.time_ns for state in chain]) - self._times[0])
+            at_states, velocities = _initial_states(poses[:, bone], tick_s, state_s)
+            for state, pose, velocity in zip(chain, at_states, velocities, strict=True):
+                values.insert(state.pose_key, gtsam.Pose3(pose))
+                values.insert(state.velocity_key, velocity)
         return values
 
     def _read(self, values: Any, poses: FloatArray, count: int) -> MotionSolution:
-        residual_m, residual_rad, weights, world_from_cam = {}, {}, {}, {}
+        residuals, world_from_cam = {}, {}
         for track in self._tracks:
             mount = self._mounts[track.camera]
             keys = self._measured_keys[track.camera]
             solved = np.array([values.atPose3(key).matrix() for key in keys]).reshape(-1, 4, 4) @ mount
             world_from_cam[track.camera] = solved
-            residual_m[track.camera], residual_rad[track.camera], weights[track.camera] = (
-                measurement_residuals(track, solved)
-            )
+            residuals[track.camera] = measurement_residuals(track, solved)
         errors, first = {}, 0
-        for kind, size in self._sizes.items():
+        for kind, size in self._factor_counts.items():
             errors[kind] = float(sum(self._graph.at(i).error(values) for i in range(first, first + size)))
             first += size
         return MotionSolution(
             world_from_bone=poses,
-            residual_m=residual_m,
-            residual_rad=residual_rad,
-            weights=weights,
+            residual_m={camera: each.distance_m for camera, each in residuals.items()},
+            residual_rad={camera: each.angle_rad for camera, each in residuals.items()},
+            weights={camera: each.weights for camera, each in residuals.items()},
             world_from_cam=world_from_cam,
             iterations=count,
             errors=errors,
         )
 
 
-def measurement_residuals(
-    track: CameraTrack, world_from_cam: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """How far (N,) the measured poses lie from solved ones, metres and rad, and the weights they keep."""
-    off = invert(track.map_from_cam) @ world_from_cam
-    whitened = np.linalg.solve(np.linalg.cholesky(camera_covariance(track)), _pose_error(off)[..., None])
-    distance_m, turn_rad = (np.linalg.norm(part, axis=1) for part in (off[:, :3, 3], so3_log(off[:, :3, :3])))
-    return distance_m, turn_rad, _geman_mcclure_weight(np.linalg.norm(whitened[..., 0], axis=1))
+def measurement_residuals(track: CameraTrack, world_from_cam: FloatArray) -> MeasurementResiduals:
+    """Compare the measured poses of a track with solved ones.
+
+    Args:
+        track: N measurements, poses in metres.
+        world_from_cam: (N,4,4) the solved poses.
+    """
+    measured_from_solved = invert(track.map_from_cam) @ world_from_cam
+    half = np.linalg.cholesky(camera_covariance(track))
+    whitened = np.linalg.solve(half, _pose_error(measured_from_solved)[..., None])
+    return MeasurementResiduals(
+        distance_m=np.linalg.norm(measured_from_solved[:, :3, 3], axis=1),
+        angle_rad=np.linalg.norm(so3_log(measured_from_solved[:, :3, :3]), axis=1),
+        weights=_geman_mcclure_weight(np.linalg.norm(whitened[..., 0], axis=1)),
+    )
 
 
-def _merge_state_time(taken: dict[int, int], time_ns: int) -> int:
-    """Time of the state off the ticks that is within `ON_TICK_TOLERANCE_NS`, or the given one, then remembered."""
-    place = time_ns // ON_TICK_TOLERANCE_NS
-    near = [taken[cell] for cell in (place - 1, place, place + 1) if cell in taken]
+def _merge_state_time(times: dict[int, int], time_ns: int) -> int:
+    """Return the time of a state within `ON_TICK_TOLERANCE_NS`, else the given time, which is then added.
+
+    Args:
+        times: Times of a bone's states off the ticks, by multiple of the tolerance.
+        time_ns: Of a measurement.
+    """
+    cell = time_ns // ON_TICK_TOLERANCE_NS
+    near = [times[index] for index in (cell - 1, cell, cell + 1) if index in times]
     found = next((time for time in near if abs(time - time_ns) <= ON_TICK_TOLERANCE_NS), time_ns)
-    return taken.setdefault(found // ON_TICK_TOLERANCE_NS, found)
+    return times.setdefault(found // ON_TICK_TOLERANCE_NS, found)
 
 
 def camera_covariance(track: CameraTrack) -> FloatArray:
-    """(N,6,6) of each measured pose in the camera's frame, rotation first, with the floors in place."""
+    """Return the covariance (N,6,6) of each measured pose in the camera's frame, rotation first."""
     variances = np.empty((len(track.times_ns), 6))
     variances[:, :3] = np.maximum(track.sigma_rad, MIN_SIGMA_RAD)[:, None] ** 2
     variances[:, 3:] = np.maximum(track.sigma_map, MIN_SIGMA_M)[:, None] ** 2
@@ -293,39 +342,48 @@ def camera_covariance(track: CameraTrack) -> FloatArray:
 
 
 def _measurement_noises(track: CameraTrack, joint_from_cam: FloatArray) -> list[Any]:
-    """Noise of the bone's pose behind each measurement: the camera's, carried through the mount."""
+    """Return the noise of the bone's pose at each measurement: the camera's, propagated through the mount."""
     adjoint = gtsam.Pose3(joint_from_cam).AdjointMap()
     covariance = adjoint @ camera_covariance(track) @ adjoint.T
     return [gtsam.noiseModel.Gaussian.Covariance(each) for each in covariance]
 
 
 def _pose_error(pose: FloatArray) -> FloatArray:
-    """Rotation vector and translation (N,6) of small poses (N,4,4)."""
+    """Return rotation vectors and translations (N,6) of small poses (N,4,4)."""
     return np.hstack([so3_log(pose[:, :3, :3]), pose[:, :3, 3]])
 
 
-def _geman_mcclure_weight(distance: FloatArray) -> FloatArray:
-    """Weight of a residual of that many sigmas."""
+def _geman_mcclure_weight(norm: FloatArray) -> FloatArray:
+    """Return the robust weight of residuals with the given norm in sigmas."""
     squared = GEMAN_MCCLURE_C**2
-    return np.asarray((squared / (squared + distance**2)) ** 2)
+    return np.asarray((squared / (squared + norm**2)) ** 2)
 
 
 def _initial_states(
-    poses: FloatArray, seconds: FloatArray, times: FloatArray
+    poses: FloatArray, tick_s: FloatArray, state_s: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Poses (N,4,4) and velocities (N,6) at `times` (N,) from poses (T,4,4) at `seconds` (T,)."""
-    last = len(seconds) - 1
+    """Interpolate poses, and take velocities from their differences.
+
+    Args:
+        poses: (T,4,4) at the ticks.
+        tick_s: (T,) times of the ticks in seconds.
+        state_s: (N,) times of the states in seconds.
+
+    Returns:
+        Poses (N,4,4) and velocities (N,6) at the states.
+    """
+    last = len(tick_s) - 1
     if last == 0:
-        return np.repeat(poses, len(times), axis=0), np.zeros((len(times), 6))
-    first = np.clip(np.searchsorted(seconds, times, side="right") - 1, 0, last - 1)
-    span = seconds[first + 1] - seconds[first]
-    alpha = np.clip((times - seconds[first]) / span, 0.0, 1.0)
+        return np.repeat(poses, len(state_s), axis=0), np.zeros((len(state_s), 6))
+    first = np.clip(np.searchsorted(tick_s, state_s, side="right") - 1, 0, last - 1)
+    span = tick_s[first + 1] - tick_s[first]
+    alpha = np.clip((state_s - tick_s[first]) / span, 0.0, 1.0)
     step = invert(poses[first]) @ poses[first + 1]
     return interpolate_pose(poses[first], poses[first + 1], alpha), _pose_error(step) / span[:, None]
 
 
 def joint_gaps(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, FloatArray]:
-    """How far each bone's joint lies from where its parent has it, by role: (T,) metres."""
+    """Return by role the distance (T,), metres, of each bone's joint from its place on the parent."""
     out = {}
     for index, bone in enumerate(bones):
         if bone.parent >= 0:
@@ -337,7 +395,7 @@ def joint_gaps(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, 
 def hinge_deviations(
     skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray
 ) -> dict[str, FloatArray]:
-    """How far the end of each hinged bone lies off its hinge's plane, by its role: (T,) metres."""
+    """Return by role the distance (T,), metres, of each hinged bone's end from the plane of its hinge."""
     out = {}
     for hinge in hinges(skeleton, tuple(bones)):
         axis = hinge.anchors_m[0] - hinge.anchors_m.mean(axis=0)

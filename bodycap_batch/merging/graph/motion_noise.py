@@ -1,4 +1,4 @@
-"""Noise of the motion prior, scaled to how fast a camera moved."""
+"""The noise of the motion prior, adapted to the measured accelerations."""
 
 from __future__ import annotations
 
@@ -12,18 +12,23 @@ from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.model.geometry import so3_log
 
 _MAX_PSD_RATIO = 100.0
-"""Largest factor on a motion model's density: accelerations ten times the table's."""
+"""Largest factor on a power spectral density of `body.bones`: ten times the usual accelerations, beyond which
+a pose is wrong. Evidence: none."""
 
 
 def scale_motion_noise(bones: Sequence[Bone], tracks: Sequence[CameraTrack]) -> tuple[Bone, ...]:
-    """Loosen the motion model where the measured motion is wilder than its table.
+    """Increase the noise of the motion prior of bones that accelerate more than usual.
 
-    The second difference of a path that follows the model has variance 2/3 q h³ besides its noise's 6 σ².
-    Bones without a camera take over the largest ratio found below them, since the limb swings as a whole.
+    For a power spectral density q and a frame interval h, the second difference of a path has the variance
+    2/3 q h³. Independent noise of the poses adds 6 σ². A bone without a camera takes the largest ratio of the
+    bones below it, because a limb swings as a whole.
 
     Args:
         bones: The graph's bones.
-        tracks: Cleaned tracks in metres.
+        tracks: Tracks without outliers, poses in metres.
+
+    Returns:
+        The bones with densities that are the usual ones or larger.
     """
     ratio = np.ones((len(bones), 2))
     for track in tracks:

@@ -10,7 +10,7 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import LIMB_CHAINS, Bone
-from bodycap_batch.merging.body.initial_poses import (
+from bodycap_batch.merging.body.provisional_scale import (
     distance_constraint,
     kinematic_neighbours,
     provisional_scale,

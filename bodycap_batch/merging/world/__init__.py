@@ -1,1 +1,1 @@
-"""The vertical and the floor: the axes of the world."""
+"""The world: planes of the map, the vertical, the floor, and the transform from the solved frame."""

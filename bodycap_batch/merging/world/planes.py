@@ -1,4 +1,4 @@
-"""The map's large planes: walls, floor, ceiling. They know the vertical better than a body does."""
+"""The large planes of the map: walls, floor, ceiling. Their vertical is more accurate than the body's."""
 
 from __future__ import annotations
 
@@ -12,22 +12,33 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import so3_exp
 
 PLANE_HALF_THICKNESS_M = 0.02
+"""Largest distance in metres of a plane's points from it. Evidence: none."""
 _MIN_POINTS = 100
+"""Points of a map below which no planes are searched. Evidence: none."""
 _MIN_PLANE_POINTS = 25
+"""Smallest number of points of a plane. Evidence: none."""
+_MIN_PLANE_SHARE = 0.03
+"""The same as a ratio of all points. Evidence: none."""
 _MAX_PLANES = 10
+"""Planes that are searched at most. Evidence: none."""
 _HYPOTHESES = 600
+"""RANSAC hypotheses for each plane. Evidence: none."""
 _HYPOTHESES_AT_ONCE = 32
-"""Hypotheses whose distances from all points are held at a time."""
+"""Hypotheses whose distances from all points are in memory at the same time. Evidence:
+docs/decisions/merging.md."""
 _NEIGHBOUR_RADIUS_M = 1.5
+"""Largest distance in metres between the points of a hypothesis: neighbours often lie on one plane."""
 _MAX_POINTS = 20_000
-"""Points that tell as much as all: a long capture's map has hundreds of thousands."""
+"""Points that are used at most; the map of a long capture has hundreds of thousands."""
 TILT_LIMIT_DEG = 20.0
-"""How far the vertical may lie from the body's own: a chest's lean and its mount's error, three sigma."""
+"""Largest angle in degrees between the vertical and the body's: three sigmas of a chest's lean and of the
+error of its mount."""
 BENT_TILT_LIMIT_DEG = 35.0
-"""The same of someone who mostly bends. At 45 a wall could pass for the floor."""
+"""The same for a person who bends most of the time. At 45 degrees, a wall could be taken for the floor."""
 _AGREEMENT_DEG = 1.0
+"""Largest angle in degrees by which a plane that agrees with a vertical may be neither level nor upright."""
 _MIN_INFORMATION_SHARE = 0.12
-"""Smallest share of the planes' points that must fix each of the two tilts."""
+"""Smallest ratio of the planes' points that must determine each of the two tilts. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +46,9 @@ class Plane:
     """A plane of the map.
 
     Attributes:
-        normal: (3,) unit.
+        normal: (3,) unit vector.
         offset_m: ``normal @ x`` of its points.
-        count: Points within `PLANE_HALF_THICKNESS_M`.
+        count: Number of points within `PLANE_HALF_THICKNESS_M`.
     """
 
     normal: FloatArray
@@ -45,8 +56,21 @@ class Plane:
     count: int
 
 
+@dataclass(frozen=True, slots=True)
+class PlaneVertical:
+    """A vertical to which planes of the map are parallel or perpendicular.
+
+    Attributes:
+        up: (3,) unit vector.
+        inlier_share: Ratio of the planes' points that belong to planes within `_AGREEMENT_DEG`.
+    """
+
+    up: FloatArray
+    inlier_share: float
+
+
 def find_planes(points_m: FloatArray, rng: np.random.Generator) -> list[Plane]:
-    """Find planes one after the other, the fullest first.
+    """Find planes one after the other, those with most points first.
 
     Args:
         points_m: (P,3).
@@ -57,18 +81,21 @@ def find_planes(points_m: FloatArray, rng: np.random.Generator) -> list[Plane]:
     planes: list[Plane] = []
     if len(points_m) > _MAX_POINTS:
         points_m = points_m[rng.choice(len(points_m), _MAX_POINTS, replace=False)]
-    left = points_m
-    smallest = max(_MIN_PLANE_POINTS, round(0.03 * len(points_m)))
-    while len(planes) < _MAX_PLANES and len(left) >= max(smallest, 4) and len(points_m) >= _MIN_POINTS:
-        plane = _largest_plane(left, rng)
+    remaining = points_m
+    smallest = max(_MIN_PLANE_POINTS, round(_MIN_PLANE_SHARE * len(points_m)))
+    while len(planes) < _MAX_PLANES and len(remaining) >= max(smallest, 4) and len(points_m) >= _MIN_POINTS:
+        plane = _largest_plane(remaining, rng)
         if plane is None or plane.count < smallest:
             break
         planes.append(plane)
-        left = left[np.abs(left @ plane.normal - plane.offset_m) > 2.0 * PLANE_HALF_THICKNESS_M]
+        remaining = remaining[
+            np.abs(remaining @ plane.normal - plane.offset_m) > 2.0 * PLANE_HALF_THICKNESS_M
+        ]
     return planes
 
 
 def _largest_plane(points: FloatArray, rng: np.random.Generator) -> Plane | None:
+    """Return the plane with most points (P,3) by RANSAC, refined to them; None without three neighbours."""
     tree = cKDTree(points)
     seeds = rng.integers(len(points), size=_HYPOTHESES)
     groups = (np.array(tree.query_ball_point(point, _NEIGHBOUR_RADIUS_M)) for point in points[seeds])
@@ -85,7 +112,7 @@ def _largest_plane(points: FloatArray, rng: np.random.Generator) -> Plane | None
     first, second, third = (points[triples[:, column]] for column in range(3))
     normals = np.cross(second - first, third - first)
     length = np.linalg.norm(normals, axis=1)
-    # Three points in a line carry no plane.
+    # Three collinear points determine no plane.
     good = (
         length > 0.1 * np.linalg.norm(second - first, axis=1) * np.linalg.norm(third - first, axis=1) + 1e-12
     )
@@ -93,14 +120,13 @@ def _largest_plane(points: FloatArray, rng: np.random.Generator) -> Plane | None
         return None
     normals, first = normals[good] / length[good, None], first[good]
     offsets = (normals * first).sum(axis=1)
-    # All at once they take 60 MB for a walk of nine seconds, 200 with the most points there may be.
-    parts = (
+    batches = (
         slice(start, start + _HYPOTHESES_AT_ONCE) for start in range(0, len(normals), _HYPOTHESES_AT_ONCE)
     )
     counts = np.concatenate(
         [
-            (np.abs(points @ normals[part].T - offsets[part]) < PLANE_HALF_THICKNESS_M).sum(axis=0)
-            for part in parts
+            (np.abs(points @ normals[batch].T - offsets[batch]) < PLANE_HALF_THICKNESS_M).sum(axis=0)
+            for batch in batches
         ]
     )
     best = int(np.argmax(counts))
@@ -116,17 +142,16 @@ def _largest_plane(points: FloatArray, rng: np.random.Generator) -> Plane | None
 
 def vertical_from_planes(
     planes: Sequence[Plane], body_up: FloatArray, limit_deg: float
-) -> tuple[FloatArray, float] | None:
-    """The direction near the body's up that most planes are parallel or perpendicular to.
+) -> PlaneVertical | None:
+    """Return the direction near the body's up that most planes are parallel or perpendicular to.
 
     Args:
         planes: From `find_planes`.
-        body_up: (3,) where to look.
-        limit_deg: How far from it.
+        body_up: (3,) centre of the search.
+        limit_deg: Radius of the search.
 
     Returns:
-        Up (3,) and the share of the planes' points that agree within `_AGREEMENT_DEG`, or None where the planes
-        do not fix both tilts.
+        None if the planes that agree do not determine both tilts.
     """
     if not planes:
         return None
@@ -146,16 +171,28 @@ def vertical_from_planes(
     agree = misalignment_deg(up @ normals.T) < _AGREEMENT_DEG
     if not _fixes_both_tilts(normals[agree], counts[agree], up, counts.sum()):
         return None
-    return up, float(counts[agree].sum() / counts.sum())
+    return PlaneVertical(up, float(counts[agree].sum() / counts.sum()))
 
 
 def misalignment_deg(cosine: FloatArray) -> FloatArray:
-    """Angle by which a plane is neither level nor upright."""
+    """Return the angle (degrees) by which planes are neither level nor upright.
+
+    Args:
+        cosine: Of the angle between each normal and the vertical.
+    """
     angle = np.degrees(np.arccos(np.clip(np.abs(cosine), 0.0, 1.0)))
     return np.asarray(np.minimum(angle, 90.0 - angle))
 
 
 def _fixes_both_tilts(normals: FloatArray, counts: FloatArray, up: FloatArray, total: float) -> bool:
+    """Return whether planes determine both tilts of a vertical.
+
+    Args:
+        normals: (N,3) of the planes that agree with it.
+        counts: (N,) their points.
+        up: (3,) the vertical.
+        total: Points of all planes.
+    """
     information = np.zeros((3, 3))
     for normal, count in zip(normals, counts, strict=True):
         level = abs(float(normal @ up)) > 0.7

@@ -1,4 +1,8 @@
-"""Which way is up: everything that has a say, what was taken, and how far the others are off."""
+"""The vertical: hypotheses from the map, the walk, the body and the job are weighed against each other.
+
+Each hypothesis has a negative log-likelihood (nats) of everything that is observed, if it were right. The
+terms are set by hand.
+"""
 
 from __future__ import annotations
 
@@ -16,44 +20,57 @@ from bodycap_batch.merging.world.planes import (
     TILT_LIMIT_DEG,
     Plane,
     find_planes,
+    misalignment_deg,
     vertical_from_planes,
 )
 
 _LEAN_SAMPLES = 3.0
-"""How many independent moments a clip's leaning counts for: a habit lasts all of it."""
+"""Number of independent observations that the lean of a whole capture is worth: the posture's systematic bias
+is the same in all of them. Evidence: none."""
 _PLANE_SHARE_NATS = 6.0
-"""What a vertical costs that none of the planes' points agree with."""
+"""Cost in nats of a vertical that none of the planes' points agree with. Evidence: none."""
 _WALK_NATS, _BODY_NATS = 1.5, 12.0
-"""What it costs to believe the walk rather than planes that agree with the body as well as it does, and to
-believe the body's leaning alone."""
+"""Cost in nats of a vertical from the walk, and from the body's lean alone. A vertical from planes is
+preferred to these if it agrees with the body as well. Evidence: none."""
 _SCENE_NATS = 4.0
-"""A trunk that moves further up and down than it stands high climbs stairs; and a room's points lie above
-its floor."""
+"""Cost in nats of a trunk that moves farther up and down than its standing height, as on stairs; and of a
+scene with points below its floor. Evidence: none."""
 _FLOOR_NATS = 2.0
+"""Gain in nats of a level plane where the floor must be. Evidence: none."""
 _FLOOR_TOLERANCE, _MAX_SHARE_BELOW = 0.35, 0.02
-"""How far the floor may be from where a trunk's height has it (a rough scale, bent knees); share of points
-below it that are wrong."""
+"""Largest error of the floor's height, over the trunk's height, because of a rough scale or bent knees; and
+largest ratio of wrong points below the floor. Evidence: none."""
 _MIN_MARGIN_NATS = 3.0
-"""Twenty to one."""
+"""Smallest difference in nats to the next best direction that determines the vertical: odds of twenty to
+one."""
 _STATED_SIGMAS = 3.0
+"""Largest angle, in sigmas, at which planes agree with a stated vertical."""
 _DISTINCT_DEG = 20.0
+"""Angle in degrees above which another direction is a rival, and not an error of the same one. Evidence:
+none."""
 _SEARCH_DEG = 5.0
+"""Radius in degrees of the search about a normal, or about a direction parallel to two planes. Evidence:
+none."""
 _SAME_DEG, _MAX_FLOOR_TILT_DEG = 1.0, 5.0
+"""Angle in degrees within which a direction was searched already; and largest tilt of a floor. Evidence:
+none."""
 _MIN_PLANE_SIGMA_DEG, _WALK_SIGMA_DEG, _BODY_SIGMA_DEG = 0.7, 2.0, 15.0
-"""Walls and floors agree with the truth to 0.3 to 1.3 degrees on five captures; a walk's ground and bounce
-are level to two; what a camera's mount is turned by looks like a lean."""
+"""Sigmas in degrees. Planes: docs/decisions/merging.md. A walk's ground and bounce are level to two degrees.
+A rotation of the camera's mount looks like a lean of the body."""
+_PLANE_SIGMA_LIMIT_DEG = 1.5
+"""Largest angle in degrees of the planes from which the sigma of a vertical is computed. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VerticalHypothesis:
-    """What one source has to say about up.
+    """A direction that may be the vertical.
 
     Attributes:
         source: "map" (its planes), "walk", "body" or "marker board".
         up: (3,) in the solved frame.
-        sigma_deg: How far off it may be, if it is the right one of several directions.
-        share: Of the planes' points that agree; 0 where it is no map's.
-        nats: How strange all of the rest would be, were it right.
+        sigma_deg: Its error, if it is the right one of several directions.
+        share: Ratio of the planes' points that agree; 0 if it does not come from planes.
+        negative_log_likelihood: Of everything observed if it is right, nats.
     """
 
     source: str
@@ -65,18 +82,18 @@ class VerticalHypothesis:
 
 @dataclass(frozen=True, slots=True)
 class Vertical:
-    """Up in the solved frame, and what it rests on.
+    """The vertical in the solved frame.
 
     Attributes:
         up: (3,).
-        source: What it was taken from.
-        body_off_deg: Angle to the body's own idea of it; None where that was taken.
-        plane_share: Of the planes' points that agree with it.
-        sigma_deg: How far off it may be.
-        others: The best each other source has to say, and the best that is far from what was taken.
-        nats: How strange all of the rest is with it.
-        margin_nats: How much stranger it is with the best far one, of those that the job states if it does;
-            None where there is none.
+        source: Of the hypothesis.
+        body_off_deg: Angle to the upright body; None if the vertical comes from the body.
+        plane_share: Ratio of the planes' points that agree with it.
+        sigma_deg: Its error.
+        alternatives: The best hypothesis of each other source, and the best rival.
+        negative_log_likelihood: Of everything observed, nats.
+        margin_nats: Negative log-likelihood of the best rival minus that of the vertical; None without a
+            rival. If the job states the vertical, only stated directions are rivals.
     """
 
     up: FloatArray
@@ -89,25 +106,25 @@ class Vertical:
     margin_nats: float | None = None
 
     def is_determined(self) -> bool:
-        """Whether the next best direction is clearly worse, and a lasting lean would have shown."""
+        """Return whether the best rival is clearly less likely, and a constant lean would have shown."""
         if self.rests_on_lean_only():
             return False
         return self.margin_nats is None or self.margin_nats >= _MIN_MARGIN_NATS
 
     def rests_on_lean_only(self) -> bool:
-        """Whether it rests on nothing but a leaning that may have lasted all the time."""
+        """Return whether it comes from a lean alone that may have been the same all the time."""
         return self.source == "body" and self.sigma_deg > _DISTINCT_DEG
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneContext:
-    """What lies about a trunk.
+    """The map around a trunk, and its path.
 
     Attributes:
         points_m: (P,3) map points in the solved frame.
         path_m: (N,3) path of the trunk's camera.
-        standing_m: Height of the trunk's joint over the soles of who stands.
-        walks: Whether the body walks most of the time.
+        standing_m: Height of the trunk's joint above the soles of the standing person.
+        walks: Whether the person walks most of the time.
     """
 
     points_m: FloatArray
@@ -118,108 +135,127 @@ class SceneContext:
 
 def estimate_vertical(
     body: TrunkOrientation,
-    around: SceneContext,
+    scene: SceneContext,
     rng: np.random.Generator,
     stated: Sequence[VerticalHypothesis] = (),
 ) -> Vertical:
-    """Weigh the verticals of the map's planes, of the walk and of the body's leaning against each other.
+    """Select the most likely vertical among those of the planes, the walk, the body and the job.
 
-    A room's planes leave six directions or more; which of them is up is told by how the trunk would lean
-    (forwards, hardly backwards or sideways), how far it would rise and fall, and whether a floor lies where
-    one has to.
+    A room's planes leave six directions or more. Three observations show which of them is up: how the trunk
+    leans (forward, seldom backward or sideways), how far it rises and falls, and whether there is a floor
+    where it must be.
 
     Args:
-        body: How the trunk leans.
-        around: The map and the trunk's path.
-        rng: Draws the planes' hypotheses.
-        stated: What the job itself says; the best of it is taken, or the planes that agree with that,
-            whatever the others say.
+        body: The trunk over time.
+        scene: The map and the trunk's path.
+        rng: Draws the hypotheses of the planes.
+        stated: From the job. The most likely of them is selected, whatever the others say, and replaced by
+            that of planes that agree with it.
     """
-    planes = find_planes(around.points_m, rng)
+    planes = find_planes(scene.points_m, rng)
     hints = [body.modal_up(), body.mean_up(), body.upright_up()]
-    says = [
+    upright = hints[2]
+    hypotheses = [
         *_hypotheses_from_planes(planes, hints),
         *(
             VerticalHypothesis(
                 source="walk", up=up, sigma_deg=_WALK_SIGMA_DEG, negative_log_likelihood=_WALK_NATS
             )
-            for up in (vertical_from_path(around.path_m, hint) for hint in hints)
+            for up in (vertical_from_path(scene.path_m, hint) for hint in hints)
             if up is not None
         ),
-        *(
-            VerticalHypothesis(
-                source="body",
-                up=up,
-                sigma_deg=_body_sigma_deg(body, up, around.walks),
-                negative_log_likelihood=_BODY_NATS,
-            )
-            for up in hints[2:]
+        VerticalHypothesis(
+            source="body",
+            up=upright,
+            sigma_deg=_body_sigma_deg(body, upright, scene.walks),
+            negative_log_likelihood=_BODY_NATS,
         ),
         *stated,
     ]
-    leans = _LEAN_SAMPLES * body.negative_log_likelihood(np.array([say.up for say in says]))
-    says = [
+    leans = _LEAN_SAMPLES * body.negative_log_likelihood(np.array([each.up for each in hypotheses]))
+    hypotheses = [
         VerticalHypothesis(
-            source=say.source,
-            up=say.up,
-            sigma_deg=say.sigma_deg,
-            share=say.share,
-            negative_log_likelihood=say.negative_log_likelihood
+            source=each.source,
+            up=each.up,
+            sigma_deg=each.sigma_deg,
+            share=each.share,
+            negative_log_likelihood=each.negative_log_likelihood
             + lean
-            + _scene_penalty(say.up, planes, around),
+            + _scene_penalty(each.up, planes, scene),
         )
-        for say, lean in zip(says, leans.tolist(), strict=True)
+        for each, lean in zip(hypotheses, leans.tolist(), strict=True)
     ]
-    sources = {say.source for say in stated}
-    return _vertical_from_hypotheses(_select(says, sources), says, sources, hints[2])
+    stated_sources = {each.source for each in stated}
+    selected = _select(hypotheses, stated_sources)
+    return _vertical_from_hypotheses(selected, hypotheses, stated_sources, upright)
 
 
-def _select(says: Sequence[VerticalHypothesis], stated: Collection[str]) -> VerticalHypothesis:
-    """The least strange; of stated ones, if any, and then as exact as planes that agree have it."""
-    best = min(
-        (say for say in says if not stated or say.source in stated),
-        key=lambda say: say.negative_log_likelihood,
-    )
-    agree = [
-        say
-        for say in says
-        if stated and say.source == "map" and angle_deg(say.up, best.up) < _STATED_SIGMAS * best.sigma_deg
+def _cost(hypothesis: VerticalHypothesis) -> float:
+    return hypothesis.negative_log_likelihood
+
+
+def _select(hypotheses: Sequence[VerticalHypothesis], stated: Collection[str]) -> VerticalHypothesis:
+    """Return the hypothesis with the lowest negative log-likelihood.
+
+    If the job states the vertical, choose among the stated ones, and take the direction of map planes that
+    agree within 3 sigma.
+    """
+    best = min((each for each in hypotheses if not stated or each.source in stated), key=_cost)
+    agreeing = [
+        each
+        for each in hypotheses
+        if stated and each.source == "map" and angle_deg(each.up, best.up) < _STATED_SIGMAS * best.sigma_deg
     ]
-    return min(agree, key=lambda say: say.negative_log_likelihood, default=best)
+    return min(agreeing, key=_cost, default=best)
 
 
 def _vertical_from_hypotheses(
-    chosen: VerticalHypothesis, says: Sequence[VerticalHypothesis], stated: Collection[str], erect: FloatArray
+    selected: VerticalHypothesis,
+    hypotheses: Sequence[VerticalHypothesis],
+    stated: Collection[str],
+    upright: FloatArray,
 ) -> Vertical:
-    """What was taken, beside what else might have been: of what the job states, another of that."""
+    """Return the selected vertical with its alternatives and the margin to its best rival.
+
+    Args:
+        selected: The most likely hypothesis.
+        hypotheses: All of them.
+        stated: Sources of the stated ones; only these are rivals then.
+        upright: (3,) up direction of the upright body.
+    """
     best: dict[str, VerticalHypothesis] = {}
-    for say in sorted(says, key=lambda say: say.negative_log_likelihood):
-        if say.source != chosen.source:
-            best.setdefault(say.source, say)
+    for each in sorted(hypotheses, key=_cost):
+        if each.source != selected.source:
+            best.setdefault(each.source, each)
     far = [
-        say
-        for say in says
-        if angle_deg(say.up, chosen.up) > _DISTINCT_DEG
-        and (say.source in stated if stated else say.source != "body")
+        each
+        for each in hypotheses
+        if angle_deg(each.up, selected.up) > _DISTINCT_DEG
+        and (each.source in stated if stated else each.source != "body")
     ]
-    rival = min(far, key=lambda say: say.negative_log_likelihood, default=None)
-    others = list(best.values())
-    if rival is not None and all(rival is not say for say in others):
-        others.append(rival)
+    rival = min(far, key=_cost, default=None)
+    alternatives = list(best.values())
+    if rival is not None and all(rival is not each for each in alternatives):
+        alternatives.append(rival)
     return Vertical(
-        up=chosen.up,
-        source=chosen.source,
-        body_off_deg=None if chosen.source == "body" else angle_deg(chosen.up, erect),
-        plane_share=chosen.share,
-        sigma_deg=chosen.sigma_deg,
-        alternatives=tuple(others),
-        negative_log_likelihood=chosen.negative_log_likelihood,
-        margin_nats=None if rival is None else rival.negative_log_likelihood - chosen.negative_log_likelihood,
+        up=selected.up,
+        source=selected.source,
+        body_off_deg=None if selected.source == "body" else angle_deg(selected.up, upright),
+        plane_share=selected.share,
+        sigma_deg=selected.sigma_deg,
+        alternatives=tuple(alternatives),
+        negative_log_likelihood=selected.negative_log_likelihood,
+        margin_nats=None if rival is None else _cost(rival) - _cost(selected),
     )
 
 
 def _hypotheses_from_planes(planes: Sequence[Plane], hints: Sequence[FloatArray]) -> list[VerticalHypothesis]:
-    """All the directions that most planes near them are level or upright to."""
+    """Return all directions to which most planes are parallel or perpendicular.
+
+    Args:
+        planes: Of the map.
+        hints: Up directions of the body, where the search starts besides the planes' own normals.
+    """
     normals = [plane.normal for plane in planes]
     level = [np.cross(a, b) for i, a in enumerate(normals) for b in normals[:i]]
     axes = [axis / np.linalg.norm(axis) for axis in (*normals, *level) if np.linalg.norm(axis) > 0.5]
@@ -227,35 +263,35 @@ def _hypotheses_from_planes(planes: Sequence[Plane], hints: Sequence[FloatArray]
     searches += [(sign * axis, _SEARCH_DEG) for axis in axes for sign in (1.0, -1.0)]
     out: list[VerticalHypothesis] = []
     for hint, limit_deg in searches:
-        if limit_deg == _SEARCH_DEG and any(angle_deg(hint, say.up) < _SAME_DEG for say in out):
+        if limit_deg == _SEARCH_DEG and any(angle_deg(hint, each.up) < _SAME_DEG for each in out):
             continue
         found = vertical_from_planes(planes, hint, limit_deg)
-        if found is None or any(angle_deg(found[0], say.up) < 0.1 * _SAME_DEG for say in out):
+        if found is None or any(angle_deg(found.up, each.up) < 0.1 * _SAME_DEG for each in out):
             continue
         out.append(
             VerticalHypothesis(
                 source="map",
-                up=found[0],
-                sigma_deg=_plane_sigma_deg(planes, found[0]),
-                share=found[1],
-                negative_log_likelihood=_PLANE_SHARE_NATS * (1.0 - found[1]),
+                up=found.up,
+                sigma_deg=_plane_sigma_deg(planes, found.up),
+                share=found.inlier_share,
+                negative_log_likelihood=_PLANE_SHARE_NATS * (1.0 - found.inlier_share),
             )
         )
     return out
 
 
 def _plane_sigma_deg(planes: Sequence[Plane], up: FloatArray) -> float:
-    """How well planes that agree within a degree and a half fix a vertical."""
-    angle = np.degrees(np.arccos(np.clip([abs(float(plane.normal @ up)) for plane in planes], 0.0, 1.0)))
-    off = np.minimum(angle, 90.0 - angle)
-    near = off[off < 1.5]
+    """Return the sigma (degrees) of a vertical from the planes that nearly agree with it."""
+    off = misalignment_deg(np.array([float(plane.normal @ up) for plane in planes]))
+    near = off[off < _PLANE_SIGMA_LIMIT_DEG]
     return float(np.hypot(_MIN_PLANE_SIGMA_DEG, np.sqrt((near**2).sum()) / max(len(near) - 1, 1)))
 
 
 def _body_sigma_deg(body: TrunkOrientation, up: FloatArray, walks: bool) -> float:
-    """Who walks is upright but for a camera's tilt, which looks like a lean: that, and half of how it moves.
+    """Return the sigma (degrees) of a vertical from the body alone.
 
-    Who sits, stands or works may lean all the time, and nothing tells by how much.
+    A person who walks is upright. The sigma then contains a rotation of the camera's mount, which looks like
+    a lean, and half of the trunk's movement. A person who sits, stands or works may lean all the time.
     """
     if not walks:
         return body.posterior_spread_deg(up)
@@ -263,23 +299,23 @@ def _body_sigma_deg(body: TrunkOrientation, up: FloatArray, walks: bool) -> floa
     return float(np.hypot(_BODY_SIGMA_DEG, 0.5 * np.sqrt((moved**2).mean())))
 
 
-def _scene_penalty(up: FloatArray, planes: Sequence[Plane], around: SceneContext) -> float:
-    """What the room and the way through it say against a direction, nats."""
-    heights = around.path_m @ up
+def _scene_penalty(up: FloatArray, planes: Sequence[Plane], scene: SceneContext) -> float:
+    """Return the negative log-likelihood (nats) of the room and of the path through it for a vertical."""
+    heights = scene.path_m @ up
     low, high = np.percentile(heights, [2.0, 98.0])
-    nats = _SCENE_NATS if high - low > around.standing_m else 0.0
-    deepest = high - (1.0 + _FLOOR_TOLERANCE) * around.standing_m
-    if len(around.points_m) and float((around.points_m @ up < deepest).mean()) > _MAX_SHARE_BELOW:
+    nats = _SCENE_NATS if high - low > scene.standing_m else 0.0
+    deepest = high - (1.0 + _FLOOR_TOLERANCE) * scene.standing_m
+    if len(scene.points_m) and float((scene.points_m @ up < deepest).mean()) > _MAX_SHARE_BELOW:
         nats += _SCENE_NATS
     for plane in planes:
         along = float(plane.normal @ up)
         if abs(along) > np.cos(np.radians(_MAX_FLOOR_TILT_DEG)):
             depth = high - plane.offset_m * float(np.sign(along))
-            if abs(depth - around.standing_m) < _FLOOR_TOLERANCE * around.standing_m + PLANE_HALF_THICKNESS_M:
+            if abs(depth - scene.standing_m) < _FLOOR_TOLERANCE * scene.standing_m + PLANE_HALF_THICKNESS_M:
                 return nats - _FLOOR_NATS
     return nats
 
 
 def angle_deg(first: FloatArray, second: FloatArray) -> float:
-    """Angle between two unit directions (3,), degrees."""
+    """Return the angle (degrees) between two unit vectors (3,)."""
     return float(np.degrees(np.arccos(np.clip(first @ second, -1.0, 1.0))))

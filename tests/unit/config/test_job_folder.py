@@ -15,7 +15,7 @@ from bodycap_batch.config.rules import problems_in
 from bodycap_batch.config.trust import PathPolicy
 from bodycap_batch.core.errors import CaptureError, JobError
 from bodycap_batch.merging.body.bones import kinematic_chain
-from bodycap_batch.merging.body.initial_poses import reach_constraint
+from bodycap_batch.merging.body.provisional_scale import reach_constraint
 from bodycap_batch.model.skeleton_presets import load_skeleton
 
 LENS = {"model": "PINHOLE", "params": [420, 420, 320, 240], "width": 640, "height": 480}

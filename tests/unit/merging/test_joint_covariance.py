@@ -14,12 +14,13 @@ from scipy import sparse
 
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.cameras.track import make_track
-from bodycap_batch.merging.graph.error_modes import ErrorModes, adjoint, stack_modes
-from bodycap_batch.merging.graph.factors import bone_key, levenberg_marquardt
+from bodycap_batch.merging.graph.error_modes import ErrorModes, stack_modes
+from bodycap_batch.merging.graph.factors import bone_key
+from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
 from bodycap_batch.merging.graph.joint_covariance import joint_covariance, sigma_percentiles
 from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution
 from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
-from bodycap_batch.model.geometry import make_transform, so3_exp
+from bodycap_batch.model.geometry import make_transform, se3_adjoint, so3_exp
 from tests.stages.walker import FPS, ROLES, make_inputs, make_walk, record
 
 
@@ -76,8 +77,8 @@ def test_a_long_chain_is_not_held_and_its_solution_is_the_same():
 
 def test_a_graph_that_holds_nothing_states_no_covariance(walk):
     graph, bones, _ = _graph(walk)
-    values, _ = levenberg_marquardt(graph._graph, graph._start(), iterations=1)
-    loose = replace(graph._solved(values), graph=gtsam.NonlinearFactorGraph())
+    values, _ = levenberg_marquardt(graph.graph, graph.initial_values(), iterations=1)
+    loose = replace(graph.solved_graph(values), graph=gtsam.NonlinearFactorGraph())
     poses = np.tile(np.eye(4), (round(FPS), len(bones), 1, 1))
     nothing = np.zeros((len(bones), 3, 0))
     spread = ErrorModes(mounts={}, log_scale=np.zeros(0), rest=nothing, offsets_m=nothing)
@@ -88,7 +89,7 @@ def test_a_graph_that_holds_nothing_states_no_covariance(walk):
 
 def test_the_adjoint_is_gtsams():
     pose = gtsam.Pose3.Expmap(np.array([0.3, -1.1, 0.7, 0.2, 2.0, -0.4]))
-    assert_allclose(adjoint(pose.matrix()), pose.AdjointMap(), atol=1e-12)
+    assert_allclose(se3_adjoint(pose.matrix()), pose.AdjointMap(), atol=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +143,7 @@ def test_without_a_spread_the_covariance_is_gtsams_marginal(walk):
     graph, bones, _ = _graph(walk)
     solution = _solve(graph, _nothing(bones))
     values, _ = _optimised(graph)
-    marginals = gtsam.Marginals(graph._graph, values)
+    marginals = gtsam.Marginals(graph.graph, values)
     hand = next(place for place, bone in enumerate(bones) if bone.role == "RightHand")
     for tick in (0, 14, 29):
         keys = gtsam.KeyVector([bone_key(tick, 0), bone_key(tick, hand)])
@@ -155,9 +156,9 @@ def test_without_a_spread_the_covariance_is_gtsams_marginal(walk):
 
 
 def _optimised(graph):
-    from bodycap_batch.merging.graph.factors import levenberg_marquardt
+    from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
 
-    return levenberg_marquardt(graph._graph, graph._start(), iterations=60)
+    return levenberg_marquardt(graph.graph, graph.initial_values(), iterations=60)
 
 
 @pytest.mark.parametrize("what", ["mount", "scale", "rest", "offset", "off the ticks"])

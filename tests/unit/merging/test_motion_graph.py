@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bodycap_batch.merging.graph.factors import gauss_newton_then_lm, levenberg_marquardt
+from bodycap_batch.merging.graph.optimiser import gauss_newton_then_lm, levenberg_marquardt
 from bodycap_batch.model.geometry import make_transform, so3_exp
 
 REAL = gtsam.GaussNewtonOptimizer

@@ -11,7 +11,7 @@ import pytest
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import kinematic_chain
-from bodycap_batch.merging.body.initial_poses import reach_constraint
+from bodycap_batch.merging.body.provisional_scale import reach_constraint
 from bodycap_batch.merging.body_calibration import calibration_graph
 from bodycap_batch.merging.body_calibration.anthropometry import bone_length_modes, joint_placement_modes
 from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph

@@ -12,12 +12,8 @@ from numpy.testing import assert_allclose
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import anatomical_axes, hinges, kinematic_chain
 from bodycap_batch.merging.body.completion import complete_skeleton, observed_joints
-from bodycap_batch.merging.body.initial_poses import (
-    fill_gaps,
-    pose_bones,
-    provisional_scale,
-    reach_constraint,
-)
+from bodycap_batch.merging.body.initial_poses import fill_gaps, pose_bones
+from bodycap_batch.merging.body.provisional_scale import provisional_scale, reach_constraint
 from bodycap_batch.merging.body_calibration.scale import (
     ScaleSource,
     chi_square,
@@ -39,11 +35,9 @@ from bodycap_batch.merging.world.floor import (
     floor_beside_path,
     floor_from_feet,
     floor_from_points,
-    initial_heading,
-    place,
-    rotation_to_z_up,
     standing_height,
 )
+from bodycap_batch.merging.world.world_frame import initial_heading, rotation_to_z_up, world_from_solved_frame
 from bodycap_batch.merging.world.planes import (
     BENT_TILT_LIMIT_DEG,
     TILT_LIMIT_DEG,
@@ -254,7 +248,7 @@ def test_mount_points_carry_exactly_the_pose_they_stand_for():
 
     points, mount = MountPoints(0.01, 0.005), make_transform(so3_exp([0.3, -0.2, 1.0]), [0.1, 0.02, -0.05])
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    add_mount_prior(graph, 0, mount, points, (0.2, 0.03))
+    add_mount_prior(graph, 0, mount, points, sigma_rad=0.2, sigma_m=0.03)
     insert_mount_points(values, 0, mount, points)
     assert_allclose(mount_from_points(values, 0, points), mount, atol=1e-12)
     keys = gtsam.KeyVector([gtsam.symbol("m", i) for i in range(4)])
@@ -283,12 +277,12 @@ def test_walls_and_floor_give_the_vertical_and_the_floor():
     found = vertical_from_planes(planes, so3_exp([0.15, 0.1, 0.0]) @ turn @ UP, TILT_LIMIT_DEG)
     assert found is not None
     # Planes 3 m wide with 5 mm of noise tilt by a fraction of a degree.
-    assert np.degrees(np.arccos(found[0] @ turn @ UP)) < 0.5
+    assert np.degrees(np.arccos(found.up @ turn @ UP)) < 0.5
     body = turn @ so3_exp([0.5, 0.2, 0.0]) @ UP  # 31 degrees: who mostly bends
     assert vertical_from_planes(planes, body, TILT_LIMIT_DEG) is None
     bent = vertical_from_planes(planes, body, BENT_TILT_LIMIT_DEG)
     assert bent is not None
-    assert np.degrees(np.arccos(bent[0] @ turn @ UP)) < 0.5
+    assert np.degrees(np.arccos(bent.up @ turn @ UP)) < 0.5
     floor_found = floor_from_points(room @ UP, Vertical(UP, "map", 0.0, 1.0), 0.08, 1.2)
     assert floor_found.source == "map"
     assert floor_found.height_m == pytest.approx(0.0, abs=0.01)
@@ -381,7 +375,7 @@ def test_world_has_hips_over_the_origin_and_faces_minus_y():
     up = np.array([0.6, 0.0, 0.8])
     rotation = rotation_to_z_up(up)
     assert_allclose(rotation @ up, UP, atol=1e-12)
-    world = place(rotation, np.array([3.0, 2.0, 1.4]), 0.5, np.radians(30.0))
+    world = world_from_solved_frame(rotation, np.array([3.0, 2.0, 1.4]), 0.5, np.radians(30.0))
     assert_allclose(world.apply(np.array([3.0, 2.0, 1.4]) @ rotation), [0.0, 0.0, 0.9], atol=1e-12)
     facing = np.array([np.cos(np.radians(30.0)), np.sin(np.radians(30.0)), 0.0]) @ rotation
     assert_allclose(world.rotation @ facing, [0.0, -1.0, 0.0], atol=1e-12)
@@ -510,8 +504,8 @@ def test_a_head_camera_reaches_the_palms_through_the_chest():
     assert found is not None
     rest = rest_positions(skeleton)
     shoulder = rest[skeleton.roles.index("LeftArm")] - rest[skeleton.roles.index("Head")]
-    assert_allclose(found[0], shoulder, atol=1e-12)
-    assert found[1] == pytest.approx((0.186 + 0.146) * 1.75)
+    assert_allclose(found.anchor_m, shoulder, atol=1e-12)
+    assert found.reach_m == pytest.approx((0.186 + 0.146) * 1.75)
     palms = kinematic_chain(skeleton, ("LeftHand", "RightHand"))
     assert reach_constraint(palms, 4, len(palms) - 1) is None
 

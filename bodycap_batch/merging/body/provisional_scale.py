@@ -1,0 +1,180 @@
+"""A provisional metric scale from the distances between cameras, before anything is solved."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.merging.body.bones import LIMB_CHAINS, Bone
+from bodycap_batch.merging.cameras.track import MAX_COARSE_GAP_NS, CameraTrack
+from bodycap_batch.model.geometry import invert
+from bodycap_batch.model.skeleton import Mount
+from bodycap_batch.model.skeleton_presets import split_side
+
+_REACH_QUANTILE = 0.9
+"""Quantile of the distances that counts as the largest one, so that single wrong poses do not."""
+_MAX_EXTENSION = 0.96
+"""Extension of a nearly straight limb over its length: walking elbows keep 15 to 30° of flexion."""
+_MIN_COMMON_FRAMES = 10
+"""Frames that two cameras must share for their distance to count. Evidence: none."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReachConstraint:
+    """Bound of the distance of a bone's joint from a point of another bone.
+
+    Attributes:
+        anchor_m: (3,) the point, in the frame of the other bone.
+        reach_m: Largest distance of the joint from it.
+    """
+
+    anchor_m: FloatArray
+    reach_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class DistanceConstraint:
+    """Bound of the length of ``scale · camera_offsets + mount_offsets_m``, the vector between two points.
+
+    Attributes:
+        camera_offsets: (N,3) differences of the cameras' centres, map units.
+        mount_offsets_m: (N,3) from the cameras to the points on the bones, as the mounts imply.
+        reach_m: Largest length; 0 if both points are the same.
+    """
+
+    camera_offsets: FloatArray
+    mount_offsets_m: FloatArray
+    reach_m: float
+
+    def typical_scale(self) -> float:
+        """Return the scale (metres per map unit) from the typical distance of the cameras alone."""
+        expected = self.reach_m + np.linalg.norm(self.mount_offsets_m, axis=1).mean()
+        measured = float(np.median(np.linalg.norm(self.camera_offsets, axis=1)))
+        return float(expected / max(measured, 1e-12))
+
+    def cost(self, scale: float) -> float:
+        """Return how far (metres) the largest distance at a scale is from that of a stretched limb."""
+        distance = np.linalg.norm(scale * self.camera_offsets + self.mount_offsets_m, axis=1)
+        if self.reach_m > 0.0:
+            return abs(float(np.quantile(distance, _REACH_QUANTILE)) - _MAX_EXTENSION * self.reach_m)
+        return float(np.median(distance))
+
+
+def provisional_scale(
+    bones: Sequence[Bone],
+    tracks: Sequence[CameraTrack],
+    mounts: Mapping[str, Mount],
+    ignored_cameras: Collection[str] = (),
+) -> float:
+    """Estimate metres per map unit from the largest distances between cameras of related bones.
+
+    At a given scale, each pair of cameras gives the distance between two points of the body, which the
+    lengths of the bones bound. The result is the scale at which the largest distances are those of
+    stretched limbs.
+
+    Args:
+        bones: The graph's bones.
+        tracks: All cameras, in the gauge of one map.
+        mounts: By camera.
+        ignored_cameras: Cameras whose distance from their kinematic neighbour is not used.
+
+    Raises:
+        EstimationError: No two related cameras were localised at the same time, or the distances fit no
+            person.
+    """
+    links = [
+        distance_constraint(bones, track, other, mounts)
+        for track, other in kinematic_neighbours(bones, tracks)
+        if track.camera not in ignored_cameras
+    ]
+    constraints = [link for link in links if link is not None]
+    if not constraints:
+        raise EstimationError(
+            "no two cameras whose distance the body knows were localised at the same time",
+            hint="metric scale comes from a camera on the trunk and one on a limb (or the head) in one map",
+        )
+    typical = [constraint.typical_scale() for constraint in constraints]
+    scales = float(np.median(typical)) * np.geomspace(0.2, 5.0, 320)
+    costs = np.array([sum(constraint.cost(scale) for constraint in constraints) for scale in scales])
+    best = int(np.argmin(costs))
+    if best in (0, len(scales) - 1):
+        raise EstimationError(
+            f"the cameras' distances fit no person: {scales[best]:.3g} m per map unit is out of bounds",
+            hint="check which camera sits where (the job's mounts)",
+        )
+    return float(scales[best])
+
+
+def kinematic_neighbours(
+    bones: Sequence[Bone], tracks: Sequence[CameraTrack]
+) -> list[tuple[CameraTrack, CameraTrack]]:
+    """Pair each camera with that of the nearest ancestor that has one, else with that nearest to the root."""
+    out = []
+    by_bone = {track.bone: track for track in reversed(tracks)}
+    root = next((track for track in tracks if track.bone == min(by_bone)), tracks[0])
+    for track in tracks:
+        above = bones[track.bone].parent
+        while above >= 0 and above not in by_bone:
+            above = bones[above].parent
+        other = by_bone.get(above, root)
+        if other is not track:
+            out.append((track, other))
+    return out
+
+
+def distance_constraint(
+    bones: Sequence[Bone], track: CameraTrack, other: CameraTrack, mounts: Mapping[str, Mount]
+) -> DistanceConstraint | None:
+    """Return the bound that the body puts on the distance between two cameras.
+
+    Returns:
+        None if the body does not bound it, or if both were hardly localised at the same time.
+    """
+    constraint = reach_constraint(bones, track.bone, other.bone)
+    if constraint is None:
+        return None
+    poses, valid = other.poses_at(track.times_ns, max_gap_ns=MAX_COARSE_GAP_NS)
+    if valid.sum() < _MIN_COMMON_FRAMES:
+        return None
+    own_poses, other_poses = track.map_from_cam[valid], poses[valid]
+    cam_from_joint = invert(mounts[track.camera].joint_from_cam)
+    cam_from_other = invert(mounts[other.camera].joint_from_cam)
+    tip = own_poses[:, :3, :3] @ cam_from_joint[:3, 3]
+    base = other_poses[:, :3, :3] @ (cam_from_other[:3, :3] @ constraint.anchor_m + cam_from_other[:3, 3])
+    return DistanceConstraint(own_poses[:, :3, 3] - other_poses[:, :3, 3], tip - base, constraint.reach_m)
+
+
+def reach_constraint(bones: Sequence[Bone], bone: int, other: int) -> ReachConstraint | None:
+    """Return how far a bone's joint can be from a point of another bone.
+
+    Returns:
+        None if a second limb lies between the bones: the distance then depends on both limbs.
+    """
+    up, down = _bones_to_root(bones, other), _bones_to_root(bones, bone)
+    shared = next(index for index in down if index in up)
+    above = up[: up.index(shared)]
+    if above and split_side(bones[other].role)[1] == "Arm":
+        # An upper arm rotates about all axes, so it does not show where the trunk is.
+        return None
+    if any(split_side(bones[bones[index].parent].role)[1] in LIMB_CHAINS for index in above):
+        return None
+    anchor, reach = -np.sum([bones[index].offset_m for index in above], axis=0) + np.zeros(3), 0.0
+    for index in down[: down.index(shared)]:
+        parent = bones[index].parent
+        if split_side(bones[parent].role)[1] in LIMB_CHAINS and parent != other:
+            reach += float(np.linalg.norm(bones[index].offset_m))
+        else:
+            anchor += bones[index].offset_m
+    return ReachConstraint(anchor, reach)
+
+
+def _bones_to_root(bones: Sequence[Bone], bone: int) -> list[int]:
+    """Return the bone and its ancestors in the graph."""
+    chain = [bone]
+    while bones[chain[-1]].parent >= 0:
+        chain.append(bones[chain[-1]].parent)
+    return chain
