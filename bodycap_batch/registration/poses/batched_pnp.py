@@ -10,7 +10,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
-from bodycap_batch.model.geometry import make_transform, transform_points
+from bodycap_batch.model.geometry import make_transform, se3_adjoint, transform_points
 
 _RAY_STEP = 1e-4
 """Step of the central differences, in units of the ray (x/z, y/z). Origin: about the cube root of the float64
@@ -87,8 +87,15 @@ class Observations:
         )
 
     def camera_poses(self, rows: IntArray, poses: FloatArray) -> FloatArray:
-        """Return the poses (N,4,4) of the cameras that observed rows (N,), given the frames' poses
-        (N,4,4)."""
+        """Return the poses of the observing cameras, given the poses of their frames.
+
+        Args:
+            rows: (N,) rows of observations.
+            poses: (N,4,4) cam_from_gauge, or rig_from_gauge, of their frames.
+
+        Returns:
+            (N,4,4) cam_from_gauge.
+        """
         if self.member is None or self.cam_from_rig is None:
             return poses
         return np.asarray(self.cam_from_rig[self.member[rows]] @ poses)
@@ -335,11 +342,7 @@ def _camera_to_rig_jacobian(jacobian: FloatArray, member: IntArray, cam_from_rig
     """
     for number, pose in enumerate(cam_from_rig):
         columns = np.flatnonzero(member == number)
-        rotation, (x, y, z) = pose[:3, :3], pose[:3, 3].tolist()
-        adjoint = np.zeros((6, 6))
-        adjoint[:3, :3] = adjoint[3:, 3:] = rotation
-        adjoint[3:, :3] = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ rotation
-        jacobian[:, :, columns] = np.einsum("dim,ik->dkm", jacobian[:, :, columns], adjoint)
+        jacobian[:, :, columns] = np.einsum("dim,ik->dkm", jacobian[:, :, columns], se3_adjoint(pose))
 
 
 def _residuals(

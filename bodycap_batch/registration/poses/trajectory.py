@@ -162,7 +162,7 @@ def _solve(
 def _assign_status(
     poses: list[FramePose], rig: RigObservations, own_inliers: IntArray, criteria: AcceptanceCriteria
 ) -> list[FramePose]:
-    """Set the status of keyframes, and of frames that only the other cameras of the rig support.
+    """Set the status of keyframes, and of frames that only other cameras of the rig support.
 
     Args:
         poses: One for each frame.
@@ -217,8 +217,10 @@ def build_trajectory(
 
 
 def _frame_statuses(poses: Sequence[FramePose], sharpness: FloatArray) -> list[FrameStatus]:
-    """Return the statuses. A frame without tracks that is much less sharp than the frames around it is
-    BLUR."""
+    """Return the statuses of the frames.
+
+    A frame without tracks that is much less sharp than the frames around it gets the status BLUR.
+    """
     statuses = []
     for index, pose in enumerate(poses):
         status = pose.status
@@ -245,7 +247,12 @@ def _interpolated_keyframe_poses(keyframes: IntArray, map_from_cam: FloatArray, 
 
 
 def _require_static_inliers(poses: list[FramePose], static_inliers: IntArray) -> list[FramePose]:
-    """Reject the poses with few inliers on static points; `static_inliers` (F,) counts these."""
+    """Reject the poses with few inliers on static points.
+
+    Args:
+        poses: One for each frame.
+        static_inliers: (F,) inliers on static points.
+    """
     has_pose = np.array([pose.gauge_from_cam is not None for pose in poses], dtype=bool)
     return _reject(poses, has_pose & (static_inliers < _MIN_STATIC_INLIERS), FrameStatus.UNCONFIRMED)
 
@@ -269,7 +276,7 @@ def _reject_outliers(
 
 
 def _reject(poses: list[FramePose], rejected: BoolArray, status: FrameStatus) -> list[FramePose]:
-    """Return the poses, those selected by `rejected` (F,) replaced by the status."""
+    """Replace the poses selected by `rejected` (F,) by the status."""
     return [
         FramePose(status=status, inliers=pose.inliers, error_px=pose.error_px) if rejected[frame] else pose
         for frame, pose in enumerate(poses)
