@@ -73,9 +73,9 @@ def first_frame(video: VideoFile, threads: int = 0) -> tuple[VideoFrame, bool]:
                 return frame, bool(stream.codec_context.has_b_frames)
         except av.error.FFmpegError as error:
             raise CaptureError(
-                f"no frame of it can be decoded ({error_reason(error)})", path=video.path, hint=COPY_AGAIN
+                f"none of its frames can be decoded ({error_reason(error)})", path=video.path, hint=COPY_AGAIN
             ) from error
-    raise CaptureError("no frame of it can be decoded", path=video.path, hint=COPY_AGAIN)
+    raise CaptureError("none of its frames can be decoded", path=video.path, hint=COPY_AGAIN)
 
 
 def open_stream(container: InputContainer, video: VideoFile, threads: int = 0) -> VideoStream:

@@ -23,8 +23,7 @@ _LUMA_FORMATS = frozenset(
 ) | {"nv12", "nv21", "nv16", "gray"}
 """Formats with 8-bit luma as their first plane, which is used directly."""
 _FULL_RANGE = 2
-# Studio range to full range (ITU-R BT.601: black 16, white 235).
-# Studio range to full range (ITU-R BT.601: black 16, white 235).
+"""FFmpeg's number of the full colour range."""
 _STUDIO_TO_FULL = np.clip(np.round((np.arange(256) - 16.0) * (255.0 / 219.0)), 0, 255).astype(np.uint8)
 """Table from studio range to full range (ITU-R BT.601: black 16, white 235)."""
 

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 
 _MAX_SECONDS = 4e9
-# anamorphic lenses lie between 1:2 and 2:1.
+"""Seconds: later than any Unix time of a recording, and far from the end of 64-bit nanoseconds."""
 _MIN_PIXEL_ASPECT = Fraction(2, 5)
-# Pixel aspects this near to 1 count as square. Origin: sizes are rounded to even numbers, and resampling
-# would blur each image for less than a pixel.
+"""Least plausible pixel aspect, and the inverse of the largest. Origin: HDV and AVCHD have 4:3; television
+and anamorphic lenses lie between 1:2 and 2:1."""
 _SQUARE_TOLERANCE = 0.004
 """Pixel aspects this near to 1 count as square. Origin: sizes are rounded to even numbers, and resampling
 would blur each image for less than a pixel."""
@@ -57,7 +57,7 @@ def index_video(path: Path, threads: int = 0) -> VideoFile:
         time_base, rate = Fraction(stream.time_base or 0), stream.average_rate or stream.guessed_rate
         pixel_aspect = _pixel_aspect(stream.sample_aspect_ratio)
     if max(abs(int(pts[0])), abs(int(pts[-1]))) * time_base > _MAX_SECONDS or time_base <= 0:
-        raise CaptureError("its timestamps are out of all bounds", path=path, hint=COPY_AGAIN)
+        raise CaptureError("its timestamps are implausible", path=path, hint=COPY_AGAIN)
     video = VideoFile(
         path=path,
         pts=pts,

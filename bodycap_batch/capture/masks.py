@@ -40,17 +40,17 @@ def read_mask(path: Path, size: tuple[int, int]) -> BoolArray:
         raise error_because("no such mask", "check the path in the job, relative to the job file")
     image = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
     if image is None:
-        raise error_because("the mask is no image", "save it as PNG")
+        raise error_because("the mask is not an image", "save it as PNG")
     height, width = image.shape
     if abs(width * size[1] / (height * size[0]) - 1.0) > _ASPECT_TOLERANCE:
         raise error_because(
-            f"the mask is {width}×{height}, the picture {size[0]}×{size[1]}: another shape",
+            f"the mask is {width}×{height}, the picture {size[0]}×{size[1]}: their aspects differ",
             "paint it over a frame as a player shows it",
         )
     mask: BoolArray = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA) >= _WHITE_LEVEL)
     if mask.mean() < _MIN_WHITE_RATIO:
         raise error_because(
-            f"the mask lets {100 * mask.mean():.1f} % of the picture be seen",
+            f"the mask leaves only {100 * mask.mean():.1f} % of the picture visible",
             "white is the room, black the wearer: is it inverted?",
         )
     mask.flags.writeable = False

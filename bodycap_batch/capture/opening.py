@@ -20,7 +20,7 @@ from bodycap_batch.model.camera import Camera, without_single_focal
 _GUESSED_FOV_DEG = 70.0
 """Degrees along the long side: the widest common lens of webcams and phones. Mapping refines it."""
 _FULL_FRAME_MM = 36.0
-# even numbers.
+"""Millimetres: width of a 35 mm film frame, by definition of the equivalent focal length."""
 _ASPECT_TOLERANCE = 0.004
 """Largest relative difference of two aspects. Origin: one pixel of 640×480, because encoders round sizes to
 even numbers."""

@@ -16,11 +16,12 @@ from bodycap_batch.core.errors import CaptureError
 _NS = 1_000_000_000
 """Nanoseconds per second."""
 _MAX_BYTES = 256 << 20
-# Creation times are whole seconds, and cameras record the start of writing, not of the exposure.
-# Creation times come in whole seconds, and cameras stamp the start of writing, not of the exposure.
+"""Bytes: largest sidecar file that is read."""
 _CLOCK_RESOLUTION_NS = 2 * _NS
-# About 146 years: sums of times and offsets stay inside int64.
+"""Nanoseconds: exactness of creation times. They are whole seconds, and cameras record the start of writing,
+not of the exposure."""
 _MAX_ABS_NS = 1 << 62
+"""Nanoseconds, about 146 years: sums of times and offsets stay inside int64."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,7 +51,9 @@ def read_timestamps(path: Path) -> IntArray:
     """
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise CaptureError("far too large for timestamps", path=path, hint="one time in seconds a line")
+            raise CaptureError(
+                "too large for a file of timestamps", path=path, hint="one time in seconds on each line"
+            )
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise CaptureError(
@@ -66,7 +69,7 @@ def read_timestamps(path: Path) -> IntArray:
                     f"time {text} does not come after the one before",
                     path=path,
                     line=number,
-                    hint="one time a frame, in seconds, increasing",
+                    hint="one time for each frame, in seconds, increasing",
                 )
     return np.array(times, dtype=np.int64)
 
@@ -79,7 +82,9 @@ def _parse_seconds(text: str, path: Path, line: int) -> int:
             return round(value * _NS)
     except InvalidOperation:
         pass
-    raise CaptureError(f"{text[:40]!r} is no time in seconds", path=path, line=line, hint="one number a line")
+    raise CaptureError(
+        f"{text[:40]!r} is not a time in seconds", path=path, line=line, hint="one number on each line"
+    )
 
 
 def join_chapters(videos: tuple[VideoFile, ...], sidecars: tuple[Path, ...]) -> Timeline:
@@ -108,7 +113,7 @@ def _sidecar_times(path: Path, frames: int) -> IntArray:
         raise CaptureError(
             f"{len(times)} timestamps for {frames} frames",
             path=path,
-            hint="one line a frame of the video; export both again from the same recording",
+            hint="one line for each frame of the video; export both again from the same recording",
         )
     return times
 

@@ -124,12 +124,12 @@ def video_stream(container: InputContainer, path: Path) -> VideoStream:
     cover = av.stream.Disposition.attached_pic
     streams = [stream for stream in container.streams.video if not stream.disposition & cover]
     if not streams:
-        what = "no video in it, sound only" if container.streams.audio else "the video holds no frame"
+        what = "it contains sound only, no video" if container.streams.audio else "the video holds no frame"
         raise CaptureError(what, path=path, hint="give the file that holds the camera's pictures")
     for stream in streams:
         if stream.codec_context is not None:
             return stream
-    raise CaptureError("no decoder knows this kind of video", path=path, hint="convert it to H.264")
+    raise CaptureError("there is no decoder for this kind of video", path=path, hint="convert it to H.264")
 
 
 def error_reason(error: Exception) -> str:

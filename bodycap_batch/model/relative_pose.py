@@ -170,11 +170,11 @@ def not_rigid_note(relative: RelativePose) -> str:
     pair = " and ".join(relative.cameras)
     if relative.instants < MIN_INSTANTS:
         return (
-            f"{pair}: {relative.instants} common frames in one map say too little of how they sit: each is on "
-            "its own"
+            f"{pair}: only {relative.instants} common frames in one map, too few for their relative pose: each "
+            "camera is treated separately"
         )
     return (
-        f"{pair}: their relative turn scatters by {np.degrees(relative.spread_rad):.2f} degrees where a rig's "
-        f"would by {np.degrees(relative.explained_rad):.2f}: each is on its own. Check offset_s, and that one "
-        "trigger exposes both"
+        f"{pair}: their relative rotation scatters by {np.degrees(relative.spread_rad):.2f} degrees, that of a "
+        f"rig would by {np.degrees(relative.explained_rad):.2f}: each camera is treated separately. Check "
+        "offset_s, and that one trigger exposes both"
     )

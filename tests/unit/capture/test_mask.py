@@ -35,7 +35,7 @@ def test_a_mask_is_read_at_the_size_of_the_picture(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("image", "reason"),
     [
-        (np.full((480, 480), 255, np.uint8), "another shape"),
+        (np.full((480, 480), 255, np.uint8), "aspects differ"),
         (np.zeros((480, 640), np.uint8), "inverted"),
         (None, "no image"),
     ],
