@@ -170,11 +170,12 @@ def not_rigid_note(relative: RelativePose) -> str:
     pair = " and ".join(relative.cameras)
     if relative.instants < MIN_INSTANTS:
         return (
-            f"{pair}: only {relative.instants} common frames in one map, too few for their relative pose: each "
-            "camera is treated separately"
+            f"{pair}: only {relative.instants} common frames in one map, too few for their relative pose: "
+            "each camera is treated separately"
         )
+    found_deg, expected_deg = np.degrees(relative.spread_rad), np.degrees(relative.explained_rad)
     return (
-        f"{pair}: their relative rotation scatters by {np.degrees(relative.spread_rad):.2f} degrees, that of a "
-        f"rig would by {np.degrees(relative.explained_rad):.2f}: each camera is treated separately. Check "
-        "offset_s, and that one trigger exposes both"
+        f"{pair}: their relative rotation scatters by {found_deg:.2f} degrees, that of a rig would by "
+        f"{expected_deg:.2f}: each camera is treated separately. Check offset_s, and that one trigger "
+        "exposes both"
     )

@@ -55,7 +55,7 @@ class RigMember:
     rig_frame: IntArray
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class PointReliability:
     """How often each point was observed in frames with a pose, and how often it agreed with the pose.
 

@@ -67,14 +67,14 @@ def find_outlier_poses(centres: FloatArray, sigma: FloatArray, times_ns: IntArra
         (N,) True if the pose is an outlier. The scale of the map has no influence.
     """
     size = np.linalg.norm(_second_differences(centres, sigma)[0], axis=1)
-    runs = np.zeros(len(centres), dtype=bool)
+    in_run = np.zeros(len(centres), dtype=bool)
     for length in _RUN_LENGTHS:
-        runs |= _outlier_runs(centres, sigma, times_ns, size, length)
+        in_run |= _outlier_runs(centres, sigma, times_ns, size, length)
     # Next to a run of outliers a correct pose would look like an outlier.
-    centres = np.where(runs[:, None], np.nan, centres)
+    centres = np.where(in_run[:, None], np.nan, centres)
     backwards = _outliers_after_gaps(centres[::-1], sigma[::-1])[::-1]
     ends = _outliers_after_gaps(centres, sigma) | backwards
-    return np.asarray(runs | _single_outliers(centres, sigma, times_ns) | ends)
+    return np.asarray(in_run | _single_outliers(centres, sigma, times_ns) | ends)
 
 
 def _single_outliers(centres: FloatArray, sigma: FloatArray, times_ns: IntArray) -> BoolArray:

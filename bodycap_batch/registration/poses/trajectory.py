@@ -103,7 +103,7 @@ def solve_rig(
     return _reject_outliers(_assign_status(accepted, rig, solution.own_inliers, criteria), times_ns, criteria)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Solution:
     """Poses of all frames, and what agrees with them.
 
