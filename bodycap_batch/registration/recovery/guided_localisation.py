@@ -36,7 +36,7 @@ _LEVELS = (
     SearchLevel(pyramid_level=0, patch_side=31, search_radius=8, min_score=0.75, limit_px=4.0),
 )
 """Searches from coarse to fine. The last one is at full size, because its errors are a quarter smaller than
-at half size. Evidence: none for the other values."""
+at half size. Evidence for that: docs/decisions/registration.md; for the other values: none."""
 _CELL_SIDE_PX = 40.0
 """Pixels at 640 px image width: side of a cell, about the side of a patch."""
 _FULL_WEIGHT_PER_CELL = 2.0
@@ -90,9 +90,17 @@ class PoseEstimate:
     def position(self) -> PositionEstimate:
         """The camera centre with its covariance in the axes of the map."""
         rotation = self.cam_from_map[:3, :3]
-        return PositionEstimate(
-            invert(self.cam_from_map)[:3, 3], rotation.T @ self.covariance[3:, 3:] @ rotation
-        )
+        covariance = rotation.T @ self.covariance[3:, 3:] @ rotation
+        return PositionEstimate(invert(self.cam_from_map)[:3, 3], covariance)
+
+    @property
+    def support(self) -> float:
+        """Number of inliers times the inlier weight ratio."""
+        return self.inliers * self.inlier_weight_ratio
+
+    def has_support(self, min_inliers: int, min_inlier_weight_ratio: float) -> bool:
+        """Return True if enough matches agree with the pose."""
+        return self.inliers >= min_inliers and self.inlier_weight_ratio >= min_inlier_weight_ratio
 
     def conditioned_on_centre(self, position: PositionEstimate) -> tuple[FloatArray, FloatArray]:
         """Return the pose and its covariance, given another position of the centre.
@@ -121,9 +129,8 @@ def fuse(first: PositionEstimate, second: PositionEstimate) -> tuple[PositionEst
     information = np.linalg.inv(first.covariance + second.covariance)
     difference = second.centre - first.centre
     centre = first.centre + first.covariance @ information @ difference
-    return PositionEstimate(centre, first.covariance @ information @ second.covariance), float(
-        difference @ information @ difference
-    )
+    covariance = first.covariance @ information @ second.covariance
+    return PositionEstimate(centre, covariance), float(difference @ information @ difference)
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,11 +199,7 @@ class GuidedLocaliser:
             estimate = self._search(self._view(search_frame, prior, neighbour), _LEVELS[0])
             if estimate is not None and (best is None or estimate.inliers > best.inliers):
                 best = estimate
-            if (
-                best is not None
-                and best.inliers >= _SUFFICIENT_INLIERS
-                and best.inlier_weight_ratio >= _SUFFICIENT_WEIGHT_RATIO
-            ):
+            if best is not None and best.has_support(_SUFFICIENT_INLIERS, _SUFFICIENT_WEIGHT_RATIO):
                 break
         for level in _LEVELS[1:]:
             if best is None:

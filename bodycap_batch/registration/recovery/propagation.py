@@ -33,7 +33,8 @@ from bodycap_batch.registration.recovery.motion_prior import (
 from bodycap_batch.registration.recovery.patch_search import Pyramid
 
 _MIN_INLIERS, _MIN_INLIER_WEIGHT_RATIO = 10, 0.45
-"""Least inliers of a pose that the propagation continues from. Evidence: none."""
+"""Least inliers, and least inlier weight ratio, of a pose that the propagation continues from. Evidence:
+none."""
 _SEED_MIN_INLIERS, _SEED_MIN_INLIER_WEIGHT_RATIO = 15, 0.5
 """Least inliers, and least inlier weight ratio, of a pose at a seed. No motion supports it. Evidence:
 none."""
@@ -135,11 +136,7 @@ class Propagation:
             estimate = self.localiser.localise(
                 interval.search_frame(frame), [prior], NeighbourPose(prior), expected
             )
-            if (
-                estimate is None
-                or estimate.inliers < _SEED_MIN_INLIERS
-                or estimate.inlier_weight_ratio < _SEED_MIN_INLIER_WEIGHT_RATIO
-            ):
+            if estimate is None or not estimate.has_support(_SEED_MIN_INLIERS, _SEED_MIN_INLIER_WEIGHT_RATIO):
                 continue
             for direction in (1, -1):
                 self.estimates[direction, frame] = estimate
@@ -150,10 +147,7 @@ class Propagation:
         best: dict[int, PoseEstimate] = {}
         for (_, frame), estimate in sorted(self.estimates.items()):
             other = best.get(frame)
-            if (
-                other is None
-                or estimate.inliers * estimate.inlier_weight_ratio > other.inliers * other.inlier_weight_ratio
-            ):
+            if other is None or estimate.support > other.support:
                 best[frame] = estimate
         return best
 
@@ -182,11 +176,7 @@ class Propagation:
                 estimate = self.localiser.relocalise(
                     search_frame, poses[frame], _neighbour_pose(before, after, poses[frame])
                 )
-                estimate = max(
-                    estimates[frame],
-                    estimate or estimates[frame],
-                    key=lambda each: each.inliers * each.inlier_weight_ratio,
-                )
+                estimate = max(estimates[frame], estimate or estimates[frame], key=lambda pose: pose.support)
             elif before is not None and after is not None:
                 halfway = invert(interpolate_pose(invert(before), invert(after), 0.5))
                 rotation = halfway[:3, :3]
@@ -194,11 +184,7 @@ class Propagation:
                 estimate = self.localiser.localise(
                     search_frame, [prior], NeighbourPose(before), positions[frame]
                 )
-            if (
-                estimate is not None
-                and estimate.inliers >= _MIN_INLIERS
-                and estimate.inlier_weight_ratio >= _MIN_INLIER_WEIGHT_RATIO
-            ):
+            if estimate is not None and estimate.has_support(_MIN_INLIERS, _MIN_INLIER_WEIGHT_RATIO):
                 accepted[frame] = estimate
         return accepted
 
@@ -232,13 +218,12 @@ class Propagation:
             neighbour = NeighbourPose(state.pose, direction)
             estimate = self.localiser.localise(interval.search_frame(frame), priors, neighbour, predicted)
             state.frame = frame
-            is_supported = (
-                estimate is not None
-                and estimate.inliers >= _MIN_INLIERS
-                and estimate.inlier_weight_ratio >= _MIN_INLIER_WEIGHT_RATIO
-            )
             fused, distance = (predicted, np.inf) if estimate is None else fuse(estimate.position, predicted)
-            if estimate is None or not is_supported or distance >= _MAX_PREDICTION_DISTANCE:
+            if (
+                estimate is None
+                or not estimate.has_support(_MIN_INLIERS, _MIN_INLIER_WEIGHT_RATIO)
+                or distance >= _MAX_PREDICTION_DISTANCE
+            ):
                 misses += 1
                 state.pose = priors[0]
                 continue

@@ -57,7 +57,8 @@ class RecoveryInputs:
             only one is held at a time.
         maps: The maps that the cameras were registered against.
         selection: The keyframes of the camera to recover.
-        in_rig: The poses were estimated from all cameras of a rig. They are then not prepared.
+        in_rig: The poses were estimated from all cameras of a rig. The preparation is then skipped, because
+            it would estimate them from one camera alone.
     """
 
     capture: Capture
@@ -73,7 +74,7 @@ def recover_lost_frames(
     """Recover the poses of one camera's lost frames.
 
     The steps are: remove misplaced keyframes of all cameras from the map; remove weak poses next to lost
-    intervals and refine the map points; search the lost frames.
+    intervals and refine the map points, unless the poses are those of a rig; search the lost frames.
 
     Args:
         registration: The frames of the camera, as tracking left them.
@@ -155,7 +156,7 @@ def find_lost_poses(
         for start, stop in intervals:
             context.check_cancelled()
             position = max(position, start)  # a further pass starts at the first interval again
-            context.progress(position, len(lost), "lost frames looked at")
+            context.progress(position, len(lost), "lost frames searched")
             poses |= interval_search.recover_interval(start, stop, localised)
         before, path = path.localised, _merge_into(path, poses, localiser.criteria)
         intervals = _extended_intervals(path.localised, before)
@@ -257,8 +258,7 @@ def _accepted_poses(propagation: Propagation, criteria: AcceptanceCriteria) -> d
         pose, covariance = estimate.conditioned_on_centre(smoothed.positions[frame])
         sigma = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
         if (
-            estimate.inliers >= criteria.min_inliers
-            and estimate.inlier_weight_ratio >= _MIN_INLIER_WEIGHT_RATIO
+            estimate.has_support(criteria.min_inliers, _MIN_INLIER_WEIGHT_RATIO)
             and smoothed.disagreement[frame] < MAX_DISAGREEMENT
             and sigma < criteria.max_sigma_depth * estimate.depth
         ):
@@ -274,9 +274,8 @@ def _merge_into(
     inliers = path.inliers.copy()
     for frame, estimate in poses.items():
         has_pose[frame], inliers[frame] = True, estimate.inliers
-    isolated = isolated_poses(
-        has_pose, inliers, ISOLATED_INLIER_FACTOR * criteria.min_inliers
-    ) | _single_poses(has_pose)
+    min_inliers = ISOLATED_INLIER_FACTOR * criteria.min_inliers
+    isolated = isolated_poses(has_pose, inliers, min_inliers) | _single_poses(has_pose)
     matrices, covariance = path.gauge_from_cam.copy(), path.covariance.copy()
     status, error_px = list(path.status), path.error_px.copy()
     for frame, estimate in poses.items():
