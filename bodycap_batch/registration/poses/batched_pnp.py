@@ -10,7 +10,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
-from bodycap_batch.model.geometry import make_transform, se3_adjoint, transform_points
+from bodycap_batch.model.geometry import make_transform, se3_adjoint, so3_exp, transform_points
 
 _RAY_STEP = 1e-4
 """Step of the central differences, in units of the ray (x/z, y/z). Origin: about the cube root of the float64
@@ -390,14 +390,4 @@ def _retract(cam_from_gauge: FloatArray, step: FloatArray) -> FloatArray:
     rotvec = step[:, :3]
     angle = np.linalg.norm(rotvec, axis=1, keepdims=True)
     scale = np.minimum(1.0, _MAX_STEP_RAD / np.maximum(angle, 1e-12))
-    return make_transform(_rotation(rotvec * scale), step[:, 3:] * scale) @ cam_from_gauge
-
-
-def _rotation(turn_rad: FloatArray) -> FloatArray:
-    """Return rotations (N,3,3) of rotation vectors (N,3) by Rodrigues' formula."""
-    angle = np.linalg.norm(turn_rad, axis=1)[:, None, None]
-    x, y, z = turn_rad.T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    half = np.sinc(angle / (2.0 * np.pi)) ** 2 / 2.0
-    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * cross + half * (cross @ cross))
+    return make_transform(so3_exp(rotvec * scale), step[:, 3:] * scale) @ cam_from_gauge
