@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX
+from bodycap_batch.model.geometry import nearest_rotation
 
 GreyImage = npt.NDArray[np.uint8]
 Pixels = npt.NDArray[np.float32]
@@ -309,11 +310,7 @@ def fit_rotation(first: FloatArray, second: FloatArray, iterations: int = 4) -> 
     weight = np.ones(len(first))
     rotation = np.eye(3)
     for _ in range(iterations):
-        covariance = (second * weight[:, None]).T @ first
-        u, _, vt = np.linalg.svd(covariance)
-        if np.linalg.det(covariance) < 0.0:
-            u[:, 2] *= -1.0
-        rotation = u @ vt
+        rotation = nearest_rotation((second * weight[:, None]).T @ first)
         residual = second - first @ rotation.T
         squared = np.einsum("ni,ni->n", residual, residual)
         median = np.partition(squared, len(squared) // 2)[len(squared) // 2]

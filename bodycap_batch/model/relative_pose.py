@@ -10,6 +10,7 @@ from bodycap_batch.core.arrays import FloatArray, IntArray, set_array
 from bodycap_batch.model.geometry import (
     invert,
     make_transform,
+    nearest_rotation,
     poses_at,
     rotation_angle_rad,
     so3_exp,
@@ -129,8 +130,7 @@ def mean_rotation(rotations: FloatArray) -> FloatArray:
 
     Nearly half of the rotations may be wrong.
     """
-    u, _, vt = np.linalg.svd(np.median(rotations, axis=0))
-    mean = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    mean = nearest_rotation(np.median(rotations, axis=0))
     for _ in range(_MAX_ITERATIONS):
         rotvec = so3_log(mean.T @ rotations)
         weight = 1.0 / np.maximum(np.linalg.norm(rotvec, axis=1), _CONVERGED_RAD)
