@@ -11,13 +11,12 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import rotation_angle_rad
+from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.pictures import Look
 from bodycap_batch.report.placing import common_times_s
 
-_BLURRED = 0.6
-"""Sharpness over that of the camera's registered frames; registration calls a frame blurred at this too."""
 _FAST_DEG = 8.0
 """Turn from one frame to the next: optical flow loses most tracks above 20°, and blur begins far earlier."""
 _PLAIN = 0.3
@@ -98,7 +97,7 @@ def cause_of(loss: Loss, look: Look | None, usual_corners: float | None) -> Caus
         return Cause.SHALLOW
     if look is not None and usual_corners and look.corners < _PLAIN * usual_corners:
         return Cause.PLAIN
-    return Cause.BLUR if loss.sharpness < _BLURRED else Cause.UNKNOWN_PLACE
+    return Cause.BLUR if loss.sharpness < BLUR_SHARPNESS_RATIO else Cause.UNKNOWN_PLACE
 
 
 def turn_per_frame_deg(trajectory: Trajectory) -> FloatArray:
