@@ -233,7 +233,7 @@ CASES = (
     Case("sound only", audio_only, 3, VIDEO, "sound only"),
     Case("lens covered", black, 3, VIDEO, "black pictures only"),
     Case("damaged in the middle", corrupt_in_the_middle, 3, VIDEO, "decod"),
-    Case("unknown codec", unknown_codec, 3, VIDEO, "no decoder knows"),
+    Case("unknown codec", unknown_codec, 3, VIDEO, "no decoder for this kind"),
     Case("one frame", one_frame, 3, VIDEO, "single frame"),
     Case("a photo", a_photo, 3, VIDEO, "single frame"),
     Case("two identical videos", identical, 3, "head.mp4", "the same video as"),
@@ -248,7 +248,7 @@ CASES = (
     Case("calibration of other cameras", replace_text(CALIB, '{"cameras": {"left": {}}}'), 3, CALIB, "torso"),
     Case("too few timestamps", few_timestamps, 3, TIMES, "2 timestamps for 40 frames"),
     Case("timestamps go back", replace_text(TIMES, "0.0\n0.2\n0.1\n"), 3, TIMES, "does not come after"),
-    Case("timestamps are words", replace_text(TIMES, "0.0\nnoon\n"), 3, TIMES, "is no time in seconds"),
+    Case("timestamps are words", replace_text(TIMES, "0.0\nnoon\n"), 3, TIMES, "is not a time in seconds"),
     Case(
         "timestamps are binary", replace_text(TIMES, b"\xff\xfe\x00"), 3, TIMES, "cannot read the timestamps"
     ),

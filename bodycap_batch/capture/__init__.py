@@ -1,6 +1,6 @@
-"""The videos of a capture: cameras, timestamps, frame decoding."""
+"""The videos of a capture: cameras, timestamps and decoded frames."""
 
-from bodycap_batch.capture.cameras import Capture, CaptureCamera, rolling_shutter_delay_s
+from bodycap_batch.capture.cameras import Capture, CaptureCamera
 from bodycap_batch.capture.kept import FrameCandidate, FrameKeeper, KeptFrames
 from bodycap_batch.capture.opening import open_camera, open_capture
 
@@ -12,5 +12,4 @@ __all__ = [
     "KeptFrames",
     "open_camera",
     "open_capture",
-    "rolling_shutter_delay_s",
 ]

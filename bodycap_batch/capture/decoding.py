@@ -1,4 +1,4 @@
-"""Decode frames of a video by index, seeking over what is not wanted."""
+"""Decode frames of a video by index, and seek over frames that are not needed."""
 
 from __future__ import annotations
 
@@ -21,40 +21,48 @@ if TYPE_CHECKING:
 def decode_frames(video: VideoFile, indices: IntArray, threads: int = 0) -> Iterator[tuple[int, VideoFrame]]:
     """Decode the frames with these increasing indices.
 
-    Frames between them that no other frame is built on (most B-frames of H.264) are not decoded.
+    Frames between them that no other frame depends on (most B-frames of H.264) are skipped.
+
+    Args:
+        video: The video.
+        indices: (N,) increasing frame indices.
+        threads: Threads of the decoder, as in `open_stream`.
+
+    Yields:
+        The index and the frame.
 
     Raises:
         CaptureError: A frame cannot be decoded.
     """
     import av
 
-    cursor = _ForwardDecoder(video, indices, threads)
+    frame_decoder = _ForwardDecoder(video, indices, threads)
     try:
-        for wanted in map(int, indices):
-            frame = cursor.advance(wanted)
-            if frame is None and not cursor.sequential:
-                # Some containers seek badly (MPEG program streams): the plain way, from the start.
-                cursor.close()
-                cursor = _ForwardDecoder(video, None, threads)
-                frame = cursor.advance(wanted)
+        for index in map(int, indices):
+            frame = frame_decoder.advance(index)
+            if frame is None and not frame_decoder.sequential:
+                # Some containers seek badly (MPEG program streams): decode everything from the start.
+                frame_decoder.close()
+                frame_decoder = _ForwardDecoder(video, None, threads)
+                frame = frame_decoder.advance(index)
             if frame is None:
-                raise _undecodable_frame(video, wanted)
-            yield wanted, frame
+                raise _undecodable_frame(video, index)
+            yield index, frame
     except av.error.FFmpegError as error:
         raise CaptureError(
-            f"decoding fails after frame {cursor.position} ({error_reason(error)})",
+            f"decoding fails after frame {frame_decoder.position} ({error_reason(error)})",
             path=video.path,
             hint=COPY_AGAIN,
         ) from error
     finally:
-        cursor.close()
+        frame_decoder.close()
 
 
 def first_frame(video: VideoFile, threads: int = 0) -> tuple[VideoFrame, bool]:
-    """The first frame that decodes, and whether the codec reorders frames.
+    """Return the first frame that decodes, and whether the codec reorders frames.
 
     Raises:
-        CaptureError: There is none.
+        CaptureError: No frame can be decoded.
     """
     import av
 
@@ -65,39 +73,49 @@ def first_frame(video: VideoFile, threads: int = 0) -> tuple[VideoFrame, bool]:
                 return frame, bool(stream.codec_context.has_b_frames)
         except av.error.FFmpegError as error:
             raise CaptureError(
-                f"no frame of it can be decoded ({error_reason(error)})", path=video.path, hint=COPY_AGAIN
+                f"none of its frames can be decoded ({error_reason(error)})", path=video.path, hint=COPY_AGAIN
             ) from error
-    raise CaptureError("no frame of it can be decoded", path=video.path, hint=COPY_AGAIN)
+    raise CaptureError("none of its frames can be decoded", path=video.path, hint=COPY_AGAIN)
 
 
 def open_stream(container: InputContainer, video: VideoFile, threads: int = 0) -> VideoStream:
-    """The video's stream, decoded on as many threads as there are for it."""
+    """Return the video's stream with its decoder set up.
+
+    Args:
+        container: The opened file.
+        video: The video.
+        threads: Threads of the decoder. 0: those of the environment's OMP_NUM_THREADS, or all processors.
+    """
     stream = video_stream(container, video.path)
     stream.thread_type = "AUTO"
-    # The task's threads, else the process's, else all processors. (In a task's process the libraries' own
-    # pools are pinned to one.)
     stream.codec_context.thread_count = threads or int(os.environ.get("OMP_NUM_THREADS") or "0")
     return stream
 
 
 class _ForwardDecoder:
-    """A decoder's place in a video, moving forwards only.
+    """Decodes a video forwards only.
 
     Args:
         video: The video.
-        indices: The frames that will be asked for: others may be passed over. Without them all are decoded.
+        indices: The frames that will be requested; others may be skipped. None: all frames are decoded.
+        threads: Threads of the decoder, as in `open_stream`.
+
+    Attributes:
+        position: Index of the last decoded frame, −1 before the first.
+        sequential: True if every frame is decoded, without seeking.
     """
 
     def __init__(self, video: VideoFile, indices: IntArray | None, threads: int) -> None:
-        self.position = -1  # index of the last decoded frame, −1 before the first
-        self.sequential = indices is None or video.counted
+        self.position = -1
+        self.sequential = indices is None or video.is_counted
         self._video = video
         self._container = open_container(video.path)
         self._stream = open_stream(self._container, video, threads)
-        # The halves of an interlaced frame may come one by one; AV1's decoder loses the first frame by it.
-        skips = indices is not None and not self.sequential and not video.interlaced
-        skips = skips and self._stream.codec_context.name == "h264"
-        self._wanted = frozenset(video.pts[indices].tolist()) if skips else None
+        # The halves of an interlaced frame may come one by one. AV1's decoder loses the first frame if it
+        # skips.
+        may_skip = indices is not None and not self.sequential and not video.is_interlaced
+        may_skip = may_skip and self._stream.codec_context.name == "h264"
+        self._needed_pts = frozenset(video.pts[indices].tolist()) if may_skip else None
         self._frames = self._decoded()
         self._key_index = np.searchsorted(video.pts, video.key_pts)
 
@@ -105,39 +123,40 @@ class _ForwardDecoder:
         """Close the file."""
         self._container.close()
 
-    def advance(self, wanted: int) -> VideoFrame | None:
-        """Decode up to a frame; None where it does not come."""
+    def advance(self, index: int) -> VideoFrame | None:
+        """Decode up to a frame and return it; None if the video does not deliver it."""
         if not self.sequential:
-            keys = self._key_index[: int(np.searchsorted(self._key_index, wanted, side="right"))]
-            if len(keys) and keys[-1] > self.position + 1:
-                self._seek(int(keys[-1]))
+            key_frames = self._key_index[: int(np.searchsorted(self._key_index, index, side="right"))]
+            if len(key_frames) and key_frames[-1] > self.position + 1:
+                self._seek(int(key_frames[-1]))
         for frame in self._frames:
-            if self._video.counted:
+            if self._video.is_counted:
                 self.position += 1
             else:
                 if frame.pts is None:
                     continue
                 self.position = int(np.searchsorted(self._video.pts, frame.pts))
-            if self.position >= wanted:
-                exact = self._video.counted or frame.pts == self._video.pts[wanted]
-                return frame if exact and self.position == wanted else None
+            if self.position >= index:
+                is_exact = self._video.is_counted or frame.pts == self._video.pts[index]
+                return frame if is_exact and self.position == index else None
         return None
 
     def _seek(self, index: int) -> None:
-        """Go to a key frame, or to an earlier one where the container cannot do better."""
+        """Go to a key frame, or to an earlier one if the container cannot do better."""
         self._container.seek(int(self._video.pts[index]), stream=self._stream, backward=True)
         self._frames = self._decoded()
 
     def _decoded(self) -> Iterator[VideoFrame]:
-        """Frames as they are shown, from here on; those to be passed over may be missing."""
+        """Yield frames in the order of presentation, from here on; skipped frames may be missing."""
         for packet in self._container.demux(self._stream):
-            if self._wanted is not None:
-                needed = packet.pts is None or packet.pts in self._wanted
+            if self._needed_pts is not None:
+                needed = packet.pts is None or packet.pts in self._needed_pts
                 self._stream.codec_context.skip_frame = "DEFAULT" if needed else "NONREF"
             yield from self._stream.decode(packet)
 
 
 def _undecodable_frame(video: VideoFile, index: int) -> CaptureError:
+    """Return the error for a frame that cannot be decoded."""
     seconds = float((int(video.pts[index]) - int(video.pts[0])) * video.time_base)
     return CaptureError(
         f"frame {index} (at {seconds:.2f} s) cannot be decoded",

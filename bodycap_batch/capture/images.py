@@ -1,4 +1,4 @@
-"""From a decoded frame to the image a stage works on."""
+"""Convert a decoded frame to an image at the work size."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ Image = npt.NDArray[np.uint8]
 Planes = npt.NDArray[np.uint8]
 """Luma and halved chroma (1.5·H,W), sides even."""
 Colours = tuple[int, int]
-"""Range and matrix of luma and chroma, as FFmpeg numbers them."""
+"""Range and matrix of luma and chroma, in FFmpeg's numbers."""
 
-# Formats whose first plane is 8-bit luma and can be taken as it is.
 _LUMA_FORMATS = frozenset(
     f"{family}{layout}" for family in ("yuv", "yuvj") for layout in ("420p", "422p", "444p", "440p", "411p")
 ) | {"nv12", "nv21", "nv16", "gray"}
+"""Formats with 8-bit luma as their first plane, which is used directly."""
 _FULL_RANGE = 2
-# Studio range to full range (ITU-R BT.601: black 16, white 235).
+"""FFmpeg's number of the full colour range."""
 _STUDIO_TO_FULL = np.clip(np.round((np.arange(256) - 16.0) * (255.0 / 219.0)), 0, 255).astype(np.uint8)
+"""Table from studio range to full range (ITU-R BT.601: black 16, white 235)."""
 
 
 def work_image(
@@ -35,14 +36,14 @@ def work_image(
     colour: bool,
     shown: tuple[int, int] | None = None,
 ) -> Image:
-    """Grey (H,W) or RGB (H,W,3), upright, at (width, height), full range; an own, contiguous array.
+    """Return an upright image at the work size: grey (H,W) or RGB (H,W,3), full range, contiguous.
 
     Args:
-        frame: As it was decoded.
-        orientation: How it is turned.
-        size: Width and height wanted.
+        frame: The decoded frame.
+        orientation: Its display matrix.
+        size: Width and height of the result.
         colour: RGB instead of grey.
-        shown: Width and height of what counts of it, where it was filled up to even sides.
+        shown: Width and height of the part of the frame that holds the image, if it was padded to even sides.
     """
     width, height = shown or (frame.width, frame.height)
     if colour or frame.format.name not in _LUMA_FORMATS:
@@ -53,62 +54,73 @@ def work_image(
 
 
 def grey_from_planes(planes: tuple[Planes, Colours], size: tuple[int, int]) -> Image:
-    """Grey (H,W), full range, of what `work_planes` made."""
+    """Return the grey image (H,W), full range, of planes from `work_planes`."""
     luma = np.ascontiguousarray(planes[0][: size[1], : size[0]])
     return luma if planes[1][0] == _FULL_RANGE else _expand_range(luma)
 
 
 def _expand_range(luma: Image) -> Image:
-    """Luma of studio range in full range."""
+    """Convert luma from studio range to full range."""
     import cv2
 
     return np.asarray(cv2.LUT(luma, _STUDIO_TO_FULL), dtype=np.uint8)
 
 
 def work_planes(frame: VideoFrame, orientation: Orientation, size: tuple[int, int]) -> tuple[Planes, Colours]:
-    """Luma and halved chroma, upright, at (width, height) filled up to even sides, in the frame's own range.
+    """Return luma and halved chroma, upright, padded to even sides, in the frame's own range.
 
-    Where the size is the frame's own and it has 8 bits and halved chroma already (4:2:0), they are its
-    planes, unchanged; of another format luma is within one level.
+    At the frame's own size, and if it has 8 bits and halved chroma (4:2:0), the planes are unchanged. In
+    other formats the luma is correct to one level.
+
+    Args:
+        frame: The decoded frame.
+        orientation: Its display matrix.
+        size: Width and height of the result, before padding.
+
+    Returns:
+        The planes, and their range and matrix.
     """
-    full = _is_full_range(frame)
-    colours = (_FULL_RANGE if full else int(frame.color_range), int(frame.colorspace))
+    is_full = _is_full_range(frame)
+    colours = (_FULL_RANGE if is_full else int(frame.color_range), int(frame.colorspace))
     if frame.format.name not in ("yuv420p", "yuvj420p"):
-        # Left to itself it makes studio range of grey and of what only its format tells to be full.
-        frame = frame.reformat(format="yuv420p", dst_color_range=_FULL_RANGE if full else None)
-    half = ((size[0] + 1) // 2, (size[1] + 1) // 2)
+        # Without an explicit range FFmpeg converts grey, and formats that are full-range by name, to studio
+        # range.
+        frame = frame.reformat(format="yuv420p", dst_color_range=_FULL_RANGE if is_full else None)
+    half_size = ((size[0] + 1) // 2, (size[1] + 1) // 2)
     luma = _resize_upright(_plane_array(frame, 0), orientation, size)
     luma = np.pad(luma, ((0, size[1] % 2), (0, size[0] % 2)), mode="edge")
     chroma = [
-        _resize_upright(_plane_array(frame, number), orientation, half).reshape(-1) for number in (1, 2)
+        _resize_upright(_plane_array(frame, number), orientation, half_size).reshape(-1) for number in (1, 2)
     ]
     flat = np.concatenate([luma.reshape(-1), *chroma])
     return flat.reshape(-1, luma.shape[1]), colours
 
 
 def _is_full_range(frame: VideoFrame) -> bool:
+    """Return True if the luma of a frame has the full range."""
     return frame.format.name.startswith(("yuvj", "gray")) or frame.color_range == _FULL_RANGE
 
 
 def _plane_array(frame: VideoFrame, number: int) -> Image:
-    """A view of a plane, without the padding of its rows."""
+    """Return a view of a plane without the padding of its rows."""
     plane = frame.planes[number]
     rows = np.asarray(memoryview(plane), dtype=np.uint8).reshape(-1, plane.line_size)
     return rows[: plane.height, : plane.width]
 
 
 def _resize_upright(image: Image, orientation: Orientation, size: tuple[int, int]) -> Image:
+    """Turn an image upright and resize it."""
     upright = turn_upright(image, orientation)
     if (upright.shape[1], upright.shape[0]) == size:
         return np.array(upright, order="C")
     import cv2
 
-    # Averaging over the source pixels keeps edges where they are and aliases least.
+    # Averaging over the source pixels keeps edges in place and aliases least.
     return np.asarray(cv2.resize(np.ascontiguousarray(upright), size, interpolation=cv2.INTER_AREA))
 
 
 def turn_upright(image: npt.NDArray[np.uint8], orientation: Orientation) -> npt.NDArray[np.uint8]:
-    """Turn a stored image (H,W) or (H,W,3) the way a player shows it."""
+    """Turn a stored image (H,W) or (H,W,3) as a player shows it."""
     (m00, m01), (m10, m11) = orientation
     if m00:
         sign_x, sign_y = m00, m11

@@ -1,4 +1,4 @@
-"""List a video's frames without decoding them."""
+"""List the frames of a video without decoding them."""
 
 from __future__ import annotations
 
@@ -27,31 +27,37 @@ if TYPE_CHECKING:
     from av.container import InputContainer
 
 
-# Later than any Unix time of a recording, and far from the end of 64-bit nanoseconds.
 _MAX_SECONDS = 4e9
-# HDV's and AVCHD's 4:3 is the usual one, television's and anamorphic lenses' lie between 1:2 and 2:1.
+"""Seconds: later than any Unix time of a recording, and far from the end of 64-bit nanoseconds."""
 _MIN_PIXEL_ASPECT = Fraction(2, 5)
-# Sizes rounded to even numbers; stretching them would blur every picture for less than a pixel.
+"""Least plausible pixel aspect, and the inverse of the largest. Origin: HDV and AVCHD have 4:3; television
+and anamorphic lenses lie between 1:2 and 2:1."""
 _SQUARE_TOLERANCE = 0.004
+"""Pixel aspects this near to 1 count as square. Origin: sizes are rounded to even numbers, and resampling
+would blur each image for less than a pixel."""
 
 
 def index_video(path: Path, threads: int = 0) -> VideoFile:
-    """List a video's frames without decoding them (one frame is decoded, for its orientation).
+    """List a video's frames without decoding them; one frame is decoded for its size and orientation.
+
+    Args:
+        path: The video file.
+        threads: Threads of the decoder, as in `open_stream`.
 
     Raises:
-        CaptureError: No video stream, no frames, or the file ends before its index says.
+        CaptureError: There is no video stream, there are no frames, or the file ends before its index says.
     """
     with open_container(path) as container:
         stream = video_stream(container, path)
         container_format = container.format.name
-        # MP4 lists every packet it should hold; looked at before reading adds to the list.
-        listed = len(stream.index_entries) if "mp4" in container_format else 0
-        pts, key_pts, end = _scan_packets(path, container, stream, listed)
+        # MP4 lists every packet of the file. The list is read first, because demuxing adds to it.
+        expected = len(stream.index_entries) if "mp4" in container_format else 0
+        pts, key_pts, end = _scan_packets(path, container, stream, expected)
         metadata = {**container.metadata, **stream.metadata}
         time_base, rate = Fraction(stream.time_base or 0), stream.average_rate or stream.guessed_rate
         pixel_aspect = _pixel_aspect(stream.sample_aspect_ratio)
     if max(abs(int(pts[0])), abs(int(pts[-1]))) * time_base > _MAX_SECONDS or time_base <= 0:
-        raise CaptureError("its timestamps are out of all bounds", path=path, hint=COPY_AGAIN)
+        raise CaptureError("its timestamps are implausible", path=path, hint=COPY_AGAIN)
     video = VideoFile(
         path=path,
         pts=pts,
@@ -69,9 +75,9 @@ def index_video(path: Path, threads: int = 0) -> VideoFile:
 
 
 def _scan_packets(
-    path: Path, container: InputContainer, stream: Any, listed: int
+    path: Path, container: InputContainer, stream: Any, expected: int
 ) -> tuple[IntArray, IntArray, int]:
-    """Timestamps of all frames, of those decoding can start from, and the end of the last one."""
+    """Return the timestamps of all frames, those of the key frames, and the end of the last frame."""
     import av
 
     pts: list[int] = []
@@ -92,19 +98,19 @@ def _scan_packets(
             path=path,
             hint=COPY_AGAIN,
         ) from error
-    if read < listed:
-        message = f"the video is cut short: {read} of the {listed} frames its index lists"
+    if read < expected:
+        message = f"the video is cut short: {read} of the {expected} frames its index lists"
         raise CaptureError(message, path=path, hint=COPY_AGAIN)
     if not pts:
         raise CaptureError("the video holds no frame", path=path, hint=COPY_AGAIN)
-    shown = np.unique(np.array(pts, dtype=np.int64))
-    if len(shown) > 1 and end <= int(shown[-1]):
-        end = int(shown[-1]) + int(np.median(np.diff(shown)))
-    return shown, np.unique(np.array(key, dtype=np.int64)), end
+    frame_pts = np.unique(np.array(pts, dtype=np.int64))
+    if len(frame_pts) > 1 and end <= int(frame_pts[-1]):
+        end = int(frame_pts[-1]) + int(np.median(np.diff(frame_pts)))
+    return frame_pts, np.unique(np.array(key, dtype=np.int64)), end
 
 
 def _nominal_fps(pts: IntArray, time_base: Fraction, rate: Fraction | None) -> float:
-    """The container's rate, or the median frame distance where it states none."""
+    """Return the container's frame rate, or that of the median frame interval if it states none."""
     if rate:
         return float(rate)
     steps = np.diff(pts)
@@ -112,14 +118,14 @@ def _nominal_fps(pts: IntArray, time_base: Fraction, rate: Fraction | None) -> f
 
 
 def _pixel_aspect(stated: Fraction | None) -> Fraction:
-    """Width of a stored pixel over its height; square where nothing, or what no camera makes, is stated."""
+    """Return the width of a stored pixel over its height; 1 if the stated value is missing or implausible."""
     aspect = Fraction(stated or 1)
-    usual = _MIN_PIXEL_ASPECT <= aspect <= 1 / _MIN_PIXEL_ASPECT
-    return aspect if usual and abs(aspect - 1) > _SQUARE_TOLERANCE else Fraction(1)
+    is_plausible = _MIN_PIXEL_ASPECT <= aspect <= 1 / _MIN_PIXEL_ASPECT
+    return aspect if is_plausible and abs(aspect - 1) > _SQUARE_TOLERANCE else Fraction(1)
 
 
 def _creation_time(metadata: dict[str, str]) -> float | None:
-    """Creation time as Unix seconds, None where absent or the epoch of an unset clock."""
+    """Return the creation time as Unix seconds; None if it is missing or from an unset clock."""
     text = metadata.get("creation_time", "")
     try:
         stamp = datetime.fromisoformat(text.replace("Z", "+00:00"))
@@ -131,7 +137,7 @@ def _creation_time(metadata: dict[str, str]) -> float | None:
 
 
 def _focal_35mm(metadata: dict[str, str]) -> float | None:
-    """35 mm equivalent focal length that phones write, None where absent."""
+    """Return the 35 mm equivalent focal length that phones write; None if it is missing."""
     for key, text in metadata.items():
         if key.lower().endswith("focal_length.35mm_equivalent"):
             with contextlib.suppress(ValueError):
@@ -141,18 +147,18 @@ def _focal_35mm(metadata: dict[str, str]) -> float | None:
 
 
 def _with_first_frame(video: VideoFile, container_format: str, threads: int) -> VideoFile:
-    """Decode one frame: the size and display matrix a decoder delivers are the ones that count.
+    """Set the size and orientation from a decoded frame, because the container may state others.
 
-    Frames before the first that decodes (a stream cut inside a group of pictures) are left out.
+    Frames before the first that decodes are left out (a stream cut inside a group of pictures).
     """
     frame, reordered = first_frame(video, threads)
     video = replace(
         video,
         stored_size=(frame.width, frame.height),
         orientation=orientation_from_frame(frame),
-        interlaced=bool(frame.interlaced_frame),
+        is_interlaced=bool(frame.interlaced_frame),
     )
     if container_format == "avi" and reordered:
-        return replace(video, counted=True, key_pts=video.pts[:1])
+        return replace(video, is_counted=True, key_pts=video.pts[:1])
     first = int(np.searchsorted(video.pts, frame.pts or 0))
     return replace(video, pts=video.pts[first:], key_pts=video.key_pts[video.key_pts >= video.pts[first]])

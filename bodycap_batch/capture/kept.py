@@ -1,4 +1,4 @@
-"""Frames kept at the work size, so that a video need not be decoded again for them."""
+"""Keep frames at the work size, so that their video need not be decoded again."""
 
 from __future__ import annotations
 
@@ -18,15 +18,18 @@ from bodycap_batch.core.arrays import BoolArray, IntArray, set_array
 from bodycap_batch.formats.mp4 import TIME_BASE_HZ, Quality, VideoWriter
 
 KEPT_NAME = "kept"
-"""Of the bundle in a keyframe artefact, and of the video beside it."""
+"""Name of the bundle in a keyframe artefact, and of the video beside it."""
 _FPS = 30
-"""Nominal: frames are known by their number."""
+"""Nominal frame rate; frames are identified by their number."""
 _FRAME_TICKS = TIME_BASE_HZ // _FPS
+"""Time between two frames, in units of the video's time base."""
 _LARGE_RATIO = 2.0
-"""Times the pixels worked at, from which on decoding the video again costs more than writing and reading all
-of its frames at the work size (4K: 66 ms of a core a frame against 9)."""
+"""Ratio of the video's pixels to those at the work size, from which on all frames are kept. Decoding the
+video again then costs more than writing and reading the copies. Evidence: docs/decisions/capture.md."""
 _GROUP_FRAMES = 12
+"""Frames from one key frame of the copy to the next, if all frames are kept. Evidence: none."""
 _IDENTITY_ORIENTATION = ((1, 0), (0, 1))
+"""Display matrix of an image that is stored upright."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,9 +39,9 @@ class KeptFrames:
     Attributes:
         path: The video.
         frames: (K,) their indices in the camera, increasing.
-        width_px: Width at which they are kept, the camera's work size.
-        height_px: Height.
-        group: Frames from one that decodes alone to the next one.
+        width_px: Width of the frames, the camera's work size.
+        height_px: Height of the frames.
+        group: Frames from one key frame to the next.
     """
 
     path: Path
@@ -51,22 +54,29 @@ class KeptFrames:
         set_array(self, "frames", (len(self.frames),), np.int64)
 
     def holds(self, indices: IntArray) -> BoolArray:
-        """Which frames of a camera are here."""
+        """Return which frames of the camera (N,) are kept."""
         return np.isin(indices, self.frames)
 
     def read(
         self, indices: IntArray, size: tuple[int, int], *, colour: bool, threads: int = 0
     ) -> Generator[Image, None, None]:
-        """Grey (H,W) or RGB (H,W,3) images of kept frames, increasing, at (width, height).
+        """Decode kept frames, grey (H,W) or RGB (H,W,3), at (width, height).
+
+        Args:
+            indices: Increasing indices in the camera.
+            size: Width and height of the result.
+            colour: RGB instead of grey.
+            threads: Threads of the decoder, as in `open_stream`.
 
         Raises:
-            CaptureError: One cannot be decoded.
+            CaptureError: A frame cannot be decoded.
         """
-        own = (self.width_px, self.height_px)
+        stored_size = (self.width_px, self.height_px)
         for _, frame in decode_frames(self._video(), np.searchsorted(self.frames, indices), threads):
-            yield work_image(frame, _IDENTITY_ORIENTATION, size, colour=colour, shown=own)
+            yield work_image(frame, _IDENTITY_ORIENTATION, size, colour=colour, shown=stored_size)
 
     def _video(self) -> VideoFile:
+        """Return the frame index of the copy."""
         pts = np.arange(len(self.frames), dtype=np.int64) * _FRAME_TICKS
         return VideoFile(
             path=self.path,
@@ -85,9 +95,9 @@ class FrameCandidate:
     """A frame that may be kept.
 
     Attributes:
-        index: In its camera.
+        index: Its index in the camera.
         grey: (H,W) at the work size.
-        planes: Makes its luma and chroma, and tells their range and matrix.
+        planes: Makes its luma and chroma, with their range and matrix.
     """
 
     index: int
@@ -96,23 +106,23 @@ class FrameCandidate:
 
 
 def should_keep_all(stored_size: tuple[int, int], work_size: tuple[int, int]) -> bool:
-    """True for videos so large that all of their frames are kept, very nearly as they are.
+    """Return True if a video is so large that all of its frames are kept, with a small loss.
 
-    Of others the keyframes are, without any loss where they have 8 bits and 4:2:0 chroma, else within a level
-    of grey: these alone are read more than twice.
+    Of other videos only the keyframes are kept, because only these are read more than twice. The copy is
+    lossless for 8 bits and 4:2:0 chroma, and correct to one grey level otherwise.
     """
     return stored_size[0] * stored_size[1] >= _LARGE_RATIO * work_size[0] * work_size[1]
 
 
 @dataclass(slots=True)
 class FrameKeeper:
-    """Writes the frames of one camera that are kept; a context manager.
+    """Writes the kept frames of one camera; a context manager.
 
     Attributes:
         folder: An existing folder.
-        width_px: Of the frames.
-        height_px: Of the frames.
-        everything: Whether all frames are kept, else those that were chosen.
+        width_px: Width of the frames.
+        height_px: Height of the frames.
+        keep_all: True if all frames are kept, not only keyframes.
     """
 
     folder: Path
@@ -124,17 +134,17 @@ class FrameKeeper:
     _writer: VideoWriter | None = None
 
     def add_frame(self, shot: FrameCandidate) -> None:
-        """A frame comes by."""
+        """Keep a frame if all frames are kept."""
         if self.keep_all:
             self._add(shot)
 
     def add_keyframe(self, shot: FrameCandidate) -> None:
-        """A frame becomes a keyframe."""
+        """Keep a keyframe, unless all frames are kept in any case."""
         if not self.keep_all:
             self._add(shot)
 
     def kept_frames(self) -> KeptFrames | None:
-        """What was written, once the keeper is closed; None where that is nothing."""
+        """Return the kept frames once the keeper is closed; None if there are none."""
         if not self._frames:
             return None
         return KeptFrames(
@@ -156,7 +166,7 @@ class FrameKeeper:
             size = (planes.shape[1], planes.shape[0] * 2 // 3)
             quality: Quality = "near" if self.keep_all else "exact"
             self._writer = VideoWriter(self._path, _FPS, size, quality, colours)
-        if colours == self._colours:  # a chapter of another kind is read where it is
+        if colours == self._colours:  # frames of a chapter with another colour range are read from the video
             self._writer.add_planes(planes)
             self._frames.append(shot.index)
 

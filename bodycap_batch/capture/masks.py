@@ -1,4 +1,4 @@
-"""An image that says where in a camera's picture the room is seen."""
+"""Read the image that marks the part of a camera's picture that shows the room."""
 
 from __future__ import annotations
 
@@ -10,43 +10,47 @@ from bodycap_batch.core.arrays import BoolArray
 from bodycap_batch.core.errors import CaptureError
 
 _WHITE_LEVEL = 128
+"""Grey level from which on a pixel counts as white."""
 _ASPECT_TOLERANCE = 0.01
+"""Largest relative difference of the aspects of mask and picture. Origin: sizes rounded to even numbers.
+Evidence: none."""
 _MIN_WHITE_RATIO = 0.05
+"""Least ratio of white pixels. Evidence: none."""
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> BoolArray:
-    """Read a mask image, white where the room is seen.
+    """Read a mask image that is white where the room is visible.
 
     Args:
-        path: The image, of any size in the shape of the picture.
+        path: The image, of any size with the aspect of the picture.
         size: Width and height of the picture.
 
     Returns:
         (H,W), read-only.
 
     Raises:
-        CaptureError: It is missing, no image, of another shape, or leaves next to nothing to see.
+        CaptureError: The mask is missing, no image, of another aspect, or leaves almost nothing visible.
     """
     import cv2
 
-    def refused(why: str, hint: str) -> CaptureError:
-        return CaptureError(why, path=path, field="mask", hint=hint)
+    def error_because(reason: str, hint: str) -> CaptureError:
+        return CaptureError(reason, path=path, field="mask", hint=hint)
 
     if not path.is_file():
-        raise refused("no such mask", "check the path in the job, relative to the job file")
+        raise error_because("no such mask", "check the path in the job, relative to the job file")
     image = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
     if image is None:
-        raise refused("the mask is no image", "save it as PNG")
+        raise error_because("the mask is not an image", "save it as PNG")
     height, width = image.shape
     if abs(width * size[1] / (height * size[0]) - 1.0) > _ASPECT_TOLERANCE:
-        raise refused(
-            f"the mask is {width}×{height}, the picture {size[0]}×{size[1]}: another shape",
+        raise error_because(
+            f"the mask is {width}×{height}, the picture {size[0]}×{size[1]}: their aspects differ",
             "paint it over a frame as a player shows it",
         )
     mask: BoolArray = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA) >= _WHITE_LEVEL)
     if mask.mean() < _MIN_WHITE_RATIO:
-        raise refused(
-            f"the mask lets {100 * mask.mean():.1f} % of the picture be seen",
+        raise error_because(
+            f"the mask leaves only {100 * mask.mean():.1f} % of the picture visible",
             "white is the room, black the wearer: is it inverted?",
         )
     mask.flags.writeable = False

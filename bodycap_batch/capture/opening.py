@@ -1,4 +1,4 @@
-"""Open the videos of a capture: frames on the clock, intrinsics at the work size."""
+"""Open the videos of a capture: frame times on the common clock, intrinsics at the work size."""
 
 from __future__ import annotations
 
@@ -17,28 +17,31 @@ from bodycap_batch.core.arrays import BoolArray, IntArray
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import Camera, with_two_focal_lengths
 
-# Widest lens in common use as webcam or phone camera; mapping refines it.
 _GUESSED_FOV_DEG = 70.0
+"""Degrees along the long side: the widest common lens of webcams and phones. Mapping refines it."""
 _FULL_FRAME_MM = 36.0
-# One pixel of 640×480: sizes rounded to even numbers by encoders keep their aspect within this.
+"""Millimetres: width of a 35 mm film frame, by definition of the equivalent focal length."""
 _ASPECT_TOLERANCE = 0.004
+"""Largest relative difference of two aspects. Origin: one pixel of 640×480, because encoders round sizes to
+even numbers."""
 
 
 def open_capture(spec: CaptureConfig, threads: int = 0) -> Capture:
-    """Index every video of a resolved capture block (demuxed, not decoded).
+    """Index every video of a resolved capture block, without decoding.
 
     Args:
-        spec: The capture block of a job that `load_job` returned.
+        spec: The capture block of a job from `load_job`.
+        threads: Threads of the decoders, as in `CaptureCamera`.
 
     Raises:
-        CaptureError: A video, its timestamps or calibration cannot be used, or nothing lies between
+        CaptureError: A video, its timestamps or its calibration cannot be used, or there is no frame between
             start_s and end_s.
     """
     return Capture(cameras=tuple(open_camera(spec, camera, threads) for camera in spec.cameras))
 
 
 def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> CaptureCamera:
-    """Index one camera's videos. Raises as `open_capture`."""
+    """Index the videos of one camera; see `open_capture`."""
     videos = tuple(index_video(path, threads) for path in config.video)
     _check_one_format(videos)
     timeline = join_chapters(videos, config.timestamps)
@@ -65,7 +68,8 @@ def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> 
         offset_s=offset_s,
         rolling_shutter_s=_shown_rolling_shutter_s(config.rolling_shutter_s or 0.0, videos[0]),
         rolling_shutter_known=config.rolling_shutter_s is not None,
-        # Sensors lie across: pictures taller than wide were turned, if only by who cut the video.
+        # Sensors are wider than tall: a tall picture was turned, at the latest by the person who cut the
+        # video.
         may_be_sideways=_is_quarter_turned(videos[0]) or camera.height_px > camera.width_px,
         notes=timeline.notes,
         videos=videos,
@@ -77,12 +81,12 @@ def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> 
 def work_size(
     shown_size: tuple[int, int], work_px: int, turned_size: tuple[int, int] | None = None
 ) -> tuple[int, int]:
-    """Size frames are worked at: the long side at most `work_px`, never enlarged.
+    """Return the size that frames are worked at: the long side is at most `work_px`, never enlarged.
 
     Args:
         shown_size: Width and height as a player shows them, in square pixels.
-        work_px: The longest side wanted.
-        turned_size: The same in stored pixels, where these are not square: neither side is enlarged.
+        work_px: The longest side.
+        turned_size: The same in stored pixels, if these are not square: neither side is enlarged.
     """
     stored = turned_size or shown_size
     scale = min(
@@ -95,21 +99,21 @@ def work_size(
 def work_camera(calibration: Calibration, video: VideoFile, work_px: int) -> Camera:
     """Scale a calibration to the work size.
 
-    One made on stored pixels that are not square is stretched as its pictures are.
+    A calibration made on stored pixels that are not square is stretched as the images are.
 
     Raises:
-        CaptureError: The calibration is of another aspect than the video.
+        CaptureError: The calibration has another aspect than the video.
     """
     width, height = video.shown_size
     if not any(_same_aspect(calibration, *size) for size in (video.shown_size, video.turned_size)):
-        turned = _same_aspect(calibration, height, width)
+        is_turned = _same_aspect(calibration, height, width)
         raise CaptureError(
             f"calibrated at {calibration.width}×{calibration.height}, but the video shows {width}×{height}: "
             "another aspect",
             path=video.path,
             field="calibration",
             hint="the video is turned against the calibration: calibrate it as a player shows it"
-            if turned
+            if is_turned
             else "calibrate in the video mode that was recorded (a crop cannot be guessed), or use `auto`",
         )
     camera = calibration.camera()
@@ -120,11 +124,15 @@ def work_camera(calibration: Calibration, video: VideoFile, work_px: int) -> Cam
 
 
 def _same_aspect(calibration: Calibration, width: int, height: int) -> bool:
+    """Return True if a calibration has the aspect of a size."""
     return abs(width * calibration.height / (height * calibration.width) - 1.0) <= _ASPECT_TOLERANCE
 
 
 def guessed_camera(video: VideoFile, work_px: int, fov_deg: float | None) -> Camera:
-    """A first guess for mapping to refine: field of view given, from the metadata, or typical."""
+    """Return a first guess for mapping to refine.
+
+    The field of view is the stated one, the one of the metadata, or a typical one, in this order.
+    """
     width, height = work_size(video.shown_size, work_px, video.turned_size)
     long_side = max(width, height)
     if fov_deg is not None:
@@ -138,16 +146,20 @@ def guessed_camera(video: VideoFile, work_px: int, fov_deg: float | None) -> Cam
 
 
 def _is_quarter_turned(video: VideoFile) -> bool:
-    """Whether a player turns the video by a quarter, so that stored rows are shown as columns."""
+    """Return True if a player turns the video by a quarter, so that stored rows are shown as columns."""
     return not video.orientation[1][1]
 
 
 def _shown_rolling_shutter_s(rolling_shutter_s: float, video: VideoFile) -> float:
-    """Read-out time along the rows (or columns) as shown: a sensor upside down is read from below."""
+    """Return the readout time along the rows (or columns) as shown.
+
+    It is negative for a sensor that is upside down.
+    """
     return rolling_shutter_s * (video.orientation[1][1] or video.orientation[0][1])
 
 
 def _check_one_format(videos: tuple[VideoFile, ...]) -> None:
+    """Raise an error if the chapters differ in size."""
     for video in videos[1:]:
         if video.shown_size != videos[0].shown_size:
             raise CaptureError(
@@ -159,18 +171,20 @@ def _check_one_format(videos: tuple[VideoFile, ...]) -> None:
 
 
 def _in_time_range(times_ns: IntArray, offset_s: float, spec: CaptureConfig) -> BoolArray:
+    """Return which frames (N,) lie between start_s and end_s on the common clock."""
     common = times_ns + round(offset_s * 1e9)
-    inside = np.ones(len(common), dtype=bool)
+    is_inside = np.ones(len(common), dtype=bool)
     if spec.start_s is not None:
-        inside &= common >= round(spec.start_s * 1e9)
+        is_inside &= common >= round(spec.start_s * 1e9)
     if spec.end_s is not None:
-        inside &= common <= round(spec.end_s * 1e9)
-    return inside
+        is_inside &= common <= round(spec.end_s * 1e9)
+    return is_inside
 
 
 def _no_frames_error(
     spec: CaptureConfig, config: CameraConfig, times_ns: IntArray, offset_s: float
 ) -> CaptureError:
+    """Return the error for a camera without frames between start_s and end_s."""
     first, last = times_ns[0] / 1e9 + offset_s, times_ns[-1] / 1e9 + offset_s
     return CaptureError(
         f"camera {config.name} has no frame between start_s and end_s: it runs from {first:.2f} s to "

@@ -1,4 +1,4 @@
-"""Run a generator ahead of its consumer, in one thread with a bounded queue, where there is a core for it."""
+"""Run a generator ahead of its consumer, in one thread with a bounded queue."""
 
 from __future__ import annotations
 
@@ -10,17 +10,22 @@ from typing import TypeVar
 Item = TypeVar("Item")
 
 _QUEUE_LENGTH = 4
+"""Items made ahead. It bounds the memory."""
 
 
 def prefetch(
     source: Generator[Item, None, None], threads: int = 0, ahead: int = _QUEUE_LENGTH
 ) -> Generator[Item, None, None]:
-    """Yield what `source` yields while the next `ahead` items are made in a thread.
+    """Yield the items of `source` while a thread makes the next `ahead` items.
 
-    Decoding and resizing release the interpreter's lock, so they overlap with the consumer's work.
-    The thread starts with the first item asked for and ends with the generator, also an abandoned
-    one. An error of the source is raised where its item would have come. A task that was given one
-    thread makes each item when it is asked for: its neighbours have the other cores.
+    Decoding and resizing release the interpreter's lock, so they overlap with the consumer's work. The thread
+    starts with the first requested item and ends with the generator, even with an abandoned one. An error of
+    the source is raised in place of its item.
+
+    Args:
+        source: The generator.
+        threads: Threads of the task. With one thread, each item is made when it is requested.
+        ahead: Items made ahead.
     """
     if threads == 1:
         yield from source

@@ -1,4 +1,4 @@
-"""Times of a camera's frames: container timestamps or sidecars, chapters joined."""
+"""Times of a camera's frames: from the container or from sidecar files, chapters joined."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.errors import CaptureError
 
 _NS = 1_000_000_000
+"""Nanoseconds per second."""
 _MAX_BYTES = 256 << 20
-# Creation times come in whole seconds, and cameras stamp the start of writing, not of the exposure.
+"""Bytes: largest sidecar file that is read."""
 _CLOCK_RESOLUTION_NS = 2 * _NS
-# About 146 years: keeps sums of times and offsets inside int64.
+"""Nanoseconds: exactness of creation times. They are whole seconds, and cameras record the start of writing,
+not of the exposure."""
 _MAX_ABS_NS = 1 << 62
+"""Nanoseconds, about 146 years: sums of times and offsets stay inside int64."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,8 +29,8 @@ class Timeline:
     """Frame times of one camera's joined chapters.
 
     Attributes:
-        times_ns: (N,) the camera's own time of every frame.
-        usable: (N,) False for frames a later chapter repeats.
+        times_ns: (N,) time of every frame on the camera's own clock.
+        usable: (N,) False for frames that a later chapter repeats.
         notes: Gaps and overlaps found.
     """
 
@@ -37,17 +40,20 @@ class Timeline:
 
 
 def read_timestamps(path: Path) -> IntArray:
-    """Read a sidecar: seconds, one line a frame; empty lines and ``#`` comments are skipped.
+    """Read a sidecar file: seconds, one line per frame; empty lines and ``#`` comments are skipped.
 
     Returns:
         (N,) nanoseconds.
 
     Raises:
-        CaptureError: Unreadable, not a number, or not increasing; names the line.
+        CaptureError: The file is unreadable, or a line is not a number or does not increase. The error names
+            the line.
     """
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise CaptureError("far too large for timestamps", path=path, hint="one time in seconds a line")
+            raise CaptureError(
+                "too large for a file of timestamps", path=path, hint="one time in seconds on each line"
+            )
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise CaptureError(
@@ -63,31 +69,33 @@ def read_timestamps(path: Path) -> IntArray:
                     f"time {text} does not come after the one before",
                     path=path,
                     line=number,
-                    hint="one time a frame, in seconds, increasing",
+                    hint="one time for each frame, in seconds, increasing",
                 )
     return np.array(times, dtype=np.int64)
 
 
 def _parse_seconds(text: str, path: Path, line: int) -> int:
-    """Seconds as exact nanoseconds: a float64 of Unix time resolves only 200 ns."""
+    """Return seconds as exact nanoseconds: a float64 of Unix time resolves only 200 ns."""
     try:
         value = Decimal(text)
         if value.is_finite() and abs(value.adjusted()) < 12 and abs(value * _NS) < _MAX_ABS_NS:
             return round(value * _NS)
     except InvalidOperation:
         pass
-    raise CaptureError(f"{text[:40]!r} is no time in seconds", path=path, line=line, hint="one number a line")
+    raise CaptureError(
+        f"{text[:40]!r} is not a time in seconds", path=path, line=line, hint="one number on each line"
+    )
 
 
 def join_chapters(videos: tuple[VideoFile, ...], sidecars: tuple[Path, ...]) -> Timeline:
     """Put the frames of all chapters on the camera's clock.
 
-    Sidecars decide (one for all chapters, or one each); without them, the containers' exact
-    timestamps. Chapters that start again at zero follow one another without a gap, unless their
-    creation times say that more than two seconds are missing.
+    Sidecar files have priority: one for all chapters, or one for each. Without them the exact timestamps of
+    the containers are used. Chapters that start again at zero follow each other without a gap, unless their
+    creation times show that more than two seconds are missing.
 
     Raises:
-        CaptureError: A sidecar does not fit its video.
+        CaptureError: A sidecar file does not match its video.
     """
     if len(sidecars) == len(videos):
         parts = [_sidecar_times(path, len(v.pts)) for path, v in zip(sidecars, videos, strict=True)]
@@ -99,31 +107,34 @@ def join_chapters(videos: tuple[VideoFile, ...], sidecars: tuple[Path, ...]) -> 
 
 
 def _sidecar_times(path: Path, frames: int) -> IntArray:
+    """Read a sidecar file and check its number of lines."""
     times = read_timestamps(path)
     if len(times) != frames:
         raise CaptureError(
             f"{len(times)} timestamps for {frames} frames",
             path=path,
-            hint="one line a frame of the video; export both again from the same recording",
+            hint="one line for each frame of the video; export both again from the same recording",
         )
     return times
 
 
 def _container_times(videos: tuple[VideoFile, ...]) -> list[IntArray]:
-    """Each chapter's times, moved behind the chapter before it where it starts again at zero."""
+    """Return the times of each chapter, moved behind the previous chapter if it starts again at zero."""
     parts = [videos[0].times_ns()]
     for before, video in itertools.pairwise(videos):
         own, start = video.times_ns(), int(parts[-1][0])
-        runs_on = int(own[0]) > start + before.duration_ns // 2
+        is_continuous = int(own[0]) > start + before.duration_ns // 2
         shift = (
-            0 if runs_on else start + before.duration_ns + _missing_between_ns(before, video) - int(own[0])
+            0
+            if is_continuous
+            else start + before.duration_ns + _missing_between_ns(before, video) - int(own[0])
         )
         parts.append(own + shift)
     return parts
 
 
 def _missing_between_ns(before: VideoFile, video: VideoFile) -> int:
-    """Recording time lost between two chapters by their creation times, 0 where they cannot tell."""
+    """Return the time lost between two chapters according to their creation times; 0 if these are unknown."""
     if before.created_s is None or video.created_s is None:
         return 0
     gap = round((video.created_s - before.created_s) * _NS) - before.duration_ns
@@ -131,7 +142,7 @@ def _missing_between_ns(before: VideoFile, video: VideoFile) -> int:
 
 
 def _join_parts(videos: tuple[VideoFile, ...], parts: list[IntArray]) -> Timeline:
-    """Concatenate chapters; frames that do not come after all earlier ones are left out."""
+    """Concatenate chapters; frames that are not later than all earlier frames are not usable."""
     times = np.concatenate(parts)
     latest = np.maximum.accumulate(times)
     usable = np.ones(len(times), dtype=bool)

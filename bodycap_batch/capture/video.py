@@ -1,4 +1,4 @@
-"""One video file: what its frames are and when, and how it is opened."""
+"""One video file: its frames, their times, and how it is opened."""
 
 from __future__ import annotations
 
@@ -22,28 +22,30 @@ Orientation = tuple[tuple[int, int], tuple[int, int]]
 """Signed permutation matrix, shown = orientation · stored, x right and y down."""
 
 COPY_AGAIN = "copy it again from the camera's card, or leave this camera out"
+"""Hint for a damaged file."""
 MAY_READ = "let the user who runs this read the file and enter its folders (chmod)"
+"""Hint for a file without permission to read."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VideoFile:
-    """One container's video stream, demuxed once.
+    """The video stream of one container, demuxed once.
 
     Attributes:
         path: The file.
-        pts: (N,) presentation timestamps in `time_base` units, increasing: one a frame.
-        key_pts: (K,) timestamps of the frames decoding can start from.
+        pts: (N,) presentation timestamps of the frames in `time_base` units, increasing.
+        key_pts: (K,) timestamps of the frames from which decoding can start.
         time_base: Seconds per unit.
-        fps: The container's nominal rate.
+        fps: Nominal frame rate of the container.
         duration_ns: From the first frame to the end of the last.
         stored_size: Width and height as coded, before the display rotation.
         orientation: (2,2) integers, display matrix: shown = orientation · stored (y down).
-        created_s: Creation time of the metadata, Unix seconds.
-        focal_35mm: 35 mm equivalent focal length of the metadata.
-        counted: True where decoders return no timestamps to know a frame by (AVI with B-frames):
-            frames are counted from the start, and are evenly spaced.
-        interlaced: True where a frame holds two half pictures of different times.
-        pixel_aspect: Width of a stored pixel over its height; 4/3 where 1440 columns are shown as 1920.
+        created_s: Creation time in the metadata, Unix seconds.
+        focal_35mm: 35 mm equivalent focal length in the metadata.
+        is_counted: True if the decoder returns no timestamps (AVI with B-frames): frames are counted from the
+            start and are evenly spaced.
+        is_interlaced: True if a frame holds two half pictures of different times.
+        pixel_aspect: Width of a stored pixel over its height; 4/3 if 1440 columns are shown as 1920.
     """
 
     path: Path
@@ -56,8 +58,8 @@ class VideoFile:
     orientation: Orientation
     created_s: float | None = None
     focal_35mm: float | None = None
-    counted: bool = False
-    interlaced: bool = False
+    is_counted: bool = False
+    is_interlaced: bool = False
     pixel_aspect: Fraction = Fraction(1)
 
     @property
@@ -76,7 +78,7 @@ class VideoFile:
         return (width, height) if self.orientation[0][0] else (height, width)
 
     def times_ns(self) -> IntArray:
-        """(N,) timestamps in nanoseconds, exact to half of one."""
+        """Return the timestamps (N,) in nanoseconds, exact to half a nanosecond."""
         top, bottom = self.time_base.numerator * 1_000_000_000, self.time_base.denominator
         exact = [(2 * value * top + bottom) // (2 * bottom) for value in self.pts.tolist()]
         return np.array(exact, dtype=np.int64)
@@ -86,7 +88,7 @@ def open_container(path: Path) -> InputContainer:
     """Open a media file.
 
     Raises:
-        CaptureError: It is missing, empty or not a video.
+        CaptureError: The file is missing, empty or not a video.
     """
     import av
 
@@ -112,26 +114,26 @@ def open_container(path: Path) -> InputContainer:
 
 
 def video_stream(container: InputContainer, path: Path) -> VideoStream:
-    """The stream that holds the camera's pictures, not a cover picture beside it.
+    """Return the stream with the camera's pictures, not a cover picture.
 
     Raises:
-        CaptureError: There is none, or no decoder for it.
+        CaptureError: There is no such stream, or no decoder for it.
     """
     import av
 
     cover = av.stream.Disposition.attached_pic
     streams = [stream for stream in container.streams.video if not stream.disposition & cover]
     if not streams:
-        what = "no video in it, sound only" if container.streams.audio else "the video holds no frame"
+        what = "it contains sound only, no video" if container.streams.audio else "the video holds no frame"
         raise CaptureError(what, path=path, hint="give the file that holds the camera's pictures")
     for stream in streams:
         if stream.codec_context is not None:
             return stream
-    raise CaptureError("no decoder knows this kind of video", path=path, hint="convert it to H.264")
+    raise CaptureError("there is no decoder for this kind of video", path=path, hint="convert it to H.264")
 
 
 def error_reason(error: Exception) -> str:
-    """What a library's error says, in a few words."""
+    """Return the message of a library's error in a few words."""
     return str(getattr(error, "strerror", "") or error)
 
 

@@ -62,7 +62,7 @@ def check_picture_quality(camera: CaptureCamera) -> list[str]:
             hint="was the lens covered? Leave the camera out; if a player shows it, convert it to H.264",
         )
     notes = []
-    if any(video.interlaced for video in camera.videos):
+    if any(video.is_interlaced for video in camera.videos):
         notes.append(
             "interlaced: make whole pictures of it first (ffmpeg -i in -vf bwdif=send_frame out.mp4)"
         )

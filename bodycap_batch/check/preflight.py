@@ -143,7 +143,7 @@ def _intrinsics_notes(camera: CaptureCamera) -> list[str]:
     lens = camera.camera
     long_side = max(lens.width_px, lens.height_px)
     notes = []
-    if any(video.interlaced for video in camera.videos):
+    if any(video.is_interlaced for video in camera.videos):
         notes.append(
             "interlaced: make whole pictures of it first (ffmpeg -i in -vf bwdif=send_frame out.mp4)"
         )

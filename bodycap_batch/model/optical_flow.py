@@ -1,4 +1,4 @@
-"""Sparse optical flow between two frames, checked forward and backward. Pixels have COLMAP's origin."""
+"""Track points between two frames, with a check forwards and backwards. Pixels have COLMAP's origin."""
 
 from __future__ import annotations
 
@@ -9,48 +9,68 @@ import numpy.typing as npt
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX
+from bodycap_batch.model.geometry import nearest_rotation
 
 GreyImage = npt.NDArray[np.uint8]
 Pixels = npt.NDArray[np.float32]
 
 REFERENCE_WIDTH_PX = 640.0
-"""Pixel thresholds are stated for images of this long side and scale with it."""
+"""Pixel thresholds are stated for images with this long side and scale with it."""
 
 BLUR_SHARPNESS_RATIO = 0.6
-"""x"""
+"""A frame is blurred if its sharpness is below this fraction of the sharpness of the frames around it.
+Evidence: none."""
 
 _WINDOW_PX = 21
+"""Pixels: side of the compared square. Evidence: none."""
 _LEVELS = 4
+"""Coarse pyramid levels without a guess."""
 _GUIDED_LEVELS = 2
+"""Coarse pyramid levels with a guess."""
 _UNCHECKED_LEVELS = 0
-"""With a guess the coarse levels only add cost and ways to go wrong."""
+"""Coarse pyramid levels with a guess and without the check: they would only add cost and wrong matches."""
 _ITERATIONS = 20
+"""Most iterations of Lucas–Kanade on a level. Evidence: none."""
 _EPSILON_PX = 0.02
+"""Pixels: an iteration that moves a point by less is the last one. Evidence: none."""
 _MAX_ROUND_TRIP_PX = 1.0
+"""Pixels: largest distance after tracking there and back. Evidence: none."""
 _COARSE_WIDTH_PX = 320.0
+"""Pixels: long side of the reduced images for the motion of the whole image. Evidence: none."""
 _COARSE_WINDOW_PX = 15
+"""Pixels of the reduced image: side of the compared square. Evidence: none."""
 _COARSE_LEVELS = 3
+"""Coarse pyramid levels of the reduced image."""
 _COARSE_POINTS = 48
+"""Most points that are followed for it. Evidence: none."""
 _MIN_COARSE_POINTS = 12
+"""Least points for a homography. Evidence: none."""
 _COARSE_ERROR_PX = 2.5
+"""Pixels of the reduced image: inlier limit of the homography. Evidence: none."""
 _COARSE_MAX_TRIALS = 300
+"""RANSAC iterations. Evidence: none."""
 _MIN_INLIERS = 7
-"""Three more than a homography fits by itself."""
+"""Least inliers of a homography. Origin: three more than the four points that determine it."""
 _RELIABLE_RATIO = 0.5
+"""Least ratio of inliers to points for a reliable motion. Origin: the majority."""
 _PIECE_SIDE_RATIO = 0.35
+"""Side of an image piece, as a fraction of the image's long side. Evidence: none."""
 _PIECE_ROWS, _PIECE_COLUMNS = 2, 3
+"""Rows and columns of image pieces. Evidence: none."""
 _MAX_PIECES = 2
+"""Best pieces whose shift is used as a guess. Evidence: none."""
 _MIN_CONTRAST = 4.0
+"""Least standard deviation of the grey values of a piece. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackedPoints:
-    """Where points went.
+    """Tracked points.
 
     Attributes:
         px: (N,2) position in the second image, COLMAP origin.
-        ok: (N,) found, inside the image and returning to where it came from.
-        round_trip_px: (N,) distance between a point and its image after going there and back.
+        ok: (N,) True if the point was found inside the image and passed the check.
+        round_trip_px: (N,) distance between a point and its image after tracking there and back.
     """
 
     px: Pixels
@@ -59,7 +79,7 @@ class TrackedPoints:
 
 
 def pixel_scale(width_px: int, height_px: int) -> float:
-    """Factor on pixel thresholds for an image of this size."""
+    """Return the factor on pixel thresholds for an image of this size."""
     return max(width_px, height_px) / REFERENCE_WIDTH_PX
 
 
@@ -72,19 +92,19 @@ def track_points(
     with_check: bool = True,
     window_px: int = _WINDOW_PX,
 ) -> TrackedPoints:
-    """Follow points from one image to the next by pyramidal Lucas–Kanade, there and back.
+    """Track points from one image to the next by pyramidal Lucas–Kanade, with a check backwards.
 
     Args:
         first: (H,W) uint8 image.
         second: (H,W) uint8 image.
         px: (N,2) float32 points in the first image.
-        guess_px: (N,2) where to start looking in the second image.
-        careful: Look far around the guess, follow the points back too and refuse those that do not return.
-            Otherwise only the guess's surroundings are searched, for a quarter of the cost.
-        window_px: Side of the square around a point that is compared.
+        guess_px: (N,2) expected positions in the second image.
+        with_check: Search far around the guess, track the points back too, and reject those that do not
+            return. Otherwise only the surroundings of the guess are searched, at a quarter of the cost.
+        window_px: Side of the compared square.
 
-    Source: Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2000; the check is
-        Kalal, Mikolajczyk, Matas, "Forward-backward error", ICPR 2010.
+    Source: Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2000; the check is Kalal,
+        Mikolajczyk, Matas, "Forward-backward error", ICPR 2010.
     """
     if len(px) == 0:
         return TrackedPoints(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0, np.float32))
@@ -99,7 +119,7 @@ def track_points(
         return TrackedPoints(found_px, is_found, np.zeros(len(px), np.float32))
     returned_px = np.full_like(tracked, np.inf)
     if is_found.any():
-        # The way back starts from the guess's own shift, so that it does not know the answer.
+        # Tracking back starts with the opposite of the guess, so that it does not start at the answer.
         return_guess = None if guess is None else tracked[is_found] - (guess - start)[is_found]
         returned, refound = _lucas_kanade(second, first, tracked[is_found], return_guess, (window_px, levels))
         returned[~refound] = np.inf
@@ -112,7 +132,18 @@ def track_points(
 def _lucas_kanade(
     first: GreyImage, second: GreyImage, start: Pixels, guess: Pixels | None, size: tuple[int, int]
 ) -> tuple[Pixels, BoolArray]:
-    """OpenCV's tracker, in OpenCV's pixels; `size` is the window's width and the number of coarse levels."""
+    """Call OpenCV's tracker, in OpenCV's pixels.
+
+    Args:
+        first: (H,W) image.
+        second: (H,W) image.
+        start: (N,2) points in the first image.
+        guess: (N,2) expected positions in the second image, if there are any.
+        size: Side of the compared square, and the number of coarse levels.
+
+    Returns:
+        Positions (N,2) in the second image, and which points (N,) were found.
+    """
     import cv2
 
     window, levels = size
@@ -126,7 +157,7 @@ def _lucas_kanade(
 
 
 def make_coarse_image(grey: GreyImage) -> GreyImage:
-    """The image reduced for `estimate_coarse_motion`, whatever its size."""
+    """Reduce an image to the size that `estimate_coarse_motion` works at."""
     import cv2
 
     scale = min(1.0, _COARSE_WIDTH_PX / max(grey.shape))
@@ -135,38 +166,38 @@ def make_coarse_image(grey: GreyImage) -> GreyImage:
 
 @dataclass(frozen=True, slots=True)
 class ImageMotion:
-    """How the whole image moved.
+    """The motion of the whole image.
 
     Attributes:
-        homography: (3,3) second from first, full-size pixels of COLMAP's origin.
-        sure: True where most points agree with it.
+        homography: (3,3) second from first, in full-size pixels with COLMAP's origin.
+        is_reliable: True if most points agree with it.
     """
 
     homography: FloatArray
     is_reliable: bool
 
     def inverse(self) -> ImageMotion:
-        """The way back."""
+        """Return the motion from the second image to the first."""
         return ImageMotion(np.asarray(np.linalg.inv(self.homography)), self.is_reliable)
 
 
 def estimate_coarse_motion(
     first: GreyImage, second: GreyImage, px: Pixels, width_px: int
 ) -> ImageMotion | None:
-    """Homography from one image to the next, near enough to start tracking from.
+    """Estimate the homography from one image to the next, as a start for tracking.
 
-    Some points are followed from where they were. Where few of them agree on a motion they are followed
-    again from where pieces of the image are found in the second one: a hand's camera turns by up to 35
-    degrees between two frames.
+    Some points are followed from their own position. If few of them agree on a motion, they are followed
+    again from the shift of image pieces that are found in the second image. The camera on a hand rotates by
+    up to 35 degrees between two frames.
 
     Args:
-        first: `make_coarse_image` of the first image.
-        second: The same of the second.
+        first: Reduced first image, from `make_coarse_image`.
+        second: Reduced second image.
         px: (N,2) points of the first image at full size; some of them are followed.
         width_px: Width of the full-size images.
 
     Returns:
-        It, or None where too few points agree.
+        The motion, or None if too few points agree.
     """
     scale = first.shape[1] / width_px
     chosen = px[np.linspace(0, len(px) - 1, min(len(px), _COARSE_POINTS)).astype(int)] if len(px) else px
@@ -179,7 +210,7 @@ def estimate_coarse_motion(
                 best, inliers = homography, count
     if best is None or inliers < _MIN_INLIERS:
         return None
-    # From OpenCV's pixels of the reduced images to COLMAP's of the full ones.
+    # From OpenCV's pixels of the reduced images to COLMAP's pixels of the full-size images.
     full_from_coarse = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, scale]])
     return ImageMotion(
         np.asarray(full_from_coarse @ best @ np.linalg.inv(full_from_coarse)),
@@ -190,7 +221,7 @@ def estimate_coarse_motion(
 def _fit_homography(
     first: GreyImage, second: GreyImage, start: Pixels, guess: Pixels | None
 ) -> tuple[FloatArray | None, int]:
-    """Homography that most followed points agree on, and how many do."""
+    """Follow points and return the homography with the most inliers, and their number."""
     import cv2
 
     if len(start) < _MIN_COARSE_POINTS:
@@ -207,7 +238,7 @@ def _fit_homography(
 
 
 def _match_image_pieces(first: GreyImage, second: GreyImage) -> list[Pixels]:
-    """Where pieces of the first image are found in the second: shifts (2,) of the best ones.
+    """Find pieces of the first image in the second, and return the shifts (2,) of the best matches.
 
     Source: Lewis, "Fast normalized cross-correlation", 1995.
     """
@@ -232,13 +263,13 @@ def _match_image_pieces(first: GreyImage, second: GreyImage) -> list[Pixels]:
 
 
 def apply_homography(px: Pixels, homography: FloatArray) -> Pixels:
-    """Points (N,2) under a homography (3,3)."""
+    """Transform points (N,2) by a homography (3,3)."""
     homogeneous = px @ homography[:, :2].T + homography[:, 2]
     return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:], dtype=np.float32)
 
 
 def detect_corners(grey: GreyImage, count: int, spacing_px: float, mask: BoolArray | None = None) -> Pixels:
-    """Corners (N,2) worth tracking, strongest first, at least `spacing_px` apart, where a mask is True.
+    """Detect corners (N,2), strongest first, at least `spacing_px` apart, where the mask is True.
 
     Source: Shi, Tomasi, "Good features to track", CVPR 1994.
     """
@@ -252,7 +283,9 @@ def detect_corners(grey: GreyImage, count: int, spacing_px: float, mask: BoolArr
 
 
 def sharpness(grey: GreyImage) -> float:
-    """Spread of the image's second derivative: falls with blur, comparable between neighbouring frames.
+    """Return the standard deviation of the image's second derivative.
+
+    It falls with blur and is comparable between neighbouring frames.
 
     Source: Pech-Pacheco et al., "Diatom autofocusing in brightfield microscopy", ICPR 2000.
     """
@@ -263,25 +296,21 @@ def sharpness(grey: GreyImage) -> float:
 
 
 def unit_directions(rays: FloatArray) -> FloatArray:
-    """Unit directions (N,3) of rays (N,2) given at depth 1."""
+    """Return the unit directions (N,3) of rays (N,2) at depth 1."""
     full = np.column_stack([rays, np.ones(len(rays))])
     return np.asarray(full / np.linalg.norm(full, axis=1, keepdims=True))
 
 
 def fit_rotation(first: FloatArray, second: FloatArray, iterations: int = 4) -> FloatArray:
-    """Rotation (3,3) that best turns unit directions (N,3) `first` into `second`, robustly.
+    """Fit the rotation (3,3) from unit directions `first` (N,3) to `second` (N,3), robustly.
 
-    Source: Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976, reweighted
-        with Cauchy weights at the median residual.
+    Source: Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976, reweighted with
+        Cauchy weights at the median residual.
     """
     weight = np.ones(len(first))
     rotation = np.eye(3)
     for _ in range(iterations):
-        covariance = (second * weight[:, None]).T @ first
-        u, _, vt = np.linalg.svd(covariance)
-        if np.linalg.det(covariance) < 0.0:
-            u[:, 2] *= -1.0
-        rotation = u @ vt
+        rotation = nearest_rotation((second * weight[:, None]).T @ first)
         residual = second - first @ rotation.T
         squared = np.einsum("ni,ni->n", residual, residual)
         median = np.partition(squared, len(squared) // 2)[len(squared) // 2]

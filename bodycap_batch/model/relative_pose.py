@@ -1,4 +1,4 @@
-"""Cameras that one bone carries: where each sits beside the other, as all their frames together tell."""
+"""Estimate the relative pose of two cameras on one bone from all of their frames."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from bodycap_batch.core.arrays import FloatArray, IntArray, set_array
 from bodycap_batch.model.geometry import (
     invert,
     make_transform,
+    nearest_rotation,
     poses_at,
     rotation_angle_rad,
     so3_exp,
@@ -18,32 +19,35 @@ from bodycap_batch.model.geometry import (
 from bodycap_batch.model.scene import Trajectory
 
 _MAX_ITERATIONS = 100
+"""Iterations of the rotation average."""
 _CONVERGED_RAD = 1e-9
+"""Radians: a smaller step ends the iterations, and no residual gets more weight than this one."""
 MIN_INSTANTS = 30
-"""A second of frames in which both cameras have a pose of their own; fewer say too little of how they sit."""
+"""Least instants with a pose of both cameras: a second of frames. Fewer do not determine the relative
+pose."""
 _MAX_SPREAD_RATIO = 1.5
-"""Spread of the relative turn over what the poses' own covariances explain (they hold the map's error too,
-which both share). Four rendered rigs, one with a rolling shutter, in step: 0.3 to 0.8; 2 ms out of step 0.8
-to 1.7; 5 ms, from where on solving them together does harm, 1.7 to 3.5; a frame 11 to 19."""
+"""Largest ratio of the scatter of the relative rotation to the scatter that the covariances of the poses
+explain. The covariances contain the error of the map, which both cameras share, so the ratio of a rig is
+below 1. Evidence: docs/decisions/registration.md."""
 _MEDIAN_NORM_3D = 1.538
 """Median length of a vector of three standard normal variables."""
 _SAME_INSTANT_RATIO = 0.25
-"""Share of a frame's duration within which two time stamps of a synchronised rig mean one exposure: they are
-rounded, and no other exposure lies between."""
+"""Largest time difference of one exposure in a synchronised rig, as a fraction of the frame interval. Time
+stamps are rounded, and no other exposure lies between."""
 _MAX_INTERPOLATION_FRAMES = 1.5
-"""Frames so near are neighbours, between which a path is interpolated."""
+"""Frame intervals between two poses that may be interpolated: they are neighbours."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RelativePose:
-    """Where one camera sits beside another.
+    """The pose of one camera relative to another.
 
     Attributes:
-        cameras: Names of the first and the second.
-        first_from_second: (4,4), translation in the unit of the gauge; NaN where no instant tells.
-        instants: How many tell.
+        cameras: Names of the first and the second camera.
+        first_from_second: (4,4), translation in the unit of the gauge; NaN if no instant has both poses.
+        instants: Number of instants with both poses.
         spread_rad: Median angle of single instants from the mean.
-        explained_rad: Median angle that the covariances of both paths' poses let expect.
+        explained_rad: Median angle that the covariances of both trajectories explain.
         spread: Median distance of single instants' centres from the mean, in the gauge's unit.
     """
 
@@ -59,29 +63,29 @@ class RelativePose:
 
     @property
     def is_rigid(self) -> bool:
-        """Whether enough instants agree that the two are held together and exposed in step."""
+        """True if enough instants agree that the cameras are mounted rigidly and exposed synchronously."""
         return self.instants >= MIN_INSTANTS and self.spread_rad < _MAX_SPREAD_RATIO * self.explained_rad
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigPoses:
-    """Where the other cameras of a rig sit beside one of them."""
+    """The relative poses of the other cameras of a rig."""
 
     relative: tuple[RelativePose, ...]
 
 
 def estimate_relative_pose(first: Trajectory, second: Trajectory, offset_ns: int) -> RelativePose:
-    """Robust mean of the second camera's pose beside the first's over all frames where both have one.
+    """Average the second camera's pose relative to the first robustly, over all frames with both poses.
 
-    The second path is interpolated to the first one's instants.
+    The second trajectory is interpolated at the times of the first.
 
     Args:
-        first: One camera's path.
-        second: The other's, in the same gauge; in another one no instant tells.
-        offset_ns: What is added to the second's times to have them on the first's clock.
+        first: Trajectory of one camera.
+        second: Trajectory of the other, in the same gauge; otherwise no instant has both poses.
+        offset_ns: Nanoseconds to add to the second camera's times to have them on the first camera's clock.
 
-    Source: rotations by Hartley, Aftab, Trumpf, "L1 rotation averaging using the Weiszfeld algorithm",
-        CVPR 2011; translations by their median along each axis.
+    Source: rotations by Hartley, Aftab, Trumpf, "L1 rotation averaging using the Weiszfeld algorithm", CVPR
+        2011; translations by their median along each axis.
     """
     names, samples = (first.camera, second.camera), np.zeros((0, 4, 4))
     if first.gauge == second.gauge and first.localised.any() and second.localised.any():
@@ -116,15 +120,17 @@ def estimate_relative_pose(first: Trajectory, second: Trajectory, offset_ns: int
 
 
 def _rotation_variance(path: Trajectory) -> float:
-    """Usual variance of a pose's turn about one axis, rad²."""
+    """Return the median variance of a pose's rotation about one axis, rad²."""
     covariance = path.covariance[path.localised][:, :3, :3]
     return float(np.median(np.trace(covariance, axis1=1, axis2=2))) / 3.0
 
 
 def mean_rotation(rotations: FloatArray) -> FloatArray:
-    """Rotation (3,3) with the least sum of angles to rotations (N,3,3): nearly half of them may be wrong."""
-    u, _, vt = np.linalg.svd(np.median(rotations, axis=0))
-    mean = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    """Return the rotation (3,3) with the least sum of angles to rotations (N,3,3).
+
+    Nearly half of the rotations may be wrong.
+    """
+    mean = nearest_rotation(np.median(rotations, axis=0))
     for _ in range(_MAX_ITERATIONS):
         rotvec = so3_log(mean.T @ rotations)
         weight = 1.0 / np.maximum(np.linalg.norm(rotvec, axis=1), _CONVERGED_RAD)
@@ -136,11 +142,14 @@ def mean_rotation(rotations: FloatArray) -> FloatArray:
 
 
 def match_instants(first_ns: IntArray, second_ns: IntArray) -> IntArray:
-    """For each of the second's frames (N,) the first's frame at the same instant; -1 where there is none.
+    """Find for each frame of the second camera (N,) the first camera's frame at the same instant.
 
     Args:
         first_ns: (F,) increasing common times.
-        second_ns: (N,) likewise.
+        second_ns: (N,) increasing common times.
+
+    Returns:
+        (N,) frame of the first camera; -1 if there is none.
     """
     if len(first_ns) < 2:
         return np.full(len(second_ns), -1, dtype=np.int64)
@@ -152,20 +161,21 @@ def match_instants(first_ns: IntArray, second_ns: IntArray) -> IntArray:
 
 
 def _frame_interval_ns(times_ns: IntArray) -> float:
-    """Usual time from one frame to the next."""
+    """Return the median frame interval in nanoseconds."""
     return float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0.0
 
 
 def not_rigid_note(relative: RelativePose) -> str:
-    """Why two cameras that the job says are a rig were not taken for one."""
+    """Explain to the user why two cameras of a stated rig are not treated as one."""
     pair = " and ".join(relative.cameras)
     if relative.instants < MIN_INSTANTS:
         return (
-            f"{pair}: {relative.instants} common frames in one map say too little of how they sit: each is on "
-            "its own"
+            f"{pair}: only {relative.instants} common frames in one map, too few for their relative pose: "
+            "each camera is treated separately"
         )
+    found_deg, expected_deg = np.degrees(relative.spread_rad), np.degrees(relative.explained_rad)
     return (
-        f"{pair}: their relative turn scatters by {np.degrees(relative.spread_rad):.2f} degrees where a rig's "
-        f"would by {np.degrees(relative.explained_rad):.2f}: each is on its own. Check offset_s, and that one "
-        "trigger exposes both"
+        f"{pair}: their relative rotation scatters by {found_deg:.2f} degrees, that of a rig would by "
+        f"{expected_deg:.2f}: each camera is treated separately. Check offset_s, and that one trigger "
+        "exposes both"
     )

@@ -1,7 +1,7 @@
-"""Rolling shutter: rows exposed one after another, moved to the instant of the middle row.
+"""Correct the rolling shutter: move observations to the instant of the middle row.
 
-Image row r of h is exposed at the frame's time + (r/h − ½) · readout_s; where a quarter turn lets the
-sensor's rows run along the picture's columns (`Camera.sideways`), column c of w at (c/w − ½) · readout_s.
+Image row r of h is exposed at the frame's time + (r/h − ½) · readout_s. If a quarter turn lets the sensor's
+rows run along the image columns (`Camera.sideways`), column c of w is exposed at (c/w − ½) · readout_s.
 """
 
 from __future__ import annotations
@@ -17,33 +17,41 @@ from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.scene import Map, Registration
 
 _MAX_GAP_FRAMES = 3.0
-"""From one side alone where the next frame is further off: over a hole in the video (a second of it) the
-readout time of a real shutter came out as 3 ms instead of 22, and the map 0.9 cm off instead of 0.3."""
+"""Largest distance to a neighbouring frame that gives a velocity, in frame intervals. Beyond it only the
+other neighbour is used, because the velocity over a hole in the video is wrong. Evidence:
+docs/decisions/registration.md."""
 _MIN_POINTS = 30
+"""Least observations of a frame. Origin: the camera motion takes six unknowns. Evidence: none."""
 _MAX_RESIDUAL_PX = 4.0
+"""Pixels at 640 px image width: larger residuals are ignored. Evidence: none."""
 _LOSS_PX = 0.5
+"""Pixels: scale of the Cauchy loss. Evidence: none."""
 _BATCH_ROWS = 1 << 14
-"""Observations whose poses are held at a time, each in a frame of its own."""
+"""Observations projected at a time, each with a pose of its own. It bounds the memory."""
 _SCREENED_OBSERVATIONS = 100_000
-"""About so many observations tell whether the shutter rolls, from frames spread over the video."""
+"""About the number of observations used, from frames spread over the video. They are enough for a
+decision."""
 _MIN_APPARENT_S = 0.0005
+"""Seconds: least readout time in the residuals that shows a rolling shutter. Origin: a global shutter shows
+less than 0.0003 s."""
 _MIN_SIGMAS = 8.0
+"""Least significance of it, in standard deviations. Evidence: none."""
 
 
 def image_velocity(
     camera: Camera, map_from_cam: FloatArray, times_ns: IntArray, frame: IntArray, points: FloatArray
 ) -> FloatArray:
-    """Velocity (M,2) in px/s at which points of the map cross the image, from the neighbouring poses.
+    """Return the velocity (M,2) in px/s of map points in the image, from the poses of neighbouring frames.
 
     Args:
-        camera: The lens.
-        map_from_cam: (N,4,4) poses of all frames, NaN where there is none.
+        camera: The camera model.
+        map_from_cam: (N,4,4) poses of all frames, NaN if there is none.
         times_ns: (N,) frame times.
         frame: (M,) frame of each observation.
-        points: (M,3) the point it observes.
+        points: (M,3) the observed point.
 
     Returns:
-        Zero where neither neighbour has a pose and is near in time, or the point is behind it.
+        Zero if neither neighbour has a pose and is near in time, or if the point is behind it.
     """
     has_pose: BoolArray = np.asarray(np.isfinite(map_from_cam).all(axis=(1, 2)))
     cam_from_map = np.full_like(map_from_cam, np.nan)
@@ -63,7 +71,7 @@ def image_velocity(
 
 
 def _usable_neighbours(has_pose: BoolArray, times_ns: IntArray) -> tuple[BoolArray, BoolArray]:
-    """(N,) whether the frame before, and the one after, has a pose and is near enough to tell a speed."""
+    """Return which frames (N,) have a previous, and which a next, frame with a pose near in time."""
     interval_ns = np.diff(times_ns)
     is_near = interval_ns <= _MAX_GAP_FRAMES * np.median(interval_ns) if len(interval_ns) else interval_ns > 0
     missing = np.zeros(1, dtype=bool)
@@ -75,7 +83,7 @@ def _usable_neighbours(has_pose: BoolArray, times_ns: IntArray) -> tuple[BoolArr
 def _project_in_frames(
     camera: Camera, cam_from_map: FloatArray, frame: IntArray, points: FloatArray
 ) -> FloatArray:
-    """Pixels (M,2) of points (M,3), each in a frame of its own; a long video is taken in parts."""
+    """Project points (M,3), each into a frame of its own, to pixels (M,2), in batches."""
     out = np.empty((len(frame), 2))
     for start in range(0, len(frame), _BATCH_ROWS):
         batch = slice(start, start + _BATCH_ROWS)
@@ -86,7 +94,7 @@ def _project_in_frames(
 
 
 def row_delay(camera: Camera, px: FloatArray) -> FloatArray:
-    """Exposure (M,) of pixels (M,2) relative to the frame's time, as a share of the readout time."""
+    """Return the exposure time (M,) of pixels (M,2) relative to the frame's time, over the readout time."""
     position = px[:, 0] / camera.width_px if camera.sideways else px[:, 1] / camera.height_px
     return np.asarray(position - 0.5, dtype=np.float64)
 
@@ -113,21 +121,21 @@ def mean_row_fraction(registration: Registration, camera: Camera) -> FloatArray:
 
 
 def px_at_mid_row(camera: Camera, px: FloatArray, velocity_px_s: FloatArray, readout_s: float) -> FloatArray:
-    """Where pixels (M,2) moving at `velocity_px_s` (M,2) are at the instant of the middle row."""
+    """Return the pixels (M,2) at the instant of the middle row, given their velocities (M,2) in px/s."""
     return np.asarray(px - velocity_px_s * (row_delay(camera, px) * readout_s)[:, None])
 
 
 def has_visible_rolling_shutter(
     registration: Registration, maps: Sequence[Map], *, allow_sideways: bool = False
 ) -> bool:
-    """Whether a rolling shutter shows in the residuals of a camera's tracks.
+    """Return True if a rolling shutter shows in the residuals of a camera's tracks.
 
-    Global shutters show less than 0.3 ms of it, a readout time of 24 ms shows 3 ms.
+    A global shutter shows less than 0.3 ms; a readout time of 24 ms shows 3 ms.
 
     Args:
-        found: The camera's poses and tracks.
-        maps: The maps they are in.
-        either_way: The sensor's rows may run along the picture's columns, too.
+        registration: The poses and tracks of the camera.
+        maps: The maps they belong to.
+        allow_sideways: Test both directions: the sensor's rows may run along the image columns.
     """
     path = registration.trajectory
     scene_map = next((item for item in maps if item.gauge == path.gauge), None)
@@ -157,21 +165,22 @@ def has_visible_rolling_shutter(
 def estimate_residual_readout(
     camera: Camera, frame: IntArray, px: FloatArray, residual_px: FloatArray, velocity_px_s: FloatArray
 ) -> tuple[float, float]:
-    """What is left of the readout time after poses and points have absorbed most of it.
+    """Estimate the part of the readout time that poses and points have not absorbed.
 
-    The residuals (observed minus projected) of a rolling shutter grow with row times velocity. What a
-    similarity and a tilt of the image explain is taken out of both, frame by frame, since the pose would
-    have absorbed it; the map absorbs more, so the figure is a lower bound: a screen, not an estimate.
+    With a rolling shutter the residuals (observed minus projected) grow with row times velocity. The part
+    that a similarity and a tilt of the image explain is removed from both, frame by frame, because the pose
+    has absorbed it. The map absorbs more. The value is therefore a lower bound, which suits a test and not a
+    correction.
 
     Args:
-        camera: The lens.
+        camera: The camera model.
         frame: (M,) frame of each observation, sorted.
         px: (M,2) observed pixel.
-        residual_px: (M,2).
+        residual_px: (M,2) residual.
         velocity_px_s: (M,2) from `image_velocity`.
 
     Returns:
-        Seconds and their standard deviation; (0, inf) where there is too little to tell.
+        Seconds and their standard deviation; (0, inf) if there are too few observations.
     """
     keep = np.linalg.norm(residual_px, axis=1) < _MAX_RESIDUAL_PX * camera.width_px / 640.0
     frame, px, residual_px, velocity_px_s = frame[keep], px[keep], residual_px[keep], velocity_px_s[keep]
@@ -196,7 +205,7 @@ def estimate_residual_readout(
 
 
 def _camera_motion_basis(x: FloatArray) -> FloatArray:
-    """Image motions (2N,6) of a small camera motion: shift, scale, roll, and the two tilts."""
+    """Return the image motions (2N,6) of a small camera motion: shift, scale, roll, and the two tilts."""
     out = np.zeros((2 * len(x), 6))
     out[0::2, 0] = out[1::2, 1] = 1.0
     out[0::2, 2], out[1::2, 2] = x[:, 0], x[:, 1]

@@ -11,16 +11,12 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, runs
 from bodycap_batch.model.geometry import rotation_angle_rad
+from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.report.drawn_scene import common_times_s
 from bodycap_batch.report.frame_pictures import FrameAppearance
 from bodycap_batch.report.report_inputs import ReportInputs
 
-_BLUR_RATIO = 0.6
-"""Sharpness relative to the camera's registered frames below which a frame is blurred.
-
-It is the ratio that registration uses for the status of a lost frame.
-"""
 _FAST_DEG = 8.0
 """Degrees from one frame to the next.
 
@@ -111,7 +107,7 @@ def likely_cause(
         return LossCause.SHALLOW
     if appearance is not None and usual_corners and appearance.corners < _PLAIN_RATIO * usual_corners:
         return LossCause.PLAIN
-    return LossCause.BLUR if loss.sharpness < _BLUR_RATIO else LossCause.UNKNOWN_PLACE
+    return LossCause.BLUR if loss.sharpness < BLUR_SHARPNESS_RATIO else LossCause.UNKNOWN_PLACE
 
 
 def turn_per_frame_deg(trajectory: Trajectory) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Lost frames found again by what the map's points look like; those that show no room stay lost."""
+"""Lost frames are recovered by the appearance of map points; frames that do not show the room stay lost."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class _Video:
 
 
 class _SolvedVideo(_Video):
-    """One whose frames are solved again."""
+    """A camera with frames that can be solved again."""
 
     camera = CAMERA
 
@@ -107,14 +107,14 @@ def pictures() -> list[np.ndarray]:
 
 
 def _hits(px: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Where lines of sight meet the room's walls."""
+    """Intersections of lines of sight with the walls of the room."""
     ray = np.column_stack([CAMERA.unproject(px), np.ones(len(px))]) @ pose[:3, :3].T
     distance = ((np.sign(ray) * HALF_M - pose[:3, 3]) / ray).min(axis=1)
     return pose[:3, 3] + ray * distance[:, None]
 
 
 def _map(pictures: list[np.ndarray]) -> Map:
-    """Corners of every fourth picture, seen wherever a keyframe looks; none from the lost stretch."""
+    """Corners of every fourth image, observed by all keyframes that see them; none from the lost interval."""
     keyframes = [frame for frame in range(0, COUNT, 4) if frame not in LOST]
     points = np.concatenate(
         [_hits(detect_corners(pictures[k], 60, 8.0).astype(float), PATH[k]) for k in keyframes]
@@ -143,7 +143,7 @@ def _map(pictures: list[np.ndarray]) -> Map:
 
 
 def _tracked() -> Registration:
-    """All frames with their true poses, a millimetre uncertain, but for the lost stretch."""
+    """All frames with their true poses and a sigma of a millimetre, except in the lost interval."""
     status = [FrameStatus.FEW_TRACKS if frame in LOST else FrameStatus.REGISTERED for frame in range(COUNT)]
     poses = np.array([np.full((4, 4), np.nan) if f in LOST else PATH[f] for f in range(COUNT)])
     covariance = np.tile(np.eye(6) * 1e-6, (COUNT, 1, 1))
@@ -193,7 +193,7 @@ def test_lost_frames_are_found_where_they_were(pictures: list[np.ndarray], conte
     assert (sigma_m > 1e-3).all()
 
 
-def test_what_tracking_found_stays_within_what_it_stated(
+def test_poses_from_tracking_move_by_less_than_their_sigma(
     pictures: list[np.ndarray], context: StageContext
 ) -> None:
     path, before = _recovered(_map(pictures), pictures, context), _tracked().trajectory
@@ -222,23 +222,23 @@ def test_frames_that_show_no_part_of_the_map_stay_lost(
     assert all(path.status[frame] is FrameStatus.FEW_TRACKS for frame in LOST)
 
 
-def test_what_the_mask_hides_is_no_room(pictures: list[np.ndarray], context: StageContext) -> None:
+def test_masked_pixels_give_no_pose(pictures: list[np.ndarray], context: StageContext) -> None:
     mask = np.ones((240, 320), dtype=bool)
     mask[10:, :] = False
     path = _recovered(_map(pictures), pictures, context, mask)
     assert not path.localised[list(LOST)].any()
 
 
-def test_of_a_long_stretch_only_so_many_pictures_are_held() -> None:
+def test_a_long_interval_holds_a_limited_number_of_images() -> None:
     video = cast(CaptureCamera, _Video([np.zeros((240, 320), np.uint8)] * COUNT))
     held = sorted(read_pyramids(video, 4, 40, [20], max_frames=12))
     assert held == [3, 4, 5, 6, 18, 19, 20, 21, 22, 38, 39, 40]
 
 
-def test_a_keyframe_in_the_wrong_place_does_not_confirm_itself(
+def test_a_misplaced_keyframe_does_not_support_itself(
     monkeypatch: pytest.MonkeyPatch, context: StageContext
 ) -> None:
-    """Far from both ends, amid black frames, one keyframe and the points of its own stand 60 cm off."""
+    """Between black frames, far from both ends, one keyframe and its own points are 60 cm off."""
     frames, middle, wrong = np.arange(90), 45, np.array([0.6, 0.0, 0.0])
     swaying = 0.02 * np.sin(np.column_stack([frames / 2.4, frames / 2.1 + 1.0, frames / 1.9 + 1.5]))
     centres = np.column_stack([0.01 * frames, 0.2 * np.sin(frames / 14.0), 0.005 * frames]) + swaying
@@ -274,7 +274,9 @@ def test_a_keyframe_in_the_wrong_place_does_not_confirm_itself(
     assert not (off_m[np.isfinite(off_m)] > 0.1).any()
 
 
-def test_points_on_one_small_thing_are_no_pose(pictures: list[np.ndarray], context: StageContext) -> None:
+def test_points_on_one_small_object_give_no_wrong_pose(
+    pictures: list[np.ndarray], context: StageContext
+) -> None:
     scene = _map(pictures)
     middle = _hits(np.array([[160.0, 120.0]]), PATH[21])[0]
     away = np.linalg.norm(scene.points - middle, axis=1) > 0.5
@@ -292,7 +294,7 @@ def test_points_on_one_small_thing_are_no_pose(pictures: list[np.ndarray], conte
 
 
 def _rolled(pictures: list[np.ndarray], readout_s: float) -> list[np.ndarray]:
-    """The lost frames again, fifteen rows at a time, each band from where the camera was at its instant."""
+    """Lost frames with a rolling shutter: bands of fifteen rows, each from the pose at its instant."""
     bands, out = 16, list(pictures)
     rows = CAMERA.height_px // bands
     for frame in LOST:
@@ -328,7 +330,7 @@ def test_a_rolling_shutter_is_undone(
     assert off[1] < 0.5 * off[0]
 
 
-def test_what_the_mask_hides_tells_nothing_of_the_exposure(
+def test_masked_pixels_do_not_influence_the_exposure_time(
     monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray]
 ) -> None:
     """The wearer's sleeve, which is still before the camera, looks like a short exposure."""
@@ -360,48 +362,48 @@ def test_what_the_mask_hides_tells_nothing_of_the_exposure(
     assert shares == [0.0, 0.6]
 
 
-def test_decoding_the_keyframes_is_told(pictures: list[np.ndarray], tmp_path: Path) -> None:
-    told: list[tuple[int, int]] = []
+def test_decoding_the_keyframes_reports_progress(pictures: list[np.ndarray], tmp_path: Path) -> None:
+    reported: list[tuple[int, int]] = []
 
     def progress(done: int, total: int, what: str = "") -> None:
         if "decoded" in what:
-            told.append((done, total))
+            reported.append((done, total))
 
     scene = _map(pictures)
     context = StageContext(work_dir=tmp_path, progress=progress)
     capture = cast(Capture, _Capture(_Video(pictures)))
     read_keyframe_patches(scene, capture, capture.camera("torso"), context)
     count = len(scene.keyframe_camera)
-    assert told == [(number + 1, count) for number in range(count)]
+    assert reported == [(number + 1, count) for number in range(count)]
 
 
-def test_what_is_left_beside_found_frames_is_looked_through_again(
+def test_frames_still_lost_next_to_found_ones_are_searched_again(
     monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray], context: StageContext
 ) -> None:
-    """From the frames found, which count as found and not as tracked; once nothing is found, no more."""
+    """The search starts from the frames found, which are not tracked, and ends if nothing is found."""
     asked = []
 
-    def vouched(march: Propagation, limits: AcceptanceCriteria) -> dict[int, PoseEstimate]:
-        stretch = march.interval
-        asked.append((stretch.start, stretch.stop))
+    def accepted_poses(propagation: Propagation, limits: AcceptanceCriteria) -> dict[int, PoseEstimate]:
+        interval = propagation.interval
+        asked.append((interval.start, interval.stop))
         if len(asked) > 1:
-            assert {18, 19} <= set(stretch.poses)
-            assert not {18, 19} & set(stretch.tracked_frames)
+            assert {18, 19} <= set(interval.poses)
+            assert not {18, 19} & set(interval.tracked_frames)
             return {}
-        fix = replace(stretch.poses[17], depth=1.0)
+        fix = replace(interval.poses[17], depth=1.0)
         return {18: fix, 19: fix}
 
-    monkeypatch.setattr(recover, "_accepted_poses", vouched)
+    monkeypatch.setattr(recover, "_accepted_poses", accepted_poses)
     path = _recovered(_map(pictures), pictures, context)
     assert asked == [(18, 26), (20, 26)]
     assert path.localised[[18, 19]].all()
     assert not path.localised[20:26].any()
 
 
-def test_progress_grows_over_the_rounds_which_end_with_nothing_left(
+def test_progress_grows_over_the_passes_until_nothing_is_left(
     pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told: list[int] = []
+    reported: list[int] = []
     rounds = [[(18, 20), (23, 25)], []]
     monkeypatch.setattr(recover, "lost_intervals", lambda _: [(18, 22), (22, 26)])
     monkeypatch.setattr(recover, "_extended_intervals", lambda *_: rounds.pop(0))
@@ -409,12 +411,12 @@ def test_progress_grows_over_the_rounds_which_end_with_nothing_left(
 
     def progress(done: int, _: int, what: str = "") -> None:
         if what.startswith("lost"):
-            told.append(done)
+            reported.append(done)
 
     context = StageContext(work_dir=tmp_path, progress=progress)
     capture = cast("Capture", _Capture(_Video(pictures)))
     find_lost_poses(_tracked(), _map(pictures), capture, RegistrationOptions(), context)
-    assert told == [18, 22, 22, 23]
+    assert reported == [18, 22, 22, 23]
 
 
 def _selection() -> KeyframeSelection:
@@ -428,7 +430,7 @@ def _selection() -> KeyframeSelection:
 
 
 def _with_tracks(found: Registration, scene: Map, weak: int) -> Registration:
-    """Every point seen by a keyframe before, tracked into the frames after it; few of them into one frame."""
+    """The points of each keyframe, tracked into the frames after it; few of them into frame `weak`."""
     frames, keyframes, features, px = [], [], [], []
     for frame in np.flatnonzero(found.trajectory.localised).tolist():
         row = int(np.searchsorted(scene.keyframe_frame, frame, side="right")) - 1
@@ -450,10 +452,10 @@ def _with_tracks(found: Registration, scene: Map, weak: int) -> Registration:
     )
 
 
-def test_a_wrong_end_of_a_lost_stretch_is_looked_for_again(
+def test_a_wrong_pose_next_to_a_lost_interval_is_searched_again(
     pictures: list[np.ndarray], context: StageContext
 ) -> None:
-    """Twenty tracks that slipped together say to a millimetre that the last frame before it is 20 cm off."""
+    """Twenty tracks slipped together: the last pose before the interval is 20 cm off with a small sigma."""
     scene, end = _map(pictures), LOST[0] - 1
     found = _with_tracks(_tracked(), scene, end)
     wrong = make_transform(np.eye(3), [0.2, 0.0, 0.0]) @ PATH[end]
@@ -468,13 +470,13 @@ def test_a_wrong_end_of_a_lost_stretch_is_looked_for_again(
     capture = cast(Capture, _Capture(_Video(pictures)))
     own = RegisteredCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), registration=found)
     options = RegistrationOptions()
-    settled_map, left = prepare_recovery(own, [], scene, _selection(), options)
+    refined_map, left = prepare_recovery(own, [], scene, _selection(), options)
     assert not left.trajectory.localised[end]
     off_m = [
         np.linalg.norm((each.gauge_from_cam - PATH)[:, :3, 3], axis=1)
         for each in (
             find_lost_poses(found, scene, capture, options, context).trajectory,
-            find_lost_poses(left, settled_map, capture, options, context).trajectory,
+            find_lost_poses(left, refined_map, capture, options, context).trajectory,
         )
     ]
     assert off_m[0][end] > 0.1
@@ -497,8 +499,8 @@ def test_a_second_thread_changes_nothing(
     for threads in (1, 2):
         cv2.setNumThreads(threads)
         context = StageContext(work_dir=tmp_path, threads=threads)
-        settled_map, left = prepare_recovery(own, [], scene, _selection(), options, threads)
-        paths.append(find_lost_poses(left, settled_map, capture, options, context).trajectory)
+        refined_map, left = prepare_recovery(own, [], scene, _selection(), options, threads)
+        paths.append(find_lost_poses(left, refined_map, capture, options, context).trajectory)
     cv2.setNumThreads(before)
     assert not left.trajectory.localised[end]
     assert paths[0].localised[list(LOST)].any()
@@ -506,21 +508,21 @@ def test_a_second_thread_changes_nothing(
     assert paths[0].covariance.tobytes() == paths[1].covariance.tobytes()
 
 
-def test_few_poses_are_left_as_they_are(monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray]) -> None:
+def test_too_few_poses_stay_unchanged(monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray]) -> None:
     scene = _map(pictures)
     found = _with_tracks(_tracked(), scene, -1)
     few = replace(found, trajectory=replace(found.trajectory, inliers=np.full(COUNT, 20)))
     own = RegisteredCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), registration=few)
     monkeypatch.setattr(preparation, "LEAST_POSED", COUNT - len(LOST) - 10)
-    settled_map, left = prepare_recovery(own, [], scene, _selection(), RegistrationOptions())
-    assert settled_map is scene
+    refined_map, left = prepare_recovery(own, [], scene, _selection(), RegistrationOptions())
+    assert refined_map is scene
     assert left is few
 
 
-def test_where_every_end_is_well_seen_all_stays(pictures: list[np.ndarray]) -> None:
+def test_well_supported_ends_leave_map_and_registration_unchanged(pictures: list[np.ndarray]) -> None:
     scene = _map(pictures)
     found = _with_tracks(_tracked(), scene, -1)
     own = RegisteredCamera(camera=cast(CaptureCamera, _SolvedVideo(pictures)), registration=found)
-    settled_map, left = prepare_recovery(own, [found.trajectory], scene, _selection(), RegistrationOptions())
-    assert settled_map is scene
+    refined_map, left = prepare_recovery(own, [found.trajectory], scene, _selection(), RegistrationOptions())
+    assert refined_map is scene
     assert left is found

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.mapping.matching.database import ImageRef
+from bodycap_batch.model.static_span import MIN_STATIC_SPAN_NS
 
 if TYPE_CHECKING:
     import pycolmap
 
-_MIN_STATIC_NS = 1_000_000_000
 _MIN_STATIC_POINTS = 20
 """Confirmed points that carry a keyframe without the others. With 15 and 30 the first capture told of below
 has 0.93 and 0.99 cm."""
@@ -52,4 +52,4 @@ def _is_static(images: list[int], refs: Mapping[int, Any], times_ns: Mapping[str
     if len({refs[image].camera for image in images}) > 1:
         return True
     times = [int(times_ns[refs[image].camera][refs[image].frame]) for image in images]
-    return max(times) - min(times) > _MIN_STATIC_NS
+    return max(times) - min(times) > MIN_STATIC_SPAN_NS

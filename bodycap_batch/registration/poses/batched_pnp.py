@@ -1,4 +1,4 @@
-"""Poses of many frames at once from map points seen in them: robust Gauss–Newton, batched in numpy."""
+"""Refine the poses of many frames at once from observed map points: robust Gauss–Newton, batched in numpy."""
 
 from __future__ import annotations
 
@@ -10,43 +10,55 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
-from bodycap_batch.model.geometry import make_transform, transform_points
+from bodycap_batch.model.geometry import make_transform, se3_adjoint, so3_exp, transform_points
 
 _RAY_STEP = 1e-4
+"""Step of the central differences, in units of the ray (x/z, y/z). Origin: about the cube root of the float64
+precision, rounded up. Evidence: none."""
 _CHUNK_FRAMES = 48
-"""Frames solved together: enough to hide numpy's overhead, few enough to stay in the cache."""
+"""Frames solved together: enough to hide numpy's overhead, few enough to stay in the processor's cache."""
 _BATCH_ROWS = 1 << 14
-"""Views that the lens is asked for at a time: what that takes is ten times what is kept of it."""
+"""Observations undistorted at a time. The camera model needs ten times the memory of its result."""
 _MAX_ITERATIONS = 20
+"""Iterations of Gauss–Newton. Evidence: none."""
 _CONVERGED_PX = 1e-2
-"""A third of what 200 points at 0.5 px leave open; 2e-3 gives the same errors for half as much time again."""
+"""Pixels: an iteration that moves the observations by less is the last one. Origin: a third of the standard
+error of 200 points with 0.5 px of noise. Evidence: docs/decisions/registration.md."""
 _MAX_STEP_RAD = 0.5
+"""Radians: largest rotation of one iteration. Origin: beyond it the linearisation does not hold. Evidence:
+none."""
 _CUTOFF_MEDIANS = 3.0
-"""Medians beyond which a residual counts as wrong while the start is still bad."""
+"""Median residuals beyond which an observation gets no weight while the start is still bad. Evidence:
+none."""
 MIN_COUNTED_WEIGHT = 0.05
-"""Views that weigh less decide nothing where there are others."""
+"""Observations with less weight are ignored in the noise estimate and in RANSAC if there are others.
+Evidence: none."""
 _LOSS_SCALE = 0.25
-"""The loss's width in limits. 1, 1/2, 1/4: walk12 0.42, 0.39, 0.38 cm; walk131 0.68, 0.67, 0.65 cm."""
+"""Scale of the Cauchy loss, as a fraction of the cut-off. Evidence: docs/decisions/registration.md."""
 _DAMPING = 1e-10
+"""Damping, as a fraction of the trace of the normal equations. It only prevents a singular matrix."""
 _TINY = 1e-300
+"""Smallest divisor; it prevents a division by zero."""
 _UNUSABLE = 1e5
-"""Pixels and depths are cut off here where only their order counts."""
+"""Residual in px, or depth, that stands for "no usable value". It exceeds every limit."""
 _MIN_OBSERVATIONS = 3
+"""Observations that a pose with six unknowns needs, two residuals each."""
 _UPPER_TRIANGLE = tuple((i, j) for i in range(6) for j in range(i, 6))
+"""Index pairs of the upper triangle of a 6×6 matrix."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Observations:
-    """Map points seen in frames, ordered by frame.
+    """Map points observed in frames, ordered by frame.
 
     Attributes:
         bounds: (F+1,) the rows of frame f are [bounds[f], bounds[f+1]).
         points: (M,3) in the gauge.
-        rays: (M,2) where they are seen, undistorted, at depth 1.
-        px_from_ray: (M,2,2) derivative of the pixel by the ray there.
-        weight: (M,) how much each counts: 1 over its variance, in units of the best.
-        member: (M,) which camera of a rig saw each; None where poses are those of the one camera there is.
-        cam_from_rig: (C,4,4) where a rig's cameras sit; poses are then the rig's.
+        rays: (M,2) undistorted observations at depth 1: x/z, y/z.
+        px_from_ray: (M,2,2) derivative of the pixel with respect to the ray.
+        weight: (M,) inverse variance, relative to that of the best observation.
+        member: (M,) index of the observing camera of a rig; None if the poses are those of a single camera.
+        cam_from_rig: (C,4,4) poses of the rig's cameras; the estimated poses are then those of the rig.
     """
 
     bounds: IntArray
@@ -58,11 +70,11 @@ class Observations:
     cam_from_rig: FloatArray | None = None
 
     def rows(self, frame: int) -> slice:
-        """Rows of one frame."""
+        """Return the rows of one frame."""
         return slice(int(self.bounds[frame]), int(self.bounds[frame + 1]))
 
     def select_frame(self, frame: int) -> Observations:
-        """The views of one frame alone."""
+        """Return the observations of one frame."""
         rows = self.rows(frame)
         return Observations(
             bounds=np.array([0, rows.stop - rows.start]),
@@ -75,7 +87,15 @@ class Observations:
         )
 
     def camera_poses(self, rows: IntArray, poses: FloatArray) -> FloatArray:
-        """Poses (N,4,4) of the cameras that rows (N,) were seen by, from those of their frames (N,4,4)."""
+        """Return the poses of the observing cameras, given the poses of their frames.
+
+        Args:
+            rows: (N,) rows of observations.
+            poses: (N,4,4) cam_from_gauge, or rig_from_gauge, of their frames.
+
+        Returns:
+            (N,4,4) cam_from_gauge.
+        """
         if self.member is None or self.cam_from_rig is None:
             return poses
         return np.asarray(self.cam_from_rig[self.member[rows]] @ poses)
@@ -83,15 +103,17 @@ class Observations:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseQuality:
-    """What `evaluate_poses` finds.
+    """How well each pose explains the observations of its frame.
 
     Attributes:
-        inliers: (F,) views within the limit.
-        error_px: (F,) their mean residual.
-        evidence: (F,) their share of the weight of all views.
-        noise_px: (F,) median of absolute residuals along an axis, evened out by weight, of those that count.
-        depth: (F,) their median depth.
-        information: (F,6,6) Gauss–Newton information of a left perturbation for a noise of 1 px.
+        inliers: (F,) number of observations within the limit.
+        error_px: (F,) mean residual of the inliers.
+        inlier_weight_ratio: (F,) weight of the inliers over the weight of all observations.
+        noise_px: (F,) median absolute residual along one axis, scaled by the root of the weight, over inliers
+            that are not almost without weight.
+        depth: (F,) median depth of the inliers.
+        information: (F,6,6) Gauss–Newton information of a left perturbation of cam_from_gauge, for 1 px of
+            noise.
     """
 
     inliers: IntArray
@@ -105,7 +127,7 @@ class PoseQuality:
 def make_observations(
     camera: Camera, bounds: IntArray, points: FloatArray, px: FloatArray, weight: FloatArray | None = None
 ) -> Observations:
-    """Undistort pixels (M,2) once, with the lens's derivative there: a pose then costs no lens model."""
+    """Undistort pixels (M,2) once, so that each iteration needs no camera model."""
     rays = np.empty((len(px), 2))
     for start in range(0, len(px), _BATCH_ROWS):
         rays[start : start + _BATCH_ROWS] = camera.unproject(px[start : start + _BATCH_ROWS])
@@ -119,7 +141,7 @@ def make_observations(
 
 
 def projection_jacobian(camera: Camera, rays: FloatArray) -> FloatArray:
-    """Derivative (N,2,2) of the pixel by the ray (x/z, y/z), by central differences."""
+    """Return the derivative (N,2,2) of the pixel by the ray (x/z, y/z), from central differences."""
     out = np.empty((len(rays), 2, 2))
     for start in range(0, len(rays), _BATCH_ROWS):
         batch = rays[start : start + _BATCH_ROWS]
@@ -133,10 +155,16 @@ def projection_jacobian(camera: Camera, rays: FloatArray) -> FloatArray:
 def refine_poses(
     observations: Observations, cam_from_gauge: FloatArray, limit_px: float, threads: int = 1
 ) -> FloatArray:
-    """Least reprojection error under a Cauchy loss cut off at `limit_px`, from starting poses (F,4,4).
+    """Minimise the reprojection error of each frame under a Cauchy loss, cut off at `limit_px`.
 
-    The loss begins as wide as the residuals are and narrows with them, so a start that is off by more
-    than the limit still converges. Frames do not influence each other.
+    The loss starts as wide as the residuals and narrows with them. A start beyond the limit therefore still
+    converges. Frames are independent of each other.
+
+    Args:
+        observations: Observations of F frames.
+        cam_from_gauge: (F,4,4) poses to start from.
+        limit_px: Inlier limit.
+        threads: Threads that solve chunks of frames. The result does not depend on them.
 
     Returns:
         (F,4,4) cam_from_gauge.
@@ -159,7 +187,7 @@ def refine_poses(
 def evaluate_poses(
     observations: Observations, cam_from_gauge: FloatArray, limit_px: float, threads: int = 1
 ) -> PoseQuality:
-    """How well poses (F,4,4) explain what their frames see."""
+    """Evaluate how well poses (F,4,4) explain the observations of their frames."""
     frame_count = len(cam_from_gauge)
     quality = PoseQuality(
         inliers=np.zeros(frame_count, np.int64),
@@ -199,7 +227,7 @@ def evaluate_poses(
 def find_inliers(
     observations: Observations, cam_from_gauge: FloatArray, limit_px: float, threads: int
 ) -> BoolArray:
-    """Which views (M,) lie within a limit of what poses (F,4,4) predict; none where a pose is NaN."""
+    """Return which observations (M,) agree with poses (F,4,4) within a limit; none does if a pose is NaN."""
     out = np.zeros(len(observations.rays), dtype=bool)
 
     def mark_chunk(chosen: IntArray) -> None:
@@ -212,7 +240,7 @@ def find_inliers(
 
 
 def _for_each_chunk(observations: Observations, work: Callable[[IntArray], None], threads: int) -> None:
-    """Do chunks of frames, on all threads of the task: frames do not influence each other."""
+    """Call `work` for each chunk of frames, on several threads. Frames are independent of each other."""
     chunks = list(_chunks(observations))
     if threads <= 1 or len(chunks) < 2:
         for frames in chunks:
@@ -224,7 +252,7 @@ def _for_each_chunk(observations: Observations, work: Callable[[IntArray], None]
 
 
 def _chunks(observations: Observations) -> Iterator[IntArray]:
-    """Frames with enough views to have a pose, some at a time."""
+    """Yield chunks of the frames that have enough observations for a pose."""
     counts = np.diff(observations.bounds)
     usable = np.flatnonzero(counts >= _MIN_OBSERVATIONS)
     for start in range(0, len(usable), _CHUNK_FRAMES):
@@ -234,6 +262,11 @@ def _chunks(observations: Observations) -> Iterator[IntArray]:
 def _gauss_newton_step(
     observations: Observations, frames: IntArray, poses: FloatArray, limit_px: float
 ) -> tuple[FloatArray, BoolArray]:
+    """Do one iteration.
+
+    Returns:
+        The new poses, and which of them have converged.
+    """
     rows, starts, owner = _rows_of_frames(observations, frames)
     residual, jacobian, _ = linearise(observations, rows, poses[owner])
     error_px = np.hypot(residual[0], residual[1])
@@ -252,7 +285,10 @@ def _gauss_newton_step(
 
 
 def _segment_medians(value: FloatArray, owner: IntArray, starts: IntArray, counts: IntArray) -> FloatArray:
-    """Lower median of each owner's `count_by_frame` smallest values: one sort, the owner in the leading digits."""
+    """Return the lower median of the `counts` smallest values of each owner.
+
+    One sort does it for all owners: the owner is added as the leading digits of each value.
+    """
     capped = np.minimum(value, _UNUSABLE)
     base = owner * (2.0 * _UNUSABLE)
     middle = starts + np.maximum(counts - 1, 0) // 2
@@ -260,7 +296,7 @@ def _segment_medians(value: FloatArray, owner: IntArray, starts: IntArray, count
 
 
 def _rows_of_frames(observations: Observations, frames: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Rows of some frames, where each frame's begin among them, and whose each is."""
+    """Return the rows of some frames, the position of each frame's first row, and the frame of each row."""
     counts = observations.bounds[frames + 1] - observations.bounds[frames]
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
     owner = np.repeat(np.arange(len(frames)), counts)
@@ -271,14 +307,17 @@ def _rows_of_frames(observations: Observations, frames: IntArray) -> tuple[IntAr
 def linearise(
     observations: Observations, rows: IntArray, cam_from_gauge: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Residuals (2,N) px, their derivative (2,6,N) by a left perturbation of cam_from_gauge, depths (N,).
+    """Return residuals, their derivatives by a left perturbation of cam_from_gauge, and depths.
 
-    Points behind the camera get a residual beyond any limit and no derivative.
+    A point behind the camera gets a residual beyond any limit and no derivative.
 
     Args:
-        views: Where points are seen.
-        rows: N of its rows.
-        cam_from_gauge: (N,4,4) a pose for each row.
+        observations: The observations.
+        rows: (N,) rows of them.
+        cam_from_gauge: (N,4,4) one pose for each row.
+
+    Returns:
+        Residuals (2,N) px, derivatives (2,6,N), rotation first, and depths (N,).
     """
     residual, (a, b, inverse, z), px_from_ray = _residuals(observations, rows, cam_from_gauge)
     jacobian = np.empty((2, 6, len(a)))
@@ -296,24 +335,25 @@ def linearise(
 
 
 def _camera_to_rig_jacobian(jacobian: FloatArray, member: IntArray, cam_from_rig: FloatArray) -> None:
-    """Make derivatives (2,6,N) by a camera's perturbation ones by its rig's, in place.
+    """Change derivatives (2,6,N) by a camera's perturbation, in place, into derivatives by its rig's.
 
     Source: the adjoint map of SE(3), as in Sola, Deray, Atchuthan, "A micro Lie theory for state estimation
         in robotics", 2018; rotation first.
     """
     for number, pose in enumerate(cam_from_rig):
         columns = np.flatnonzero(member == number)
-        rotation, (x, y, z) = pose[:3, :3], pose[:3, 3].tolist()
-        adjoint = np.zeros((6, 6))
-        adjoint[:3, :3] = adjoint[3:, 3:] = rotation
-        adjoint[3:, :3] = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ rotation
-        jacobian[:, :, columns] = np.einsum("dim,ik->dkm", jacobian[:, :, columns], adjoint)
+        jacobian[:, :, columns] = np.einsum("dim,ik->dkm", jacobian[:, :, columns], se3_adjoint(pose))
 
 
 def _residuals(
     observations: Observations, rows: IntArray, cam_from_gauge: FloatArray
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]:
-    """Residuals (2,N) as `linearise` has them; x/z, y/z, 1/z, z; the lens (2,2,N), 0 where unusable."""
+    """Return residuals (2,N), the projection and the derivative of the pixel.
+
+    Returns:
+        Residuals (2,N) as in `linearise`; x/z, y/z, 1/z and z (N,) each; px_from_ray (2,2,N), which is 0 for
+        unusable observations.
+    """
     x, y, z = transform_points(observations.camera_poses(rows, cam_from_gauge), observations.points[rows]).T
     in_front = z > 1e-9
     inverse = 1.0 / np.where(in_front, z, 1.0)
@@ -330,6 +370,7 @@ def _residuals(
 def _normal_equations(
     residual: FloatArray, jacobian: FloatArray, weight: FloatArray, starts: IntArray
 ) -> tuple[FloatArray, FloatArray]:
+    """Return the weighted Hessians (F,6,6) and gradients (F,6) of the frames."""
     frames = len(starts)
     hessian, gradient = np.empty((frames, 6, 6)), np.empty((frames, 6))
     weighted = jacobian * weight
@@ -342,18 +383,11 @@ def _normal_equations(
 
 
 def _retract(cam_from_gauge: FloatArray, step: FloatArray) -> FloatArray:
-    """Left perturbation (N,6) of poses (N,4,4), rotation first; a turn is held to what is sane."""
+    """Apply left perturbations (N,6), rotation first, to poses (N,4,4).
+
+    A perturbation with a large rotation is shortened.
+    """
     rotvec = step[:, :3]
     angle = np.linalg.norm(rotvec, axis=1, keepdims=True)
     scale = np.minimum(1.0, _MAX_STEP_RAD / np.maximum(angle, 1e-12))
-    return make_transform(_rotation(rotvec * scale), step[:, 3:] * scale) @ cam_from_gauge
-
-
-def _rotation(turn_rad: FloatArray) -> FloatArray:
-    """Rodrigues' formula for (N,3)."""
-    angle = np.linalg.norm(turn_rad, axis=1)[:, None, None]
-    x, y, z = turn_rad.T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    half = np.sinc(angle / (2.0 * np.pi)) ** 2 / 2.0
-    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * cross + half * (cross @ cross))
+    return make_transform(so3_exp(rotvec * scale), step[:, 3:] * scale) @ cam_from_gauge

@@ -1,4 +1,4 @@
-"""Which lost frames should become keyframes, so that the map grows where tracking failed."""
+"""Select lost frames that should become keyframes, so that the map grows where tracking failed."""
 
 from __future__ import annotations
 
@@ -7,18 +7,26 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, evenly_spaced, runs
 
 _WINDOW_FRAMES = 3
+"""Frames of which the sharpest one is requested. Evidence: none."""
 _END_OFFSET_FRAMES = 1
+"""Distance in frames from a lost interval to the frame with a pose that is requested with it: the adjacent
+one."""
 _MIN_BUDGET = 20
+"""Frames that may always be requested at a time. Evidence: none."""
 _BUDGET_RATIO = 0.5
+"""Most frames requested at a time, as a fraction of those offered before. Origin: it bounds the growth of the
+map in one round. Evidence: none."""
 
 
 def lost_intervals(localised: BoolArray) -> list[tuple[int, int]]:
-    """Maximal runs [start, stop) of frames without a pose."""
+    """Return the maximal intervals [start, stop) of frames without a pose."""
     return runs(~localised)
 
 
 def request_keyframes(localised: BoolArray, sharpness: FloatArray, tried: IntArray) -> IntArray:
-    """Frames to offer to the map: the sharpest of every few lost ones, and the ends they hang on.
+    """Select lost frames to offer to the mapper, and the frames with poses next to them.
+
+    The sharpest of every few lost frames is taken.
 
     Args:
         localised: (N,) frames with a pose.
@@ -26,10 +34,10 @@ def request_keyframes(localised: BoolArray, sharpness: FloatArray, tried: IntArr
         tried: Frames that were offered before.
 
     Returns:
-        Frame indices, increasing; at most half as many as were tried before (and 20).
+        Frame indices, increasing; at most half as many as were offered before, but up to 20 in any case.
 
-    Source: Algorithm 1 of Vo, Kim, Choudhary, "Motion capture using body mounted cameras in an
-        unknown environment".
+    Source: Algorithm 1 of Vo, Kim, Choudhary, "Motion capture using body mounted cameras in an unknown
+        environment".
     """
     was_tried = np.zeros(len(localised), dtype=bool)
     was_tried[tried] = True

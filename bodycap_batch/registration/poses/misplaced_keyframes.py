@@ -1,4 +1,4 @@
-"""Keyframes that the video itself contradicts: tracks that run on where the map makes the camera leap."""
+"""Find keyframes whose pose contradicts the video: tracks continue where the map makes the camera jump."""
 
 from __future__ import annotations
 
@@ -14,26 +14,27 @@ from bodycap_batch.registration.poses.pnp import AcceptanceCriteria, ransac_pose
 from bodycap_batch.registration.tracking.klt import Tracks
 
 _MIN_TRACKS = 15
+"""Tracks between two keyframes that a decision needs. Origin: about the least number of inliers of a pose.
+Evidence: none."""
 _MAX_MEDIAN_ERROR = 4.0
-"""Median distance of tracks from where the map expects them, in inlier limits. Between keyframes in their
-right place it stays below 2.5 limits (walk131, room131, a rendered brown-lens walk); a keyframe 24 cm off
-makes 4.5, one 146 cm off 60."""
+"""Largest median distance of tracks from their expected pixels between correct keyframes, in inlier limits.
+Evidence: docs/decisions/registration.md."""
 _UNSEEN_ERROR_PX = 1e5
+"""Pixels: error of a point that the keyframe cannot see. It exceeds every limit."""
 
 
 _MIN_OTHER_POSE_RATIO = 0.5
-"""Share of the tracks into a keyframe that lead to one other pose: of those that contradict a misplaced
-keyframe 75 to 97 % (at least one way), of tracks that slipped on a fast turn 35 and 44 %. Tracks that end
-where the map expects them lead to its own pose: half of those behind a sleeve did, and the others slipped."""
+"""Least ratio of the tracks into a keyframe that agree on one other pose, if the keyframe is misplaced.
+Tracks that merely slipped do not agree. Evidence: docs/decisions/registration.md."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Interval:
-    """Two neighbouring keyframes of a camera.
+    """Two successive keyframes of a camera.
 
     Attributes:
-        whole: Tracks between them confirm their places.
-        torn: They contradict them.
+        consistent: The tracks between them agree with their poses.
+        inconsistent: The tracks contradict their poses. Neither is true if there are too few tracks.
     """
 
     consistent: bool
@@ -42,14 +43,14 @@ class _Interval:
 
 @dataclass(frozen=True, slots=True)
 class _ArrivingTracks:
-    """Tracks that arrive in the next keyframe.
+    """Tracks that arrive in another keyframe.
 
     Attributes:
-        to: (N,) which of the camera's keyframes they arrive in.
-        source: (N,) which they come from.
-        point: (N,) the map's points.
-        px: (N,2) where they arrive.
-        error_px: (N,) how far from where the map expects them.
+        target: (N,) index of the keyframe they arrive in, among the camera's keyframes.
+        source: (N,) index of the keyframe they come from.
+        point: (N,) map points.
+        px: (N,2) pixel of arrival.
+        error_px: (N,) distance from the pixel that the map predicts.
     """
 
     target: IntArray
@@ -62,17 +63,20 @@ class _ArrivingTracks:
 def find_misplaced_keyframes(
     camera: str, scene_map: Map, tracks: Tracks, criteria: AcceptanceCriteria
 ) -> IntArray:
-    """Rows of a camera's keyframes that stand apart from neighbours which tracking ties them to.
+    """Find keyframes whose pose contradicts the tracks from their neighbours.
 
-    Points tracked from one keyframe to the next must arrive where the map expects them. Where they do not,
-    one side of the gap is in the wrong place: the one whose keyframes, as far as tracks tie them together,
-    see fewer of the map's points that others see too.
+    Points tracked from one keyframe to the next must arrive at the pixels that the map predicts. If they do
+    not, one side of the interval is misplaced: the side with fewer points that are shared with other
+    keyframes. A side extends as far as consistent intervals connect its keyframes.
 
     Args:
         camera: Camera name.
         scene_map: The map.
-        tracks: Observations tracked from keyframes into the frames around them, the next keyframe included.
-        limits: What makes an observation agree with a pose.
+        tracks: Observations tracked from keyframes into the frames around them, including the next keyframe.
+        criteria: The inlier limit of an observation.
+
+    Returns:
+        Rows of the misplaced keyframes in the map.
 
     Source: the loop of tracking and map as a check is Zach, Klopschitz, Pollefeys, "Disambiguating visual
         relations using loop constraints", CVPR 2010, in its simplest form.
@@ -97,6 +101,7 @@ def find_misplaced_keyframes(
 
 
 def _arriving_tracks(camera: str, scene_map: Map, rows: IntArray, tracks: Tracks) -> _ArrivingTracks:
+    """Select the tracks that end in a keyframe, with their distance from the predicted pixel."""
     frames = scene_map.keyframe_frame[rows]
     arrived = np.flatnonzero(np.isin(tracks.frame, frames))
     point = scene_map.points_of(camera, tracks.keyframe[arrived], tracks.feature[arrived])
@@ -113,7 +118,7 @@ def _arriving_tracks(camera: str, scene_map: Map, rows: IntArray, tracks: Tracks
 def _check_interval(
     lens: Camera, scene_map: Map, arriving: _ArrivingTracks, number: int, criteria: AcceptanceCriteria
 ) -> _Interval:
-    """What the tracks between a keyframe and the next, both ways, say of their places."""
+    """Compare the tracks between a keyframe and the next one, both ways, with the keyframes' poses."""
     directions = [
         np.flatnonzero((arriving.source == source) & (arriving.target == target))
         for source, target in ((number, number + 1), (number + 1, number))
@@ -140,7 +145,7 @@ def _check_interval(
 def _arrival_errors(
     scene_map: Map, camera: str, row: IntArray, point: IntArray, px: FloatArray
 ) -> FloatArray:
-    """Distances (N,) of pixels from where keyframes (rows) see points; far where they cannot."""
+    """Return the distances (N,) of pixels from where keyframes (rows) project points."""
     if len(row) == 0:
         return np.zeros(0)
     x_in_cam = transform_points(invert(scene_map.map_from_cam[row]), scene_map.points[point])
@@ -150,7 +155,7 @@ def _arrival_errors(
 
 
 def _count_shared_points(scene_map: Map) -> IntArray:
-    """(K,) how many of its points each keyframe shares with another camera or three keyframes and more."""
+    """Count the points (K,) of each keyframe that at least three observations of the map share."""
     keyframe_count = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))
     return np.bincount(
         scene_map.obs_keyframe[keyframe_count[scene_map.obs_point] > 2],
@@ -159,7 +164,7 @@ def _count_shared_points(scene_map: Map) -> IntArray:
 
 
 def map_without_keyframes(scene_map: Map, rows: IntArray) -> Map:
-    """The same map in the same gauge without some of its keyframes and what they see."""
+    """Return the map without some keyframes and their observations, in the same gauge."""
     keep = np.ones(len(scene_map.keyframe_camera), dtype=bool)
     keep[rows] = False
     obs_kept: BoolArray = keep[scene_map.obs_keyframe]

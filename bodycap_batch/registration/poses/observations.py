@@ -1,4 +1,4 @@
-"""What cameras see of the map, a stretch of frames at a time."""
+"""Collect the observations of map points by the cameras of a rig, block by block."""
 
 from __future__ import annotations
 
@@ -18,32 +18,35 @@ from bodycap_batch.registration.poses.static_points import static_points
 from bodycap_batch.registration.tracking.klt import Tracks
 
 _POINT_VARIANCE_RATIO = 6.0
-"""Variance that a point seen by n keyframes adds to its projections, times n, in units of a track's own.
-Without it and with 3, 6, 9: walk131 0.65, 0.59, 0.55, 0.55 cm; room131 3.1, 3.0, 2.9, 2.9; walk12 0.38 for
-all; room12 0.55, 0.55, 0.56, 0.56."""
+"""Variance that the position error of a point adds to its observations, for a point seen by one keyframe,
+relative to the variance of a track. It falls with the number of keyframes. Evidence:
+docs/decisions/registration.md."""
 _TRANSIENT_WEIGHT = 0.01
-"""Weight of points that nothing confirms. With 1, 0.1, 0.03, 0.01: room131 1.86, 1.39, 1.38, 1.36 cm; a
-rendered capture with textured sleeves in view 1.00, 0.72, 0.61, 0.58 cm; room12 0.58, 0.60, 0.61, 0.61 cm."""
+"""Weight factor of points that are not known to be static. Evidence: docs/decisions/registration.md."""
 BLOCK_FRAMES = 1200
-"""Frames whose views are held at a time. Solving 144 s of one camera took 792 MB with all of them held, and
-takes 484; the poses are the same."""
+"""Frames whose observations are held at a time. It bounds the memory; the poses do not depend on it.
+Evidence: docs/decisions/registration.md."""
 _MIN_OBSERVED = 4
+"""Observations of a point below which its reliability counts as full. Evidence: none."""
 
 
 def point_weights(keyframe_count: IntArray) -> FloatArray:
-    """X"""
+    """Return the weights of observations of points that `keyframe_count` (N,) keyframes see, relative to 1.
+
+    More keyframes determine a point better.
+    """
     return np.asarray(keyframe_count / (keyframe_count + _POINT_VARIANCE_RATIO))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigMember:
-    """One of the cameras that see a frame together.
+    """One camera of a rig.
 
     Attributes:
-        camera: Its video.
+        camera: The camera.
         tracks: Observations in its frames, ordered by frame.
-        cam_from_rig: (4,4) where it sits; frames' poses are those of the rig.
-        rig_frame: (N,) frame of the rig at the instant of each of its own; -1 where there is none.
+        cam_from_rig: (4,4) its pose in the rig; the poses of frames are those of the rig.
+        rig_frame: (N,) frame of the rig at the instant of each frame of this camera; -1 if there is none.
     """
 
     camera: CaptureCamera
@@ -52,12 +55,12 @@ class RigMember:
     rig_frame: IntArray
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class PointReliability:
-    """How often points were seen in frames with a pose, and how often they agreed with it.
+    """How often each point was observed in frames with a pose, and how often it agreed with the pose.
 
     Attributes:
-        seen: (C*P,) by camera and point.
+        observed: (C*P,) by camera and point.
         agreed: (C*P,) likewise.
     """
 
@@ -66,29 +69,28 @@ class PointReliability:
 
     @staticmethod
     def zero(count: int) -> PointReliability:
-        """No votes on so many points."""
+        """Return empty counts for `count` points."""
         return PointReliability(np.zeros(count, np.int64), np.zeros(count, np.int64))
 
     def add(self, keys: IntArray, has_pose: BoolArray, agrees: BoolArray) -> None:
-        """Count views (M,) of points `keys`, those alone whose frames are posed."""
+        """Count observations (M,) of points `keys`, in frames with a pose only."""
         self.observed[:] += np.bincount(keys[has_pose], minlength=len(self.observed))
         self.agreed[:] += np.bincount(keys[has_pose & agrees], minlength=len(self.observed))
 
     def agreement(self, keys: IntArray) -> FloatArray:
-        """Share (M,) of a point's views that agree; 1 where fewer than `_MIN_OBSERVED` tell."""
+        """Return the ratio (M,) of a point's observations that agree; 1 for fewer than `_MIN_OBSERVED`."""
         ratio = self.agreed / np.maximum(self.observed, 1)
         return np.asarray(np.where(self.observed < _MIN_OBSERVED, 1.0, ratio)[keys])
 
 
 @dataclass(slots=True)
 class RigObservations:
-    """Cameras and the map.
+    """The cameras of a rig and the map, with the observations of the last block if it is the only one.
 
     Attributes:
-        members: The cameras; the first one's frames are the rig's.
+        members: The cameras. The frames of the first one are those of the rig.
         scene_map: The map.
-        confirmed: (C,P) points that something confirms, by camera.
-        kept: The only stretch, once it is known.
+        static: (C,P) static points, by camera.
     """
 
     members: Sequence[RigMember]
@@ -98,12 +100,12 @@ class RigObservations:
 
     @staticmethod
     def create(members: Sequence[RigMember], scene_map: Map) -> RigObservations:
-        """Cameras with what confirms the map's points to each."""
+        """Find the static points of each camera."""
         static = np.array([static_points(member.camera, scene_map) for member in members])
         return RigObservations(members, scene_map, static)
 
     def blocks(self) -> Iterator[FrameBlock]:
-        """What is seen, some frames at a time; a single stretch is kept for the next time."""
+        """Yield the observations of successive blocks of frames. A single block is cached."""
         count = len(self.members[0].camera.times_ns)
         if count > BLOCK_FRAMES:
             for first in range(0, count, BLOCK_FRAMES):
@@ -114,6 +116,7 @@ class RigObservations:
         yield self._only_block
 
     def _make_block(self, frames: slice) -> FrameBlock:
+        """Collect the observations of all cameras in some frames, ordered by frame."""
         parts = [_observations_of(member, self.scene_map, frames) for member in self.members]
         frame, point, px = (np.concatenate(each) for each in zip(*parts, strict=True))
         member = np.repeat(np.arange(len(self.members)), [len(part[0]) for part in parts])
@@ -122,27 +125,26 @@ class RigObservations:
 
     @property
     def lenses(self) -> list[Camera]:
-        """Their lenses, as the map has them."""
+        """The camera models of the map, one for each member."""
         return [self.scene_map.cameras[member.camera.name] for member in self.members]
 
     @property
     def rolling(self) -> bool:
-        """Whether pixels have to be moved to the middle row's instant."""
+        """True if observations must be moved to the instant of the middle row."""
         return any(self.scene_map.readout_s.get(member.camera.name, 0.0) for member in self.members)
 
 
 @dataclass(slots=True)
 class FrameBlock:
-    """What a rig sees of the map in a stretch of frames: tracked points, and keyframes' own observations.
+    """Observations of the map by a rig in a block of frames: tracked points, and observations of keyframes.
 
     Attributes:
         rig: The rig.
-        frames: Which frames.
+        frames: The frames of the block.
         frame: (M,) frame index, increasing.
         point: (M,) point index.
-        px: (M,2) where.
-        member: (M,) which camera saw it.
-        made: Its views, once they are made.
+        px: (M,2) pixel.
+        member: (M,) index of the observing camera.
     """
 
     rig: RigObservations
@@ -154,7 +156,13 @@ class FrameBlock:
     _observations: Observations | None = field(default=None, init=False, repr=False)
 
     def observations(self, px: FloatArray | None, reliability: PointReliability | None) -> Observations:
-        """What is seen, at pixels (M,2) where these are not its own; `reliability` tell how far points agree."""
+        """Return the weighted observations, at pixels (M,2) if these differ from the block's own.
+
+        Args:
+            px: (M,2) corrected pixels, or None for the block's own; the latter are undistorted once and
+                cached.
+            reliability: Agreement of the points with the poses of an earlier solution, if there is one.
+        """
         if px is not None:
             observations = self._make_observations(px)
         elif self._observations is not None:
@@ -167,8 +175,8 @@ class FrameBlock:
         return replace(observations, weight=weight)
 
     def _make_observations(self, px: FloatArray) -> Observations:
+        """Undistort pixels (M,2) and weight them by the certainty of their points."""
         scene_map, lenses = self.rig.scene_map, self.rig.lenses
-        # Where a point stands is known the better the more keyframes see it.
         count = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))[self.point]
         weight = point_weights(count) * np.where(self.static, 1.0, _TRANSIENT_WEIGHT)
         bounds = np.searchsorted(self.frame, np.arange(self.frames.start, self.frames.stop + 1))
@@ -192,16 +200,16 @@ class FrameBlock:
 
     @property
     def static(self) -> BoolArray:
-        """(M,) whether something confirms the point that is seen."""
+        """(M,) whether the observed point is static."""
         return np.asarray(self.rig.static[self.member, self.point])
 
     @property
     def point_keys(self) -> IntArray:
-        """(M,) camera and point, as votes number them."""
+        """(M,) index by camera and point, as in `PointReliability`."""
         return self.member * len(self.rig.scene_map.points) + self.point
 
     def px_at_mid_row(self, path: FloatArray) -> FloatArray:
-        """Pixels (M,2) at the instant of the middle row, for the rig's poses of all frames."""
+        """Return pixels (M,2) at the instant of the middle row, given the rig's poses of all frames."""
         out = self.px.copy()
         scene_map, times_ns = self.rig.scene_map, self.rig.members[0].camera.times_ns
         for number, (member, lens) in enumerate(zip(self.rig.members, self.rig.lenses, strict=True)):
@@ -214,7 +222,7 @@ class FrameBlock:
         return out
 
     def count_by_frame(self, selected: BoolArray) -> IntArray:
-        """How many of the rows under a mask each frame of the stretch has."""
+        """Count the selected rows of each frame of the block."""
         return np.bincount(
             self.frame[selected] - self.frames.start, minlength=self.frames.stop - self.frames.start
         )
@@ -223,7 +231,7 @@ class FrameBlock:
 def _observations_of(
     member: RigMember, scene_map: Map, frames: slice
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Frames of the rig, points and pixels of what one camera sees in a stretch."""
+    """Return rig frames, points and pixels of the observations of one camera in a block of frames."""
     name = member.camera.name
     inside = np.flatnonzero((member.rig_frame >= frames.start) & (member.rig_frame < frames.stop))
     first, stop = (int(inside[0]), int(inside[-1]) + 1) if len(inside) else (0, 0)

@@ -1,4 +1,4 @@
-"""Frames' poses from tracked map points, with the covariance that the data support."""
+"""Estimate the poses of frames from observed map points, and their covariance."""
 
 from __future__ import annotations
 
@@ -20,31 +20,36 @@ from bodycap_batch.registration.poses.batched_pnp import (
 )
 
 _MIN_INLIER_WEIGHT_RATIO = 0.3
+"""Least weight of the inliers over the weight of all observations. Evidence: none."""
 _MIN_NOISE_PX = 0.3
+"""Pixels: smallest noise of an observation that is assumed, however small the residuals are. Evidence:
+none."""
 MAP_COVARIANCE_SCALE = 5.0
-"""Variance of a pose over what its residuals tell: the map's points around a frame are displaced together.
+"""Variance of a pose over the variance that its residuals suggest.
 
-Measured as the normalised error without it (median over what a chi-squared has): walk12 5.1, room12 4.1,
-walk131 5.2 (room131, where blocks of the map are loose, 16). The poses that a frame's two keyframes lead to
-differ by 0.8 of their own variances, so nothing in a frame alone can tell."""
+The map points around a frame are displaced together, which the residuals of one frame cannot show. Evidence:
+docs/decisions/registration.md."""
 _UNCONSTRAINED_VARIANCE = 1e12
+"""Variance of a pose without a solution; it exceeds every limit."""
 _WEIGHT_RATIO_FLOOR = 1e-3
+"""Smallest inlier weight ratio by which sigmas are divided; it prevents a division by zero."""
 _MAX_TRIALS = 2000
+"""RANSAC iterations. Evidence: none."""
 TRUSTED_WEIGHT_RATIO = 0.6
-"""Share of the weight with the inliers above which a start led to the right pose: sampling never found a
-better one."""
+"""Inlier weight ratio from which on a start is accepted without RANSAC. Above it RANSAC never found a better
+pose."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AcceptanceCriteria:
-    """What makes a pose acceptable.
+    """The conditions that a pose must meet.
 
     Attributes:
-        max_error_px: RANSAC's inlier threshold.
+        max_error_px: Inlier limit.
         min_inliers: Fewest inliers.
-        max_sigma_depth: Largest centre sigma as a share of the median depth.
-        min_noise_px: Least noise of a view that residuals are believed to tell.
-        seed: RANSAC's seed.
+        max_sigma_depth: Largest sigma of the camera centre, as a fraction of the median depth.
+        min_noise_px: Smallest noise of an observation that is assumed.
+        seed: Seed of RANSAC.
     """
 
     max_error_px: float
@@ -56,14 +61,14 @@ class AcceptanceCriteria:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FramePose:
-    """Outcome of one frame.
+    """The result for one frame.
 
     Attributes:
-        status: REGISTERED or the reason why not.
+        status: REGISTERED, or the reason why there is no pose.
         gauge_from_cam: (4,4), None unless registered.
-        covariance: (6,6) as `Trajectory` has it.
+        covariance: (6,6) as in `Trajectory`.
         inliers: Number of inliers.
-        evidence: Their share of the weight of all views.
+        inlier_weight_ratio: Weight of the inliers over the weight of all observations.
         error_px: Mean reprojection error of the inliers.
     """
 
@@ -83,16 +88,17 @@ def solve_poses(
     criteria: AcceptanceCriteria,
     threads: int = 1,
 ) -> list[FramePose]:
-    """Poses of all frames of a camera, or of a rig, from the map points seen in them.
+    """Estimate the poses of all frames of a camera or a rig from the observed map points.
+
+    A frame whose start leads to few inliers, or that has no start, is solved again from a RANSAC pose.
 
     Args:
-        lenses: The camera's lens, or those of the rig's cameras.
-        views: Points and where they are seen (M rows), by frame.
-        px: (M,2) the same as pixels.
-        start: (F,4,4) cam_from_gauge to start from; NaN where there is none.
-        limits: What makes a pose acceptable.
-
-    Where a start leads to few inliers, or there is none, the frame is sampled from scratch.
+        lenses: The camera model, or those of the rig's cameras.
+        observations: Observations (M rows), by frame.
+        px: (M,2) the same observations as pixels.
+        start: (F,4,4) cam_from_gauge to start from; NaN if there is none.
+        criteria: The conditions that a pose must meet.
+        threads: Threads that solve chunks of frames. The result does not depend on them.
     """
     has_start = np.asarray(np.isfinite(start).all(axis=(1, 2)))
     initial = np.where(has_start[:, None, None], start, np.eye(4))
@@ -124,7 +130,10 @@ def _ransac(
     px: FloatArray,
     criteria: AcceptanceCriteria,
 ) -> FloatArray | None:
-    """Pose (4,4) of one frame from some of its views; of its rig where several cameras see them."""
+    """Return the RANSAC pose (4,4) of one frame from some of its observations.
+
+    If several cameras of a rig observe them, it is the pose of the rig from all of them.
+    """
     points, px = observations.points[chosen], px[chosen]
     if observations.member is None or observations.cam_from_rig is None:
         return ransac_pose(lenses[0], points, px, criteria)
@@ -143,10 +152,18 @@ def _ransac_rig_pose(
     px: FloatArray,
     criteria: AcceptanceCriteria,
 ) -> FloatArray | None:
-    """Pose rig_from_gauge (4,4) from map points (N,3) that its cameras `member` (N,) see at pixels (N,2).
+    """Return the pose rig_from_gauge (4,4) of a rig from map points that its cameras see.
 
-    Source: Hee Lee et al., "Minimal solutions for pose estimation of a multi-camera system", ISRR 2013, as
-        in COLMAP.
+    Args:
+        lenses: (C) camera models.
+        cam_from_rig: (C,4,4) their poses in the rig.
+        member: (N,) camera that sees each point.
+        points: (N,3) map points.
+        px: (N,2) pixels.
+        criteria: The inlier limit and the seed.
+
+    Source: Hee Lee et al., "Minimal solutions for pose estimation of a multi-camera system", ISRR 2013, as in
+        COLMAP.
     """
     import pycolmap
 
@@ -168,7 +185,7 @@ def _ransac_rig_pose(
 def ransac_pose(
     camera: Camera, points: FloatArray, px: FloatArray, criteria: AcceptanceCriteria
 ) -> FloatArray | None:
-    """Pose cam_from_gauge (4,4) of a calibrated camera from map points (N,3) seen at pixels (N,2).
+    """Return the pose cam_from_gauge (4,4) of a calibrated camera from map points (N,3) at pixels (N,2).
 
     Source: Lebeda, Matas, Chum, "Fixing the locally optimized RANSAC", BMVC 2012, as in COLMAP.
     """
@@ -191,7 +208,7 @@ def accept_poses(
     criteria: AcceptanceCriteria,
     threads: int = 1,
 ) -> list[FramePose]:
-    """Count the inliers of poses (F,4,4), estimate their covariance, and accept or refuse them."""
+    """Count the inliers of poses (F,4,4), estimate their covariance, and accept or reject them."""
     quality = evaluate_poses(observations, cam_from_gauge, criteria.max_error_px, threads)
     covariance = _covariance(quality, criteria.min_noise_px)
     sigma = np.sqrt(np.linalg.eigvalsh(covariance[:, 3:, 3:])[:, -1])
@@ -223,13 +240,13 @@ def accept_poses(
 
 
 def _covariance(quality: PoseQuality, min_noise_px: float) -> FloatArray:
-    """Covariance (F,6,6) from the inliers' information and their own spread; huge where there is no inverse.
+    """Return covariances (F,6,6) from the information and the noise of the inliers.
 
-    Views that disagree with a pose are evidence against it: the sigmas grow as the inliers' share falls.
-    (room131, frames off by more than 10 cm: 5 of 7 then lie beyond the limit, none of 7 without.)
+    Without an inverse the variances are huge. Observations that disagree with a pose are evidence against it:
+    the sigmas grow as the inlier weight ratio falls. Evidence: docs/decisions/registration.md.
 
-    A left perturbation of cam_from_gauge is a right one of gauge_from_cam with the sign turned: the
-    covariance is the same.
+    A left perturbation of cam_from_gauge is a right perturbation of gauge_from_cam with the opposite sign.
+    The covariance is therefore the same.
     """
     noise_px = np.maximum(1.4826 * np.nan_to_num(quality.noise_px), min_noise_px)
     solvable = np.linalg.matrix_rank(quality.information) == 6

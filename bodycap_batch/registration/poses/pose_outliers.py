@@ -1,4 +1,4 @@
-"""Poses that their neighbours speak against, or that nothing confirms."""
+"""Find poses that deviate from their neighbours, and isolated poses."""
 
 from __future__ import annotations
 
@@ -7,72 +7,82 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, runs
 
 _MIN_SIGMAS = 8.0
+"""Least deviation of an outlier, in standard deviations of the centres. Evidence: none."""
 _MIN_SCALE_RATIO = 10.0
-"""A jump stands out of the bends of the path around it, whatever the scale and the speed."""
+"""Least deviation of an outlier, as a multiple of the typical second difference around it. It is independent
+of the map's scale and of the speed. Evidence: none."""
 _MIN_NEIGHBOUR_RESPONSE = 0.5
-"""How much of a frame's bend its two neighbours' bends undo: all of it at a jump, nothing at a jerk."""
+"""Least ratio of a frame's second difference that the second differences of its neighbours undo. It is 1 at a
+single outlier and 0 at a jerk of the camera. Origin: halfway."""
 _SLOW_SPAN_NS, _MIN_NEIGHBOUR_RESPONSE_SLOW = 90_000_000, 0.8
-"""The share where both neighbours are so far apart, as below 22 Hz: a gesture there and back bends as few
-frames there as a jump does, its neighbours less. Of 256 of them, of 12 and 20 cm within 0.2 to 0.4 s, seen at
-10 to 20 Hz, 0.5 refuses 131 frames, 0.8 refuses 34; of single wrong poses at 10 and 15 Hz it misses up to 7 %
-more."""
+"""The same for neighbours that are farther apart in time than _SLOW_SPAN_NS. A fast gesture then bends as few
+frames as an outlier does, but its neighbours less. Evidence: docs/decisions/registration.md."""
 _GAP_MIN_SIGMAS = 4.0
+"""Least deviation of an outlier next to a lost interval, in standard deviations. Evidence:
+docs/decisions/registration.md."""
 _GAP_MIN_SCALE_RATIO = 5.0
-"""The same for the ends of lost stretches. On 14 results with truth six of some 150 such ends bend the path
-so much: five beside poses that are off by 6 to 16 cm, one beside a pose off by 3 cm."""
+"""Least deviation of an outlier next to a lost interval, as a multiple of the typical second difference.
+Evidence: docs/decisions/registration.md."""
 _RUN_LENGTHS = (2, 3)
+"""Numbers of successive outliers that are tested. Longer runs may be motion."""
 _MAX_RUN_SPAN_NS = 140_000_000
-"""From the frame before a run to the one behind it, three poses at 30 Hz: in longer ones a body gets there
-and back."""
+"""Nanoseconds from the frame before a run to the frame after it. Origin: three poses at 30 Hz; in a longer
+time a body can move there and back."""
 _MIN_KINK_RATIO = 2.0
-"""A body that stops dead leaves the line between before and after, too: wrong poses by so many times more."""
+"""Least deviation of a run, as a multiple of the deviation that a sudden stop of the body explains. Evidence:
+none."""
 _MAX_EXTRAPOLATION_RATIO = 0.5
-"""Of that offset, by which the pose behind the run may miss where the way before it leads: a path that steps
-aside for good has nothing to be judged by."""
+"""Largest extrapolation error at the pose after the run, as a fraction of the deviation. If the path moves
+permanently aside, the test does not apply. Evidence: none."""
 _SECOND_MIN_RESPONSE, _FIRST_MAX_RESPONSE, _SECOND_MAX_RESPONSE = 0.25, 0.45, 1.0
-"""Answers of the third pose's bend to the second's: between 0.25 and 0.45 either of the first two may be
-wrong, beyond 1 neither is."""
+"""Response of the third pose's second difference to that of the second. Above it the second pose after a lost
+interval may be wrong; above _SECOND_MAX_RESPONSE it is right; below _FIRST_MAX_RESPONSE the first pose may be
+wrong. Origin: a wrong first pose gives 0, a wrong second pose 0.5, a wrong third pose 2. Evidence: none for
+the limits between them."""
 _SCALE_WINDOW = 12
+"""Frames on either side that determine the typical second difference. Evidence: none."""
 ISOLATED_INLIER_FACTOR = 4
-"""x"""
+"""An isolated pose needs this multiple of the usual least number of inliers. Evidence: none."""
 _MAX_ISOLATED_RUN = 2
+"""Most successive frames of an isolated pose. Evidence: none."""
 _MIN_ISOLATING_GAP = 3
+"""Lost frames on either side that make a pose isolated. Evidence: none."""
 
 
 def find_outlier_poses(centres: FloatArray, sigma: FloatArray, times_ns: IntArray) -> BoolArray:
-    """Frames, up to three in a row, whose centre leaves the line between its neighbours as nothing near does.
+    """Find up to three successive frames whose centre leaves the line between its neighbours by far.
 
-    The bend of a frame is its offset from the middle of the frames before and after it. A jump bends itself
-    by its full height and both neighbours by half of it, the other way; a body that stops dead or starts with
-    a jerk bends one frame and its neighbours hardly. Beside a lost stretch one side is all there is to judge
-    by, and more poses are wrong. What takes longer than 0.14 s there and back is motion, unless one frame
-    alone shows it.
+    The test uses second differences: the offset of a centre from the midpoint of the centres before and after
+    it. A single outlier changes its own second difference by its full height, and those of both neighbours by
+    half of it with the opposite sign. A body that stops suddenly changes mainly one second difference. Next
+    to a lost interval only one side can be tested; the limits are lower there, because more poses are wrong.
+    A deviation of several frames that lasts longer than `_MAX_RUN_SPAN_NS` counts as motion.
 
     Args:
         centres: (N,3) camera centres; NaN where there is no pose.
-        sigma: (N,) standard deviation of the centre beside its neighbours', same unit; NaN likewise.
-        times_ns: (N,) of the frames, rising.
+        sigma: (N,) standard deviation of each centre relative to its neighbours, same unit; NaN likewise.
+        times_ns: (N,) times of the frames, increasing.
 
     Returns:
-        (N,) True where the pose is to be refused. Scaling the map changes nothing.
+        (N,) True if the pose is an outlier. The scale of the map has no influence.
     """
     size = np.linalg.norm(_second_differences(centres, sigma)[0], axis=1)
-    runs = np.zeros(len(centres), dtype=bool)
+    in_run = np.zeros(len(centres), dtype=bool)
     for length in _RUN_LENGTHS:
-        runs |= _outlier_runs(centres, sigma, times_ns, size, length)
-    # Beside one of several wrong poses a right one would be blamed.
-    centres = np.where(runs[:, None], np.nan, centres)
+        in_run |= _outlier_runs(centres, sigma, times_ns, size, length)
+    # Next to a run of outliers a correct pose would look like an outlier.
+    centres = np.where(in_run[:, None], np.nan, centres)
     backwards = _outliers_after_gaps(centres[::-1], sigma[::-1])[::-1]
     ends = _outliers_after_gaps(centres, sigma) | backwards
-    return np.asarray(runs | _single_outliers(centres, sigma, times_ns) | ends)
+    return np.asarray(in_run | _single_outliers(centres, sigma, times_ns) | ends)
 
 
 def _single_outliers(centres: FloatArray, sigma: FloatArray, times_ns: IntArray) -> BoolArray:
-    """Frames (N,) that leave the line between their neighbours by themselves."""
+    """Return the frames (N,) that leave the line between their neighbours by themselves."""
     offset, noise = _second_differences(centres, sigma)
     size = np.linalg.norm(offset, axis=1)
     out = np.zeros(len(centres), dtype=bool)
-    # Without both neighbours' own bends the wrong one of the three could be blamed.
+    # Without the second differences of both neighbours, the wrong frame of the three could be selected.
     frames = 1 + _run_starts(np.isfinite(size), 3)
     highest = np.maximum(size[frames - 1], size[frames + 1])
     frames = frames[(size[frames] > _MIN_SIGMAS * noise[frames]) & (size[frames] >= highest)]
@@ -89,14 +99,16 @@ def _single_outliers(centres: FloatArray, sigma: FloatArray, times_ns: IntArray)
 def _outlier_runs(
     centres: FloatArray, sigma: FloatArray, times_ns: IntArray, size: FloatArray, length: int
 ) -> BoolArray:
-    """Frames (N,) of runs of so many poses that all leave the way from before the run to behind it.
+    """Return the frames (N,) of runs of outliers of a given length.
+
+    A run is tested against the straight line from the pose before it to the pose after it.
 
     Args:
-        centres: (N,3).
-        sigma: (N,).
-        times_ns: (N,).
-        bend: (N,) every frame's own.
-        length: How many poses.
+        centres: (N,3) camera centres.
+        sigma: (N,) standard deviation of each centre.
+        times_ns: (N,) times of the frames.
+        size: (N,) length of each frame's second difference.
+        length: Number of poses in a run.
     """
     out = np.zeros(len(centres), dtype=bool)
     steps = length + 1
@@ -115,20 +127,23 @@ def _outlier_runs(
         smallest > np.maximum(_MIN_KINK_RATIO * kink, extrapolation_error / _MAX_EXTRAPOLATION_RATIO)
     )
     for row in np.flatnonzero(candidate).tolist():
-        # What a steady bend amounts to over the run.
+        # The deviation that a constant second difference adds up to over the run.
         local = _local_scale(size, before[row], behind[row] + 1, _SCALE_WINDOW) * 0.25 * steps**2
         out[run[row]] |= smallest[row] > _MIN_SCALE_RATIO * local
     return out
 
 
 def _local_scale(size: FloatArray, start: int, stop: int, window: int) -> float:
-    """Median bend of `window` frames on either side of start:stop; infinite where too few are known."""
+    """Return the median size of `window` second differences on either side of start:stop.
+
+    It is infinite if too few are known.
+    """
     nearby = np.concatenate([size[max(0, start - window) : start], size[stop : stop + window]])
     return float(np.nanmedian(nearby)) if np.isfinite(nearby).sum() >= _SCALE_WINDOW // 2 else np.inf
 
 
 def _run_starts(known: BoolArray, length: int) -> IntArray:
-    """First ones of so many known frames in a row."""
+    """Return the first frames of all runs of `length` known frames."""
     if len(known) < length:
         return np.zeros(0, dtype=np.int64)
     rows = np.lib.stride_tricks.sliding_window_view(known, length)
@@ -136,7 +151,7 @@ def _run_starts(known: BoolArray, length: int) -> IntArray:
 
 
 def _second_differences(centres: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Offsets (N,3) from the middle of both neighbours, and the standard deviation (N,) of such a one."""
+    """Return the offsets (N,3) from the midpoint of both neighbours, and their standard deviations (N,)."""
     offset, noise = np.full((len(centres), 3), np.nan), np.full(len(centres), np.nan)
     if len(centres) >= 3:
         offset[1:-1] = centres[1:-1] - 0.5 * (centres[:-2] + centres[2:])
@@ -145,11 +160,13 @@ def _second_differences(centres: FloatArray, sigma: FloatArray) -> tuple[FloatAr
 
 
 def _outliers_after_gaps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
-    """Wrong poses (N,) that come first or second after a lost stretch.
+    """Return the wrong poses (N,) among the first two after each lost interval.
 
-    The first one bends the second by half of its height and the third not at all; the second one bends itself
-    by all of it and the third by half, the other way. Where that does not tell them apart both are refused.
-    The third one bends itself twice as much as the second: it has both neighbours to be judged by.
+    A wrong first pose changes the second difference of the second pose by half of its height, and that of the
+    third pose not at all. A wrong second pose changes its own by its full height, and that of the third pose
+    by half of it with the opposite sign. If the response does not tell these cases apart, both poses are
+    rejected. A wrong third pose changes its own second difference by twice as much as that of the second
+    pose; it has both neighbours and is tested like any other frame.
     """
     offset, noise = _second_differences(centres, sigma)
     size = np.linalg.norm(offset, axis=1)
@@ -168,15 +185,15 @@ def _outliers_after_gaps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
 
 
 def isolated_poses(localised: BoolArray, inliers: IntArray, min_inliers: int) -> BoolArray:
-    """Frames of which nothing but their own few inliers speaks: no neighbouring frame confirms them.
+    """Return the frames whose pose has few inliers and no support from neighbouring frames.
 
     Args:
         localised: (N,) frames with a pose.
-        inliers: (N,) of each pose.
-        enough: Inliers with which a pose stands by itself.
+        inliers: (N,) inliers of each pose.
+        min_inliers: Inliers with which a pose needs no support.
 
     Returns:
-        (N,) True in runs of one or two poses amid at least three lost frames on either side.
+        (N,) True in runs of one or two poses between at least three lost frames on either side.
     """
     out = np.zeros(len(localised), dtype=bool)
     for start, stop in runs(localised):

@@ -1,4 +1,4 @@
-"""The cameras of a rig and what their own frames say of it."""
+"""Relate the cameras of a rig by what their own frames gave."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from bodycap_batch.registration.tracking.klt import Tracks
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegisteredCamera:
-    """A camera of a rig with what its own frames gave.
+    """A camera with its registration.
 
     Attributes:
-        camera: Its video.
-        found: Its registration.
+        camera: The camera.
+        registration: Its registration.
     """
 
     camera: CaptureCamera
@@ -30,7 +30,7 @@ class RegisteredCamera:
 
     @property
     def tracks(self) -> Tracks:
-        """What was tracked in its frames."""
+        """The tracked observations in its frames."""
         registration = self.registration
         return Tracks(
             registration.obs_frame, registration.obs_keyframe, registration.obs_feature, registration.obs_px
@@ -38,7 +38,7 @@ class RegisteredCamera:
 
 
 def estimate_relative_poses(own: RegisteredCamera, others: Sequence[RegisteredCamera]) -> list[RelativePose]:
-    """Where each other camera sits beside a camera; the same, whichever of the two is asked for."""
+    """Estimate the relative pose of a camera and each other one; the pair is ordered by name."""
     out = []
     for other in others:
         first, second = sorted((own, other), key=lambda each: each.camera.name)
@@ -52,7 +52,7 @@ def estimate_relative_poses(own: RegisteredCamera, others: Sequence[RegisteredCa
 def rig_members(
     own: RegisteredCamera, others: Sequence[RegisteredCamera], relative: Sequence[RelativePose]
 ) -> list[RigMember]:
-    """The camera, in the rig's origin, and those others whose place beside it is known well."""
+    """Return the camera, at the origin of the rig, and the other cameras with a well-known relative pose."""
     count = len(own.camera.times_ns)
     out = [
         RigMember(camera=own.camera, tracks=own.tracks, cam_from_rig=np.eye(4), rig_frame=np.arange(count))
@@ -76,7 +76,10 @@ def rig_members(
 def initial_rig_poses(
     own: RegisteredCamera, others: Sequence[RegisteredCamera], members: Sequence[RigMember]
 ) -> FloatArray:
-    """Poses rig_from_map (F,4,4) to start from: the camera's own, else what another one's make of it."""
+    """Return poses rig_from_map (F,4,4) to start from; NaN if no camera has one.
+
+    The camera's own pose is preferred to one that is derived from another camera.
+    """
     out = np.full((len(own.camera.times_ns), 4, 4), np.nan)
     by_name = {item.camera.name: item.registration.trajectory for item in (own, *others)}
     for member in reversed(members):

@@ -1,4 +1,4 @@
-"""Which points of a map stand in the room: those that more than one glance of one camera saw."""
+"""Find the static points of a map: those that one camera did not see only for a moment."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from bodycap_batch.model.scene import Map
 from bodycap_batch.model.static_span import MIN_STATIC_SPAN_NS
 
 _MIN_KEYFRAME_RATIO = 0.5
+"""Least ratio of a camera's keyframes that must see enough static points. Evidence: none."""
 _MIN_STATIC_POINTS = 12
-"""Unless so large a share of a camera's keyframes sees so many confirmed points the test tells nothing: a
-camera alone that always moves on."""
+"""Static points that a keyframe must see to support the test. A single camera that always moves on sees
+fewer; the test is then not applied. Evidence: none."""
 
 
 def static_points(camera: CaptureCamera, scene_map: Map) -> BoolArray:
-    """(P,) points that another camera saw too, or this one more than a moment apart.
+    """Return which points (P,) another camera saw too, or this camera over more than MIN_STATIC_SPAN_NS.
 
-    What moves with a camera, the wearer's own arm first of all, looks like a still room to that camera for a
-    while and to no other. True for all where few of the camera's keyframes see confirmed points.
+    Things that move with a camera, above all the wearer's own arm, look static to that camera for a while but
+    to no other camera. All points count as static if few of the camera's keyframes see static ones.
     """
     count = len(scene_map.points)
     rows = scene_map.keyframes_of(camera.name)
@@ -34,7 +35,9 @@ def static_points(camera: CaptureCamera, scene_map: Map) -> BoolArray:
     static_seen = np.bincount(
         scene_map.obs_keyframe[is_own], weights=static[point], minlength=len(scene_map.keyframe_camera)
     )
-    observing = np.intersect1d(rows, scene_map.obs_keyframe)  # a refused one may be kept that sees nothing
+    observing = np.intersect1d(
+        rows, scene_map.obs_keyframe
+    )  # A keyframe without observations does not count.
     is_usable = len(observing) > 0 and bool(
         (static_seen[observing] >= _MIN_STATIC_POINTS).mean() >= _MIN_KEYFRAME_RATIO
     )

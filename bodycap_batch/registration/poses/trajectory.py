@@ -1,4 +1,4 @@
-"""All frames of a camera solved against the map, again with what the first solution taught."""
+"""Solve all frames of a camera or a rig against the map, repeatedly with what the solution before showed."""
 
 from __future__ import annotations
 
@@ -29,22 +29,26 @@ from bodycap_batch.registration.poses.pose_outliers import (
 from bodycap_batch.registration.tracking.klt import Tracks, camera_pixel_scale
 
 _MIN_STATIC_INLIERS = 6
-"""Confirmed inliers without which a pose is that of the wearer's sleeve."""
+"""Inliers on static points below which a pose is taken for one relative to the wearer's sleeve. Evidence:
+none."""
 _MAP_NOISE_PX = 0.6
-"""x"""
+"""Pixels at 640 px image width: standard deviation of a map point's projection. Evidence: none."""
 _INLIER_SIGMAS = 3.5
-"""x"""
+"""Inlier limit in standard deviations of an observation. Origin: it covers 99.8 % of a 2D normal
+distribution."""
 _BLUR_WINDOW_FRAMES = 15
-"""x"""
+"""Frames on either side with which the sharpness of a frame is compared. Evidence: none."""
 _REPEATS = 1
+"""Repetitions with weights from the agreement of each point."""
 _REPEATS_ROLLING = 2
-"""The velocity that moves pixels comes from the poses that the moved pixels give."""
+"""The same with a rolling shutter. Its correction needs poses for the image velocities, so poses and
+corrected pixels are solved alternately, twice."""
 
 
 def acceptance_criteria(
     camera: CaptureCamera, selection: KeyframeSelection, options: RegistrationOptions
 ) -> AcceptanceCriteria:
-    """X"""
+    """Return the conditions for poses of a camera, from the noise of its tracks and the options."""
     noise_px = np.hypot(_MAP_NOISE_PX * camera_pixel_scale(camera), 2.0 * selection.noise_px)
     return AcceptanceCriteria(
         max_error_px=float(_INLIER_SIGMAS * noise_px),
@@ -56,7 +60,7 @@ def acceptance_criteria(
 def solve_camera(
     camera: CaptureCamera, scene_map: Map, tracks: Tracks, criteria: AcceptanceCriteria, threads: int = 1
 ) -> list[FramePose]:
-    """Solve every frame of a camera from the map points seen in it; see `solve_rig`."""
+    """Estimate the pose of every frame of a camera from the observed map points; see `solve_rig`."""
     count = len(camera.times_ns)
     member = RigMember(camera=camera, tracks=tracks, cam_from_rig=np.eye(4), rig_frame=np.arange(count))
     rows = scene_map.keyframes_of(camera.name)
@@ -71,20 +75,21 @@ def solve_rig(
     criteria: AcceptanceCriteria,
     threads: int = 1,
 ) -> list[FramePose]:
-    """Solve every frame of a rig from the map points that its cameras see at that instant.
+    """Estimate the pose of every frame of a rig from the map points that its cameras observe at that instant.
 
-    Points that move with the wearer, or were matched wrongly, lie off in most frames whatever the pose:
-    once the poses stand, a point counts by the share of frames that agree with it, and all is solved
-    again. Pixels of a rolling shutter are moved to the middle row's instant on the way.
+    Points that move with the wearer and wrongly matched points disagree with the poses of most frames. After
+    a first solution each point is weighted by the ratio of frames that agree with it, and all frames are
+    solved again. Observations of a rolling shutter are moved to the instant of the middle row.
 
     Args:
-        members: Its cameras. The first one sits in the rig's origin and has its frames.
+        members: The cameras. The first one is at the origin of the rig, and its frames are those of the rig.
         scene_map: The map.
-        start: (F,4,4) rig_from_map to start from; NaN where there is none.
-        limits: What makes a pose acceptable.
+        start: (F,4,4) rig_from_map to start from; NaN if there is none.
+        criteria: The conditions that a pose must meet.
+        threads: Threads that solve chunks of frames. The result does not depend on them.
 
     Returns:
-        Poses of the first camera; `FrameStatus.RIG` where it saw too little for one of its own.
+        Poses of the first camera; their status is `FrameStatus.RIG` if it alone has too few inliers.
     """
     rig = RigObservations.create(members, scene_map)
     solution = _solve(rig, start, criteria, threads)
@@ -98,15 +103,15 @@ def solve_rig(
     return _reject_outliers(_assign_status(accepted, rig, solution.own_inliers, criteria), times_ns, criteria)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Solution:
-    """Poses of all frames and what agrees with them.
+    """Poses of all frames, and what agrees with them.
 
     Attributes:
-        poses: One a frame.
-        votes: What each point's views say.
-        confirmed: (F,) confirmed points that agree.
-        own: (F,) points of the first camera that agree.
+        poses: One for each frame.
+        reliability: How often each point agreed.
+        static: (F,) number of inliers on static points.
+        own_inliers: (F,) number of inliers of the first camera.
     """
 
     poses: list[FramePose]
@@ -123,14 +128,17 @@ def _solve(
     reliability: PointReliability | None = None,
     path: FloatArray | None = None,
 ) -> _Solution:
-    """Poses of all frames, a stretch at a time: what is seen in a long video would fill the memory.
+    """Estimate the poses of all frames, one block after another.
+
+    All observations of a long video would fill the memory.
 
     Args:
         rig: Cameras and map.
         start: (F,4,4) rig_from_map to start from.
-        limits: What makes a pose acceptable.
-        votes: How far each point is to be trusted.
-        path: (F,4,4) map_from_rig with which pixels of a rolling shutter are moved.
+        criteria: The conditions that a pose must meet.
+        threads: Threads that solve chunks of frames.
+        reliability: Agreement of each point in the solution before.
+        path: (F,4,4) map_from_rig that corrects the rolling shutter; None for a global shutter.
     """
     count = len(start)
     out = _Solution(
@@ -154,7 +162,14 @@ def _solve(
 def _assign_status(
     poses: list[FramePose], rig: RigObservations, own_inliers: IntArray, criteria: AcceptanceCriteria
 ) -> list[FramePose]:
-    """Tell keyframes, and frames that the rig's other cameras carry; `own_inliers` counts the first one's inliers."""
+    """Set the status of keyframes, and of frames that only other cameras of the rig support.
+
+    Args:
+        poses: One for each frame.
+        rig: The rig.
+        own_inliers: (F,) inliers of the first camera.
+        criteria: The least number of inliers.
+    """
     rows = rig.scene_map.keyframes_of(rig.members[0].camera.name)
     status = dict.fromkeys(rig.scene_map.keyframe_frame[rows].tolist(), FrameStatus.KEYFRAME)
     if len(rig.members) > 1:
@@ -168,7 +183,7 @@ def _assign_status(
 
 
 def pose_array(poses: Sequence[FramePose]) -> FloatArray:
-    """Poses gauge_from_cam (N,4,4), NaN where there is none."""
+    """Return the poses gauge_from_cam (N,4,4); NaN if there is none."""
     missing = np.full((4, 4), np.nan)
     matrices = [missing if pose.gauge_from_cam is None else pose.gauge_from_cam for pose in poses]
     return np.array(matrices).reshape(-1, 4, 4)
@@ -177,7 +192,14 @@ def pose_array(poses: Sequence[FramePose]) -> FloatArray:
 def build_trajectory(
     camera: CaptureCamera, gauge: str, poses: Sequence[FramePose], sharpness: FloatArray
 ) -> Trajectory:
-    """X"""
+    """Return the trajectory of a camera with the status of each frame.
+
+    Args:
+        camera: The camera.
+        gauge: Gauge of the poses.
+        poses: One for each frame.
+        sharpness: (F,) sharpness of the frames.
+    """
     missing = np.full((6, 6), np.nan)
     return Trajectory(
         camera=camera.name,
@@ -195,7 +217,10 @@ def build_trajectory(
 
 
 def _frame_statuses(poses: Sequence[FramePose], sharpness: FloatArray) -> list[FrameStatus]:
-    """X"""
+    """Return the statuses of the frames.
+
+    A frame without tracks that is much less sharp than the frames around it gets the status BLUR.
+    """
     statuses = []
     for index, pose in enumerate(poses):
         status = pose.status
@@ -208,7 +233,10 @@ def _frame_statuses(poses: Sequence[FramePose], sharpness: FloatArray) -> list[F
 
 
 def _interpolated_keyframe_poses(keyframes: IntArray, map_from_cam: FloatArray, count: int) -> FloatArray:
-    """Poses cam_from_map (count,4,4) interpolated between keyframes; the nearest one's outside them."""
+    """Return cam_from_map (count,4,4), interpolated between keyframes.
+
+    Frames outside all keyframes get the pose of the nearest one.
+    """
     frames = np.arange(count)
     after = np.clip(np.searchsorted(keyframes, frames), 1, max(1, len(keyframes) - 1))
     after = np.minimum(after, len(keyframes) - 1)
@@ -219,7 +247,12 @@ def _interpolated_keyframe_poses(keyframes: IntArray, map_from_cam: FloatArray, 
 
 
 def _require_static_inliers(poses: list[FramePose], static_inliers: IntArray) -> list[FramePose]:
-    """Refuse the poses that hardly any confirmed point agrees with; `static_inliers` counts them by frame."""
+    """Reject the poses with few inliers on static points.
+
+    Args:
+        poses: One for each frame.
+        static_inliers: (F,) inliers on static points.
+    """
     has_pose = np.array([pose.gauge_from_cam is not None for pose in poses], dtype=bool)
     return _reject(poses, has_pose & (static_inliers < _MIN_STATIC_INLIERS), FrameStatus.UNCONFIRMED)
 
@@ -227,13 +260,13 @@ def _require_static_inliers(poses: list[FramePose], static_inliers: IntArray) ->
 def _reject_outliers(
     poses: list[FramePose], times_ns: IntArray, criteria: AcceptanceCriteria
 ) -> list[FramePose]:
-    """Refuse the poses that jump away from both neighbours and back, and weak ones that stand alone."""
+    """Reject poses that deviate from their neighbours, and isolated poses with few inliers."""
     centres = np.full((len(poses), 3), np.nan)
     sigma = np.full(len(poses), np.nan)
     for frame, pose in enumerate(poses):
         if pose.gauge_from_cam is not None and pose.covariance is not None:
             centres[frame] = pose.gauge_from_cam[:3, 3]
-            # Neighbours share the map's error.
+            # Neighbouring frames share the error of the map.
             sigma[frame] = np.sqrt(np.trace(pose.covariance[3:, 3:]) / MAP_COVARIANCE_SCALE)
     accepted = _reject(poses, find_outlier_poses(centres, sigma, times_ns), FrameStatus.POSE_JUMP)
     localised = np.array([pose.gauge_from_cam is not None for pose in accepted], dtype=bool)
@@ -243,6 +276,7 @@ def _reject_outliers(
 
 
 def _reject(poses: list[FramePose], rejected: BoolArray, status: FrameStatus) -> list[FramePose]:
+    """Replace the poses selected by `rejected` (F,) by the status."""
     return [
         FramePose(status=status, inliers=pose.inliers, error_px=pose.error_px) if rejected[frame] else pose
         for frame, pose in enumerate(poses)

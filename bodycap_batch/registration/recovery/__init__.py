@@ -1,1 +1,1 @@
-"""Poses of frames that tracking lost, by guided search from their neighbours."""
+"""Find the poses of lost frames."""

@@ -1,4 +1,4 @@
-"""Poses of single frames, from the map's points found where a pose nearby leads them."""
+"""Localise single frames by searching map points where an expected pose predicts them."""
 
 from __future__ import annotations
 
@@ -31,33 +31,37 @@ from bodycap_batch.registration.recovery.patch_search import (
 )
 
 _LEVELS = (
-    SearchLevel(pyramid_level=2, patch_side=15, search_radius=14, score=0.6, limit_px=12.0),
-    SearchLevel(pyramid_level=1, patch_side=21, search_radius=8, score=0.7, limit_px=6.0),
-    SearchLevel(pyramid_level=0, patch_side=31, search_radius=8, score=0.75, limit_px=4.0),
+    SearchLevel(pyramid_level=2, patch_side=15, search_radius=14, min_score=0.6, limit_px=12.0),
+    SearchLevel(pyramid_level=1, patch_side=21, search_radius=8, min_score=0.7, limit_px=6.0),
+    SearchLevel(pyramid_level=0, patch_side=31, search_radius=8, min_score=0.75, limit_px=4.0),
 )
-"""From far and coarse to near and fine. The last one at full size: errors of frames with known poses are a
-quarter smaller than from half size."""
+"""Searches from coarse to fine. The last one is at full size, because its errors are a quarter smaller than
+at half size. Evidence for that: docs/decisions/registration.md; for the other values: none."""
 _CELL_SIDE_PX = 40.0
+"""Pixels at 640 px image width: side of a cell, about the side of a patch."""
 _FULL_WEIGHT_PER_CELL = 2.0
-"""Patches that overlap err together: so many count in a square of about a patch's side. Otherwise fifty
-patches on one grating of a ceiling pass for a pose that is 60 cm off."""
+"""Matches of one cell that have their full weight together; overlapping patches have common errors. Evidence:
+docs/decisions/registration.md."""
 _MIN_NOISE_PX = 1.0
-"""Of patches found in blurred frames: fewer than twenty that happen to agree better tell nothing better."""
+"""Pixels at 640 px image width: smallest noise of a patch match that is assumed. Few matches in a blurred
+frame may agree better by chance. Evidence: none."""
 _MIN_MATCHES = 8
+"""Least matches for a pose. Evidence: none."""
 _SUFFICIENT_INLIERS, _SUFFICIENT_WEIGHT_RATIO = 25, 0.6
+"""Inliers, and inlier weight ratio, with which no further expected pose is tried. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseEstimate:
-    """A pose from points found where they were looked for.
+    """A pose from patch matches or from tracking.
 
     Attributes:
         cam_from_map: (4,4).
-        covariance: (6,6) as `Trajectory` has it.
-        inliers: Points that agree.
-        evidence: Their share of the weight of all that were found.
-        error_px: Their mean residual.
-        depth: Their median depth.
+        covariance: (6,6) as in `Trajectory`.
+        inliers: Number of inliers.
+        inlier_weight_ratio: Weight of the inliers over the weight of all matches.
+        error_px: Mean residual of the inliers.
+        depth: Median depth of the matched points.
     """
 
     cam_from_map: FloatArray
@@ -69,7 +73,10 @@ class PoseEstimate:
 
     @staticmethod
     def from_trajectory(path: Trajectory, frame: int) -> PoseEstimate:
-        """A pose that tracking found; the depth of its points is not known any more."""
+        """Return the pose of a frame from tracking.
+
+        The depth of its points is not stored; it is set to infinity.
+        """
         return PoseEstimate(
             cam_from_map=invert(path.gauge_from_cam[frame]),
             covariance=path.covariance[frame],
@@ -81,16 +88,27 @@ class PoseEstimate:
 
     @property
     def position(self) -> PositionEstimate:
-        """Where the camera was."""
+        """The camera centre with its covariance in the axes of the map."""
         rotation = self.cam_from_map[:3, :3]
-        return PositionEstimate(
-            invert(self.cam_from_map)[:3, 3], rotation.T @ self.covariance[3:, 3:] @ rotation
-        )
+        covariance = rotation.T @ self.covariance[3:, 3:] @ rotation
+        return PositionEstimate(invert(self.cam_from_map)[:3, 3], covariance)
+
+    @property
+    def support(self) -> float:
+        """Number of inliers times the inlier weight ratio."""
+        return self.inliers * self.inlier_weight_ratio
+
+    def has_support(self, min_inliers: int, min_inlier_weight_ratio: float) -> bool:
+        """Return True if enough matches agree with the pose."""
+        return self.inliers >= min_inliers and self.inlier_weight_ratio >= min_inlier_weight_ratio
 
     def conditioned_on_centre(self, position: PositionEstimate) -> tuple[FloatArray, FloatArray]:
-        """The pose cam_from_map (4,4) and its covariance (6,6) once the centre is known to be elsewhere.
+        """Return the pose and its covariance, given another position of the centre.
 
-        The turn follows as far as the points tie it to the centre.
+        The rotation changes as far as it is correlated with the centre.
+
+        Returns:
+            cam_from_map (4,4) and its covariance (6,6).
         """
         rotation, centre = self.cam_from_map[:3, :3], invert(self.cam_from_map)[:3, 3]
         gain = self.covariance[:3, 3:] @ np.linalg.inv(self.covariance[3:, 3:])
@@ -107,22 +125,21 @@ class PoseEstimate:
 
 
 def fuse(first: PositionEstimate, second: PositionEstimate) -> tuple[PositionEstimate, float]:
-    """The place that two independent ones make, and their squared Mahalanobis distance."""
+    """Combine two independent positions; return the weighted mean and their squared Mahalanobis distance."""
     information = np.linalg.inv(first.covariance + second.covariance)
     difference = second.centre - first.centre
     centre = first.centre + first.covariance @ information @ difference
-    return PositionEstimate(centre, first.covariance @ information @ second.covariance), float(
-        difference @ information @ difference
-    )
+    covariance = first.covariance @ information @ second.covariance
+    return PositionEstimate(centre, covariance), float(difference @ information @ difference)
 
 
 @dataclass(frozen=True, slots=True)
 class SearchFrame:
-    """A frame as it is searched.
+    """A frame to be searched.
 
     Attributes:
-        pyramid: Its picture.
-        row: Its own among the map's keyframes, -1 where it is none.
+        pyramid: Its image.
+        keyframe_row: Its own row among the map's keyframes, or -1.
     """
 
     pyramid: Pyramid
@@ -131,11 +148,11 @@ class SearchFrame:
 
 @dataclass(frozen=True, slots=True)
 class NeighbourPose:
-    """Where the camera was a frame away.
+    """Pose of the camera one frame away.
 
     Attributes:
         pose: (4,4) cam_from_map.
-        step: 1 where that was a frame earlier, −1 where it was one later.
+        direction: 1 if it is one frame earlier, −1 if it is one frame later.
     """
 
     pose: FloatArray
@@ -144,15 +161,15 @@ class NeighbourPose:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuidedLocaliser:
-    """Finds poses of a camera's frames near where they are expected.
+    """Localises frames of a camera near an expected pose.
 
     Attributes:
-        lens: The camera's.
-        gallery: The map and what its points look like.
-        limits: What makes a pose acceptable.
-        exposure: Share of the time between two frames that the shutter is open.
-        readout: The same from the first row's exposure to the last's.
-        sees_room: Which pixels (N,2) of the camera show the room, as its mask says.
+        lens: The camera model.
+        patches: The map and the images of its keyframes.
+        criteria: The conditions that a pose must meet.
+        exposure_ratio: Exposure time as a fraction of the frame interval.
+        readout_ratio: Readout time as a fraction of the frame interval.
+        is_unmasked: Returns which pixels (N,2) the mask of the camera leaves visible.
     """
 
     lens: Camera
@@ -169,24 +186,20 @@ class GuidedLocaliser:
         neighbour: NeighbourPose,
         predicted: PositionEstimate,
     ) -> PoseEstimate | None:
-        """The pose of a frame.
+        """Estimate the pose of a frame.
 
         Args:
-            seen: The frame.
-            priors: Poses cam_from_map (4,4) it may have, the likeliest first.
-            beside: The frame before or after.
-            place: Where its motion leads to.
+            search_frame: The frame.
+            priors: Expected poses cam_from_map (4,4), the most likely first.
+            neighbour: Pose of the frame before or after.
+            predicted: Position predicted by the motion.
         """
         best: PoseEstimate | None = None
         for prior in priors:
             estimate = self._search(self._view(search_frame, prior, neighbour), _LEVELS[0])
             if estimate is not None and (best is None or estimate.inliers > best.inliers):
                 best = estimate
-            if (
-                best is not None
-                and best.inliers >= _SUFFICIENT_INLIERS
-                and best.inlier_weight_ratio >= _SUFFICIENT_WEIGHT_RATIO
-            ):
+            if best is not None and best.has_support(_SUFFICIENT_INLIERS, _SUFFICIENT_WEIGHT_RATIO):
                 break
         for level in _LEVELS[1:]:
             if best is None:
@@ -198,10 +211,17 @@ class GuidedLocaliser:
     def relocalise(
         self, search_frame: SearchFrame, pose: FloatArray, neighbour: NeighbourPose
     ) -> PoseEstimate | None:
-        """The pose (4,4) of a frame that is nearly known; the rest as for `localise`."""
+        """Estimate the pose of a frame again, near a good pose.
+
+        Args:
+            search_frame: The frame.
+            pose: (4,4) cam_from_map.
+            neighbour: Pose of the frame before or after.
+        """
         return self._search(self._view(search_frame, pose, neighbour), _LEVELS[-1])
 
     def _view(self, search_frame: SearchFrame, pose: FloatArray, neighbour: NeighbourPose) -> PredictedView:
+        """Return the expected view of a frame."""
         return PredictedView(
             lens=self.lens,
             pyramid=search_frame.pyramid,
@@ -213,6 +233,7 @@ class GuidedLocaliser:
         )
 
     def _search(self, view: PredictedView, level: SearchLevel) -> PoseEstimate | None:
+        """Search the points that a view should show, and estimate the pose from them."""
         rows = select_patches(self.patches, view)
         if len(rows) < _MIN_MATCHES:
             return None
@@ -221,6 +242,10 @@ class GuidedLocaliser:
         return self._solve(view, matches, level) if len(matches.point) >= _MIN_MATCHES else None
 
     def _solve(self, view: PredictedView, matches: PatchMatches, level: SearchLevel) -> PoseEstimate | None:
+        """Estimate a pose from matches.
+
+        It starts from the expected pose, and from RANSAC if few matches agree with that one.
+        """
         scale = view.pyramid.step_px[0]
         criteria = replace(
             self.criteria,
@@ -247,6 +272,7 @@ class GuidedLocaliser:
     def _refined(
         self, observations: Observations, start: FloatArray, criteria: AcceptanceCriteria
     ) -> PoseEstimate | None:
+        """Refine a pose; return None if it is not acceptable."""
         pose = refine_poses(observations, start[None], criteria.max_error_px)
         accepted = accept_poses(observations, pose, criteria)[0]
         if accepted.covariance is None:
@@ -262,7 +288,12 @@ class GuidedLocaliser:
 
 
 def _match_weights(cell: FloatArray, keyframe_count: IntArray) -> FloatArray:
-    """X"""
+    """Return the weights (N,) of matches.
+
+    Args:
+        cell: (N,2) position in units of a cell; the matches of a crowded cell share its weight.
+        keyframe_count: (N,) keyframes that see each point.
+    """
     _, group, count = np.unique(np.floor(cell).astype(int), axis=0, return_inverse=True, return_counts=True)
     crowding = np.maximum(1.0, count[np.ravel(group)] / _FULL_WEIGHT_PER_CELL)
     return np.asarray(point_weights(keyframe_count) / crowding)

@@ -1,4 +1,4 @@
-"""Where a body-worn camera can be, from where it was: centres whose acceleration changes little."""
+"""Model the motion of a body-worn camera's centre: its acceleration changes little between frames."""
 
 from __future__ import annotations
 
@@ -10,17 +10,28 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray, IntArray
 
 _PERCENTILE = 80.0
-"""Percentile of a camera's own third and fourth differences: lost stretches are among its faster ones."""
+"""Percentile of a camera's third and fourth differences. It is high because lost intervals belong to the
+faster movements. Evidence: none."""
 _MAX_INTERVAL_DEVIATION = 0.1
+"""Largest deviation of a frame interval from the median, as a fraction of it, for differences across it.
+Evidence: none."""
 _ITERATIONS = 5
+"""Iterations of reweighted least squares. Evidence: none."""
 _LOSS_WIDTH = 4.0
-"""Squared Mahalanobis distance at which a place, or a bend of the path, counts half."""
+"""Squared Mahalanobis distance at which a position, or a residual of the motion, has half of its weight.
+Evidence: none."""
 _VELOCITY_SIGMA_JERKS, _ACCELERATION_SIGMA_JERKS = 30.0, 4.0
-"""Velocity and acceleration that nothing is known of, in the camera's usual third differences."""
+"""Sigmas of an unknown velocity and of an unknown acceleration, in units of the camera's jerk sigma.
+Evidence: none."""
 MAX_DISAGREEMENT = 11.3
-"""x"""
+"""Largest squared Mahalanobis distance between a found centre and its smoothed position. Origin: 99 % of a
+chi-squared variable with three degrees of freedom. Beyond it one of the two is wrong, and it is unknown
+which."""
 _NEIGHBOURS = 4
+"""Neighbouring frames that a cubic is drawn through: two before and two after."""
 _PRIOR = 1e-9
+"""Information of a weak prior on every centre, as a fraction of the mean. It only prevents a singular
+matrix."""
 
 
 def times_in_intervals(times_ns: IntArray) -> FloatArray:
@@ -31,7 +42,7 @@ def times_in_intervals(times_ns: IntArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class PositionEstimate:
-    """Where a camera was.
+    """Position of a camera, with its uncertainty.
 
     Attributes:
         centre: (3,) in the map.
@@ -44,11 +55,12 @@ class PositionEstimate:
 
 @dataclass(frozen=True, slots=True)
 class MotionStatistics:
-    """How evenly a camera moves, in the map's unit along an axis, for frames one interval apart.
+    """How smoothly a camera moves, in map units along one axis, for frames one interval apart.
 
     Attributes:
-        jerk: Third difference of its centre from frame to frame.
-        bend: Distance of a centre from the cubic through the two before it and the two after it.
+        jerk_sigma: Third difference of the centre from frame to frame.
+        cubic_residual_sigma: Distance of a centre from the cubic through the two centres before it and the
+            two after it.
     """
 
     jerk_sigma: float
@@ -56,7 +68,15 @@ class MotionStatistics:
 
     @staticmethod
     def estimate(times: FloatArray, centres: FloatArray) -> MotionStatistics | None:
-        """From centres (N,3) at times (N,) in frame intervals, NaN where unknown; None where too few are."""
+        """Estimate the statistics of a path.
+
+        Args:
+            times: (N,) in frame intervals.
+            centres: (N,3) camera centres; NaN where unknown.
+
+        Returns:
+            None if too few centres are known.
+        """
         sizes = []
         for order in (3, 4):
             differences = np.diff(centres, order, axis=0)
@@ -75,10 +95,10 @@ class MotionStatistics:
 
 
 class CentreKalmanFilter:
-    """A camera's centre, velocity and acceleration while frames are walked through, forwards or backwards.
+    """Kalman filter of a camera's centre, velocity and acceleration, run forwards or backwards in time.
 
-    Source: Tang, Yoon, Barfoot, "A white-noise-on-jerk motion prior for continuous-time trajectory
-        estimation on SE(3)", RA-L 2019, for the prior, on the centre alone: a hand turns as it likes.
+    Source: Tang, Yoon, Barfoot, "A white-noise-on-jerk motion prior for continuous-time trajectory estimation
+        on SE(3)", RA-L 2019, applied to the centre alone, because a hand rotates freely.
     """
 
     def __init__(self, statistics: MotionStatistics, start: PositionEstimate) -> None:
@@ -91,7 +111,7 @@ class CentreKalmanFilter:
         self._covariance[6:, 6:] = np.eye(3) * (_ACCELERATION_SIGMA_JERKS * jerk) ** 2
 
     def predict(self, interval: float) -> PositionEstimate:
-        """Go on by some frame intervals (> 0); where the camera should be then."""
+        """Advance by `interval` (> 0) frame intervals and return the predicted position."""
         powers = np.array([[1.0, interval, interval**2 / 2.0], [0.0, 1.0, interval], [0.0, 0.0, 1.0]])
         transition = np.kron(powers, np.eye(3))
         noise = np.array([interval**3 / 6.0, interval**2 / 2.0, interval]) * self._jerk
@@ -102,7 +122,7 @@ class CentreKalmanFilter:
         return PositionEstimate(self._state[:3].copy(), self._covariance[:3, :3].copy())
 
     def update(self, observed: PositionEstimate) -> None:
-        """Take in where the camera was found."""
+        """Update the state with an observed position."""
         gain = self._covariance[:, :3] @ np.linalg.inv(self._covariance[:3, :3] + observed.covariance)
         self._state = self._state + gain @ (observed.centre - self._state[:3])
         covariance = self._covariance - gain @ self._covariance[:3]
@@ -111,11 +131,11 @@ class CentreKalmanFilter:
 
 @dataclass(frozen=True, slots=True)
 class SmoothedCentres:
-    """Places of consecutive frames, each with what all of them tell.
+    """Smoothed positions of successive frames.
 
     Attributes:
-        places: By frame.
-        disagreement: By frame that was found: squared Mahalanobis distance from its smoothed place.
+        positions: By frame.
+        disagreement: By observed frame: squared Mahalanobis distance from the smoothed position.
     """
 
     positions: Mapping[int, PositionEstimate]
@@ -129,16 +149,17 @@ def smooth_centres(
     trusted: Collection[int],
     statistics: MotionStatistics,
 ) -> SmoothedCentres:
-    """Centres of consecutive frames near where they were found, on a path that bends as it usually does.
+    """Smooth the centres of successive frames, given observed positions and the statistics of the motion.
 
-    Both the places and the bends count under a Cauchy loss: a place may be wrong, and a hand may stop dead.
+    Positions and motion residuals are weighted by a Cauchy loss: a position may be wrong, and a hand may stop
+    suddenly.
 
     Args:
         frames: (N,) frame indices.
         times: (N,) in frame intervals.
-        found: Places, by frame.
-        trusted: Frames whose places are never doubted.
-        steadiness: The camera's.
+        observed: Observed positions, by frame.
+        trusted: Frames whose positions always have their full weight.
+        statistics: How smoothly the camera moves.
     """
     at = {frame: index for index, frame in enumerate(frames.tolist())}
     rows, sigma = _cubic_residual_rows(times, statistics.cubic_residual_sigma)
@@ -169,19 +190,22 @@ def smooth_centres(
 def _solve_block_tridiagonal(
     rows: FloatArray, weight: FloatArray, information: FloatArray, weighted: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Centres (N,3) and their covariances (N,3,3) of the least squares that bends and places make.
+    """Solve the least-squares problem of motion residuals and positions.
 
-    A bend ties five frames together, so that groups of four are tied to the next group only: the time and
-    memory grow with the number of frames, not with its powers.
+    A motion residual connects five frames. Blocks of four frames are therefore connected to the next block
+    only, and time and memory grow linearly with the number of frames.
 
     Args:
-        bends: (N−4,5) as `_cubic_residual_rows` gives them.
+        rows: (N−4,5) as returned by `_cubic_residual_rows`.
         weight: (N−4,) their information.
-        known: (N,3,3) information of the places.
-        pull: (N,3) the same times the places.
+        information: (N,3,3) information of the positions.
+        weighted: (N,3) the information times the positions.
 
-    Source: block elimination, and its way back for the blocks of the inverse, as in Rauch, Tung, Striebel,
-        "Maximum likelihood estimates of linear dynamic systems", AIAA Journal 1965.
+    Returns:
+        Centres (N,3) and their covariances (N,3,3).
+
+    Source: block elimination and back substitution for the blocks of the inverse, as in Rauch, Tung,
+        Striebel, "Maximum likelihood estimates of linear dynamic systems", AIAA Journal 1965.
     """
     count, size = len(information), 3 * _NEIGHBOURS
     groups = -(-count // _NEIGHBOURS)
@@ -209,7 +233,11 @@ def _solve_block_tridiagonal(
 
 
 def _information_blocks(rows: FloatArray, weight: FloatArray, groups: int) -> tuple[FloatArray, FloatArray]:
-    """(G,4,4) information that bends are about groups of four frames, and (G,4,4) with the group after."""
+    """Return the information of motion residuals, in blocks of four frames.
+
+    Returns:
+        (G,4,4) within each block, and (G,4,4) between each block and the next one.
+    """
     pairs = np.zeros((groups + 1, 2 * _NEIGHBOURS, 2 * _NEIGHBOURS))
     for number, row in enumerate(rows):
         group, first = divmod(number, _NEIGHBOURS)
@@ -221,9 +249,12 @@ def _information_blocks(rows: FloatArray, weight: FloatArray, groups: int) -> tu
 
 
 def _cubic_residual_rows(times: FloatArray, bend: float) -> tuple[FloatArray, FloatArray]:
-    """Rows (N−4,5) that give a centre's distance from the cubic through its neighbours, and its sigma.
+    """Return the linear map from five successive centres to the distance from their cubic.
 
-    Row n is about frames n to n+4.
+    Row n concerns the frames n to n+4.
+
+    Returns:
+        Rows (N−4,5), and the sigma (N−4,) of each distance.
     """
     count = max(0, len(times) - _NEIGHBOURS)
     rows, sigma = np.zeros((count, _NEIGHBOURS + 1)), np.full(count, bend)
@@ -234,6 +265,6 @@ def _cubic_residual_rows(times: FloatArray, bend: float) -> tuple[FloatArray, Fl
         for index in others:
             rest = window[[each for each in others if each != index]]
             rows[number, index] = -np.prod((window[2] - rest) / (window[index] - rest))
-        # What a cubic misses grows with the third power of the time it spans.
+        # The residual of a cubic grows with the third power of the time that it spans.
         sigma[number] *= ((window[-1] - window[0]) / _NEIGHBOURS) ** 3
     return rows, sigma

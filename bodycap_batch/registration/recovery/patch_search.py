@@ -1,4 +1,4 @@
-"""Map points found in a frame by the look they have in keyframes, where a pose says to look for them."""
+"""Find map points in a frame by the patches that keyframes show of them, near an expected pose."""
 
 from __future__ import annotations
 
@@ -17,33 +17,45 @@ from bodycap_batch.model.scene import Map
 from bodycap_batch.registration.tracking.klt import grid_sample
 
 _MAX_POINTS = 300
+"""Points searched in a frame. Evidence: none."""
 _GRID_CELLS = 8
+"""Cells along each side of the image over which these points are spread. Evidence: none."""
 _MARGIN_PX = 4.0
+"""Pixels: least distance of a searched point from the border of the image. Evidence: none."""
 _MIN_COSINE = 0.6
-"""Of the angle between the two lines of sight: a patch is taken to face the camera."""
+"""Least cosine of the angle between both lines of sight. A patch is assumed to face the camera, which holds
+for similar directions only. Evidence: none."""
 _MAX_LOG_SCALE = 0.8
+"""Largest absolute logarithm of the ratio of both distances. Evidence: none."""
 _SCALE_PENALTY, _SHARPNESS_REWARD = 0.3, 0.1
-"""What a keyframe's distance (log of the ratio) and sharpness count beside its line of sight's cosine."""
+"""Factors of the logarithm of the distance ratio and of the sharpness in the score of a keyframe, relative to
+the cosine. Evidence: none."""
 _MAX_BLUR_PX = 40.0
+"""Pixels at 640 px image width: longest blur that is rendered. Evidence: none."""
 _MAX_BLUR_SAMPLES = 5
+"""Most samples along a blur. It bounds the time."""
 _BLUR_STEP_PX = 3.0
-"""Pixels of the level from sample to sample; a longer blur is sampled less densely."""
+"""Pixels of the pyramid level between two samples; a longer blur is sampled less densely. Evidence: none."""
 _WARP_STEP_PX = 4.0
+"""Pixels: step of the differences that give the warp of a patch. Evidence: none."""
 _MIN_DEPTH_RATIO = 0.25
-"""Of the median depth: what seems to hang before the lens was triangulated wrongly and would tie the pose."""
+"""Least depth of a point, as a fraction of the median depth. A nearer point is usually wrong, and it would
+dominate the pose. Evidence: none."""
 _MIN_CONTRAST = 3.0
+"""Least standard deviation of the grey values of a patch. Evidence: none."""
 _LEVELS = 3
+"""Levels of an image pyramid."""
 
 Patches = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
 class Pyramid:
-    """A frame reduced to at most 640 pixels' long side, to half and to a quarter of that.
+    """A frame at a width of at most 640 pixels, and at half and a quarter of that.
 
     Attributes:
         levels: The images.
-        step_px: (3,) how many of the frame's own pixels one of theirs is.
+        step_px: (3,) pixels of the frame per pixel of each level.
     """
 
     levels: tuple[GreyImage, ...]
@@ -68,14 +80,14 @@ class Pyramid:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeyframePatches:
-    """What a map's points look like.
+    """The map and the images of its keyframes.
 
     Attributes:
         scene_map: The map.
-        pictures: Keyframes by their row in the map.
-        sharpness: (K,) of the keyframes, in medians of their camera.
-        usable: (P,) points that may be looked for.
-        seen: (P,) by how many keyframes each point is seen.
+        pyramids: Images of keyframes, by their row in the map.
+        sharpness: (K,) sharpness of the keyframes, relative to the median of their camera.
+        usable: (P,) points that may be searched.
+        keyframe_count: (P,) number of keyframes that see each point.
     """
 
     scene_map: Map
@@ -87,17 +99,17 @@ class KeyframePatches:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictedView:
-    """Where a frame is thought to be.
+    """The expected view of a frame.
 
     Attributes:
-        lens: Its camera.
-        pyramid: Its picture.
-        cam_from_map: (4,4) its pose.
-        before: (4,4) the same a frame earlier; a frame later where `readout_ratio` is negative.
-        exposure: Share of the time between two frames that the shutter is open.
-        readout: Share of it from the first row's exposure to the last's that the map was refined for.
-        row: Of the frame itself among the map's keyframes, -1 where it is none: its own look is found in it
-            wherever the map puts it.
+        lens: The camera model.
+        pyramid: The image.
+        cam_from_map: (4,4) the expected pose.
+        neighbour_pose: (4,4) the pose one frame earlier, or one frame later if `readout_ratio` is negative.
+        exposure_ratio: Exposure time as a fraction of the frame interval.
+        readout_ratio: Readout time as a fraction of the frame interval, if the map was refined for it.
+        keyframe_row: The frame's own row among the map's keyframes, or -1. Its own patches are not used,
+            because they are found wherever the map puts the frame.
     """
 
     lens: Camera
@@ -111,31 +123,31 @@ class PredictedView:
 
 @dataclass(frozen=True, slots=True)
 class SearchLevel:
-    """How points are looked for.
+    """How points are searched.
 
     Attributes:
-        level: Of the pyramid.
-        side: Of a patch, in the level's pixels; odd.
-        radius: How far around its expected place a patch is looked for, in the level's pixels.
-        score: Least correlation.
-        limit_px: Inlier limit of the pose that is solved from what is found, at 640 pixels' width.
+        pyramid_level: Level of the pyramid.
+        patch_side: Side of a patch in pixels of the level; odd.
+        search_radius: Largest distance from the expected pixel, in pixels of the level.
+        min_score: Least correlation.
+        limit_px: Inlier limit of the pose from the matches, in pixels at 640 px image width.
     """
 
     pyramid_level: int
     patch_side: int
     search_radius: int
-    score: float
+    min_score: float
     limit_px: float
 
 
 @dataclass(frozen=True, slots=True)
 class PatchMatches:
-    """Points found.
+    """Map points found in a frame.
 
     Attributes:
-        point: (N,) which.
-        px: (N,2) where.
-        mid_row_px: (N,2) where they were at the instant of the middle row, to which the map's poses belong.
+        point: (N,) index of the map point.
+        px: (N,2) pixel.
+        mid_row_px: (N,2) pixel at the instant of the middle row, to which the poses of the map belong.
         score: (N,) normalised correlation.
     """
 
@@ -145,14 +157,18 @@ class PatchMatches:
     score: FloatArray
 
     def select(self, selected: BoolArray) -> PatchMatches:
-        """Some of them."""
+        """Return the matches under a mask."""
         return PatchMatches(
             self.point[selected], self.px[selected], self.mid_row_px[selected], self.score[selected]
         )
 
 
 def select_patches(patches: KeyframePatches, view: PredictedView) -> IntArray:
-    """Rows of the map's observations to take points' looks from: one for each of some well spread points."""
+    """Select the observations of the map that provide the patches: one for each of some well-spread points.
+
+    Returns:
+        Rows of the map's observations, increasing.
+    """
     scene, lens = patches.scene_map, view.lens
     x_in_cam = transform_points(view.cam_from_map, scene.points)
     px = lens.project(x_in_cam)
@@ -190,23 +206,22 @@ def select_patches(patches: KeyframePatches, view: PredictedView) -> IntArray:
 def match_patches(
     patches: KeyframePatches, view: PredictedView, rows: IntArray, level: SearchLevel
 ) -> PatchMatches:
-    """Look for points around where a pose projects them, by normalised correlation.
+    """Search points around their expected pixels by normalised correlation.
 
-    A point's look is taken from a keyframe, warped to how this camera sees it (its surroundings are taken to
-    face the camera, at the point's depth) and blurred along the way that it crosses the image while the
-    shutter is open.
+    A patch of a keyframe is warped to the expected view, as if its surface faced the camera at the depth of
+    the point. It is blurred along the path of the point in the image while the shutter is open.
 
     Args:
-        gallery: The map and its keyframes' pictures.
-        view: The frame and its expected pose.
-        rows: Observations of the map to take looks from, as `select_patches` gives them.
-        search: Where and how.
+        patches: The map and the images of its keyframes.
+        view: The expected view of the frame.
+        rows: Observations of the map that provide the patches, from `select_patches`.
+        level: Size and range of the search.
 
     Returns:
-        The points found, to a fraction of a pixel.
+        The points found, with subpixel precision.
 
-    Source: Klein, Murray, "Improving the agility of keyframe-based SLAM", ECCV 2008, for looking in blurred
-        frames for what blurs alike; the warp is Klein, Murray, "Parallel tracking and mapping", ISMAR 2007.
+    Source: Klein, Murray, "Improving the agility of keyframe-based SLAM", ECCV 2008, for the search in
+        blurred frames; the warp is Klein, Murray, "Parallel tracking and mapping", ISMAR 2007.
     """
     scene, lens = patches.scene_map, view.lens
     points = scene.points[scene.obs_point[rows]]
@@ -219,7 +234,7 @@ def match_patches(
     step = view.pyramid.step_px[level.pyramid_level]
     motion = _image_motion(view, points, px)
     images, is_inside = _render_patches(patches, rows, warp, _motion_blur(view, motion), level, step)
-    # Within the readout a point crosses a small part of the image: its row hardly depends on it.
+    # During the readout a point moves by a small part of the image, so its row hardly changes.
     expected_px = px_at_mid_row(lens, px, motion, -view.readout_ratio)
     found_px, score = np.full((len(rows), 2), np.nan), np.zeros(len(rows))
     target = view.pyramid.levels[level.pyramid_level].astype(np.float32)
@@ -228,7 +243,7 @@ def match_patches(
         if match is not None:
             found_px[number] = (np.array(match[:2]) + 0.5) * step
             score[number] = match[2]
-    accepted = (score > level.score) & np.isfinite(found_px).all(axis=1)
+    accepted = (score > level.min_score) & np.isfinite(found_px).all(axis=1)
     mid_row_px = px_at_mid_row(lens, found_px, motion, view.readout_ratio)
     return PatchMatches(
         scene.obs_point[rows[accepted]], found_px[accepted], mid_row_px[accepted], score[accepted]
@@ -238,7 +253,15 @@ def match_patches(
 def _patch_warps(
     scene: Map, lens: Camera, cam_from_map: FloatArray, rows: IntArray, px: FloatArray
 ) -> FloatArray:
-    """(N,2,2) the keyframes' pixels by this camera's, around points seen at `px` (N,2)."""
+    """Return the derivatives (N,2,2) of the keyframes' pixels by this camera's pixels.
+
+    Args:
+        scene: The map.
+        lens: This camera's model.
+        cam_from_map: (4,4) its pose.
+        rows: (N,) observations of the map that provide the patches.
+        px: (N,2) pixels at which this camera sees the points.
+    """
     keyframe = scene.obs_keyframe[rows]
     depth = transform_points(cam_from_map, scene.points[scene.obs_point[rows]])[:, 2]
     map_from_cam, keyframe_from_map = invert(cam_from_map), invert(scene.map_from_cam[keyframe])
@@ -258,12 +281,12 @@ def _patch_warps(
 
 
 def _image_motion(view: PredictedView, points: FloatArray, px: FloatArray) -> FloatArray:
-    """(N,2) how far points seen at `px` (N,2) moved since the frame before."""
+    """Return how far points seen at `px` (N,2) moved since the neighbouring frame, in px (N,2)."""
     return np.asarray(np.nan_to_num(px - view.lens.project(transform_points(view.neighbour_pose, points))))
 
 
 def _motion_blur(view: PredictedView, motion_px: FloatArray) -> FloatArray:
-    """(N,2) how far points cross the image while the shutter is open; held to what is sane."""
+    """Return how far points move while the shutter is open, in px (N,2), limited to `_MAX_BLUR_PX`."""
     blur = motion_px * view.exposure_ratio
     longest = _MAX_BLUR_PX * max(1.0, view.pyramid.step_px[0])
     return np.asarray(
@@ -279,9 +302,18 @@ def _render_patches(
     level: SearchLevel,
     step_px: float,
 ) -> tuple[Patches, BoolArray]:
-    """Looks (N,side,side) of points, warped and blurred, and which (N,) lie within their keyframes.
+    """Render the patches of points, warped and blurred.
 
-    `step_px` is what one of the patches' pixels spans in the frame they are looked for in.
+    Args:
+        patches: The map and the images of its keyframes.
+        rows: (N,) observations of the map that provide the patches.
+        warp: (N,2,2) derivative of the keyframe's pixel by the frame's pixel.
+        blur_px: (N,2) motion in the frame while the shutter is open.
+        level: Size of the patches.
+        step_px: Pixels of the frame per pixel of a patch.
+
+    Returns:
+        Patches (N,side,side), and which of them (N,) lie inside their keyframes and have contrast.
     """
     import cv2
 
@@ -325,7 +357,7 @@ def _render_patches(
 def _best_match(
     target: Patches, patch: Patches, expected: FloatArray, radius: int
 ) -> tuple[float, float, float] | None:
-    """Column, row and correlation of a patch's best place near an expected one; None at the border."""
+    """Return column, row and correlation of the best match near an expected pixel; None at the border."""
     import cv2
 
     half = patch.shape[0] // 2
@@ -345,6 +377,6 @@ def _best_match(
 
 
 def _subpixel_peak(before: float, middle: float, after: float) -> float:
-    """Where a parabola through three values peaks, from the middle one."""
+    """Return the offset of the peak of a parabola through three values from the middle one."""
     curvature = float(before) - 2.0 * float(middle) + float(after)
     return 0.5 * (float(before) - float(after)) / curvature if curvature < 0.0 else 0.0

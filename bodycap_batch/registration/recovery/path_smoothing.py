@@ -1,4 +1,4 @@
-"""Centres that pixels tell worse than motion does, moved to where both have them."""
+"""Smooth the camera centres that the observations determine less exactly than the camera's motion does."""
 
 from __future__ import annotations
 
@@ -20,26 +20,23 @@ from bodycap_batch.registration.recovery.motion_prior import (
 
 
 def smooth_weak_centres(path: Trajectory, adjustable: BoolArray | None = None) -> Trajectory:
-    """A camera's path on which the centres of weakly seen frames follow their neighbours.
+    """Move the centres of weakly observed frames towards their neighbours.
 
-    Where a violent move leaves few points, a centre is known worse than the path's own evenness from frame to
-    frame tells it. Such centres are moved to where both have them, and the turn follows as far as the points
-    tie it to the centre. Errors of all frames before and after: walk12 0.31, 0.30 cm, room12 0.54, 0.50,
-    walk131 0.37, 0.34, room131 1.78, 1.63, a rendered one with arms thrown about 1.84, 1.61 (the worst 12.8,
-    9.9). With half and twice as much unevenness room12 has 0.49 and 0.51, walk131 0.37 and 0.35.
+    Few points remain in a fast movement. A centre may then be less certain than its prediction from the
+    neighbouring frames. Such a centre becomes the weighted mean of both, and the rotation follows as far as
+    it is correlated with the centre.
 
-    At an end of a lost stretch a path is told from one side only: to be steadied after lost frames were
-    looked for. (Before it, the rendered one's worst is 14.4.)
+    At the end of a lost interval the path is known from one side only. Recovery therefore comes before
+    smoothing. Evidence: docs/decisions/registration.md.
 
     Args:
-        path: Poses of one camera, solved frame by frame.
-        movable: (N,) frames whose centres may move; all by default.
+        path: Poses of one camera, estimated frame by frame.
+        adjustable: (N,) frames whose centres may move; all by default.
 
     Returns:
-        The same with centres moved. The covariances stay: neighbours share the map's error, which smoothing
-        does not take out. With the smoothed ones walk12's normalised squared error rises from 1.4 to 2.2 an
-        axis; with these it stays. So do ``error_px`` and ``inliers``: they tell how well pixels fixed
-        the pose that was measured.
+        The trajectory with moved centres. The covariances stay: neighbouring frames share the error of the
+        map, which smoothing does not reduce. `error_px` and `inliers` stay, because they describe the
+        measured pose.
 
     Source: as for `smooth_centres`.
     """

@@ -1,4 +1,4 @@
-"""What lost frames are looked for with: poses that enough speaks for, and points where those see them."""
+"""Remove weakly supported poses next to lost intervals, and refine points from the remaining poses."""
 
 from __future__ import annotations
 
@@ -17,39 +17,41 @@ from bodycap_batch.registration.poses.keyframe_requests import lost_intervals
 from bodycap_batch.registration.poses.pnp import MAP_COVARIANCE_SCALE
 
 _WELL_SUPPORTED_FACTOR = 4
-"""Times the usual inliers with which an end of a lost stretch stands by itself."""
+"""Multiple of the usual least number of inliers with which a pose next to a lost interval is kept. Evidence:
+docs/decisions/registration.md."""
 _MAX_BOUNDARY_FRAMES = 8
-"""Frames from a lost stretch that are doubted: where little is seen all the time no more than these are."""
+"""Frames next to a lost interval that may be removed. It keeps poses of a camera that always sees little.
+Evidence: none."""
 _NOISE_PX = 0.8
-"""Of an observation, at 640 pixels' width."""
+"""Pixels at 640 px image width: standard deviation of an observation. Evidence: none."""
 _LOSS_SIGMAS, _MAX_SIGMAS = 2.0, 5.0
-"""An observation counts half at the first, and nothing in the end beyond the second, both in sigmas."""
+"""Sigmas: an observation has half of its weight at _LOSS_SIGMAS, and is removed in the end beyond
+_MAX_SIGMAS. Evidence: none."""
 _ITERATIONS, _COARSE_ITERATIONS = 10, 4
+"""Iterations of Gauss–Newton, and how many of them have strong damping. Evidence: none."""
 _COARSE_DAMPING, _FINE_DAMPING = 1e-3, 1e-6
-"""Damping as a share of a point's own information: of the first rounds and of the others."""
+"""Damping of the first and of the other iterations, as a fraction of a point's mean information. Evidence:
+none."""
 _MIN_OBSERVATIONS = 2
+"""Observations that a point needs: two lines of sight determine it."""
 _CHUNK_ROWS = 1 << 15
-"""Observations that are held at a time."""
+"""Observations held at a time. It bounds the memory."""
 
 
 def remove_weak_boundary_poses(path: Trajectory, min_inliers: int) -> Trajectory:
-    """A camera's path without poses at the ends of its lost stretches that too few points support.
+    """Remove poses next to lost intervals that too few points support.
 
-    A keyframe there hangs on points that it helped to place and on few others: they agree with it wherever it
-    is. On three captures with arms thrown about such keyframes, of 17 to 64 inliers and half a pixel, were 6
-    to 17 cm off and stated 1 to 2, and what was found beside them hung on them. They are looked for again as
-    any lost frame is.
-
-    Without and with this and `refine_points`, on the same maps, frames with a pose, their error and the
-    worst in cm: room131 370, 1.7, 7.4 and 380, 1.8, 8.6; two rendered ones 260, 3.0, 17.2 and 260, 2.0, 10.5,
-    and 250, 2.2, 12.2 and 256, 2.4, 14.9. Poses inside their 95 %: 61, 65, 59 and 67, 72, 63 of 100.
+    A keyframe there depends on points that it helped to triangulate, and on few others. Its own points agree
+    with it wherever it is. The removed frames are searched again like any lost frame. Evidence:
+    docs/decisions/registration.md.
 
     Args:
-        path: As tracking left it.
+        path: The trajectory, as tracking left it.
         min_inliers: Fewest inliers of any pose.
 
     Returns:
-        The same with those poses `UNCONFIRMED`, itself where there are none; frames that a rig carries stay.
+        The trajectory with those frames `UNCONFIRMED`, or `path` itself if there are none. Frames that are
+        supported by a rig stay.
     """
     weak = path.inliers < _WELL_SUPPORTED_FACTOR * min_inliers
     weak &= np.array([status is not FrameStatus.RIG for status in path.status], dtype=bool)
@@ -73,7 +75,10 @@ def remove_weak_boundary_poses(path: Trajectory, min_inliers: int) -> Trajectory
 
 
 def _first_supported(weak: BoolArray, frame: int, step: int) -> int:
-    """The first frame from one on that is not weak; the last one that is doubted is followed by it."""
+    """Return the first frame that is not weak, in steps from a given frame.
+
+    At most `_MAX_BOUNDARY_FRAMES` frames are passed over.
+    """
     last = frame + step * _MAX_BOUNDARY_FRAMES
     while frame != last and 0 <= frame < len(weak) and weak[frame]:
         frame += step
@@ -81,18 +86,19 @@ def _first_supported(weak: BoolArray, frame: int, step: int) -> int:
 
 
 def refine_points(scene_map: Map, paths: Sequence[Trajectory]) -> Map:
-    """The map as frames with poses see it: keyframes where these have them, and points moved to suit.
+    """Refine the points of a map from the poses of the frames.
 
-    The mapper leaves keyframes at the ends of lost stretches far from where tracking puts them (by up to 36
-    cm), and their points with them.
+    The mapper may leave keyframes at the ends of lost intervals, and with them their points, far from the
+    poses that tracking gives. Evidence: docs/decisions/registration.md.
 
     Args:
         scene_map: The map.
-        paths: Of all cameras; keyframes of those in another gauge are taken to stand where the map has them.
+        paths: Trajectories of all cameras. Keyframes of cameras in another gauge keep the poses of the map.
 
     Returns:
-        The same points, keyframes and gauge. Keyframes of lost frames stay where they are and see nothing;
-        views that do not suit are left out, and points of which fewer than two are left are seen by nobody.
+        The map with keyframes at the poses of the trajectories, refined points, and the same gauge. Keyframes
+        of lost frames keep their pose and lose their observations. Observations that do not agree are
+        removed; so are all observations of points with fewer than two left.
     """
     poses, covariance = scene_map.map_from_cam.copy(), np.zeros((len(scene_map.keyframe_frame), 6, 6))
     has_pose = np.ones(len(poses), dtype=bool)
@@ -126,7 +132,7 @@ def refine_points(scene_map: Map, paths: Sequence[Trajectory]) -> Map:
 
 
 def _mid_row_px(scene_map: Map, paths: Mapping[str, Trajectory]) -> FloatArray:
-    """Observed pixels (M,2) at the instant of the middle row, to which the poses belong."""
+    """Return the observed pixels (M,2) at the instant of the middle row, to which the poses belong."""
     out = scene_map.obs_px.copy()
     for name, readout_s in sorted(scene_map.readout_s.items()):
         path = paths.get(name)
@@ -141,7 +147,7 @@ def _mid_row_px(scene_map: Map, paths: Mapping[str, Trajectory]) -> FloatArray:
 
 
 def _split_by_point(point: IntArray) -> list[slice]:
-    """Parts of observations (M,) in order of their points, each with all of its points' own."""
+    """Split observations (M,), ordered by point, into chunks of whole points."""
     starts = np.flatnonzero(np.diff(point, prepend=-1))
     cuts = [0]
     for start in starts.tolist():
@@ -153,10 +159,20 @@ def _split_by_point(point: IntArray) -> list[slice]:
 def _refine_points_gauss_newton(
     scene_map: Map, points: FloatArray, rows: IntArray, px: FloatArray, covariance: FloatArray
 ) -> BoolArray:
-    """Move the points (P,3) that observations `rows` (M,), in order of points, see; which of these suit them.
+    """Refine the points (P,3) that some observations see, in place.
 
-    Source: Gauss–Newton under a Cauchy loss, every observation weighed by its pixel's noise and its
-        keyframe's pose's.
+    Args:
+        scene_map: The map.
+        points: (P,3) points of the map, changed in place.
+        rows: (M,) observations, ordered by point.
+        px: (M,2) their pixels.
+        covariance: (K,6,6) covariance of the keyframes' poses.
+
+    Returns:
+        (M,) which observations agree with the refined points.
+
+    Source: Gauss–Newton under a Cauchy loss. Each observation is weighted by the noise of its pixel and of
+        its keyframe's pose.
     """
     keyframe = scene_map.obs_keyframe[rows]
     point_index, starts, number = np.unique(scene_map.obs_point[rows], return_index=True, return_inverse=True)
@@ -188,7 +204,16 @@ def _refine_points_gauss_newton(
 def _single_observations(
     scene_map: Map, keyframe: IntArray, px: FloatArray
 ) -> tuple[Observations, FloatArray]:
-    """Pixels (M,2) of keyframes (M,) as views, each a frame of its own, and their noise (M,) in pixels."""
+    """Undistort pixels of keyframes, as observations in a frame of their own each.
+
+    Args:
+        scene_map: The map.
+        keyframe: (M,) keyframe of each pixel.
+        px: (M,2) pixels.
+
+    Returns:
+        The observations, and the noise (M,) of each in pixels.
+    """
     count = len(px)
     out = Observations(
         bounds=np.arange(count + 1),

@@ -1,4 +1,4 @@
-"""From where frames have poses into the stretches where they were lost, one frame after another."""
+"""Propagate poses into a lost interval, frame by frame, from the frames with poses around it."""
 
 from __future__ import annotations
 
@@ -33,31 +33,40 @@ from bodycap_batch.registration.recovery.motion_prior import (
 from bodycap_batch.registration.recovery.patch_search import Pyramid
 
 _MIN_INLIERS, _MIN_INLIER_WEIGHT_RATIO = 10, 0.45
+"""Least inliers, and least inlier weight ratio, of a pose that the propagation continues from. Evidence:
+none."""
 _SEED_MIN_INLIERS, _SEED_MIN_INLIER_WEIGHT_RATIO = 15, 0.5
+"""Least inliers, and least inlier weight ratio, of a pose at a seed. No motion supports it. Evidence:
+none."""
 _MAX_PREDICTION_DISTANCE = 16.0
-"""Squared Mahalanobis distance from where the motion leads: 99.9 % of three axes."""
+"""Squared Mahalanobis distance between the found and the predicted centre. Origin: 99.9 % of a chi-squared
+variable with three degrees of freedom."""
 _MAX_MISSES = 3
-"""Frames in a row that are not found, after which a stretch is left: by then the prediction is off by more
-than is searched."""
+"""Successive frames without a pose after which a propagation ends. The prediction is then off by more than
+the search range. Evidence: none."""
 _SEED_SIGMA_JERKS = 40.0
+"""Sigma of a seed's centre along each axis, in units of the camera's jerk sigma. Evidence: none."""
 _INITIAL_FRAMES = 6
+"""Most frames before an interval that initialise the motion filter. Evidence: none."""
 _MAX_CORNERS, _CORNER_SPACING_PX, _GRID_SIDE = 48, 12.0, 4
+"""Corners for the image motion, their least distance in pixels of the reduced image, and points along each
+side of the grid to which the camera's rotation is fitted. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LostInterval:
-    """A lost stretch and what is around it.
+    """A lost interval and the frames around it.
 
     Attributes:
-        start: Its first frame.
-        stop: One past its last.
-        times: (N,) of all the camera's frames, in frame intervals.
-        pyramids: Pictures by frame, of the frames on either side too.
-        known: Poses around it, by frame.
-        tracked: Frames whose poses tracking found.
-        seeds: Poses cam_from_map (4,4) within it that are not believed.
-        rows: Their rows in the map, by frame.
-        steadiness: How evenly the camera moves.
+        start: First lost frame.
+        stop: One past the last lost frame.
+        times: (N,) times of all frames of the camera, in frame intervals.
+        pyramids: Images by frame, including the frames on either side.
+        poses: Poses around the interval, by frame.
+        tracked_frames: Frames with a pose from tracking.
+        seed_poses: Poses cam_from_map (4,4) of keyframes in the interval that were not accepted, by frame.
+        keyframe_rows: Rows of these keyframes in the map, by frame.
+        statistics: How smoothly the camera moves.
     """
 
     start: int
@@ -71,13 +80,20 @@ class LostInterval:
     statistics: MotionStatistics
 
     def search_frame(self, frame: int) -> SearchFrame:
-        """A frame of which the picture is held."""
+        """Return a frame with its image."""
         return SearchFrame(self.pyramids[frame], self.keyframe_rows.get(frame, -1))
 
 
 @dataclass(slots=True)
 class _PropagationState:
-    """Where a walk has come to: the last frame, its pose and its turn from the one before."""
+    """State of a propagation.
+
+    Attributes:
+        frame: The last frame.
+        pose: (4,4) its pose cam_from_map.
+        rotation_step: (3,3) its rotation from the frame before.
+        motion_filter: Filter of the centre.
+    """
 
     frame: int
     pose: FloatArray
@@ -87,12 +103,12 @@ class _PropagationState:
 
 @dataclass(slots=True)
 class Propagation:
-    """Walks through a stretch from all sides.
+    """Propagation of poses through a lost interval from all sides.
 
     Attributes:
-        finder: Finds poses.
-        stretch: The stretch.
-        fixes: What was found, by direction and frame.
+        localiser: Estimates the pose of a frame near an expected one.
+        interval: The interval.
+        estimates: Poses found, by direction and frame.
     """
 
     localiser: GuidedLocaliser
@@ -100,7 +116,10 @@ class Propagation:
     estimates: dict[tuple[int, int], PoseEstimate] = field(default_factory=dict)
 
     def run(self) -> dict[int, PoseEstimate]:
-        """The best pose found for each frame, walking in from both ends and out from the seeds."""
+        """Return the best pose of each frame.
+
+        Poses are propagated inwards from both ends and outwards from the seeds.
+        """
         interval = self.interval
         for direction, end in ((1, interval.start - 1), (-1, interval.stop)):
             if end in interval.poses:
@@ -117,11 +136,7 @@ class Propagation:
             estimate = self.localiser.localise(
                 interval.search_frame(frame), [prior], NeighbourPose(prior), expected
             )
-            if (
-                estimate is None
-                or estimate.inliers < _SEED_MIN_INLIERS
-                or estimate.inlier_weight_ratio < _SEED_MIN_INLIER_WEIGHT_RATIO
-            ):
+            if estimate is None or not estimate.has_support(_SEED_MIN_INLIERS, _SEED_MIN_INLIER_WEIGHT_RATIO):
                 continue
             for direction in (1, -1):
                 self.estimates[direction, frame] = estimate
@@ -132,21 +147,18 @@ class Propagation:
         best: dict[int, PoseEstimate] = {}
         for (_, frame), estimate in sorted(self.estimates.items()):
             other = best.get(frame)
-            if (
-                other is None
-                or estimate.inliers * estimate.inlier_weight_ratio > other.inliers * other.inlier_weight_ratio
-            ):
+            if other is None or estimate.support > other.support:
                 best[frame] = estimate
         return best
 
     def second_pass(
         self, estimates: Mapping[int, PoseEstimate], positions: Mapping[int, PositionEstimate]
     ) -> dict[int, PoseEstimate]:
-        """Look once more from smoothed places, and between two frames of which one was missed.
+        """Search again from the smoothed positions, also in a single frame missed between two others.
 
         Args:
-            fixes: What `run` found.
-            places: Smoothed places of these frames and those around them.
+            estimates: The result of `run`.
+            positions: Smoothed positions of these frames and of those around them.
         """
         accepted = {}
         poses = {
@@ -164,11 +176,7 @@ class Propagation:
                 estimate = self.localiser.relocalise(
                     search_frame, poses[frame], _neighbour_pose(before, after, poses[frame])
                 )
-                estimate = max(
-                    estimates[frame],
-                    estimate or estimates[frame],
-                    key=lambda each: each.inliers * each.inlier_weight_ratio,
-                )
+                estimate = max(estimates[frame], estimate or estimates[frame], key=lambda pose: pose.support)
             elif before is not None and after is not None:
                 halfway = invert(interpolate_pose(invert(before), invert(after), 0.5))
                 rotation = halfway[:3, :3]
@@ -176,16 +184,12 @@ class Propagation:
                 estimate = self.localiser.localise(
                     search_frame, [prior], NeighbourPose(before), positions[frame]
                 )
-            if (
-                estimate is not None
-                and estimate.inliers >= _MIN_INLIERS
-                and estimate.inlier_weight_ratio >= _MIN_INLIER_WEIGHT_RATIO
-            ):
+            if estimate is not None and estimate.has_support(_MIN_INLIERS, _MIN_INLIER_WEIGHT_RATIO):
                 accepted[frame] = estimate
         return accepted
 
     def _initialised(self, end: int, direction: int) -> _PropagationState:
-        """A walk that has come through the frames with poses up to an end of the stretch."""
+        """Return a state at the end of the interval, filtered over the frames with poses before it."""
         poses = self.interval.poses
         candidates = [end - direction * number for number in range(_INITIAL_FRAMES)]
         gap = next((number for number, frame in enumerate(candidates) if frame not in poses), _INITIAL_FRAMES)
@@ -199,6 +203,7 @@ class Propagation:
         return _PropagationState(end, poses[end].cam_from_map, rotation_step, motion_filter)
 
     def _propagate(self, state: _PropagationState, direction: int) -> None:
+        """Propagate frame by frame, until too many frames are missed or the interval ends."""
         interval, misses = self.interval, 0
         while misses <= _MAX_MISSES:
             frame = state.frame + direction
@@ -213,13 +218,12 @@ class Propagation:
             neighbour = NeighbourPose(state.pose, direction)
             estimate = self.localiser.localise(interval.search_frame(frame), priors, neighbour, predicted)
             state.frame = frame
-            is_supported = (
-                estimate is not None
-                and estimate.inliers >= _MIN_INLIERS
-                and estimate.inlier_weight_ratio >= _MIN_INLIER_WEIGHT_RATIO
-            )
             fused, distance = (predicted, np.inf) if estimate is None else fuse(estimate.position, predicted)
-            if estimate is None or not is_supported or distance >= _MAX_PREDICTION_DISTANCE:
+            if (
+                estimate is None
+                or not estimate.has_support(_MIN_INLIERS, _MIN_INLIER_WEIGHT_RATIO)
+                or distance >= _MAX_PREDICTION_DISTANCE
+            ):
                 misses += 1
                 state.pose = priors[0]
                 continue
@@ -229,7 +233,10 @@ class Propagation:
             state.rotation_step, state.pose, misses = pose[:3, :3] @ state.pose[:3, :3].T, pose, 0
 
     def _candidate_rotations(self, state: _PropagationState, frame: int) -> list[FloatArray]:
-        """Rotations (3,3) the next frame may have: as the image turned, and as the camera turned before."""
+        """Return rotations (3,3) that the next frame may have.
+
+        They are the one from the image motion, if that is known, and the one of a constant angular velocity.
+        """
         rotation, lens = state.pose[:3, :3], self.localiser.lens
         previous_pyramid, pyramid = self.interval.pyramids.get(state.frame), self.interval.pyramids[frame]
         constant_rotation = [state.rotation_step @ rotation]
@@ -252,7 +259,10 @@ class Propagation:
 
 
 def _neighbour_pose(before: FloatArray | None, after: FloatArray | None, pose: FloatArray) -> NeighbourPose:
-    """The frame before, else the one after, else one as if the camera stood."""
+    """Return the pose before, else the pose after, else the frame's own pose.
+
+    The frame's own pose stands for a camera that does not move.
+    """
     if before is not None:
         return NeighbourPose(before)
     return NeighbourPose(pose) if after is None else NeighbourPose(after, -1)

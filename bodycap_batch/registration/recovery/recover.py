@@ -57,7 +57,8 @@ class RecoveryInputs:
             only one is held at a time.
         maps: The maps that the cameras were registered against.
         selection: The keyframes of the camera to recover.
-        in_rig: The poses were estimated from all cameras of a rig. They are then not prepared.
+        in_rig: The poses were estimated from all cameras of a rig. The preparation is then skipped, because
+            it would estimate them from one camera alone.
     """
 
     capture: Capture
@@ -73,7 +74,7 @@ def recover_lost_frames(
     """Recover the poses of one camera's lost frames.
 
     The steps are: remove misplaced keyframes of all cameras from the map; remove weak poses next to lost
-    intervals and refine the map points; search the lost frames.
+    intervals and refine the map points, unless the poses are those of a rig; search the lost frames.
 
     Args:
         registration: The frames of the camera, as tracking left them.
@@ -110,24 +111,25 @@ def find_lost_poses(
     options: RegistrationOptions,
     context: StageContext,
 ) -> Registration:
-    """Give lost frames the poses that can be vouched for.
+    """Search the lost frames of a camera and give them the poses that are well supported.
 
-    From both ends of a lost stretch, and from keyframes within it whose poses were not believed, the frames
-    are walked through one after another: the map's points are looked for where the motion so far leads, as
-    they look in keyframes of any camera. What is found is smoothed together with the poses around the
-    stretch: a body-worn camera's centre has little change of acceleration from frame to frame. A frame gets
-    a pose where enough points agree, its own place is near the smoothed one, and that is known well enough.
-    What is still lost beside them is walked through again from there, until nothing more is found.
+    Frames are searched one after another, from both ends of a lost interval and from keyframes in it whose
+    poses were not accepted. In each frame the map points are searched where the motion so far predicts them,
+    by their appearance in keyframes of any camera. The centres found are smoothed together with those around
+    the interval, because the acceleration of a body-worn camera changes little from frame to frame. A pose is
+    accepted if enough points agree, if its centre is near the smoothed one, and if its sigma is small. Frames
+    still lost next to accepted poses are searched again, until nothing more is found.
 
     Args:
-        found: One camera's frames as tracking left them.
-        scene_map: The map they were solved in.
+        registration: The frames of the camera, as tracking left them.
+        scene_map: The map of its poses.
         capture: All cameras.
-        options: Limits.
-        context: Progress, cancellation.
+        options: Acceptance limits.
+        context: Progress and cancellation.
 
     Returns:
-        The same with more poses, their observations not kept, and the path steadied.
+        The registration with more poses and a smoothed trajectory. Observations of recovered frames are not
+        kept.
     """
     path = registration.trajectory
     camera = capture.camera(path.camera)
@@ -153,8 +155,8 @@ def find_lost_poses(
         localised = _localised_poses(path)
         for start, stop in intervals:
             context.check_cancelled()
-            position = max(position, start)  # a further round begins in front again
-            context.progress(position, len(lost), "lost frames looked at")
+            position = max(position, start)  # a further pass starts at the first interval again
+            context.progress(position, len(lost), "lost frames searched")
             poses |= interval_search.recover_interval(start, stop, localised)
         before, path = path.localised, _merge_into(path, poses, localiser.criteria)
         intervals = _extended_intervals(path.localised, before)
@@ -168,7 +170,7 @@ def _make_localiser(
     options: RegistrationOptions,
     context: StageContext,
 ) -> GuidedLocaliser:
-    """What finds poses of a camera's frames."""
+    """Collect what a localiser needs: the keyframes of all cameras and the exposure time."""
     camera = capture.camera(path.camera)
     criteria = AcceptanceCriteria(
         max_error_px=1.0, min_inliers=options.min_inliers, max_sigma_depth=options.max_sigma_depth
@@ -187,16 +189,16 @@ def _make_localiser(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _IntervalSearch:
-    """What looking for a camera's lost frames takes.
+    """The search for the lost frames of one camera.
 
     Attributes:
         camera: The camera.
         scene_map: The map.
-        finder: Finds poses.
-        times: (N,) of its frames, in frame intervals.
-        steadiness: How evenly it moves.
-        seeds: Rows of the map's keyframes among its lost frames, by frame.
-        tracked: Frames whose poses tracking found.
+        localiser: Estimates the pose of a frame near an expected one.
+        times: (N,) times of the frames, in frame intervals.
+        statistics: How smoothly the camera moves.
+        seed_rows: Rows of the map's keyframes among the lost frames, by frame.
+        tracked_frames: Frames with a pose from tracking.
     """
 
     camera: CaptureCamera
@@ -210,7 +212,7 @@ class _IntervalSearch:
     def recover_interval(
         self, start: int, stop: int, poses: Mapping[int, PoseEstimate]
     ) -> dict[int, PoseEstimate]:
-        """Poses vouched for of the lost frames [start, stop) amid `poses` ones."""
+        """Return accepted poses of the lost frames [start, stop), given the poses around them."""
         seed_rows = {frame: row for frame, row in self.seed_rows.items() if start <= frame < stop}
         interval = LostInterval(
             start=start,
@@ -227,13 +229,13 @@ class _IntervalSearch:
 
 
 def _extended_intervals(has_pose: BoolArray, before: BoolArray) -> list[tuple[int, int]]:
-    """Stretches still lost at an end of which a pose was found."""
+    """Return the intervals that are still lost next to a new pose."""
     is_new = np.concatenate([[False], has_pose & ~before, [False]])
     return [(start, stop) for start, stop in lost_intervals(has_pose) if is_new[start] or is_new[stop + 1]]
 
 
 def _smooth(estimates: Mapping[int, PoseEstimate], interval: LostInterval) -> SmoothedCentres:
-    """Places of a stretch's frames and of those around it."""
+    """Smooth the centres of an interval together with those of the frames around it."""
     first = max(0, interval.start - _SMOOTHING_MARGIN)
     frames = np.arange(first, min(len(interval.times), interval.stop + _SMOOTHING_MARGIN))
     neighbours = {
@@ -245,7 +247,7 @@ def _smooth(estimates: Mapping[int, PoseEstimate], interval: LostInterval) -> Sm
 
 
 def _accepted_poses(propagation: Propagation, criteria: AcceptanceCriteria) -> dict[int, PoseEstimate]:
-    """Smoothed poses of the frames of a stretch that enough speaks for."""
+    """Return the smoothed poses of an interval that have enough support."""
     estimates = propagation.run()
     if not estimates:
         return {}
@@ -256,8 +258,7 @@ def _accepted_poses(propagation: Propagation, criteria: AcceptanceCriteria) -> d
         pose, covariance = estimate.conditioned_on_centre(smoothed.positions[frame])
         sigma = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
         if (
-            estimate.inliers >= criteria.min_inliers
-            and estimate.inlier_weight_ratio >= _MIN_INLIER_WEIGHT_RATIO
+            estimate.has_support(criteria.min_inliers, _MIN_INLIER_WEIGHT_RATIO)
             and smoothed.disagreement[frame] < MAX_DISAGREEMENT
             and sigma < criteria.max_sigma_depth * estimate.depth
         ):
@@ -268,14 +269,13 @@ def _accepted_poses(propagation: Propagation, criteria: AcceptanceCriteria) -> d
 def _merge_into(
     path: Trajectory, poses: Mapping[int, PoseEstimate], criteria: AcceptanceCriteria
 ) -> Trajectory:
-    """A trajectory with more poses, without those that stand alone amid lost frames."""
+    """Add poses to a trajectory, except isolated ones."""
     has_pose: BoolArray = path.localised.copy()
     inliers = path.inliers.copy()
     for frame, estimate in poses.items():
         has_pose[frame], inliers[frame] = True, estimate.inliers
-    isolated = isolated_poses(
-        has_pose, inliers, ISOLATED_INLIER_FACTOR * criteria.min_inliers
-    ) | _single_poses(has_pose)
+    min_inliers = ISOLATED_INLIER_FACTOR * criteria.min_inliers
+    isolated = isolated_poses(has_pose, inliers, min_inliers) | _single_poses(has_pose)
     matrices, covariance = path.gauge_from_cam.copy(), path.covariance.copy()
     status, error_px = list(path.status), path.error_px.copy()
     for frame, estimate in poses.items():
@@ -295,20 +295,20 @@ def _merge_into(
 
 
 def _single_poses(has_pose: BoolArray) -> BoolArray:
-    """(N,) frames with a pose that neither neighbour has."""
+    """Return the frames (N,) with a pose of which neither neighbour has one."""
     padded = np.concatenate([[False], has_pose, [False]])
     return np.asarray(has_pose & ~padded[:-2] & ~padded[2:])
 
 
 def _localised_poses(path: Trajectory) -> dict[int, PoseEstimate]:
-    """Poses that tracking found, by frame."""
+    """Return the poses of a trajectory, by frame."""
     return {
         frame: PoseEstimate.from_trajectory(path, frame) for frame in np.flatnonzero(path.localised).tolist()
     }
 
 
 def _seed_keyframes(scene_map: Map, camera: str, lost: BoolArray) -> dict[int, int]:
-    """Rows of the map's keyframes among a camera's lost frames, by frame."""
+    """Return the rows of the map's keyframes among the lost frames of a camera, by frame."""
     rows = scene_map.keyframes_of(camera)
     frames = scene_map.keyframe_frame[rows]
     return {int(frame): int(row) for row, frame in zip(rows, frames, strict=True) if lost[frame]}

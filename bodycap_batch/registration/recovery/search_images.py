@@ -26,7 +26,8 @@ from bodycap_batch.registration.recovery.patch_search import (
 _MAX_KEYFRAMES = 600
 """Keyframes held in memory, half a megabyte each. Origin: the memory limit of the task."""
 _MAX_DISTANCE_FRAMES = 90
-"""Frames: farthest distance of a searched frame from an end of its interval or from a seed. Evidence: none."""
+"""Frames: farthest distance of a searched frame from an end of its interval or from a seed. Evidence:
+none."""
 _MAX_FRAMES = 400
 """Frames of one interval held in memory; the nearest to an end or a seed are kept. Origin: the memory limit
 of the task."""
@@ -34,8 +35,9 @@ _EXPOSURE_CANDIDATES = (0.0, 0.3, 0.6)
 """Exposure times tried, as a fraction of the frame interval. Evidence: none."""
 _EXPOSURE_FRAMES = 4
 """Fastest frames with a pose that are compared for each exposure time. Evidence: none."""
-_EXPOSURE_LEVEL = SearchLevel(pyramid_level=1, patch_side=21, search_radius=4, score=-1.0, limit_px=6.0)
-"""Search for the comparison of exposure times; a score of -1 accepts every correlation. Evidence: none."""
+_EXPOSURE_LEVEL = SearchLevel(pyramid_level=1, patch_side=21, search_radius=4, min_score=-1.0, limit_px=6.0)
+"""Search for the comparison of exposure times; a least correlation of -1 accepts every match. Evidence:
+none."""
 
 
 def read_keyframe_patches(
@@ -98,7 +100,20 @@ def read_pyramids(
 
 
 def estimate_exposure(camera: CaptureCamera, localiser: GuidedLocaliser, path: Trajectory) -> float:
-    """Share of the time between two frames that the shutter is open, as blurred frames with poses show it."""
+    """Estimate the exposure time from blurred frames that have a pose.
+
+    The map points are searched in the fastest frames, blurred for each candidate time. The time with the
+    highest sum of correlations is selected. Masked pixels do not count: the wearer's sleeve, still in front
+    of the camera, looks like a short exposure.
+
+    Args:
+        camera: The camera.
+        localiser: Its localiser, with any exposure time.
+        path: Its poses.
+
+    Returns:
+        Exposure time as a fraction of the frame interval.
+    """
     has_pose = path.localised
     pairs = np.flatnonzero(has_pose[1:] & has_pose[:-1]) + 1
     rotations = path.gauge_from_cam[:, :3, :3]

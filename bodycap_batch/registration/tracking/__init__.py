@@ -1,1 +1,1 @@
-"""Map points tracked from keyframes into the frames between them."""
+"""Track map points from keyframes into the frames between them."""

@@ -1,4 +1,4 @@
-"""Which stretches of a video are tracked, and which are known from an earlier round."""
+"""Decide which intervals of a video are tracked, and reuse the tracks of an earlier round."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from bodycap_batch.model.scene import FrameStatus, Registration
 from bodycap_batch.registration.tracking.klt import KeyframePoints, Tracks, track_range
 
 _MIN_RANGE_FRAMES = 15
-"""A shorter rest is not worth a decoder of its own."""
+"""Frames: a shorter rest is not worth a decoder of its own. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackCache:
-    """What was tracked before.
+    """The tracks of an earlier round.
 
     Attributes:
         tracks: The observations.
-        keyframes: The frames they were tracked from and between, increasing.
+        keyframes: Frame indices of the keyframes they were tracked from and between, increasing.
     """
 
     tracks: Tracks
@@ -32,7 +32,7 @@ class TrackCache:
 
     @staticmethod
     def from_registration(previous: Registration | None) -> TrackCache | None:
-        """What an earlier registration tracked."""
+        """Return the tracks of an earlier registration; None if there is none."""
         if previous is None:
             return None
         status = previous.trajectory.status
@@ -47,7 +47,14 @@ def track_all(
     cache: TrackCache | None,
     context: StageContext,
 ) -> Tracks:
-    """Track every stretch between neighbouring keyframes, or reuse what was tracked there before."""
+    """Track every interval between successive keyframes, or reuse the tracks of an earlier round.
+
+    Args:
+        camera: The camera.
+        points_by_keyframe: Map points of the keyframes, by frame index.
+        cache: Tracks of an earlier round, reused in intervals between the same two keyframes.
+        context: Threads, progress and cancellation.
+    """
     count = len(camera.times_ns)
     frames = sorted(points_by_keyframe)
     intervals = list(zip([None, *frames], [*frames, None], strict=True))
@@ -62,7 +69,7 @@ def track_all(
     parts += _track_ranges(
         camera, points_by_keyframe, _split_by_thread(missing, frames, context.threads), context
     )
-    tracks = Tracks.join_and_clear(parts)  # which takes them out one by one: nothing else may hold them
+    tracks = Tracks.join_and_clear(parts)  # nothing else may hold the parts: it releases them one by one
     context.progress(0, 0, "poses")
     return tracks
 
@@ -73,7 +80,7 @@ def _track_ranges(
     ranges: list[tuple[int, int]],
     context: StageContext,
 ) -> list[Tracks]:
-    """Track ranges of frames, as many at a time as there are threads; what is found is the same."""
+    """Track ranges of frames, one on each thread at a time. The result does not depend on the threads."""
     stopped, lock = Event(), Lock()
     total = sum(stop - start for start, stop in ranges)
     position = [start for start, _ in ranges]
@@ -104,7 +111,7 @@ def _track_ranges(
 def _split_by_thread(
     ranges: list[tuple[int, int]], keyframes: list[int], threads: int
 ) -> list[tuple[int, int]]:
-    """Cut ranges at keyframes where they are longer than a thread's even share."""
+    """Split ranges at keyframes if they are longer than an even share of the threads."""
     total = sum(stop - start for start, stop in ranges)
     thread_frames = -(-total // max(1, threads))
     out = []
@@ -119,7 +126,7 @@ def _split_by_thread(
 
 
 def _merge_ranges(intervals: list[tuple[int | None, int | None]], count: int) -> list[tuple[int, int]]:
-    """Merge stretches that touch into ranges [start, stop) of frames, keyframes included."""
+    """Merge intervals that touch into ranges [start, stop) of frames, keyframes included."""
     ranges: list[tuple[int, int]] = []
     for first, last in intervals:
         start, stop = first or 0, count if last is None else last + 1
@@ -131,14 +138,14 @@ def _merge_ranges(intervals: list[tuple[int | None, int | None]], count: int) ->
 
 
 def _reusable(tracks: Tracks, intervals: list[tuple[int | None, int | None]], count: int) -> Tracks:
-    """Tracks from a keyframe at an end of one of the stretches to where they lie in it.
+    """Select the tracks from the keyframes at the ends of some intervals that lie inside these intervals.
 
-    A keyframe ends two stretches: what was tracked into it across one that is tracked again is left out, or
-    it would count twice.
+    A keyframe belongs to two intervals. Tracks from it into an interval that is tracked again are left out,
+    because they would count twice.
     """
     kept_frames = np.zeros(
         (count, 2), dtype=np.int64
-    )  # how far back and ahead of a keyframe its tracks are kept
+    )  # frames before and after a keyframe in which its tracks are kept
     for first, last in intervals:
         if first is not None:
             kept_frames[first, 1] = (count if last is None else last) - first

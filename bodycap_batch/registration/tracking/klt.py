@@ -1,4 +1,4 @@
-"""Carry the map's points from keyframes into the frames between them, from both sides."""
+"""Track map points from keyframes into the frames between them, from both sides, with the KLT tracker."""
 
 from __future__ import annotations
 
@@ -27,23 +27,32 @@ from bodycap_batch.model.optical_flow import (
 from bodycap_batch.model.scene import Map
 
 _MAX_TRACKS = 250
+"""Map points tracked from a keyframe. Evidence: none."""
 _GRID_CELLS = 8
+"""Cells along each side of the image over which these points are spread. Evidence: none."""
 _MAX_BUFFERED_FRAMES = 90
-"""Frames held in memory for the way back from a keyframe; bounds memory where keyframes are far apart."""
+"""Frames held in memory for tracking back from a keyframe. It bounds the memory if keyframes are far
+apart."""
 _MIN_TRACKS = 6
+"""Fewer tracks are not continued. Origin: too few for a pose."""
 _MAX_CLOSURE_PX = 2.0
+"""Pixels at 640 px image width: largest distance at which a track has arrived at a keyframe's own
+observation. Evidence: none."""
 _MIN_MOTION_POINTS = 48
+"""Points from which the motion of the whole image is estimated; corners are detected if fewer are tracked.
+Evidence: none."""
 _CORNER_SPACING_PX = 12.0
+"""Least distance of these corners, in pixels of the reduced image. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframePoints:
-    """The map points a keyframe observes.
+    """The map points that a keyframe observes.
 
     Attributes:
         feature: (N,) feature index in the keyframe.
-        point: (N,) the map's points.
-        px: (N,2) float32 where it sees them.
+        point: (N,) index of the map point.
+        px: (N,2) float32 observed pixel.
     """
 
     feature: IntArray
@@ -51,13 +60,13 @@ class KeyframePoints:
     px: Pixels
 
     def select(self, mask: npt.NDArray[Any]) -> KeyframePoints:
-        """Keep the points under a mask."""
+        """Return the points under a mask."""
         return KeyframePoints(self.feature[mask], self.point[mask], self.px[mask])
 
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """Observations of map points in frames, named by the keyframe feature they come from.
+    """Observations of map points in frames, named by the keyframe feature they start from.
 
     Attributes:
         frame: (M,) frame index.
@@ -73,9 +82,10 @@ class Tracks:
 
     @staticmethod
     def join_and_clear(parts: list[Tracks]) -> Tracks:
-        """Concatenate, ordered by frame, keyframe and feature; the list is emptied.
+        """Concatenate tracks, ordered by frame, keyframe and feature, and clear the list.
 
-        One field after the other lets go of its parts: ten minutes of video have 260 MB of observations.
+        The memory of the parts is released field by field, because a long video has many observations.
+        Evidence: docs/decisions/registration.md.
         """
         if not parts:
             none = np.zeros(0, np.int64)
@@ -94,21 +104,24 @@ class Tracks:
         feature = feature[order]
         px = px[order]
         for field in (frame, keyframe, feature, px):
-            field.flags.writeable = False  # so that a registration takes them as they are
+            field.flags.writeable = False  # so that a registration does not copy them
         return Tracks(frame, keyframe, feature, px)
 
     def in_frames(self, first: int, stop: int) -> Tracks:
-        """Those in frames from `first` on and before `stop`, of tracks that are ordered by frame."""
+        """Return the observations in frames first <= frame < stop; the tracks must be ordered by frame."""
         low, high = np.searchsorted(self.frame, [first, stop]).tolist()
         return self.select(slice(low, high))
 
     def select(self, mask: npt.NDArray[Any] | slice) -> Tracks:
-        """Keep the observations under a mask."""
+        """Return the observations under a mask."""
         return Tracks(self.frame[mask], self.keyframe[mask], self.feature[mask], self.px[mask])
 
 
 def select_keyframe_points(scene_map: Map, camera: str) -> dict[int, KeyframePoints]:
-    """The best spread, longest seen map points of each of a camera's keyframes, by frame index."""
+    """Select map points of each keyframe of a camera, spread over the image, by frame index.
+
+    Points that many keyframes observe are preferred.
+    """
     keyframe_count = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))
     lens = scene_map.cameras[camera]
     order = np.argsort(scene_map.obs_keyframe, kind="stable")
@@ -132,7 +145,7 @@ def select_keyframe_points(scene_map: Map, camera: str) -> dict[int, KeyframePoi
 
 
 def grid_sample(cell: IntArray, score: IntArray, count: int) -> IntArray:
-    """Rows of up to `count` items, taken from the cells in turn, the most valuable first."""
+    """Return the rows of up to `count` items, taken from the cells in turn, highest score first."""
     order = np.lexsort((-score, cell))
     sorted_cells = cell[order]
     cell_start = np.searchsorted(sorted_cells, sorted_cells)
@@ -161,10 +174,10 @@ class _ActiveTracks:
     """Tracks alive in the newest frame.
 
     Attributes:
-        keyframe: Frame index they come from.
-        anchor: What they began as.
-        slot: (N,) which of the anchor's points they are, increasing.
-        px: (N,2) where they are now.
+        keyframe: Frame index of the keyframe they start from.
+        start: The points they started from.
+        rows: (N,) their rows among these points, increasing.
+        px: (N,2) current pixel.
     """
 
     keyframe: int
@@ -174,15 +187,16 @@ class _ActiveTracks:
 
     @staticmethod
     def start_at(keyframe: int, keyframe_points: KeyframePoints) -> _ActiveTracks:
-        """Begin in a keyframe."""
+        """Start tracks in a keyframe."""
         return _ActiveTracks(
             keyframe, keyframe_points, np.arange(len(keyframe_points.px)), keyframe_points.px
         )
 
     def advance(self, first: _VideoFrame, second: _VideoFrame, motion: ImageMotion | None) -> bool:
-        """Follow the tracks into a frame; False once too few are left."""
+        """Follow the tracks into a frame; return False if too few are left."""
         guess = None if motion is None else apply_homography(self.px, motion.homography)
-        # A track that slips disagrees with the pose: the way back is followed only where many would.
+        # A slipped track is rejected by the pose later. Tracking back is only worth its cost if many would
+        # slip.
         with_check = motion is None or not motion.is_reliable
         tracked = track_points(first.grey, second.grey, self.px, guess, with_check=with_check)
         keep = tracked.ok & second.camera.is_unmasked(tracked.px)
@@ -190,7 +204,7 @@ class _ActiveTracks:
         return len(self.rows) >= _MIN_TRACKS
 
     def observe(self, frame: int) -> Tracks:
-        """What the tracks see in the frame they are in."""
+        """Return the observations in the current frame."""
         return _make_tracks(frame, self.keyframe, self.start.feature[self.rows], self.px)
 
 
@@ -199,10 +213,10 @@ class _BufferedFrame:
     """A frame on the way to the next keyframe.
 
     Attributes:
-        picture: The frame.
-        motion: From the next frame into it.
-        slot: (N,) forward tracks alive in it.
-        px: (N,2) where they were.
+        frame: The frame.
+        motion: Image motion from the next frame to this one.
+        rows: (N,) rows of the forward tracks alive in it.
+        px: (N,2) their pixels.
     """
 
     frame: _VideoFrame
@@ -212,6 +226,7 @@ class _BufferedFrame:
 
 
 def _make_tracks(frame: int, keyframe: int, feature: IntArray, px: Pixels) -> Tracks:
+    """Return the observations of one frame."""
     count = len(feature)
     return Tracks(np.full(count, frame, np.int64), np.full(count, keyframe, np.int64), feature, px)
 
@@ -225,12 +240,12 @@ def track_range(
 ) -> Iterator[Tracks]:
     """Track from every keyframe in [start, stop) forward to the next one and back to the one before.
 
-    Memory is bounded by `_MAX_BUFFERED_FRAMES` frames. Yields the observations found, in no particular order.
+    At most `_MAX_BUFFERED_FRAMES` frames are held in memory. The observations are yielded in no fixed order.
 
     Args:
-        camera: Video.
-        anchors: Keyframes of the map by frame index.
-        start: First frame; tracking forward begins at the first keyframe at or after it.
+        camera: The camera.
+        points_by_keyframe: Map points of the keyframes, by frame index.
+        start: First frame. Forward tracking starts at the first keyframe at or after it.
         stop: One past the last frame.
         context: Cancellation.
     """
@@ -259,6 +274,7 @@ def track_range(
 
 
 def _buffer(frame: _VideoFrame, motion: ImageMotion | None, active: _ActiveTracks | None) -> _BufferedFrame:
+    """Keep a frame for tracking back from the next keyframe."""
     backward = None if motion is None else motion.inverse()
     if active is None:
         return _BufferedFrame(frame, backward, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
@@ -268,13 +284,12 @@ def _buffer(frame: _VideoFrame, motion: ImageMotion | None, active: _ActiveTrack
 def _close_tracks(
     active: _ActiveTracks, keyframe: int, keyframe_points: KeyframePoints, buffered: deque[_BufferedFrame]
 ) -> Generator[Tracks, None, BoolArray]:
-    """Tracks that arrive where the next keyframe sees the same point, told from that keyframe's side.
+    """Shift tracks that arrive at the next keyframe's observation of the same point, so that they end in it.
 
-    Tracking such a point back would retrace the same path: it is moved to end in the keyframe's own
-    observation instead.
+    Tracking such a point back from the keyframe would only retrace the same path.
 
     Returns:
-        (N,) which of the keyframe's points that covers.
+        (N,) True for the keyframe's points that need no tracking back.
     """
     _, active_rows, point_rows = np.intersect1d(
         active.start.point[active.rows], keyframe_points.point, return_indices=True
@@ -297,6 +312,7 @@ def _close_tracks(
 def _estimate_motion(
     first: _VideoFrame, second: _VideoFrame, active: _ActiveTracks | None
 ) -> ImageMotion | None:
+    """Estimate the motion of the whole image from the active tracks, or from corners if these are few."""
     if active is not None and len(active.px) >= _MIN_MOTION_POINTS:
         points = active.px
     else:
@@ -308,6 +324,7 @@ def _estimate_motion(
 def _track_back(
     frame: _VideoFrame, keyframe_points: KeyframePoints, buffered: deque[_BufferedFrame]
 ) -> Iterator[Tracks]:
+    """Track points of a keyframe back through the buffered frames."""
     active = _ActiveTracks.start_at(frame.index, keyframe_points)
     later = frame
     for item in reversed(buffered):
@@ -318,5 +335,5 @@ def _track_back(
 
 
 def camera_pixel_scale(camera: CaptureCamera) -> float:
-    """Factor on pixel thresholds for this camera."""
+    """Return the factor on pixel thresholds for a camera."""
     return pixel_scale(camera.camera.width_px, camera.camera.height_px)

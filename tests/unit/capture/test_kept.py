@@ -66,7 +66,7 @@ def test_keyframes_are_kept_bit_by_bit_and_need_no_video(tmp_path: Path, pix_fmt
     assert_same(both(kept, CHOSEN), wanted)
 
 
-@pytest.mark.parametrize("told", [0, 1, 2], ids=["range not told", "studio range", "full range"])
+@pytest.mark.parametrize("reported", [0, 1, 2], ids=["range not reported", "studio range", "full range"])
 @pytest.mark.parametrize(
     ("pix_fmt", "off"),
     [
@@ -74,11 +74,13 @@ def test_keyframes_are_kept_bit_by_bit_and_need_no_video(tmp_path: Path, pix_fmt
         *((name, 1) for name in ("yuv420p10le", "yuv422p10le", "rgb24", "bgr0", "gbrp")),
     ],
 )
-def test_luma_of_any_format_is_kept_in_the_range_that_is_told(pix_fmt: str, off: int, told: int) -> None:
+def test_luma_of_any_format_is_kept_in_the_range_that_is_reported(
+    pix_fmt: str, off: int, reported: int
+) -> None:
     ramp = np.tile(np.arange(256, dtype=np.uint8), (16, 1))
     frame = av.VideoFrame.from_ndarray(np.stack([ramp, ramp[::-1], 255 - ramp], axis=-1), format="rgb24")
     frame = frame.reformat(format=pix_fmt)
-    frame.color_range = told
+    frame.color_range = reported
     upright = ((1, 0), (0, 1))
     grey = work_image(frame, upright, (256, 16), colour=False)
     kept = grey_from_planes(work_planes(frame, upright, (256, 16)), (256, 16))
@@ -100,7 +102,7 @@ def test_one_frame_more_is_read_from_the_video_in_its_place(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("size", [0, 2000])
-def test_copies_that_cannot_be_read_are_replaced_by_the_video_and_told(
+def test_copies_that_cannot_be_read_are_replaced_by_the_video_and_reported(
     tmp_path: Path, size: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     camera = opened(write_video(tmp_path / "a.mp4", noisy_frames(64, 48)))

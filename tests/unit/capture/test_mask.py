@@ -35,9 +35,9 @@ def test_a_mask_is_read_at_the_size_of_the_picture(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("image", "reason"),
     [
-        (np.full((480, 480), 255, np.uint8), "another shape"),
+        (np.full((480, 480), 255, np.uint8), "aspects differ"),
         (np.zeros((480, 640), np.uint8), "inverted"),
-        (None, "no image"),
+        (None, "not an image"),
     ],
 )
 def test_a_useless_mask_is_refused_with_its_reason(

@@ -9,12 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bodycap_batch.capture import CaptureCamera, open_camera, open_capture, rolling_shutter_delay_s
+from bodycap_batch.capture import CaptureCamera, open_camera, open_capture
 from bodycap_batch.capture.timeline import read_timestamps
 from bodycap_batch.config.folder import natural_key
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.model.rolling_shutter import row_delay
 from tests.videos import textured_frame, write_video
 
 FRAMES = [textured_frame(index) for index in range(12)]
@@ -36,10 +37,10 @@ def test_rows_are_exposed_one_after_the_other(tmp_path: Path) -> None:
     camera = opened(
         write_video(tmp_path / "a.mp4", FRAMES), camera={"offset_s": 0.12, "rolling_shutter_s": 0.020}
     )
-    rows = camera.row_times_ns(3, [0, 24, 48])
-    middle = int(camera.common_times_ns()[3])
-    assert (rows - middle).tolist() == [-10_000_000, 0, 10_000_000]
-    assert rolling_shutter_delay_s(480, 480, 0.02) == pytest.approx(0.01)
+    delay_s = (
+        row_delay(camera.camera, np.array([[5.0, 0.0], [5.0, 24.0], [5.0, 48.0]])) * camera.rolling_shutter_s
+    )
+    np.testing.assert_allclose(delay_s, [-0.01, 0.0, 0.01])
 
 
 def test_a_turned_sensor_is_read_the_other_way(tmp_path: Path) -> None:
@@ -57,8 +58,8 @@ def test_a_quarter_turn_shows_the_sensors_rows_as_columns(tmp_path: Path, rotati
     camera = opened(path, camera={"rolling_shutter_s": 0.02})
     _, shown = next(camera.grey_frames())
     first, last = (4, 44) if shown[:, 4].mean() > shown[:, 44].mean() else (44, 4)
-    times = camera.row_times_ns(3, [first, last])
-    assert times[0] < camera.common_times_ns()[3] < times[1]
+    delay_s = row_delay(camera.camera, np.array([[first, 5.0], [last, 5.0]])) * camera.rolling_shutter_s
+    assert delay_s[0] < 0.0 < delay_s[1]
     assert (camera.camera.sideways, camera.may_be_sideways, camera.notes) == (True, True, ())
     # Not stated, the data tell which way it is read.
     free = opened(path)
@@ -89,11 +90,11 @@ def test_a_sidecar_decides(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("lines", "message", "line"),
     [
-        ("0.0\n0.1\nhalf\n", "is no time", 3),
+        ("0.0\n0.1\nhalf\n", "is not a time", 3),
         ("0.0\n0.1\n0.1\n", "does not come after", 3),
         ("0.2\n0.1\n", "does not come after", 2),
-        ("nan\n", "is no time", 1),
-        ("1e400\n", "is no time", 1),
+        ("nan\n", "is not a time", 1),
+        ("1e400\n", "is not a time", 1),
         ("0\n1\n2\n", "3 timestamps for 12 frames", None),
         ("", "0 timestamps for 12 frames", None),
     ],

@@ -172,7 +172,7 @@ def remuxed(source: Path, target: Path, shift: int = 0, skip: int = 0, **options
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("codec", ["libx264", "mpeg4", "libx265"])
-def test_frames_that_nothing_is_built_on_are_passed_over(
+def test_frames_that_no_other_depends_on_are_skipped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, codec: str, threads: int
 ) -> None:
     camera = replace(opened(write_video(tmp_path / "a.mp4", FRAMES, codec=codec, gop=40)), threads=threads)

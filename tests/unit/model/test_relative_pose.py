@@ -158,7 +158,7 @@ def test_a_camera_that_sees_nothing_is_carried_and_says_so() -> None:
     assert np.sqrt((error_m**2).mean()) < 0.004
 
 
-def test_a_keyframe_that_sees_too_little_is_no_less_carried() -> None:
+def test_a_keyframe_with_few_observations_is_supported_by_the_rig() -> None:
     scene_map, (first, second) = _rig()
     kept = (scene_map.obs_keyframe != 1) | (np.cumsum(scene_map.obs_keyframe == 1) <= 5)
     poor = replace(
@@ -172,9 +172,7 @@ def test_a_keyframe_that_sees_too_little_is_no_less_carried() -> None:
     assert found.status[KEYFRAMES[1]] is FrameStatus.RIG
 
 
-def test_what_the_rig_left_outlasts_the_search_for_lost_frames(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_relative_poses_of_the_rig_survive_recovery(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene_map, cameras = _rig()
     folders = [tmp_path / each.camera.name for each in cameras]
     for folder, each in zip(folders, cameras, strict=True):
@@ -225,7 +223,7 @@ def test_cameras_out_of_step_are_left_as_they_are() -> None:
     assert _solved(scene_map, first, late) is first.registration
 
 
-def test_the_mean_place_is_robust_and_tells_its_spread() -> None:
+def test_the_mean_relative_pose_is_robust_and_reports_its_spread() -> None:
     _, (first, second) = _rig()
     poses = second.registration.trajectory.gauge_from_cam.copy()
     poses[::4, :3, 3] += 1.0

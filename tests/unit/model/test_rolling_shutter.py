@@ -145,8 +145,8 @@ def readouts_of(film: Film, camera: Any) -> tuple[Any, Any]:
     model = RollingShutterModel(
         the_map(film, range(1, FRAMES, 5)), {"head": film.trajectory()}, {"head": camera}
     )
-    model, told = estimate_readouts(model, {"head": camera}, mapper_options(MapOptions(), [1], 1.0), [1])
-    return model, told["head"]
+    model, reported = estimate_readouts(model, {"head": camera}, mapper_options(MapOptions(), [1], 1.0), [1])
+    return model, reported["head"]
 
 
 def found(readout_s: float, *, known: bool = False, stated_s: float = 0.0) -> Any:
@@ -176,21 +176,21 @@ def test_a_stated_readout_time_is_not_looked_for() -> None:
 
 @pytest.mark.parametrize("sideways", [False, True])
 @pytest.mark.parametrize("readout_s", [0.02, -0.02, 0.0])
-def test_the_data_tell_which_way_a_turned_sensor_is_read(readout_s: float, sideways: bool) -> None:
+def test_the_direction_of_a_turned_sensor_is_estimated(readout_s: float, sideways: bool) -> None:
     film = Film(readout_s, sideways)
-    model, told = readouts_of(film, camera_of(film, may_be_sideways=True))
-    assert told.source == ("estimated" if readout_s else "none found")
-    assert abs(told.seconds - readout_s) <= 0.1 * abs(readout_s)
-    assert told.sideways == (sideways and readout_s != 0.0)
+    model, reported = readouts_of(film, camera_of(film, may_be_sideways=True))
+    assert reported.source == ("estimated" if readout_s else "none found")
+    assert abs(reported.seconds - readout_s) <= 0.1 * abs(readout_s)
+    assert reported.sideways == (sideways and readout_s != 0.0)
     # Moved pixels lie where the true poses see their points, but for noise and the velocities' curvature.
-    assert misfit_px(model.moved({"head": told.seconds}), film) < 1.0
+    assert misfit_px(model.moved({"head": reported.seconds}), film) < 1.0
     assert readout_s == 0.0 or misfit_px(model.moved({}), film) > 1.5
 
 
 def test_a_stated_readout_runs_the_way_the_video_is_turned() -> None:
     film = Film(0.02, sideways=True)
-    _, told = readouts_of(film, camera_of(film, known=True, stated_s=0.02, may_be_sideways=True))
-    assert (told.seconds, told.source, told.sideways) == (0.02, "stated", True)
+    _, reported = readouts_of(film, camera_of(film, known=True, stated_s=0.02, may_be_sideways=True))
+    assert (reported.seconds, reported.source, reported.sideways) == (0.02, "stated", True)
 
 
 def test_a_stated_readout_keeps_its_way_where_none_could_be_looked_for(
@@ -201,16 +201,16 @@ def test_a_stated_readout_keeps_its_way_where_none_could_be_looked_for(
 
     monkeypatch.setattr(RollingShutterModel, "find", fails)
     film = Film(0.02, sideways=True)
-    _, told = readouts_of(film, camera_of(film, known=True, stated_s=0.02, may_be_sideways=True))
-    assert (told.seconds, told.sideways) == (0.02, True)
-    _, told = readouts_of(film, camera_of(film, may_be_sideways=True))
-    assert (told.seconds, told.source) == (0.0, "not determined: no convergence")
+    _, reported = readouts_of(film, camera_of(film, known=True, stated_s=0.02, may_be_sideways=True))
+    assert (reported.seconds, reported.sideways) == (0.02, True)
+    _, reported = readouts_of(film, camera_of(film, may_be_sideways=True))
+    assert (reported.seconds, reported.source) == (0.0, "not determined: no convergence")
 
 
 def test_a_sensor_that_was_not_turned_is_read_along_rows_alone() -> None:
     film = Film(0.02, sideways=True)
-    _, told = readouts_of(film, camera_of(film))
-    assert not told.sideways
+    _, reported = readouts_of(film, camera_of(film))
+    assert not reported.sideways
 
 
 def test_a_map_says_which_way_its_sensors_are_read() -> None:
@@ -228,11 +228,11 @@ def test_a_map_says_which_way_its_sensors_are_read() -> None:
         obs_feature=np.zeros(0, np.int64),
         obs_px=np.zeros((0, 2)),
     )
-    told = {
+    reported = {
         "head": Readout(0.02, 0.0, "stated", 0.02, True),
         "torso": Readout(0.0, 1.0, "none found", 0.0, True),
     }
-    read = map_with_readouts(scene, told)
+    read = map_with_readouts(scene, reported)
     assert read.readout_s == {"head": 0.02}
     assert {name: lens.sideways for name, lens in read.cameras.items()} == {"head": True, "torso": False}
 
@@ -266,7 +266,7 @@ def test_the_fastest_keyframes_are_looked_at() -> None:
     assert set(np.diff(frames)) == {2}, "one run of successive keyframes"
 
 
-def test_errors_are_told_where_the_poses_hold() -> None:
+def test_errors_are_reported_where_the_poses_hold() -> None:
     film = Film(0.02)
     frame = 40
     points, px = film.seen(frame)

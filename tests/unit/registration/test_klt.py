@@ -1,4 +1,4 @@
-"""Tracks between keyframes: told from both sides, the same whatever the number of threads."""
+"""Tracks between keyframes, from both sides; the number of threads does not change them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COUNT = 48
 CONTEXT = StageContext(work_dir=Path())
 
 
-def _video(seen_to_px: float = 640.0) -> CaptureCamera:
+def _video(visible_to_px: float = 640.0) -> CaptureCamera:
     """A textured plane that slides by `STEP_PX` a frame; a mask covers what is right of a column."""
     noise = np.random.default_rng(0).random((480, 640)).astype(np.float32)
     texture = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.5), None, 0, 255, cv2.NORM_MINMAX)
@@ -37,14 +37,14 @@ def _video(seen_to_px: float = 640.0) -> CaptureCamera:
         for index in range(*slice(start, stop).indices(COUNT)):
             yield index, images[index].astype(np.uint8)
 
-    def sees_room(px: np.ndarray) -> np.ndarray:
-        return px[:, 0] < seen_to_px
+    def is_unmasked(px: np.ndarray) -> np.ndarray:
+        return px[:, 0] < visible_to_px
 
-    video = SimpleNamespace(times_ns=np.arange(COUNT), grey_frames=grey_frames, is_unmasked=sees_room)
+    video = SimpleNamespace(times_ns=np.arange(COUNT), grey_frames=grey_frames, is_unmasked=is_unmasked)
     return cast("CaptureCamera", video)
 
 
-def _anchors(frames: list[int]) -> dict[int, KeyframePoints]:
+def _keyframe_points(frames: list[int]) -> dict[int, KeyframePoints]:
     """A grid of points of the plane in each keyframe; a keyframe's detector is off by up to half a pixel."""
     rng = np.random.default_rng(1)
     grid = np.stack(np.meshgrid(np.arange(-120, 640, 40), np.arange(0, 600, 40)), axis=-1).reshape(-1, 2)
@@ -57,11 +57,11 @@ def _anchors(frames: list[int]) -> dict[int, KeyframePoints]:
     return out
 
 
-def _shift_from_anchor(tracks: Tracks, anchors: dict[int, KeyframePoints]) -> np.ndarray:
+def _shift_from_start(tracks: Tracks, points_by_keyframe: dict[int, KeyframePoints]) -> np.ndarray:
     """(M,2) how much further each observation moved than the plane did."""
     began = np.array(
         [
-            anchors[k].px[f // 2]
+            points_by_keyframe[k].px[f // 2]
             for k, f in zip(tracks.keyframe.tolist(), tracks.feature.tolist(), strict=True)
         ]
     )
@@ -69,64 +69,72 @@ def _shift_from_anchor(tracks: Tracks, anchors: dict[int, KeyframePoints]) -> np
 
 
 def test_points_are_followed_from_both_keyframes_and_end_in_their_observations() -> None:
-    anchors = _anchors([4, 20])
-    tracks = Tracks.join_and_clear(list(track_range(_video(), anchors, 0, 30, CONTEXT)))
+    points_by_keyframe = _keyframe_points([4, 20])
+    tracks = Tracks.join_and_clear(list(track_range(_video(), points_by_keyframe, 0, 30, CONTEXT)))
     # Up to 16 steps of a few hundredths of a pixel each, and a wrapped border that enters some windows.
-    assert np.median(np.linalg.norm(_shift_from_anchor(tracks, anchors), axis=1)) < 0.15
+    assert np.median(np.linalg.norm(_shift_from_start(tracks, points_by_keyframe), axis=1)) < 0.15
     for frame in (5, 12, 19):
         for keyframe in (4, 20):
             mine = (tracks.frame == frame) & (tracks.keyframe == keyframe)
-            assert mine.sum() > 0.7 * len(anchors[keyframe].px)
+            assert mine.sum() > 0.7 * len(points_by_keyframe[keyframe].px)
             assert len(np.unique(tracks.feature[mine])) == mine.sum()
     assert set(np.unique(tracks.frame[tracks.keyframe == 20])) == set(range(30)) - {20} - set(range(4))
 
 
-def test_a_point_seen_elsewhere_by_the_next_keyframe_is_followed_on_its_own() -> None:
-    anchors = _anchors([4, 12])
-    shared = np.isin(anchors[12].point, anchors[4].point)
-    other = np.roll(anchors[12].point, 1)
-    wrong = KeyframePoints(anchors[12].feature, np.where(shared, other, anchors[12].point), anchors[12].px)
-    tracks = Tracks.join_and_clear(list(track_range(_video(), {4: anchors[4], 12: wrong}, 4, 13, CONTEXT)))
-    # Were the neighbour's path taken for it, it would be off by the grid's 40 px.
-    assert np.linalg.norm(_shift_from_anchor(tracks, anchors), axis=1).max() < 5.0
+def test_a_point_that_the_next_keyframe_observes_elsewhere_is_tracked_by_itself() -> None:
+    points_by_keyframe = _keyframe_points([4, 12])
+    shared = np.isin(points_by_keyframe[12].point, points_by_keyframe[4].point)
+    other = np.roll(points_by_keyframe[12].point, 1)
+    wrong = KeyframePoints(
+        points_by_keyframe[12].feature,
+        np.where(shared, other, points_by_keyframe[12].point),
+        points_by_keyframe[12].px,
+    )
+    tracks = Tracks.join_and_clear(
+        list(track_range(_video(), {4: points_by_keyframe[4], 12: wrong}, 4, 13, CONTEXT))
+    )
+    # If the path of the neighbouring point were used, it would be off by the grid spacing of 40 px.
+    assert np.linalg.norm(_shift_from_start(tracks, points_by_keyframe), axis=1).max() < 5.0
 
 
 def test_tracks_end_where_the_mask_begins() -> None:
-    tracks = Tracks.join_and_clear(list(track_range(_video(400.0), _anchors([4, 20]), 0, 30, CONTEXT)))
+    tracks = Tracks.join_and_clear(
+        list(track_range(_video(400.0), _keyframe_points([4, 20]), 0, 30, CONTEXT))
+    )
     moved = tracks.frame != tracks.keyframe
     assert moved.sum() > 1000
     assert tracks.px[moved, 0].max() < 400.0 + STEP_PX[0] * 16
 
 
-def test_a_keyframe_taken_out_and_put_back_leaves_no_track_twice() -> None:
-    video, anchors = _video(), _anchors([4, 14, 24, 40])
-    fresh = track_all(video, anchors, None, CONTEXT)
-    rest = {frame: anchor for frame, anchor in anchors.items() if frame != 24}
-    without = track_all(video, rest, TrackCache(fresh, sorted(anchors)), CONTEXT)
-    again = track_all(video, anchors, TrackCache(without, sorted(rest)), CONTEXT)
+def test_a_keyframe_removed_and_restored_duplicates_no_track() -> None:
+    video, points_by_keyframe = _video(), _keyframe_points([4, 14, 24, 40])
+    fresh = track_all(video, points_by_keyframe, None, CONTEXT)
+    rest = {frame: anchor for frame, anchor in points_by_keyframe.items() if frame != 24}
+    without = track_all(video, rest, TrackCache(fresh, sorted(points_by_keyframe)), CONTEXT)
+    again = track_all(video, points_by_keyframe, TrackCache(without, sorted(rest)), CONTEXT)
     for found, wanted in ((without, track_all(video, rest, None, CONTEXT)), (again, fresh)):
         for name in ("frame", "keyframe", "feature", "px"):
             np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
 
 
-def test_threads_find_the_same_tracks_and_tell_growing_progress() -> None:
-    video, anchors = _video(), _anchors([2, 10, 17, 25, 33, 44])
-    told: list[int] = []
-    one = track_all(video, anchors, None, CONTEXT)
+def test_threads_find_the_same_tracks_and_report_growing_progress() -> None:
+    video, points_by_keyframe = _video(), _keyframe_points([2, 10, 17, 25, 33, 44])
+    reported: list[int] = []
+    one = track_all(video, points_by_keyframe, None, CONTEXT)
     context = StageContext(
-        work_dir=Path(), threads=3, progress=lambda done, total, what="": told.append(done)
+        work_dir=Path(), threads=3, progress=lambda done, total, what="": reported.append(done)
     )
-    three = track_all(video, anchors, None, context)
+    three = track_all(video, points_by_keyframe, None, context)
     for name in ("frame", "keyframe", "feature", "px"):
         np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
-    assert told == sorted(told)
-    assert len(told) > 20
+    assert reported == sorted(reported)
+    assert len(reported) > 20
 
 
 def test_cancelling_stops_all_threads() -> None:
     context = StageContext(work_dir=Path(), threads=2, cancelled=lambda: True)
     with pytest.raises(Cancelled):
-        track_all(_video(), _anchors([2, 20, 40]), None, context)
+        track_all(_video(), _keyframe_points([2, 20, 40]), None, context)
 
 
 def test_tracks_of_a_long_video_are_joined_in_little_more_than_their_own_memory() -> None:
@@ -143,11 +151,11 @@ def test_tracks_of_a_long_video_are_joined_in_little_more_than_their_own_memory(
     tracemalloc.stop()
     assert len(joined.frame) == 100_000
     assert (np.diff(joined.frame) >= 0).all()
-    # Of 32 bytes an observation, 8 for the order, 8 for the field at hand and 8 that sorting takes.
+    # 32 bytes for each observation, and 8 each for the order, the current field and sorting.
     assert peak < 1.8 * own
 
 
-def test_what_was_tracked_before_is_held_once_while_new_tracks_join_it(
+def test_reused_tracks_are_held_once_while_new_tracks_are_joined(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rng = np.random.default_rng(2)
@@ -157,12 +165,12 @@ def test_what_was_tracked_before_is_held_once_while_new_tracks_join_it(
     video = _video()
     monkeypatch.setattr(frame_ranges, "_track_ranges", lambda *_: [Tracks.join_and_clear([])])
     tracemalloc.start()
-    anchors = dict.fromkeys(
+    points_by_keyframe = dict.fromkeys(
         (2, COUNT - 2, COUNT - 1), KeyframePoints(*np.zeros((2, 0), np.int64), np.zeros((0, 2)))
     )
-    joined = track_all(video, anchors, known, CONTEXT)
+    joined = track_all(video, points_by_keyframe, known, CONTEXT)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert len(joined.frame) == len(frame)
-    # What of it lies in stretches that stay, and what joining takes; 2.5 with that held while it is sorted.
+    # The reused tracks and the memory of joining; the factor is 2.5 if both are held while sorting.
     assert peak < 2.25 * len(frame) * 32

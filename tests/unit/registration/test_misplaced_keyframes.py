@@ -1,4 +1,4 @@
-"""Keyframes that tracks contradict are found, and the right side of the gap is blamed."""
+"""Keyframes that contradict the tracks are found, on the correct side of the interval."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([40
 _KEYFRAMES = 12
 _STEP = 5
 _POINTS = 120
-_LIMITS = AcceptanceCriteria(max_error_px=2.0, min_inliers=15, max_sigma_depth=0.05)
+_CRITERIA = AcceptanceCriteria(max_error_px=2.0, min_inliers=15, max_sigma_depth=0.05)
 
 
 def _walk() -> FloatArray:
@@ -37,7 +37,7 @@ def _points() -> FloatArray:
 
 
 def _map(moved: IntArray, shift_m: float) -> tuple[Map, Tracks]:
-    """A map in which some keyframes stand elsewhere, with their own points; tracks of the true walk."""
+    """A map in which some keyframes are misplaced together with their points, and tracks of the true walk."""
     poses, points = _walk(), _points()
     true_px = np.array([_LENS.project(transform_points(pose, points)) for pose in invert(poses)])
     shift = np.array([0.0, shift_m, 0.0])
@@ -67,24 +67,24 @@ def _map(moved: IntArray, shift_m: float) -> tuple[Map, Tracks]:
 
 
 @pytest.mark.parametrize("moved", [[5], [4, 5, 6], [0, 1], [10, 11]])
-def test_a_block_in_the_wrong_place_is_blamed(moved: list[int]) -> None:
+def test_a_misplaced_block_of_keyframes_is_found(moved: list[int]) -> None:
     # 0.2 m at 3 m and 400 px are 27 px: far beyond four limits of 2 px.
     scene_map, tracks = _map(np.array(moved), 0.2)
-    assert find_misplaced_keyframes("cam", scene_map, tracks, _LIMITS).tolist() == moved
+    assert find_misplaced_keyframes("cam", scene_map, tracks, _CRITERIA).tolist() == moved
 
 
-def test_tracks_that_slipped_condemn_no_keyframe() -> None:
+def test_slipped_tracks_do_not_make_a_keyframe_misplaced() -> None:
     scene_map, tracks = _map(np.array([], dtype=np.int64), 0.0)
     px = tracks.px.copy()
     gap = (tracks.frame == 5 * _STEP) & (tracks.keyframe == 4 * _STEP)
     gap |= (tracks.frame == 4 * _STEP) & (tracks.keyframe == 5 * _STEP)
     px[gap] += np.random.default_rng(1).normal(0.0, 40.0, (int(gap.sum()), 2)).astype(np.float32)
     slipped = Tracks(tracks.frame, tracks.keyframe, tracks.feature, px)
-    assert len(find_misplaced_keyframes("cam", scene_map, slipped, _LIMITS)) == 0
+    assert len(find_misplaced_keyframes("cam", scene_map, slipped, _CRITERIA)) == 0
 
 
-def test_tracks_that_lead_to_where_a_keyframe_stands_do_not_speak_against_it() -> None:
-    """Half of the tracks slipped: the others' one pose is the keyframe's own."""
+def test_tracks_that_agree_with_the_keyframe_s_own_pose_do_not_contradict_it() -> None:
+    """Half of the tracks slipped; the others agree with the keyframe's own pose."""
     scene_map, tracks = _map(np.array([], dtype=np.int64), 0.0)
     px = tracks.px.copy()
     gap = (tracks.frame == 5 * _STEP) & (tracks.keyframe == 4 * _STEP)
@@ -92,28 +92,28 @@ def test_tracks_that_lead_to_where_a_keyframe_stands_do_not_speak_against_it() -
     half = np.flatnonzero(gap & (tracks.feature % 2 == 0))
     px[half] += np.random.default_rng(1).uniform(40.0, 120.0, (len(half), 2)).astype(np.float32)
     slipped = Tracks(tracks.frame, tracks.keyframe, tracks.feature, px)
-    assert len(find_misplaced_keyframes("cam", scene_map, slipped, _LIMITS)) == 0
+    assert len(find_misplaced_keyframes("cam", scene_map, slipped, _CRITERIA)) == 0
 
 
-def test_a_bent_but_whole_map_is_left_alone() -> None:
+def test_a_bent_but_consistent_map_stays() -> None:
     # 0.03 m are 4 px, two limits.
     scene_map, tracks = _map(np.array([4, 5, 6]), 0.03)
-    assert len(find_misplaced_keyframes("cam", scene_map, tracks, _LIMITS)) == 0
-    assert len(find_misplaced_keyframes("cam", scene_map, Tracks.join_and_clear([]), _LIMITS)) == 0
-    assert len(find_misplaced_keyframes("other", scene_map, tracks, _LIMITS)) == 0
+    assert len(find_misplaced_keyframes("cam", scene_map, tracks, _CRITERIA)) == 0
+    assert len(find_misplaced_keyframes("cam", scene_map, Tracks.join_and_clear([]), _CRITERIA)) == 0
+    assert len(find_misplaced_keyframes("other", scene_map, tracks, _CRITERIA)) == 0
 
 
-def test_the_scale_of_a_map_changes_no_verdict() -> None:
+def test_the_scale_of_the_map_does_not_change_the_result() -> None:
     scene_map, tracks = _map(np.array([4, 5, 6]), 0.2)
     for factor in (0.1, 10.0):
         poses = scene_map.map_from_cam.copy()
         poses[:, :3, 3] *= factor
         fields = {name: getattr(scene_map, name) for name in scene_map.__dataclass_fields__}
         scaled = Map(**{**fields, "map_from_cam": poses, "points": factor * scene_map.points})
-        assert find_misplaced_keyframes("cam", scaled, tracks, _LIMITS).tolist() == [4, 5, 6]
+        assert find_misplaced_keyframes("cam", scaled, tracks, _CRITERIA).tolist() == [4, 5, 6]
 
 
-def test_the_rest_keeps_its_observations() -> None:
+def test_the_remaining_keyframes_keep_their_observations() -> None:
     scene_map, _ = _map(np.array([5]), 0.2)
     rest = map_without_keyframes(scene_map, np.array([5]))
     assert rest.gauge == scene_map.gauge
@@ -124,7 +124,7 @@ def test_the_rest_keeps_its_observations() -> None:
 
 
 def _registered(tracks: Tracks, gauge: str) -> RegisteredCamera:
-    """A camera and what registration left of it."""
+    """A camera with its registration."""
     count = _KEYFRAMES * _STEP
     times_ns, none = np.arange(count) * 33_333_333, np.zeros(0, np.int64)
     camera = CaptureCamera(
@@ -162,9 +162,11 @@ def _registered(tracks: Tracks, gauge: str) -> RegisteredCamera:
 
 
 @pytest.mark.parametrize(("gauge", "left_out"), [("g", [5]), ("another", [])])
-def test_what_registration_left_out_is_left_out_of_the_map(gauge: str, left_out: list[int]) -> None:
+def test_keyframes_misplaced_in_a_registration_are_removed_from_the_map(
+    gauge: str, left_out: list[int]
+) -> None:
     scene_map, tracks = _map(np.array([5]), 0.2)
-    # Nothing is tracked from a keyframe that was left out, but the others' tracks run through its frame.
+    # No track starts at a removed keyframe, but tracks of other keyframes pass through its frame.
     through = tracks.keyframe != 5 * _STEP
     tracks = Tracks(*(each[through] for each in (tracks.frame, tracks.keyframe, tracks.feature, tracks.px)))
     selection = KeyframeSelection(

@@ -1,4 +1,4 @@
-"""Centres smoothed by how evenly a camera moves, and the filter that leads from frame to frame."""
+"""Smoothing of camera centres by the statistics of the motion, and the Kalman filter."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ PATH = np.column_stack([np.sin(TIMES / 6.0), np.cos(TIMES / 8.0), 0.02 * TIMES])
 STEADY = MotionStatistics(jerk_sigma=0.01, cubic_residual_sigma=0.002)
 
 
-def _places(sigma: float, rng: np.random.Generator) -> dict[int, PositionEstimate]:
+def _positions(sigma: float, rng: np.random.Generator) -> dict[int, PositionEstimate]:
     return {
         frame: PositionEstimate(PATH[frame] + rng.normal(0, sigma, 3), np.eye(3) * sigma**2)
         for frame in range(len(TIMES))
     }
 
 
-def test_smoothing_brings_noisy_places_nearer() -> None:
-    found = _places(0.05, np.random.default_rng(1))
+def test_smoothing_reduces_the_error_of_noisy_positions() -> None:
+    found = _positions(0.05, np.random.default_rng(1))
     smoothed = smooth_centres(np.arange(40), TIMES, found, (), STEADY)
     off = np.array([smoothed.positions[f].centre - PATH[f] for f in range(40)])
     before = np.array([found[f].centre - PATH[f] for f in range(40)])
     assert np.sqrt((off**2).mean()) < 0.6 * np.sqrt((before**2).mean())
     sigma = np.sqrt([np.trace(smoothed.positions[f].covariance) for f in range(40)])
-    # Usual places count half under the loss, so that the sigmas are wide by up to the root of two and more.
+    # Typical positions have half weight under the loss, so the sigmas are too large by about the root of two.
     assert 0.2 < (np.linalg.norm(off, axis=1) ** 2 / sigma**2).mean() < 1.5
 
 
-def test_a_wrong_place_is_told_and_does_not_bend_the_path() -> None:
-    found = _places(0.01, np.random.default_rng(2))
+def test_a_wrong_position_is_reported_and_does_not_bend_the_path() -> None:
+    found = _positions(0.01, np.random.default_rng(2))
     found[20] = PositionEstimate(PATH[20] + [0.5, 0.0, 0.0], np.eye(3) * 0.01**2)
     smoothed = smooth_centres(np.arange(40), TIMES, found, (), STEADY)
     assert smoothed.disagreement[20] > 100.0
@@ -45,15 +45,17 @@ def test_a_wrong_place_is_told_and_does_not_bend_the_path() -> None:
     assert max(value for frame, value in smoothed.disagreement.items() if frame != 20) < 25.0
 
 
-def test_what_lies_far_from_all_places_is_hardly_known() -> None:
-    found = {frame: place for frame, place in _places(0.01, np.random.default_rng(3)).items() if frame < 10}
+def test_far_from_all_positions_the_sigma_is_large() -> None:
+    found = {
+        frame: place for frame, place in _positions(0.01, np.random.default_rng(3)).items() if frame < 10
+    }
     smoothed = smooth_centres(np.arange(40), TIMES, found, (), STEADY)
     sigma = [float(np.sqrt(np.trace(smoothed.positions[frame].covariance))) for frame in (9, 11, 15, 25)]
     assert sigma == sorted(sigma)
     assert sigma[2] > 5.0 * sigma[0]
 
 
-def test_a_long_stretch_costs_memory_in_proportion_to_its_length() -> None:
+def test_memory_grows_linearly_with_the_interval() -> None:
     frames = np.arange(1500)
     ends = [*range(8), *range(1492, 1500)]
     found = {frame: PositionEstimate(np.array([0.01 * frame, 0.0, 0.0]), np.eye(3) * 1e-4) for frame in ends}
@@ -66,7 +68,7 @@ def test_a_long_stretch_costs_memory_in_proportion_to_its_length() -> None:
     np.testing.assert_allclose(smoothed.positions[4].centre, found[4].centre, atol=1e-3)
 
 
-def test_uneven_times_bend_no_even_path() -> None:
+def test_uneven_times_do_not_bend_a_smooth_path() -> None:
     times = np.cumsum(np.random.default_rng(4).choice([1.0, 2.0], 40))
     path = np.column_stack([0.1 * times, 0.01 * times**2, 0.001 * times**3])
     found = {frame: PositionEstimate(path[frame], np.eye(3) * 1e-6) for frame in range(0, 40, 3)}
@@ -75,22 +77,22 @@ def test_uneven_times_bend_no_even_path() -> None:
     assert max(off[:37]) < 1e-2
 
 
-def test_steadiness_is_what_the_path_shows_and_scales_with_it() -> None:
+def test_motion_statistics_follow_the_path_and_its_scale() -> None:
     centres = PATH.copy()
     centres[10] = np.nan
-    steady, large = MotionStatistics.estimate(TIMES, centres), MotionStatistics.estimate(TIMES, 7.0 * centres)
-    assert steady is not None
+    smooth, large = MotionStatistics.estimate(TIMES, centres), MotionStatistics.estimate(TIMES, 7.0 * centres)
+    assert smooth is not None
     assert large is not None
     np.testing.assert_allclose(
         [large.jerk_sigma, large.cubic_residual_sigma],
-        [7.0 * steady.jerk_sigma, 7.0 * steady.cubic_residual_sigma],
+        [7.0 * smooth.jerk_sigma, 7.0 * smooth.cubic_residual_sigma],
     )
     # The third derivative of sin(t/6) is 1/216.
-    assert 0.0005 < steady.jerk_sigma < 0.005
+    assert 0.0005 < smooth.jerk_sigma < 0.005
     assert MotionStatistics.estimate(TIMES[:5], centres[:5]) is None
 
 
-def test_the_filter_leads_on_along_the_path_and_knows_how_well() -> None:
+def test_the_filter_predicts_the_path_with_correct_sigmas() -> None:
     path = CentreKalmanFilter(STEADY, PositionEstimate(PATH[0], np.eye(3) * 1e-4))
     for frame in range(1, 20):
         path.predict(1.0)

@@ -1,4 +1,4 @@
-"""Weakly seen centres follow the path's own evenness; what was measured well stays."""
+"""Weakly observed centres are smoothed; well-observed centres stay."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _off_m(path: Trajectory) -> np.ndarray:
     return np.asarray(np.linalg.norm(path.gauge_from_cam[:, :3, 3] - _truth()[:, :3, 3], axis=1))
 
 
-def test_weak_centres_come_nearer_to_the_truth_and_strong_ones_stay() -> None:
+def test_weak_centres_improve_and_strong_ones_stay() -> None:
     before = _measured()
     after = smooth_weak_centres(before)
     assert np.sqrt((_off_m(after)[WEAK] ** 2).mean()) < 0.7 * np.sqrt((_off_m(before)[WEAK] ** 2).mean())
@@ -65,7 +65,7 @@ def test_covariances_and_statuses_stay() -> None:
     assert after.status == before.status
 
 
-def test_a_centre_that_motion_contradicts_stays_as_it_was_measured() -> None:
+def test_a_centre_that_contradicts_the_motion_stays() -> None:
     before = _measured()
     poses = before.gauge_from_cam.copy()
     poses[45, :3, 3] += 20.0 * WEAK_M
@@ -73,7 +73,7 @@ def test_a_centre_that_motion_contradicts_stays_as_it_was_measured() -> None:
     np.testing.assert_array_equal(smooth_weak_centres(leaping).gauge_from_cam[45], poses[45])
 
 
-def test_the_turn_follows_the_centre_as_points_tie_them() -> None:
+def test_the_rotation_follows_the_centre_as_far_as_they_are_correlated() -> None:
     """Points two metres ahead: a centre moved sideways is turned back towards them."""
     before = _measured()
     covariance = before.covariance.copy()
@@ -94,7 +94,7 @@ def test_the_turn_follows_the_centre_as_points_tie_them() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 3, 19])
-def test_a_path_too_short_to_tell_how_the_camera_moves_stays(count: int) -> None:
+def test_a_path_too_short_for_motion_statistics_stays(count: int) -> None:
     before = _measured(count)
     np.testing.assert_array_equal(smooth_weak_centres(before).gauge_from_cam, before.gauge_from_cam)
 
@@ -111,7 +111,7 @@ def test_the_unit_of_the_map_does_not_matter(scale: float) -> None:
     )
 
 
-def test_only_movable_centres_move() -> None:
+def test_only_adjustable_centres_move() -> None:
     before, movable = _measured(), np.ones(COUNT, dtype=bool)
     movable[WEAK[:5]] = False
     after = smooth_weak_centres(before, movable)
@@ -121,7 +121,7 @@ def test_only_movable_centres_move() -> None:
 
 
 @pytest.mark.parametrize(("lost", "moves"), [(LEAST_LOST - 1, True), (LEAST_LOST, False)])
-def test_where_lost_frames_are_looked_for_next_the_path_is_left_to_that(lost: int, moves: bool) -> None:
+def test_a_path_is_not_smoothed_before_recovery(lost: int, moves: bool) -> None:
     path = _measured()
     gone = np.arange(COUNT) < lost
     none = np.where(gone[:, None, None], np.nan, 1.0)

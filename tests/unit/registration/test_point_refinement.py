@@ -1,4 +1,4 @@
-"""What lost frames are looked for with: ends that little supports are taken out, points follow the frames."""
+"""Weak poses next to lost intervals are removed, and points are refined from the remaining poses."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WRONG_M = 0.3
 
 
 def _path(inliers: dict[int, int] | None = None, status: dict[int, FrameStatus] | None = None) -> Trajectory:
-    """A camera that sways before a wall, lost in the middle."""
+    """A camera that moves in front of a wall, with lost frames in the middle."""
     frames = np.arange(COUNT)
     centres = np.column_stack([0.05 * frames - 1.0, 0.4 * np.sin(frames / 5.0), 0.3 * np.cos(frames / 6.0)])
     poses = make_transform(so3_exp(np.outer(np.sin(frames / 4.0), [0.05, 0.1, 0.02])), centres)
@@ -54,11 +54,11 @@ def _taken(path: Trajectory) -> list[int]:
     return list(taken)
 
 
-def test_ends_of_a_lost_stretch_that_few_points_support_are_taken_out() -> None:
+def test_weak_poses_next_to_a_lost_interval_are_removed() -> None:
     assert _taken(_path({16: 17, 17: 40, 24: 59})) == [16, 17, 24]
 
 
-def test_a_well_seen_end_stands_before_what_lies_behind_it() -> None:
+def test_a_well_supported_end_protects_weak_poses_behind_it() -> None:
     assert _taken(_path({16: 17, 17: 60, 24: 60, 25: 17})) == []
 
 
@@ -66,13 +66,13 @@ def test_weak_poses_far_from_lost_frames_and_at_the_ends_of_a_video_stay() -> No
     assert _taken(_path({0: 15, 5: 15, 30: 15, COUNT - 1: 15})) == []
 
 
-def test_where_little_is_seen_all_the_time_a_path_is_kept() -> None:
+def test_a_path_with_few_inliers_everywhere_is_kept() -> None:
     taken = _taken(_path(dict.fromkeys(range(COUNT), 30)))
     reach = point_refinement._MAX_BOUNDARY_FRAMES
     assert taken == [*range(LOST[0] - reach, LOST[0]), *range(LOST[-1] + 1, LOST[-1] + 1 + reach)]
 
 
-def test_frames_that_a_rig_carries_stay() -> None:
+def test_frames_supported_by_a_rig_stay() -> None:
     assert _taken(_path({17: 3}, {17: FrameStatus.RIG})) == []
 
 
@@ -86,7 +86,7 @@ def _true_points() -> np.ndarray:
 
 
 def _map(path: Trajectory, *, readout_s: float = 0.0) -> Map:
-    """Every third frame a keyframe: one of them, and the points that it placed, is off by a step."""
+    """Every third frame is a keyframe. One of them is misplaced, together with the points it triangulated."""
     truth, points = _path(status=dict.fromkeys(LOST, FrameStatus.REGISTERED)), _true_points()
     frames = np.arange(0, COUNT, 3)
     poses = truth.gauge_from_cam[frames].copy()
@@ -125,12 +125,12 @@ def _map(path: Trajectory, *, readout_s: float = 0.0) -> Map:
 
 
 def _off_m(scene: Map) -> np.ndarray:
-    """Of points that three keyframes and more see."""
+    """Errors of the points that at least three keyframes see."""
     seen = np.bincount(scene.obs_point, minlength=len(scene.points)) > 2
     return np.asarray(np.linalg.norm(scene.points - _true_points(), axis=1)[seen])
 
 
-def test_points_come_to_where_frames_with_poses_see_them() -> None:
+def test_points_move_to_agree_with_the_poses_of_frames() -> None:
     path = _path()
     before = _map(path)
     after = refine_points(before, [path])
@@ -142,7 +142,7 @@ def test_points_come_to_where_frames_with_poses_see_them() -> None:
     np.testing.assert_allclose(after.map_from_cam[5], path.gauge_from_cam[15])
 
 
-def test_keyframes_without_a_pose_stay_and_see_nothing() -> None:
+def test_keyframes_of_lost_frames_keep_their_pose_and_lose_their_observations() -> None:
     path = _path()
     before = _map(path)
     after = refine_points(before, [path])
@@ -153,7 +153,7 @@ def test_keyframes_without_a_pose_stay_and_see_nothing() -> None:
     assert np.bincount(after.obs_point)[np.unique(after.obs_point)].min() >= 2
 
 
-def test_views_that_suit_no_place_are_left_out() -> None:
+def test_observations_that_agree_with_no_position_are_removed() -> None:
     path = _path()
     before = _map(path)
     px = before.obs_px.copy()
@@ -166,7 +166,7 @@ def test_views_that_suit_no_place_are_left_out() -> None:
     assert np.median(_off_m(after)) < 0.02
 
 
-def test_keyframes_of_a_camera_in_another_gauge_keep_their_place_and_their_say() -> None:
+def test_keyframes_of_a_camera_in_another_gauge_keep_pose_and_observations() -> None:
     path = _path()
     before = _map(path)
     after = refine_points(before, [replace(path, gauge="map-1")])
@@ -185,7 +185,7 @@ def test_a_rolling_shutter_is_undone() -> None:
     assert off[1] < 0.5 * off[0]
 
 
-def test_a_few_at_a_time_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_give_the_same_points(monkeypatch: pytest.MonkeyPatch) -> None:
     path = _path()
     whole = refine_points(_map(path), [path])
     monkeypatch.setattr(point_refinement, "_CHUNK_ROWS", 50)
@@ -194,7 +194,7 @@ def test_a_few_at_a_time_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None
     np.testing.assert_array_equal(parts.obs_feature, whole.obs_feature)
 
 
-def test_a_map_that_nobody_sees_stays() -> None:
+def test_a_map_without_observations_stays() -> None:
     path = _path()
     scene = _map(path)
     none = replace(

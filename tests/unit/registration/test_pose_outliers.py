@@ -1,4 +1,4 @@
-"""Jumping poses are found, quick motion is not blamed."""
+"""Outlier poses are found, fast motion is not an outlier."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_one_wrong_pose_is_found_at_any_scale(scale: float) -> None:
 @pytest.mark.parametrize("scale", [0.1, 10.0])
 @pytest.mark.parametrize("together", [True, False])
 @pytest.mark.parametrize("length", [2, 3])
-def test_wrong_poses_in_a_row_are_found_and_no_right_one(
+def test_runs_of_wrong_poses_are_found_and_no_correct_pose(
     *, length: int, together: bool, scale: float
 ) -> None:
     rng = np.random.default_rng(6)
@@ -38,7 +38,7 @@ def test_wrong_poses_in_a_row_are_found_and_no_right_one(
     assert found.tolist() == list(range(31, 31 + length))
 
 
-def test_a_path_that_steps_aside_or_rebounds_is_no_run_of_wrong_poses() -> None:
+def test_a_sidestep_or_a_rebound_is_not_a_run_of_wrong_poses() -> None:
     rng = np.random.default_rng(7)
     aside = np.cumsum(np.full((60, 3), 0.02), axis=0) + rng.normal(0, 0.0002, (60, 3))
     aside[30:] += [0.0, 0.3, 0.0]
@@ -52,9 +52,7 @@ def test_a_path_that_steps_aside_or_rebounds_is_no_run_of_wrong_poses() -> None:
     ("hz", "seconds"), [(10, 0.3), (10, 0.4), (12, 0.3), (15, 0.25), (20, 0.2), (20, 0.25)]
 )
 @pytest.mark.parametrize("height", [0.12, 0.2])
-def test_a_gesture_there_and_back_is_no_jump_however_few_frames_see_it(
-    hz: int, seconds: float, height: float
-) -> None:
+def test_a_fast_gesture_there_and_back_is_not_an_outlier(hz: int, seconds: float, height: float) -> None:
     refused = 0
     for shift in np.linspace(0, 1, 8, endpoint=False):
         times = (np.arange(60) + shift) / hz
@@ -64,7 +62,7 @@ def test_a_gesture_there_and_back_is_no_jump_however_few_frames_see_it(
         refused += find_outlier_poses(
             centres, np.full(60, 0.001), np.round(times * 1e9).astype(np.int64)
         ).sum()
-    # One that a single frame sees, still before and behind it, cannot be told from a jump.
+    # A gesture seen by a single frame, with rest before and after, cannot be distinguished from an outlier.
     assert refused <= 1
 
 
@@ -78,20 +76,20 @@ def test_a_wrong_pose_of_a_slow_video_is_found(hz: int) -> None:
     assert np.flatnonzero(found).tolist() == [31]
 
 
-def test_a_violent_swing_is_no_jump() -> None:
+def test_a_fast_swing_is_not_an_outlier() -> None:
     rng = np.random.default_rng(1)
     for hz in (0.5, 2.0, 4.0):
         assert not find_outlier_poses(_swing(hz) + rng.normal(0, 0.004, (60, 3)), SIGMA, TIMES_NS).any()
 
 
-def test_a_sudden_stop_is_no_jump() -> None:
+def test_a_sudden_stop_is_not_an_outlier() -> None:
     centres = np.cumsum(np.where(np.arange(60) < 30, 0.05, 0.0))[:, None] * np.array([1.0, 0.2, 0.0])
     noisy = centres + np.random.default_rng(2).normal(0, 0.004, (60, 3))
     assert not find_outlier_poses(noisy, SIGMA, TIMES_NS).any()
 
 
-def test_a_jerk_is_no_jump_however_exactly_it_is_seen() -> None:
-    # 2 m/s to nothing within one frame: bent by 3 cm, 100 sigmas, where nothing else bends.
+def test_a_jerk_with_small_sigmas_is_not_an_outlier() -> None:
+    # 2 m/s to rest within one frame: a second difference of 3 cm, 100 sigmas, on a straight path.
     centres = np.cumsum(np.where(np.arange(60) < 30, 0.067, 0.0))[:, None] * np.array([1.0, 0.2, 0.0])
     noisy = centres + np.random.default_rng(5).normal(0, 0.0002, (60, 3))
     assert not find_outlier_poses(noisy, 0.0003 * np.ones(60), TIMES_NS).any()
@@ -99,7 +97,7 @@ def test_a_jerk_is_no_jump_however_exactly_it_is_seen() -> None:
     assert np.flatnonzero(find_outlier_poses(noisy, 0.0003 * np.ones(60), TIMES_NS)).tolist() == [12]
 
 
-def test_wide_covariance_and_gaps_are_no_evidence() -> None:
+def test_large_covariances_and_gaps_give_no_outliers() -> None:
     rng = np.random.default_rng(3)
     centres = _swing(1.0) + rng.normal(0, 0.004, (60, 3))
     centres[31] += 0.2
@@ -114,7 +112,7 @@ def test_wide_covariance_and_gaps_are_no_evidence() -> None:
 
 @pytest.mark.parametrize("backwards", [False, True])
 @pytest.mark.parametrize("wrong", [30, 31, 32])
-def test_a_wrong_pose_beside_a_lost_stretch_is_told_from_its_neighbour(
+def test_a_wrong_pose_next_to_a_lost_interval_is_distinguished_from_its_neighbour(
     *, wrong: int, backwards: bool
 ) -> None:
     centres = _swing(1.0) + np.random.default_rng(4).normal(0, 0.004, (60, 3))
@@ -138,7 +136,7 @@ def test_a_wrong_pose_beside_a_lost_stretch_is_told_from_its_neighbour(
         ("#########", []),
     ],
 )
-def test_a_weak_pose_that_no_neighbour_confirms_is_doubtful(seen: str, refused: list[int]) -> None:
+def test_an_isolated_pose_needs_more_inliers(seen: str, refused: list[int]) -> None:
     localised = np.array([letter == "#" for letter in seen])
     inliers = np.where(localised, 40, 0)
     assert np.flatnonzero(isolated_poses(localised, inliers, 60)).tolist() == refused

@@ -28,7 +28,7 @@ CAMERA = Camera(
     height_px=480,
     params=np.array([420.0, 430.0, 322.0, 238.0, -0.2, 0.05, 1e-3, -5e-4]),
 )
-LIMITS = AcceptanceCriteria(max_error_px=2.5, min_inliers=15, max_sigma_depth=0.05)
+CRITERIA = AcceptanceCriteria(max_error_px=2.5, min_inliers=15, max_sigma_depth=0.05)
 
 
 def _scene(rng: np.random.Generator, count: int, patch_px: float | None = None) -> tuple[np.ndarray, ...]:
@@ -50,7 +50,7 @@ def _solve(points: np.ndarray, px: np.ndarray, start: np.ndarray | None = None) 
     """One frame alone, from a starting cam_from_gauge or from none."""
     views = make_observations(CAMERA, np.array([0, len(px)]), points, px)
     first = np.full((4, 4), np.nan) if start is None else start
-    return solve_poses([CAMERA], views, px, first[None], LIMITS)[0]
+    return solve_poses([CAMERA], views, px, first[None], CRITERIA)[0]
 
 
 def test_pose_survives_a_third_of_wrong_points() -> None:
@@ -99,12 +99,12 @@ def test_threads_of_a_task_solve_the_same_poses(monkeypatch: pytest.MonkeyPatch)
     found = {}
     for threads, name in ((1, "MainThread"), (2, "poses")):
         workers.clear()
-        found[threads] = batched_pnp.refine_poses(views, start, LIMITS.max_error_px, threads)
+        found[threads] = batched_pnp.refine_poses(views, start, CRITERIA.max_error_px, threads)
         assert workers == {name}
     assert (found[1] == found[2]).all()
 
 
-def test_the_lens_is_asked_for_some_views_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_observations_are_undistorted_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     count = 200_000
     px = np.random.default_rng(0).uniform((20.0, 20.0), (620.0, 460.0), (count, 2))
     points = np.ones((count, 3))
@@ -113,7 +113,7 @@ def test_the_lens_is_asked_for_some_views_at_a_time(monkeypatch: pytest.MonkeyPa
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     kept = views.rays.nbytes + views.px_from_ray.nbytes + views.weight.nbytes
-    # Beside what is kept: a part's ray, pixel and point, of which several are held, 24 bytes each at most.
+    # Besides the result: several arrays of rays, pixels and points of one batch, at most 24 bytes per row.
     assert kept <= peak < kept + 16 * 24 * batched_pnp._BATCH_ROWS
     monkeypatch.setattr(batched_pnp, "_BATCH_ROWS", count)
     whole = make_observations(CAMERA, np.array([0, count]), points, px)
@@ -128,7 +128,9 @@ def test_frames_solved_together_do_not_influence_each_other() -> None:
     start = np.stack([invert(scene[2]) for scene in scenes])
     bounds = np.concatenate([[0], np.cumsum([len(part) for part in px])])
     points, pixels = np.concatenate([scene[0] for scene in scenes]), np.concatenate(px)
-    together = solve_poses([CAMERA], make_observations(CAMERA, bounds, points, pixels), pixels, start, LIMITS)
+    together = solve_poses(
+        [CAMERA], make_observations(CAMERA, bounds, points, pixels), pixels, start, CRITERIA
+    )
     assert [pose.status for pose in together] == [
         FrameStatus.REGISTERED if len(part) > 50 else FrameStatus.FEW_TRACKS for part in px
     ]
@@ -139,7 +141,7 @@ def test_frames_solved_together_do_not_influence_each_other() -> None:
         np.testing.assert_allclose(together[index].covariance, alone.covariance, rtol=1e-9)
 
 
-def test_points_that_are_known_badly_count_less() -> None:
+def test_uncertain_points_have_less_weight() -> None:
     rng = np.random.default_rng(6)
     points, px, truth = _scene(rng, 100)
     seen = px + rng.normal(0, 0.3, px.shape)
@@ -149,7 +151,7 @@ def test_points_that_are_known_badly_count_less() -> None:
 
     def solve(weight: float) -> np.ndarray:
         views = make_observations(CAMERA, np.array([0, 100]), points, seen, np.where(displaced, weight, 1.0))
-        pose = solve_poses([CAMERA], views, seen, start, LIMITS)[0].gauge_from_cam
+        pose = solve_poses([CAMERA], views, seen, start, CRITERIA)[0].gauge_from_cam
         assert pose is not None
         return pose
 
@@ -176,7 +178,7 @@ def test_normalised_error_of_the_covariance_is_near_one() -> None:
     assert 0.7 < np.mean(errors) < 1.4
 
 
-def test_a_small_patch_of_perfect_inliers_is_refused() -> None:
+def test_inliers_in_a_small_patch_are_rejected() -> None:
     rng = np.random.default_rng(1)
     points, px, _ = _scene(rng, 25, patch_px=42.0)
     found = _solve(points, px + rng.normal(0, 0.5, px.shape))
@@ -185,7 +187,7 @@ def test_a_small_patch_of_perfect_inliers_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("count", "status"), [(10, FrameStatus.FEW_TRACKS), (60, FrameStatus.FEW_INLIERS)])
-def test_too_little_evidence_names_its_reason(count: int, status: FrameStatus) -> None:
+def test_a_rejected_pose_has_its_reason_as_status(count: int, status: FrameStatus) -> None:
     rng = np.random.default_rng(2)
     points, px, _ = _scene(rng, count)
     found = _solve(points, rng.permutation(px))
@@ -193,13 +195,13 @@ def test_too_little_evidence_names_its_reason(count: int, status: FrameStatus) -
     assert found.gauge_from_cam is None
 
 
-def test_lost_runs_are_maximal() -> None:
+def test_lost_intervals_are_maximal() -> None:
     localised = np.array([0, 1, 1, 0, 0, 1, 0], dtype=bool)
     assert lost_intervals(localised) == [(0, 1), (3, 5), (6, 7)]
     assert lost_intervals(np.ones(4, dtype=bool)) == []
 
 
-def test_growth_takes_the_sharpest_lost_frames_and_the_ends_they_hang_on() -> None:
+def test_the_sharpest_lost_frames_and_those_next_to_them_are_requested() -> None:
     localised = np.ones(40, dtype=bool)
     localised[10:16] = False
     sharpness = np.ones(40)
@@ -208,14 +210,14 @@ def test_growth_takes_the_sharpest_lost_frames_and_the_ends_they_hang_on() -> No
     assert wanted.tolist() == [9, 11, 14, 16]
 
 
-def test_growth_ends_once_every_lost_stretch_was_tried() -> None:
+def test_nothing_is_requested_once_every_lost_interval_was_tried() -> None:
     localised = np.ones(40, dtype=bool)
     localised[10:16] = False
     tried = np.array([0, 11, 14, 39])
     assert len(request_keyframes(localised, np.ones(40), tried)) == 0
 
 
-def test_growth_is_bounded() -> None:
+def test_the_number_of_requests_is_bounded() -> None:
     wanted = request_keyframes(np.zeros(3000, dtype=bool), np.ones(3000), np.arange(0, 3000, 50))
     assert 20 <= len(wanted) <= 30
     assert (np.diff(wanted) > 0).all()

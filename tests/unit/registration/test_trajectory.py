@@ -1,4 +1,4 @@
-"""All frames solved together: points on the wearer lose their say, lost frames come back when asked again."""
+"""All frames of a camera are solved; points on the wearer lose their weight."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bodycap_batch.registration.poses.trajectory import solve_camera
 from bodycap_batch.registration.tracking.klt import Tracks
 
 LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
-LIMITS = AcceptanceCriteria(max_error_px=2.2, min_inliers=15, max_sigma_depth=0.05)
+CRITERIA = AcceptanceCriteria(max_error_px=2.2, min_inliers=15, max_sigma_depth=0.05)
 COUNT = 31
 KEYFRAMES = [0, 30]
 
@@ -35,7 +35,7 @@ def _path() -> np.ndarray:
 
 
 def _capture(worn: int, rng: np.random.Generator) -> tuple[Map, Tracks]:
-    """60 points of a room 3 to 5 m off, and `worn` on the wearer that sway against it."""
+    """60 points of a room at 3 to 5 m, and `worn` points on the wearer that move relative to it."""
     path = _path()
     rays = np.column_stack([rng.uniform(-0.5, 0.5, 60 + worn), rng.uniform(-0.4, 0.4, 60 + worn)])
     x_in_cam = np.column_stack([rays, np.ones(60 + worn)]) * rng.uniform(3.0, 5.0, (60 + worn, 1))
@@ -74,7 +74,7 @@ def _capture(worn: int, rng: np.random.Generator) -> tuple[Map, Tracks]:
 
 def _solve(scene_map: Map, tracks: Tracks) -> list[FramePose]:
     camera = cast("CaptureCamera", SimpleNamespace(name="torso", times_ns=np.arange(COUNT) * 33_333_333))
-    return solve_camera(camera, scene_map, tracks, LIMITS)
+    return solve_camera(camera, scene_map, tracks, CRITERIA)
 
 
 def _error_m(poses: list[FramePose]) -> float:
@@ -92,29 +92,29 @@ def test_keyframes_and_frames_between_them_are_solved() -> None:
     assert 0.0002 < _error_m(poses) < 0.005
 
 
-def test_points_that_sway_against_the_room_do_not_carry_the_camera_away() -> None:
+def test_points_that_move_with_the_wearer_do_not_pull_the_poses() -> None:
     scene_map, tracks = _capture(30, np.random.default_rng(1))
     poses = _solve(scene_map, tracks)
     assert all(pose.status.localised for pose in poses)
-    # Swaying with them, by up to 4 px at 4 m and 420 px, the camera would be off by 2.7 cm on the average.
+    # If it followed them, by up to 4 px at 4 m and 420 px, the camera would be off by 2.7 cm on average.
     assert _error_m(poses) < 0.005
 
 
-def test_a_point_counts_by_the_frames_that_agree_with_it() -> None:
+def test_a_point_is_weighted_by_the_ratio_of_frames_that_agree() -> None:
     point = np.array([0, 1, 2] * 6)
     posed = np.repeat([True, True, True, True, True, False], 3)
     agrees = np.ones(18, dtype=bool)
     agrees[[1, 4, 7]] = False
     agrees[[2, 5, 8, 11, 14]] = False
-    votes = PointReliability.zero(3)
-    votes.add(point[:9], posed[:9], agrees[:9])
-    # Three views of a point are too few to condemn it.
-    np.testing.assert_array_equal(votes.agreement(point), np.ones(18))
-    votes.add(point[9:], posed[9:], agrees[9:])
-    np.testing.assert_allclose(votes.agreement(point[:3]), [1.0, 0.4, 0.0])
+    reliability = PointReliability.zero(3)
+    reliability.add(point[:9], posed[:9], agrees[:9])
+    # Three observations of a point are too few to lower its weight.
+    np.testing.assert_array_equal(reliability.agreement(point), np.ones(18))
+    reliability.add(point[9:], posed[9:], agrees[9:])
+    np.testing.assert_allclose(reliability.agreement(point[:3]), [1.0, 0.4, 0.0])
 
 
-def test_a_long_video_is_solved_in_stretches_as_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_of_frames_give_the_same_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     scene_map, tracks = _capture(30, np.random.default_rng(1))
     whole = trajectory.pose_array(_solve(scene_map, tracks))
     monkeypatch.setattr(observations, "BLOCK_FRAMES", 7)
