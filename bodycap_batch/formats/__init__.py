@@ -1,1 +1,1 @@
-"""Readers and writers, one file a format, each with its own conventions."""
+"""Readers and writers of file formats. Each format's axes, units and conventions are handled in its own module."""
