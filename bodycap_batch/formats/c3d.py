@@ -15,8 +15,8 @@ _MM_PER_M = 1000.0
 """Millimetres per metre."""
 
 _TOLERANCE_M = 1e-5
-"""Metres. Largest accepted change of a coordinate when the file is read back. Derivation: the format has single
-precision, 1 µm at a distance of 10 m."""
+"""Metres. Largest accepted change of a coordinate when the file is read back. Derivation: the format has
+single precision, 1 µm at a distance of 10 m."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,7 +1,7 @@
 """Store frozen dataclasses as ``<name>.json`` (structure and scalars) and ``<name>.npz`` (arrays).
 
-The types of the fields determine the format. Supported are arrays, scalars, enums, paths, tuples, mappings and
-dataclasses of these. Pickle is not used, and equal values give equal bytes.
+The types of the fields determine the format. Supported are arrays, scalars, enums, paths, tuples, mappings
+and dataclasses of these. Pickle is not used, and equal values give equal bytes.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ T = TypeVar("T")
 Arrays = dict[str, np.ndarray[Any, Any]]
 
 _ZIP_DATE = (1980, 1, 1, 0, 0, 0)
-"""Date of every zip entry: the earliest that the zip format can hold. It is constant so that equal arrays give
-equal bytes."""
+"""Date of every zip entry: the earliest that the zip format can hold. It is constant so that equal arrays
+give equal bytes."""
 
 
 def write_dataclass(value: Any, folder: Path, name: str) -> None:

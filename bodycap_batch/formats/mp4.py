@@ -53,8 +53,8 @@ class VideoWriter:
         size: Width and height of the images in pixels.
         quality: "high"; "lossless", except for the chroma, which has half the resolution; "exact", which is
             lossless and lets every frame be decoded alone; "near", with hardly visible losses; or "small".
-        colours: Colour range and colour matrix of the images given to `add_planes`, as numbers of FFmpeg. They
-            are stored in the file.
+        colours: Colour range and colour matrix of the images given to `add_planes`, as numbers of FFmpeg.
+            They are stored in the file.
 
     Raises:
         StoreError: The file cannot be written.

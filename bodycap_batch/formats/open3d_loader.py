@@ -1,10 +1,10 @@
 """Import Open3D without its Plotly drawing functions, which take most of the import time.
 
-``import open3d`` imports dash and plotly for ``open3d.visualization.draw_plotly``. They take three quarters of the
-import time, and this project does not use them. Open3D has no switch to leave them out. Therefore `load_open3d`
-puts a placeholder for that one module into ``sys.modules`` before the import. This is a monkeypatch of a
-third-party package; it is confined to this module. If a drawing function is called nevertheless, the placeholder
-imports the real module, so Open3D still works completely.
+``import open3d`` imports dash and plotly for ``open3d.visualization.draw_plotly``. They take three quarters
+of the import time, and this project does not use them. Open3D has no switch to leave them out. Therefore
+`load_open3d` puts a placeholder for that one module into ``sys.modules`` before the import. This is a
+monkeypatch of a third-party package; it is confined to this module. If a drawing function is called
+nevertheless, the placeholder imports the real module, so Open3D still works completely.
 """
 
 from __future__ import annotations

@@ -44,9 +44,9 @@ class TimedPoses:
 def read_tum(path: Path | str) -> TimedPoses:
     """Read a trajectory.
 
-    The file may have comments, a header line, commas or tabs between the numbers, and CRLF line ends. Lines are
-    sorted by time; of lines with the same time, the first is used. A file with comments only has no poses, as
-    for a camera without localised frames.
+    The file may have comments, a header line, commas or tabs between the numbers, and CRLF line ends. Lines
+    are sorted by time; of lines with the same time, the first is used. A file with comments only has no
+    poses, as for a camera without localised frames.
 
     Raises:
         JobError: The file is missing, malformed or empty. The error names the line.

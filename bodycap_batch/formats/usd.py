@@ -28,8 +28,8 @@ def write_usd(path: Path, motion: Motion) -> Path:
     """Write a motion as a skinned, animated stick figure. Time codes are frame numbers from 0.
 
     The mesh is bound to the joints in the T-pose. Joint tokens are paths of names that USD allows
-    (``mixamorig_Hips``); the original names are in ``jointNames``. Translations, rotations and scales are written
-    for every frame.
+    (``mixamorig_Hips``); the original names are in ``jointNames``. Translations, rotations and scales are
+    written for every frame.
 
     Args:
         path: The file (``.usd``, ``.usda``, ``.usdc``); it is replaced atomically.

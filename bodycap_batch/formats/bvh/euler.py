@@ -7,8 +7,8 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 
 _GIMBAL_LOCK_COSINE = 1e-7
-"""Cosine of the second angle below which the rotation counts as gimbal lock. Derivation: the first and third angle
-have errors of 1e-16 divided by this cosine; at 1e-7 that is 1e-9 rad."""
+"""Cosine of the second angle below which the rotation counts as gimbal lock. Derivation: the first and third
+angle have errors of 1e-16 divided by this cosine; at 1e-7 that is 1e-9 rad."""
 
 _FULL_TURN_RAD = 2.0 * np.pi
 """Radians. One full turn."""
@@ -46,8 +46,8 @@ def continuous_angles(orders: tuple[str, ...], rotation: FloatArray) -> FloatArr
     """Convert rotations to the Euler angles that change as little as possible from tick to tick.
 
     Every rotation has two triples of angles, (a, b, c) and (a + π, π − b, c + π), to which full turns may be
-    added. The triple nearest to that of the previous tick is returned. In gimbal lock only a ± c is determined;
-    of all solutions, the nearest to the previous tick is returned.
+    added. The triple nearest to that of the previous tick is returned. In gimbal lock only a ± c is
+    determined; of all solutions, the nearest to the previous tick is returned.
 
     Args:
         orders: (J,) order of three different axes for each joint, the first axis leftmost ("ZXY").
@@ -76,8 +76,8 @@ def _principal_angles(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
         rotation: (...,3,3) rotations.
 
     Returns:
-        (...,3) angles in radians; in gimbal lock, the first is c + sign(b) · a and the third is 0. And the lock
-        (...): sign(b) in gimbal lock, else 0.
+        (...,3) angles in radians; in gimbal lock, the first is c + sign(b) · a and the third is 0. And the
+        lock (...): sign(b) in gimbal lock, else 0.
     """
     cos_b = np.hypot(rotation[..., 0, 0], rotation[..., 0, 1])
     b = np.arctan2(rotation[..., 0, 2], cos_b)
@@ -109,8 +109,8 @@ def _add_full_turns(angles: FloatArray, previous: FloatArray) -> FloatArray:
 def _split_locked_sum(angles: FloatArray, locked: FloatArray, previous: FloatArray) -> FloatArray:
     """Return the angles (J,3) in gimbal lock for which a and c change by the same, smallest amount.
 
-    In gimbal lock only the sum c + sign · a is determined. `angles` may be either of the two equivalent triples:
-    adding π to a and c changes the sum by full turns only.
+    In gimbal lock only the sum c + sign · a is determined. `angles` may be either of the two equivalent
+    triples: adding π to a and c changes the sum by full turns only.
     """
     total = angles[:, 0] + locked * angles[:, 2]
     before = previous[:, 2] + locked * previous[:, 0]

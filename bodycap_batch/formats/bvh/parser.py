@@ -16,8 +16,8 @@ _CHANNELS = {name.lower(): name for axis in "XYZ" for name in (f"{axis}position"
 """Channel names as written in the specification, by their lower-case spelling."""
 
 _MAX_JOINTS = 10_000
-"""Largest number of joints. Derivation: a production skeleton with face and fingers has a few hundred, so a file
-with more than this is no skeleton."""
+"""Largest number of joints. Derivation: a production skeleton with face and fingers has a few hundred, so a
+file with more than this is no skeleton."""
 
 
 @dataclass(slots=True)

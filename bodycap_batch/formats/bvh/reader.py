@@ -17,23 +17,24 @@ from bodycap_batch.model.skeleton import Motion, SkeletonModel
 logger = logging.getLogger(__name__)
 
 _MAX_METRE_EXTENT = 10.0
-"""File units. If the zero pose spans less than this, the file is in metres. Derivation: a body spans 1 to 2 m,
-which is 100 to 200 cm."""
+"""File units. If the zero pose spans less than this, the file is in metres. Derivation: a body spans 1 to 2
+m, which is 100 to 200 cm."""
 
 _MOTION_THRESHOLD = 1e-3
 """File units. A joint whose position changes by less than this is taken as constant. Derivation: 10 µm in
 centimetres, above the rounding of the usual six decimals."""
 
 _WARNING_THRESHOLD = 1.0
-"""File units. A larger change of a bone's offset is reported. Derivation: 1 cm in centimetres, which is visible."""
+"""File units. A larger change of a bone's offset is reported. Derivation: 1 cm in centimetres, which is
+visible."""
 
 
 def read_bvh(path: Path | str, *, units: str = "auto") -> tuple[SkeletonModel, Motion | None]:
     """Read a BVH file and convert it to world axes and metres.
 
-    Position channels replace the OFFSET, as in Blender and MotionBuilder. They give the motion of the root, and
-    of hips that are the first child of the root. For other joints, constant position channels give the bone; if
-    they change, the OFFSET is used.
+    Position channels replace the OFFSET, as in Blender and MotionBuilder. They give the motion of the root,
+    and of hips that are the first child of the root. For other joints, constant position channels give the
+    bone; if they change, the OFFSET is used.
 
     Args:
         path: The file.
@@ -75,8 +76,8 @@ def read_bvh(path: Path | str, *, units: str = "auto") -> tuple[SkeletonModel, M
 def rate_from_frame_time(frame_time: str) -> float:
     """Return the frames per second of a Frame Time.
 
-    A rounded Frame Time gives its nominal rate: 0.0333333 means 30 Hz, not 30.00003 Hz. The difference would be
-    0.1 s per hour.
+    A rounded Frame Time gives its nominal rate: 0.0333333 means 30 Hz, not 30.00003 Hz. The difference would
+    be 0.1 s per hour.
     """
     seconds = float(frame_time.replace(",", "."))
     if seconds == 0:

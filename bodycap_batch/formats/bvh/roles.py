@@ -1,8 +1,8 @@
 """Assign anatomical roles to the joints of a skeleton from their names and the tree.
 
 Skeletons use names differently: "LeftShoulder" is the collar bone in HumanIK and Mixamo, but the upper arm in
-skeletons with a LeftCollar or a LeftElbow. Therefore a word only gives candidate roles, and the order of the joints
-along the limb decides.
+skeletons with a LeftCollar or a LeftElbow. Therefore a word only gives candidate roles, and the order of the
+joints along the limb decides.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ _ARM_WORDS = {
     (2,): "forearm lowerarm lowarm loarm elbow radius",
     (3,): "hand wrist palm",
 }
-"""Words of joint names by the arm's slots (indices of `_ARM`) they may stand for, the most likely slot first."""
+"""Words of joint names by the arm's slots (indices of `_ARM`) they may stand for, the most likely slot
+first."""
 
 _LEG_WORDS = {
     (0,): "upleg upperleg thigh femur hip",
@@ -65,8 +66,8 @@ _LEG_SCORES = (10.0, 10.0, 10.0, 9.0)
 """Score of each slot of the leg that is found. The toes count less because a skeleton may lack them."""
 
 _SECOND_CHOICE_COST = 0.1
-"""Score that is subtracted for each less likely meaning of a word. Derivation: less than the difference between two
-slot scores, so it only decides between equal scores."""
+"""Score that is subtracted for each less likely meaning of a word. Derivation: less than the difference
+between two slot scores, so it only decides between equal scores."""
 
 _MIN_OFFSET_M = 1e-9
 """Metres. A joint with a shorter offset is a helper joint without a bone. Derivation: zero up to rounding."""
@@ -90,13 +91,13 @@ def assign_roles(
     Args:
         joints: (J,) joint names of the skeleton.
         parents: (J,) index of each parent, −1 for the root; parents come before their children.
-        offsets_m: (J,3) joint centres in the frames of their parents. With them, joints with a bone are preferred
-            to helper joints of zero length.
+        offsets_m: (J,3) joint centres in the frames of their parents. With them, joints with a bone are
+            preferred to helper joints of zero length.
 
     Returns:
-        (J,) roles with the names of HumanIK: Hips, Spine, Spine1 (the joint from which the arms branch), Neck,
-        Head, LeftShoulder (the collar bone), LeftArm and so on; "" for a joint without a role. Each role occurs
-        at most once.
+        (J,) roles with the names of HumanIK: Hips, Spine, Spine1 (the joint from which the arms branch),
+        Neck, Head, LeftShoulder (the collar bone), LeftArm and so on; "" for a joint without a role. Each
+        role occurs at most once.
     """
     names = [_split_name(name) for name in _strip_common_prefix(joints)]
     ancestors = [_ancestors(joint, parents) for joint in range(len(joints))]

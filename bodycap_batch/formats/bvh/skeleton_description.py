@@ -21,11 +21,12 @@ _MAX_NAMED_DIRECTION_DEG = 10.0
 """Degrees. Up to this angle a bone counts as parallel to one of the six directions. Evidence: none."""
 
 _MIN_HEIGHT_DIFFERENCE_M = 0.2
-"""Metres. In a standing pose the head is higher and the feet are lower than the hips by at least this. Derivation:
-less than half of either distance for a child of 1 m."""
+"""Metres. In a standing pose the head is higher and the feet are lower than the hips by at least this.
+Derivation: less than half of either distance for a child of 1 m."""
 
 _MIN_BONE_M = 1e-6
-"""Metres. A shorter bone has no direction. Derivation: below the six decimals of a BVH file in centimetres."""
+"""Metres. A shorter bone has no direction. Derivation: below the six decimals of a BVH file in
+centimetres."""
 
 _NEXT_PART = {
     "Shoulder": "Arm",
@@ -49,8 +50,10 @@ class JointDescription:
         name: Name of the joint in the file.
         role: Anatomical name, "" without one.
         parent: Name of the parent, "" for the root.
-        bone_m: Length of the bone: to the next joint of the limb, else to the only child or the end of the bone.
-        points: Direction of the bone in the T-pose: ``left``, ``down, 20° left`` …; "" for a bone without length.
+        bone_m: Length of the bone: to the next joint of the limb, else to the only child or the end of the
+            bone.
+        points: Direction of the bone in the T-pose: ``left``, ``down, 20° left`` …; "" for a bone without
+            length.
         note: Remark about the joint, "" without one.
     """
 

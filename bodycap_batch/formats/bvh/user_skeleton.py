@@ -20,8 +20,8 @@ NO_ROLE = "none"
 """The role that a user writes for a joint without a role."""
 
 _MIN_WIDTH_M = 0.02
-"""Metres. Horizontal distance of the left and the right joint from which the facing direction can be computed.
-Derivation: far above rounding, far below the width of shoulders or hips."""
+"""Metres. Horizontal distance of the left and the right joint from which the facing direction can be
+computed. Derivation: far above rounding, far below the width of shoulders or hips."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,8 +29,8 @@ class RigOptions:
     """What the user states about a skeleton.
 
     Attributes:
-        roles: Role by joint name, ``none`` for a joint without a role. These take precedence over the roles that
-            follow from the names.
+        roles: Role by joint name, ``none`` for a joint without a role. These take precedence over the roles
+            that follow from the names.
         tpose_frame: Number of the frame, counted from 0, that has the T-pose; None if it is the zero pose.
     """
 
@@ -100,7 +100,7 @@ def _tpose_rotations(path: Path, skeleton: SkeletonModel, motion: Motion | None,
     """Return the local rotations (J,3,3) of a frame, rotated about the vertical such that the body faces −Y."""
     count = 0 if motion is None else len(motion.root_in_world_m)
     if motion is None or not 0 <= frame < count:
-        hint = f"frames are counted from 0; the file has {count}"
+        hint = f"frames count from 0; the file has {count}"
         raise JobError(f"it has no frame {frame}", path=path, field="tpose_frame", hint=hint)
     local: FloatArray = motion.local_rotation[frame].copy()
     pose = rest_pose(replace(skeleton, tpose_rotation=local))

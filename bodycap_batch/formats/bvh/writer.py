@@ -18,8 +18,9 @@ _POSITION_CHANNELS = ("Xposition", "Yposition", "Zposition")
 def write_bvh(path: Path | str, motion: Motion, *, units: str = "cm", euler_order: str = "ZXY") -> None:
     """Write a motion as a BVH file.
 
-    A skeleton from a file keeps the hierarchy, the OFFSETs and the channel order of that file. If the channels of
-    a joint do not allow every rotation, the missing ones are appended. The root always has position channels.
+    A skeleton from a file keeps the hierarchy, the OFFSETs and the channel order of that file. If the
+    channels of a joint do not allow every rotation, the missing ones are appended. The root always has
+    position channels.
 
     Args:
         path: The file; it is replaced atomically.

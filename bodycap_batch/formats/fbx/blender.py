@@ -28,8 +28,8 @@ _START_TEST = "import bpy"
 def find_blender() -> Path:
     """Return the path of a Python that has the module ``bpy``, or of a Blender executable.
 
-    The search order is: ``BODYCAP_BLENDER``, the running Python, and ``.venv-blender`` in the working folder and
-    in the folder that contains this package.
+    The search order is: ``BODYCAP_BLENDER``, the running Python, and ``.venv-blender`` in the working folder
+    and in the folder that contains this package.
 
     Raises:
         JobError: Nothing was found, or ``BODYCAP_BLENDER`` names no program.

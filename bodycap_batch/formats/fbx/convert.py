@@ -2,8 +2,8 @@
 
     python convert.py in.glb out.fbx report.json fps frames
 
-The unit of the Blender scene is the centimetre. Blender's glTF importer converts metres to it, so the FBX needs no
-scale.
+The unit of the Blender scene is the centimetre. Blender's glTF importer converts metres to it, so the FBX
+needs no scale.
 """
 
 from __future__ import annotations

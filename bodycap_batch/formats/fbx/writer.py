@@ -17,22 +17,22 @@ from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import Motion
 
 POSITION_TOLERANCE_M = 1e-4
-"""Metres. Largest accepted distance of a joint when the file is read back. Derivation: FBX and GLB have single
-precision, and this is below what an animator sees."""
+"""Metres. Largest accepted distance of a joint when the file is read back. Derivation: FBX and GLB have
+single precision, and this is below what an animator sees."""
 
 _CONVERT_SCRIPT = Path(__file__).with_name("convert.py")
 
 _BEFORE_BLENDER_IMPORT = so3_exp([-np.pi / 2, 0.0, 0.0])
-"""Rotation of the scene in the GLB. It cancels the quarter turn about X of Blender's glTF importer, so that the
-axes of the joints stay as they are."""
+"""Rotation of the scene in the GLB. It cancels the quarter turn about X of Blender's glTF importer, so that
+the axes of the joints stay as they are."""
 
 
 def write_fbx(path: Path, motion: Motion) -> Path:
     """Write a motion as FBX.
 
-    Blender converts a GLB file to FBX and reads it back; the joint centres are compared with the motion. The file
-    is in centimetres, Y up, facing +Z. The armature has no scale and no rotation, and all joints have identity
-    rotations in the T-pose.
+    Blender converts a GLB file to FBX and reads it back; the joint centres are compared with the motion. The
+    file is in centimetres, Y up, facing +Z. The armature has no scale and no rotation, and all joints have
+    identity rotations in the T-pose.
 
     Args:
         path: The file; it is replaced atomically.

@@ -23,8 +23,8 @@ from bodycap_batch.model.skeleton import Motion, SkeletonModel
 def read_glb(path: Path | str) -> Motion:
     """Read the animated skeleton of a file that `write_glb` has written.
 
-    The rest pose of the nodes becomes the T-pose; in the zero pose all rotations are the identity. The file does
-    not contain the far ends of bones and the BVH channels.
+    The rest pose of the nodes becomes the T-pose; in the zero pose all rotations are the identity. The file
+    does not contain the far ends of bones and the BVH channels.
 
     Raises:
         JobError: The file is no GLB file with one skin and one animation.

@@ -36,9 +36,9 @@ def write_glb(
 ) -> None:
     """Write a motion as a skinned, animated stick figure.
 
-    The joints are nodes below one node ``Armature``. The mesh is bound to them in the T-pose. Every joint has a
-    LINEAR rotation channel; the root, and hips that move freely below it, also have a translation channel. Frame k
-    is at k / fps seconds.
+    The joints are nodes below one node ``Armature``. The mesh is bound to them in the T-pose. Every joint has
+    a LINEAR rotation channel; the root, and hips that move freely below it, also have a translation channel.
+    Frame k is at k / fps seconds.
 
     Args:
         path: The file; it is replaced atomically.

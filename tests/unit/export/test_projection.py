@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.export import projection_solver
-from bodycap_batch.export.projection import project_motion
+from bodycap_batch.export.projection import initial_motion, project_motion, projection_problem
 from bodycap_batch.export.projection_solver import (
-    ProjectionProblem,
     RigidMotion,
     StandingJoint,
-    _cost,
-    _normal_equations,
-    _retract,
+    cost,
+    normal_equations,
+    retract,
     solve_rigid_motion,
+    windows,
 )
 from bodycap_batch.model.geometry import rotation_angle_rad
+from bodycap_batch.model.skeleton import forward_kinematics
 from tests.bodies import merged, reaching
 
 
@@ -127,12 +127,12 @@ def test_gradient_and_optimum(sigma_m: float | None) -> None:
     """
     truth = reaching(6)
     result, clocks = merged(truth, noise_m=0.004)
-    problem = problem_of(result, clocks)
+    problem = projection_problem(result, clocks)
     if sigma_m is not None:
         hand = truth.skeleton.index_of_role("LeftHand")
         assert hand is not None
         held = np.array([True, True, False, False, True])
-        problem = replace(problem, planted=(StandingJoint(joint=hand, held=held, sigma_m=sigma_m),))
+        problem = replace(problem, standing=(StandingJoint(joint=hand, held=held, sigma_m=sigma_m),))
     rotation = result.world_from_joint[..., :3, :3]
     local = rotation.copy()
     for joint in range(1, len(truth.skeleton.joints)):
@@ -141,21 +141,21 @@ def test_gradient_and_optimum(sigma_m: float | None) -> None:
     rng = np.random.default_rng(1)
     # away from the graph, so that the change of the correction over time takes part
     away = 3e-3 * rng.normal(size=(6, 3 + 3 * len(problem.solved)))
-    start = _retract(problem, start, away)
-    _, _, gradient = _normal_equations(problem, start, problem.reach())
+    start = retract(problem, start, away)
+    gradient = normal_equations(problem, start, problem.ancestor_matrix()).gradient
     for _ in range(5):
         step = rng.normal(size=gradient.shape)
-        change = _cost(problem, _retract(problem, start, 1e-6 * step)) - _cost(
-            problem, _retract(problem, start, -1e-6 * step)
+        change = cost(problem, retract(problem, start, 1e-6 * step)) - cost(
+            problem, retract(problem, start, -1e-6 * step)
         )
         # logarithms' own derivative is taken as the identity: errors here are up to 0.03 rad
         assert change / 2e-6 == pytest.approx(2.0 * float((gradient * step).sum()), rel=0.03)
     found = solve_rigid_motion(problem, start)
-    best = _cost(problem, found)
-    assert best < _cost(problem, start)
+    best = cost(problem, found)
+    assert best < cost(problem, start)
     for _ in range(20):
         step = 1e-3 * rng.normal(size=gradient.shape)
-        assert _cost(problem, _retract(problem, found, step)) > best
+        assert cost(problem, retract(problem, found, step)) > best
 
 
 @pytest.mark.parametrize("standing", [False, True])
@@ -207,46 +207,35 @@ def test_what_stands_in_the_graph_stands_in_the_file() -> None:
         for each in (free, held)
     ]
     assert slide[1] < 0.5 * slide[0]
-    told = held.gap["feet"][still.skeleton.joints[hand]]
-    assert told["slide_p50_m_per_s"] == pytest.approx(still.fps * slide[1], rel=0.3)
+    feet = held.gap["feet"][still.skeleton.joints[hand]]
+    assert feet["slide_p50_m_per_s"] == pytest.approx(still.fps * slide[1], rel=0.3)
     assert "feet" not in free.gap
     # The cameras are met as well as they were: their noise is no longer followed, that is all.
     assert held.gap["cameras"]["left_palm"]["p95_m"] < 1.2 * free.gap["cameras"]["left_palm"]["p95_m"]
 
 
-def test_a_long_motion_is_corrected_in_stretches_as_of_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_motion_is_solved_in_windows_as_in_one_piece() -> None:
     result, clocks = merged(reaching(120), noise_m=0.005)
     standing = np.zeros((120, len(result.skeleton.joints)), dtype=bool)
     standing[50:70, result.skeleton.index_of_role("LeftHand")] = True
     standing[10:30, result.skeleton.index_of_role("RightHand")] = True
     result = replace(result, standing=standing)
-    whole = project_motion(result, clocks).motion.world_from_joint()
-    solved: list[int] = []
-    equations = projection_solver._normal_equations
-
-    def counted(problem, now, reach):  # type: ignore[no-untyped-def]
-        solved.append(len(now.root))
-        return equations(problem, now, reach)
-
-    monkeypatch.setattr(projection_solver, "_normal_equations", counted)
-    monkeypatch.setattr(projection_solver, "_WINDOW_TICKS", 40)
-    monkeypatch.setattr(projection_solver, "_OVERLAP_S", 25 / 30)
-    pieces = project_motion(result, clocks).motion.world_from_joint()
-    # A correction is forgotten at a tenth a tick and faster where cameras measure.
-    assert np.abs(pieces - whole)[..., :3, 3].max() < 1e-4
-    assert set(solved) == {65, 90}
+    problem, start = projection_problem(result, clocks), initial_motion(result)
+    whole = solve_rigid_motion(problem, start)
+    # Three windows of 40 ticks, each with 25 ticks more on both sides: 65, 90 and 65 ticks.
+    pieces = solve_rigid_motion(problem, start, window_ticks=40, overlap_s=25 / 30)
+    centres = [
+        forward_kinematics(result.skeleton, motion.root, motion.local)[..., :3, 3]
+        for motion in (whole, pieces)
+    ]
+    # The influence of a tick falls by a tenth per tick, and faster at ticks with camera poses.
+    assert 0.0 < np.abs(centres[1] - centres[0]).max() < 1e-4
 
 
-def problem_of(result, clocks) -> ProjectionProblem:  # type: ignore[no-untyped-def]
-    from bodycap_batch.export.projection import _camera_targets
-
-    return ProjectionProblem(
-        fps=result.fps,
-        skeleton=result.skeleton,
-        solved=np.flatnonzero(result.solved),
-        world_from_joint=result.world_from_joint,
-        cameras=_camera_targets(result, clocks, {}),
-    )
+def test_windows_cover_all_ticks() -> None:
+    assert windows(120, 2000) == [(0, 120)]
+    assert windows(120, 40) == [(0, 40), (40, 80), (80, 120)]
+    assert windows(121, 40) == [(0, 30), (30, 60), (60, 91), (91, 121)]
 
 
 def test_no_camera_and_nothing_solved() -> None:

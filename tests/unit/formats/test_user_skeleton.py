@@ -95,7 +95,7 @@ def test_overrides_move_roles(tmp_path: Path) -> None:
         (RigOptions(roles={"Nek": "Neck"}), "no joint 'Nek'", "did you mean 'Neck'"),
         (RigOptions(roles={"Neck": "Tentacle"}), "no role 'Tentacle'", "one of"),
         (RigOptions(roles={"Neck": "Head", "Spine": "Head"}), "two joints", "one joint"),
-        (RigOptions(tpose_frame=2), "no frame 2", "it has 2"),
+        (RigOptions(tpose_frame=2), "no frame 2", "the file has 2"),
         (RigOptions(tpose_frame=-1), "no frame -1", "count from 0"),
     ],
 )
