@@ -1,4 +1,7 @@
-"""``metrics.json``: the figures of a job. It has no run times and host names, so equal jobs give equal files."""
+"""``metrics.json``: the figures of a job.
+
+The file has no run times, dates and host names, so equal jobs give equal files.
+"""
 
 from __future__ import annotations
 

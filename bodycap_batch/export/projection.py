@@ -160,7 +160,7 @@ def _camera_targets(
 
 
 def _gap(merge: MergeResult, motion: Motion, cameras: tuple[CameraTarget, ...]) -> dict[str, Any]:
-    """Return the differences of the rigid motion to the motion graph and to the cameras (`Projection.gap`)."""
+    """Return the differences of the rigid motion to motion graph and cameras (`Projection.gap`)."""
     exported = motion.world_from_joint()
     out: dict[str, Any] = {}
     if merge.solved.any():

@@ -1,11 +1,12 @@
-"""The least-squares problem of the projection onto the rigid skeleton, and its solution by Levenberg-Marquardt.
+"""The least-squares problem of the projection onto the rigid skeleton, and its solution.
 
-The unknowns of a tick are a shift of the root and, for each solved joint, a rotation of all its descendants about
-its centre, in world axes. Only neighbouring ticks are linked, so the normal equations are block-tridiagonal, and
-the solution takes a time proportional to the number of ticks. Long motions are solved in overlapping windows, so
-that the memory does not grow with their length.
+The unknowns of a tick are a shift of the root and, for each solved joint, a rotation of all its descendants
+about its centre, in world axes. Only neighbouring ticks are linked, so the normal equations are
+block-tridiagonal, and the solution takes a time proportional to the number of ticks. Long motions are solved
+in overlapping windows, so that the memory does not grow with their length.
 
-Source: D. C. Fraser, J. E. Potter, "The optimum linear smoother as a combination of two optimum linear filters",
+Source: D. C. Fraser, J. E. Potter, "The optimum linear smoother as a combination of two optimum linear
+filters",
     IEEE Trans. Automatic Control 1969 (the forward-backward elimination used here).
 """
 
@@ -119,7 +120,7 @@ class ProjectionProblem:
     standing: tuple[StandingJoint, ...] = ()
 
     def ancestor_matrix(self) -> FloatArray:
-        """Return a matrix (J,S) with 1 if a solved joint is a joint itself or one of its ancestors, else 0."""
+        """Return a matrix (J,S): 1 if the solved joint is the joint itself or its ancestor, else 0."""
         out = np.zeros((len(self.skeleton.joints), len(self.solved)))
         for joint in range(len(out)):
             ancestor = joint
@@ -195,7 +196,7 @@ def windows(ticks: int, window_ticks: int) -> list[tuple[int, int]]:
 
 
 def _solve_window(problem: ProjectionProblem, start: RigidMotion) -> RigidMotion:
-    """Minimise the cost by Levenberg-Marquardt: a step that does not reduce the cost increases the damping."""
+    """Minimise the cost by Levenberg-Marquardt; a step that increases the cost is rejected."""
     ancestors = problem.ancestor_matrix()
     motion, damping = start, 1e-6
     current_cost = cost(problem, motion)
@@ -249,7 +250,10 @@ def _camera_error(target: CameraTarget, world: FloatArray, ticks: slice) -> tupl
 
 
 def _graph_error(problem: ProjectionProblem, world: FloatArray, ticks: slice) -> FloatArray:
-    """Return the differences (T,S,6) of the solved joints to the motion graph, rotation first, rad and metres."""
+    """Return the differences (T,S,6) of the solved joints to the motion graph, in rad and metres.
+
+    Rotation comes before translation. `world` has the joint poses of the rigid skeleton at `ticks`.
+    """
     graph, rigid = problem.world_from_joint[ticks][:, problem.solved], world[:, problem.solved]
     rotvec = so3_log(rigid[..., :3, :3] @ np.swapaxes(graph[..., :3, :3], -1, -2))
     return np.concatenate([rotvec, rigid[..., :3, 3] - graph[..., :3, 3]], axis=-1)
@@ -379,7 +383,7 @@ def _add_standing_joints(
 def _weighted_residuals(
     problem: ProjectionProblem, world: FloatArray, ancestors: FloatArray, ticks: slice
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Return the Jacobian (T,6,n) and the error (T,6) of each solved joint and camera, weighted, in sigmas."""
+    """Return the weighted Jacobian (T,6,n) and error (T,6) of each solved joint and camera, in sigmas."""
     centres = world[:, problem.solved][..., :3, 3]
     out = []
     graph_error = _graph_error(problem, world, ticks)

@@ -97,7 +97,7 @@ def _motion_writers(
 
 
 def _exported_sigma_m(merge: MergeResult, motion: Motion) -> FloatArray:
-    """Return the standard deviation (T,J) of each exported joint's centre; NaN for joints that were not solved."""
+    """Return the standard deviation (T,J) of each exported joint's centre; NaN for unsolved joints."""
     kept = [merge.skeleton.joints.index(name) for name in motion.skeleton.joints]
     return merge.joint_sigma_m()[:, kept]
 

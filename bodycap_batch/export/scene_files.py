@@ -124,7 +124,10 @@ def _camera_centres(trajectory: Trajectory) -> FloatArray:
 
 
 def _extent(points: FloatArray) -> float:
-    """Return the diagonal of the box from the 5th to the 95th percentile of points (N,3); 1 for a point or none."""
+    """Return the diagonal of the box between the 5th and the 95th percentile of points (N,3).
+
+    The result is 1 for fewer than two different points.
+    """
     if len(points) < 2:
         return 1.0
     low, high = np.percentile(points, [5, 95], axis=0)

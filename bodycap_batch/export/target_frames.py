@@ -31,7 +31,10 @@ class ExportedMap:
 
 
 def maps_in_target_frames(inputs: ExportInputs) -> tuple[ExportedMap, ...]:
-    """Return all maps with their target frames: first those in the world, then the others, each largest first."""
+    """Return all maps with their target frames: first those in the world, then the others.
+
+    Within each group, the largest map comes first.
+    """
     world_from_map = {} if inputs.merge is None else inputs.merge.world_from_map
     exported = [
         ExportedMap(
@@ -45,12 +48,12 @@ def maps_in_target_frames(inputs: ExportInputs) -> tuple[ExportedMap, ...]:
 
 
 def trajectories_in_target_frames(inputs: ExportInputs) -> tuple[Trajectory, ...]:
-    """Return each camera's trajectory: that of merging in the world if there is one, else in its map's gauge."""
+    """Return each camera's trajectory: in the world if merging has it, else in its map's gauge."""
     merged = {} if inputs.merge is None else {path.camera: path for path in inputs.merge.trajectories}
     return tuple(merged.get(path.camera, path) for path in inputs.trajectories)
 
 
 def main_target_name(inputs: ExportInputs) -> str:
-    """Return the name of the results' target frame: the world if possible, else the gauge of the largest map."""
+    """Return the name of the main target frame: the world if it exists, else the largest map's gauge."""
     exported = maps_in_target_frames(inputs)
     return exported[0].target if exported else WORLD

@@ -1,1 +1,1 @@
-"""Readers and writers of file formats. Each format's axes, units and conventions are handled in its own module."""
+"""Readers and writers of file formats; each module handles the axes and units of its format."""

@@ -40,7 +40,7 @@ MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 
 
 def image_name(camera: str, frame_number: int) -> str:
-    """Return the image name of a keyframe: one folder per camera, named after the frame number in the video."""
+    """Return the image name of a keyframe: the camera as folder, the frame number in the video as file."""
     return f"{camera}/{frame_number:06d}.png"
 
 

@@ -1,4 +1,4 @@
-"""TUM trajectory files: one line ``timestamp tx ty tz qx qy qz qw`` per pose, in seconds and world_from_camera."""
+"""TUM trajectory files: one line ``timestamp tx ty tz qx qy qz qw`` per pose world_from_camera, in seconds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Conversion between the axes and units of the world and those of a BVH file: BVH = (x, z, −y) · units per metre."""
+"""Convert between the axes and units of the world and of a BVH file: BVH = (x, z, −y) · units per metre."""
 
 from __future__ import annotations
 

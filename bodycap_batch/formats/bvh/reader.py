@@ -146,7 +146,7 @@ def _offsets_from_channels(
 
 
 def _positions(joint: FileJoint, values: FloatArray, offset: FloatArray) -> FloatArray:
-    """Return the positions (T,3) of a joint in file axes and units: its position channels, else the OFFSET."""
+    """Return the positions (T,3) of a joint in file axes and units: its channels, else the OFFSET."""
     out = np.tile(offset, (len(values), 1))
     for column, name in enumerate(joint.channels):
         if name.endswith("position"):

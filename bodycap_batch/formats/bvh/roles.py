@@ -130,7 +130,7 @@ def _strip_common_prefix(joints: Sequence[str]) -> list[str]:
 
 
 def _split_name(name: str) -> tuple[str, str]:
-    """Split a joint name into its side ("l", "r" or "") and the rest, in lower case and without final digits."""
+    """Split a joint name into its side ("l", "r" or "") and the rest, in lower case without final digits."""
     tokens = [token.lower() for token in _WORD_PATTERN.findall(name)]
     while tokens and tokens[-1].isdigit():
         tokens.pop()
@@ -254,7 +254,7 @@ def _joints_between(upper: int | None, lower: int | None, ancestors: Sequence[li
 def _choose_joint(
     word: str, among: Sequence[int], bases: Sequence[str], has_bone: Sequence[bool]
 ) -> int | None:
-    """Return the joint with this name and a bone, else the first with a bone, else the first; None for none."""
+    """Return the joint with this name and a bone, else the first with a bone, else the first, else None."""
     order = sorted(
         among, key=lambda joint: (not (bases[joint] == word and has_bone[joint]), not has_bone[joint])
     )

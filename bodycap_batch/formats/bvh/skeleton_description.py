@@ -92,7 +92,7 @@ def describe_joints(skeleton: SkeletonModel) -> tuple[JointDescription, ...]:
 
 
 def _bone_vector(skeleton: SkeletonModel, rest: FloatArray, joint: int) -> FloatArray:
-    """Return the vector (3,) of the bone that starts at a joint, in the world; zero for a joint that branches.
+    """Return the vector (3,) of the bone that starts at a joint, in the world; zero at a branch.
 
     Args:
         skeleton: The skeleton.

@@ -97,7 +97,7 @@ def _suggest_name(word: str, names: tuple[str, ...]) -> str:
 
 
 def _tpose_rotations(path: Path, skeleton: SkeletonModel, motion: Motion | None, frame: int) -> FloatArray:
-    """Return the local rotations (J,3,3) of a frame, rotated about the vertical such that the body faces −Y."""
+    """Return the local rotations (J,3,3) of a frame, with the body rotated to face −Y."""
     count = 0 if motion is None else len(motion.root_in_world_m)
     if motion is None or not 0 <= frame < count:
         hint = f"frames count from 0; the file has {count}"

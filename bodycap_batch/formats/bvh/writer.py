@@ -131,7 +131,7 @@ def _hierarchy_lines(
 
 
 def _format_vector(vector: FloatArray) -> str:
-    """Return three lengths as text, with at least six decimals, all digits of the source and no negative zero."""
+    """Return three lengths as text, with six to twelve decimals and no negative zero."""
     return " ".join(_format_length(float(value)) for value in vector)
 
 

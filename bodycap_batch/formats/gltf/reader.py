@@ -1,4 +1,4 @@
-"""Read GLB files that the writer of this package has written; other GLB files only if they have the same form."""
+"""Read GLB files that `write_glb` has written, or that have the same form."""
 
 from __future__ import annotations
 

@@ -169,7 +169,7 @@ def _figure_primitive(skeleton: SkeletonModel, turn: FloatArray, buffer: _Binary
 
 
 def _motion_animation(motion: Motion, turn: FloatArray, buffer: _BinaryBuffer) -> Any:
-    """Return the animation: rotations of all joints, and translations of the root and of freely moving hips."""
+    """Return the animation: rotations of all joints, translations of the root and of freely moving hips."""
     import pygltflib as gl
 
     times = buffer.add(np.arange(len(motion.root_in_world_m)) / motion.fps, "SCALAR")

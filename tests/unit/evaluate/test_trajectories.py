@@ -220,7 +220,7 @@ def test_a_camera_without_poses_counts_against_coverage() -> None:
     assert (score.cameras["b"].coverage, score.total.coverage) == (0.0, 0.5)
     with pytest.raises(JobError, match="0 frames have both"):
         relative_camera_error({"a": walk(0), "b": nothing}, truths, "a", "b")
-    with pytest.raises(JobError, match="truth of camera b holds no poses"):
+    with pytest.raises(JobError, match="truth of camera b has no poses"):
         score_trajectories({"b": walk(0)}, {"b": nothing})
 
 
