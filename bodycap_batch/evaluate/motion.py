@@ -1,4 +1,4 @@
-"""Errors of a motion against the true motion: joint positions and orientations, matched by anatomical role."""
+"""Errors of a motion against the true motion. Joints are matched by anatomical role."""
 
 from __future__ import annotations
 

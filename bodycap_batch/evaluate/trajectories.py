@@ -1,4 +1,7 @@
-"""Errors of camera trajectories against ground truth (ATE, RPE, coverage), with one alignment for all cameras."""
+"""Errors of camera trajectories against ground truth: ATE, RPE and coverage.
+
+One alignment is estimated for all cameras together.
+"""
 
 from __future__ import annotations
 
@@ -237,7 +240,7 @@ def _truth_from_estimate(pairs: Mapping[str, _MatchedPoses], align: Alignment) -
 
 
 def _pose_errors(pair: _MatchedPoses, alignment: Similarity, delta_s: float) -> tuple[FloatArray, ...]:
-    """Return the errors of centres and orientations, and the relative errors of both, in metres and degrees."""
+    """Return the errors of centres (m) and orientations (deg), then the relative errors of both."""
     aligned = alignment.apply_to_poses(pair.estimate)
     centres = np.linalg.norm(aligned[:, :3, 3] - pair.truth[:, :3, 3], axis=1)
     difference = invert(pair.truth) @ aligned

@@ -148,7 +148,8 @@ def yuv420_from_rgb(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     height, width = image.shape[:2]
     planes = cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420)
     half = cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-    # OpenCV takes the chroma of one pixel of four, so thin coloured lines flicker. The mean of the four does not.
+    # cvtColor takes the chroma of one pixel of four, which makes thin coloured lines flicker. The mean of the
+    # four pixels does not.
     _, red, blue = cv2.split(cv2.cvtColor(half, cv2.COLOR_RGB2YCrCb))
     for plane, chroma in zip(planes[height:].reshape(2, -1), (blue, red), strict=True):
         plane[:] = cv2.LUT(chroma, _STUDIO_RANGE_CHROMA).ravel()

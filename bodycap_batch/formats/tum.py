@@ -1,4 +1,7 @@
-"""TUM trajectory files: one line ``timestamp tx ty tz qx qy qz qw`` per pose world_from_camera, in seconds."""
+"""TUM trajectory files: one line ``timestamp tx ty tz qx qy qz qw`` per pose.
+
+The timestamp is in seconds, and the pose is world_from_camera.
+"""
 
 from __future__ import annotations
 

@@ -15,8 +15,8 @@ BLENDER_VARIABLE = "BODYCAP_BLENDER"
 """Environment variable with the path of Blender, or of a Python that has its module."""
 
 _HINT = (
-    f"`make blender` installs it as a Python module (Python 3.11); or set {BLENDER_VARIABLE} to a Python that "
-    "has bpy, or to a blender executable"
+    f"`make blender` installs it as a Python module (Python 3.11); or set {BLENDER_VARIABLE} to a Python "
+    "that has bpy, or to a blender executable"
 )
 _TIMEOUT_S = 3600.0
 """Seconds. Longest run of Blender. Evidence: none; it only ends a process that hangs."""
