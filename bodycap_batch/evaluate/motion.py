@@ -15,7 +15,7 @@ from bodycap_batch.evaluate.association import interpolate_truth
 from bodycap_batch.evaluate.trajectories import ErrorSummary
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.tum import TimedPoses
-from bodycap_batch.model.geometry import Similarity, align_points, rotation_angle_rad
+from bodycap_batch.model.geometry import Similarity, align_points, nearest_rotation, rotation_angle_rad
 from bodycap_batch.model.skeleton import Motion
 
 _ROLE_BY_TRUTH_NAME = {
@@ -243,9 +243,8 @@ def _angles_without_offset(rotation: FloatArray, true_rotation: FloatArray) -> F
     The offset of a joint is the chordal mean of true rotation relative to estimated rotation (T,J,3,3).
     """
     offset = np.swapaxes(rotation, -1, -2) @ true_rotation
-    u, _, vt = np.linalg.svd(offset.sum(axis=0))
-    u[..., -1] *= np.linalg.det(u @ vt)[..., None]
-    return np.asarray(np.rad2deg(rotation_angle_rad(np.swapaxes(offset, -1, -2) @ (u @ vt))))
+    mean = nearest_rotation(offset.sum(axis=0))
+    return np.asarray(np.rad2deg(rotation_angle_rad(np.swapaxes(offset, -1, -2) @ mean)))
 
 
 def _procrustes_distances(positions: FloatArray, true_positions: FloatArray) -> FloatArray:
