@@ -36,7 +36,8 @@ in a second."""
 
 _INDEPENDENT_HZ = 30.0
 """Hertz. Number of errors per second that count as independent. At other rates each tick has a weight, so
-that the same time has the same weight. Evidence: none."""
+that the same time has the same weight. Evidence for the
+weighting: docs/decisions/export.md; for the value: none."""
 
 _SLIP_HUBER_SIGMAS = 2.0
 """Sigmas. Threshold of the Huber loss for the movement of a standing foot, as in the motion graph. A larger

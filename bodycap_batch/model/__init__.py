@@ -1,1 +1,1 @@
-"""The data types that all stages share: cameras, maps, trajectories, skeletons and motions; their geometry."""
+"""The data types that all stages share (camera, map, trajectory, skeleton, motion) and their geometry."""

@@ -33,7 +33,8 @@ def shared(inputs: ReportInputs) -> str:
             says = (
                 f"{name} sees {counts[row, row]:,} points"
                 if row == column
-                else f"{name} and {other} share {counts[row, column]:,} points, {format_percent(share)} of {name}'s"
+                else f"{name} and {other} share {counts[row, column]:,} points, "
+                f"{format_percent(share)} of {name}'s"
             )
             x = _LEFT + column * _CELL
             parts.append(
