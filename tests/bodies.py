@@ -68,7 +68,7 @@ def reaching(ticks: int = 60, skeleton: SkeletonModel | None = None, fps: float 
 def trajectory_of(
     motion: Motion, mount: Mount, rng: np.random.Generator, *, noise_m: float, lost: slice, offset_ns: int
 ) -> Trajectory:
-    """Return the measured path of a camera with lost frames, noise of `noise_m` and of 0.3° per 5 mm of it."""
+    """Return the measured path of a camera with lost frames, and noise of `noise_m` and of 0.3° per 5 mm."""
     joint = motion.skeleton.index_of_role(mount.role)
     poses = motion.world_from_joint()[:, joint] @ mount.joint_from_cam
     count = len(poses)

@@ -19,8 +19,8 @@ from bodycap_batch.model.geometry import rotation_angle_rad
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
 
 POSITION_TOLERANCE_M = 1e-4
-"""Metres. Largest accepted difference of a joint centre. Derivation: a hundred times the last digit of a BVH
-file in centimetres, and below what an animator sees."""
+"""Metres. Largest accepted difference of a joint centre. Derivation: above the rounding of all formats,
+below what an animator sees."""
 
 ANGLE_TOLERANCE_DEG = 0.01
 """Degrees. Largest accepted difference of an orientation. Derivation: 0.1 mm at the end of a bone of 0.6

@@ -6,8 +6,7 @@ block-tridiagonal, and the solution takes a time proportional to the number of t
 in overlapping windows, so that the memory does not grow with their length.
 
 Source: D. C. Fraser, J. E. Potter, "The optimum linear smoother as a combination of two optimum linear
-filters",
-    IEEE Trans. Automatic Control 1969 (the forward-backward elimination used here).
+    filters", IEEE Trans. Automatic Control 1969 (the forward-backward elimination used here).
 """
 
 from __future__ import annotations
@@ -35,9 +34,8 @@ Derivation: below what a viewer sees as jitter. It grows with the square root of
 in a second."""
 
 _INDEPENDENT_HZ = 30.0
-"""Hertz. Number of errors per second that count as independent. At other rates each tick has a weight, so
-that the same time has the same weight. Evidence for the
-weighting: docs/decisions/export.md; for the value: none."""
+"""Hertz. Number of errors per second that count as independent. The weight of a tick is proportional to its
+duration. Evidence: docs/decisions/export.md for the weight; none for the value."""
 
 _SLIP_HUBER_SIGMAS = 2.0
 """Sigmas. Threshold of the Huber loss for the movement of a standing foot, as in the motion graph. A larger
@@ -48,7 +46,7 @@ _GEMAN_MCCLURE_SQUARED = 100.0
 the six components of the error."""
 
 _MAX_STEPS = 12
-"""Largest number of Levenberg-Marquardt steps. Evidence: none; the solve usually needs fewer."""
+"""Largest number of Levenberg-Marquardt steps. Evidence: none."""
 
 _STEP_TOLERANCE = 1e-6
 """Metres and radians. The solve ends when all components of a step are below this. Derivation: a micrometre

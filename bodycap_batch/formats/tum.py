@@ -95,7 +95,7 @@ def _parse_line(path: Path, number: int, words: list[str]) -> tuple[int, list[fl
             "NaN, infinity or a time out of range",
             path=path,
             line=number,
-            hint="leave frames without a pose out",
+            hint="omit frames without a pose",
         )
     if np.linalg.norm(row[3:]) < 1e-6:
         raise JobError("the quaternion is zero", path=path, line=number, hint="order: qx qy qz qw")

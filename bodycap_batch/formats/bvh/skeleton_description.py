@@ -22,7 +22,7 @@ _MAX_NAMED_DIRECTION_DEG = 10.0
 
 _MIN_HEIGHT_DIFFERENCE_M = 0.2
 """Metres. In a standing pose the head is higher and the feet are lower than the hips by at least this.
-Derivation: less than half of either distance for a child of 1 m."""
+Derivation: less than either distance for a child of 1 m."""
 
 _MIN_BONE_M = 1e-6
 """Metres. A shorter bone has no direction. Derivation: below the six decimals of a BVH file in

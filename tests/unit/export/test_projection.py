@@ -42,7 +42,7 @@ def test_slack_is_removed_and_the_cameras_reduce_the_error() -> None:
     world, true = projection.motion.world_from_joint(), truth.world_from_joint()
     loose = joint_error(result.world_from_joint, true)[:, result.solved].mean()
     rigid = joint_error(world, true)[:, result.solved].mean()
-    # The joints of the graph have errors of 4 mm per coordinate, 6.4 mm in all; the cameras have smaller ones.
+    # The joints of the graph have errors of 4 mm per coordinate, 6.4 mm in all; cameras have smaller ones.
     assert rigid < 0.65 * loose
     centres = world[..., :3, 3]
     bones = np.linalg.norm(centres[:, 1:] - centres[:, truth.skeleton.parents[1:]], axis=-1)
