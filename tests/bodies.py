@@ -1,4 +1,4 @@
-"""A moving body with cameras on it, as merging would hand it over: joints with slack, cameras with noise."""
+"""A moving body with cameras, as the result of merging: joints with slack, camera poses with noise."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ Frame Time: 0.0333333
 1 100 2 0 0 0 90 0 0
 1 100 2 0 0 90 0 0 0
 """
-"""Two joints, two frames: the smallest file with all that a BVH file has."""
+"""The smallest BVH file with all elements of the format: two joints, two frames."""
 
 
 def reaching(ticks: int = 60, skeleton: SkeletonModel | None = None, fps: float = 30.0) -> Motion:
-    """A body that walks forward (−Y), turns and swings its arms; its legs stay at rest."""
+    """Return the motion of a body that walks forward (−Y), turns and swings its arms, with still legs."""
     body = skeleton or load_skeleton("upper_body", 1.75)
     time = np.arange(ticks) / fps
     local = np.tile(np.eye(3), (ticks, len(body.joints), 1, 1))
@@ -71,7 +71,7 @@ def reaching(ticks: int = 60, skeleton: SkeletonModel | None = None, fps: float 
 def trajectory_of(
     motion: Motion, mount: Mount, rng: np.random.Generator, *, noise_m: float, lost: slice, offset_ns: int
 ) -> Trajectory:
-    """The camera's measured path: noise of `noise_m` and the same in 0.3° per 5 mm, some frames lost."""
+    """Return the measured path of a camera with lost frames, and noise of `noise_m` and of 0.3° per 5 mm."""
     joint = motion.skeleton.index_of_role(mount.role)
     poses = motion.world_from_joint()[:, joint] @ mount.joint_from_cam
     count = len(poses)
@@ -103,7 +103,7 @@ def merged(
     world_from_map: dict[str, Similarity] | None = None,
     projected: bool = True,
 ) -> tuple[MergeResult, dict[str, CameraClock]]:
-    """What the skeleton stage would return for this motion, with slack in its joints.
+    """Return the merge result for a motion, with slack in its joints, and the clocks of the cameras.
 
     Without `projected` its rigid motion is the given one, which spares a long motion the solve.
     """

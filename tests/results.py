@@ -1,4 +1,4 @@
-"""What two runs of a job have to agree on, byte for byte."""
+"""The result files that must have equal bytes in two runs of a job."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def results_of(folder: Path) -> dict[str, bytes]:
-    """All files whose bytes may not depend on when, where and how fast they were made, by relative path."""
+    """Return the content of all files that do not depend on time, place and speed of a run, by path."""
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in sorted(folder.rglob("*"))

@@ -1,4 +1,4 @@
-"""Which truth belongs to which estimate: by time, interpolated or nearest."""
+"""Associate ground truth with estimates by time: interpolated, or the nearest pose."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ from bodycap_batch.model.geometry import poses_at
 Association = Literal["interpolate", "nearest"]
 
 _SNAP_NS = 1_000_000
-"""Timestamps are written with as few as four decimals: a pose this near needs no neighbour."""
+"""Nanoseconds. A true pose this near in time is used even without a second neighbour. Derivation: some files
+have timestamps of only four decimals."""
 
 
 def interpolate_truth(
     truth: TimedPoses, times_ns: IntArray, max_gap_s: float
 ) -> tuple[FloatArray, BoolArray]:
-    """The truth at given times: slerp and linear between its two neighbours.
+    """Interpolate the true poses at given times: rotations by slerp, positions linearly.
 
     Args:
-        truth: Poses in time order.
-        times_ns: (N,) when.
-        max_gap_s: Where the neighbours are further apart than this, there is no truth.
+        truth: True poses in the order of time.
+        times_ns: (N,) times to interpolate at.
+        max_gap_s: Largest time between two true poses; in a longer gap there is no truth.
 
     Returns:
-        (N,4,4) poses (identity where there is none) and (N,) which there are.
+        (N,4,4) true poses, the identity without truth, and a mask (N,) of the times with truth.
     """
     return poses_at(
         truth.times_ns,
@@ -39,15 +40,15 @@ def interpolate_truth(
 
 
 def nearest_truth(truth: TimedPoses, times_ns: IntArray, max_diff_s: float) -> tuple[FloatArray, BoolArray]:
-    """The truth nearest to given times, as benchmark tools associate.
+    """Return the true poses that are nearest to given times, as the TUM benchmark tools do.
 
     Args:
-        truth: Poses in time order.
-        times_ns: (N,) when.
-        max_diff_s: Largest time difference of a pair.
+        truth: True poses in the order of time.
+        times_ns: (N,) times of the estimates.
+        max_diff_s: Largest time difference between an estimate and its truth.
 
     Returns:
-        (N,4,4) poses and (N,) which are near enough.
+        (N,4,4) nearest true poses, and a mask (N,) of those that are near enough.
     """
     if len(truth.times_ns) == 0:
         return np.tile(np.eye(4), (len(times_ns), 1, 1)), np.zeros(len(times_ns), dtype=bool)

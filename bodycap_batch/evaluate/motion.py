@@ -1,4 +1,4 @@
-"""A motion against the true one: joint positions and bone orientations, matched by anatomical role."""
+"""Errors of a motion against the true motion. Joints are matched by anatomical role."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bodycap_batch.evaluate.association import interpolate_truth
 from bodycap_batch.evaluate.trajectories import ErrorSummary
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.tum import TimedPoses
-from bodycap_batch.model.geometry import Similarity, align_points, rotation_angle_rad
+from bodycap_batch.model.geometry import Similarity, align_points, nearest_rotation, rotation_angle_rad
 from bodycap_batch.model.skeleton import Motion
 
 _ROLE_BY_TRUTH_NAME = {
@@ -35,7 +35,7 @@ _ROLE_BY_TRUTH_NAME = {
         }.items()
     },
 }
-"""Joint names of a capture's ``gt/joints.npz``."""
+"""Anatomical role by the joint names of the ground truth file ``gt/joints.npz``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,11 +43,11 @@ class MotionOptions:
     """How motions are compared.
 
     Attributes:
-        align: One rigid alignment over all joints and frames, or none.
-        root: Role whose position is subtracted for the root-relative error.
-        offset_s: Added to the estimate's times before the truth is looked up.
-        max_gap_s: No truth inside a longer gap.
-        roles: Compare these joints only (with the root); all that both have when empty.
+        align: One rigid alignment ("se3") for all joints and frames, or no alignment ("none").
+        root: Role of the joint whose position is subtracted for the root-relative error.
+        offset_s: Added to the times of the estimate before the truth is interpolated.
+        max_gap_s: A longer gap of the truth has no true poses.
+        roles: The roles to compare, besides the root; all common ones if empty.
     """
 
     align: Literal["se3", "none"] = "se3"
@@ -59,18 +59,18 @@ class MotionOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionReport:
-    """Errors of joints, over all frames.
+    """Errors of the joints over all frames.
 
     Attributes:
-        frames: Frames compared.
-        joints: Roles compared.
-        mpjpe_m: Distance of joint centres after alignment.
-        root_relative_m: The same with the root's position taken from each.
-        procrustes_m: After a similarity of its own for every frame (shape alone).
-        angle_deg: Angle between bone orientations after alignment; None where the truth has none.
-        angle_offset_free_deg: The same with each joint's constant offset taken out.
+        frames: Number of compared frames.
+        joints: Compared roles.
+        mpjpe_m: Mean per-joint position error: distance of joint centres after alignment, metres.
+        root_relative_m: The same distance with the position of the root subtracted from both motions.
+        procrustes_m: The same distance after a separate similarity alignment of every frame.
+        angle_deg: Angle between orientations after alignment, degrees; None if the truth has no orientations.
+        angle_offset_free_deg: The same angle with a constant rotation offset of each joint removed.
         per_joint_m: Mean root-relative error by role.
-        per_joint_deg: Mean angle by role, constant offset taken out.
+        per_joint_deg: Mean angle by role, with the constant offset removed.
     """
 
     frames: int
@@ -84,13 +84,21 @@ class MotionReport:
     per_joint_deg: Mapping[str, float]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values."""
+        """Return the errors as plain JSON values."""
         return asdict(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _JointPoses:
-    """Timed joint positions (T,J,3) and orientations (T,J,3,3), the latter identity if not `oriented`."""
+    """The poses of J joints at T times.
+
+    Attributes:
+        times_ns: (T,) times.
+        roles: (J,) anatomical roles.
+        positions: (T,J,3) joint centres in metres.
+        rotations: (T,J,3,3) orientations; identities if unknown.
+        oriented: Whether the orientations are known.
+    """
 
     times_ns: IntArray
     roles: tuple[str, ...]
@@ -100,29 +108,35 @@ class _JointPoses:
 
 
 def evaluate_motion(estimate: Path, truth: Path, options: MotionOptions | None = None) -> MotionReport:
-    """Compare a BVH with another, or with a capture's ``joints.npz`` (positions only).
+    """Compare a BVH file with the truth, a BVH file or ``joints.npz`` (positions only).
 
-    Both start at the same instant; joints are matched by anatomical role, the truth is interpolated at
-    the estimate's times.
+    Both motions start at the same instant. Joints are matched by anatomical role, and the truth is
+    interpolated at the times of the estimate.
+
+    Args:
+        estimate: BVH file of the estimated motion.
+        truth: File of the true motion.
+        options: How the motions are compared.
 
     Raises:
-        JobError: A file is missing or malformed, or the two share no joints or no time.
+        JobError: A file is missing or malformed, or the motions have no common joints or times.
     """
-    found = _read_truth(Path(truth))
+    true_joints = _read_truth(Path(truth))
     _, motion = read_bvh(estimate)
     if motion is None:
         raise JobError("no frames in the file", path=estimate, hint="give the motion.bvh of a result")
-    return _compare_joints(_joints_from_motion(motion), found, options or MotionOptions())
+    return _compare_joints(_joints_from_motion(motion), true_joints, options or MotionOptions())
 
 
 def score_motion(estimate: Motion, truth: Motion, options: MotionOptions | None = None) -> MotionReport:
-    """Compare two motions on one clock; see `evaluate_motion`."""
+    """Compare two motions with the same clock; see `evaluate_motion`."""
     return _compare_joints(
         _joints_from_motion(estimate), _joints_from_motion(truth), options or MotionOptions()
     )
 
 
 def _read_truth(path: Path) -> _JointPoses:
+    """Read the true joint poses from a BVH or a .npz file."""
     if path.suffix.lower() != ".npz":
         _, motion = read_bvh(path)
         if motion is None:
@@ -144,6 +158,7 @@ def _read_truth(path: Path) -> _JointPoses:
 
 
 def _joints_from_motion(motion: Motion) -> _JointPoses:
+    """Return the poses of the joints with a role."""
     roles = motion.skeleton.roles
     kept = [index for index, role in enumerate(roles) if role]
     poses = motion.world_from_joint()[:, kept]
@@ -157,34 +172,37 @@ def _joints_from_motion(motion: Motion) -> _JointPoses:
 
 
 def _compare_joints(estimate: _JointPoses, truth: _JointPoses, options: MotionOptions) -> MotionReport:
-    wanted = {*options.roles, options.root} if options.roles else set(truth.roles)
-    roles = tuple(role for role in estimate.roles if role in truth.roles and role in wanted)
+    """Return the errors of the joints that both motions have."""
+    selected = {*options.roles, options.root} if options.roles else set(truth.roles)
+    roles = tuple(role for role in estimate.roles if role in truth.roles and role in selected)
     if options.root not in roles or len(roles) < 3:
         message = f"the two share {len(roles)} joints ({', '.join(roles)}); needs {options.root} and two more"
         raise JobError(message, hint="joints are matched by name: HumanIK, Mixamo, Biped, CMU ... names")
-    mine, theirs, rotations, true_rotations = _match_joints(estimate, truth, roles, options)
-    if len(mine) == 0:
+    positions, true_positions, rotations, true_rotations = _match_joints(estimate, truth, roles, options)
+    if len(positions) == 0:
         raise JobError("the two motions share no time", hint="check offset_s and the frame times")
     alignment = Similarity(1.0, np.eye(3), np.zeros(3))
     if options.align == "se3":
-        alignment = align_points(mine.reshape(-1, 3), theirs.reshape(-1, 3), with_scale=False)
-    aligned = alignment.apply(mine)
+        alignment = align_points(positions.reshape(-1, 3), true_positions.reshape(-1, 3), with_scale=False)
+    aligned = alignment.apply(positions)
     root = roles.index(options.root)
     relative = np.linalg.norm(
-        (aligned - aligned[:, root : root + 1]) - (theirs - theirs[:, root : root + 1]), axis=-1
+        (aligned - aligned[:, root : root + 1]) - (true_positions - true_positions[:, root : root + 1]),
+        axis=-1,
     )
     angles = offset_free = None
     if truth.oriented:
-        turned = alignment.rotation @ rotations
-        angles = np.rad2deg(rotation_angle_rad(np.swapaxes(turned, -1, -2) @ true_rotations))
-        offset_free = _angles_without_offset(turned, true_rotations)
+        aligned_rotations = alignment.rotation @ rotations
+        difference = np.swapaxes(aligned_rotations, -1, -2) @ true_rotations
+        angles = np.rad2deg(rotation_angle_rad(difference))
+        offset_free = _angles_without_offset(aligned_rotations, true_rotations)
     others = [index for index in range(len(roles)) if index != root]
     return MotionReport(
-        frames=len(mine),
+        frames=len(positions),
         joints=roles,
-        mpjpe_m=_summary(np.linalg.norm(aligned - theirs, axis=-1)),
+        mpjpe_m=_summary(np.linalg.norm(aligned - true_positions, axis=-1)),
         root_relative_m=_summary(relative[:, others]),
-        procrustes_m=_summary(_procrustes_distances(mine, theirs)),
+        procrustes_m=_summary(_procrustes_distances(positions, true_positions)),
         angle_deg=None if angles is None else _summary(angles),
         angle_offset_free_deg=None if offset_free is None else _summary(offset_free),
         per_joint_m={roles[index]: float(relative[:, index].mean()) for index in others},
@@ -197,9 +215,9 @@ def _compare_joints(estimate: _JointPoses, truth: _JointPoses, options: MotionOp
 def _match_joints(
     estimate: _JointPoses, truth: _JointPoses, roles: tuple[str, ...], options: MotionOptions
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Positions of both and rotations of both, where both have a time."""
+    """Return positions and true positions, rotations and true rotations, at the times with truth."""
     times = estimate.times_ns + round(options.offset_s * 1e9)
-    mine = [estimate.roles.index(role) for role in roles]
+    estimate_joints = [estimate.roles.index(role) for role in roles]
     positions = np.empty((len(times), len(roles), 3))
     rotations = np.empty((len(times), len(roles), 3, 3))
     found = np.ones(len(times), dtype=bool)
@@ -212,28 +230,31 @@ def _match_joints(
         at_times, found = interpolate_truth(timed, times, options.max_gap_s)
         positions[:, index], rotations[:, index] = at_times[:, :3, 3], at_times[:, :3, :3]
     return (
-        estimate.positions[found][:, mine],
+        estimate.positions[found][:, estimate_joints],
         positions[found],
-        estimate.rotations[found][:, mine],
+        estimate.rotations[found][:, estimate_joints],
         rotations[found],
     )
 
 
 def _angles_without_offset(rotation: FloatArray, true_rotation: FloatArray) -> FloatArray:
-    """Angles (T,J) left after the one right-hand offset per joint that explains most (chordal mean)."""
+    """Return the angles (T,J), degrees, after removing the mean offset rotation of each joint.
+
+    The offset of a joint is the chordal mean of true rotation relative to estimated rotation (T,J,3,3).
+    """
     offset = np.swapaxes(rotation, -1, -2) @ true_rotation
-    u, _, vt = np.linalg.svd(offset.sum(axis=0))
-    u[..., -1] *= np.linalg.det(u @ vt)[..., None]
-    return np.asarray(np.rad2deg(rotation_angle_rad(np.swapaxes(offset, -1, -2) @ (u @ vt))))
+    mean = nearest_rotation(offset.sum(axis=0))
+    return np.asarray(np.rad2deg(rotation_angle_rad(np.swapaxes(offset, -1, -2) @ mean)))
 
 
-def _procrustes_distances(mine: FloatArray, theirs: FloatArray) -> FloatArray:
-    """Distances (T,J) after a similarity for each frame."""
-    out = np.empty(mine.shape[:2])
-    for frame, (source, target) in enumerate(zip(mine, theirs, strict=True)):
+def _procrustes_distances(positions: FloatArray, true_positions: FloatArray) -> FloatArray:
+    """Return the distances (T,J) of positions (T,J,3) after a similarity alignment of each frame."""
+    out = np.empty(positions.shape[:2])
+    for frame, (source, target) in enumerate(zip(positions, true_positions, strict=True)):
         out[frame] = np.linalg.norm(align_points(source, target).apply(source) - target, axis=-1)
     return out
 
 
 def _summary(errors: FloatArray) -> ErrorSummary:
+    """Return the statistics of errors of any shape."""
     return ErrorSummary.of(errors.reshape(-1))

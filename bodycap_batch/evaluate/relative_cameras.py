@@ -1,4 +1,4 @@
-"""One camera against another on the same body, and whether covariances mean what they say."""
+"""Errors of the relative pose of two cameras on one body, and of poses in units of their covariance."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from bodycap_batch.model.geometry import align_points, invert, so3_log
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RelativeCameraError:
-    """How well the vector from one camera to another is known, in metres.
+    """Errors of the vector from one camera to another.
 
     Attributes:
-        frames: Frames where both cameras have a pose and a truth.
-        vector_m: Error of the vector between the centres, the world turned by one rigid alignment of
-            both trajectories.
-        in_reference_m: Error of the camera's centre in the reference camera's own frame, no alignment.
+        frames: Number of frames in which both cameras have a pose and a true pose.
+        vector_m: Error in metres of the vector between the centres, after one rigid alignment of both
+            trajectories.
+        in_reference_m: Error in metres of the camera's centre in the frame of the reference camera, without
+            alignment.
     """
 
     frames: int
@@ -31,7 +32,7 @@ class RelativeCameraError:
     in_reference_m: ErrorSummary
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values."""
+        """Return the errors as plain JSON values."""
         return asdict(self)
 
 
@@ -42,23 +43,23 @@ def relative_camera_error(
     reference: str,
     options: TrajectoryOptions | None = None,
 ) -> RelativeCameraError:
-    """Compare the vector between two cameras with the truth. Scale is not touched: estimates are metric.
+    """Compare the vector between two cameras with the truth. The scale is not estimated.
 
     Args:
-        estimates: world_from_camera by camera name, metres, on the common clock.
-        truths: The same, true.
+        estimates: By camera, world_from_camera in metres at common time.
+        truths: By camera, the true poses in the same form.
         camera: The camera on the limb.
         reference: The camera on the trunk.
-        options: Only the association is used.
+        options: How true poses are associated; the other options are not used.
 
     Raises:
-        JobError: A camera is missing, or fewer than 3 frames have all four poses.
+        JobError: A camera is missing, or fewer than three frames have all four poses.
     """
     options = options or TrajectoryOptions()
     for name in (camera, reference):
         if name not in estimates or name not in truths:
             raise JobError(
-                f"camera {name!r} has no estimate or no truth", hint="name a camera that both folders hold"
+                f"camera {name!r} has no estimate or no truth", hint="name a camera that both folders contain"
             )
     times = estimates[camera].times_ns
     columns = [
@@ -67,7 +68,7 @@ def relative_camera_error(
         truth_at(truths[camera], times, options),
         truth_at(truths[reference], times, options),
     ]
-    found = np.logical_and.reduce([there for _, there in columns])
+    found = np.logical_and.reduce([mask for _, mask in columns])
     if found.sum() < 3:
         hint = "check that all files use the same clock"
         raise JobError(f"{found.sum()} frames have both cameras and their truth", hint=hint)
@@ -78,23 +79,26 @@ def relative_camera_error(
     )
     vector = (limb[:, :3, 3] - trunk[:, :3, 3]) @ alignment.rotation.T
     true_vector = true_limb[:, :3, 3] - true_trunk[:, :3, 3]
-    inside = (invert(trunk) @ limb)[:, :3, 3] - (invert(true_trunk) @ true_limb)[:, :3, 3]
+    in_reference = (invert(trunk) @ limb)[:, :3, 3] - (invert(true_trunk) @ true_limb)[:, :3, 3]
     return RelativeCameraError(
         frames=int(found.sum()),
         vector_m=ErrorSummary.of(np.linalg.norm(vector - true_vector, axis=1)),
-        in_reference_m=ErrorSummary.of(np.linalg.norm(inside, axis=1)),
+        in_reference_m=ErrorSummary.of(np.linalg.norm(in_reference, axis=1)),
     )
 
 
 def normalised_errors(
     gauge_from_cam: FloatArray, covariance: FloatArray, true_gauge_from_cam: FloatArray
 ) -> FloatArray:
-    """Squared pose errors in units of their covariance (N,): mean 6 where the covariance is right.
+    """Return the squared pose errors (N,) in units of their covariance.
+
+    Their mean is 6 if the covariances are correct.
 
     Args:
-        gauge_from_cam: (N,4,4) estimates.
-        covariance: (N,6,6) rotation (rad) first, then translation, right perturbation.
-        true_gauge_from_cam: (N,4,4) the truth in the same gauge.
+        gauge_from_cam: (N,4,4) estimated poses.
+        covariance: (N,6,6) covariance of each pose: rotation (rad), then translation, as a right
+            perturbation.
+        true_gauge_from_cam: (N,4,4) true poses in the same gauge.
 
     Source: Y. Bar-Shalom et al., "Estimation with Applications to Tracking and Navigation", 2001, 5.4
         (normalised estimation error squared).

@@ -1,4 +1,7 @@
-"""Camera trajectories against the truth: ATE, RPE, coverage; all cameras under one alignment."""
+"""Errors of camera trajectories against ground truth: ATE, RPE and coverage.
+
+One alignment is estimated for all cameras together.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +26,12 @@ class TrajectoryOptions:
     """How trajectories are compared.
 
     Attributes:
-        align: Similarity, rigid or no alignment, one for all cameras of a capture.
-        association: The truth interpolated at the frame's time, or the nearest one.
-        max_gap_s: Interpolation: no truth inside a longer gap.
-        max_diff_s: Nearest: largest time difference of a pair.
-        rpe_delta_s: Time between the two poses of a relative error.
+        align: Similarity ("sim3"), rigid ("se3") or no alignment ("none"), the same for all cameras.
+        association: Whether the truth is interpolated at the time of a frame, or the nearest true pose is
+            used.
+        max_gap_s: For interpolation: a longer gap of the truth has no true poses.
+        max_diff_s: For the nearest pose: largest time difference to the frame.
+        rpe_delta_s: Time between the two poses of a relative pose error.
     """
 
     align: Alignment = "sim3"
@@ -39,7 +43,7 @@ class TrajectoryOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorSummary:
-    """Statistics of an error, in the unit of its name."""
+    """Statistics of an error, in the unit that the name of the field ends with."""
 
     rmse: float
     mean: float
@@ -49,7 +53,7 @@ class ErrorSummary:
 
     @classmethod
     def of(cls, errors: FloatArray) -> ErrorSummary:
-        """Summarise errors (N,), N ≥ 1."""
+        """Return the statistics of errors (N,), N ≥ 1."""
         return cls(
             rmse=float(np.sqrt(np.mean(errors**2))),
             mean=float(np.mean(errors)),
@@ -61,17 +65,17 @@ class ErrorSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraScore:
-    """One camera (or all) against the truth.
+    """Errors of one camera, or of all cameras together.
 
     Attributes:
-        frames: Frames of the video, None where not told.
-        registered: Frames with a pose.
-        coverage: registered / frames.
-        scored: Registered frames that have a truth.
-        ate_m: Distance of camera centres after alignment, metres.
-        rotation_deg: Angle between orientations after alignment.
-        rpe_m: Translation error over `rpe_delta_s`, metres.
-        rpe_deg: Rotation error over `rpe_delta_s`.
+        frames: Number of frames of the video; None if unknown.
+        registered: Number of frames with a pose.
+        coverage: Ratio of `registered` to `frames`; None if unknown.
+        scored: Number of registered frames with a true pose.
+        ate_m: Absolute trajectory error: distance of camera centres after alignment, metres.
+        rotation_deg: Angle between orientations after alignment, degrees.
+        rpe_m: Relative pose error over `rpe_delta_s`: translation, metres.
+        rpe_deg: Relative pose error over `rpe_delta_s`: rotation, degrees.
     """
 
     frames: int | None
@@ -86,14 +90,14 @@ class CameraScore:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrajectoryReport:
-    """Scores of a capture.
+    """Errors of the trajectories of a capture.
 
     Attributes:
-        options: How it was compared.
+        options: How the trajectories were compared.
         scale: Scale of the alignment (truth = scale · estimate).
-        cameras: By camera name.
-        total: All cameras together.
-        truth_from_estimate: The one alignment.
+        cameras: Errors by camera name.
+        total: Errors of all cameras together.
+        truth_from_estimate: The alignment.
     """
 
     options: TrajectoryOptions
@@ -103,7 +107,7 @@ class TrajectoryReport:
     truth_from_estimate: Similarity
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values."""
+        """Return the errors as plain JSON values."""
         return {
             "options": asdict(self.options),
             "scale": self.scale,
@@ -118,16 +122,16 @@ def evaluate_trajectories(
     options: TrajectoryOptions | None = None,
     frames: Mapping[str, int] | None = None,
 ) -> TrajectoryReport:
-    """Score TUM files against TUM files.
+    """Compare estimated with true trajectories, given as TUM files.
 
     Args:
-        estimates: world_from_camera by camera, in any gauge that is common to all.
-        truths: world_from_camera by camera; cameras without truth are an error.
-        options: How to compare.
-        frames: Frames of each video, for the coverage.
+        estimates: By camera, the file of estimated poses world_from_camera, in one gauge for all cameras.
+        truths: By camera, the file of true poses. Every estimated camera needs one.
+        options: How the trajectories are compared.
+        frames: By camera, the number of frames of its video, for the coverage.
 
     Raises:
-        JobError: A file is missing or malformed, or too few poses have a truth.
+        JobError: A file is missing or malformed, or too few poses have a true pose.
     """
     return score_trajectories(
         {name: read_tum(path) for name, path in estimates.items()},
@@ -139,7 +143,14 @@ def evaluate_trajectories(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _MatchedPoses:
-    """One camera's estimates with their truths."""
+    """The N estimated poses of one camera that have a true pose.
+
+    Attributes:
+        times_ns: (N,) times.
+        estimate: (N,4,4) estimated poses.
+        truth: (N,4,4) true poses.
+        registered: Number of all estimated poses, also of those without a true pose.
+    """
 
     times_ns: IntArray
     estimate: FloatArray
@@ -153,7 +164,7 @@ def score_trajectories(
     options: TrajectoryOptions | None = None,
     frames: Mapping[str, int] | None = None,
 ) -> TrajectoryReport:
-    """Score poses against poses; see `evaluate_trajectories`.
+    """Compare estimated with true poses; see `evaluate_trajectories`.
 
     Source: S. Umeyama, PAMI 1991 (alignment); J. Sturm et al., "A benchmark for the evaluation of RGB-D
         SLAM systems", IROS 2012 (ATE and RPE).
@@ -166,7 +177,7 @@ def score_trajectories(
     empty = sorted(name for name in estimates if len(truths[name].times_ns) == 0)
     if empty:
         raise JobError(
-            f"the truth of camera {', '.join(empty)} holds no poses",
+            f"the truth of camera {', '.join(empty)} has no poses",
             hint="a TUM file: time tx ty tz qx qy qz qw",
         )
     pairs = {name: _match_poses(estimates[name], truths[name], options) for name in sorted(estimates)}
@@ -177,9 +188,9 @@ def score_trajectories(
         name: _score(counts.get(name), pairs[name].registered, len(pairs[name].times_ns), errors[name])
         for name in pairs
     }
-    known = all(name in counts for name in pairs)
+    has_all_counts = all(name in counts for name in pairs)
     total = _score(
-        sum(counts[name] for name in pairs) if known else None,
+        sum(counts[name] for name in pairs) if has_all_counts else None,
         sum(pair.registered for pair in pairs.values()),
         sum(len(pair.times_ns) for pair in pairs.values()),
         tuple(np.concatenate(parts) for parts in zip(*errors.values(), strict=True)),
@@ -196,13 +207,14 @@ def score_trajectories(
 def truth_at(
     truth: TimedPoses, times_ns: IntArray, options: TrajectoryOptions
 ) -> tuple[FloatArray, BoolArray]:
-    """The truth (N,4,4) at given times and where there is one (N,)."""
+    """Return the true poses (N,4,4) at given times (N,), and a mask (N,) of the times with truth."""
     if options.association == "nearest":
         return nearest_truth(truth, times_ns, options.max_diff_s)
     return interpolate_truth(truth, times_ns, options.max_gap_s)
 
 
 def _match_poses(estimate: TimedPoses, truth: TimedPoses, options: TrajectoryOptions) -> _MatchedPoses:
+    """Return the estimated poses of one camera that have a true pose."""
     poses, found = truth_at(truth, estimate.times_ns, options)
     return _MatchedPoses(
         times_ns=estimate.times_ns[found],
@@ -213,7 +225,7 @@ def _match_poses(estimate: TimedPoses, truth: TimedPoses, options: TrajectoryOpt
 
 
 def _truth_from_estimate(pairs: Mapping[str, _MatchedPoses], align: Alignment) -> Similarity:
-    """truth_from_estimate over the centres of all cameras."""
+    """Return the alignment truth_from_estimate that fits the centres of all cameras best."""
     if align == "none":
         return Similarity(1.0, np.eye(3), np.zeros(3))
     estimate = np.concatenate([pair.estimate[:, :3, 3] for pair in pairs.values()])
@@ -228,33 +240,34 @@ def _truth_from_estimate(pairs: Mapping[str, _MatchedPoses], align: Alignment) -
 
 
 def _pose_errors(pair: _MatchedPoses, alignment: Similarity, delta_s: float) -> tuple[FloatArray, ...]:
-    """Errors of centres, orientations, and of relative motion (m, deg)."""
+    """Return the errors of centres (m) and orientations (deg), then the relative errors of both."""
     aligned = alignment.apply_to_poses(pair.estimate)
     centres = np.linalg.norm(aligned[:, :3, 3] - pair.truth[:, :3, 3], axis=1)
     difference = invert(pair.truth) @ aligned
     angles = np.rad2deg(rotation_angle_rad(difference[:, :3, :3])) if len(aligned) else np.zeros(0)
     first, second = _pairs_at_interval(pair.times_ns, delta_s)
-    moved = invert(aligned[first]) @ aligned[second]
-    should = invert(pair.truth[first]) @ pair.truth[second]
-    relative = invert(should) @ moved
-    turns = np.rad2deg(rotation_angle_rad(relative[:, :3, :3])) if len(first) else np.zeros(0)
-    return centres, angles, np.linalg.norm(relative[:, :3, 3], axis=1), turns
+    estimated = invert(aligned[first]) @ aligned[second]
+    expected = invert(pair.truth[first]) @ pair.truth[second]
+    relative = invert(expected) @ estimated
+    relative_angles = np.rad2deg(rotation_angle_rad(relative[:, :3, :3])) if len(first) else np.zeros(0)
+    return centres, angles, np.linalg.norm(relative[:, :3, 3], axis=1), relative_angles
 
 
 def _pairs_at_interval(times_ns: IntArray, delta_s: float) -> tuple[IntArray, IntArray]:
-    """Index pairs whose times differ by delta, to half a frame."""
+    """Return the indices of pairs of poses whose times differ by `delta_s`, up to half a frame interval."""
     if len(times_ns) < 2:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    wanted = times_ns + round(delta_s * 1e9)
-    after = np.minimum(np.searchsorted(times_ns, wanted), len(times_ns) - 1)
+    target_ns = times_ns + round(delta_s * 1e9)
+    after = np.minimum(np.searchsorted(times_ns, target_ns), len(times_ns) - 1)
     before = after - 1
-    nearer = np.where(wanted - times_ns[before] < np.abs(times_ns[after] - wanted), before, after)
-    near = np.abs(times_ns[nearer] - wanted) <= 0.5 * np.median(np.diff(times_ns))
-    first = np.flatnonzero(near & (nearer > np.arange(len(times_ns))))
-    return first, nearer[first]
+    nearest = np.where(target_ns - times_ns[before] < np.abs(times_ns[after] - target_ns), before, after)
+    is_near = np.abs(times_ns[nearest] - target_ns) <= 0.5 * np.median(np.diff(times_ns))
+    first = np.flatnonzero(is_near & (nearest > np.arange(len(times_ns))))
+    return first, nearest[first]
 
 
 def _score(frames: int | None, registered: int, scored: int, errors: tuple[FloatArray, ...]) -> CameraScore:
+    """Return the score of one camera; `errors` are those that `_pose_errors` returns."""
     ate, rotation, rpe_m, rpe_deg = (ErrorSummary.of(part) if len(part) else None for part in errors)
     return CameraScore(
         frames=frames,

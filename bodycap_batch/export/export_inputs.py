@@ -1,4 +1,4 @@
-"""What the export stage works on."""
+"""The inputs of the export stage."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from bodycap_batch.model.scene import KeyframeSelection, Map, Trajectory
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExportInputs:
-    """All results of a job, before they become files.
+    """The results of all earlier stages of a job.
 
     Attributes:
-        out_dir: Folder the files go into (created where missing).
-        maps: The models, largest first, each in its own gauge.
-        trajectories: One per camera, in the gauge of the map it was solved in.
-        clocks: By camera name.
+        out_dir: Folder for the files; it is created if it does not exist.
+        maps: The maps, largest first, each in its own gauge.
+        trajectories: One per camera, in the gauge of its map.
+        clocks: The clock of each camera, by name.
         selections: Keyframe selections, one per camera.
-        merge: The body in the world; None for ``skeleton: none`` or when merging failed.
-        partial_reason: Why there is no body although one was asked for.
-        row_fraction: By camera, (N,) mean row of the observations behind each pose over the image height, for
-            rolling shutters; a camera that is missing is taken at the middle row.
-        relative_poses: Of cameras on one segment, in the unit of the gauge both were solved in.
-        log: Plain JSON values about the map's making (no clocks, no paths), kept in ``metrics.json``.
+        merge: The body in the world; None for ``skeleton: none``, or if merging failed.
+        partial_reason: Why there is no body although the job asks for one; None otherwise.
+        row_fraction: By camera, (N,) mean image row of the observations behind each pose, as a fraction of
+            the image height. It corrects times for a rolling shutter. A camera without an entry has 0.5.
+        relative_poses: Relative poses of cameras on one segment, in the unit of the gauge of both cameras.
+        log: Diagnostics of mapping as plain JSON values without times and paths; they are written to
+            ``metrics.json``.
     """
 
     out_dir: Path
@@ -43,6 +44,6 @@ class ExportInputs:
     log: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        missing = [t.camera for t in self.trajectories if t.camera not in self.clocks]
+        missing = [path.camera for path in self.trajectories if path.camera not in self.clocks]
         if missing:
             raise ValueError(f"no clock for {', '.join(missing)}")

@@ -1,4 +1,4 @@
-"""``frames.csv``: every frame of every camera, localised or not and why."""
+"""``frames.csv``: the status of every frame of every camera."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ LOST = "LOST"
 
 
 def write_frame_table(path: Path, inputs: ExportInputs) -> Path:
-    """Write the table (times in seconds, error in pixels at the work size) and return its path.
+    """Write one line per camera and frame, and return the path.
 
-    `status` is KEYFRAME, REGISTERED, RIG (carried by the other cameras of a rig) or LOST; `reason` says why
-    a frame is lost.
+    Times are in seconds, errors in pixels at the work size. The column `status` is KEYFRAME, REGISTERED, RIG
+    or LOST. RIG means that the pose follows from other cameras of the rig. The column `reason` says why a
+    frame is lost, with the values of `FrameStatus`.
 
     Raises:
         StoreError: The file cannot be written.
@@ -50,4 +51,5 @@ def write_frame_table(path: Path, inputs: ExportInputs) -> Path:
 
 
 def _status_and_reason(status: FrameStatus) -> tuple[str, str]:
+    """Return the columns `status` and `reason`."""
     return (status.value, "") if status.localised else (LOST, status.value)

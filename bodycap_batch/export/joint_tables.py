@@ -1,4 +1,4 @@
-"""``joints.csv`` and ``joints.npz``: the motion as numbers, every joint at every tick."""
+"""``joints.csv`` and ``joints.npz``: the pose of every joint at every tick."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ COLUMNS = "time,joint,x_m,y_m,z_m,qx,qy,qz,qw,local_qx,local_qy,local_qz,local_q
 
 
 def write_joint_table(path: Path, motion: Motion, sigma_m: FloatArray | None = None) -> Path:
-    """Write one line a tick and joint, and return the path.
+    """Write one line per tick and joint as CSV, and return the path.
 
-    Common time in seconds; position and orientation (world_from_joint) in the world, rotation in the parent;
-    whether cameras measured the joint; one sigma per axis of its centre relative to the first solved joint's
-    (empty: not known).
+    The columns are: common time in seconds; position and orientation in the world (world_from_joint);
+    rotation in the frame of the parent; whether cameras measured the joint; `sigma_m`, empty if unknown.
 
     Args:
         path: The file.
         motion: The motion in the world.
-        sigma_m: (T,J), NaN where not known.
+        sigma_m: (T,J) standard deviation per axis of each joint's centre relative to the first solved
+            joint's; NaN if unknown.
 
     Raises:
         StoreError: The file cannot be written.
@@ -44,34 +44,40 @@ def write_joint_table(path: Path, motion: Motion, sigma_m: FloatArray | None = N
         time = seconds_text(time_ns)
         for joint, name in enumerate(names):
             sigma = np.nan if sigma_m is None else sigma_m[tick, joint]
-            known = f"{sigma:.6f}" if np.isfinite(sigma) else ""
-            text.write(line % (time, name, *numbers[tick, joint], motion.observed[tick, joint], known))
+            sigma_text = f"{sigma:.6f}" if np.isfinite(sigma) else ""
+            text.write(line % (time, name, *numbers[tick, joint], motion.observed[tick, joint], sigma_text))
     write_text(path, text.getvalue())
     return path
 
 
 def _csv_field(name: str) -> str:
-    """A joint's name as CSV takes it."""
+    """Return a joint name as a CSV field, quoted if necessary."""
     doubled = name.replace('"', '""')
     return f'"{doubled}"' if set(name) & set(',"\n') else name
 
 
 def write_joint_arrays(path: Path, motion: Motion, sigma_m: FloatArray | None = None) -> Path:
-    """Write the same as arrays, and return the path; J joints, T ticks.
+    """Write the motion of J joints at T ticks as arrays, and return the path.
 
-    ``names`` and ``roles`` (J,), ``parents`` (J,) −1 for the root, ``offsets_m`` (J,3) in the parent,
-    ``t`` (T,) seconds on the common clock, ``fps``, ``world`` (T,J,3) metres, ``world_quat_xyzw`` and
-    ``local_quat_xyzw`` (T,J,4), ``observed`` (T,J), ``sigma_m`` (T,J) NaN where not known.
+    The arrays are: ``names`` and ``roles`` (J,); ``parents`` (J,), −1 for the root; ``offsets_m`` (J,3) in
+    the frame of the parent; ``t`` (T,), common time in seconds; ``fps``; ``world`` (T,J,3), metres;
+    ``world_quat_xyzw`` and ``local_quat_xyzw`` (T,J,4); ``observed`` (T,J); ``sigma_m`` (T,J), NaN if
+    unknown.
+
+    Args:
+        path: The file.
+        motion: The motion in the world.
+        sigma_m: As in `write_joint_table`.
 
     Raises:
         StoreError: The file cannot be written.
     """
-    poses, body = motion.world_from_joint(), motion.skeleton
+    poses, skeleton = motion.world_from_joint(), motion.skeleton
     arrays = {
-        "names": np.array(body.joints),
-        "roles": np.array(body.roles),
-        "parents": body.parents,
-        "offsets_m": body.offsets_m,
+        "names": np.array(skeleton.joints),
+        "roles": np.array(skeleton.roles),
+        "parents": skeleton.parents,
+        "offsets_m": skeleton.offsets_m,
         "t": motion.times_ns() / 1e9,
         "fps": np.array(motion.fps),
         "world": poses[..., :3, 3],

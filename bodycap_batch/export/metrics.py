@@ -1,4 +1,7 @@
-"""``metrics.json``: the figures of a job. No clocks, durations or host names: the same job, the same file."""
+"""``metrics.json``: the figures of a job.
+
+The file has no run times, dates and host names, so equal jobs give equal files.
+"""
 
 from __future__ import annotations
 
@@ -25,16 +28,16 @@ from bodycap_batch.model.skeleton import Motion
 
 
 def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[str, Any]) -> dict[str, Any]:
-    """All figures as plain JSON values.
+    """Return all figures as plain JSON values.
 
     Args:
         inputs: The results.
-        motion: The motion as exported, or None.
-        gap: How far it is from the graph and the cameras.
+        motion: The exported motion, or None without a body.
+        gap: Difference of the exported motion to the motion graph and to the cameras (`Projection.gap`).
     """
     errors = [observation_errors(scene, inputs.trajectories) for scene in inputs.maps]
     trajectories = trajectories_in_target_frames(inputs)
-    cameras = {item.camera: _camera_metrics(inputs, item, errors) for item in trajectories}
+    cameras = {path.camera: _camera_metrics(inputs, path, errors) for path in trajectories}
     out: dict[str, Any] = {
         "frame": main_target_name(inputs),
         "metric": main_target_name(inputs) == WORLD,
@@ -44,12 +47,12 @@ def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[st
         "total": _total_metrics(inputs, cameras, errors),
         "models": [
             {
-                "frame": placed.frame,
-                "scale": None if placed.target_from_map is None else placed.target_from_map.scale,
-                "keyframes": dict(sorted(Counter(placed.scene.keyframe_camera).items())),
-                **_map_counts(placed.scene, errors[_map_index(inputs.maps, placed.scene)]),
+                "frame": exported.target,
+                "scale": None if exported.target_from_map is None else exported.target_from_map.scale,
+                "keyframes": dict(sorted(Counter(exported.scene.keyframe_camera).items())),
+                **_map_counts(exported.scene, errors[_map_index(inputs.maps, exported.scene)]),
             }
-            for placed in maps_in_target_frames(inputs)
+            for exported in maps_in_target_frames(inputs)
         ],
         "mapping": dict(inputs.log),
     }
@@ -66,39 +69,42 @@ def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[st
 
 
 def _map_index(maps: Sequence[Map], scene: Map) -> int:
+    """Return the index of a map, by identity."""
     return next(index for index, item in enumerate(maps) if item is scene)
 
 
 def observation_errors(scene: Map, trajectories: Sequence[Trajectory]) -> FloatArray:
-    """Reprojection error (M,) of every observation, pixels at the work size.
+    """Return the reprojection error (M,) of every observation of a map, in pixels at the work size.
 
-    Pixels of a camera whose rolling shutter was taken out are moved to the instant its poses hold for.
+    For a camera with rolling-shutter correction, the observed pixels are first moved to the exposure of the
+    middle row, at which its poses are given.
 
     Args:
         scene: The map.
-        trajectories: The frames' poses; those in the map's gauge tell how its keyframes move.
+        trajectories: The trajectories of the cameras. Those in the map's gauge give the velocity of its
+            keyframes, which the rolling-shutter correction needs.
     """
     paths = {path.camera: path for path in trajectories if path.gauge == scene.gauge}
     out = np.full(len(scene.obs_px), np.nan)
     order = np.argsort(scene.obs_keyframe, kind="stable")
     bounds = np.searchsorted(scene.obs_keyframe[order], np.arange(len(scene.keyframe_camera) + 1))
     for keyframe, camera in enumerate(scene.keyframe_camera):
-        mine = order[bounds[keyframe] : bounds[keyframe + 1]]
-        if len(mine) == 0:
+        observations = order[bounds[keyframe] : bounds[keyframe + 1]]
+        if len(observations) == 0:
             continue
-        points = scene.points[scene.obs_point[mine]]
-        lens, px = scene.cameras[camera], scene.obs_px[mine]
+        points = scene.points[scene.obs_point[observations]]
+        intrinsics, px = scene.cameras[camera], scene.obs_px[observations]
         if camera in paths and camera in scene.readout_s:
-            path, frame = paths[camera], np.full(len(mine), scene.keyframe_frame[keyframe])
-            velocity = image_velocity(lens, path.gauge_from_cam, path.times_ns, frame, points)
-            px = px_at_mid_row(lens, px, velocity, scene.readout_s[camera])
-        projected = lens.project(transform_points(invert(scene.map_from_cam[keyframe]), points))
-        out[mine] = np.linalg.norm(projected - px, axis=1)
+            path, frame = paths[camera], np.full(len(observations), scene.keyframe_frame[keyframe])
+            velocity = image_velocity(intrinsics, path.gauge_from_cam, path.times_ns, frame, points)
+            px = px_at_mid_row(intrinsics, px, velocity, scene.readout_s[camera])
+        projected = intrinsics.project(transform_points(invert(scene.map_from_cam[keyframe]), points))
+        out[observations] = np.linalg.norm(projected - px, axis=1)
     return out
 
 
 def _map_counts(scene: Map, errors: FloatArray) -> dict[str, Any]:
-    """Points, measurements and their mean error of one map."""
+    """Return the number of points and observations of one map, and the mean reprojection error."""
     return {
         "points": len(scene.points),
         "measurements": len(scene.obs_px),
@@ -109,51 +115,62 @@ def _map_counts(scene: Map, errors: FloatArray) -> dict[str, Any]:
 def _camera_metrics(
     inputs: ExportInputs, trajectory: Trajectory, errors: Sequence[FloatArray]
 ) -> dict[str, Any]:
-    """One camera's line of the tables."""
+    """Return the figures of one camera.
+
+    Args:
+        inputs: The results.
+        trajectory: The trajectory of the camera.
+        errors: (M,) reprojection error of each observation, for each map.
+    """
     name = trajectory.camera
-    kept = trajectory.localised
-    mine = [
+    localised = trajectory.localised
+    own_observations = [
         (
             np.array([camera == name for camera in scene.keyframe_camera], dtype=bool)[scene.obs_keyframe],
             scene,
         )
         for scene in inputs.maps
     ]
-    mapped = [np.concatenate([np.zeros(0), *(e[seen] for (seen, _), e in zip(mine, errors, strict=True))])]
+    own_errors = (e[own] for (own, _), e in zip(own_observations, errors, strict=True))
+    map_errors = np.concatenate([np.zeros(0), *own_errors])
     selected = [len(item.frames) for item in inputs.selections if item.camera == name]
     return {
         "frame": trajectory.gauge,
-        "frames": len(kept),
-        "frames_registered": int(kept.sum()),
-        "coverage": float(kept.mean()) if len(kept) else 0.0,
+        "frames": len(localised),
+        "frames_registered": int(localised.sum()),
+        "coverage": float(localised.mean()) if len(localised) else 0.0,
         "status": dict(sorted(Counter(status.value for status in trajectory.status).items())),
         "keyframes_selected": sum(selected) if selected else None,
         "keyframes": sum(scene.keyframe_camera.count(name) for scene in inputs.maps),
-        "points": sum(len(np.unique(scene.obs_point[seen])) for seen, scene in mine),
-        "measurements": sum(int(seen.sum()) for seen, _ in mine),
-        "mean_reprojection_error_px": _finite_mean(mapped[0]),
+        "points": sum(len(np.unique(scene.obs_point[own])) for own, scene in own_observations),
+        "measurements": sum(int(own.sum()) for own, _ in own_observations),
+        "mean_reprojection_error_px": _finite_mean(map_errors),
         "registration": _registration_metrics(trajectory),
     }
 
 
 def _registration_metrics(trajectory: Trajectory) -> dict[str, Any]:
-    """Measurements behind the frames' poses."""
-    kept = trajectory.localised & np.isfinite(trajectory.error_px)
-    weights = trajectory.inliers[kept]
-    total = int(weights.sum())
-    error = float((trajectory.error_px[kept] * weights).sum() / total) if total else None
+    """Return the figures of the observations behind the poses of one camera's frames."""
+    localised = trajectory.localised & np.isfinite(trajectory.error_px)
+    inliers = trajectory.inliers[localised]
+    total = int(inliers.sum())
+    error = float((trajectory.error_px[localised] * inliers).sum() / total) if total else None
     return {
         "measurements": total,
-        "median_inliers": float(np.median(weights)) if len(weights) else None,
+        "median_inliers": float(np.median(inliers)) if len(inliers) else None,
         "mean_reprojection_error_px": error,
     }
 
 
 def _relative_pose_metrics(inputs: ExportInputs, item: RelativePose) -> dict[str, Any]:
-    """Where one camera of a segment sits beside another: metres in the world, else the map's unit."""
+    """Return the figures of the relative pose of two cameras on one segment.
+
+    Lengths are in metres if the map is in the world, else in the unit of the map.
+    """
     gauge = {path.camera: path.gauge for path in inputs.trajectories}.get(item.cameras[0])
-    placed = next((each for each in maps_in_target_frames(inputs) if each.scene.gauge == gauge), None)
-    target_from_map = None if placed is None else placed.target_from_map
+    candidates = (exported for exported in maps_in_target_frames(inputs) if exported.scene.gauge == gauge)
+    exported = next(candidates, None)
+    target_from_map = None if exported is None else exported.target_from_map
     scale = 1.0 if target_from_map is None else target_from_map.scale
     pose = item.first_from_second
     return {
@@ -171,29 +188,29 @@ def _relative_pose_metrics(inputs: ExportInputs, item: RelativePose) -> dict[str
 def _total_metrics(
     inputs: ExportInputs, cameras: Mapping[str, Mapping[str, Any]], errors: Sequence[FloatArray]
 ) -> dict[str, Any]:
-    """All cameras together."""
+    """Return the figures of all cameras together."""
 
-    def added(key: str) -> int:
+    def total(key: str) -> int:
         return sum(int(camera[key] or 0) for camera in cameras.values())
 
-    frames, registered = added("frames"), added("frames_registered")
+    frames, registered = total("frames"), total("frames_registered")
     return {
         "cameras": len(cameras),
         "cameras_registered": sum(camera["frames_registered"] > 0 for camera in cameras.values()),
         "frames": frames,
         "frames_registered": registered,
         "coverage": registered / frames if frames else 0.0,
-        "keyframes_selected": added("keyframes_selected"),
-        "keyframes": added("keyframes"),
+        "keyframes_selected": total("keyframes_selected"),
+        "keyframes": total("keyframes"),
         "points": sum(len(scene.points) for scene in inputs.maps),
-        "measurements": added("measurements"),
+        "measurements": total("measurements"),
         "mean_reprojection_error_px": _finite_mean(np.concatenate([np.zeros(0), *errors])),
     }
 
 
 def _motion_metrics(motion: Motion, gap: Mapping[str, Any]) -> dict[str, Any]:
-    """The exported motion: rate, length, what was measured, and the gap."""
-    share = motion.observed.mean(axis=0) if len(motion.observed) else np.zeros(len(motion.skeleton.joints))
+    """Return the figures of the exported motion: rate, length, observed joints, and the gap."""
+    ratio = motion.observed.mean(axis=0) if len(motion.observed) else np.zeros(len(motion.skeleton.joints))
     return {
         "fps": motion.fps,
         "frames": len(motion.root_in_world_m),
@@ -202,8 +219,8 @@ def _motion_metrics(motion: Motion, gap: Mapping[str, Any]) -> dict[str, Any]:
         "joints": {
             name: {
                 "role": motion.skeleton.roles[index] or None,
-                "observed": bool(share[index] > 0),
-                "observed_share": float(share[index]),
+                "observed": bool(ratio[index] > 0),
+                "observed_share": float(ratio[index]),
             }
             for index, name in enumerate(motion.skeleton.joints)
         },
@@ -212,12 +229,13 @@ def _motion_metrics(motion: Motion, gap: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _finite_mean(values: FloatArray) -> float | None:
+    """Return the mean of the finite values, or None if there is none."""
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else None
 
 
 def _json_value(value: Any) -> Any:
-    """JSON values: numpy scalars and arrays unwrapped, NaN and infinity as null."""
+    """Return a value as plain JSON values: numpy types are converted, NaN and infinity become null."""
     if isinstance(value, Mapping):
         return {str(key): _json_value(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

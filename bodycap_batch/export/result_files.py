@@ -1,4 +1,4 @@
-"""The order of the files; figures come last, so that they stand for files that are there."""
+"""Write all result files of a job. The metrics are written last, so they exist only if all other files do."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ from bodycap_batch.model.skeleton import Motion, with_file_zero_pose
 
 
 def export_results(inputs: ExportInputs, options: ExportOptions, context: StageContext) -> tuple[Path, ...]:
-    """Write a job's results into ``inputs.out_dir``, each file whole or not at all, and verify them.
+    """Write the result files of a job to ``inputs.out_dir``. Each file is written atomically.
 
-    ``map.ply``, ``trajectories/<camera>.tum``, ``colmap/<n>/``, ``frames.csv``, ``joints.csv``,
-    ``motion.bvh``, ``motion.glb`` and further formats (as the options ask) and always ``metrics.json``.
-    Everything is in the world where there is one.
+    The options select among ``map.ply``, ``trajectories/<camera>.tum``, ``colmap/<n>/``, ``frames.csv``,
+    ``joints.csv``, ``motion.bvh``, ``motion.glb`` and further formats. ``metrics.json`` is always written.
+    All files are in the world if it exists.
 
     Args:
         inputs: Maps, trajectories and the merged body.
-        options: Which files, and how the BVH is laid out.
+        options: The formats, and the layout of the motion files.
         context: Progress and cancelling.
 
     Returns:
-        The files written, relative to the folder.
+        The written files, relative to the folder.
 
     Raises:
-        JobError: A format takes a library or a program that is not installed.
-        StoreError: A file cannot be written, or read back it differs from what was meant.
+        JobError: A format needs a library or a program that is not installed.
+        StoreError: A file cannot be written, or it differs from the motion when it is read back.
     """
     require_libraries(options.formats)
     motion, gap = _exported_motion(inputs, options)
@@ -78,7 +78,11 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
 def _motion_writers(
     folder: Path, motion: Motion, options: ExportOptions, sigma_m: FloatArray | None
 ) -> dict[str, Callable[[], list[Path]]]:
-    """The files of the motion: for animation as it is laid out, for measuring as it was solved."""
+    """Return a function that writes each format of the motion.
+
+    The formats for animation have the layout of the options. The formats for measurements have the solved
+    motion.
+    """
     animated, centres = apply_layout(motion, options), points_from_motion(motion)
     return {
         "bvh": lambda: [write_verified_bvh(folder / "motion.bvh", animated, options)],
@@ -92,12 +96,13 @@ def _motion_writers(
 
 
 def _exported_sigma_m(merge: MergeResult, motion: Motion) -> FloatArray:
-    """(T,J) how well each exported joint's centre is known, NaN where nothing measured it."""
+    """Return the standard deviation (T,J) of each exported joint's centre; NaN for unsolved joints."""
     kept = [merge.skeleton.joints.index(name) for name in motion.skeleton.joints]
     return merge.joint_sigma_m()[:, kept]
 
 
 def _write_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[str, Any]) -> Path:
+    """Write ``metrics.json`` and return its path."""
     path = inputs.out_dir / "metrics.json"
     metrics = collect_metrics(inputs, motion, gap)
     write_text(path, json.dumps(metrics, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
@@ -105,7 +110,7 @@ def _write_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[str
 
 
 def _exported_motion(inputs: ExportInputs, options: ExportOptions) -> tuple[Motion | None, dict[str, Any]]:
-    """The motion to export and its distance from the graph; None without a body."""
+    """Return the motion to export and its gap (`Projection.gap`); None and an empty gap without a body."""
     if inputs.merge is None:
         return None, {}
     motion = with_file_zero_pose(inputs.merge.motion)

@@ -1,4 +1,4 @@
-"""Files of the room and the cameras: PLY, TUM trajectories, COLMAP models."""
+"""Write the files of the map and the cameras: PLY point clouds, TUM trajectories and COLMAP models."""
 
 from __future__ import annotations
 
@@ -22,22 +22,28 @@ from bodycap_batch.formats.tum import TimedPoses, write_tum
 from bodycap_batch.model.scene import Trajectory
 
 PATH_SPACING_M = 0.01
+"""Metres. Distance of the points of a camera path in the world. Evidence: none; it looks like a line."""
+
 _PATH_SPACING_RATIO = 1e-3
-"""In a map's own gauge: this share of its points' extent (a room of 10 m: 1 cm)."""
+"""Ratio to the extent of the points, for the same in a map's own gauge. Derivation: 1 cm in a room of 10
+m."""
 
 
 def write_maps(inputs: ExportInputs) -> list[Path]:
-    """``map.ply`` in the results' frame; maps in other gauges as ``map_<n>.ply``.
+    """Write the maps in the main target frame to ``map.ply``, and those of other gauges to ``map_<n>.ply``.
+
+    Returns:
+        The written files.
 
     Raises:
         StoreError: A file cannot be written.
     """
-    frame = main_target_name(inputs)
+    main_target = main_target_name(inputs)
     written = []
     colours = camera_colours(item.camera for item in inputs.trajectories)
     groups: dict[str, list[ExportedMap]] = {}
-    for placed in maps_in_target_frames(inputs):
-        groups.setdefault(placed.frame, []).append(placed)
+    for exported in maps_in_target_frames(inputs):
+        groups.setdefault(exported.target, []).append(exported)
     for number, (name, members) in enumerate(groups.items()):
         points = [_points_in_target(member) for member in members]
         cloud = PointCloud(
@@ -49,67 +55,79 @@ def write_maps(inputs: ExportInputs) -> list[Path]:
             if item.gauge == name
         }
         spacing = PATH_SPACING_M if name == WORLD else _PATH_SPACING_RATIO * _extent(cloud.points)
-        file = inputs.out_dir / ("map.ply" if name == frame else f"map_{number}.ply")
+        file = inputs.out_dir / ("map.ply" if name == main_target else f"map_{number}.ply")
         write_ply(file, add_camera_paths(cloud, paths, spacing, colours) if paths else cloud)
         written.append(file)
     return written
 
 
 def write_trajectories(inputs: ExportInputs) -> list[Path]:
-    """One TUM file a camera, localised frames only, the camera's own timestamps.
+    """Write one TUM file per camera with its localised frames and its own timestamps.
 
-    A camera whose map merging could not place goes to ``trajectories/unplaced/``: its frame is not the
-    others'.
+    The file of a camera that is not in the main target frame is written to ``trajectories/unplaced/``.
+
+    Returns:
+        The written files.
 
     Raises:
         StoreError: A file cannot be written.
     """
-    frame = main_target_name(inputs)
+    main_target = main_target_name(inputs)
     written = []
     for trajectory in trajectories_in_target_frames(inputs):
-        kept = trajectory.localised
+        localised = trajectory.localised
         folder = inputs.out_dir / "trajectories"
-        folder = folder if trajectory.gauge == frame or not kept.any() else folder / "unplaced"
+        folder = folder if trajectory.gauge == main_target or not localised.any() else folder / "unplaced"
         file = folder / f"{trajectory.camera}.tum"
-        poses = TimedPoses(times_ns=trajectory.times_ns[kept], world_from_cam=trajectory.gauge_from_cam[kept])
+        poses = TimedPoses(
+            times_ns=trajectory.times_ns[localised], world_from_cam=trajectory.gauge_from_cam[localised]
+        )
         write_tum(file, poses, _header_comments(trajectory))
         written.append(file)
     return written
 
 
 def _header_comments(trajectory: Trajectory) -> list[str]:
-    frame = "world_from_camera: metres, Z up, floor at z = 0"
+    """Return the comments at the top of a TUM file: camera, frame of reference and clock."""
+    poses = "world_from_camera: metres, Z up, floor at z = 0"
     if trajectory.gauge != WORLD:
-        frame = f"map_from_camera: gauge {trajectory.gauge}, its scale and axes are arbitrary"
-    return [f"camera {trajectory.camera}", frame, "timestamps: the camera's own clock, seconds"]
+        poses = f"map_from_camera: gauge {trajectory.gauge}, its scale and axes are arbitrary"
+    return [f"camera {trajectory.camera}", poses, "timestamps: the camera's own clock, seconds"]
 
 
 def write_colmap(inputs: ExportInputs) -> list[Path]:
-    """One COLMAP model a map: ``colmap/0``, ``colmap/1`` ..., the world's first.
+    """Write one COLMAP model per map: ``colmap/0``, ``colmap/1`` and so on, those in the world first.
+
+    Returns:
+        The written files.
 
     Raises:
         StoreError: A file cannot be written.
     """
     numbers = {item.camera: item.frame_numbers for item in inputs.trajectories}
     written: list[Path] = []
-    for index, placed in enumerate(maps_in_target_frames(inputs)):
+    for index, exported in enumerate(maps_in_target_frames(inputs)):
         folder = inputs.out_dir / "colmap" / str(index)
-        written += write_colmap_model(folder, placed.scene, placed.target_from_map, numbers)
+        written += write_colmap_model(folder, exported.scene, exported.target_from_map, numbers)
     return written
 
 
-def _points_in_target(placed: ExportedMap) -> FloatArray:
-    points = placed.scene.points
-    return points if placed.target_from_map is None else placed.target_from_map.apply(points)
+def _points_in_target(exported: ExportedMap) -> FloatArray:
+    """Return the points (P,3) of a map in its target frame."""
+    points = exported.scene.points
+    return points if exported.target_from_map is None else exported.target_from_map.apply(points)
 
 
 def _camera_centres(trajectory: Trajectory) -> FloatArray:
-    """(N,3) camera centres, NaN where not localised."""
+    """Return the camera centres (N,3); NaN for lost frames."""
     return np.asarray(trajectory.gauge_from_cam[:, :3, 3])
 
 
 def _extent(points: FloatArray) -> float:
-    """Size of the cloud without its farthest points, 1 for an empty one."""
+    """Return the diagonal of the box between the 5th and the 95th percentile of points (N,3).
+
+    The result is 1 for fewer than two different points.
+    """
     if len(points) < 2:
         return 1.0
     low, high = np.percentile(points, [5, 95], axis=0)

@@ -1,1 +1,1 @@
-"""Readers and writers, one file a format, each with its own conventions."""
+"""Readers and writers of file formats; each module handles the axes and units of its format."""

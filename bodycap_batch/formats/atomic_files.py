@@ -1,4 +1,4 @@
-"""Writing a result so that no reader ever meets half a file."""
+"""Write files atomically: a reader sees either the old or the complete new file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _HINTS = {
 
 
 def store_error_from_os_error(error: OSError, path: Path) -> StoreError:
-    """Turn a failed write to `path` into the typed error, with its remedy."""
+    """Convert the error of a failed write to `path` into a `StoreError` with a hint."""
     return StoreError(
         f"cannot write: {error.strerror or error}",
         path=path,
@@ -30,13 +30,13 @@ def store_error_from_os_error(error: OSError, path: Path) -> StoreError:
 
 @contextmanager
 def atomic_replacement(path: Path) -> Iterator[Path]:
-    """Yield a temporary sibling of `path`; rename it over `path` when the block ends well.
+    """Yield a temporary file in the folder of `path`, and rename it to `path` if the block succeeds.
 
-    The sibling keeps the suffix (libraries choose the format by it) and is deleted on any failure, so
-    an earlier `path` stays as it was.
+    The temporary file has the same suffix, because libraries choose the format by it. After a failure it is
+    deleted, and an existing file at `path` is unchanged.
 
     Raises:
-        StoreError: The file cannot be written (disk full, no permission ...).
+        StoreError: The file cannot be written, for example because the disk is full.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
@@ -49,12 +49,12 @@ def atomic_replacement(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise store_error_from_os_error(error, path) from error
     finally:
-        with suppress(OSError):  # gone after the rename; nothing to do where the folder itself is bad
+        with suppress(OSError):  # the file no longer exists after the rename
             temporary.unlink()
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a UTF-8 text file (LF line ends) in one step.
+    """Write a UTF-8 text file with LF line ends atomically.
 
     Raises:
         StoreError: The file cannot be written.

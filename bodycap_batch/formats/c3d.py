@@ -1,4 +1,4 @@
-"""C3D: joint centres as points, millimetres, in the world's own axes (Z up, facing −Y)."""
+"""C3D files: joint centres as labelled points in millimetres, in the axes of the world (Z up, facing −Y)."""
 
 from __future__ import annotations
 
@@ -12,18 +12,21 @@ from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.atomic_files import atomic_replacement
 
 _MM_PER_M = 1000.0
+"""Millimetres per metre."""
+
 _TOLERANCE_M = 1e-5
-"""The format keeps single precision: 1 µm at 10 m."""
+"""Metres. Largest accepted change of a coordinate when the file is read back. Derivation: the format has
+single precision, 1 µm at a distance of 10 m."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LabelledPoints:
-    """Named points over time, in the world.
+    """The positions of N labelled points at T times, in the world.
 
     Attributes:
         names: (N,) labels.
         fps: Frames per second.
-        x_in_world_m: (T,N,3).
+        x_in_world_m: (T,N,3) positions in metres.
     """
 
     names: tuple[str, ...]
@@ -35,13 +38,13 @@ class LabelledPoints:
 
 
 def write_c3d(path: Path, points: LabelledPoints) -> Path:
-    """Write points as C3D and verify them by reading them back.
+    """Write points as a C3D file, read the file back and compare.
 
     Returns:
         The path.
 
     Raises:
-        StoreError: The file cannot be written, or does not hold the points.
+        StoreError: The file cannot be written, or its points differ from the given ones.
     """
     import ezc3d
 
@@ -70,10 +73,10 @@ def write_c3d(path: Path, points: LabelledPoints) -> Path:
 
 
 def read_c3d(path: Path) -> LabelledPoints:
-    """Read the points of a C3D file in millimetres.
+    """Read the points of a C3D file with millimetres as its unit.
 
     Raises:
-        JobError: The file is missing or no C3D file.
+        JobError: The file is missing, or is no C3D file.
     """
     import ezc3d
 

@@ -1,4 +1,4 @@
-"""COLMAP's sparse model, binary: what COLMAP, Blender add-ons, nerfstudio and splatting tools open."""
+"""COLMAP's binary sparse model, which COLMAP, Blender add-ons, nerfstudio and splatting tools read."""
 
 from __future__ import annotations
 
@@ -28,16 +28,19 @@ _COLMAP_MODEL_IDS = {
     "RADIAL_FISHEYE": 9,
     "THIN_PRISM_FISHEYE": 10,
 }
-"""Model numbers of COLMAP's binary format."""
+"""Number of each camera model in the binary format. Source: COLMAP, sensor/models.h."""
 
 _POINT2D = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
+"""One 2D point of an image in images.bin."""
+
 _TRACK = np.dtype([("image", "<i4"), ("index", "<i4")])
+"""One element of a point's track in points3D.bin: image id and index among the 2D points of that image."""
 
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 
 
 def image_name(camera: str, frame_number: int) -> str:
-    """Name of a keyframe's image: one folder a camera, the frame's number in the video."""
+    """Return the image name of a keyframe: the camera as folder, the frame number in the video as file."""
     return f"{camera}/{frame_number:06d}.png"
 
 
@@ -47,49 +50,50 @@ def write_colmap_model(
     target_from_map: Similarity | None = None,
     frame_numbers: Mapping[str, IntArray] | None = None,
 ) -> tuple[Path, ...]:
-    """Write cameras.bin, images.bin and points3D.bin.
+    """Write a map as cameras.bin, images.bin and points3D.bin.
 
-    An image's 2D points are its triangulated observations only. Ids count from 1: cameras in name
-    order, images in (camera, frame) order, points in the map's order.
+    The 2D points of an image are only those that were triangulated. Ids start at 1. Cameras are ordered by
+    name, images by camera and frame, points as in the map.
 
     Args:
-        folder: The model's folder.
+        folder: Folder of the model.
         scene: The map.
-        target_from_map: Moves the model into another frame (the world).
-        frame_numbers: By camera, the video's frame number of each frame index, for the image names;
-            without it the index itself.
+        target_from_map: Transform of the model into another frame of reference, usually the world; None for
+            the identity.
+        frame_numbers: By camera, the frame number in the video of each frame index, for the image names.
+            Cameras without an entry use the index.
 
     Returns:
-        The files written.
+        The written files.
 
     Raises:
         StoreError: A file cannot be written.
     """
-    move = target_from_map or Similarity(1.0, np.eye(3), np.zeros(3))
+    transform = target_from_map or Similarity(1.0, np.eye(3), np.zeros(3))
     numbers = frame_numbers or {}
     names = sorted(scene.cameras)
     order = sorted(
         range(len(scene.keyframe_camera)), key=lambda k: (scene.keyframe_camera[k], scene.keyframe_frame[k])
     )
-    titles = []
+    image_names = []
     for keyframe in order:
         camera, frame = scene.keyframe_camera[keyframe], int(scene.keyframe_frame[keyframe])
-        titles.append(image_name(camera, int(numbers[camera][frame]) if camera in numbers else frame))
+        image_names.append(image_name(camera, int(numbers[camera][frame]) if camera in numbers else frame))
     image_of = np.empty(len(order), dtype=np.int64)
     image_of[order] = np.arange(1, len(order) + 1)
     by_image = np.lexsort((scene.obs_feature, image_of[scene.obs_keyframe]))
     images = image_of[scene.obs_keyframe][by_image]
     starts = np.searchsorted(images, np.arange(1, len(order) + 2))
-    cam_from_target = invert(move.apply_to_poses(scene.map_from_cam[order]))
+    cam_from_target = invert(transform.apply_to_poses(scene.map_from_cam[order]))
     blobs = (
         _encode_cameras([(index, scene.cameras[name]) for index, name in enumerate(names, start=1)]),
         _encode_images(
             cam_from_target,
             [names.index(scene.keyframe_camera[keyframe]) + 1 for keyframe in order],
-            titles,
+            image_names,
             _encode_observations(scene, by_image, starts),
         ),
-        _encode_points(scene, move.apply(scene.points), by_image, images, starts),
+        _encode_points(scene, transform.apply(scene.points), by_image, images, starts),
     )
     written = []
     for file, blob in zip(MODEL_FILES, blobs, strict=True):
@@ -100,6 +104,7 @@ def write_colmap_model(
 
 
 def _encode_cameras(cameras: list[tuple[int, Camera]]) -> bytes:
+    """Return the content of cameras.bin for pairs of id and camera."""
     parts = [struct.pack("<Q", len(cameras))]
     for index, camera in cameras:
         parts.append(
@@ -110,7 +115,13 @@ def _encode_cameras(cameras: list[tuple[int, Camera]]) -> bytes:
 
 
 def _encode_observations(scene: Map, by_image: IntArray, starts: IntArray) -> list[bytes]:
-    """Each image's 2D points."""
+    """Return the encoded 2D points of each image.
+
+    Args:
+        scene: The map.
+        by_image: (M,) indices of the map's observations, ordered by image.
+        starts: (K+1,) index in `by_image` at which each image begins.
+    """
     table = np.empty(len(by_image), dtype=_POINT2D)
     table["x"], table["y"] = scene.obs_px[by_image].T
     table["point"] = scene.obs_point[by_image] + 1
@@ -118,14 +129,15 @@ def _encode_observations(scene: Map, by_image: IntArray, starts: IntArray) -> li
 
 
 def _encode_images(
-    cam_from_target: FloatArray, camera_ids: list[int], titles: list[str], points2d: list[bytes]
+    cam_from_target: FloatArray, camera_ids: list[int], image_names: list[str], points2d: list[bytes]
 ) -> bytes:
+    """Return the content of images.bin for poses (K,4,4) and, per image, camera id, name and 2D points."""
     quats = np.roll(quat_xyzw_from_rotation(cam_from_target[:, :3, :3]), 1, axis=-1)
-    parts = [struct.pack("<Q", len(titles))]
-    for index, title in enumerate(titles):
+    parts = [struct.pack("<Q", len(image_names))]
+    for index, name in enumerate(image_names):
         pose = (*quats[index], *cam_from_target[index, :3, 3])
         parts.append(struct.pack("<i7di", index + 1, *pose, camera_ids[index]))
-        parts.append(title.encode("utf-8") + b"\0")
+        parts.append(name.encode("utf-8") + b"\0")
         parts.append(struct.pack("<Q", len(points2d[index]) // _POINT2D.itemsize) + points2d[index])
     return b"".join(parts)
 
@@ -133,6 +145,15 @@ def _encode_images(
 def _encode_points(
     scene: Map, positions: FloatArray, by_image: IntArray, images: IntArray, starts: IntArray
 ) -> bytes:
+    """Return the content of points3D.bin.
+
+    Args:
+        scene: The map.
+        positions: (P,3) points in the target frame.
+        by_image: (M,) indices of the map's observations, ordered by image.
+        images: (M,) image id of each of these observations.
+        starts: (K+1,) index in `by_image` at which each image begins.
+    """
     track = np.empty(len(by_image), dtype=_TRACK)
     track["image"] = images
     track["index"] = np.arange(len(by_image)) - starts[images - 1]
@@ -141,8 +162,8 @@ def _encode_points(
     track, bounds = track[by_point], np.searchsorted(points[by_point], np.arange(len(positions) + 1))
     parts = [struct.pack("<Q", len(positions))]
     for index, position in enumerate(positions):
-        mine = track[bounds[index] : bounds[index + 1]]
+        elements = track[bounds[index] : bounds[index + 1]]
         color = scene.colors[index].tolist()
         parts.append(struct.pack("<Q3d3Bd", index + 1, *position, *color, scene.point_error_px[index]))
-        parts.append(struct.pack("<Q", len(mine)) + mine.tobytes())
+        parts.append(struct.pack("<Q", len(elements)) + elements.tobytes())
     return b"".join(parts)

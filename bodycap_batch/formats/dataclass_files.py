@@ -1,7 +1,7 @@
-"""Frozen dataclasses as ``<name>.json`` (structure and scalars) plus ``<name>.npz`` (arrays).
+"""Store frozen dataclasses as ``<name>.json`` (structure and scalars) and ``<name>.npz`` (arrays).
 
-What is written follows the types of the fields, so every dataclass made of arrays, scalars, enums, paths,
-tuples, mappings and other such dataclasses can be kept. No pickle, and equal values give equal bytes.
+The types of the fields determine the format. Supported are arrays, scalars, enums, paths, tuples, mappings
+and dataclasses of these. Pickle is not used, and equal values give equal bytes.
 """
 
 from __future__ import annotations
@@ -26,20 +26,21 @@ T = TypeVar("T")
 Arrays = dict[str, np.ndarray[Any, Any]]
 
 _ZIP_DATE = (1980, 1, 1, 0, 0, 0)
-"""The earliest time a zip entry can carry; a constant, so that the bytes do not tell the clock."""
+"""Date of every zip entry: the earliest that the zip format can hold. It is constant so that equal arrays
+give equal bytes."""
 
 
 def write_dataclass(value: Any, folder: Path, name: str) -> None:
-    """Write a dataclass instance as ``<name>.json`` and, if it holds arrays, ``<name>.npz``.
+    """Write a dataclass instance as ``<name>.json`` and, if it contains arrays, ``<name>.npz``.
 
     Args:
-        value: The instance; its paths must lie below `folder` and are kept relative to it.
-        folder: An existing folder.
-        name: File stem.
+        value: The instance. Its paths must lie below `folder` and are stored relative to it.
+        folder: Existing folder for the files.
+        name: File name without suffix.
     """
     arrays: Arrays = {}
-    body = _encode(value, type(value), _Location(folder, arrays))
-    document = {"type": type(value).__name__, "value": body}
+    encoded = _encode(value, type(value), _Location(folder, arrays))
+    document = {"type": type(value).__name__, "value": encoded}
     text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
     (folder / f"{name}.json").write_text(text + "\n", encoding="utf-8")
     if arrays:
@@ -47,10 +48,10 @@ def write_dataclass(value: Any, folder: Path, name: str) -> None:
 
 
 def read_dataclass(cls: type[T], folder: Path, name: str) -> T:
-    """Read what `write_dataclass` wrote.
+    """Read an instance that `write_dataclass` has written.
 
     Raises:
-        StoreError: A file is missing, broken, or holds another type.
+        StoreError: A file is missing or damaged, or contains another type.
     """
     path = folder / f"{name}.json"
     try:
@@ -66,7 +67,7 @@ def read_dataclass(cls: type[T], folder: Path, name: str) -> T:
 
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
-    """Write arrays as an uncompressed .npz whose bytes depend on the arrays alone."""
+    """Write arrays as an uncompressed .npz file. Its bytes depend only on names and arrays."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():
             buffer = io.BytesIO()
@@ -75,77 +76,86 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
 
 
 def read_npz(path: Path) -> Arrays:
-    """Read all arrays of a .npz; pickled objects are refused."""
+    """Read all arrays of a .npz file; pickled objects are refused."""
     with np.load(path, allow_pickle=False) as archive:
         return {name: archive[name] for name in archive.files}
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Location:
-    """Where a value stands: its folder, all arrays, and the name of the value itself."""
+    """Position of a value in the stored instance.
+
+    Attributes:
+        folder: Folder that stored paths are relative to.
+        arrays: All arrays of the instance, by name.
+        name: Dotted name of the value, "" for the instance itself.
+    """
 
     folder: Path
     arrays: Arrays
     name: str = ""
 
     def inner(self, part: object) -> _Location:
+        """Return the position of a field or an element of this value."""
         name = f"{self.name}.{part}" if self.name else str(part)
         return dataclasses.replace(self, name=name)
 
 
-def _encode(value: Any, hint: Any, place: _Location) -> Any:  # noqa: PLR0911 - one case a kind of type
+def _encode(value: Any, hint: Any, location: _Location) -> Any:  # noqa: PLR0911 - one return per kind of type
+    """Return a value of type `hint` as JSON values, and add its arrays to the location."""
     hint = _strip_none(hint)
     origin = typing.get_origin(hint) or hint
     if value is None:
         return None
     if origin is np.ndarray:
-        place.arrays[place.name] = value
-        return place.name
+        location.arrays[location.name] = value
+        return location.name
     if dataclasses.is_dataclass(hint):
         hints = typing.get_type_hints(hint)
         names = [field.name for field in dataclasses.fields(hint)]
-        return {name: _encode(getattr(value, name), hints[name], place.inner(name)) for name in names}
+        return {name: _encode(getattr(value, name), hints[name], location.inner(name)) for name in names}
     if origin is tuple:
         inner = _element_hints(hint, len(value))
-        return [_encode(value[i], inner[i], place.inner(i)) for i in range(len(value))]
+        return [_encode(value[i], inner[i], location.inner(i)) for i in range(len(value))]
     if isinstance(origin, type) and issubclass(origin, Mapping):
         inner_hint = (*typing.get_args(hint), Any, Any)[1]
-        return {str(key): _encode(value[key], inner_hint, place.inner(key)) for key in value}
+        return {str(key): _encode(value[key], inner_hint, location.inner(key)) for key in value}
     if isinstance(origin, type) and issubclass(origin, Enum):
         return value.value
     if isinstance(origin, type) and issubclass(origin, Path):
-        return Path(value).resolve().relative_to(place.folder.resolve()).as_posix()
+        return Path(value).resolve().relative_to(location.folder.resolve()).as_posix()
     if origin is float:
         return float(value) if math.isfinite(value) else str(float(value))
     return _json_value(value)
 
 
-def _decode(value: Any, hint: Any, place: _Location) -> Any:
+def _decode(value: Any, hint: Any, location: _Location) -> Any:
+    """Return the value of type `hint` that `_encode` has encoded."""
     hint = _strip_none(hint)
     origin = typing.get_origin(hint) or hint
     if value is None:
         return None
     if origin is np.ndarray:
-        return place.arrays[value]
+        return location.arrays[value]
     if dataclasses.is_dataclass(hint):
         hints = typing.get_type_hints(hint)
-        parts = {name: _decode(part, hints[name], place.inner(name)) for name, part in value.items()}
+        parts = {name: _decode(part, hints[name], location.inner(name)) for name, part in value.items()}
         return typing.cast(type, hint)(**parts)
     if origin is tuple:
         inner = _element_hints(hint, len(value))
-        return tuple(_decode(value[i], inner[i], place.inner(i)) for i in range(len(value)))
+        return tuple(_decode(value[i], inner[i], location.inner(i)) for i in range(len(value)))
     if isinstance(origin, type) and issubclass(origin, Mapping):
         inner_hint = (*typing.get_args(hint), Any, Any)[1]
-        return {key: _decode(part, inner_hint, place.inner(key)) for key, part in value.items()}
+        return {key: _decode(part, inner_hint, location.inner(key)) for key, part in value.items()}
     if isinstance(origin, type) and issubclass(origin, Enum):
         return origin(value)
     if isinstance(origin, type) and issubclass(origin, Path):
-        return place.folder / value
+        return location.folder / value
     return float(value) if origin is float else value
 
 
 def _strip_none(hint: Any) -> Any:
-    """X for ``X | None``; other hints as they are."""
+    """Return X for ``X | None``, Any for other unions, and other hints unchanged."""
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         kinds = [kind for kind in typing.get_args(hint) if kind is not type(None)]
         return kinds[0] if len(kinds) == 1 else Any
@@ -153,12 +163,13 @@ def _strip_none(hint: Any) -> Any:
 
 
 def _element_hints(hint: Any, count: int) -> tuple[Any, ...]:
+    """Return the type hints of the elements of a tuple type with `count` elements."""
     hints = typing.get_args(hint)
     return (hints[0],) * count if len(hints) == 2 and hints[1] is Ellipsis else hints
 
 
 def _json_value(value: Any) -> Any:
-    """A value of no declared type as JSON; what is not a finite number becomes null."""
+    """Return a value without a declared type as JSON values; NaN and infinity become null."""
     if isinstance(value, Mapping):
         return {str(key): _json_value(part) for key, part in value.items()}
     if isinstance(value, (list, tuple)):
@@ -169,4 +180,4 @@ def _json_value(value: Any) -> Any:
         return None
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
-    raise TypeError(f"cannot be kept as JSON: {type(value).__name__}")
+    raise TypeError(f"cannot be stored as JSON: {type(value).__name__}")

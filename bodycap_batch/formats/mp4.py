@@ -1,4 +1,4 @@
-"""MP4 with H.264, written one frame after the other; what browsers and editors play."""
+"""Write H.264 video as MP4 files, which browsers and video editors play."""
 
 from __future__ import annotations
 
@@ -17,34 +17,44 @@ if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
 TIME_BASE_HZ = 15360
+"""Ticks per second of the time stamps. Derivation: a multiple of the usual rates 24, 30, 60 and 120 Hz;
+FFmpeg's default for 30 Hz."""
+
 _FAST_X264_PARAMS = "bframes=0:rc-lookahead=0:weightp=0:8x8dct=0"
-"""Without looking ahead a picture takes 16 ms instead of 22, and a file a tenth more; without weights and
-large transforms a tenth less time, and it is no larger and no worse."""
+"""Options of x264 for fast encoding: no look-ahead, no weighted prediction, no large transforms. Evidence:
+docs/decisions/formats.md."""
+
 _ENCODER_OPTIONS = {
     "high": {"crf": "16", "preset": "superfast"},
     "lossless": {"crf": "0", "preset": "ultrafast"},
-    # Every frame decodes alone.
+    # A group of one picture: every frame can be decoded without others.
     "exact": {"qp": "0", "preset": "ultrafast", "g": "1"},
     "near": {"crf": "12", "preset": "ultrafast", "g": "12"},
     "small": {"crf": "27", "preset": "superfast", "x264-params": _FAST_X264_PARAMS},
 }
+"""Encoder options of each quality (`VideoWriter`)."""
+
 _CONTAINER_OPTIONS = {"small": {"movflags": "+faststart"}}
-"""The index first, so that a page plays the file while it is still loading."""
+"""Puts the index at the start of the file, so that a web page can play it while it loads."""
+
 Quality = Literal["high", "lossless", "exact", "near", "small"]
 _STUDIO_RANGE_CHROMA = np.round((np.arange(256) - 128.0) * (224.0 / 255.0) + 128.0).astype(np.uint8)
-"""Chroma of full range in studio range (ITU-R BT.601)."""
+"""Look-up table from chroma in full range to chroma in studio range. Source: ITU-R BT.601."""
 
 
 class VideoWriter:
-    """H.264 in an MP4 file. One encoder thread, so that the same frames give the same bytes.
+    """Writer of an MP4 file with H.264 video.
+
+    It uses one encoder thread, so that the same frames give the same bytes.
 
     Args:
         path: The file.
         fps: Frames per second.
-        size: Width and height.
-        quality: "high", "lossless" (but for the chroma, which has half the resolution), "exact" (the same,
-            every frame by itself), "near" (hardly a difference to be seen), or "small".
-        colours: Range and matrix of what `add_planes` is given, as FFmpeg numbers them; told in the file.
+        size: Width and height of the images in pixels.
+        quality: "high"; "lossless", except for the chroma, which has half the resolution; "exact", which is
+            lossless and lets every frame be decoded alone; "near", with hardly visible losses; or "small".
+        colours: Colour range and colour matrix of the images given to `add_planes`, as numbers of FFmpeg.
+            They are stored in the file.
 
     Raises:
         StoreError: The file cannot be written.
@@ -86,7 +96,10 @@ class VideoWriter:
             self._add(self._av.VideoFrame.from_ndarray(image, format="rgb24"))
 
     def add_planes(self, planes: npt.NDArray[np.uint8]) -> None:
-        """Append luma and halved chroma (1.5·H,W), in the range that the file tells."""
+        """Append an image as planes (1.5·H,W): luma, then both chroma planes at half resolution.
+
+        The values must be in the colour range that is stored in the file.
+        """
         self._add(self._av.VideoFrame.from_ndarray(planes, format="yuv420p"))
 
     def _add(self, frame: VideoFrame) -> None:
@@ -103,6 +116,7 @@ class VideoWriter:
             raise self._failure(error) from error
 
     def _failure(self, error: Exception) -> StoreError:
+        """Return the typed error for an error of the encoder or the disk."""
         if isinstance(error, OSError):
             return store_error_from_os_error(error, self._path)
         return StoreError(f"cannot write the video: {error}", path=self._path, hint="check the disk")
@@ -123,9 +137,9 @@ class VideoWriter:
 
 
 def yuv420_from_rgb(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Luma and halved chroma (1.5·H,W) of an RGB image (H,W,3) whose sides are even, in studio range.
+    """Convert an RGB image (H,W,3) of even width and height to YUV 4:2:0 planes (1.5·H,W) in studio range.
 
-    FFmpeg's conversion takes 3.5 ms for 1280×720, this 1.0, and a picture's encoding 8.
+    This is faster than FFmpeg's conversion. Evidence: docs/decisions/formats.md.
 
     Source: ITU-R BT.601.
     """
@@ -134,7 +148,8 @@ def yuv420_from_rgb(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     height, width = image.shape[:2]
     planes = cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420)
     half = cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-    # OpenCV takes the chroma of one pixel in four, where thin coloured lines flicker: the mean of them.
+    # cvtColor takes the chroma of one pixel of four, which makes thin coloured lines flicker. The mean of the
+    # four pixels does not.
     _, red, blue = cv2.split(cv2.cvtColor(half, cv2.COLOR_RGB2YCrCb))
     for plane, chroma in zip(planes[height:].reshape(2, -1), (blue, red), strict=True):
         plane[:] = cv2.LUT(chroma, _STUDIO_RANGE_CHROMA).ravel()

@@ -1,4 +1,11 @@
-"""Open3D as we need it: without the drawing in web pages, which takes most of the time it loads."""
+"""Import Open3D without its Plotly drawing functions, which take most of the import time.
+
+``import open3d`` imports dash and plotly for ``open3d.visualization.draw_plotly``. They take three quarters
+of the import time, and this project does not use them. Open3D has no switch to leave them out. Therefore
+`load_open3d` puts a placeholder for that one module into ``sys.modules`` before the import. This is a
+monkeypatch of a third-party package; it is confined to this module. If a drawing function is called
+nevertheless, the placeholder imports the real module, so Open3D still works completely.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +15,12 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
-# `import open3d` loads dash and plotly for these functions: three quarters of the time, nothing we use.
 _PLOTLY_MODULE = "open3d.visualization.draw_plotly"
+"""The module that the placeholder replaces."""
 
 
 class _LazyModule(ModuleType):
-    """Stands for a module; a function taken from it loads the module at its first call."""
+    """A placeholder for a module. Each of its functions imports the real module when it is called."""
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("__"):
@@ -28,7 +35,10 @@ class _LazyModule(ModuleType):
 
 
 def load_open3d() -> Any:
-    """Import Open3D; its `draw_plotly` functions load what they need when they are called."""
+    """Import and return Open3D, with `_PLOTLY_MODULE` replaced by a placeholder.
+
+    If Open3D is already imported, it is returned as it is.
+    """
     if "open3d" not in sys.modules:
         sys.modules[_PLOTLY_MODULE] = _LazyModule(_PLOTLY_MODULE)
     return import_module("open3d")

@@ -1,4 +1,4 @@
-"""Importing this loads Open3D: for a child that has nothing else to do yet."""
+"""Load Open3D on import, so that a child process can load it while it waits for its task."""
 
 from bodycap_batch.formats.open3d_loader import load_open3d
 

@@ -1,4 +1,4 @@
-"""Formats that take more than the base installation."""
+"""File formats that need a library outside the base installation."""
 
 from __future__ import annotations
 
@@ -8,21 +8,24 @@ from importlib.util import find_spec
 from bodycap_batch.core.errors import JobError
 
 _LIBRARY_MODULES = {"usd": "pxr", "c3d": "ezc3d"}
+"""The module that each format imports."""
 
 
 def require_libraries(formats: Iterable[str]) -> None:
-    """Refuse formats whose library is not installed, before anything is computed.
+    """Check that the libraries of all formats are installed.
+
+    A job calls this first, so that a missing library is reported before anything is computed.
 
     Args:
-        formats: The job's `export.formats`.
+        formats: The formats of the job (`export.formats`).
 
     Raises:
-        JobError: Names the format and the extra that brings it.
+        JobError: A library is missing; the hint says how to install it.
     """
     for name in formats:
         if name in _LIBRARY_MODULES and find_spec(_LIBRARY_MODULES[name]) is None:
             raise JobError(
-                f"{name.upper()} files take a library that is not installed ({_LIBRARY_MODULES[name]})",
+                f"{name.upper()} files need a library that is not installed ({_LIBRARY_MODULES[name]})",
                 field="export.formats",
                 hint="`make extras`, or `pip install 'bodycap_batch[formats]'`; or leave the format out",
             )

@@ -1,4 +1,4 @@
-"""PLY: a coloured point cloud, the cameras' paths as dense coloured samples in it."""
+"""PLY files: a coloured point cloud that contains the camera paths as dense series of points."""
 
 from __future__ import annotations
 
@@ -20,16 +20,23 @@ Colors = npt.NDArray[np.uint8]
 
 
 _VERTEX_BYTES = 3 * 8 + 3
+"""Bytes per point: three doubles and three colour bytes."""
+
 _HEADER_BYTES = 512
+"""Bytes. Upper limit of the size of the header. Derivation: Open3D's header has fewer than 300 bytes."""
+
+_MAX_SAMPLES_PER_STEP = 100
+"""Largest number of samples between two camera centres, so that a wrong pose does not make the file huge.
+Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointCloud:
-    """Coloured points.
+    """P coloured points.
 
     Attributes:
-        points: (P,3).
-        colors: (P,3) uint8 RGB.
+        points: (P,3) points.
+        colors: (P,3) colours, uint8 RGB.
     """
 
     points: FloatArray
@@ -46,13 +53,14 @@ def add_camera_paths(
     spacing: float,
     colours: Mapping[str, Colour] | None = None,
 ) -> PointCloud:
-    """Add each camera's path as a string of points in a colour of its own.
+    """Return the point cloud with the path of each camera added as a series of points.
 
     Args:
-        cloud: The map.
-        paths: (N,3) camera centres in time order, NaN where there is a gap, by camera name.
-        spacing: Largest distance between two samples, in the cloud's unit.
-        colours: By camera name, where there are more cameras than these paths'.
+        cloud: The points of the map.
+        paths: By camera name, (N,3) camera centres in time order; NaN for a lost frame.
+        spacing: Largest distance between two points of a path, in the unit of the cloud.
+        colours: By camera name, the colour of each path. Without it, colours are assigned to the cameras of
+            `paths`; give it if the job has more cameras.
     """
     points, colors = [cloud.points], [cloud.colors]
     colours = colours or camera_colours(paths)
@@ -64,30 +72,35 @@ def add_camera_paths(
 
 
 def _sample_polyline(path: FloatArray, spacing: float) -> FloatArray:
-    """Points along a polyline at most `spacing` apart, every vertex kept, gaps left open."""
+    """Return points along a path (N,3): all its vertices, and samples at most `spacing` apart between them.
+
+    Gaps of the path (NaN) are not filled.
+    """
     out = []
     for start, end in pairwise(path):
         if np.isfinite(start).all():
             steps = 1
             if np.isfinite(end).all():
-                steps = max(1, min(100, int(np.ceil(np.linalg.norm(end - start) / spacing))))
+                steps = int(np.ceil(np.linalg.norm(end - start) / spacing))
+                steps = max(1, min(_MAX_SAMPLES_PER_STEP, steps))
             out.append(start + np.arange(steps)[:, None] / steps * np.nan_to_num(end - start))
     out.append(path[-1:][np.isfinite(path[-1:]).all(axis=1)])
     return np.concatenate(out)
 
 
 def write_ply(path: Path, cloud: PointCloud) -> None:
-    """Write a binary PLY through Open3D and verify it by reading it back.
+    """Write a binary PLY file with Open3D, read it back and compare.
 
     Raises:
-        StoreError: The file cannot be written, or does not hold what was written.
+        StoreError: The file cannot be written, or it differs from the given point cloud.
     """
     open3d = load_open3d()
     content = open3d.geometry.PointCloud()
     content.points = open3d.utility.Vector3dVector(cloud.points.copy())
     content.colors = open3d.utility.Vector3dVector(cloud.colors / 255.0)
     with atomic_replacement(path) as temporary:
-        # Open3D gives no reason, and tells of a full disk by a flood of lines: ask the system first.
+        # Open3D reports a full disk without a reason and with many lines. Reserving the space first gives the
+        # error of the operating system.
         temporary.write_bytes(bytes(_HEADER_BYTES + _VERTEX_BYTES * len(cloud.points)))
         if not open3d.io.write_point_cloud(temporary, content, write_ascii=False):
             hint = "check that the disk is not full"
@@ -100,7 +113,7 @@ def write_ply(path: Path, cloud: PointCloud) -> None:
 
 
 def read_ply(path: Path) -> PointCloud:
-    """Read a PLY's points and colours (black where it has none)."""
+    """Read the points and colours of a PLY file; a file without colours gives black points."""
     open3d = load_open3d()
     content = open3d.io.read_point_cloud(path)
     points = np.asarray(content.points, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""A stick figure for formats that show nothing without a mesh: one slim spindle a bone."""
+"""The mesh of a stick figure, for formats whose viewers show no bones: one slim octahedron per bone."""
 
 from __future__ import annotations
 
@@ -11,22 +11,32 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.model.skeleton import SkeletonModel, rest_pose
 
 _WAIST_RATIO = 0.15
-"""Where along the bone its spindle is widest."""
+"""Ratio. Position of the largest width along the bone. Evidence: none; a matter of looks."""
+
 _MIN_BONE_M = 1e-4
-_WIDTH_SHARE, _WIDTH_M = 0.08, (0.008, 0.03)
-"""Half width: this share of the length, within these bounds."""
+"""Metres. Shorter bones have no mesh. Evidence: none; far below any bone that can be seen."""
+
+_HALF_WIDTH_RATIO = 0.08
+"""Ratio of half the width to the length of the bone. Evidence: none; a matter of looks."""
+
+_HALF_WIDTH_RANGE_M = (0.008, 0.03)
+"""Metres. Limits of half the width. Evidence: none; a matter of looks."""
+
 _FACES = np.array([[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4], [5, 1, 2], [5, 2, 3], [5, 3, 4], [5, 4, 1]])
+
+
+"""Corners of the eight triangles of an octahedron, counter-clockwise from outside (`_spindle_corners`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StickFigure:
-    """A triangle mesh in world axes, bound to a skeleton in its rest pose.
+    """A triangle mesh with V vertices and F faces in world axes, bound to a skeleton in its rest pose.
 
     Attributes:
-        vertices_m: (V,3).
+        vertices_m: (V,3) vertices in metres.
         normals: (V,3) unit normals of the flat faces.
-        faces: (F,3) vertex indices, counter-clockwise seen from outside.
-        joints: (V,) the one joint that moves each vertex.
+        faces: (F,3) vertex indices, counter-clockwise from outside.
+        joints: (V,) index of the joint that moves each vertex.
     """
 
     vertices_m: FloatArray
@@ -36,7 +46,9 @@ class StickFigure:
 
 
 def make_stick_figure(skeleton: SkeletonModel) -> StickFigure:
-    """One spindle from each joint to each of its children and to its end; bones of zero length have none.
+    """Return a mesh with one octahedron from each joint to each of its children and to its end.
+
+    Bones without length have no octahedron.
 
     Raises:
         ValueError: No bone has a length.
@@ -61,7 +73,7 @@ def make_stick_figure(skeleton: SkeletonModel) -> StickFigure:
 
 
 def _iterate_bones(skeleton: SkeletonModel, rest: FloatArray) -> Iterator[tuple[int, FloatArray]]:
-    """Each joint with the far end (3,) of each of its bones; a root on the floor has none."""
+    """Yield the joint and the far end (3,) of each bone; a root on the floor has no bone."""
     on_floor = len(skeleton.joints) > 1 and skeleton.roles[:2] == ("", "Hips")
     for joint, parent in enumerate(skeleton.parents.tolist()):
         end = skeleton.end_offsets_m[joint]
@@ -74,14 +86,14 @@ def _iterate_bones(skeleton: SkeletonModel, rest: FloatArray) -> Iterator[tuple[
 
 
 def _spindle_corners(start: FloatArray, end: FloatArray) -> FloatArray:
-    """The six corners (6,3) of a slim octahedron: start, four around the waist, end."""
+    """Return the corners (6,3) of a slim octahedron: its start, four around its waist, its end."""
     along = end - start
     length = float(np.linalg.norm(along))
     along = along / length
     side = np.cross(along, [0.0, 0.0, 1.0] if abs(along[2]) < 0.9 else [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
     other = np.cross(along, side)
-    half = float(np.clip(_WIDTH_SHARE * length, *_WIDTH_M))
+    half = float(np.clip(_HALF_WIDTH_RATIO * length, *_HALF_WIDTH_RANGE_M))
     waist = start + _WAIST_RATIO * length * along
     around = [waist + half * offset for offset in (side, other, -side, -other)]
     return np.array([start, *around, end])

@@ -1,4 +1,4 @@
-"""TRC, OpenSim's marker file: joint centres in millimetres, Y up, X forward, Z to the right."""
+"""TRC, the marker format of OpenSim: joint centres in millimetres with X forward, Y up and Z to the right."""
 
 from __future__ import annotations
 
@@ -13,11 +13,14 @@ from bodycap_batch.formats.c3d import LabelledPoints
 _FILE_FROM_WORLD: FloatArray = frozen_array(
     [[0, -1, 0], [0, 0, 1], [-1, 0, 0]], name="file_from_world", shape=(3, 3)
 )
+"""Axes of the file from those of the world (Z up, facing −Y, left +X)."""
+
 _MM_PER_M = 1000.0
+"""Millimetres per metre."""
 
 
 def write_trc(path: Path, points: LabelledPoints) -> Path:
-    """Write points; a frame's time counts from 0, a micrometre is its last digit.
+    """Write points as a TRC file. Times start at 0; coordinates have three decimals, which is one micrometre.
 
     Returns:
         The path.

@@ -1,4 +1,7 @@
-"""TUM trajectories: ``timestamp tx ty tz qx qy qz qw`` a line, seconds, world_from_camera."""
+"""TUM trajectory files: one line ``timestamp tx ty tz qx qy qz qw`` per pose.
+
+The timestamp is in seconds, and the pose is world_from_camera.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,8 @@ from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.model.geometry import make_transform, quat_xyzw_from_rotation, rotation_from_quat_xyzw
 
 _NS_PER_S = 1_000_000_000
+"""Nanoseconds per second."""
+
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
 _COMMENT_PREFIXES = ("#", "%", "//", ";")
 _HEADER_WORDS = ("timestamp", "time", "t")
@@ -22,11 +27,11 @@ _HEADER_WORDS = ("timestamp", "time", "t")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TimedPoses:
-    """Poses in time order.
+    """N poses in the order of time.
 
     Attributes:
-        times_ns: (N,) increasing.
-        world_from_cam: (N,4,4).
+        times_ns: (N,) times, increasing.
+        world_from_cam: (N,4,4) poses.
     """
 
     times_ns: IntArray
@@ -40,13 +45,14 @@ class TimedPoses:
 
 
 def read_tum(path: Path | str) -> TimedPoses:
-    """Read a trajectory: comments, a heading, commas, tabs and CRLF are understood.
+    """Read a trajectory.
 
-    Rows out of order are sorted; of rows with the same time the first counts. A file of comments alone
-    is a camera that was never localised: no poses.
+    The file may have comments, a header line, commas or tabs between the numbers, and CRLF line ends. Lines
+    are sorted by time; of lines with the same time, the first is used. A file with comments only has no
+    poses, as for a camera without localised frames.
 
     Raises:
-        JobError: The file is missing, malformed or empty; names the line.
+        JobError: The file is missing, malformed or empty. The error names the line.
     """
     path = Path(path)
     times: list[int] = []
@@ -75,7 +81,7 @@ def read_tum(path: Path | str) -> TimedPoses:
 
 
 def _parse_line(path: Path, number: int, words: list[str]) -> tuple[int, list[float]]:
-    """Time and the seven numbers of one line."""
+    """Return the time in nanoseconds and the seven numbers of one line."""
     if len(words) != 8:
         message = f"{len(words)} columns, expected 8"
         raise JobError(message, path=path, line=number, hint=f"a line holds: {_COLUMNS}")
@@ -89,7 +95,7 @@ def _parse_line(path: Path, number: int, words: list[str]) -> tuple[int, list[fl
             "NaN, infinity or a time out of range",
             path=path,
             line=number,
-            hint="leave frames without a pose out",
+            hint="omit frames without a pose",
         )
     if np.linalg.norm(row[3:]) < 1e-6:
         raise JobError("the quaternion is zero", path=path, line=number, hint="order: qx qy qz qw")
@@ -97,12 +103,12 @@ def _parse_line(path: Path, number: int, words: list[str]) -> tuple[int, list[fl
 
 
 def write_tum(path: Path, poses: TimedPoses, comments: Sequence[str] = ()) -> None:
-    """Write a trajectory with 9 decimals: nanoseconds, nanometres.
+    """Write a trajectory with nine decimals, which are nanoseconds and nanometres.
 
     Args:
-        path: The file; replaced in one step.
-        poses: What to write.
-        comments: Lines for the head of the file, without the ``#``.
+        path: The file; it is replaced atomically.
+        poses: The poses.
+        comments: Comment lines for the top of the file, without ``#``.
 
     Raises:
         StoreError: The file cannot be written.
@@ -118,7 +124,7 @@ def write_tum(path: Path, poses: TimedPoses, comments: Sequence[str] = ()) -> No
 
 
 def seconds_text(time_ns: int) -> str:
-    """Nanoseconds as seconds with all nine decimals."""
+    """Return a time in nanoseconds as seconds with nine decimals."""
     sign = "-" if time_ns < 0 else ""
     whole, rest = divmod(abs(int(time_ns)), _NS_PER_S)
     return f"{sign}{whole}.{rest:09d}"

@@ -1,4 +1,4 @@
-"""USD: the world's own axes and metres (Z up, facing −Y); SkelRoot, Skeleton, SkelAnimation, stick figure."""
+"""USD files: a skeleton, its animation and a skinned stick figure, in metres and the axes of the world."""
 
 from __future__ import annotations
 
@@ -17,17 +17,23 @@ from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 _BODY_PATH, _SKELETON_PATH, _FIGURE_PATH = "/Body", "/Body/Skeleton", "/Body/Figure"
 _MOTION_PATH = "/Body/Skeleton/Motion"
 _FIGURE_COLOR_RGB = (0.86, 0.39, 0.10)
+"""Colour of the stick figure, 0 to 1."""
+
+_EXTENT_MARGIN_M = 0.3
+"""Metres. Added around the joint centres for the extent of the figure. Derivation: head, hands and feet reach
+beyond their joints by less than this."""
 
 
 def write_usd(path: Path, motion: Motion) -> Path:
-    """Write a motion as a skinned, animated stick figure; time codes count frames from 0.
+    """Write a motion as a skinned, animated stick figure. Time codes are frame numbers from 0.
 
-    Joints bind at the T-pose. Their tokens are paths of names that USD allows (``mixamorig_Hips``); the names
-    as they are stand in ``jointNames``. Translations, rotations and scales are authored at every frame.
+    The mesh is bound to the joints in the T-pose. Joint tokens are paths of names that USD allows
+    (``mixamorig_Hips``); the original names are in ``jointNames``. Translations, rotations and scales are
+    written for every frame.
 
     Args:
-        path: The file (``.usd``, ``.usda``, ``.usdc``); replaced in one step.
-        motion: What to write; world axes, metres.
+        path: The file (``.usd``, ``.usda``, ``.usdc``); it is replaced atomically.
+        motion: The motion, in world axes and metres.
 
     Returns:
         The path.
@@ -63,12 +69,8 @@ def write_usd(path: Path, motion: Motion) -> Path:
     return path
 
 
-_EXTENT_MARGIN_M = 0.3
-"""The figure's bones reach beyond the joints' centres: head, hands, feet."""
-
-
 def _joint_tokens(skeleton: SkeletonModel) -> list[str]:
-    """Each joint's path, of names that USD allows; siblings never share one."""
+    """Return a unique path for each joint, made of names that USD allows."""
     from pxr import Tf
 
     out: list[str] = []
@@ -83,13 +85,14 @@ def _joint_tokens(skeleton: SkeletonModel) -> list[str]:
 
 
 def _usd_matrices(poses: FloatArray) -> Any:
-    """Poses (J,4,4) as USD keeps matrices: row vectors."""
+    """Convert poses (J,4,4) to USD matrices, which multiply row vectors."""
     from pxr import Gf, Vt
 
     return Vt.Matrix4dArray([Gf.Matrix4d(*pose.T.reshape(-1).tolist()) for pose in poses])
 
 
 def _define_skeleton(stage: Any, model: SkeletonModel, tokens: list[str]) -> Any:
+    """Add the skeleton with its T-pose as rest and bind pose to the stage, and return it."""
     from pxr import UsdSkel
 
     rest = rest_pose(model)
@@ -103,6 +106,7 @@ def _define_skeleton(stage: Any, model: SkeletonModel, tokens: list[str]) -> Any
 
 
 def _define_animation(stage: Any, motion: Motion, tokens: list[str]) -> Any:
+    """Add the animation of all joints to the stage, and return it."""
     from pxr import Gf, UsdSkel, Vt
 
     animation = UsdSkel.Animation.Define(stage, _MOTION_PATH)
@@ -125,7 +129,7 @@ def _define_animation(stage: Any, motion: Motion, tokens: list[str]) -> Any:
 
 
 def _define_figure(stage: Any, figure: StickFigure, skeleton: Any) -> None:
-    """The mesh, every vertex bound to one joint with weight 1."""
+    """Add the mesh to the stage. Every vertex is bound to one joint with weight 1."""
     from pxr import Gf, UsdGeom, UsdSkel, Vt
 
     mesh = UsdGeom.Mesh.Define(stage, _FIGURE_PATH)
@@ -151,7 +155,9 @@ def _define_figure(stage: Any, figure: StickFigure, skeleton: Any) -> None:
 
 
 def read_usd(path: Path) -> Motion:
-    """Read the animated skeleton of a file of ours; its T-pose is the rest pose, its zero pose unturned.
+    """Read the animated skeleton of a file that `write_usd` has written.
+
+    The rest pose of the file becomes the T-pose; in the zero pose all rotations are the identity.
 
     Raises:
         JobError: The file is no USD stage with a skeleton and its animation.
@@ -167,12 +173,16 @@ def read_usd(path: Path) -> Motion:
         UsdSkel.Animation.Get(stage, _MOTION_PATH),
     )
     if not skeleton or not animation:
-        raise JobError("holds no skeleton with its motion", path=path, hint="give the motion.usd of a result")
+        raise JobError(
+            "contains no skeleton with a motion", path=path, hint="give the motion.usd of a result"
+        )
     frames = [float(frame) for frame in range(round(stage.GetEndTimeCode()) + 1)]
     tokens = list(animation.GetJointsAttr().Get())
     parents = [tokens.index(t.rpartition("/")[0]) if "/" in t else -1 for t in tokens]
-    moved = np.array([animation.GetTranslationsAttr().Get(frame) for frame in frames], dtype=np.float64)
-    turned = np.array(
+    translations = np.array(
+        [animation.GetTranslationsAttr().Get(frame) for frame in frames], dtype=np.float64
+    )
+    quats = np.array(
         [
             [[*quat.GetImaginary(), quat.GetReal()] for quat in animation.GetRotationsAttr().Get(frame)]
             for frame in frames
@@ -190,13 +200,13 @@ def read_usd(path: Path) -> Motion:
         bvh_channels=((),) * count,
         tpose_rotation=rest[:, :3, :3],
     )
-    travels = count > 1 and bool(np.ptp(moved[:, 1], axis=0).max() > 0.0)
+    hips_move = count > 1 and bool(np.ptp(translations[:, 1], axis=0).max() > 0.0)
     return Motion(
         skeleton=model,
         fps=float(stage.GetTimeCodesPerSecond()),
         start_ns=0,
-        root_in_world_m=moved[:, 0],
-        local_rotation=rotation_from_quat_xyzw(turned),
+        root_in_world_m=translations[:, 0],
+        local_rotation=rotation_from_quat_xyzw(quats),
         observed=np.ones((len(frames), count), dtype=bool),
-        hips_in_root_m=moved[:, 1] if travels else None,
+        hips_in_root_m=translations[:, 1] if hips_move else None,
     )

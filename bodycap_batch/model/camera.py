@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 CV2_PIXEL_OFFSET_PX = 0.5
-"""Pixels: COLMAP's coordinates are OpenCV's plus this. OpenCV puts (0, 0) at the centre of the first pixel."""
+"""Pixels: COLMAP's coordinates are OpenCV's plus this. OpenCV puts (0, 0) at the centre of the first
+pixel."""
 
 _FOCAL_INDICES = {
     "SIMPLE_PINHOLE": (0,),
@@ -73,8 +74,8 @@ class Camera:
         height_px: Image height.
         params: Parameters of the model in COLMAP's order, in pixels with COLMAP's origin.
         refine: Whether the parameters are only an initial guess that mapping may refine.
-        sideways: Whether the sensor's rows are the image's columns, as for a phone that was held upright. Only
-            the rolling-shutter correction uses it.
+        sideways: Whether the sensor's rows are the image's columns, as for a phone that was held upright.
+            Only the rolling-shutter correction uses it.
     """
 
     model: str

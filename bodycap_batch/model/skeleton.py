@@ -27,7 +27,8 @@ class SkeletonModel:
         end_offsets_m: (J,3) far end of the bone in the frame of its joint; NaN for joints with children.
         roles: (J,) anatomical (HumanIK) name of each joint, "" for joints without one.
         bvh_channels: (J,) channel names from a BVH file, or () for the default order.
-        tpose_rotation: (J,3,3) parent_from_joint rotations of the T-pose; None if the T-pose is the zero pose.
+        tpose_rotation: (J,3,3) parent_from_joint rotations of the T-pose; None if the T-pose is the zero
+            pose.
         file_rotation: (J,3,3) world_from_joint rotations of the T-pose in the original file, if this skeleton
             was made by `with_tpose_as_zero_pose`; else None.
     """
@@ -95,8 +96,8 @@ class Motion:
         fps: Ticks per second.
         start_ns: Common time of tick 0.
         root_in_world_m: (T,3) root position.
-        local_rotation: (T,J,3,3) parent_from_joint rotations; for the root, world_from_root. The zero pose has
-            identities.
+        local_rotation: (T,J,3,3) parent_from_joint rotations; for the root, world_from_root. The zero pose
+            has identities.
         observed: (T,J) True if cameras measured the joint; False if its pose follows from priors only.
         hips_in_root_m: (T,3) position of the root's first child in the frame of the root, for a root on the
             floor from which the hips move freely. None if every bone has a constant length.

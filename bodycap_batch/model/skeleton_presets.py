@@ -21,8 +21,8 @@ PRESETS = ("upper_body", "full_body")
 """Both names give the whole skeleton. The cameras, not the preset, determine which joints are estimated."""
 
 MEAN_HEIGHT_M = 1.70
-"""Metres. The stature if none is given: between the means of adult women and men in Europe, 1.64 m and 1.78 m.
-Source: NCD Risk Factor Collaboration, "A century of trends in adult human height", eLife 2016."""
+"""Metres. The stature if none is given: between the means of adult women and men in Europe, 1.64 m and 1.78
+m. Source: NCD Risk Factor Collaboration, "A century of trends in adult human height", eLife 2016."""
 
 _STATURE_RANGE_M = (0.5, 2.8)
 """Metres. Statures outside are refused. Derivation: small children to the tallest people, with a margin; a
@@ -165,8 +165,8 @@ def segment_axes(skeleton: SkeletonModel, role: str) -> FloatArray:
     The columns are:
 
     1. along: to the far end of the bone; up for trunk and head, down for the feet;
-    2. forward: where the standing body faces; the side to which the elbow bends; the thumb's side of the hand;
-    3. outward: away from the body for a hanging limb; left for trunk and head; the back of the hand.
+    2. forward: where the standing body faces; the side to which the elbow bends; the thumb's side of the
+    hand; 3. outward: away from the body for a hanging limb; left for trunk and head; the back of the hand.
 
     The axes are taken from the T-pose, so they do not depend on how the arms are held in the zero pose. The
     axes of left limbs are left-handed, so mirrored segments have mirrored axes.
@@ -237,8 +237,8 @@ _REACH_MARGIN_M = 0.05
 """Metres. Widens the reach on both sides, because straps slip. Evidence: none."""
 
 _MIN_DISTANCE_M = 0.08
-"""Metres. Smallest distance of two cameras on different bones. Derivation: each camera stands off its own bone
-by 4 to 5 cm (mounts.yaml)."""
+"""Metres. Smallest distance of two cameras on different bones. Derivation: each camera stands off its own
+bone by 4 to 5 cm (mounts.yaml)."""
 
 
 def camera_reach(skeleton: SkeletonModel, mounts: Sequence[Mount]) -> list[tuple[str, str, float, float]]:
@@ -252,8 +252,8 @@ def camera_reach(skeleton: SkeletonModel, mounts: Sequence[Mount]) -> list[tuple
         Rows (first camera, second camera, smallest, largest distance) in metres, rounded to centimetres. The
         margins `_REACH_MARGIN_RATIO` and `_REACH_MARGIN_M` are included.
 
-    Source: extremes of a chain of ball joints. The largest distance has all links in one line, the smallest has
-        the longest link against all others.
+    Source: extremes of a chain of ball joints. The largest distance has all links in one line, the smallest
+        has the longest link against all others.
     """
     rest = rest_positions(skeleton)
     rows = []

@@ -1,4 +1,4 @@
-"""The export stage: every file, what it holds, and what happens when the disk does not play along."""
+"""The export stage: all files, their content, and errors of the disk."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_trajectories_hold_localised_frames_on_the_cameras_own_clock(tmp_path: P
         assert "world_from_camera" in file.read_text().splitlines()[1]
 
 
-def test_frames_table_tells_every_frame_and_both_clocks(tmp_path: Path) -> None:
+def test_frames_table_has_every_frame_and_both_clocks(tmp_path: Path) -> None:
     inputs = inputs_of(tmp_path)
     run(inputs)
     with open(inputs.out_dir / "frames.csv", newline="") as handle:
@@ -147,7 +147,7 @@ def test_metrics_hold_the_tables(tmp_path: Path) -> None:
     first, second = metrics["models"]
     assert (first["frame"], second["frame"]) == ("world", "map-1")
     assert first["keyframes"] == {"left_palm": 2, "torso": 3}
-    # a two-dimensional error with 0.5 px a coordinate has a mean of 0.5 · √(π/2) = 0.63
+    # a two-dimensional error of 0.5 px per coordinate has a mean of 0.5 · √(π/2) = 0.63
     assert first["mean_reprojection_error_px"] == pytest.approx(0.627, rel=0.12)
     assert second["mean_reprojection_error_px"] < 1e-9
     assert torso["registration"]["mean_reprojection_error_px"] == pytest.approx(0.5)
@@ -172,7 +172,7 @@ def test_motion_file_is_the_projected_motion(tmp_path: Path) -> None:
     assert back is not None
     assert model.joints == motion.skeleton.joints
     position_m, angle_deg = motion_difference(back, motion)
-    # six decimals of a centimetre and of a degree, along a chain of seven joints of 2 m in all
+    # six decimals of a centimetre and of a degree, along a chain of seven joints with a total length of 2 m
     assert position_m < 1e-6
     assert angle_deg < 1e-4
     assert metrics["motion"]["fps"] == 30.0
@@ -180,7 +180,7 @@ def test_motion_file_is_the_projected_motion(tmp_path: Path) -> None:
 
 
 def test_the_body_stands_upright_in_the_file(tmp_path: Path) -> None:
-    """In the file: Y up, the left hand on +X of the right one at first, the feet on the floor, in cm."""
+    """In the file, Y is up, the left hand starts on +X of the right one, the feet are on the floor; cm."""
     inputs = inputs_of(tmp_path)
     run(inputs)
     text = (inputs.out_dir / "motion.bvh").read_text()
@@ -229,7 +229,7 @@ def test_further_formats_hold_the_same_joints(tmp_path: Path) -> None:
     assert inputs.merge is not None
     motion = inputs.merge.motion
     arrays = np.load(inputs.out_dir / "joints.npz", allow_pickle=False)
-    # what is measured stays in the world, whatever the files for animation look like
+    # files for measurements stay in the world, whatever the layout of the files for animation
     np.testing.assert_array_equal(arrays["world"], motion.world_from_joint()[..., :3, 3])
     np.testing.assert_array_equal(arrays["observed"], motion.observed)
     np.testing.assert_allclose(
@@ -241,7 +241,7 @@ def test_further_formats_hold_the_same_joints(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("hierarchy", ["full", "solved"])
-def test_how_well_joints_are_known_is_in_the_tables(tmp_path: Path, hierarchy: str) -> None:
+def test_the_tables_have_the_sigmas_of_the_joints(tmp_path: Path, hierarchy: str) -> None:
     inputs = inputs_of(tmp_path)
     assert inputs.merge is not None
     hand = inputs.merge.skeleton.index_of_role("LeftHand")
@@ -250,15 +250,15 @@ def test_how_well_joints_are_known_is_in_the_tables(tmp_path: Path, hierarchy: s
     merge = replace(inputs.merge, joint_covariance_m2=covariance)
     run(replace(inputs, merge=merge), formats=("csv", "npz"), hierarchy=hierarchy)
     arrays = np.load(inputs.out_dir / "joints.npz", allow_pickle=False)
-    known = arrays["names"] == "LeftHand"
-    np.testing.assert_allclose(arrays["sigma_m"][:, known], 0.02)
-    assert np.isnan(arrays["sigma_m"][:, ~known]).all()
+    has_sigma = arrays["names"] == "LeftHand"
+    np.testing.assert_allclose(arrays["sigma_m"][:, has_sigma], 0.02)
+    assert np.isnan(arrays["sigma_m"][:, ~has_sigma]).all()
     with open(inputs.out_dir / "joints.csv", newline="") as handle:
-        told = {(row["joint"], row["sigma_m"]) for row in csv.DictReader(handle) if row["sigma_m"]}
-    assert told == {("LeftHand", "0.020000")}
+        rows = {(row["joint"], row["sigma_m"]) for row in csv.DictReader(handle) if row["sigma_m"]}
+    assert rows == {("LeftHand", "0.020000")}
 
 
-def test_a_missing_library_is_told_before_anything_is_written(
+def test_a_missing_library_is_reported_before_anything_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inputs = inputs_of(tmp_path)
@@ -268,7 +268,7 @@ def test_a_missing_library_is_told_before_anything_is_written(
     assert not inputs.out_dir.exists()
 
 
-def test_solved_hierarchy_drops_what_hangs_off(tmp_path: Path) -> None:
+def test_solved_hierarchy_drops_unsolved_branches(tmp_path: Path) -> None:
     inputs = inputs_of(tmp_path)
     run(inputs, formats=("bvh",), hierarchy="solved")
     model, motion = read_bvh(inputs.out_dir / "motion.bvh")
@@ -357,7 +357,7 @@ def test_a_full_disk_leaves_no_half_file(tmp_path: Path, monkeypatch: pytest.Mon
 def test_a_motion_that_reads_back_differently_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A writer that is 0.02° off must not pass as done."""
+    """A writer with an error of 0.02° is refused."""
     inputs = inputs_of(tmp_path)
 
     def wrong(path: Path, motion: Any, **options: Any) -> None:

@@ -1,4 +1,4 @@
-"""How a motion is laid out for animation: rate, names and spine count, T-pose, root."""
+"""The layout of a motion for animation software: frame rate, joint names, spine joints, T-pose and root."""
 
 from __future__ import annotations
 
@@ -12,23 +12,24 @@ __all__ = ["apply_layout"]
 
 
 def apply_layout(motion: Motion, options: ExportOptions) -> Motion:
-    """The motion as the files for animation hold it (BVH, GLB, FBX, USD).
+    """Return the motion with the layout of the files for animation (BVH, GLB, FBX, USD).
 
-    Names and spine count leave the joints where they are; a user's own skeleton keeps both.
+    Other joint names and numbers of spine joints do not move any joint in the world. A user's own skeleton
+    keeps its names and joints.
 
     Args:
         motion: The solved motion in the world.
-        options: What the job asks for.
+        options: The export options of the job.
     """
     if options.smoothing_hz is not None:
         motion = smooth(motion, options.smoothing_hz)
     if options.fps is not None:
         motion = resample(motion, options.fps)
-    own = any(motion.skeleton.bvh_channels)
-    if not own:
+    is_user_skeleton = any(motion.skeleton.bvh_channels)
+    if not is_user_skeleton:
         motion = rename_joints(motion, options.names)
     if options.tpose:
         motion = prepend_tpose(motion)
     return apply_root_mode(
-        motion, options.root, floor_root_name("hik" if own else options.names, options.root)
+        motion, options.root, floor_root_name("hik" if is_user_skeleton else options.names, options.root)
     )

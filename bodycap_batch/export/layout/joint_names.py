@@ -1,4 +1,4 @@
-"""Joint names and spine counts of other rigs."""
+"""Joint names and numbers of spine joints of common animation skeletons."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from bodycap_batch.model.skeleton_presets import split_side
 
 @cache
 def naming_preset(preset: str) -> dict[str, Any]:
-    """The entry of a preset in ``names.yaml``."""
+    """Return the entry of a naming preset in ``names.yaml``."""
     text = resources.files("bodycap_batch.presets").joinpath("names.yaml").read_text(encoding="utf-8")
     return dict(yaml.safe_load(text)[preset])
 
 
 def rename_joints(motion: Motion, preset: str) -> Motion:
-    """Give joints a preset's names, spine and neck its number of joints.
+    """Return the motion with the joint names and the numbers of spine and neck joints of a preset.
 
-    Joints that are added lie on the bone they divide and turn about it only, each by an equal share of the
-    twist of the joint above: so no other joint moves or turns in the world.
+    Added joints lie on the bone that they divide. They rotate about this bone only, each by an equal part of
+    the twist of the joint at the bone's end. Therefore no other joint moves or rotates in the world.
     """
     chosen = naming_preset(preset)
     prefix, spine, neck = chosen.get("prefix", ""), chosen["spine"], chosen["neck"]
-    titles = {"Spine": spine[0], "Spine1": spine[-1], "Neck": neck[0]}
+    trunk_names = {"Spine": spine[0], "Spine1": spine[-1], "Neck": neck[0]}
     skeleton = motion.skeleton
     joints = tuple(
-        prefix + (titles.get(role) or _joint_name(role, chosen) if role else name)
+        prefix + (trunk_names.get(role) or _joint_name(role, chosen) if role else name)
         for name, role in zip(skeleton.joints, skeleton.roles, strict=True)
     )
     motion = replace(motion, skeleton=replace(skeleton, joints=joints))
@@ -43,25 +43,36 @@ def rename_joints(motion: Motion, preset: str) -> Motion:
 
 
 def _joint_name(role: str, chosen: dict[str, Any]) -> str:
-    """A role's name in the preset."""
+    """Return the name of the joint with a role in a preset."""
     side, part = split_side(role)
     name = chosen.get("names", {}).get(part, part)
     return f"{name}{chosen['sides'][side]}" if side and "sides" in chosen else f"{side}{name}"
 
 
 def _insert_joints(motion: Motion, lower: str, upper: str, names: list[str]) -> Motion:
-    """Put joints of these names between two joints that follow each other."""
+    """Return the motion with new joints between two joints.
+
+    It is returned unchanged if the joints do not exist or are not parent and child.
+
+    Args:
+        motion: The motion.
+        lower: Role of the parent.
+        upper: Role of the child.
+        names: Names of the new joints, from the parent to the child.
+    """
     skeleton = motion.skeleton
     start, end = skeleton.index_of_role(lower), skeleton.index_of_role(upper)
     if not names or start is None or end is None or skeleton.parents[end] != start:
         return motion
     parts = len(names) + 1
     bone = skeleton.offsets_m[end]
-    share = so3_exp(_twist_rad(motion.local_rotation[:, end], bone)[:, None] / parts * _unit_vector(bone))
-    back = np.linalg.matrix_power(np.swapaxes(share, -1, -2), parts - 1)
+    partial_twist = so3_exp(
+        _twist_rad(motion.local_rotation[:, end], bone)[:, None] / parts * _unit_vector(bone)
+    )
+    untwist = np.linalg.matrix_power(np.swapaxes(partial_twist, -1, -2), parts - 1)
     local = motion.local_rotation.copy()
-    local[:, end] = back @ local[:, end]
-    added = np.repeat(share[:, None], len(names), axis=1)
+    local[:, end] = untwist @ local[:, end]
+    added = np.repeat(partial_twist[:, None], len(names), axis=1)
     observed = np.repeat(motion.observed[:, end, None], len(names), axis=1)
     return replace(
         motion,
@@ -72,12 +83,12 @@ def _insert_joints(motion: Motion, lower: str, upper: str, names: list[str]) -> 
 
 
 def _skeleton_with_joints(skeleton: SkeletonModel, end: int, names: list[str]) -> SkeletonModel:
-    """The zero pose with joints of these names before the joint `end`, evenly along its bone."""
+    """Return the skeleton with new joints evenly spaced along the bone from its parent to the joint `end`."""
     count = len(names)
-    moved = np.where(skeleton.parents >= end, skeleton.parents + count, skeleton.parents)
+    shifted = np.where(skeleton.parents >= end, skeleton.parents + count, skeleton.parents)
     chain = [int(skeleton.parents[end]), *range(end, end + count)]
-    moved[end] = chain[-1]
-    parents = np.concatenate([moved[:end], chain[:-1], moved[end:]])
+    shifted[end] = chain[-1]
+    parents = np.concatenate([shifted[:end], chain[:-1], shifted[end:]])
     bones = np.array(skeleton.offsets_m)
     bones[end] /= count + 1
     tpose = skeleton.tpose_rotation
@@ -94,12 +105,15 @@ def _skeleton_with_joints(skeleton: SkeletonModel, end: int, names: list[str]) -
 
 
 def _twist_rad(rotation: FloatArray, axis: FloatArray) -> FloatArray:
-    """Angle (T,) of the turn about an axis that comes last in each rotation (T,3,3); continuous."""
+    """Return the twist angle (T,) of rotations (T,3,3) about an axis (3,), continuous over time.
+
+    Source: swing-twist decomposition of a quaternion.
+    """
     quat = quat_xyzw_from_rotation(rotation)
     half = np.arctan2(quat[:, :3] @ _unit_vector(axis), quat[:, 3])
     return np.asarray(np.unwrap(2.0 * half))
 
 
 def _unit_vector(vector: FloatArray) -> FloatArray:
-    """The direction; zero for a bone without length."""
+    """Return the unit vector of a vector (3,); zero for a vector without length."""
     return np.asarray(vector / (np.linalg.norm(vector) or 1.0))

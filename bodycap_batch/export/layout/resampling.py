@@ -1,4 +1,4 @@
-"""Another frame rate, and smoothing."""
+"""Resample a motion to another frame rate, and smooth it."""
 
 from __future__ import annotations
 
@@ -16,18 +16,31 @@ from bodycap_batch.model.geometry import (
 from bodycap_batch.model.skeleton import Motion
 
 _TICK_TOLERANCE = 1e-9
-"""A new tick this near to an old one, as a share of their distance, is that one."""
+"""Ratio to the distance of two old ticks. A new tick nearer than this to an old one coincides with it.
+Derivation: above the rounding of tick times."""
+
+_LAST_TICK_TOLERANCE = 1e-6
+"""New ticks. The last old tick is included if it misses the new timeline by less than this. Derivation: above
+the rounding of tick times."""
+
+_TWO_PASS_CUTOFF_RATIO = float((2**0.5 - 1) ** 0.25)
+"""Ratio of the cut-off frequency after two passes of the filter to that of one pass. Source: D. A. Winter,
+Biomechanics and Motor Control of Human Movement, 4th ed., section 3.4.4."""
+
+_MIN_TICKS = 4
+"""A shorter motion is not smoothed. Evidence: none."""
 
 
 def resample(motion: Motion, fps: float) -> Motion:
-    """The motion at another rate, from its first tick to its last.
+    """Return the motion at another rate, from its first to its last tick.
 
-    Rotations by slerp, positions linearly; a tick between two others was observed if both were.
+    Rotations are interpolated by slerp, positions linearly. A tick between two old ticks counts as observed
+    if both old ticks were observed.
     """
     if fps == motion.fps:
         return motion
     last = len(motion.root_in_world_m) - 1
-    ticks = int(np.floor(last / motion.fps * fps + 1e-6)) + 1
+    ticks = int(np.floor(last / motion.fps * fps + _LAST_TICK_TOLERANCE)) + 1
     at = np.minimum(np.arange(ticks) * (motion.fps / fps), last)
     before = np.minimum(at.astype(np.int64), max(last - 1, 0))
     after = np.minimum(before + 1, last)
@@ -48,13 +61,17 @@ def resample(motion: Motion, fps: float) -> Motion:
 
 
 def smooth(motion: Motion, cutoff_hz: float) -> Motion:
-    """Take out what is faster than the cut-off from the root's path and all rotations, without delay.
+    """Return the motion with root path and rotations low-pass filtered, without delay.
 
-    Nothing is done where the rate cannot hold anything faster.
+    The motion is returned unchanged if the cut-off frequency is not below half the frame rate.
+
+    Args:
+        motion: The motion.
+        cutoff_hz: Cut-off frequency of the filter.
 
     Source: D. A. Winter, Biomechanics and Motor Control of Human Movement, 4th ed., section 3.4.4: a
-        second-order Butterworth low-pass, forwards and backwards, its cut-off corrected for the two passes;
-        here on positions and on the components of sign-continuous quaternions.
+        second-order Butterworth low-pass, forwards and backwards, with its cut-off corrected for the two
+        passes. It is applied to positions and to the components of quaternions with continuous signs.
     """
     if 2.0 * cutoff_hz / _TWO_PASS_CUTOFF_RATIO >= motion.fps or len(motion.root_in_world_m) < _MIN_TICKS:
         return motion
@@ -66,14 +83,12 @@ def smooth(motion: Motion, cutoff_hz: float) -> Motion:
     )
 
 
-_TWO_PASS_CUTOFF_RATIO = float((2**0.5 - 1) ** 0.25)
-_MIN_TICKS = 4
-
-
 def _low_pass(values: FloatArray, cutoff_hz: float, fps: float) -> FloatArray:
-    """Filter along time (T,...)."""
+    """Low-pass filter values (T,...) along time."""
     from scipy.signal import butter, sosfiltfilt
 
     sections = butter(2, cutoff_hz / _TWO_PASS_CUTOFF_RATIO, fs=fps, output="sos")
-    reach = min(len(values) - 1, round(3.0 * fps / cutoff_hz))
-    return np.asarray(sosfiltfilt(sections, values, axis=0, padlen=reach))
+    padding = min(
+        len(values) - 1, round(3.0 * fps / cutoff_hz)
+    )  # three periods: the filter's start has decayed
+    return np.asarray(sosfiltfilt(sections, values, axis=0, padlen=padding))

@@ -1,4 +1,4 @@
-"""Where the body's travel goes: onto the hips, onto a root on the floor, or nowhere."""
+"""The T-pose frame and the root motion: on the hips, on a root joint on the floor, or removed."""
 
 from __future__ import annotations
 
@@ -13,21 +13,23 @@ from bodycap_batch.model.geometry import quat_xyzw_from_rotation, so3_exp
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 
 _MIN_HEADING_NORM = 0.1
-"""Below this the hips are near upside down and have no heading: the one before is kept."""
+"""Norm of the heading part (w, z) of a unit quaternion. Below this the hips are nearly upside down and have
+no heading. Evidence: none."""
 
 _HIPS_OFFSET_M = 1e-3
-"""At rest the hips stand this little before the root: right above it, at the tip of its bone, Blender's FBX
-importer takes them for fixed to it and ignores their motion."""
+"""Metres. In the rest pose the hips are this far in front of the root on the floor. Derivation: directly
+above it they would be at the tip of its bone. Blender's FBX importer would then connect them to it and ignore
+their motion."""
 
 
 def floor_root_name(names: str, mode: RootMode) -> str | None:
-    """Name of the root on the floor where the preset or the mode asks for one."""
+    """Return the name of the root on the floor if the naming preset or the mode needs one, else None."""
     chosen = naming_preset(names)
     return str(chosen["floor"]) if mode == "ground" or chosen.get("always") else None
 
 
 def prepend_tpose(motion: Motion) -> Motion:
-    """Put the T-pose before the first frame: standing where the motion begins, facing the front (−Y)."""
+    """Return the motion with one frame more at the start: the T-pose at the first position, facing −Y."""
     skeleton = motion.skeleton
     tpose = skeleton.tpose_rotation
     local = np.tile(np.eye(3), (len(skeleton.joints), 1, 1)) if tpose is None else tpose
@@ -42,27 +44,27 @@ def prepend_tpose(motion: Motion) -> Motion:
 
 
 def apply_root_mode(motion: Motion, mode: RootMode, floor: str | None) -> Motion:
-    """Put the travel where the mode wants it.
+    """Return the motion with the root motion that a mode describes.
 
-    ``hips``: all of it on the hips. ``ground``: the root on the floor below the hips has their path and
-    heading, the hips keep their height and the rest of their rotation; no joint moves in the world.
-    ``in_place``: the hips do not leave the vertical through the origin.
+    ``hips``: The hips carry the whole motion. ``ground``: The root on the floor below the hips carries their
+    horizontal path and their heading. The hips keep their height and the rest of their rotation, and no joint
+    moves in the world. ``in_place``: The hips stay on the vertical through the origin.
 
     Args:
-        motion: The motion, its root the hips.
-        mode: Where the travel goes.
-        floor: Name of a root on the floor, or None without one.
+        motion: The motion, with the hips as its root.
+        mode: The mode of the root motion.
+        floor: Name of the root on the floor, or None for none.
     """
     if mode == "in_place":
         motion = replace(motion, root_in_world_m=motion.root_in_world_m * [0.0, 0.0, 1.0])
     if floor is None:
         return motion
-    turn = np.zeros(len(motion.root_in_world_m))
-    path = np.zeros((len(turn), 3))
+    heading = np.zeros(len(motion.root_in_world_m))
+    path = np.zeros((len(heading), 3))
     if mode == "ground":
-        turn = heading_rad(motion.local_rotation[:, 0])
+        heading = heading_rad(motion.local_rotation[:, 0])
         path[:, :2] = motion.root_in_world_m[:, :2]
-    world_from_floor = so3_exp(turn[:, None] * [0.0, 0.0, 1.0])
+    world_from_floor = so3_exp(heading[:, None] * [0.0, 0.0, 1.0])
     local = motion.local_rotation.copy()
     local[:, 0] = np.swapaxes(world_from_floor, -1, -2) @ local[:, 0]
     hips = np.einsum("tji,tj->ti", world_from_floor, motion.root_in_world_m - path)
@@ -77,27 +79,30 @@ def apply_root_mode(motion: Motion, mode: RootMode, floor: str | None) -> Motion
 
 
 def heading_rad(world_from_hips: FloatArray) -> FloatArray:
-    """Turn (T,) about the vertical: the twist of each rotation (T,3,3) about Z, continuous."""
+    """Return the heading (T,) of rotations (T,3,3): their twist about Z, in radians and continuous over time.
+
+    At a tick without a defined heading, the last defined one is returned.
+    """
     quat = quat_xyzw_from_rotation(world_from_hips)
-    known = np.hypot(quat[:, 2], quat[:, 3]) > _MIN_HEADING_NORM
-    turn = 2.0 * np.arctan2(quat[:, 2], quat[:, 3])
-    if not known.any():
-        return np.zeros_like(turn)
-    latest = np.maximum.accumulate(np.where(known, np.arange(len(turn)), np.argmax(known)))
-    return np.asarray(np.unwrap(turn[latest]))
+    defined = np.hypot(quat[:, 2], quat[:, 3]) > _MIN_HEADING_NORM
+    heading = 2.0 * np.arctan2(quat[:, 2], quat[:, 3])
+    if not defined.any():
+        return np.zeros_like(heading)
+    latest = np.maximum.accumulate(np.where(defined, np.arange(len(heading)), np.argmax(defined)))
+    return np.asarray(np.unwrap(heading[latest]))
 
 
 def _skeleton_with_floor_root(skeleton: SkeletonModel, name: str) -> SkeletonModel:
-    """The skeleton with a root on the floor, below its first root."""
-    free, number = name, 2
-    while free in skeleton.joints:
-        free, number = f"{name}{number}", number + 1
+    """Return the skeleton with an additional root on the floor, the parent of its first root."""
+    unique_name, number = name, 2
+    while unique_name in skeleton.joints:
+        unique_name, number = f"{name}{number}", number + 1
     offsets = np.concatenate([np.zeros((1, 3)), skeleton.offsets_m])
     offsets[1] = [0.0, -_HIPS_OFFSET_M, rest_pose(skeleton)[0, 2, 3]]
     tpose = skeleton.tpose_rotation
     return SkeletonModel(
         name=skeleton.name,
-        joints=(free, *skeleton.joints),
+        joints=(unique_name, *skeleton.joints),
         parents=np.concatenate([[-1], skeleton.parents + 1]),
         offsets_m=offsets,
         end_offsets_m=np.concatenate([np.full((1, 3), np.nan), skeleton.end_offsets_m]),

@@ -1,4 +1,4 @@
-"""BVH: Y up, degrees, Euler angles in a chosen order, centimetres; converted here and nowhere else."""
+"""BVH files: Y up, centimetres, and Euler angles in degrees. Only this package converts these conventions."""
 
 from bodycap_batch.formats.bvh.reader import read_bvh
 from bodycap_batch.formats.bvh.roles import ROLES, assign_roles

@@ -1,4 +1,4 @@
-"""World axes against file axes: BVH = (x, z, −y) · units per metre."""
+"""Convert between the axes and units of the world and of a BVH file: BVH = (x, z, −y) · units per metre."""
 
 from __future__ import annotations
 
@@ -11,28 +11,29 @@ from bodycap_batch.core.arrays import FloatArray, frozen_array
 Units = Literal["cm", "m"]
 
 UNITS_PER_METRE: dict[str, float] = {"cm": 100.0, "m": 1.0}
+"""File units per metre, by the name of the unit."""
 
 WORLD_FROM_FILE: FloatArray = frozen_array(
     [[1, 0, 0], [0, 0, -1], [0, 1, 0]], name="world_from_file", shape=(3, 3)
 )
-"""World (Z up, facing −Y) from file (Y up, facing +Z) axes."""
+"""Rotation from file axes (Y up, facing +Z) to world axes (Z up, facing −Y)."""
 
 
 def world_from_file_points(x_in_file: FloatArray, units: str) -> FloatArray:
-    """Points (...,3) in file axes and units to world axes and metres."""
+    """Convert points (...,3) from file axes and units to world axes and metres."""
     return np.asarray(x_in_file @ WORLD_FROM_FILE.T / UNITS_PER_METRE[units])
 
 
 def file_from_world_points(x_in_world: FloatArray, units: str) -> FloatArray:
-    """Points (...,3) in world axes and metres to file axes and units."""
+    """Convert points (...,3) from world axes and metres to file axes and units."""
     return np.asarray(x_in_world @ WORLD_FROM_FILE * UNITS_PER_METRE[units])
 
 
 def world_from_file_rotations(rotation: FloatArray) -> FloatArray:
-    """Local rotations (...,3,3) expressed in file axes to world axes."""
+    """Convert local rotations (...,3,3) from file axes to world axes."""
     return np.asarray(WORLD_FROM_FILE @ rotation @ WORLD_FROM_FILE.T)
 
 
 def file_from_world_rotations(rotation: FloatArray) -> FloatArray:
-    """Local rotations (...,3,3) expressed in world axes to file axes."""
+    """Convert local rotations (...,3,3) from world axes to file axes."""
     return np.asarray(WORLD_FROM_FILE.T @ rotation @ WORLD_FROM_FILE)

@@ -1,4 +1,4 @@
-"""Intrinsic Euler angles in any order, continuous over time."""
+"""Intrinsic Euler angles in any order of the axes, continuous over time."""
 
 from __future__ import annotations
 
@@ -7,20 +7,22 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 
 _GIMBAL_LOCK_COSINE = 1e-7
-"""Below this the first and third angle cannot be told apart: each alone would be wrong by 1e-16 over it."""
+"""Cosine of the second angle below which the rotation counts as gimbal lock. Derivation: the first and third
+angle have errors of 1e-16 divided by this cosine; at 1e-7 that is 1e-9 rad."""
 
 _FULL_TURN_RAD = 2.0 * np.pi
+"""Radians. One full turn."""
 
 
 def rotation_from_angles(axes: str, angles_rad: FloatArray) -> FloatArray:
-    """Product of elementary rotations in the given order (first axis leftmost).
+    """Multiply elementary rotations in the given order, the first axis leftmost.
 
     Args:
-        axes: K letters of X, Y, Z; repeats allowed.
-        angles_rad: (T,K).
+        axes: K letters of X, Y, Z, which may repeat.
+        angles_rad: (T,K) angle about each axis.
 
     Returns:
-        (T,3,3) rotations, identity for no axes.
+        (T,3,3) rotations; the identity for K = 0.
     """
     out = np.broadcast_to(np.eye(3), (len(angles_rad), 3, 3)).copy()
     for column, axis in enumerate(axes):
@@ -29,7 +31,7 @@ def rotation_from_angles(axes: str, angles_rad: FloatArray) -> FloatArray:
 
 
 def _elementary_rotation(axis: int, angle_rad: FloatArray) -> FloatArray:
-    """Rotations (T,3,3) about one axis."""
+    """Return the rotations (T,3,3) about one axis (0 = X) by angles (T,)."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     first, second = (axis + 1) % 3, (axis + 2) % 3
     out = np.zeros((len(angle_rad), 3, 3))
@@ -41,18 +43,18 @@ def _elementary_rotation(axis: int, angle_rad: FloatArray) -> FloatArray:
 
 
 def continuous_angles(orders: tuple[str, ...], rotation: FloatArray) -> FloatArray:
-    """Euler angles that move as little as possible from one tick to the next.
+    """Convert rotations to the Euler angles that change as little as possible from tick to tick.
 
-    Every rotation has two triples, (a, b, c) and (a + π, π − b, c + π), each with any number of whole
-    turns; the nearest to the previous tick is taken. In gimbal lock only a ± c is fixed, and the rest of
-    the freedom is spent on staying close.
+    Every rotation has two triples of angles, (a, b, c) and (a + π, π − b, c + π), to which full turns may be
+    added. The triple nearest to that of the previous tick is returned. In gimbal lock only a ± c is
+    determined; of all solutions, the nearest to the previous tick is returned.
 
     Args:
-        orders: J orders of three different axes each, first axis leftmost ("ZXY").
-        rotation: (T,J,3,3).
+        orders: (J,) order of three different axes for each joint, the first axis leftmost ("ZXY").
+        rotation: (T,J,3,3) rotations.
 
     Returns:
-        (T,J,3) angles in radians, in the order's order.
+        (T,J,3) angles in radians, in the order of the axes.
     """
     axes = np.array([["XYZ".index(letter) for letter in order] for order in orders], dtype=np.int64)
     parity = np.where((axes[:, 1] - axes[:, 0]) % 3 == 1, 1.0, -1.0)
@@ -68,10 +70,14 @@ def continuous_angles(orders: tuple[str, ...], rotation: FloatArray) -> FloatArr
 
 
 def _principal_angles(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Angles (...,3) of R = Rx(a) Ry(b) Rz(c), and which are locked.
+    """Return the angles (a, b, c) of rotations R = Rx(a) Ry(b) Rz(c), and which rotations are in gimbal lock.
 
-    In gimbal lock the first angle holds c + sign(b) · a. The second output is 0 where not locked, else
-    sign(b).
+    Args:
+        rotation: (...,3,3) rotations.
+
+    Returns:
+        (...,3) angles in radians; in gimbal lock, the first is c + sign(b) · a and the third is 0. And the
+        lock (...): sign(b) in gimbal lock, else 0.
     """
     cos_b = np.hypot(rotation[..., 0, 0], rotation[..., 0, 1])
     b = np.arctan2(rotation[..., 0, 2], cos_b)
@@ -84,7 +90,7 @@ def _principal_angles(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _nearest_equivalent(principal: FloatArray, locked: FloatArray, previous: FloatArray) -> FloatArray:
-    """The equivalent angles (J,3) nearest to the previous ones."""
+    """Return the equivalent angles (J,3) that are nearest to those of the previous tick (J,3)."""
     direct = _add_full_turns(principal, previous)
     other = _add_full_turns(principal * [1, -1, 1] + np.pi, previous)
     if locked.any():
@@ -96,15 +102,15 @@ def _nearest_equivalent(principal: FloatArray, locked: FloatArray, previous: Flo
 
 
 def _add_full_turns(angles: FloatArray, previous: FloatArray) -> FloatArray:
-    """Add the whole turns that bring each angle within half a turn of the previous one."""
+    """Add full turns such that each angle is within half a turn of the previous one."""
     return np.asarray(angles + _FULL_TURN_RAD * np.round((previous - angles) / _FULL_TURN_RAD))
 
 
 def _split_locked_sum(angles: FloatArray, locked: FloatArray, previous: FloatArray) -> FloatArray:
-    """In gimbal lock, split the one known sum c + sign · a so that a and c move equally little.
+    """Return the angles (J,3) in gimbal lock for which a and c change by the same, smallest amount.
 
-    `angles` is either triple of the lock: both have the same middle axis pose, and the sum is a plus
-    sign times c in each (π added to both a and c leaves it the same up to whole turns).
+    In gimbal lock only the sum c + sign · a is determined. `angles` may be either of the two equivalent
+    triples: adding π to a and c changes the sum by full turns only.
     """
     total = angles[:, 0] + locked * angles[:, 2]
     before = previous[:, 2] + locked * previous[:, 0]

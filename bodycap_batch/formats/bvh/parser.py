@@ -1,4 +1,4 @@
-"""The text of a BVH file: braces, keywords and numbers, with the line of whatever is wrong."""
+"""Parse the text of a BVH file. Errors name the line."""
 
 from __future__ import annotations
 
@@ -13,13 +13,26 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
 
 _CHANNELS = {name.lower(): name for axis in "XYZ" for name in (f"{axis}position", f"{axis}rotation")}
+"""Channel names as written in the specification, by their lower-case spelling."""
+
 _MAX_JOINTS = 10_000
-"""A face-and-fingers production rig has a few hundred; beyond this it is no skeleton."""
+"""Largest number of joints. Derivation: a production skeleton with face and fingers has a few hundred, so a
+file with more than this is no skeleton."""
 
 
 @dataclass(slots=True)
 class FileJoint:
-    """One ROOT or JOINT block, in the file's axes and units."""
+    """One ROOT or JOINT block, in the axes and units of the file.
+
+    Attributes:
+        name: Name of the joint, unique in the file.
+        parent: Index of the parent, −1 for the root.
+        line: Line of the block, counted from 1.
+        offset: (3,) the OFFSET.
+        end: (3,) the OFFSET of the End Site, if there is one.
+        channels: Channel names.
+        children: Number of child joints.
+    """
 
     name: str
     parent: int
@@ -32,12 +45,12 @@ class FileJoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BvhFile:
-    """A parsed file.
+    """The content of a BVH file.
 
     Attributes:
-        joints: Blocks in file order (a parent before its children).
-        values: (T, channels) the MOTION block, or None without frames.
-        frame_time: The Frame Time as written ("" without frames).
+        joints: The joints in the order of the file, every parent before its children.
+        values: (T, channels) values of the MOTION block, or None without frames.
+        frame_time: Text of the Frame Time, "" without frames.
     """
 
     joints: list[FileJoint]
@@ -46,10 +59,10 @@ class BvhFile:
 
 
 def parse_bvh(path: Path) -> BvhFile:
-    """Parse a file.
+    """Parse a BVH file.
 
     Raises:
-        JobError: The file is missing or malformed; names the line.
+        JobError: The file is missing or malformed. The error names the line.
     """
     try:
         with open(path, "rb") as handle:
@@ -64,7 +77,7 @@ def parse_bvh(path: Path) -> BvhFile:
 
 @dataclass
 class _LineReader:
-    """The file's non-empty lines with their numbers, read one at a time."""
+    """Reader of the statements of a file, which knows the number of the current line."""
 
     path: Path
     source: Iterator[bytes]
@@ -72,7 +85,7 @@ class _LineReader:
     pending: list[str] = field(default_factory=list)
 
     def next(self) -> str | None:
-        """The next statement, or None at the end of the file. Braces are statements of their own."""
+        """Return the next statement, or None at the end of the file. Each brace is a separate statement."""
         while not self.pending:
             raw = next(self.source, None)
             if raw is None:
@@ -83,7 +96,7 @@ class _LineReader:
         return self.pending.pop(0)
 
     def error(self, message: str, *, line: int | None = None, hint: str | None = None) -> JobError:
-        """The typed error at this line."""
+        """Return a `JobError` for the current line, or for another one."""
         return JobError(
             message,
             path=self.path,
@@ -93,6 +106,7 @@ class _LineReader:
 
 
 def _decode(raw: bytes) -> str:
+    """Decode a line as UTF-8, else as Latin-1."""
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -100,12 +114,16 @@ def _decode(raw: bytes) -> str:
 
 
 def _read_hierarchy(lines: _LineReader) -> tuple[list[FileJoint], bool]:
-    """Parse up to MOTION (True) or the end of the file (False)."""
+    """Parse the HIERARCHY block.
+
+    Returns:
+        The joints, and whether the block ends with MOTION (True) or with the end of the file (False).
+    """
     if (lines.next() or "").upper() != "HIERARCHY":
         raise lines.error("a BVH file begins with HIERARCHY", line=max(lines.number, 1))
     joints: list[FileJoint] = []
-    stack: list[int | None] = []  # open blocks: a joint's index, or None for an End Site
-    opening: list[int | None] = []  # a header whose brace is still to come
+    stack: list[int | None] = []  # open blocks: the index of the joint, or None for an End Site
+    opening: list[int | None] = []  # the block whose opening brace must come next
     at_motion = False
     while (text := lines.next()) is not None:
         keyword = text.split(" ", 1)[0].upper()
@@ -139,7 +157,7 @@ def _read_statement(
     if keyword in ("ROOT", "JOINT"):
         inside = stack[-1] if stack else None
         if keyword == "ROOT" and joints:
-            raise lines.error("a second ROOT", hint="one skeleton a file")
+            raise lines.error("a second ROOT", hint="the file must have one skeleton")
         if keyword == "JOINT" and inside is None:
             raise lines.error("a JOINT outside of ROOT or inside an End Site")
         if len(joints) >= _MAX_JOINTS:
@@ -166,6 +184,7 @@ def _read_statement(
 
 
 def _read_offset(lines: _LineReader, rest: str, joints: list[FileJoint], stack: list[int | None]) -> None:
+    """Parse an OFFSET line and store it in the joint of the innermost open block."""
     numbers = [_parse_number(lines, token) for token in rest.split()]
     if len(numbers) != 3:
         raise lines.error(f"OFFSET needs 3 numbers, found {len(numbers)}")
@@ -178,6 +197,7 @@ def _read_offset(lines: _LineReader, rest: str, joints: list[FileJoint], stack: 
 
 
 def _read_channels(lines: _LineReader, rest: str) -> tuple[str, ...]:
+    """Parse a CHANNELS line and return the channel names."""
     count, *names = rest.split() or [""]
     if not count.isdigit() or int(count) != len(names):
         raise lines.error(f"CHANNELS {count or '?'} is followed by {len(names)} names")
@@ -192,7 +212,7 @@ def _read_channels(lines: _LineReader, rest: str) -> tuple[str, ...]:
 
 
 def _unique_name(name: str, joints: list[FileJoint]) -> str:
-    """The name, with a number added when an earlier joint has it."""
+    """Return the name, with a number added if an earlier joint has the same name."""
     taken = {joint.name for joint in joints}
     free, number = name, 2
     while free in taken:
@@ -201,6 +221,7 @@ def _unique_name(name: str, joints: list[FileJoint]) -> str:
 
 
 def _check_joints(lines: _LineReader, joints: list[FileJoint]) -> None:
+    """Check that there is a root and that every joint has an OFFSET."""
     if not joints:
         raise lines.error("no ROOT in the hierarchy")
     for joint in joints:
@@ -209,7 +230,7 @@ def _check_joints(lines: _LineReader, joints: list[FileJoint]) -> None:
 
 
 def _parse_number(lines: _LineReader, token: str) -> float:
-    """A finite number; a decimal comma is understood."""
+    """Parse a finite number, which may have a decimal comma."""
     try:
         value = float(token.replace(",", "."))
     except ValueError:
@@ -222,7 +243,11 @@ def _parse_number(lines: _LineReader, token: str) -> float:
 def _read_motion(
     lines: _LineReader, joints: list[FileJoint], size_bytes: int
 ) -> tuple[FloatArray | None, str]:
-    """Frames (T, channels) and the Frame Time as written; None when there are no frames."""
+    """Parse the MOTION block.
+
+    Returns:
+        The values (T, channels), None without frames, and the text of the Frame Time.
+    """
     frames = _read_header(lines, "FRAMES")
     if frames is None:
         return None, ""
@@ -237,28 +262,28 @@ def _read_motion(
     if _parse_number(lines, frame_time) < 0 or (_parse_number(lines, frame_time) == 0 and count > 1):
         raise lines.error(f"Frame Time {frame_time} is not a positive duration")
     width = sum(len(joint.channels) for joint in joints)
-    wanted = int(count) * width
-    if 2 * wanted > size_bytes + 1:
+    total = int(count) * width
+    if 2 * total > size_bytes + 1:  # every value takes a digit and a separator
         raise lines.error(
             f"{int(count)} frames of {width} channels do not fit into {size_bytes} bytes",
             hint="the file is truncated, or Frames is wrong",
         )
-    values = np.empty(wanted)
+    values = np.empty(total)
     done = 0
-    while done < wanted and (text := lines.next()) is not None:
-        row = _parse_row(lines, text)[: wanted - done]
+    while done < total and (text := lines.next()) is not None:
+        row = _parse_row(lines, text)[: total - done]
         values[done : done + len(row)] = row
         done += len(row)
-    if done < wanted:
+    if done < total:
         raise lines.error(
-            f"the motion ends after {done} of {wanted} values ({int(count)} frames of {width} channels)",
+            f"the motion ends after {done} of {total} values ({int(count)} frames of {width} channels)",
             hint="the file is truncated, or Frames is wrong",
         )
     return values.reshape(int(count), width), frame_time
 
 
 def _read_header(lines: _LineReader, label: str) -> str | None:
-    """The value of ``label: value``; None at the end of the file."""
+    """Parse a line ``label: value`` and return the value; None at the end of the file."""
     text = lines.next()
     if text is None:
         return None
@@ -270,6 +295,7 @@ def _read_header(lines: _LineReader, label: str) -> str | None:
 
 
 def _parse_row(lines: _LineReader, text: str) -> list[float]:
+    """Parse a line of finite numbers."""
     tokens = text.split()
     try:
         row = [float(token) for token in tokens]

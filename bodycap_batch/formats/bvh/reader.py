@@ -1,4 +1,4 @@
-"""Reading BVH files as they are met: any rig, any channel order, tabs, CRLF, odd spacing."""
+"""Read BVH files of any skeleton and channel order, with tabs, CRLF line ends and irregular spaces."""
 
 from __future__ import annotations
 
@@ -17,32 +17,35 @@ from bodycap_batch.model.skeleton import Motion, SkeletonModel
 logger = logging.getLogger(__name__)
 
 _MAX_METRE_EXTENT = 10.0
-"""A body's zero pose spans 100-200 cm or 1-2 m: a file below this many units is in metres."""
+"""File units. If the zero pose spans less than this, the file is in metres. Derivation: a body spans 1 to 2
+m, which is 100 to 200 cm."""
 
 _MOTION_THRESHOLD = 1e-3
-"""Joint translation, in file units, below which a joint holds still."""
+"""File units. A joint whose position changes by less than this is taken as constant. Derivation: 10 µm in
+centimetres, above the rounding of the usual six decimals."""
 
 _WARNING_THRESHOLD = 1.0
-"""Joint translation, in file units, that is worth a warning."""
+"""File units. A larger change of a bone's offset is reported. Derivation: 1 cm in centimetres, which is
+visible."""
 
 
 def read_bvh(path: Path | str, *, units: str = "auto") -> tuple[SkeletonModel, Motion | None]:
-    """Read a BVH file into world axes and metres.
+    """Read a BVH file and convert it to world axes and metres.
 
-    Position channels are absolute, as Blender and MotionBuilder take them (they replace the OFFSET).
-    Only the root travels, and hips that are its first child: where other joints have position channels that
-    hold still, they are the bone; where they change, the OFFSET is kept.
+    Position channels replace the OFFSET, as in Blender and MotionBuilder. They give the motion of the root,
+    and of hips that are the first child of the root. For other joints, constant position channels give the
+    bone; if they change, the OFFSET is used.
 
     Args:
         path: The file.
-        units: "cm", "m", or "auto" (centimetres unless the whole zero pose spans less than 10 units).
+        units: "cm", "m", or "auto": metres if the zero pose spans less than 10 units, else centimetres.
 
     Returns:
-        The skeleton, and its motion or None when the file holds no frames. `Motion.start_ns` is 0 and
-        every joint counts as observed.
+        The skeleton, and its motion or None if the file has no frames. `Motion.start_ns` is 0 and every joint
+        counts as observed.
 
     Raises:
-        JobError: The file is missing or malformed; names the line.
+        JobError: The file is missing or malformed. The error names the line.
     """
     path = Path(path)
     text = parse_bvh(path)
@@ -71,13 +74,14 @@ def read_bvh(path: Path | str, *, units: str = "auto") -> tuple[SkeletonModel, M
 
 
 def rate_from_frame_time(frame_time: str) -> float:
-    """Frames per second; a rounded Frame Time is taken for the nominal rate it stands for.
+    """Return the frames per second of a Frame Time.
 
-    0.0333333 means 30 Hz, not 30.00003: over an hour that is 0.1 s.
+    A rounded Frame Time gives its nominal rate: 0.0333333 means 30 Hz, not 30.00003 Hz. The difference would
+    be 0.1 s per hour.
     """
     seconds = float(frame_time.replace(",", "."))
     if seconds == 0:
-        return 30.0  # a single pose: the rate has no meaning
+        return 30.0  # the file has a single pose, whose rate is not used
     mantissa = frame_time.lower().partition("e")[0].replace(",", ".")
     digits = len(mantissa.replace(".", "").lstrip("+-0"))
     resolution = 10.0 ** -len(mantissa.partition(".")[2])
@@ -90,13 +94,13 @@ def rate_from_frame_time(frame_time: str) -> float:
 
 
 def _channel_slices(joints: list[FileJoint]) -> list[slice]:
-    """Where each joint's channels stand in a frame."""
+    """Return the columns of each joint's channels in a frame."""
     ends = np.cumsum([len(joint.channels) for joint in joints]).tolist()
     return [slice(end - len(joint.channels), end) for end, joint in zip(ends, joints, strict=True)]
 
 
 def _have_hips_own_translation(joints: list[FileJoint], values: FloatArray) -> bool:
-    """True where the root carries hips with a moving position of their own."""
+    """Return whether the first child of the root is the hips and has a position that changes."""
     parents = [joint.parent for joint in joints]
     if len(joints) < 2 or assign_roles([joint.name for joint in joints], parents)[:2] != ("", "Hips"):
         return False
@@ -109,7 +113,14 @@ def _have_hips_own_translation(joints: list[FileJoint], values: FloatArray) -> b
 def _offsets_from_channels(
     path: Path, joints: list[FileJoint], offsets: FloatArray, values: FloatArray
 ) -> FloatArray:
-    """Bones (J,3), taken from position channels that hold one value other than zero."""
+    """Return the offsets (J,3), with those of joints with constant, non-zero position channels replaced.
+
+    Args:
+        path: The file, for warnings.
+        joints: The joints of the file.
+        offsets: (J,3) OFFSET of each joint, file axes and units.
+        values: (T, channels) values of all frames.
+    """
     out = offsets.copy()
     for index, (joint, columns) in enumerate(zip(joints, _channel_slices(joints), strict=True)):
         if index == 0 or not any(name.endswith("position") for name in joint.channels):
@@ -119,7 +130,12 @@ def _offsets_from_channels(
         positions = _positions(joint, values[:, columns], offsets[index])
         spread = float(np.ptp(positions, axis=0).max())
         if spread > _WARNING_THRESHOLD:
-            logger.warning("%s: joint %s stretches by %.3g; its OFFSET is kept", path, joint.name, spread)
+            logger.warning(
+                "%s: the offset of joint %s changes by %.3g units; its OFFSET is used",
+                path,
+                joint.name,
+                spread,
+            )
         if (
             spread < _MOTION_THRESHOLD
             and positions.any()
@@ -130,7 +146,7 @@ def _offsets_from_channels(
 
 
 def _positions(joint: FileJoint, values: FloatArray, offset: FloatArray) -> FloatArray:
-    """Position (T,3) in file axes and units: the channels where there are any, else the OFFSET."""
+    """Return the positions (T,3) of a joint in file axes and units: its channels, else the OFFSET."""
     out = np.tile(offset, (len(values), 1))
     for column, name in enumerate(joint.channels):
         if name.endswith("position"):
@@ -139,25 +155,26 @@ def _positions(joint: FileJoint, values: FloatArray, offset: FloatArray) -> Floa
 
 
 def _rotations(joints: list[FileJoint], values: FloatArray) -> FloatArray:
-    """Local rotations (T,J,3,3) in file axes."""
+    """Return the local rotations (T,J,3,3) of all joints in file axes."""
     out = np.empty((len(values), len(joints), 3, 3))
     for index, (joint, columns) in enumerate(zip(joints, _channel_slices(joints), strict=True)):
-        turning = [i for i, name in enumerate(joint.channels) if name.endswith("rotation")]
-        axes = "".join(joint.channels[i][0] for i in turning)
-        out[:, index] = rotation_from_angles(axes, np.deg2rad(values[:, columns][:, turning]))
+        rotating = [i for i, name in enumerate(joint.channels) if name.endswith("rotation")]
+        axes = "".join(joint.channels[i][0] for i in rotating)
+        out[:, index] = rotation_from_angles(axes, np.deg2rad(values[:, columns][:, rotating]))
     return out
 
 
 def _detect_units(joints: list[FileJoint], offsets: FloatArray) -> str:
-    """Tell metres from centimetres by the size of the zero pose."""
-    placed = np.zeros_like(offsets)
+    """Return "m" or "cm", by the extent of the zero pose with offsets (J,3)."""
+    centres = np.zeros_like(offsets)
     for index, joint in enumerate(joints[1:], start=1):
-        placed[index] = placed[joint.parent] + offsets[index]
-    extent = float(np.ptp(placed, axis=0).max())
+        centres[index] = centres[joint.parent] + offsets[index]
+    extent = float(np.ptp(centres, axis=0).max())
     return "m" if 0.0 < extent < _MAX_METRE_EXTENT else "cm"
 
 
 def _skeleton(name: str, joints: list[FileJoint], offsets: FloatArray, units: str) -> SkeletonModel:
+    """Return the skeleton of joints with offsets (J,3) in file axes and units."""
     ends = np.full((len(joints), 3), np.nan)
     for index, joint in enumerate(joints):
         if joint.children == 0:

@@ -1,7 +1,8 @@
-"""Which joint of a rig is the elbow? Anatomical roles from joint names and the tree.
+"""Assign anatomical roles to the joints of a skeleton from their names and the tree.
 
-Rigs disagree on names: "LeftShoulder" is the collar bone in HumanIK and Mixamo, the upper arm in rigs that
-have a LeftCollar or a LeftElbow. So a word only offers candidates, and the order along the limb decides.
+Skeletons use names differently: "LeftShoulder" is the collar bone in HumanIK and Mixamo, but the upper arm in
+skeletons with a LeftCollar or a LeftElbow. Therefore a word only gives candidate roles, and the order of the
+joints along the limb decides.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ ROLES = (
     *("Hips", "Spine", "Spine1", "Neck", "Head"),
     *(side + part for side in ("Left", "Right") for part in (*_ARM, *_LEG)),
 )
-"""Every role: HumanIK's names."""
+"""All roles, with the names of HumanIK."""
 
 _ARM_WORDS = {
     (0,): "clavicle collar collarbone clav",
@@ -29,6 +30,9 @@ _ARM_WORDS = {
     (2,): "forearm lowerarm lowarm loarm elbow radius",
     (3,): "hand wrist palm",
 }
+"""Words of joint names by the arm's slots (indices of `_ARM`) they may stand for, the most likely slot
+first."""
+
 _LEG_WORDS = {
     (0,): "upleg upperleg thigh femur hip",
     (1, 0): "leg",
@@ -37,6 +41,8 @@ _LEG_WORDS = {
     (2, 3): "foot",
     (3,): "toe toes toebase ball",
 }
+"""The same for the slots of the leg (`_LEG`)."""
+
 _HIPS_WORDS = {"hips", "hip", "pelvis", "waist", "root"}
 _SPINE_WORDS = {
     "spine",
@@ -53,13 +59,24 @@ _NECK_WORDS = {"neck", "lowerneck", "upperneck"}
 _HEAD_WORDS = {"head", "skull"}
 
 _ARM_SCORES = (9.0, 10.0, 10.0, 10.0)
+"""Score of each slot of the arm that is found. The collar bone counts less because a skeleton may lack it.
+Evidence: none; only the order of the scores matters."""
+
 _LEG_SCORES = (10.0, 10.0, 10.0, 9.0)
-"""What finding each joint of a limb is worth: collar bone and toes are the ones a rig may lack."""
+"""Score of each slot of the leg that is found. The toes count less because a skeleton may lack them."""
+
+_SECOND_CHOICE_COST = 0.1
+"""Score that is subtracted for each less likely meaning of a word. Derivation: less than the difference
+between two slot scores, so it only decides between equal scores."""
+
+_MIN_OFFSET_M = 1e-9
+"""Metres. A joint with a shorter offset is a helper joint without a bone. Derivation: zero up to rounding."""
 
 _WORD_PATTERN = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 
 
 def _slots_by_word(words: dict[tuple[int, ...], str]) -> dict[str, tuple[int, ...]]:
+    """Return the candidate slots of each word."""
     return {word: slots for slots, text in words.items() for word in text.split()}
 
 
@@ -69,37 +86,38 @@ _ARM_SLOTS, _LEG_SLOTS = _slots_by_word(_ARM_WORDS), _slots_by_word(_LEG_WORDS)
 def assign_roles(
     joints: Sequence[str], parents: Sequence[int], offsets_m: FloatArray | None = None
 ) -> tuple[str, ...]:
-    """Name the anatomical role of each joint.
+    """Assign an anatomical role to each joint.
 
     Args:
-        joints: (J,) names as the rig has them.
-        parents: (J,) index of each parent, −1 for the root; parents before children.
-        offsets_m: (J,3) joint centres in their parents, to prefer the joints that have a bone over
-            helpers of zero length.
+        joints: (J,) joint names of the skeleton.
+        parents: (J,) index of each parent, −1 for the root; parents come before their children.
+        offsets_m: (J,3) joint centres in the frames of their parents. With them, joints with a bone are
+            preferred to helper joints of zero length.
 
     Returns:
-        (J,) HumanIK names (Hips, Spine, Spine1 = the joint that carries the arms, Neck, Head,
-        LeftShoulder = collar bone, LeftArm ...), "" where a joint has none; each role at most once.
+        (J,) roles with the names of HumanIK: Hips, Spine, Spine1 (the joint from which the arms branch),
+        Neck, Head, LeftShoulder (the collar bone), LeftArm and so on; "" for a joint without a role. Each
+        role occurs at most once.
     """
     names = [_split_name(name) for name in _strip_common_prefix(joints)]
-    chains = [_ancestors(joint, parents) for joint in range(len(joints))]
+    ancestors = [_ancestors(joint, parents) for joint in range(len(joints))]
     found: dict[str, int] = {}
-    for side, title in (("l", "Left"), ("r", "Right")):
-        for table, slots, worth in ((_ARM_SLOTS, _ARM, _ARM_SCORES), (_LEG_SLOTS, _LEG, _LEG_SCORES)):
-            allowed = [table.get(base, ()) if mine == side else () for mine, base in names]
-            for slot, joint in _best_chain(allowed, chains, worth).items():
-                found[title + slots[slot]] = joint
+    for side, side_name in (("l", "Left"), ("r", "Right")):
+        for table, parts, scores in ((_ARM_SLOTS, _ARM, _ARM_SCORES), (_LEG_SLOTS, _LEG, _LEG_SCORES)):
+            candidates = [table.get(base, ()) if own == side else () for own, base in names]
+            for slot, joint in _best_chain(candidates, ancestors, scores).items():
+                found[side_name + parts[slot]] = joint
     has_bone = np.ones(len(joints), dtype=bool)
     if offsets_m is not None:
-        has_bone = np.linalg.norm(np.asarray(offsets_m), axis=1) > 1e-9
+        has_bone = np.linalg.norm(np.asarray(offsets_m), axis=1) > _MIN_OFFSET_M
     bases = [base if not side else "" for side, base in names]
-    _assign_trunk(found, bases, chains, has_bone.tolist())
+    _assign_trunk(found, bases, ancestors, has_bone.tolist())
     role_of = {joint: role for role, joint in found.items()}
     return tuple(role_of.get(joint, "") for joint in range(len(joints)))
 
 
 def _strip_common_prefix(joints: Sequence[str]) -> list[str]:
-    """Drop a namespace ("mixamorig:") and what all names begin with ("Bip01 ", "Character1_")."""
+    """Remove a namespace ("mixamorig:") and a common prefix ("Bip01 ", "Character1_") from all names."""
     names = [name.rsplit(":", 1)[-1].rsplit("|", 1)[-1] for name in joints]
     if len(names) < 3:
         return names
@@ -112,28 +130,28 @@ def _strip_common_prefix(joints: Sequence[str]) -> list[str]:
 
 
 def _split_name(name: str) -> tuple[str, str]:
-    """Split a joint name into its side ("l", "r" or "") and the rest in lower case, digits dropped."""
+    """Split a joint name into its side ("l", "r" or "") and the rest, in lower case without final digits."""
     tokens = [token.lower() for token in _WORD_PATTERN.findall(name)]
     while tokens and tokens[-1].isdigit():
         tokens.pop()
     side = ""
-    for place in (0, -1):
-        if len(tokens) > 1 and tokens[place] in ("left", "right", "l", "r"):
-            side = tokens.pop(place)[0]
+    for position in (0, -1):
+        if len(tokens) > 1 and tokens[position] in ("left", "right", "l", "r"):
+            side = tokens.pop(position)[0]
             break
     while tokens and tokens[-1].isdigit():
         tokens.pop()
     base = "".join(tokens)
-    known = base in _ARM_SLOTS or base in _LEG_SLOTS
+    is_limb = base in _ARM_SLOTS or base in _LEG_SLOTS
     for prefix in ("left", "right", "l", "r"):
         rest = base.removeprefix(prefix)
-        if not side and not known and rest != base and (rest in _ARM_SLOTS or rest in _LEG_SLOTS):
+        if not side and not is_limb and rest != base and (rest in _ARM_SLOTS or rest in _LEG_SLOTS):
             return prefix[0], rest
     return side, base
 
 
 def _ancestors(joint: int, parents: Sequence[int]) -> list[int]:
-    """A joint's parent, its parent, and so on to the root."""
+    """Return the ancestors of a joint, from its parent to the root."""
     out: list[int] = []
     while parents[joint] >= 0:
         joint = int(parents[joint])
@@ -142,34 +160,46 @@ def _ancestors(joint: int, parents: Sequence[int]) -> list[int]:
 
 
 def _best_chain(
-    allowed: Sequence[tuple[int, ...]], chains: Sequence[list[int]], worth: tuple[float, ...]
+    candidates: Sequence[tuple[int, ...]], ancestors: Sequence[list[int]], scores: tuple[float, ...]
 ) -> dict[int, int]:
-    """Pick joints down one path of the tree, slots increasing, that are worth the most together.
+    """Select the joints along one path of the tree with the largest sum of scores.
 
-    A word's second choice costs a little; among equals the joint nearest the trunk wins.
+    The slots must increase along the path. Of equal sums, the joint nearest to the trunk is selected.
+
+    Args:
+        candidates: (J,) slots that each joint may have, the most likely first.
+        ancestors: (J,) ancestors of each joint, from its parent to the root.
+        scores: Score of each slot.
 
     Returns:
-        Joint index of each slot that was found.
+        Joint index by slot.
     """
     best: dict[tuple[int, int], tuple[float, dict[int, int]]] = {}
     top: tuple[float, dict[int, int]] = (0.0, {})
-    for joint, slots in enumerate(allowed):
+    for joint, slots in enumerate(candidates):
         for choice, slot in enumerate(slots):
             start: tuple[float, dict[int, int]] = (0.0, {})
-            for ancestor in chains[joint]:
-                for before in range(slot):
-                    candidate = best.get((ancestor, before), start)
+            for ancestor in ancestors[joint]:
+                for earlier_slot in range(slot):
+                    candidate = best.get((ancestor, earlier_slot), start)
                     start = candidate if candidate[0] > start[0] else start
-            score = start[0] + worth[slot] - 0.1 * choice
+            score = start[0] + scores[slot] - _SECOND_CHOICE_COST * choice
             best[joint, slot] = (score, {**start[1], slot: joint})
             top = best[joint, slot] if score > top[0] else top
     return top[1]
 
 
 def _assign_trunk(
-    found: dict[str, int], bases: Sequence[str], chains: Sequence[list[int]], has_bone: Sequence[bool]
+    found: dict[str, int], bases: Sequence[str], ancestors: Sequence[list[int]], has_bone: Sequence[bool]
 ) -> None:
-    """Add Hips, Spine, Spine1, Neck and Head to the limbs already found."""
+    """Add Hips, Spine, Spine1, Neck and Head to the roles of the limbs.
+
+    Args:
+        found: Joint index by role; it is extended.
+        bases: (J,) name of each joint in lower case, "" for joints with a side.
+        ancestors: (J,) ancestors of each joint, from its parent to the root.
+        has_bone: (J,) False for helper joints of zero length.
+    """
     taken = set(found.values())
 
     def first(words: set[str], among: Sequence[int]) -> int | None:
@@ -181,49 +211,50 @@ def _assign_trunk(
             taken.add(joint)
 
     everything = range(len(bases))
-    hips = _lowest_common_ancestor([found.get("LeftUpLeg"), found.get("RightUpLeg")], chains)
+    hips = _lowest_common_ancestor([found.get("LeftUpLeg"), found.get("RightUpLeg")], ancestors)
     named = first(_HIPS_WORDS - {"root"}, everything)
     claim(
         "Hips", named if named is not None else hips if hips is not None else first(_HIPS_WORDS, everything)
     )
     claim("Head", first(_HEAD_WORDS, everything))
     arms = [found.get(f"{side}Shoulder", found.get(f"{side}Arm")) for side in ("Left", "Right")]
-    chest = _lowest_common_ancestor(arms, chains)
-    while chest is not None and bases[chest] in _NECK_WORDS and chains[chest]:
-        chest = chains[chest][0]
+    chest = _lowest_common_ancestor(arms, ancestors)
+    while chest is not None and bases[chest] in _NECK_WORDS and ancestors[chest]:
+        chest = ancestors[chest][0]
     if chest is None or chest in taken:
         spine = [joint for joint in everything if bases[joint] in _SPINE_WORDS and joint not in taken]
         chest = spine[-1] if spine else None
     claim("Spine1", chest)
-    between = _joints_between(found.get("Hips"), found.get("Spine1"), chains)
+    between = _joints_between(found.get("Hips"), found.get("Spine1"), ancestors)
     claim("Spine", _choose_joint("spine", between, bases, has_bone))
-    necks = _joints_between(found.get("Spine1", found.get("Hips")), found.get("Head"), chains)
+    necks = _joints_between(found.get("Spine1", found.get("Hips")), found.get("Head"), ancestors)
     necks = [joint for joint in necks if bases[joint] in _NECK_WORDS] or (
         necks[:1] if "Spine1" in found else []
     )
     claim("Neck", _choose_joint("neck", necks, bases, has_bone))
 
 
-def _lowest_common_ancestor(joints: Sequence[int | None], chains: Sequence[list[int]]) -> int | None:
-    """The lowest joint that stands above all the given ones; None when one is missing."""
-    given = [joint for joint in joints if joint is not None]
-    if len(given) < len(joints):
+def _lowest_common_ancestor(joints: Sequence[int | None], ancestors: Sequence[list[int]]) -> int | None:
+    """Return the lowest joint that is an ancestor of all given joints; None if one of them is None."""
+    present = [joint for joint in joints if joint is not None]
+    if len(present) < len(joints):
         return None
-    return next((joint for joint in chains[given[0]] if all(joint in chains[other] for other in given)), None)
+    common = (joint for joint in ancestors[present[0]] if all(joint in ancestors[other] for other in present))
+    return next(common, None)
 
 
-def _joints_between(upper: int | None, lower: int | None, chains: Sequence[list[int]]) -> list[int]:
-    """Joints strictly between two joints of one path, from the upper one down."""
-    if upper is None or lower is None or upper not in chains[lower]:
+def _joints_between(upper: int | None, lower: int | None, ancestors: Sequence[list[int]]) -> list[int]:
+    """Return the joints strictly between two joints of one path, from the upper to the lower one."""
+    if upper is None or lower is None or upper not in ancestors[lower]:
         return []
-    path = chains[lower]
+    path = ancestors[lower]
     return path[: path.index(upper)][::-1]
 
 
 def _choose_joint(
     word: str, among: Sequence[int], bases: Sequence[str], has_bone: Sequence[bool]
 ) -> int | None:
-    """Of several joints the one named exactly so, else the first with a bone, else the first."""
+    """Return the joint with this name and a bone, else the first with a bone, else the first, else None."""
     order = sorted(
         among, key=lambda joint: (not (bases[joint] == word and has_bone[joint]), not has_bone[joint])
     )

@@ -1,4 +1,4 @@
-"""A rig's mapping in words: roles, bones, where limbs point, what is missing."""
+"""Describe a user's skeleton in words: the role of each joint, the direction of its bone, missing joints."""
 
 from __future__ import annotations
 
@@ -15,7 +15,19 @@ _DIRECTIONS = {
     "left": (1, 0, 0), "right": (-1, 0, 0), "up": (0, 0, 1), "down": (0, 0, -1), "forward": (0, -1, 0),
     "back": (0, 1, 0),
 }  # fmt: skip
+"""Unit vectors of the body's directions in world axes."""
+
+_MAX_NAMED_DIRECTION_DEG = 10.0
+"""Degrees. Up to this angle a bone counts as parallel to one of the six directions. Evidence: none."""
+
+_MIN_HEIGHT_DIFFERENCE_M = 0.2
+"""Metres. In a standing pose the head is higher and the feet are lower than the hips by at least this.
+Derivation: less than either distance for a child of 1 m."""
+
 _MIN_BONE_M = 1e-6
+"""Metres. A shorter bone has no direction. Derivation: below the six decimals of a BVH file in
+centimetres."""
+
 _NEXT_PART = {
     "Shoulder": "Arm",
     "Arm": "ForeArm",
@@ -24,20 +36,25 @@ _NEXT_PART = {
     "Leg": "Foot",
     "Foot": "ToeBase",
 }
+"""The part of a limb at the far end of each bone."""
+
 _OPTIONAL_PARTS = ("Shoulder", "ToeBase")
+"""Parts whose absence is no reason for a warning."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JointDescription:
-    """One joint as it is understood.
+    """How one joint of a skeleton was understood.
 
     Attributes:
-        name: As the rig has it.
+        name: Name of the joint in the file.
         role: Anatomical name, "" without one.
-        parent: The parent's name, "" for the root.
-        bone_m: Length of the bone from the joint to the next of its limb, else to its only child or its end.
-        points: Where that bone points in the T-pose: ``left``, ``down, 20° left`` …, "" without length.
-        note: What is special about it.
+        parent: Name of the parent, "" for the root.
+        bone_m: Length of the bone: to the next joint of the limb, else to the only child or the end of the
+            bone.
+        points: Direction of the bone in the T-pose: ``left``, ``down, 20° left`` …; "" for a bone without
+            length.
+        note: Remark about the joint, "" without one.
     """
 
     name: str
@@ -49,7 +66,7 @@ class JointDescription:
 
 
 def describe_joints(skeleton: SkeletonModel) -> tuple[JointDescription, ...]:
-    """Every joint of a rig, in its order."""
+    """Return a description of each joint of a skeleton, in the order of the joints."""
     rest = rest_pose(skeleton)
     out = []
     for joint, name in enumerate(skeleton.joints):
@@ -57,9 +74,9 @@ def describe_joints(skeleton: SkeletonModel) -> tuple[JointDescription, ...]:
         bone = _bone_vector(skeleton, rest, joint)
         length = float(np.linalg.norm(bone))
         role = skeleton.roles[joint]
-        helper = parent >= 0 and float(np.linalg.norm(skeleton.offsets_m[joint])) < _MIN_BONE_M
+        is_helper = parent >= 0 and float(np.linalg.norm(skeleton.offsets_m[joint])) < _MIN_BONE_M
         note = "stays at zero" if not role else ""
-        if helper:
+        if is_helper:
             note = f"{note}, " * bool(note) + "sits on its parent"
         out.append(
             JointDescription(
@@ -75,29 +92,40 @@ def describe_joints(skeleton: SkeletonModel) -> tuple[JointDescription, ...]:
 
 
 def _bone_vector(skeleton: SkeletonModel, rest: FloatArray, joint: int) -> FloatArray:
-    """The bone (3,) that starts at a joint, in the world; zero where the rig branches."""
+    """Return the vector (3,) of the bone that starts at a joint, in the world; zero at a branch.
+
+    Args:
+        skeleton: The skeleton.
+        rest: (J,4,4) joint poses in the T-pose.
+        joint: Index of the joint.
+    """
     side = next((word for word in ("Left", "Right") if skeleton.roles[joint].startswith(word)), "")
     following = _NEXT_PART.get(skeleton.roles[joint].removeprefix(side)) if side else None
-    after = None if following is None else skeleton.index_of_role(side + following)
+    end = None if following is None else skeleton.index_of_role(side + following)
     children = np.flatnonzero(skeleton.parents == joint)
-    if after is None and len(children) == 1:
-        after = int(children[0])
-    if after is not None:
-        return np.asarray(rest[after, :3, 3] - rest[joint, :3, 3])
+    if end is None and len(children) == 1:
+        end = int(children[0])
+    if end is not None:
+        return np.asarray(rest[end, :3, 3] - rest[joint, :3, 3])
     return np.asarray(rest[joint, :3, :3] @ np.nan_to_num(skeleton.end_offsets_m[joint]))
 
 
 def describe_direction(vector: FloatArray) -> str:
-    """A direction in the body's words: the nearest of six, and how far it leans to the next."""
+    """Describe a direction by the nearest of six directions, and the angle towards the second nearest.
+
+    Examples are ``left`` and ``down, 20° left``.
+    """
     unit = vector / np.linalg.norm(vector)
     ranked = sorted(_DIRECTIONS, key=lambda word: -float(unit @ np.array(_DIRECTIONS[word])))
     nearest = unit @ np.array(_DIRECTIONS[ranked[0]])
-    lean = float(np.degrees(np.arccos(np.clip(nearest, -1.0, 1.0))))
-    return ranked[0] if lean < 10.0 else f"{ranked[0]}, {lean:.0f}° {ranked[1]}"
+    angle_deg = float(np.degrees(np.arccos(np.clip(nearest, -1.0, 1.0))))
+    if angle_deg < _MAX_NAMED_DIRECTION_DEG:
+        return ranked[0]
+    return f"{ranked[0]}, {angle_deg:.0f}° {ranked[1]}"
 
 
 def describe_arm_pose(skeleton: SkeletonModel) -> str:
-    """How the rig stands in the pose its limb axes are read from."""
+    """Describe how the arms are held in the T-pose, which the axes of the limbs are taken from."""
     rest, arms = rest_pose(skeleton), []
     for side in ("Left", "Right"):
         joint = skeleton.index_of_role(f"{side}Arm")
@@ -113,26 +141,32 @@ def describe_arm_pose(skeleton: SkeletonModel) -> str:
 
 
 def _describe_direction_or_empty(vector: FloatArray) -> str:
-    """The same, "" for a vector of no length."""
+    """Describe the direction of a vector, "" for a vector without length."""
     return describe_direction(vector) if np.linalg.norm(vector) > _MIN_BONE_M else ""
 
 
 def missing_roles(skeleton: SkeletonModel) -> tuple[str, ...]:
-    """Roles that no joint plays."""
+    """Return the roles that no joint has."""
     return tuple(role for role in ROLES if role not in skeleton.roles)
 
 
 def skeleton_warnings(skeleton: SkeletonModel) -> Iterator[str]:
-    """What will hurt: missing joints, and a pose that is none of a standing body."""
+    """Yield a warning for missing joints and for a T-pose that is not the pose of a standing body."""
     missing = [role for role in missing_roles(skeleton) if not role.endswith(_OPTIONAL_PARTS)]
     if missing:
-        yield f"no joint plays {', '.join(missing)}: name one with --map JOINT=ROLE; no camera can ride there"
+        yield (
+            f"no joint has the role {', '.join(missing)}: name one with --map JOINT=ROLE; "
+            "no camera can be mounted there"
+        )
     rest = rest_pose(skeleton)
     head, hips, foot = (skeleton.index_of_role(role) for role in ("Head", "Hips", "LeftFoot"))
-    if head is not None and hips is not None and not rest[head, 2, 3] > rest[hips, 2, 3] + 0.2:
+    height, margin = rest[:, 2, 3], _MIN_HEIGHT_DIFFERENCE_M
+    if head is not None and hips is not None and not height[head] > height[hips] + margin:
         yield "the head is not above the hips in this pose: name a frame that stands with --tpose-frame N"
-    elif foot is not None and hips is not None and not rest[foot, 2, 3] < rest[hips, 2, 3] - 0.2:
+    elif foot is not None and hips is not None and not height[foot] < height[hips] - margin:
         yield "the feet are not below the hips in this pose: name a frame that stands with --tpose-frame N"
     left, right = (skeleton.index_of_role(f"{side}UpLeg") for side in ("Left", "Right"))
     if left is not None and right is not None and not rest[left, 0, 3] > rest[right, 0, 3]:
-        yield "its left is not on +X (facing +Z in the file): name a frame that stands with --tpose-frame N"
+        yield (
+            "the left leg is not on +X (facing +Z in the file): name a frame that stands with --tpose-frame N"
+        )

@@ -1,4 +1,4 @@
-"""A user's own rig: which joint plays which role, with overrides, and the frame that holds its T-pose."""
+"""Read a user's own skeleton, with roles that the user sets and a T-pose from one of its frames."""
 
 from __future__ import annotations
 
@@ -17,15 +17,21 @@ from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 
 NO_ROLE = "none"
+"""The role that a user writes for a joint without a role."""
+
+_MIN_WIDTH_M = 0.02
+"""Metres. Horizontal distance of the left and the right joint from which the facing direction can be
+computed. Derivation: far above rounding, far below the width of shoulders or hips."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigOptions:
-    """What the user says about a rig.
+    """What the user states about a skeleton.
 
     Attributes:
-        roles: Role by joint name (``none`` for a joint that plays none), over what its name says.
-        tpose_frame: The frame, counted from 0, that holds the T-pose, where the zero pose is another one.
+        roles: Role by joint name, ``none`` for a joint without a role. These take precedence over the roles
+            that follow from the names.
+        tpose_frame: Number of the frame, counted from 0, that has the T-pose; None if it is the zero pose.
     """
 
     roles: Mapping[str, str] = field(default_factory=dict)
@@ -33,17 +39,19 @@ class RigOptions:
 
 
 def read_rig(path: Path | str, options: RigOptions | None = None) -> tuple[SkeletonModel, Motion | None]:
-    """Read a BVH file as a rig to solve onto: hierarchy, OFFSETs, channel order and zero pose as they are.
+    """Read a BVH file as the skeleton of a job.
+
+    Hierarchy, OFFSETs, channel order and zero pose stay as in the file.
 
     Args:
         path: The file.
-        options: What the user says about it.
+        options: What the user states about it.
 
     Returns:
-        The rig, and the file's motion or None without frames.
+        The skeleton, and the motion of the file or None without frames.
 
     Raises:
-        JobError: The file cannot be read, a joint or role does not exist, or the frame does not.
+        JobError: The file cannot be read, or a joint, a role or the frame does not exist.
     """
     path, options = Path(path), options or RigOptions()
     skeleton, motion = read_bvh(path)
@@ -56,39 +64,43 @@ def read_rig(path: Path | str, options: RigOptions | None = None) -> tuple[Skele
     return skeleton, None if motion is None else replace(motion, skeleton=skeleton)
 
 
-def _override_roles(path: Path, skeleton: SkeletonModel, wanted: Mapping[str, str]) -> tuple[str, ...]:
-    """The roles with the user's in their place; one the user gives is taken from the joint that had it."""
+def _override_roles(path: Path, skeleton: SkeletonModel, user_roles: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the roles with those of the user in place.
+
+    If the user gives a role to a joint, another joint that had this role loses it.
+    """
     roles = list(skeleton.roles)
-    for name, role in wanted.items():
+    for name, role in user_roles.items():
         if name not in skeleton.joints:
             hint = _suggest_name(name, skeleton.joints)
             raise JobError(f"it has no joint {name!r}", path=path, field="skeleton_map", hint=hint)
         if role not in (*ROLES, NO_ROLE):
             hint = _suggest_name(role, (*ROLES, NO_ROLE))
             raise JobError(f"there is no role {role!r}", path=path, field="skeleton_map", hint=hint)
-    given = [role for role in wanted.values() if role != NO_ROLE]
-    twice = next((role for role in given if given.count(role) > 1), None)
-    if twice is not None:
-        hint = "each role is played by one joint"
-        raise JobError(f"{twice} is given to two joints", path=path, field="skeleton_map", hint=hint)
+    assigned = [role for role in user_roles.values() if role != NO_ROLE]
+    repeated = next((role for role in assigned if assigned.count(role) > 1), None)
+    if repeated is not None:
+        hint = "only one joint can have a role"
+        raise JobError(f"{repeated} is given to two joints", path=path, field="skeleton_map", hint=hint)
     for index, name in enumerate(skeleton.joints):
-        if name in wanted:
-            roles[index] = "" if wanted[name] == NO_ROLE else wanted[name]
-        elif roles[index] in given:
+        if name in user_roles:
+            roles[index] = "" if user_roles[name] == NO_ROLE else user_roles[name]
+        elif roles[index] in assigned:
             roles[index] = ""
     return tuple(roles)
 
 
-def _suggest_name(word: str, known: tuple[str, ...]) -> str:
-    near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-    return f"did you mean {near[0]!r}?" if near else f"one of {', '.join(known[:40])}"
+def _suggest_name(word: str, names: tuple[str, ...]) -> str:
+    """Return a hint with the most similar name, or with the first names if none is similar."""
+    similar = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
+    return f"did you mean {similar[0]!r}?" if similar else f"one of {', '.join(names[:40])}"
 
 
 def _tpose_rotations(path: Path, skeleton: SkeletonModel, motion: Motion | None, frame: int) -> FloatArray:
-    """Local rotations (J,3,3) of a frame, turned about the vertical until the body faces the front (−Y)."""
+    """Return the local rotations (J,3,3) of a frame, with the body rotated to face −Y."""
     count = 0 if motion is None else len(motion.root_in_world_m)
     if motion is None or not 0 <= frame < count:
-        hint = f"frames count from 0; it has {count}"
+        hint = f"frames count from 0; the file has {count}"
         raise JobError(f"it has no frame {frame}", path=path, field="tpose_frame", hint=hint)
     local: FloatArray = motion.local_rotation[frame].copy()
     pose = rest_pose(replace(skeleton, tpose_rotation=local))
@@ -96,7 +108,7 @@ def _tpose_rotations(path: Path, skeleton: SkeletonModel, motion: Motion | None,
         left, right = (skeleton.index_of_role(side + part) for side in ("Left", "Right"))
         if left is not None and right is not None:
             across = pose[left, :2, 3] - pose[right, :2, 3]
-            if np.linalg.norm(across) > 0.02:
+            if np.linalg.norm(across) > _MIN_WIDTH_M:
                 turn = so3_exp([0.0, 0.0, -np.arctan2(across[1], across[0])])
                 local[0] = turn @ local[0]
                 break

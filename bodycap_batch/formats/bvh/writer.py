@@ -1,4 +1,4 @@
-"""Writing BVH files that Blender, MotionBuilder and retargeters read."""
+"""Write BVH files that Blender, MotionBuilder and retargeting tools read."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ _POSITION_CHANNELS = ("Xposition", "Yposition", "Zposition")
 
 
 def write_bvh(path: Path | str, motion: Motion, *, units: str = "cm", euler_order: str = "ZXY") -> None:
-    """Write a motion.
+    """Write a motion as a BVH file.
 
-    A skeleton that came from a file keeps that file's hierarchy, OFFSETs and channel order; a joint
-    whose channels cannot hold a free rotation gets the missing ones after its own, and the root its
-    position.
+    A skeleton from a file keeps the hierarchy, the OFFSETs and the channel order of that file. If the
+    channels of a joint do not allow every rotation, the missing ones are appended. The root always has
+    position channels.
 
     Args:
-        path: The file; replaced in one step.
-        motion: What to write; world axes, metres (a `Motion` holds no NaN).
+        path: The file; it is replaced atomically.
+        motion: The motion, in world axes and metres.
         units: Length unit of the file, "cm" or "m".
-        euler_order: Rotation channels of joints whose skeleton names none.
+        euler_order: Order of the rotation channels of joints without channels of their own.
 
     Raises:
         StoreError: The file cannot be written.
@@ -47,7 +47,7 @@ def write_bvh(path: Path | str, motion: Motion, *, units: str = "cm", euler_orde
 
 
 def _depth_first_order(skeleton: SkeletonModel) -> list[int]:
-    """Joints in the order of the file: each followed by its whole subtree."""
+    """Return the joints in the order of the file: each joint is followed by all its descendants."""
     children: list[list[int]] = [[] for _ in skeleton.joints]
     for joint, parent in enumerate(skeleton.parents.tolist()[1:], start=1):
         children[parent].append(joint)
@@ -58,18 +58,18 @@ def _depth_first_order(skeleton: SkeletonModel) -> list[int]:
     return order
 
 
-def _joint_channels(skeleton: SkeletonModel, euler_order: str, travelling: int) -> list[tuple[str, ...]]:
-    """Channel names of each joint; the first `travelling` joints have a position."""
+def _joint_channels(skeleton: SkeletonModel, euler_order: str, position_count: int) -> list[tuple[str, ...]]:
+    """Return the channel names of each joint; the first `position_count` joints have position channels."""
     out = []
-    for index, given in enumerate(skeleton.bvh_channels):
-        names = given or tuple(f"{axis}rotation" for axis in euler_order)
+    for index, channels in enumerate(skeleton.bvh_channels):
+        names = channels or tuple(f"{axis}rotation" for axis in euler_order)
         positions = tuple(name for name in names if name.endswith("position"))
         rotations = tuple(name for name in names if name.endswith("rotation"))
         if len(set(rotations)) != 3 or len(rotations) != 3:
             unique = tuple(dict.fromkeys(rotations))
             rotations = unique + tuple(f"{axis}rotation" for axis in "ZXY" if f"{axis}rotation" not in unique)
             names = positions + rotations
-        if index < travelling and len(positions) != 3:
+        if index < position_count and len(positions) != 3:
             names = _POSITION_CHANNELS + rotations
         out.append(names)
     return out
@@ -78,7 +78,7 @@ def _joint_channels(skeleton: SkeletonModel, euler_order: str, travelling: int) 
 def _frame_values(
     motion: Motion, channels: list[tuple[str, ...]], order: list[int], units: str
 ) -> FloatArray:
-    """Frames (T, channels) in file axes and units, degrees."""
+    """Return the values (T, channels) of all frames in file axes and units; angles are in degrees."""
     orders = tuple("".join(name[0] for name in names if name.endswith("rotation")) for names in channels)
     angles = np.rad2deg(continuous_angles(orders, file_from_world_rotations(motion.local_rotation)))
     position = file_from_world_points(motion.local_position_m(), units)
@@ -95,12 +95,14 @@ def _frame_values(
 def _hierarchy_lines(
     motion: Motion, channels: list[tuple[str, ...]], order: list[int], units: str
 ) -> list[str]:
-    """The text of the HIERARCHY block."""
+    """Return the lines of the joints in the HIERARCHY block."""
     skeleton = motion.skeleton
     offsets = file_from_world_points(skeleton.offsets_m, units)
     ends = file_from_world_points(np.nan_to_num(skeleton.end_offsets_m), units)
     if not any(skeleton.bvh_channels):
-        offsets[0] = 0.0  # readers disagree whether the root's channels add to its OFFSET
+        offsets[0] = (
+            0.0  # some readers add the root's position to its OFFSET, others replace the OFFSET by it
+        )
     if motion.hips_in_root_m is not None:
         offsets[1] = 0.0
     has_child = set(skeleton.parents.tolist())
@@ -129,11 +131,12 @@ def _hierarchy_lines(
 
 
 def _format_vector(vector: FloatArray) -> str:
-    """Three lengths: every digit the file had, six decimals or more, no negative zero."""
+    """Return three lengths as text, with six to twelve decimals and no negative zero."""
     return " ".join(_format_length(float(value)) for value in vector)
 
 
 def _format_length(value: float) -> str:
+    """Return a length with six to twelve decimals."""
     text = f"{round(value, 12) + 0.0:.12f}".rstrip("0")
     whole, _, decimals = text.partition(".")
     return f"{whole}.{decimals:0<6}"

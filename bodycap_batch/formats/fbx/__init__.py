@@ -1,4 +1,4 @@
-"""FBX, made by Blender in a process of its own: centimetres, Y up, facing +Z."""
+"""FBX files in centimetres, Y up, facing +Z. Blender writes them in a separate process."""
 
 from bodycap_batch.formats.fbx.blender import find_blender, require_blender
 from bodycap_batch.formats.fbx.writer import write_fbx

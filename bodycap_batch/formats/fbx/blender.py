@@ -1,4 +1,4 @@
-"""Where Blender is, and running a script in it."""
+"""Find Blender and run a script in it."""
 
 from __future__ import annotations
 
@@ -12,22 +12,27 @@ from pathlib import Path
 from bodycap_batch.core.errors import JobError
 
 BLENDER_VARIABLE = "BODYCAP_BLENDER"
+"""Environment variable with the path of Blender, or of a Python that has its module."""
+
 _HINT = (
-    f"`make blender` installs it as a Python module (Python 3.11); or set {BLENDER_VARIABLE} to a Python that "
-    "has bpy, or to a blender executable"
+    f"`make blender` installs it as a Python module (Python 3.11); or set {BLENDER_VARIABLE} to a Python "
+    "that has bpy, or to a blender executable"
 )
 _TIMEOUT_S = 3600.0
+"""Seconds. Longest run of Blender. Evidence: none; it only ends a process that hangs."""
+
 _START_TEST = "import bpy"
+"""Python statement that fails if Blender does not start."""
 
 
 def find_blender() -> Path:
-    """A Python that has ``bpy``, or a blender executable.
+    """Return the path of a Python that has the module ``bpy``, or of a Blender executable.
 
-    Looked for in ``BODYCAP_BLENDER``, this Python, and ``.venv-blender`` in the working folder and beside
-    this package.
+    The search order is: ``BODYCAP_BLENDER``, the running Python, and ``.venv-blender`` in the working folder
+    and in the folder that contains this package.
 
     Raises:
-        JobError: There is none, or the one that is named does not exist.
+        JobError: Nothing was found, or ``BODYCAP_BLENDER`` names no program.
     """
     named = os.environ.get(BLENDER_VARIABLE)
     if named:
@@ -36,19 +41,19 @@ def find_blender() -> Path:
         return Path(named)
     if importlib.util.find_spec("bpy") is not None:
         return Path(sys.executable)
-    beside = Path(__file__).resolve().parents[3]
-    for folder in (Path.cwd(), beside):
+    package_parent = Path(__file__).resolve().parents[3]
+    for folder in (Path.cwd(), package_parent):
         python = folder / ".venv-blender" / "bin" / "python"
         if python.is_file():
             return python
-    raise JobError("FBX files take Blender, which was not found", field="export.formats", hint=_HINT)
+    raise JobError("FBX files need Blender, which was not found", field="export.formats", hint=_HINT)
 
 
 def require_blender() -> None:
-    """Find Blender and start it once.
+    """Check that Blender is installed and starts.
 
     Raises:
-        JobError: It is not there or does not start.
+        JobError: Blender was not found or does not start.
     """
     blender = find_blender()
     script = ["--python-expr", _START_TEST] if is_blender_executable(blender) else ["-c", _START_TEST]
@@ -59,7 +64,7 @@ def require_blender() -> None:
 
 
 def run_script(script: Path, arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    """Run a Python file in Blender; names hash the same in every run, so that files come out the same."""
+    """Run a Python file in Blender. The hash seed is constant, so that every run writes the same bytes."""
     blender = find_blender()
     if is_blender_executable(blender):
         return _run([str(blender), *_flags(blender), "--python", str(script), "--", *arguments])
@@ -67,17 +72,19 @@ def run_script(script: Path, arguments: Sequence[str]) -> subprocess.CompletedPr
 
 
 def is_blender_executable(blender: Path) -> bool:
-    """True for Blender itself, False for a Python with its module."""
+    """Return whether a program is Blender itself, and not a Python with its module."""
     return blender.name.lower().startswith("blender")
 
 
 def _flags(blender: Path) -> list[str]:
+    """Return the command-line options that start Blender without window and user settings."""
     if is_blender_executable(blender):
         return ["--background", "--factory-startup", "--python-exit-code", "1"]
     return ["-P"]
 
 
 def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    """Run a command without the PYTHON… variables of this process, which could break Blender's Python."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     environment = {**kept, "PYTHONHASHSEED": "0"}
     return subprocess.run(

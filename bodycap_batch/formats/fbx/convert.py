@@ -1,8 +1,9 @@
-"""Run by Blender's Python: a GLB becomes an FBX, which is read back for comparison.
+"""Convert a GLB file to FBX and report the joints of the result. This script runs in Blender's Python.
 
     python convert.py in.glb out.fbx report.json fps frames
 
-Blender's unit is the centimetre here: its glTF importer turns metres into it, the FBX needs no scale.
+The unit of the Blender scene is the centimetre. Blender's glTF importer converts metres to it, so the FBX
+needs no scale.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ from pathlib import Path
 from typing import Any
 
 _COMPARED_FRAMES = 20
+"""Number of frames whose joints are reported. Evidence: none; enough to find a wrong frame rate or axis."""
 
 
 def convert(source: str, target: str, fps: float, frames: int) -> None:
-    """Import the GLB and export the FBX: no leaf bones, every frame a key."""
+    """Import the GLB file and export the FBX file without leaf bones and with a key at every frame."""
     import bpy
 
     export_fbx_bin: Any = importlib.import_module("io_scene_fbx.export_fbx_bin")
@@ -31,7 +33,7 @@ def convert(source: str, target: str, fps: float, frames: int) -> None:
     bpy.ops.import_scene.gltf(filepath=source, disable_bone_shape=True)
     scene.frame_start, scene.frame_end = 0, frames - 1
     header = export_fbx_bin.fbx_header_elements
-    # The one place that would hold the time of day.
+    # The header would contain the current time, so equal motions would give different bytes.
     export_fbx_bin.fbx_header_elements = functools.partial(header, time=dt.datetime(1970, 1, 1))
     bpy.ops.export_scene.fbx(
         filepath=target,
@@ -52,7 +54,12 @@ def convert(source: str, target: str, fps: float, frames: int) -> None:
 
 
 def read_back(target: str, fps: float) -> dict[str, Any]:
-    """Import the FBX into an empty scene: where its joints are at some frames, in metres, Z up."""
+    """Import the FBX file into an empty scene and return its joint centres.
+
+    Returns:
+        ``first`` and ``last``: the frame range; ``frames``: the compared frames, counted from the first;
+        ``joints``: by name, the centres at these frames in metres, Z up.
+    """
     import bpy
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -73,12 +80,13 @@ def read_back(target: str, fps: float) -> dict[str, Any]:
 
 
 def _set_rate(scene: Any, fps: float) -> None:
+    """Set the frame rate of a scene; Blender stores it as an integer and a divisor."""
     scene.render.fps = max(1, round(fps))
     scene.render.fps_base = scene.render.fps / fps
 
 
 def main(arguments: list[str]) -> None:
-    """Convert, read back, report."""
+    """Convert a file, read the result back and write the report."""
     source, target, report, fps, frames = arguments
     convert(source, target, float(fps), int(frames))
     Path(report).write_text(json.dumps(read_back(target, float(fps))), encoding="utf-8")

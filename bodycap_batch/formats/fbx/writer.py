@@ -1,4 +1,4 @@
-"""Writing FBX files for Maya, Unreal and Unity, which read no BVH."""
+"""Write FBX files, for Maya, Unreal and Unity, which do not read BVH."""
 
 from __future__ import annotations
 
@@ -17,25 +17,32 @@ from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import Motion
 
 POSITION_TOLERANCE_M = 1e-4
+"""Metres. Largest accepted distance of a joint when the file is read back. Derivation: FBX and GLB have
+single precision, and this is below what an animator sees."""
+
 _CONVERT_SCRIPT = Path(__file__).with_name("convert.py")
-# Blender turns a GLB by a quarter about X on its way in; turned back before, the joints keep our axes.
+
 _BEFORE_BLENDER_IMPORT = so3_exp([-np.pi / 2, 0.0, 0.0])
+"""Rotation of the scene in the GLB. It cancels the quarter turn about X of Blender's glTF importer, so that
+the axes of the joints stay as they are."""
 
 
 def write_fbx(path: Path, motion: Motion) -> Path:
-    """Write a motion as FBX: Blender makes it from a GLB, reads it back, and its joints are compared.
+    """Write a motion as FBX.
 
-    Centimetres, Y up, facing +Z; no scale and no turn on the armature, all joints unturned in the T-pose.
+    Blender converts a GLB file to FBX and reads it back; the joint centres are compared with the motion. The
+    file is in centimetres, Y up, facing +Z. The armature has no scale and no rotation, and all joints have
+    identity rotations in the T-pose.
 
     Args:
-        path: The file; replaced in one step.
-        motion: What to write; world axes, metres.
+        path: The file; it is replaced atomically.
+        motion: The motion, in world axes and metres.
 
     Returns:
         The path.
 
     Raises:
-        JobError: Blender is not there.
+        JobError: Blender was not found.
         StoreError: Blender failed, or the file differs from the motion by more than 0.1 mm.
     """
     with tempfile.TemporaryDirectory() as folder, atomic_replacement(path) as temporary:
@@ -56,7 +63,10 @@ def write_fbx(path: Path, motion: Motion) -> Path:
 
 
 def _max_joint_difference_m(report: dict[str, Any], motion: Motion) -> float:
-    """Largest distance between the joints Blender read and the motion's; infinite where they cannot match."""
+    """Return the largest distance between the joints in Blender's report and those of the motion.
+
+    It is infinite if the joints or the frame range differ.
+    """
     joints, frames = report["joints"], report["frames"]
     count = len(motion.root_in_world_m)
     if set(joints) != set(motion.skeleton.joints) or (report["first"], report["last"]) != (1, count):

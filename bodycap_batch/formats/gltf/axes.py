@@ -1,4 +1,4 @@
-"""World axes against file axes, and the numbers of the format."""
+"""Conversion between world axes and file axes, and the numbers that the format defines."""
 
 from __future__ import annotations
 
@@ -12,24 +12,29 @@ from bodycap_batch.model.geometry import make_transform
 FILE_FROM_WORLD: FloatArray = frozen_array(
     [[1, 0, 0], [0, 0, 1], [0, -1, 0]], name="file_from_world", shape=(3, 3)
 )
-"""File (Y up, facing +Z) from world (Z up, facing −Y) axes."""
+"""Rotation from world axes (Z up, facing −Y) to file axes (Y up, facing +Z)."""
 
 FLOAT, UINT16, UINT32 = 5126, 5123, 5125
+"""Component types of an accessor. Source: glTF 2.0 specification, 3.6.2."""
+
 COMPONENT_DTYPES: dict[int, np.dtype[Any]] = {
     FLOAT: np.dtype("<f4"),
     UINT16: np.dtype("<u2"),
     UINT32: np.dtype("<u4"),
 }
 ELEMENT_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+"""Number of components of each accessor type. Source: glTF 2.0 specification, 3.6.2."""
+
 ELEMENT_ARRAY_BUFFER, ARRAY_BUFFER = 34963, 34962
+"""Targets of a buffer view: vertex indices, vertex attributes. Source: glTF 2.0 specification, 5.11."""
 
 
 def poses_in_file_axes(world_from_joint: FloatArray) -> FloatArray:
-    """Poses (...,4,4) with both frames turned from world axes to the file's."""
+    """Convert poses (...,4,4) from world axes to file axes, for the joint and its parent alike."""
     rotation = FILE_FROM_WORLD @ world_from_joint[..., :3, :3] @ FILE_FROM_WORLD.T
     return make_transform(rotation, world_from_joint[..., :3, 3] @ FILE_FROM_WORLD.T)
 
 
 def rotations_in_world_axes(rotation: FloatArray) -> FloatArray:
-    """Local rotations (...,3,3) from the file's axes to the world's."""
+    """Convert local rotations (...,3,3) from file axes to world axes."""
     return np.asarray(FILE_FROM_WORLD.T @ rotation @ FILE_FROM_WORLD)

@@ -1,4 +1,4 @@
-"""Reading back what the writer wrote; other GLB files only as far as they look the same."""
+"""Read GLB files that `write_glb` has written, or that have the same form."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from bodycap_batch.model.skeleton import Motion, SkeletonModel
 
 
 def read_glb(path: Path | str) -> Motion:
-    """Read the animated skeleton of a file of ours.
+    """Read the animated skeleton of a file that `write_glb` has written.
 
-    Its zero pose has all rotations zero, its T-pose is the rest pose of the nodes; end points of bones and
-    BVH channels are not in the file.
+    The rest pose of the nodes becomes the T-pose; in the zero pose all rotations are the identity. The file
+    does not contain the far ends of bones and the BVH channels.
 
     Raises:
-        JobError: The file is no GLB with one skin and one animation.
+        JobError: The file is no GLB file with one skin and one animation.
     """
     import pygltflib as gl
 
@@ -35,7 +35,7 @@ def read_glb(path: Path | str) -> Motion:
         document = gl.GLTF2.load_binary(str(path))
         if document is None or len(document.skins) != 1 or len(document.animations) != 1:
             raise JobError(
-                "holds no single skin with a single animation",
+                "does not contain exactly one skin and one animation",
                 path=path,
                 hint="give the motion.glb of a result",
             )
@@ -47,16 +47,17 @@ def read_glb(path: Path | str) -> Motion:
 
 
 def _read_motion(document: Any, name: str) -> Motion:
+    """Return the motion of a parsed file."""
     skin, animation = document.skins[0], document.animations[0]
-    place = {node: joint for joint, node in enumerate(skin.joints)}
-    skeleton = _read_skeleton(document, name, place)
+    joint_of_node = {node: joint for joint, node in enumerate(skin.joints)}
+    skeleton = _read_skeleton(document, name, joint_of_node)
     times = _read_accessor(document, animation.samplers[0].input)[:, 0]
-    shape = (len(times), len(place))
+    shape = (len(times), len(joint_of_node))
     local = np.tile(np.eye(3), (*shape, 1, 1))
     position: dict[int, FloatArray] = {}
     for channel in animation.channels:
         values = _read_accessor(document, animation.samplers[channel.sampler].output)
-        joint = place[channel.target.node]
+        joint = joint_of_node[channel.target.node]
         if channel.target.path == "rotation":
             local[:, joint] = rotations_in_world_axes(rotation_from_quat_xyzw(values))
         else:
@@ -72,12 +73,13 @@ def _read_motion(document: Any, name: str) -> Motion:
     )
 
 
-def _read_skeleton(document: Any, name: str, place: dict[int, int]) -> SkeletonModel:
-    nodes = [document.nodes[node] for node in place]
+def _read_skeleton(document: Any, name: str, joint_of_node: dict[int, int]) -> SkeletonModel:
+    """Return the skeleton of a parsed file; `joint_of_node` gives the joint index of each node."""
+    nodes = [document.nodes[node] for node in joint_of_node]
     parents = np.full(len(nodes), -1)
     for joint, node in enumerate(nodes):
         for child in node.children or ():
-            parents[place[child]] = joint
+            parents[joint_of_node[child]] = joint
     offsets = np.array([node.translation for node in nodes]) @ FILE_FROM_WORLD
     rest = rotation_from_quat_xyzw([node.rotation for node in nodes])
     return SkeletonModel(
@@ -93,13 +95,13 @@ def _read_skeleton(document: Any, name: str, place: dict[int, int]) -> SkeletonM
 
 
 def _read_accessor(document: Any, accessor: int) -> FloatArray:
-    """The values (N, width) of an accessor."""
-    wanted = document.accessors[accessor]
-    view = document.bufferViews[wanted.bufferView]
+    """Return the values (N, width) of the accessor with this index."""
+    entry = document.accessors[accessor]
+    view = document.bufferViews[entry.bufferView]
     values = np.frombuffer(
         document.binary_blob(),
-        dtype=COMPONENT_DTYPES[wanted.componentType],
-        count=wanted.count * ELEMENT_WIDTHS[wanted.type],
-        offset=view.byteOffset + wanted.byteOffset,
+        dtype=COMPONENT_DTYPES[entry.componentType],
+        count=entry.count * ELEMENT_WIDTHS[entry.type],
+        offset=view.byteOffset + entry.byteOffset,
     )
-    return np.asarray(values.reshape(wanted.count, ELEMENT_WIDTHS[wanted.type]), dtype=np.float64)
+    return np.asarray(values.reshape(entry.count, ELEMENT_WIDTHS[entry.type]), dtype=np.float64)

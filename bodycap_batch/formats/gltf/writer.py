@@ -1,4 +1,4 @@
-"""Writing GLB files that Blender, game engines and web viewers open."""
+"""Write GLB files that Blender, game engines and web viewers read."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, make_tran
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 
 _FIGURE_COLOR_RGBA = (0.86, 0.39, 0.10, 1.0)
+"""Colour of the stick figure, 0 to 1."""
 
 
 def write_glb(
@@ -35,13 +36,14 @@ def write_glb(
 ) -> None:
     """Write a motion as a skinned, animated stick figure.
 
-    Joints are nodes under one node ``Armature``; bones bind at the T-pose. Every joint has a LINEAR rotation
-    channel, the root (and hips that travel in it) a translation too. Frame k is at k / fps seconds.
+    The joints are nodes below one node ``Armature``. The mesh is bound to them in the T-pose. Every joint has
+    a LINEAR rotation channel; the root, and hips that move freely below it, also have a translation channel.
+    Frame k is at k / fps seconds.
 
     Args:
-        path: The file; replaced in one step.
-        motion: What to write; world axes, metres.
-        file_from_up: (3,3) turns the whole scene, for a converter that will turn it back; default not.
+        path: The file; it is replaced atomically.
+        motion: The motion, in world axes and metres.
+        file_from_up: (3,3) rotation of the whole scene, for a converter that rotates it back; None for none.
 
     Raises:
         StoreError: The file cannot be written.
@@ -93,7 +95,7 @@ def write_glb(
 
 
 class _BinaryBuffer:
-    """The binary part: arrays one after the other, each with its view and accessor."""
+    """The binary part of the file: arrays in a row, each with a buffer view and an accessor."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -103,7 +105,7 @@ class _BinaryBuffer:
     def add(
         self, array: npt.NDArray[Any], kind: str, *, target: int | None = None, component: int = FLOAT
     ) -> int:
-        """Append an array (N, …) and return its accessor's index."""
+        """Append an array (N, …) and return the index of its accessor."""
         import pygltflib as gl
 
         values = np.ascontiguousarray(array, dtype=COMPONENT_DTYPES[component])
@@ -127,7 +129,7 @@ class _BinaryBuffer:
 
 
 def _joint_nodes(skeleton: SkeletonModel, rest: FloatArray) -> list[Any]:
-    """One node a joint, at rest in the bind pose."""
+    """Return one node per joint, in the T-pose; `rest` has its joint poses (J,4,4) in file axes."""
     import pygltflib as gl
 
     parents = skeleton.parents.tolist()
@@ -146,7 +148,7 @@ def _joint_nodes(skeleton: SkeletonModel, rest: FloatArray) -> list[Any]:
 
 
 def _figure_primitive(skeleton: SkeletonModel, turn: FloatArray, buffer: _BinaryBuffer) -> Any:
-    """The stick figure as a primitive: every vertex follows one joint with weight 1."""
+    """Return the stick figure as a primitive. Every vertex is bound to one joint with weight 1."""
     import pygltflib as gl
 
     figure = make_stick_figure(skeleton)
@@ -167,7 +169,7 @@ def _figure_primitive(skeleton: SkeletonModel, turn: FloatArray, buffer: _Binary
 
 
 def _motion_animation(motion: Motion, turn: FloatArray, buffer: _BinaryBuffer) -> Any:
-    """Rotations of all joints, translations of those that travel."""
+    """Return the animation: rotations of all joints, translations of the root and of freely moving hips."""
     import pygltflib as gl
 
     times = buffer.add(np.arange(len(motion.root_in_world_m)) / motion.fps, "SCALAR")
@@ -176,8 +178,8 @@ def _motion_animation(motion: Motion, turn: FloatArray, buffer: _BinaryBuffer) -
     local[:, 0] = turn @ local[:, 0]
     quats, position = continuous_quat_xyzw(local[..., :3, :3]), local[..., :3, 3]
     curves = [(joint, "rotation", buffer.add(quats[:, joint], "VEC4")) for joint in range(quats.shape[1])]
-    travelling = range(1 if motion.hips_in_root_m is None else 2)
-    curves += [(joint, "translation", buffer.add(position[:, joint], "VEC3")) for joint in travelling]
+    translated = range(1 if motion.hips_in_root_m is None else 2)
+    curves += [(joint, "translation", buffer.add(position[:, joint], "VEC3")) for joint in translated]
     return gl.Animation(
         name="Motion",
         samplers=[

@@ -1,8 +1,8 @@
-"""From the graph's bones, whose joints have slack, to a rigid skeleton that still meets the cameras.
+"""Project the solved motion onto a rigid skeleton.
 
-The exported motion moves by rotations and the root's travel alone. Both start from the graph's and are
-corrected by a short least-squares solve: meet the measured cameras, stay close to the graph, and let the
-correction change slowly over time.
+In the motion graph the joints have some slack, so bones can shift by millimetres. In a rigid motion only the
+root moves, and all other joints rotate. This module estimates the rigid motion that is close to the measured
+camera poses and to the motion graph, and whose correction changes slowly over time.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.projection.solver import (
     CameraTarget,
     ProjectionProblem,
@@ -23,20 +23,26 @@ from bodycap_batch.merging.projection.solver import (
 )
 from bodycap_batch.model.geometry import invert, poses_at, rotation_angle_rad
 from bodycap_batch.model.merge_data import CameraClock, SolvedBody, standing_sigma_m
-from bodycap_batch.model.skeleton import Motion, SkeletonModel, forward_kinematics
+from bodycap_batch.model.skeleton import Motion, forward_kinematics
 
 _MAX_GAP_INTERVALS = 1.6
-"""A measured pose is interpolated between neighbouring frames, never across a lost one."""
+"""Frame intervals. Measured poses are interpolated over gaps up to this. Derivation: between one interval
+(neighbouring frames) and two (a lost frame between them)."""
+
+_SNAP_NS = 1_000_000
+"""Nanoseconds. A measured pose this near to a tick is used without interpolation. Evidence: none; motion in 1
+ms is below the noise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Projection:
-    """A motion of the rigid skeleton, and how far it is from what it stands for.
+    """The motion of the rigid skeleton, and its differences to the solution of the graph.
 
     Attributes:
         motion: The rigid motion.
-        gap: JSON values: graph joints against its joints, the merge's camera paths (measured, or solved with
-            the body: `MergeOptions.camera_paths`) against its cameras, how fast standing feet slide.
+        gap: Plain JSON values. ``joints``: difference to the joints of the motion graph. ``cameras``:
+            difference to the camera paths (`MergeOptions.camera_paths`). ``feet``:
+            sliding speed of standing feet.
     """
 
     motion: Motion
@@ -51,25 +57,16 @@ def project_motion(
     """Project the solution of the factor graph onto its own rigid skeleton.
 
     Args:
-        body: The solved bones.
-        clocks: By camera name.
-        row_fraction: By camera, (N,) mean row behind each pose over the image height (rolling shutter).
+        body: The solution of the factor graph.
+        clocks: The clock of each camera, by name.
+        row_fraction: By camera, (N,) mean image row of the observations behind each pose, as a fraction of
+            the image height, for the times of rolling-shutter cameras.
 
     Returns:
-        The motion on the body's timeline. Joints the graph did not solve keep their local rotations.
+        The motion on the timeline of merging. Joints that the graph did not solve keep their local rotations.
     """
-    cameras = _camera_targets(body, clocks, row_fraction or {})
-    solved = np.flatnonzero(body.solved)
-    start = _initial_motion(body.skeleton, body.graph_world_from_joint, body.solved)
-    problem = ProjectionProblem(
-        fps=body.fps,
-        skeleton=body.skeleton,
-        solved=solved,
-        world_from_joint=body.graph_world_from_joint,
-        cameras=cameras,
-        planted=_standing_joints(body),
-    )
-    result = solve_rigid_motion(problem, start)
+    problem = projection_problem(body, clocks, row_fraction)
+    result = solve_rigid_motion(problem, initial_motion(body))
     motion = Motion(
         skeleton=body.skeleton,
         fps=body.fps,
@@ -78,11 +75,43 @@ def project_motion(
         local_rotation=result.local,
         observed=body.observed,
     )
-    return Projection(motion=motion, gap=_gap(body, motion, cameras))
+    return Projection(motion=motion, gap=_gap(body, motion, problem.cameras))
+
+
+def projection_problem(
+    body: SolvedBody,
+    clocks: Mapping[str, CameraClock],
+    row_fraction: Mapping[str, FloatArray] | None = None,
+) -> ProjectionProblem:
+    """Return the least-squares problem of `project_motion`, with the same arguments."""
+    return ProjectionProblem(
+        fps=body.fps,
+        skeleton=body.skeleton,
+        solved=np.flatnonzero(body.solved),
+        world_from_joint=body.graph_world_from_joint,
+        cameras=_camera_targets(body, clocks, row_fraction or {}),
+        standing=_standing_joints(body),
+    )
+
+
+def initial_motion(body: SolvedBody) -> RigidMotion:
+    """Return the rigid motion with the rotations of the motion graph.
+
+    The root is where the centres of the solved joints agree best with the graph.
+    """
+    skeleton, solved = body.skeleton, body.solved
+    rotation = body.graph_world_from_joint[..., :3, :3]
+    local = rotation.copy()
+    for joint in range(1, len(skeleton.joints)):
+        local[:, joint] = np.swapaxes(rotation[:, skeleton.parents[joint]], -1, -2) @ rotation[:, joint]
+    centres = forward_kinematics(skeleton, np.zeros((len(local), 3)), local)[..., :3, 3]
+    used = solved if solved.any() else np.ones(len(solved), dtype=bool)
+    root = (body.graph_world_from_joint[:, used][..., :3, 3] - centres[:, used]).mean(axis=1)
+    return RigidMotion(root=root, local=local)
 
 
 def _standing_joints(body: SolvedBody) -> tuple[StandingJoint, ...]:
-    """The ankles whose feet stand now and then."""
+    """Return the ankles of the feet that stand at some ticks."""
     if body.standing is None:
         return ()
     held = body.standing[1:] & body.standing[:-1]
@@ -93,42 +122,30 @@ def _standing_joints(body: SolvedBody) -> tuple[StandingJoint, ...]:
     )
 
 
-def _initial_motion(skeleton: SkeletonModel, world_from_joint: FloatArray, solved: BoolArray) -> RigidMotion:
-    """The graph's rotations, and the root where the solved joints fit best."""
-    rotation = world_from_joint[..., :3, :3]
-    local = rotation.copy()
-    for joint in range(1, len(skeleton.joints)):
-        local[:, joint] = np.swapaxes(rotation[:, skeleton.parents[joint]], -1, -2) @ rotation[:, joint]
-    placed = forward_kinematics(skeleton, np.zeros((len(local), 3)), local)[..., :3, 3]
-    trusted = solved if solved.any() else np.ones(len(solved), dtype=bool)
-    root = (world_from_joint[:, trusted][..., :3, 3] - placed[:, trusted]).mean(axis=1)
-    return RigidMotion(root=root, local=local)
-
-
 def _camera_targets(
     body: SolvedBody, clocks: Mapping[str, CameraClock], row_fraction: Mapping[str, FloatArray]
 ) -> tuple[CameraTarget, ...]:
-    """Each camera's measured poses at the ticks of the motion."""
+    """Return the measured poses of each camera, interpolated at the ticks of the motion."""
     out = []
     mounts = {mount.camera: mount for mount in body.mounts}
     for trajectory in body.trajectories:
-        kept = np.flatnonzero(trajectory.localised)
+        localised = np.flatnonzero(trajectory.localised)
         mount = mounts.get(trajectory.camera)
         joint = None if mount is None else body.skeleton.index_of_role(mount.role)
-        if mount is None or joint is None or not len(kept):
+        if mount is None or joint is None or not len(localised):
             continue
         rows = row_fraction.get(trajectory.camera)
         times = clocks[trajectory.camera].common_times_ns(
-            trajectory.times_ns[kept], None if rows is None else rows[kept]
+            trajectory.times_ns[localised], None if rows is None else rows[localised]
         )
         order = np.argsort(times, kind="stable")
         interval = np.median(np.diff(trajectory.times_ns)) if len(trajectory.times_ns) > 1 else 0.0
         poses, found = poses_at(
             times[order],
-            trajectory.gauge_from_cam[kept[order]],
+            trajectory.gauge_from_cam[localised[order]],
             body.times_ns(),
             max_gap_ns=round(_MAX_GAP_INTERVALS * float(interval)),
-            snap_ns=1_000_000,
+            snap_ns=_SNAP_NS,
         )
         out.append(
             CameraTarget(
@@ -143,38 +160,38 @@ def _camera_targets(
 
 
 def _gap(body: SolvedBody, motion: Motion, cameras: tuple[CameraTarget, ...]) -> dict[str, Any]:
-    """How far the exported motion is from the graph and from the cameras."""
+    """Return the differences of the rigid motion to motion graph and cameras (`Projection.gap`)."""
     exported = motion.world_from_joint()
     out: dict[str, Any] = {}
     if body.solved.any():
         graph, rigid = body.graph_world_from_joint[:, body.solved], exported[:, body.solved]
         out["joints"] = _pose_difference(graph, rigid)
     out["cameras"] = {
-        tracked.camera: _pose_difference(
-            tracked.world_from_cam[tracked.found],
-            exported[tracked.found, tracked.joint] @ tracked.joint_from_cam,
+        target.camera: _pose_difference(
+            target.world_from_cam[target.found],
+            exported[target.found, target.joint] @ target.joint_from_cam,
         )
-        for tracked in cameras
-        if tracked.found.any()
+        for target in cameras
+        if target.found.any()
     }
     if body.standing is not None:
         out["feet"] = {
-            body.skeleton.joints[planted.joint]: _slide_speed(
-                exported[:, planted.joint, :3, 3], planted, body.fps
+            body.skeleton.joints[standing.joint]: _slide_speed(
+                exported[:, standing.joint, :3, 3], standing, body.fps
             )
-            for planted in _standing_joints(body)
+            for standing in _standing_joints(body)
         }
     return out
 
 
-def _slide_speed(centre: FloatArray, planted: StandingJoint, fps: float) -> dict[str, float]:
-    """How fast an ankle (T,3) slides while its foot stands."""
-    speed = fps * np.linalg.norm(np.diff(centre, axis=0), axis=1)[planted.held]
+def _slide_speed(centre: FloatArray, standing: StandingJoint, fps: float) -> dict[str, float]:
+    """Return percentiles of the speed of an ankle, with centres (T,3), while its foot stands."""
+    speed = fps * np.linalg.norm(np.diff(centre, axis=0), axis=1)[standing.held]
     return {f"slide_p{q}_m_per_s": float(np.percentile(speed, q)) for q in (50, 95)}
 
 
 def _pose_difference(first: FloatArray, second: FloatArray) -> dict[str, float]:
-    """Median and 95th percentile of distance and angle between poses (...,4,4)."""
+    """Return the median and the 95th percentile of distance and angle between poses (...,4,4)."""
     difference = invert(first) @ second
     distance = np.linalg.norm(difference[..., :3, 3], axis=-1)
     angle = np.rad2deg(rotation_angle_rad(difference[..., :3, :3]))

@@ -1,9 +1,9 @@
-"""The least-squares solve behind the projection: Gauss-Newton over many ticks at once.
+"""The least-squares problem of the projection onto the rigid skeleton, and its solution.
 
-Unknowns of a tick are a shift of the root and, for each solved joint, a rotation of everything below it
-about its centre, in world axes. Ticks are tied to their neighbours only, so the normal equations are block
-tridiagonal and the solve is linear in time. Long motions are solved in stretches, so that memory does not
-grow with them.
+The unknowns of a tick are a shift of the root and, for each solved joint, a rotation of all its descendants
+about its centre, in world axes. Only neighbouring ticks are linked, so the normal equations are
+block-tridiagonal, and the solution takes a time proportional to the number of ticks. Long motions are solved
+in overlapping windows, so that the memory does not grow with their length.
 
 Source: D. C. Fraser, J. E. Potter, "The optimum linear smoother as a combination of two optimum linear
     filters", IEEE Trans. Automatic Control 1969 (the forward-backward elimination used here).
@@ -17,44 +17,64 @@ from itertools import pairwise
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.model.geometry import so3_exp, so3_log
+from bodycap_batch.model.geometry import skew, so3_exp, so3_log
 from bodycap_batch.model.skeleton import SkeletonModel, forward_kinematics
 
 _CAMERA_SIGMA = np.repeat([np.deg2rad(0.5), 0.005], 3)
-"""Rotation and centre of a localised camera: what easy captures reach (0.3-0.5°, 5 mm)."""
+"""Radians and metres, one sigma of the rotation and the centre of a localised camera. Evidence:
+docs/decisions/export.md."""
 
 _GRAPH_SIGMA = np.repeat([np.deg2rad(3.0), 0.01], 3)
-"""How far a joint may leave the graph: its pose priors are wider (20-45°), its joints' slack is 5 mm."""
+"""Radians and metres, one sigma of the difference of a joint to the motion graph. Derivation: less than the
+graph's pose priors (20 to 45°), more than the slack of its joints (5 mm)."""
 
 _CHANGE_SIGMA = np.repeat([0.002, np.deg2rad(0.3)], 3)
-"""Change of the correction over a thirtieth of a second, root shift and rotations: below what a viewer sees
-as jitter. It grows with the square root of the time: 1.1 cm and 1.6° over a second."""
+"""Metres and radians, one sigma of the change of the correction in 1/30 s: root shift and rotations.
+Derivation: below what a viewer sees as jitter. It grows with the square root of the time, to 1.1 cm and 1.6°
+in a second."""
 
 _INDEPENDENT_HZ = 30.0
-"""So many errors a second count as independent: at other rates a tick counts for the time it stands for."""
+"""Hertz. Number of errors per second that count as independent. The weight of a tick is proportional to its
+duration. Evidence: docs/decisions/export.md for the weight; none for the value."""
 
 _SLIP_HUBER_SIGMAS = 2.0
-"""Sigmas beyond which a standing foot slips after all (Huber), as in the graph."""
+"""Sigmas. Threshold of the Huber loss for the movement of a standing foot, as in the motion graph. A larger
+movement counts as slipping."""
 
 _GEMAN_MCCLURE_SQUARED = 100.0
-"""Geman-McClure's c² on the squared error in sigmas: 3 to 4 sigmas on each of six numbers."""
+"""Squared sigmas. Parameter c² of the Geman-McClure loss for a camera. Derivation: 3 to 4 sigmas on each of
+the six components of the error."""
 
 _MAX_STEPS = 12
+"""Largest number of Levenberg-Marquardt steps. Evidence: none."""
+
 _STEP_TOLERANCE = 1e-6
-"""Largest step (m, rad) below which the solve is done: a thousandth of what the file resolves."""
+"""Metres and radians. The solve ends when all components of a step are below this. Derivation: a micrometre
+and a microradian are far below what a viewer sees."""
 
 _JACOBIAN_CHUNK_TICKS = 1000
+"""Ticks whose Jacobians are held in memory at the same time. Evidence: none; it only limits the memory."""
 
-_WINDOW_TICKS = 2000
-"""Solved at once, besides the overlaps: with 15 joints, four blocks of 18 kB a tick, that takes 180 MB at 30
-ticks a second, 350 at 240."""
-_OVERLAP_S = 4.0
-"""Either side of a stretch: 0.3° in 1/30 s against 3° are forgotten by a tenth in it, to e^-12 here."""
+WINDOW_TICKS = 2000
+"""Ticks that are solved together, without the overlaps. Derivation: with 15 joints and four blocks of 18 kB
+per tick, this takes 180 MB at 30 ticks per second and 350 MB at 240."""
+
+OVERLAP_S = 4.0
+"""Seconds that a window is extended by on both sides. Derivation: with sigmas of 0.3° per 1/30 s and 3°, the
+influence of a tick falls by a tenth per 1/30 s, so to e^-12 over the overlap."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraTarget:
-    """A camera on a bone, measured at the ticks (T,); `world_from_cam` counts where `found`."""
+    """The measured poses of a camera at T ticks.
+
+    Attributes:
+        camera: Camera name.
+        joint: Index of the joint at which the camera's bone starts.
+        joint_from_cam: (4,4) mount of the camera.
+        world_from_cam: (T,4,4) measured poses.
+        found: (T,) True for the ticks with a measured pose.
+    """
 
     camera: str
     joint: int
@@ -65,7 +85,13 @@ class CameraTarget:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StandingJoint:
-    """A joint that should stay where it is from one tick to the next, to `sigma_m`, where `held` (T-1,)."""
+    """A joint that should not move while its foot stands.
+
+    Attributes:
+        joint: Index of the joint.
+        held: (T-1,) True if the joint should not move from a tick to the next one.
+        sigma_m: Standard deviation of its movement between two ticks, per axis.
+    """
 
     joint: int
     held: BoolArray
@@ -74,9 +100,15 @@ class StandingJoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProjectionProblem:
-    """What the corrected motion should meet: graph poses (T,J,4,4) of the solved joints, cameras, ground.
+    """The terms of the least-squares problem for T ticks.
 
-    Its ticks follow each other at `fps` a second.
+    Attributes:
+        fps: Ticks per second.
+        skeleton: The rigid skeleton, with J joints.
+        solved: (S,) indices of the joints that the motion graph solved.
+        world_from_joint: (T,J,4,4) joint poses of the motion graph.
+        cameras: Measured poses of the cameras.
+        standing: Joints that should not move while their feet stand.
     """
 
     fps: float
@@ -84,10 +116,10 @@ class ProjectionProblem:
     solved: IntArray
     world_from_joint: FloatArray
     cameras: tuple[CameraTarget, ...]
-    planted: tuple[StandingJoint, ...] = ()
+    standing: tuple[StandingJoint, ...] = ()
 
-    def reach(self) -> FloatArray:
-        """(J,S) one where a solved joint turns a joint: itself and its ancestors."""
+    def ancestor_matrix(self) -> FloatArray:
+        """Return a matrix (J,S): 1 if the solved joint is the joint itself or its ancestor, else 0."""
         out = np.zeros((len(self.skeleton.joints), len(self.solved)))
         for joint in range(len(out)):
             ancestor = joint
@@ -97,257 +129,313 @@ class ProjectionProblem:
         return out
 
     @property
-    def tick_share(self) -> float:
-        """How much a tick's errors count for: as many ticks as stand for the same time count alike."""
+    def tick_weight(self) -> float:
+        """Weight of the errors of one tick, which is proportional to the duration of a tick."""
         return _INDEPENDENT_HZ / self.fps
 
-    def between(self, low: int, high: int) -> ProjectionProblem:
-        """The same of ticks `low` to before `high` alone."""
+    def for_ticks(self, low: int, high: int) -> ProjectionProblem:
+        """Return the problem for the ticks [low, high) only."""
         ticks = slice(low, high)
         cameras = (
-            replace(each, world_from_cam=each.world_from_cam[ticks], found=each.found[ticks])
-            for each in self.cameras
+            replace(target, world_from_cam=target.world_from_cam[ticks], found=target.found[ticks])
+            for target in self.cameras
         )
-        planted = (replace(each, held=each.held[low : high - 1]) for each in self.planted)
+        standing = (replace(joint, held=joint.held[low : high - 1]) for joint in self.standing)
         return replace(
             self,
             world_from_joint=self.world_from_joint[ticks],
             cameras=tuple(cameras),
-            planted=tuple(planted),
+            standing=tuple(standing),
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigidMotion:
-    """A rigid motion: root (T,3) and local rotations (T,J,3,3)."""
+    """A motion of bones of constant length.
+
+    Attributes:
+        root: (T,3) root position in the world, metres.
+        local: (T,J,3,3) parent_from_joint rotations; for the root, world_from_root.
+    """
 
     root: FloatArray
     local: FloatArray
 
 
-def solve_rigid_motion(problem: ProjectionProblem, start: RigidMotion) -> RigidMotion:
-    """Fit the rigid motion, a long one stretch by stretch."""
-    count, overlap = len(start.root), round(_OVERLAP_S * problem.fps)
+def solve_rigid_motion(
+    problem: ProjectionProblem,
+    start: RigidMotion,
+    *,
+    window_ticks: int = WINDOW_TICKS,
+    overlap_s: float = OVERLAP_S,
+) -> RigidMotion:
+    """Return the rigid motion with the smallest cost; a long motion is solved in overlapping windows.
+
+    Args:
+        problem: The terms of the cost.
+        start: Initial motion.
+        window_ticks: Largest number of ticks that are solved together, without the overlaps.
+        overlap_s: Seconds that a window is extended by on both sides.
+    """
+    count, overlap = len(start.root), round(overlap_s * problem.fps)
     root, local = np.empty_like(start.root), np.empty_like(start.local)
-    cuts = np.linspace(0, count, max(1, -(-count // _WINDOW_TICKS)) + 1).round().astype(int).tolist()
-    for first, last in pairwise(cuts):
+    for first, last in windows(count, window_ticks):
         low, high = max(first - overlap, 0), min(last + overlap, count)
         part = RigidMotion(root=start.root[low:high], local=start.local[low:high])
-        found = _solve_window(problem.between(low, high), part)
-        own = slice(first - low, last - low)
-        root[first:last], local[first:last] = found.root[own], found.local[own]
+        solution = _solve_window(problem.for_ticks(low, high), part)
+        inner = slice(first - low, last - low)
+        root[first:last], local[first:last] = solution.root[inner], solution.local[inner]
     return RigidMotion(root=root, local=local)
 
 
+def windows(ticks: int, window_ticks: int) -> list[tuple[int, int]]:
+    """Return windows [first, last) of nearly equal length, at most `window_ticks`, that cover all ticks."""
+    cuts = np.linspace(0, ticks, max(1, -(-ticks // window_ticks)) + 1).round().astype(int).tolist()
+    return list(pairwise(cuts))
+
+
 def _solve_window(problem: ProjectionProblem, start: RigidMotion) -> RigidMotion:
-    """Levenberg-Marquardt: a step that does not help is shortened."""
-    reach = problem.reach()
-    now, damping = start, 1e-6
-    cost = _cost(problem, now)
+    """Minimise the cost by Levenberg-Marquardt; a step that increases the cost is rejected."""
+    ancestors = problem.ancestor_matrix()
+    motion, damping = start, 1e-6
+    current_cost = cost(problem, motion)
     for _ in range(_MAX_STEPS):
-        blocks, coupling, gradient = _normal_equations(problem, now, reach)
-        step = _solve_tridiagonal(blocks, coupling, -gradient, damping)
-        trial = _retract(problem, now, step)
-        trial_cost = _cost(problem, trial)
-        if trial_cost <= cost:
-            now, cost, damping = trial, trial_cost, max(damping * 0.1, 1e-9)
+        step = _solve_tridiagonal(normal_equations(problem, motion, ancestors), damping)
+        trial = retract(problem, motion, step)
+        trial_cost = cost(problem, trial)
+        if trial_cost <= current_cost:
+            motion, current_cost, damping = trial, trial_cost, max(damping * 0.1, 1e-9)
         else:
             damping *= 100.0
         if np.abs(step).max(initial=0.0) < _STEP_TOLERANCE:
             break
-    return now
+    return motion
 
 
-def _retract(problem: ProjectionProblem, now: RigidMotion, step: FloatArray) -> RigidMotion:
-    """Apply a step (T, 3+3S): shift the root, turn solved joints by rotation vectors in world axes."""
-    rotation = forward_kinematics(problem.skeleton, now.root, now.local)[..., :3, :3]
-    local = now.local.copy()
+def retract(problem: ProjectionProblem, motion: RigidMotion, step: FloatArray) -> RigidMotion:
+    """Return the motion after a step.
+
+    Args:
+        problem: The problem, for skeleton and solved joints.
+        motion: The current motion.
+        step: (T,3+3S) shift of the root in metres, and a rotation vector in world axes for each solved joint.
+    """
+    rotation = forward_kinematics(problem.skeleton, motion.root, motion.local)[..., :3, :3]
+    local = motion.local.copy()
     for column, joint in enumerate(problem.solved):
-        turn = step[:, 3 + 3 * column : 6 + 3 * column]
+        rotvec = step[:, 3 + 3 * column : 6 + 3 * column]
         if joint > 0:
             parent = rotation[:, problem.skeleton.parents[joint]]
-            turn = np.einsum("tji,tj->ti", parent, turn)
-        local[:, joint] = so3_exp(turn) @ local[:, joint]
-    return RigidMotion(root=now.root + step[:, :3], local=local)
+            rotvec = np.einsum("tji,tj->ti", parent, rotvec)
+        local[:, joint] = so3_exp(rotvec) @ local[:, joint]
+    return RigidMotion(root=motion.root + step[:, :3], local=local)
 
 
-def _camera_error(tracked: CameraTarget, world: FloatArray, ticks: slice) -> tuple[FloatArray, FloatArray]:
-    """Errors (T,6) in sigmas, zero where not measured, and the exported centres (T,3)."""
-    exported = world[:, tracked.joint] @ tracked.joint_from_cam
-    measured = tracked.world_from_cam[ticks]
-    turn = so3_log(exported[:, :3, :3] @ np.swapaxes(measured[:, :3, :3], -1, -2))
-    error = np.concatenate([turn, exported[:, :3, 3] - measured[:, :3, 3]], axis=1) / _CAMERA_SIGMA
-    return np.where(tracked.found[ticks, None], error, 0.0), exported[:, :3, 3]
+def _camera_error(target: CameraTarget, world: FloatArray, ticks: slice) -> tuple[FloatArray, FloatArray]:
+    """Return the errors (T,6) of a camera in sigmas, and its centres (T,3) on the rigid skeleton.
+
+    Rotation comes before translation. The error of a tick without a measured pose is zero.
+
+    Args:
+        target: The measured poses of the camera.
+        world: (T,J,4,4) joint poses of the rigid skeleton at `ticks`.
+        ticks: The ticks of the target.
+    """
+    rigid = world[:, target.joint] @ target.joint_from_cam
+    measured = target.world_from_cam[ticks]
+    rotvec = so3_log(rigid[:, :3, :3] @ np.swapaxes(measured[:, :3, :3], -1, -2))
+    error = np.concatenate([rotvec, rigid[:, :3, 3] - measured[:, :3, 3]], axis=1) / _CAMERA_SIGMA
+    return np.where(target.found[ticks, None], error, 0.0), rigid[:, :3, 3]
 
 
 def _graph_error(problem: ProjectionProblem, world: FloatArray, ticks: slice) -> FloatArray:
-    """Errors (T,S,6) of the solved joints against the graph, rotation first, in rad and m."""
+    """Return the differences (T,S,6) of the solved joints to the motion graph, in rad and metres.
+
+    Rotation comes before translation. `world` has the joint poses of the rigid skeleton at `ticks`.
+    """
     graph, rigid = problem.world_from_joint[ticks][:, problem.solved], world[:, problem.solved]
-    turn = so3_log(rigid[..., :3, :3] @ np.swapaxes(graph[..., :3, :3], -1, -2))
-    return np.concatenate([turn, rigid[..., :3, 3] - graph[..., :3, 3]], axis=-1)
+    rotvec = so3_log(rigid[..., :3, :3] @ np.swapaxes(graph[..., :3, :3], -1, -2))
+    return np.concatenate([rotvec, rigid[..., :3, 3] - graph[..., :3, 3]], axis=-1)
 
 
-def _scaled_correction(problem: ProjectionProblem, now: RigidMotion, graph: FloatArray) -> FloatArray:
-    """What may change only slowly (T, 3+3S): the root's shift and the joints' turns off the graph."""
-    shift = now.root - problem.world_from_joint[:, 0, :3, 3]
-    return np.concatenate([shift, graph[..., :3].reshape(len(shift), -1)], axis=1) / _change_sigma(problem)
+def _scaled_correction(
+    problem: ProjectionProblem, motion: RigidMotion, graph_error: FloatArray
+) -> FloatArray:
+    """Return the correction (T,3+3S) of the motion graph in sigmas of its change from tick to tick.
+
+    It consists of the shift of the root and the rotation of each solved joint; `graph_error` is (T,S,6).
+    """
+    shift = motion.root - problem.world_from_joint[:, 0, :3, 3]
+    rotations = graph_error[..., :3].reshape(len(shift), -1)
+    return np.concatenate([shift, rotations], axis=1) / _change_sigma(problem)
 
 
 def _change_sigma(problem: ProjectionProblem) -> FloatArray:
-    """(3+3S,) of the change from one tick to the next."""
-    sigma = _CHANGE_SIGMA * np.sqrt(problem.tick_share)
+    """Return the standard deviations (3+3S,) of the change of the correction from tick to tick."""
+    sigma = _CHANGE_SIGMA * np.sqrt(problem.tick_weight)
     return np.concatenate([sigma[:3], np.tile(sigma[3:], len(problem.solved))])
 
 
-def _cost(problem: ProjectionProblem, now: RigidMotion) -> float:
+def cost(problem: ProjectionProblem, motion: RigidMotion) -> float:
+    """Return the value of the robust least-squares cost."""
     everything = slice(None)
-    world = forward_kinematics(problem.skeleton, now.root, now.local)
-    graph = _graph_error(problem, world, everything)
-    cost = float(((graph / _GRAPH_SIGMA) ** 2).sum())
-    for tracked in problem.cameras:
-        squared = (_camera_error(tracked, world, everything)[0] ** 2).sum(axis=1)
-        cost += float((_GEMAN_MCCLURE_SQUARED * squared / (_GEMAN_MCCLURE_SQUARED + squared)).sum())
-    cost *= problem.tick_share
-    cost += float((np.diff(_scaled_correction(problem, now, graph), axis=0) ** 2).sum())
-    for planted in problem.planted:
-        size = np.linalg.norm(_slip(planted, world), axis=1)
-        cost += float(
-            np.where(
-                size < _SLIP_HUBER_SIGMAS, size**2, _SLIP_HUBER_SIGMAS * (2.0 * size - _SLIP_HUBER_SIGMAS)
-            ).sum()
-        )
-    return cost
+    world = forward_kinematics(problem.skeleton, motion.root, motion.local)
+    graph_error = _graph_error(problem, world, everything)
+    out = float(((graph_error / _GRAPH_SIGMA) ** 2).sum())
+    for target in problem.cameras:
+        squared = (_camera_error(target, world, everything)[0] ** 2).sum(axis=1)
+        out += float((_GEMAN_MCCLURE_SQUARED * squared / (_GEMAN_MCCLURE_SQUARED + squared)).sum())
+    out *= problem.tick_weight
+    out += float((np.diff(_scaled_correction(problem, motion, graph_error), axis=0) ** 2).sum())
+    for joint in problem.standing:
+        size = np.linalg.norm(_slip(joint, world), axis=1)
+        linear = _SLIP_HUBER_SIGMAS * (2.0 * size - _SLIP_HUBER_SIGMAS)
+        out += float(np.where(size < _SLIP_HUBER_SIGMAS, size**2, linear).sum())
+    return out
 
 
-def _slip(planted: StandingJoint, world: FloatArray) -> FloatArray:
-    """How far (T-1,3) a joint moves from tick to tick while it should not, in sigmas."""
-    moved = np.diff(world[:, planted.joint, :3, 3], axis=0)
-    return np.asarray(np.where(planted.held[:, None], moved / planted.sigma_m, 0.0))
+def _slip(standing: StandingJoint, world: FloatArray) -> FloatArray:
+    """Return the movement (T-1,3) of a joint between ticks in sigmas; zero if it may move."""
+    movement = np.diff(world[:, standing.joint, :3, 3], axis=0)
+    return np.asarray(np.where(standing.held[:, None], movement / standing.sigma_m, 0.0))
 
 
-def _normal_equations(
-    problem: ProjectionProblem, now: RigidMotion, reach: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Diagonal blocks (T,n,n), the blocks (T-1,n,n) that tie neighbours, and the gradient (T,n)."""
-    world = forward_kinematics(problem.skeleton, now.root, now.local)
+@dataclass(frozen=True, slots=True)
+class NormalEquations:
+    """The block-tridiagonal normal equations of T ticks with n = 3+3S unknowns each.
+
+    Attributes:
+        blocks: (T,n,n) blocks on the diagonal.
+        coupling: (T-1,n,n) blocks that link each tick with the next one.
+        gradient: (T,n) half the gradient of the cost.
+    """
+
+    blocks: FloatArray
+    coupling: FloatArray
+    gradient: FloatArray
+
+
+def normal_equations(
+    problem: ProjectionProblem, motion: RigidMotion, ancestors: FloatArray
+) -> NormalEquations:
+    """Return the normal equations at a motion.
+
+    Args:
+        problem: The problem.
+        motion: The motion at which the cost is linearised.
+        ancestors: (J,S) the ancestor matrix of the problem.
+    """
+    world = forward_kinematics(problem.skeleton, motion.root, motion.local)
     ticks, size = len(world), 3 + 3 * len(problem.solved)
     blocks, gradient = np.zeros((ticks, size, size)), np.zeros((ticks, size))
     for first in range(0, ticks, _JACOBIAN_CHUNK_TICKS):
         chunk = slice(first, min(first + _JACOBIAN_CHUNK_TICKS, ticks))
-        for jacobian, error in _residual_blocks(problem, world[chunk], reach, chunk):
-            transposed = problem.tick_share * np.swapaxes(jacobian, -1, -2)
+        for jacobian, error in _weighted_residuals(problem, world[chunk], ancestors, chunk):
+            transposed = problem.tick_weight * np.swapaxes(jacobian, -1, -2)
             blocks[chunk] += transposed @ jacobian
             gradient[chunk] += (transposed @ error[..., None])[..., 0]
-    change = _scaled_correction(problem, now, _graph_error(problem, world, slice(None)))
-    turns = np.zeros((size, size))
-    turns[:3, :3] = np.eye(3)
-    turns[3:, 3:] = np.kron(reach[problem.solved], np.eye(3))
-    turns /= _change_sigma(problem)[:, None]
-    coupling = turns.T @ turns
-    neighbours = np.full(ticks, 2.0)
-    neighbours[[0, -1]] = 1.0 if ticks > 1 else 0.0
-    blocks += neighbours[:, None, None] * coupling
-    pull = np.zeros_like(gradient)
-    pull[:-1] -= np.diff(change, axis=0)
-    pull[1:] += np.diff(change, axis=0)
-    gradient += pull @ turns
-    ties = np.broadcast_to(-coupling, (ticks - 1, size, size))
-    if problem.planted:
-        ties = ties.copy()
-        _add_standing_joints(problem, world, reach, (blocks, ties, gradient))
-    return blocks, ties, gradient
+    correction = _scaled_correction(problem, motion, _graph_error(problem, world, slice(None)))
+    correction_jacobian = np.zeros((size, size))
+    correction_jacobian[:3, :3] = np.eye(3)
+    correction_jacobian[3:, 3:] = np.kron(ancestors[problem.solved], np.eye(3))
+    correction_jacobian /= _change_sigma(problem)[:, None]
+    information = correction_jacobian.T @ correction_jacobian
+    neighbour_count = np.full(ticks, 2.0)
+    neighbour_count[[0, -1]] = 1.0 if ticks > 1 else 0.0
+    blocks += neighbour_count[:, None, None] * information
+    change_gradient = np.zeros_like(gradient)
+    change_gradient[:-1] -= np.diff(correction, axis=0)
+    change_gradient[1:] += np.diff(correction, axis=0)
+    gradient += change_gradient @ correction_jacobian
+    coupling = np.broadcast_to(-information, (ticks - 1, size, size))
+    if problem.standing:
+        coupling = coupling.copy()
+    equations = NormalEquations(blocks, coupling, gradient)
+    _add_standing_joints(problem, world, ancestors, equations)
+    return equations
 
 
 def _add_standing_joints(
-    problem: ProjectionProblem,
-    world: FloatArray,
-    reach: FloatArray,
-    system: tuple[FloatArray, FloatArray, FloatArray],
+    problem: ProjectionProblem, world: FloatArray, ancestors: FloatArray, equations: NormalEquations
 ) -> None:
-    """Add the standing feet to the normal equations."""
-    blocks, ties, gradient = system
-    for planted in problem.planted:
-        (held,) = np.nonzero(planted.held)
-        slip = _slip(planted, world)[held]
-        root_weight = np.sqrt(
-            _SLIP_HUBER_SIGMAS / np.maximum(np.linalg.norm(slip, axis=1), _SLIP_HUBER_SIGMAS)
-        )
-        rows = []
+    """Add the terms of the standing joints to the normal equations, in place."""
+    for standing in problem.standing:
+        (held,) = np.nonzero(standing.held)
+        slip = _slip(standing, world)[held]
+        size = np.maximum(np.linalg.norm(slip, axis=1), _SLIP_HUBER_SIGMAS)
+        sqrt_weight = np.sqrt(_SLIP_HUBER_SIGMAS / size)
+        jacobians = []
         for ticks in (held, held + 1):
             centres = world[ticks][:, problem.solved][..., :3, 3]
-            jacobian = _jacobian(centres, world[ticks, planted.joint, :3, 3], reach[planted.joint])[:, 3:]
-            rows.append(jacobian * (root_weight / planted.sigma_m)[:, None, None])
-        before, after = rows
-        error = (slip * root_weight[:, None])[..., None]
-        blocks[held] += np.swapaxes(before, 1, 2) @ before
-        blocks[held + 1] += np.swapaxes(after, 1, 2) @ after
-        ties[held] -= np.swapaxes(before, 1, 2) @ after
-        gradient[held] -= (np.swapaxes(before, 1, 2) @ error)[..., 0]
-        gradient[held + 1] += (np.swapaxes(after, 1, 2) @ error)[..., 0]
+            point = world[ticks, standing.joint, :3, 3]
+            jacobian = _jacobian(centres, point, ancestors[standing.joint])[:, 3:]
+            jacobians.append(jacobian * (sqrt_weight / standing.sigma_m)[:, None, None])
+        before, after = jacobians
+        error = (slip * sqrt_weight[:, None])[..., None]
+        equations.blocks[held] += np.swapaxes(before, 1, 2) @ before
+        equations.blocks[held + 1] += np.swapaxes(after, 1, 2) @ after
+        equations.coupling[held] -= np.swapaxes(before, 1, 2) @ after
+        equations.gradient[held] -= (np.swapaxes(before, 1, 2) @ error)[..., 0]
+        equations.gradient[held + 1] += (np.swapaxes(after, 1, 2) @ error)[..., 0]
 
 
-def _residual_blocks(
-    problem: ProjectionProblem, world: FloatArray, reach: FloatArray, ticks: slice
+def _weighted_residuals(
+    problem: ProjectionProblem, world: FloatArray, ancestors: FloatArray, ticks: slice
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Jacobians (T,6,n) and errors (T,6) in sigmas of every joint and camera."""
+    """Return the weighted Jacobian (T,6,n) and error (T,6) of each solved joint and camera, in sigmas."""
     centres = world[:, problem.solved][..., :3, 3]
     out = []
-    graph = _graph_error(problem, world, ticks)
+    graph_error = _graph_error(problem, world, ticks)
     for column, joint in enumerate(problem.solved):
-        jacobian = _jacobian(centres, world[:, joint, :3, 3], reach[joint])
-        out.append((jacobian / _GRAPH_SIGMA[:, None], graph[:, column] / _GRAPH_SIGMA))
-    for tracked in problem.cameras:
-        error, centre = _camera_error(tracked, world, ticks)
-        root_weight = (
-            _GEMAN_MCCLURE_SQUARED / (_GEMAN_MCCLURE_SQUARED + (error**2).sum(axis=1)) * tracked.found[ticks]
-        )
-        jacobian = _jacobian(centres, centre, reach[tracked.joint]) / _CAMERA_SIGMA[:, None]
-        out.append((jacobian * root_weight[:, None, None], error * root_weight[:, None]))
+        jacobian = _jacobian(centres, world[:, joint, :3, 3], ancestors[joint])
+        out.append((jacobian / _GRAPH_SIGMA[:, None], graph_error[:, column] / _GRAPH_SIGMA))
+    for target in problem.cameras:
+        error, centre = _camera_error(target, world, ticks)
+        squared = (error**2).sum(axis=1)
+        sqrt_weight = _GEMAN_MCCLURE_SQUARED / (_GEMAN_MCCLURE_SQUARED + squared) * target.found[ticks]
+        jacobian = _jacobian(centres, centre, ancestors[target.joint]) / _CAMERA_SIGMA[:, None]
+        out.append((jacobian * sqrt_weight[:, None, None], error * sqrt_weight[:, None]))
     return out
 
 
-def _jacobian(centres: FloatArray, point: FloatArray, reach: FloatArray) -> FloatArray:
-    """Turn and shift (T,6,n) of a body point by the unknowns.
+def _jacobian(centres: FloatArray, point: FloatArray, is_ancestor: FloatArray) -> FloatArray:
+    """Return the Jacobian (T,6,n) of rotation and position of a body point with respect to the unknowns.
 
     Args:
-        centres: (T,S,3) what the solved joints turn about.
-        point: (T,3) the point.
-        reach: (S,) one where a solved joint carries the point.
+        centres: (T,S,3) centres of the solved joints.
+        point: (T,3) position of the point.
+        is_ancestor: (S,) 1 if the point moves with a solved joint, else 0.
     """
     ticks, solved = centres.shape[:2]
     out = np.zeros((ticks, 6, 3 + 3 * solved))
     out[:, 3:, :3] = np.eye(3)
-    for column in np.flatnonzero(reach):
-        place = slice(3 + 3 * column, 6 + 3 * column)
-        out[:, :3, place] = np.eye(3)
-        x, y, z = (point - centres[:, column]).T
-        out[:, 3:, place] = np.stack([0 * x, z, -y, -z, 0 * x, x, y, -x, 0 * x], axis=1).reshape(-1, 3, 3)
+    for column in np.flatnonzero(is_ancestor):
+        unknowns = slice(3 + 3 * column, 6 + 3 * column)
+        out[:, :3, unknowns] = np.eye(3)
+        out[:, 3:, unknowns] = skew(centres[:, column] - point)
     return out
 
 
-def _solve_tridiagonal(
-    blocks: FloatArray, coupling: FloatArray, right: FloatArray, damping: float
-) -> FloatArray:
-    """Solve the block tridiagonal system by elimination forwards, substitution backwards.
+def _solve_tridiagonal(equations: NormalEquations, damping: float) -> FloatArray:
+    """Return the Levenberg-Marquardt step (T,n) by forward elimination and backward substitution.
 
     Args:
-        blocks: (T,n,n) on the diagonal.
-        coupling: (T-1,n,n) of each tick with the next one.
-        right: (T,n).
-        damping: Share that is added to the diagonal.
+        equations: The normal equations.
+        damping: Fraction by which the diagonal is increased.
     """
+    blocks, coupling, right = equations.blocks, equations.coupling, -equations.gradient
     ticks, size = right.shape
-    more = 1.0 + damping * np.eye(size)
-    carried = np.zeros_like(blocks)
+    diagonal_factor = 1.0 + damping * np.eye(size)
+    eliminated = np.zeros_like(blocks)
     out = np.empty_like(right)
     for tick in range(ticks):
-        block, value = blocks[tick] * more, right[tick]
+        block, value = blocks[tick] * diagonal_factor, right[tick]
         if tick:
-            block = block - coupling[tick - 1].T @ carried[tick - 1]
+            block = block - coupling[tick - 1].T @ eliminated[tick - 1]
             value = value - coupling[tick - 1].T @ out[tick - 1]
         following = coupling[tick] if tick + 1 < ticks else np.zeros((size, 0))
         both = np.linalg.solve(block, np.column_stack([following, value]))
-        carried[tick, :, : following.shape[1]], out[tick] = both[:, :-1], both[:, -1]
+        eliminated[tick, :, : following.shape[1]], out[tick] = both[:, :-1], both[:, -1]
     for tick in range(ticks - 2, -1, -1):
-        out[tick] -= carried[tick] @ out[tick + 1]
+        out[tick] -= eliminated[tick] @ out[tick + 1]
     return out

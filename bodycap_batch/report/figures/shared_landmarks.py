@@ -38,7 +38,8 @@ def draw_shared_landmarks(inputs: ReportInputs) -> str:
             description = (
                 f"{name} sees {counts[row, row]:,} points"
                 if row == column
-                else f"{name} and {other} share {counts[row, column]:,} points, {format_percent(share)} of {name}'s"
+                else f"{name} and {other} share {counts[row, column]:,} points, "
+                f"{format_percent(share)} of {name}'s"
             )
             x = _LEFT + column * _CELL
             opacity = 0.06 + 0.9 * min(share / _FULL_SHADE_SHARE, 1.0)

@@ -156,7 +156,7 @@ def test_formats_that_cannot_be_written_are_refused_beforehand(
     assert errors() == []
     monkeypatch.setattr(optional_libraries, "find_spec", lambda name: None)
     (text,) = errors(formats=("bvh", "usd"))
-    assert text.startswith("export.formats: USD files take a library")
+    assert text.startswith("export.formats: USD files need a library")
     monkeypatch.setenv("BODYCAP_BLENDER", str(tmp_path / "nothing"))
     (text,) = errors(formats=("fbx",))
     assert "BODYCAP_BLENDER names no program" in text

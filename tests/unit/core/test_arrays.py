@@ -1,4 +1,4 @@
-"""Arrays of the frozen types: nobody else can write to them, and long ones are not copied for nothing."""
+"""Frozen arrays are read-only and are not copied without need; runs and evenly spaced indices."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from bodycap_batch.core.arrays import evenly_spaced, frozen_array, runs
 
 
-def test_an_array_that_may_be_written_to_is_copied() -> None:
+def test_a_writeable_array_is_copied() -> None:
     given = np.arange(4.0)
     kept = frozen_array(given, name="given", shape=(4,))
     given[0] = 9.0
@@ -17,7 +17,7 @@ def test_an_array_that_may_be_written_to_is_copied() -> None:
         kept[0] = 1.0
 
 
-def test_a_frozen_array_is_taken_as_it_is_but_not_a_view() -> None:
+def test_a_frozen_array_is_shared_but_a_view_is_copied() -> None:
     kept = frozen_array(np.arange(4.0), name="kept", shape=(4,))
     assert frozen_array(kept, name="again", shape=(None,)) is kept
     base = np.arange(4.0)

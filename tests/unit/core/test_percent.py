@@ -1,4 +1,4 @@
-"""A share below one never reads as all, one above nothing never as none."""
+"""A fraction below one is never rounded to 100 %, one above zero never to 0 %."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from bodycap_batch.core.percent import format_percent
 
 
 @pytest.mark.parametrize(
-    ("share", "digits", "says"),
+    ("fraction", "digits", "expected"),
     [
         (1.0, 1, "100.0%"),
         (0.9996, 1, "99.9%"),
@@ -21,5 +21,5 @@ from bodycap_batch.core.percent import format_percent
         (-0.04, 1, "-4.0%"),
     ],
 )
-def test_rounding_never_says_all_or_nothing_where_it_is_not(share: float, digits: int, says: str) -> None:
-    assert format_percent(share, digits) == says
+def test_only_one_gives_100_and_only_zero_gives_0(fraction: float, digits: int, expected: str) -> None:
+    assert format_percent(fraction, digits) == expected

@@ -19,7 +19,7 @@ from bodycap_batch.model.skeleton_presets import load_skeleton
 def swinging(
     fps: float = 30.0, seconds: float = 2.0, *, turn_rad: float = 0.0, reach_rad: float = 0.0
 ) -> Motion:
-    """A body that walks a circle and swings its joints; turned about +Z, an elbow bent further."""
+    """Return a motion in a circle with swinging joints, rotated about +Z, with one elbow bent further."""
     skeleton = load_skeleton("full_body", 1.75)
     ticks = round(seconds * fps) + 1
     time = np.arange(ticks) / fps
@@ -42,7 +42,7 @@ def swinging(
     )
 
 
-def test_itself_is_perfect_wherever_it_stands() -> None:
+def test_a_motion_has_no_error_against_itself_after_a_rigid_transform() -> None:
     moved = swinging(turn_rad=1.0)
     moved = Motion(
         skeleton=moved.skeleton,
@@ -60,7 +60,7 @@ def test_itself_is_perfect_wherever_it_stands() -> None:
     assert report.angle_deg.max < 1e-5
     raw = score_motion(moved, swinging(), MotionOptions(align="none"))
     assert raw.mpjpe_m.mean > 2.0
-    # turned by 1 rad = 57.3° and nothing else
+    # the only error is the rotation of 1 rad = 57.3°
     assert raw.angle_deg is not None
     assert raw.angle_deg.mean == pytest.approx(np.rad2deg(1.0), abs=1e-6)
 
@@ -71,11 +71,11 @@ def test_a_bent_elbow_shows_at_the_hand_and_nowhere_else() -> None:
     hand = skeleton.index_of_role("LeftHand")
     assert hand is not None
     forearm_m = float(np.linalg.norm(skeleton.offsets_m[hand]))
-    # chord of the forearm's turn about an axis across it
+    # the chord of the forearm's rotation about an axis perpendicular to it
     assert report.per_joint_m["LeftHand"] == pytest.approx(2 * forearm_m * np.sin(0.1), rel=1e-6)
     assert report.per_joint_m["LeftForeArm"] < 1e-9
     assert report.per_joint_m["RightHand"] < 1e-9
-    # a constant offset of the forearm: gone once each joint's own offset is taken out
+    # a constant offset of the forearm, which vanishes when the mean offset of each joint is removed
     assert report.angle_deg is not None
     assert report.angle_deg.max == pytest.approx(np.rad2deg(0.2), rel=1e-6)
     assert report.per_joint_deg["LeftForeArm"] < 1e-5
@@ -87,7 +87,7 @@ def test_other_rates_are_interpolated(tmp_path: Path) -> None:
     report = evaluate_motion(tmp_path / "a.bvh", tmp_path / "b.bvh")
     assert report.frames == 61
     assert report.mpjpe_m.max < 1e-5
-    # between ticks of 120 Hz a joint that swings at 3 rad/s is off by its curvature: (1/240)² / 2 · a
+    # interpolation between ticks of 120 Hz misses the curvature of a swing of 3 rad/s: (1/240)² / 2 · a
     shifted = evaluate_motion(tmp_path / "a.bvh", tmp_path / "b.bvh", MotionOptions(offset_s=1 / 240))
     assert 1e-6 < shifted.mpjpe_m.mean < 0.02
 
@@ -104,19 +104,19 @@ def test_truth_from_joint_positions(tmp_path: Path) -> None:
     report = evaluate_motion(tmp_path / "a.bvh", tmp_path / "joints.npz", MotionOptions())
     assert sorted(report.joints) == sorted(names.values())
     assert report.angle_deg is None
-    # one joint of four is 5 cm off: the alignment spreads it, between 5/4 cm and all of it at the hand
+    # One joint of four has an error of 5 cm. The alignment distributes it: 5/4 cm to 5 cm at the hand.
     assert 0.0125 < report.per_joint_m["LeftHand"] < 0.0501
     assert report.mpjpe_m.mean < 0.025
 
 
-def test_only_the_joints_asked_for() -> None:
+def test_only_the_selected_joints_are_compared() -> None:
     options = MotionOptions(align="none", roles=("RightArm", "RightHand"))
     report = score_motion(swinging(reach_rad=0.2), swinging(), options)
     assert sorted(report.joints) == ["Hips", "RightArm", "RightHand"]
     assert report.mpjpe_m.max < 1e-9
 
 
-def test_what_cannot_be_compared_is_named(tmp_path: Path) -> None:
+def test_errors_name_what_cannot_be_compared(tmp_path: Path) -> None:
     write_bvh(tmp_path / "a.bvh", swinging())
     np.savez(tmp_path / "b.npz", names=["root", "tail"], t=np.arange(3), world=np.zeros((3, 2, 3)))
     with pytest.raises(JobError, match="share 1 joints"):

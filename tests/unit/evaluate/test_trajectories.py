@@ -1,4 +1,4 @@
-"""Scores: equal to evo, blind to what they should be blind to, and not to the rest."""
+"""Trajectory errors: equal to those of evo, invariant to the gauge, sensitive to real errors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RATE_NS = 33_333_333
 
 
 def walk(seed: int, frames: int = 300, *, noise_m: float = 0.0, phase: float = 0.0) -> TimedPoses:
-    """A camera that walks a bent path and looks around."""
+    """Return a camera that moves along a curved path and looks around."""
     rng = np.random.default_rng(seed)
     time = np.arange(frames) / 30.0
     position = np.stack([np.sin(time + phase), 1.3 * np.cos(0.7 * time), 0.05 * np.sin(9 * time)], axis=1)
@@ -52,20 +52,20 @@ def evo_errors(
     from evo.tools import file_interface
 
     true = file_interface.read_tum_trajectory_file(str(truth))
-    mine = file_interface.read_tum_trajectory_file(str(estimate))
-    true, mine = sync.associate_trajectories(true, mine, max_diff=max_diff_s)
-    mine.align(true, correct_scale=scale)
+    estimate_path = file_interface.read_tum_trajectory_file(str(estimate))
+    true, estimate_path = sync.associate_trajectories(true, estimate_path, max_diff=max_diff_s)
+    estimate_path.align(true, correct_scale=scale)
     ate = metrics.APE(metrics.PoseRelation.translation_part)
-    ate.process_data((true, mine))
+    ate.process_data((true, estimate_path))
     out = {"ate": ate.get_statistic(metrics.StatisticsType.rmse), "count": float(len(ate.error))}
     if delta:
         rpe = metrics.RPE(metrics.PoseRelation.translation_part, delta, metrics.Unit.frames, all_pairs=True)
-        rpe.process_data((true, mine))
+        rpe.process_data((true, estimate_path))
         out["rpe"] = rpe.get_statistic(metrics.StatisticsType.rmse)
         turn = metrics.RPE(
             metrics.PoseRelation.rotation_angle_deg, delta, metrics.Unit.frames, all_pairs=True
         )
-        turn.process_data((true, mine))
+        turn.process_data((true, estimate_path))
         out["rpe_deg"] = turn.get_statistic(metrics.StatisticsType.rmse)
     return out
 
@@ -90,7 +90,7 @@ def test_same_as_evo(tmp_path: Path, align: str) -> None:
     assert ours.ate_m.rmse == pytest.approx(theirs["ate"], abs=1e-6)
     assert ours.rpe_m.rmse == pytest.approx(theirs["rpe"], abs=1e-6)
     assert ours.rpe_deg.rmse == pytest.approx(theirs["rpe_deg"], abs=1e-6)
-    # 2 cm a coordinate, less the seven fitted parameters of 900: 3.5 cm
+    # 2 cm per coordinate with seven fitted parameters of 900 give 3.5 cm
     assert 0.030 < ours.ate_m.rmse < 0.038
 
 
@@ -138,7 +138,7 @@ def test_moving_turning_and_scaling_the_estimate_changes_nothing(
 
 
 def test_one_similarity_for_all_cameras() -> None:
-    """Each camera alone is perfect, together they are 10 cm off: that must show."""
+    """Each camera alone has no error, but they are displaced by 10 cm; the common alignment must show it."""
     truths = {"a": walk(0), "b": walk(0, phase=0.4)}
     shifted = moved(truths["b"], Similarity(1.0, np.eye(3), np.array([0.1, 0.0, 0.0])))
     together = score_trajectories({"a": truths["a"], "b": shifted}, truths).total.ate_m
@@ -146,11 +146,11 @@ def test_one_similarity_for_all_cameras() -> None:
     assert together is not None
     assert alone is not None
     assert alone.rmse < 1e-9
-    # the best compromise puts each camera 5 cm off; turn and scale mend little of it
+    # the best alignment leaves 5 cm for each camera; rotation and scale reduce it little
     assert 0.035 < together.rmse < 0.0501
 
 
-def test_alignment_modes_see_scale_and_place() -> None:
+def test_alignment_modes_differ_in_scale_and_position() -> None:
     truth = walk(0)
     scaled = moved(truth, Similarity(1.1, np.eye(3), np.zeros(3)))
     shifted = moved(truth, Similarity(1.0, np.eye(3), np.array([0.0, 0.0, 0.2])))
@@ -168,7 +168,7 @@ def test_alignment_modes_see_scale_and_place() -> None:
 
 
 def test_truth_is_interpolated_and_long_gaps_are_refused() -> None:
-    """A frame half way between two truths is half way; inside a gap of 0.5 s there is no truth."""
+    """Half way between two true poses the truth is half way; in a gap of 0.5 s there is no truth."""
     times = np.array([0, 100, 200, 700, 800]) * 1_000_000
     position = np.stack([times / 1e9, np.zeros(5), np.zeros(5)], axis=1)
     turn = so3_exp(np.stack([np.zeros(5), np.zeros(5), times / 1e9], axis=1))
@@ -197,7 +197,7 @@ def test_nearest_association_keeps_to_its_limit() -> None:
     assert score_trajectories({"a": estimate}, {"a": truth}, options).total.scored == 4
 
 
-def test_a_time_a_hair_outside_the_truth_still_counts() -> None:
+def test_a_time_slightly_outside_the_truth_has_a_true_pose() -> None:
     truth = walk(0, 10)
     late = TimedPoses(times_ns=truth.times_ns + 50_000, world_from_cam=truth.world_from_cam)
     assert score_trajectories({"a": late}, {"a": truth}).total.scored == 10
@@ -220,7 +220,7 @@ def test_a_camera_without_poses_counts_against_coverage() -> None:
     assert (score.cameras["b"].coverage, score.total.coverage) == (0.0, 0.5)
     with pytest.raises(JobError, match="0 frames have both"):
         relative_camera_error({"a": walk(0), "b": nothing}, truths, "a", "b")
-    with pytest.raises(JobError, match="truth of camera b holds no poses"):
+    with pytest.raises(JobError, match="truth of camera b has no poses"):
         score_trajectories({"b": walk(0)}, {"b": nothing})
 
 
@@ -233,7 +233,7 @@ def test_missing_truth_and_other_clocks_are_named() -> None:
 
 
 def test_relative_error_of_two_cameras() -> None:
-    """A palm 3 cm off in the torso's frame, the whole capture moved and turned: 3 cm, and scale shows."""
+    """The palm is 3 cm wrong in the torso's frame; a rigid transform adds no error, a scale does."""
     truths = {"torso": walk(0), "palm": walk(0, phase=0.4)}
     off: FloatArray = truths["torso"].world_from_cam[:, :3, :3] @ np.array([0.0, 0.03, 0.0])
     palm = truths["palm"].world_from_cam.copy()
@@ -246,7 +246,7 @@ def test_relative_error_of_two_cameras() -> None:
     error = relative_camera_error(estimates, truths, "palm", "torso")
     assert error.frames == 300
     assert error.in_reference_m.mean == pytest.approx(0.03, abs=1e-9)
-    # the alignment is of both paths, not of their difference: a tenth either way
+    # both paths are aligned together, not their difference, which changes the error by up to a tenth
     assert 0.027 < error.vector_m.mean < 0.033
     bigger = {n: moved(p, Similarity(1.2, np.eye(3), np.zeros(3))) for n, p in truths.items()}
     span = np.linalg.norm(
@@ -257,7 +257,7 @@ def test_relative_error_of_two_cameras() -> None:
 
 
 def test_normalised_errors_are_one_per_dimension() -> None:
-    """Poses drawn from their own covariance: mean 6, and 24 after doubling the error."""
+    """Poses sampled from their covariance have a mean of 6, and of 24 after doubling the error."""
     rng = np.random.default_rng(2)
     count = 4000
     root = rng.normal(size=(6, 6)) * np.array([[0.01], [0.01], [0.02], [0.05], [0.02], [0.01]])
@@ -267,5 +267,5 @@ def test_normalised_errors_are_one_per_dimension() -> None:
     for factor, expected in ((1.0, 6.0), (2.0, 24.0)):
         step = make_transform(so3_exp(factor * draws[:, :3]), factor * draws[:, 3:])
         errors = normalised_errors(estimate, np.tile(covariance, (count, 1, 1)), estimate @ step)
-        # a chi-square mean of 6 with variance 12: ± 4 sigma of the mean
+        # chi-square with mean 6 and variance 12: ± 4 sigma of the mean
         assert errors.mean() == pytest.approx(expected, rel=4 * np.sqrt(12 / count) / 6)

@@ -1,4 +1,4 @@
-"""USD, C3D, TRC and tables: what is written comes back; what is missing is named."""
+"""USD, C3D, TRC and tables: round trips, and errors for missing libraries."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.bodies import reaching
 
 
 @pytest.mark.parametrize("options", [{}, {"names": "unreal", "root": "ground"}, {"names": "mixamo"}], ids=str)
-def test_usd_comes_back_and_complies(tmp_path: Path, options: dict[str, Any]) -> None:
+def test_usd_round_trip_and_validation(tmp_path: Path, options: dict[str, Any]) -> None:
     from pxr import Usd, UsdGeom, UsdSkel, UsdValidation
 
     motion = apply_layout(reaching(12), ExportOptions.model_validate(options))
@@ -48,7 +48,7 @@ def test_usd_comes_back_and_complies(tmp_path: Path, options: dict[str, Any]) ->
 
 
 def test_usd_skinning_moves_the_figure(tmp_path: Path) -> None:
-    """USD's own skinning: the figure's corners land on our joints."""
+    """With USD's own skinning, the corners of the figure are at the joints."""
     from pxr import Usd, UsdSkel
 
     motion = reaching(12)
@@ -68,7 +68,7 @@ def test_usd_skinning_moves_the_figure(tmp_path: Path) -> None:
     assert np.linalg.norm(corners[:, None] - joints[None], axis=-1).min(axis=0).max() < 1e-5
 
 
-def test_odd_joint_names_become_tokens_of_their_own(tmp_path: Path) -> None:
+def test_odd_joint_names_become_unique_tokens(tmp_path: Path) -> None:
     motion = reaching(2)
     names = ("Bip01 Pelvis", "9 lives", "a:b", "Spine.x", *motion.skeleton.joints[4:])
     odd = replace(motion, skeleton=replace(motion.skeleton, joints=names))
@@ -90,7 +90,7 @@ def test_c3d_is_in_millimetres_z_up(tmp_path: Path) -> None:
     np.testing.assert_allclose(back.x_in_world_m, motion.world_from_joint()[..., :3, 3], atol=1e-6)
 
 
-def test_c3d_refuses_what_does_not_come_back(tmp_path: Path) -> None:
+def test_c3d_refuses_points_that_lose_precision(tmp_path: Path) -> None:
     far = LabelledPoints(names=("a",), fps=30.0, x_in_world_m=np.full((3, 1, 3), 123456.789))
     with pytest.raises(StoreError, match="read back"):
         write_c3d(tmp_path / "a.c3d", far)
@@ -114,7 +114,7 @@ def test_trc_is_in_millimetres_x_forward_y_up(tmp_path: Path) -> None:
     assert at["RightHand"][0, 2] > 200 > -200 > at["LeftHand"][0, 2]
 
 
-def test_tables_hold_everything(tmp_path: Path) -> None:
+def test_tables_have_all_joints_and_ticks(tmp_path: Path) -> None:
     motion = reaching(3)
     sigma = np.full((3, 21), np.nan)
     sigma[1, 4] = 0.0125
@@ -137,7 +137,7 @@ def test_tables_hold_everything(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.reshape(numbers, (3, 21, 3)), poses[..., :3, 3], atol=6e-7)
 
 
-def test_a_missing_library_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_for_a_missing_library_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     optional_libraries.require_libraries(("bvh", "glb", "trc", "fbx"))
     monkeypatch.setattr(optional_libraries, "find_spec", lambda name: None)
     for name in ("usd", "c3d"):
@@ -147,7 +147,7 @@ def test_a_missing_library_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPa
         assert caught.value.field == "export.formats"
 
 
-def test_blender_that_is_not_there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_blender_is_not_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("BODYCAP_BLENDER", str(tmp_path / "nothing"))
     with pytest.raises(JobError, match="names no program"):
         blender.find_blender()
@@ -160,7 +160,7 @@ def test_blender_that_is_not_there(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     assert "make blender" in str(caught.value.hint)
 
 
-def test_blender_that_does_not_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_blender_does_not_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     program = tmp_path / "blender"
     program.write_text("#!/bin/sh\necho 'libX11.so.6: not found' >&2\nexit 127\n")
     program.chmod(0o755)
@@ -169,7 +169,7 @@ def test_blender_that_does_not_start(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         blender.require_blender()
 
 
-def test_a_joints_name_survives_the_table(tmp_path: Path) -> None:
+def test_joint_names_are_quoted_in_the_table(tmp_path: Path) -> None:
     motion = reaching(1)
     odd = ('Hips "A", low', *motion.skeleton.joints[1:])
     write_joint_table(tmp_path / "joints.csv", replace(motion, skeleton=replace(motion.skeleton, joints=odd)))

@@ -1,4 +1,4 @@
-"""Layouts for animation: other names, spine counts, rates and roots, and the joints stay where they were."""
+"""Layouts for animation: joint names, spine joints, rates and roots; the joints do not move in the world."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def laid_out(motion: Motion, **options: Any) -> Motion:
 
 
 def poses(motion: Motion, roles: tuple[str, ...]) -> np.ndarray:
-    """(T,R,4,4) poses of the joints that play the roles."""
+    """Return the poses (T,R,4,4) of the joints with these roles."""
     return motion.world_from_joint()[:, [motion.skeleton.roles.index(role) for role in roles]]
 
 
 def looking_about(ticks: int = 40) -> Motion:
-    """A body that also turns its head and chest a full half turn, bending."""
+    """Return a motion with bends and half turns of head and chest."""
     motion = reaching(ticks)
     local = motion.local_rotation.copy()
     for role, scale in (("Head", 1.2), ("Spine1", 3.5)):
@@ -45,7 +45,7 @@ def looking_about(ticks: int = 40) -> Motion:
 
 @pytest.mark.parametrize("names", NAMES)
 @pytest.mark.parametrize("root", ["hips", "ground"])
-def test_no_joint_moves_or_turns_in_the_world(names: str, root: str) -> None:
+def test_no_joint_moves_or_rotates_in_the_world(names: str, root: str) -> None:
     motion = looking_about()
     out = laid_out(motion, names=names, root=root)
     roles = motion.skeleton.roles
@@ -87,13 +87,13 @@ def test_files_keep_names_roles_and_motion(tmp_path: Path, names: str, root: str
     model, back = read_bvh(tmp_path / "a.bvh")
     assert model.joints == motion.skeleton.joints
     assert assign_roles(model.joints, model.parents.tolist()) == motion.skeleton.roles
-    # six decimals of a centimetre and of a degree, along a chain of nine joints of 2 m in all
+    # six decimals of a centimetre and of a degree, along a chain of nine joints with a total length of 2 m
     position_m, angle_deg = motion_difference(back, motion)
     assert position_m < 1e-6
     assert angle_deg < 1e-4
 
 
-def test_added_joints_share_the_twist_of_the_bone_they_divide() -> None:
+def test_added_joints_have_equal_parts_of_the_twist() -> None:
     motion = reaching(2)
     local = motion.local_rotation.copy()
     joint = motion.skeleton.roles.index("Spine1")
@@ -140,7 +140,7 @@ def test_in_place_the_hips_stay_above_the_origin() -> None:
 
 
 @pytest.mark.parametrize("root", ROOTS)
-def test_the_t_pose_comes_first_and_shifts_no_time(root: str) -> None:
+def test_the_t_pose_is_the_first_frame_and_other_times_do_not_change(root: str) -> None:
     motion = reaching(10)
     out = laid_out(motion, tpose=True, root=root)
     assert len(out.root_in_world_m) == 11
@@ -153,7 +153,7 @@ def test_the_t_pose_comes_first_and_shifts_no_time(root: str) -> None:
 
 
 @pytest.mark.parametrize("fps", [30.0, 60.0, 120.0])
-def test_resampling_keeps_every_old_tick_and_goes_straight_between(fps: float) -> None:
+def test_resampling_keeps_every_old_tick_and_interpolates_linearly(fps: float) -> None:
     motion = reaching(31)
     out = resample(motion, fps)
     factor = round(fps / 30)
@@ -173,13 +173,13 @@ def test_resampling_down_follows_the_motion() -> None:
     np.testing.assert_allclose(out.root_in_world_m[:, 1], -1.1 * at, atol=1e-9)
 
 
-def test_a_tick_is_observed_where_both_its_neighbours_were() -> None:
+def test_a_tick_is_observed_if_both_neighbours_were() -> None:
     motion = replace(reaching(4), observed=np.repeat([[True], [True], [False], [True]], 21, axis=1))
     out = resample(motion, 60.0)
     assert out.observed[:, 0].tolist() == [True, True, True, False, False, False, True]
 
 
-def test_smoothing_takes_out_noise_and_leaves_slow_motion(rng: np.random.Generator) -> None:
+def test_smoothing_removes_noise_and_keeps_slow_motion(rng: np.random.Generator) -> None:
     motion = reaching(300)
     noise = so3_exp(rng.normal(scale=0.02, size=(*motion.local_rotation.shape[:2], 3)))
     noisy = replace(
@@ -193,9 +193,9 @@ def test_smoothing_takes_out_noise_and_leaves_slow_motion(rng: np.random.Generat
         turned = np.swapaxes(motion.local_rotation, -1, -2) @ other.local_rotation
         return float(np.sqrt((rotation_angle_rad(turned) ** 2).mean()))
 
-    # of white noise this share of the band that passes is left: sqrt(4 Hz / 15 Hz) = 0.52
+    # The filter passes this fraction of white noise: sqrt(4 Hz / 15 Hz) = 0.52
     assert 0.4 < error(out) / error(noisy) < 0.62
-    inside = slice(10, -10)  # the very ends are held where they were measured
+    inside = slice(10, -10)  # the filter keeps the first and the last position
     path = out.root_in_world_m - motion.root_in_world_m
     assert 0.4 < path[inside].std() / 0.01 < 0.62
     assert smooth(motion, 20.0) is motion

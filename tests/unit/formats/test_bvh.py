@@ -1,4 +1,4 @@
-"""BVH: what is written comes back, what others wrote is understood, what is broken is named."""
+"""BVH files: round trips, files of other programs, and errors that name the line."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def motion(model: SkeletonModel, local_rotation: FloatArray, rng: np.random.Gene
 
 
 def reference_positions(path: Path) -> FloatArray:
-    """Joint centres (T,J,3) in file axes and units, by an independent reading of our own files."""
+    """Return joint centres (T,J,3) in file axes and units, read by an independent parser."""
     rows = path.read_text().splitlines()
     start = rows.index("MOTION")
     frames = [list(map(float, row.split())) for row in rows[start + 3 :]]
@@ -121,9 +121,7 @@ def motions(draw: st.DrawFn) -> Motion:
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(moving=motions(), order=st.sampled_from(ORDERS), units=st.sampled_from(["cm", "m"]))
-def test_what_is_written_comes_back(
-    tmp_path_factory: pytest.TempPathFactory, moving: Motion, order: str, units: str
-) -> None:
+def test_round_trip(tmp_path_factory: pytest.TempPathFactory, moving: Motion, order: str, units: str) -> None:
     path = tmp_path_factory.mktemp("bvh") / "random.bvh"
     write_bvh(path, moving, units=units, euler_order=order)
     model, back = read_bvh(path, units=units)
@@ -145,24 +143,24 @@ def test_what_is_written_comes_back(
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), order=st.sampled_from(ORDERS))
 def test_angles_are_continuous_through_the_lock_and_over_many_turns(seed: int, order: str) -> None:
-    """A joint that turns by at most 0.1 rad a tick, whose middle angle passes ±90° again and again."""
+    """The joint rotates by at most 0.1 rad per tick, and its middle angle passes ±90° many times."""
     rng = np.random.default_rng(seed)
     angles = np.cumsum(rng.uniform(-0.03, 0.07, size=(400, 3)), axis=0)
     rotation = rotation_from_angles(order, angles)
     out = continuous_angles((order,), rotation[:, None])[:, 0]
-    # The branch is only fixed up to the other triple and whole turns: both move exactly as the truth does.
+    # The angles may be the equivalent triple or differ by full turns; both change exactly as the truth does.
     np.testing.assert_allclose(np.abs(np.diff(out, axis=0)), np.abs(np.diff(angles, axis=0)), atol=1e-6)
 
 
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("quarter", [-90.0, 90.0])
-def test_exact_lock_stays_still_and_exact(order: str, quarter: float) -> None:
+def test_exact_gimbal_lock_keeps_the_angles_close(order: str, quarter: float) -> None:
     first = np.deg2rad(np.linspace(0.0, 300.0, 61))
     angles = np.stack([first, np.full(61, np.deg2rad(quarter)), np.zeros(61)], axis=1)
     rotation = rotation_from_angles(order, angles)
     out = continuous_angles((order,), rotation[:, None])[:, 0]
     np.testing.assert_allclose(rotation_from_angles(order, out), rotation, atol=1e-9)
-    # Each tick turns by 5°, shared by the two locked axes: none may move more than all of it.
+    # Each tick rotates by 5° about the two locked axes together, so neither may change by more than that.
     assert np.abs(np.diff(out, axis=0)).max() < np.deg2rad(5.001)
 
 
@@ -181,8 +179,8 @@ def test_axes_and_units(tmp_path: Path) -> None:
     np.testing.assert_allclose(model.offsets_m[1], [0.2, 0.0, 0.0])
     joints = moving.world_from_joint()
     tip = joints[0, 1, :3, :3] @ model.end_offsets_m[1] + joints[0, 1, :3, 3]
-    # First frame: +90° about the file's Z (forward) lifts the left arm; second: +90° about the file's Y
-    # (up) turns the left side to the back, which is +Y in the world.
+    # First frame: +90° about the file's Z (forward) lifts the left arm. Second frame: +90° about the file's
+    # Y (up) rotates the left side to the back, which is +Y in the world.
     np.testing.assert_allclose(tip, [0.21, -0.02, 1.3], atol=1e-12)
     np.testing.assert_allclose(joints[1, 1, :3, 3], [0.01, 0.18, 1.0], atol=1e-12)
 
@@ -211,7 +209,7 @@ def test_a_files_hierarchy_offsets_and_channels_are_kept(tmp_path: Path) -> None
 
 def test_default_layout(tmp_path: Path, rng: np.random.Generator) -> None:
     model = skeleton([-1, 0], rng)
-    # a standing position must not be added to the root's path by readers that do so
+    # some readers add the OFFSET of the root to its path, so it must be zero
     model = replace(model, offsets_m=np.array([[0.0, 0.0, 0.9], [0.1, 0.0, 0.2]]))
     moving = motion(model, np.broadcast_to(np.eye(3), (3, 2, 3, 3)), rng)
     write_bvh(tmp_path / "a.bvh", moving)
@@ -225,7 +223,7 @@ def test_default_layout(tmp_path: Path, rng: np.random.Generator) -> None:
     assert "-0.000000" not in rows[-1]
 
 
-def test_a_hinge_or_a_root_without_position_gets_what_it_lacks(tmp_path: Path) -> None:
+def test_missing_channels_of_a_hinge_or_root_are_added(tmp_path: Path) -> None:
     text = BVH_PAIR.replace("6 Xposition Yposition Zposition Zrotation", "3 Zrotation")
     text = text.replace("3 Zrotation Xrotation Yrotation\n    End", "1 Xrotation\n    End")
     text = text.replace("1 100 2 0 0 0 90 0 0\n1 100 2 0 0 90 0 0 0", "0 0 0 90\n0 0 90 0")
@@ -291,7 +289,7 @@ def test_no_motion(tmp_path: Path, tail: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "line", "says"),
+    ("old", "new", "line", "message"),
     [
         ("HIERARCHY", "HIERACHY", 1, "begins with HIERARCHY"),
         ("OFFSET 20 0 0", "OFFSET 20 0", 8, "3 numbers"),
@@ -312,10 +310,10 @@ def test_no_motion(tmp_path: Path, tail: str) -> None:
         ("1 100 2 0 0 90 0 0 0", "1 100 2 0 0 90 0 0 inf", 20, "infinity"),
     ],
 )
-def test_broken_files_are_named(tmp_path: Path, old: str, new: str, line: int, says: str) -> None:
+def test_broken_files_are_named(tmp_path: Path, old: str, new: str, line: int, message: str) -> None:
     assert old in BVH_PAIR
     path = write(tmp_path, BVH_PAIR.replace(old, new, 1))
-    with pytest.raises(JobError, match=says) as caught:
+    with pytest.raises(JobError, match=message) as caught:
         read_bvh(path)
     assert (caught.value.path, caught.value.line) == (str(path), line)
 
@@ -400,7 +398,7 @@ def test_real_skeleton_files(data_root: Path, tmp_path: Path, folder: str, chest
 def test_damaged_files_are_read_or_refused_but_never_crash(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
-    """Lines dropped, doubled, swapped, cut, or sprinkled with noise."""
+    """The lines are deleted, repeated, swapped, cut, or changed at random."""
     lines = BVH_PAIR.encode().split(b"\n")
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(lines) - 1))

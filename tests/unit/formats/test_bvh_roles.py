@@ -1,4 +1,4 @@
-"""Which joint is the elbow, in the rigs people have."""
+"""Anatomical roles of the joints of common skeletons."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ROLES = (
 
 HUMANIK = "LeftShoulder LeftArm LeftForeArm LeftHand LeftUpLeg LeftLeg LeftFoot LeftToeBase"
 RIGS = {
-    # name: trunk (hips, helpers..., chest), neck and head, then the left limbs in order ("-" = not there)
+    # name: trunk (hips, helpers..., chest), neck and head, then the left limbs in order ("-" = missing)
     "humanik": ("Hips Spine Spine1", "Neck Head", HUMANIK),
     "mixamo": (
         "mixamorig:Hips mixamorig:Spine mixamorig:Spine1 mixamorig:Spine2",
@@ -79,7 +79,7 @@ def right(name: str) -> str:
 
 
 def build(rig: str, prefix: str = "") -> tuple[list[str], list[int], dict[str, str]]:
-    """Joints, parents and the expected name of each role."""
+    """Return joints, parents and the expected joint of each role."""
     trunk, top, left = (part.split() for part in RIGS[rig])
     joints, parents = list(trunk), list(range(-1, len(trunk) - 1))
     expected = {"Hips": trunk[0], "Spine1": trunk[-1], "Neck": top[0], "Head": top[-1]}
@@ -106,7 +106,7 @@ def found(joints: list[str], parents: list[int]) -> dict[str, str]:
 
 @pytest.mark.parametrize("rig", RIGS)
 @pytest.mark.parametrize("prefix", ["", "actor:"])
-def test_known_rigs(rig: str, prefix: str) -> None:
+def test_known_skeletons(rig: str, prefix: str) -> None:
     joints, parents, expected = build(rig, prefix)
     assert found(joints, parents) == expected
 
@@ -126,14 +126,14 @@ def test_helpers_twists_and_fingers_have_no_role() -> None:
 
 
 def test_clavicles_on_the_neck_leave_the_chest_below_it() -> None:
-    """3ds Max's Biped links the collar bones to the neck."""
+    """In 3ds Max's Biped, the collar bones are children of the neck."""
     joints, parents, expected = build("biped")
     for side in "LR":
         parents[joints.index(f"Bip01_{side}_Clavicle")] = joints.index("Bip01_Neck")
     assert found(joints, parents) == expected
 
 
-def test_a_helper_of_zero_length_gives_way_to_the_joint_that_has_a_bone() -> None:
+def test_a_joint_with_a_bone_is_preferred_to_a_helper_of_zero_length() -> None:
     joints = ["Hips", "lowerback", "Chest", "Chest2", "lowerneck", "Neck", "Head", "LeftArm", "RightArm"]
     parents = [-1, 0, 1, 2, 3, 4, 5, 3, 3]
     offsets = np.ones((9, 3))
@@ -143,6 +143,6 @@ def test_a_helper_of_zero_length_gives_way_to_the_joint_that_has_a_bone() -> Non
     assert assign_roles(joints, parents)[1] == "Spine"
 
 
-def test_no_body_at_all() -> None:
+def test_a_tree_without_body_names_has_no_roles() -> None:
     assert assign_roles(["root", "a", "b"], [-1, 0, 1]) == ("Hips", "", "")
     assert assign_roles(["tail"], [-1]) == ("",)

@@ -1,4 +1,4 @@
-"""COLMAP's sparse model, read back by pycolmap."""
+"""COLMAP's sparse model, read by pycolmap."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_pycolmap_reads_what_was_written(tmp_path: Path) -> None:
 
 
 def test_observations_still_reproject(tmp_path: Path) -> None:
-    """A similarity moves points and cameras together: every residual stays, to rounding."""
+    """A similarity moves points and cameras together, so every residual is unchanged up to rounding."""
     import pycolmap
 
     scene = small_map()
@@ -58,7 +58,7 @@ def test_observations_still_reproject(tmp_path: Path) -> None:
         assert point.track.length() == int((scene.obs_point == index - 1).sum())
 
 
-def test_every_lens_model_has_colmaps_number(tmp_path: Path) -> None:
+def test_every_camera_model_has_the_number_of_colmap(tmp_path: Path) -> None:
     import pycolmap
 
     from bodycap_batch.formats.colmap import _COLMAP_MODEL_IDS

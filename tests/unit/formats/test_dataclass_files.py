@@ -29,7 +29,7 @@ from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
 
 
 def same(first: Any, second: Any) -> bool:
-    """Deep equality that takes NaN for equal to itself."""
+    """Return whether two values are equal, with NaN equal to NaN."""
     if isinstance(first, np.ndarray):
         return first.dtype == second.dtype and np.array_equal(
             first, second, equal_nan=first.dtype.kind == "f"
@@ -198,14 +198,14 @@ def test_a_value_without_arrays_needs_no_npz(tmp_path: Path) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Loose:
-    """Values whose type says little."""
+    """Fields with types that do not determine the values."""
 
     number: float
     anything: Mapping[str, Any]
     maybe: float | None = None
 
 
-def test_numbers_that_json_lacks_survive_where_their_type_is_known(tmp_path: Path) -> None:
+def test_nan_and_infinity_are_kept_in_fields_declared_as_float(tmp_path: Path) -> None:
     value = Loose(number=float("-inf"), anything={"nan": float("nan"), "np": np.float64(0.5), "t": (1, 2)})
     write_dataclass(value, tmp_path, "value")
     read = read_dataclass(Loose, tmp_path, "value")
@@ -214,7 +214,7 @@ def test_numbers_that_json_lacks_survive_where_their_type_is_known(tmp_path: Pat
     assert read.maybe is None
 
 
-def test_what_is_no_plain_value_is_refused(tmp_path: Path) -> None:
+def test_other_objects_are_refused(tmp_path: Path) -> None:
     with pytest.raises(TypeError, match="object"):
         write_dataclass(Loose(number=1.0, anything={"x": object()}), tmp_path, "value")
 
@@ -244,4 +244,4 @@ def test_pickled_arrays_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="pickle"):
         read_npz(tmp_path / "evil.npz")
     with pytest.raises(ValueError, match="Object arrays"):
-        write_npz(tmp_path / "mine.npz", {"evil": np.array([object()], dtype=object)})
+        write_npz(tmp_path / "other.npz", {"evil": np.array([object()], dtype=object)})

@@ -1,4 +1,4 @@
-"""GLB: what is written comes back, and stands in the file as the format wants it."""
+"""GLB files: round trips, and the content as the specification of the format requires it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 class Parsed:
-    """A GLB taken apart by hand, after the format's specification."""
+    """A parser of GLB files, written after the specification of the format."""
 
     def __init__(self, path: Path) -> None:
         data = path.read_bytes()
@@ -50,7 +50,7 @@ class Parsed:
 
 
 def hanging(ticks: int = 5) -> Motion:
-    """A rig that rests with its arms down, and knows its T-pose."""
+    """Return a motion of a skeleton with hanging arms in the zero pose and a separate T-pose."""
     motion = reaching(ticks)
     tpose = np.tile(np.eye(3), (len(motion.skeleton.joints), 1, 1))
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
@@ -59,7 +59,7 @@ def hanging(ticks: int = 5) -> Motion:
 
 
 def on_the_floor(ticks: int = 20) -> Motion:
-    """Hips that travel in a root of their own."""
+    """Return a motion with a root on the floor."""
     motion = reaching(ticks)
     body = motion.skeleton
     skeleton = replace(
@@ -83,7 +83,7 @@ def on_the_floor(ticks: int = 20) -> Motion:
 
 
 @pytest.mark.parametrize("motion", [reaching(20), hanging(), on_the_floor()], ids=["T", "hanging", "floor"])
-def test_what_is_written_comes_back(tmp_path: Path, motion: Motion) -> None:
+def test_round_trip(tmp_path: Path, motion: Motion) -> None:
     write_glb(tmp_path / "a.glb", motion)
     back = read_glb(tmp_path / "a.glb")
     assert (back.skeleton.joints, back.skeleton.roles) == (motion.skeleton.joints, motion.skeleton.roles)
@@ -113,7 +113,7 @@ def test_the_skin_binds_every_joint_at_the_t_pose(tmp_path: Path, motion: Motion
         placed[node] = local if parent is None else placed[parent] @ local
         np.testing.assert_allclose(inverse[node] @ placed[node], np.eye(4), atol=1e-6)
     by_role = dict(zip(motion.skeleton.roles, (placed[node][:3, 3] for node in skin["joints"]), strict=True))
-    # Y up, left is +X, toes point to +Z, in metres; the arms stretched out at shoulder height
+    # Y is up, left is +X, toes point to +Z, metres; the arms are stretched out at the height of the shoulders
     assert 1.5 < by_role["Head"][1] < 1.7
     if motion.skeleton.tpose_rotation is None:
         assert by_role["LeftHand"][0] > 0.7 > -0.7 > by_role["RightHand"][0]
@@ -137,11 +137,11 @@ def test_every_vertex_follows_one_joint(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
     corners = parsed.array(attributes["POSITION"])
     faces = parsed.array(primitive["indices"]).reshape(-1, 3)
-    # a closed surface seen from outside holds a positive volume, each spindle by itself
+    # the volume of each octahedron is positive, so its faces are counter-clockwise from outside
     volume = np.einsum("fi,fi->f", corners[faces[:, 0]], np.cross(corners[faces[:, 1]], corners[faces[:, 2]]))
     per_bone = volume.reshape(-1, 8).sum(axis=1) / 6
     assert (per_bone > 0).all()
-    # a light figure: 24 vertices a bone
+    # a small mesh: 24 vertices per bone
     assert len(corners) == 24 * (len(motion.skeleton.joints) - 1 + len(leaves))
 
 
@@ -172,7 +172,7 @@ def test_a_still_body_without_length_is_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"glTF", b"nothing of the kind", b"glTF\2\0\0\0\x14\0\0\0"])
-def test_what_is_no_glb_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a.glb"
     path.write_bytes(content)
     with pytest.raises(JobError, match=r"GLB|skin"):

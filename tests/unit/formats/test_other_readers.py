@@ -1,4 +1,4 @@
-"""BVH, C3D and TRC through readers that others wrote."""
+"""BVH, C3D and TRC files, read by other libraries."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ TOLERANCE_CM = 2e-4
 
 
 def file_axes_cm(motion: Motion) -> np.ndarray:
-    """(T,J,3) joint centres as a BVH has them: Y up, facing +Z, centimetres."""
+    """Return the joint centres (T,J,3) in the axes and units of a BVH file: Y up, facing +Z, centimetres."""
     world = motion.world_from_joint()[..., :3, 3]
     return 100.0 * np.stack([world[..., 0], world[..., 2], -world[..., 1]], axis=-1)
 
 
 @pytest.mark.parametrize("names", ["hik", "mixamo", "biped"])
-def test_pybvh_places_the_joints_where_we_do(tmp_path: Path, names: str) -> None:
+def test_pybvh_gives_the_same_joint_centres(tmp_path: Path, names: str) -> None:
     import pybvh
 
     motion = apply_layout(reaching(30), ExportOptions.model_validate({"names": names, "tpose": True}))
@@ -40,7 +40,7 @@ def test_pybvh_places_the_joints_where_we_do(tmp_path: Path, names: str) -> None
 
 @pytest.mark.parametrize("names", ["hik", "mixamo", "biped", "unreal"])
 @pytest.mark.parametrize("root", ["hips", "ground"])
-def test_bvhio_places_the_joints_where_we_do(tmp_path: Path, names: str, root: str) -> None:
+def test_bvhio_gives_the_same_joint_centres(tmp_path: Path, names: str, root: str) -> None:
     import bvhio
 
     motion = apply_layout(reaching(20), ExportOptions.model_validate({"names": names, "root": root}))

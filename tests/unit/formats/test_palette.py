@@ -1,4 +1,4 @@
-"""One colour a camera, wherever it is drawn."""
+"""One colour per camera in all files and images."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SEEN_WITHOUT = {
     "green": ((0.367322, 0.860646, -0.227968), (0.280085, 0.672501, 0.047413), (-0.01182, 0.04294, 0.968881)),
     "blue": ((1.255528, -0.076749, -0.178779), (-0.078411, 0.930809, 0.147602), (0.004733, 0.691367, 0.3039)),
 }
-"""Linear sRGB as seen without one kind of cones (Machado et al. 2009)."""
+"""Matrices from linear sRGB to linear sRGB as seen without one kind of cones (Machado et al. 2009)."""
 XYZ_OF_WHITE = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 
 
@@ -42,33 +42,33 @@ def _linear(colour: tuple[int, ...]) -> FloatArray:
 
 
 def _luminance(colour: tuple[int, ...]) -> float:
-    """Of sRGB, as the Web Content Accessibility Guidelines count it."""
+    """Return the relative luminance of an sRGB colour, as in the Web Content Accessibility Guidelines."""
     return float(_linear(colour) @ (0.2126, 0.7152, 0.0722))
 
 
 def _lab(linear: FloatArray) -> FloatArray:
-    """CIELAB of linear sRGB."""
+    """Convert linear sRGB to CIELAB."""
     xyz = XYZ_OF_WHITE @ linear / XYZ_OF_WHITE.sum(axis=1)
     x, y, z = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
     return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
 
 
 @pytest.mark.parametrize("lacking", SEEN_WITHOUT)
-def test_any_two_are_told_apart_by_the_colour_blind(lacking: str) -> None:
+def test_any_two_differ_with_a_colour_vision_deficiency(lacking: str) -> None:
     sight = np.array(SEEN_WITHOUT[lacking])
     seen = [_lab(np.clip(sight @ _linear(colour), 0.0, 1.0)) for colour in CAMERA_COLOURS]
     assert min(np.linalg.norm(one - other) for one, other in combinations(seen, 2)) >= 16.0
 
 
 @pytest.mark.parametrize("colour", CAMERA_COLOURS)
-def test_each_is_seen_on_white_paper_and_on_the_dark_ground(colour: tuple[int, int, int]) -> None:
+def test_each_has_contrast_on_white_and_on_the_dark_background(colour: tuple[int, int, int]) -> None:
     for ground in ((255, 255, 255), (28, 32, 36), tuple(BACKGROUND.tolist())):
         light, dark = sorted((_luminance(colour), _luminance(ground)), reverse=True)
         assert (light + 0.05) / (dark + 0.05) >= 3.0
     assert re.fullmatch("#[0-9a-f]{6}", hex_from_colour(colour))
 
 
-def test_a_camera_has_its_colour_whatever_the_order_and_keeps_it_where_others_are_not_drawn() -> None:
+def test_the_colour_of_a_camera_depends_only_on_the_names_of_all_cameras() -> None:
     every = camera_colours(["torso", "left_palm", "right_palm"])
     assert every == camera_colours(["right_palm", "torso", "left_palm"])
     assert len(set(camera_colours(f"camera {number}" for number in range(8)).values())) == 8
@@ -77,12 +77,12 @@ def test_a_camera_has_its_colour_whatever_the_order_and_keeps_it_where_others_ar
     assert tuple(cloud.colors[0].tolist()) == every["torso"]
 
 
-def test_page_and_film_have_it_from_there(tmp_path: Path) -> None:
+def test_page_and_preview_use_these_colours(tmp_path: Path) -> None:
     inputs = report_inputs(frames=30)
     own = camera_colours(inputs.cameras)
-    told = re.search(r'"tones": ?(\{[^}]*\})', written(inputs, tmp_path))
-    assert told is not None
-    assert json.loads(told.group(1)) == {name: hex_from_colour(colour) for name, colour in own.items()}
+    tones = re.search(r'"tones": ?(\{[^}]*\})', written(inputs, tmp_path))
+    assert tones is not None
+    assert json.loads(tones.group(1)) == {name: hex_from_colour(colour) for name, colour in own.items()}
     for name in ("left_palm", "torso"):
         write_video(tmp_path / "videos" / f"{name}.mp4", [textured_frame(index) for index in range(9)])
     capture = open_capture(load_job(tmp_path / "videos").capture)

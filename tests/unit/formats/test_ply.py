@@ -1,4 +1,4 @@
-"""PLY: points, colours and camera paths, through Open3D and by an independent reading of the header."""
+"""PLY files: points, colours and camera paths, read by Open3D and by an independent parser."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ def test_round_trip_and_an_independent_reading(tmp_path: Path) -> None:
 def test_paths_keep_every_vertex_and_leave_gaps_open() -> None:
     path = np.array([[0, 0, 0], [1, 0, 0], [np.nan] * 3, [5, 0, 0], [5, 0.05, 0]])
     both = add_camera_paths(cloud(10), {"b": path, "a": np.full((2, 3), np.nan)}, spacing=0.25)
-    mine = both.points[10:]
-    np.testing.assert_allclose(mine[:, 0], [0, 0.25, 0.5, 0.75, 1, 5, 5])
+    path = both.points[10:]
+    np.testing.assert_allclose(path[:, 0], [0, 0.25, 0.5, 0.75, 1, 5, 5])
     assert (both.colors[10:] == camera_colours("ab")["b"]).all()
 
 
-def test_a_missing_folder_is_made_and_a_forbidden_one_named(tmp_path: Path) -> None:
+def test_a_missing_folder_is_created_and_a_forbidden_one_is_an_error(tmp_path: Path) -> None:
     write_ply(tmp_path / "new" / "map.ply", cloud(1))
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match="cannot write"):
@@ -66,7 +66,7 @@ def test_a_failing_writer_keeps_the_earlier_file(tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.slow
-def test_open3d_loads_without_its_web_pages_which_come_when_they_are_asked_for() -> None:
+def test_open3d_loads_without_plotly_which_loads_on_use() -> None:
     code = """
 import sys
 from bodycap_batch.formats.open3d_loader import load_open3d

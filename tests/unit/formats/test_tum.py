@@ -1,4 +1,4 @@
-"""TUM trajectories: written exactly, read tolerantly, refused with the line."""
+"""TUM trajectories: exact writing, tolerant reading, and errors that name the line."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def test_round_trip(tmp_path_factory: pytest.TempPathFactory, seed: int, start_n
     assert rotation_angle_rad(turned).max() < 4e-9
 
 
-def test_heading_names_the_columns(tmp_path: Path) -> None:
+def test_the_header_names_the_columns(tmp_path: Path) -> None:
     write_tum(tmp_path / "a.tum", poses(1, 0), ["gauge: map"])
     lines = (tmp_path / "a.tum").read_text().splitlines()
     assert lines[:2] == ["# gauge: map", "# timestamp tx ty tz qx qy qz qw"]
 
 
-def test_odd_files_are_understood(tmp_path: Path) -> None:
+def test_files_of_other_programs_are_read(tmp_path: Path) -> None:
     text = (
         "\ufefftimestamp,tx,ty,tz,qx,qy,qz,qw\r\n\r\n# comment\r\n% another\r\n"
         "1305031098.6758, 4 5 6, 0 0 2 0\r\n1305031098.6659,1,2,3,0,0,0,1\r\n"
@@ -60,7 +60,7 @@ def test_odd_files_are_understood(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("row", "says"),
+    ("row", "message"),
     [
         ("1 2 3", "3 columns"),
         ("1 2 3 4 0 0 0 x", "not a number"),
@@ -71,10 +71,10 @@ def test_odd_files_are_understood(tmp_path: Path) -> None:
         ("1 2 3 4 0 0 0 0", "quaternion is zero"),
     ],
 )
-def test_broken_rows_are_named(tmp_path: Path, row: str, says: str) -> None:
+def test_broken_rows_are_named(tmp_path: Path, row: str, message: str) -> None:
     path = tmp_path / "a.tum"
     path.write_text(f"# head\n0 0 0 0 0 0 0 1\n{row}\n")
-    with pytest.raises(JobError, match=says) as caught:
+    with pytest.raises(JobError, match=message) as caught:
         read_tum(path)
     assert (caught.value.path, caught.value.line) == (str(path), 3)
 

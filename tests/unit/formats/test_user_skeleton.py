@@ -1,4 +1,4 @@
-"""A user's own rig: its mapping, overrides, and a T-pose that is not its zero pose."""
+"""A user's own skeleton: its roles, roles set by the user, and a T-pose that is not its zero pose."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.bodies import reaching
 
 
 def folded(turn_rad: float = 0.9) -> Motion:
-    """A rig whose zero pose is no pose at all; frame 1 holds a T-pose, facing any way."""
+    """Return a motion of a skeleton with a meaningless zero pose; frame 1 has a T-pose with any heading."""
     motion = reaching(3)
     body = motion.skeleton
     zero = so3_exp(np.random.default_rng(4).normal(size=(len(body.joints), 3)))
@@ -65,7 +65,7 @@ def test_the_t_pose_comes_from_a_frame_and_faces_the_front(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("role", ["LeftForeArm", "RightHand", "LeftLeg", "RightFoot", "Spine1", "Head"])
 def test_limb_axes_are_those_of_the_t_pose(tmp_path: Path, role: str) -> None:
-    """A camera sits at the same place on the body, whatever the rig's zero pose."""
+    """The nominal mount on the body does not depend on the zero pose of the skeleton."""
     write_bvh(tmp_path / "rig.bvh", folded())
     rig, _ = read_rig(tmp_path / "rig.bvh", RigOptions(tpose_frame=1))
     plain = load_skeleton("upper_body", 1.75)
@@ -90,24 +90,24 @@ def test_overrides_move_roles(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "says", "hint"),
+    ("options", "message", "hint"),
     [
         (RigOptions(roles={"Nek": "Neck"}), "no joint 'Nek'", "did you mean 'Neck'"),
         (RigOptions(roles={"Neck": "Tentacle"}), "no role 'Tentacle'", "one of"),
         (RigOptions(roles={"Neck": "Head", "Spine": "Head"}), "two joints", "one joint"),
-        (RigOptions(tpose_frame=2), "no frame 2", "it has 2"),
+        (RigOptions(tpose_frame=2), "no frame 2", "the file has 2"),
         (RigOptions(tpose_frame=-1), "no frame -1", "count from 0"),
     ],
 )
-def test_what_does_not_exist_is_named(tmp_path: Path, options: RigOptions, says: str, hint: str) -> None:
+def test_what_does_not_exist_is_named(tmp_path: Path, options: RigOptions, message: str, hint: str) -> None:
     write_bvh(tmp_path / "rig.bvh", reaching(2))
-    with pytest.raises(JobError, match=says) as caught:
+    with pytest.raises(JobError, match=message) as caught:
         read_rig(tmp_path / "rig.bvh", options)
     assert hint in str(caught.value.hint)
     assert caught.value.path is not None
 
 
-def test_the_mapping_in_words() -> None:
+def test_the_description_of_the_joints() -> None:
     body: SkeletonModel = load_skeleton("full_body", 1.75)
     lines = {line.role: line for line in describe_joints(body)}
     assert (lines["LeftForeArm"].points, lines["RightLeg"].points) == ("left", "down")
@@ -131,7 +131,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "JOINT=ROLE" in capsys.readouterr().err
 
 
-def test_a_rig_with_a_t_pose_keeps_its_file_layout(tmp_path: Path) -> None:
+def test_a_skeleton_with_a_t_pose_keeps_the_layout_of_its_file(tmp_path: Path) -> None:
     motion = folded()
     write_bvh(tmp_path / "rig.bvh", motion)
     rig, moving = read_rig(tmp_path / "rig.bvh", RigOptions(tpose_frame=1))
@@ -145,7 +145,7 @@ def test_a_rig_with_a_t_pose_keeps_its_file_layout(tmp_path: Path) -> None:
 
 
 def test_a_motion_solved_in_the_t_pose_goes_back_into_the_file(tmp_path: Path) -> None:
-    """Solved on a body whose zero pose is the T-pose, written on the rig as the file has it."""
+    """The motion is solved with the T-pose as zero pose and written with the zero pose of the file."""
     write_bvh(tmp_path / "rig.bvh", folded())
     rig, _ = read_rig(tmp_path / "rig.bvh", RigOptions(tpose_frame=1))
     body = with_tpose_as_zero_pose(rig)
@@ -158,7 +158,7 @@ def test_a_motion_solved_in_the_t_pose_goes_back_into_the_file(tmp_path: Path) -
     assert back.skeleton.file_rotation is None
     ours, theirs = solved.world_from_joint(), back.world_from_joint()
     np.testing.assert_allclose(theirs[..., :3, 3], ours[..., :3, 3], atol=1e-9)
-    # what nothing measured rests in the T-pose
+    # joints that were not solved are in the T-pose
     assert rig.tpose_rotation is not None
     leg = rig.roles.index("LeftLeg")
     np.testing.assert_allclose(

@@ -1,4 +1,4 @@
-"""From loose bones to the rigid skeleton."""
+"""The projection of a motion with slack onto the rigid skeleton."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.merging.projection import solver
-from bodycap_batch.merging.projection.project import project_motion
+from bodycap_batch.merging.projection.project import initial_motion, project_motion, projection_problem
 from bodycap_batch.merging.projection.solver import (
-    ProjectionProblem,
     RigidMotion,
     StandingJoint,
-    _cost,
-    _normal_equations,
-    _retract,
+    cost,
+    normal_equations,
+    retract,
     solve_rigid_motion,
+    windows,
 )
 from bodycap_batch.model.geometry import rotation_angle_rad
+from bodycap_batch.model.skeleton import forward_kinematics
 from tests.bodies import merged, reaching
 
 
@@ -26,7 +26,7 @@ def joint_error(motion_world: np.ndarray, true_world: np.ndarray) -> np.ndarray:
     return np.linalg.norm(motion_world[..., :3, 3] - true_world[..., :3, 3], axis=-1)
 
 
-def test_a_rigid_graph_stays_as_it_is() -> None:
+def test_a_rigid_graph_does_not_change() -> None:
     truth = reaching()
     result, clocks = merged(truth, slack_m=0.0, slack_rad=0.0, noise_m=0.0)
     projection = project_motion(result, clocks)
@@ -35,14 +35,14 @@ def test_a_rigid_graph_stays_as_it_is() -> None:
     assert projection.gap["cameras"]["left_palm"]["p95_m"] < 1e-9
 
 
-def test_slack_is_taken_out_and_the_cameras_pull_towards_the_truth() -> None:
+def test_slack_is_removed_and_the_cameras_reduce_the_error() -> None:
     truth = reaching()
     result, clocks = merged(truth)
     projection = project_motion(result, clocks)
     world, true = projection.motion.world_from_joint(), truth.world_from_joint()
     loose = joint_error(result.graph_world_from_joint, true)[:, result.solved].mean()
     rigid = joint_error(world, true)[:, result.solved].mean()
-    # the graph's joints are off by 4 mm a coordinate, 6.4 mm in all; the cameras know better
+    # The joints of the graph have errors of 4 mm per coordinate, 6.4 mm in all; cameras have smaller ones.
     assert rigid < 0.65 * loose
     centres = world[..., :3, 3]
     bones = np.linalg.norm(centres[:, 1:] - centres[:, truth.skeleton.parents[1:]], axis=-1)
@@ -52,7 +52,7 @@ def test_slack_is_taken_out_and_the_cameras_pull_towards_the_truth() -> None:
     assert 0.003 < projection.gap["joints"]["p50_m"] < 0.012
 
 
-def test_joints_nothing_measures_keep_their_rotations() -> None:
+def test_unsolved_joints_keep_their_rotations() -> None:
     truth = reaching()
     result, clocks = merged(truth)
     motion = project_motion(result, clocks).motion
@@ -67,7 +67,7 @@ def test_joints_nothing_measures_keep_their_rotations() -> None:
 
 @pytest.mark.parametrize("wrong_by_s", [0.0, 0.24])
 def test_the_clock_offset_has_a_sign(wrong_by_s: float) -> None:
-    """Cameras 0.12 s off the common clock are met; with the sign flipped (0.24 s) they are missed."""
+    """A clock offset of 0.12 s is applied; with the opposite sign, an error of 0.24 s, the gap is large."""
     truth = reaching()
     result, clocks = merged(truth, noise_m=0.0, slack_m=0.0, slack_rad=0.0, offset_s=0.12)
     clocks = {name: replace(clock, offset_s=clock.offset_s - wrong_by_s) for name, clock in clocks.items()}
@@ -77,7 +77,7 @@ def test_the_clock_offset_has_a_sign(wrong_by_s: float) -> None:
 
 
 def test_rolling_shutter_has_a_sign() -> None:
-    """Poses that rest on the top rows were taken 10 ms before the frame time of a 20 ms shutter."""
+    """For a readout time of 20 ms, poses from the top rows are 10 ms before the frame time."""
     truth = reaching()
     result, clocks = merged(truth, noise_m=0.0, slack_m=0.0, slack_rad=0.0, offset_s=-0.01)
     clocks = {name: replace(clock, offset_s=0.0, rolling_shutter_s=0.02) for name, clock in clocks.items()}
@@ -86,13 +86,13 @@ def test_rolling_shutter_has_a_sign() -> None:
     def gap(row_fraction: dict[str, np.ndarray]) -> float:
         return float(project_motion(result, clocks, row_fraction).gap["cameras"]["torso"]["p50_m"])
 
-    # 1.1 m/s · 10 ms = 11 mm, of which the solve takes up a part; twice that with the wrong sign
+    # 1.1 m/s · 10 ms = 11 mm; the solve absorbs a part of it. The wrong sign doubles the error.
     assert gap(rows) < 1e-6
     assert gap({}) > 0.002
     assert gap({name: 1.0 - row for name, row in rows.items()}) > gap({})
 
 
-def test_a_camera_far_off_does_not_drag_the_body() -> None:
+def test_a_gross_camera_error_does_not_move_the_body() -> None:
     truth = reaching()
     result, clocks = merged(truth)
     poses = result.trajectories[1].gauge_from_cam.copy()
@@ -104,63 +104,63 @@ def test_a_camera_far_off_does_not_drag_the_body() -> None:
     )
     clean = project_motion(result, clocks).motion.world_from_joint()
     pulled = project_motion(replace(result, trajectories=paths), clocks).motion.world_from_joint()
-    # 60 cm is 120 sigmas: what is left of it is below the noise
+    # 60 cm are 120 sigmas; the robust loss leaves an influence below the noise
     assert joint_error(pulled, clean).max() < 0.01
 
 
 def test_the_correction_does_not_jitter() -> None:
-    """White noise of the cameras must not become jitter of the body: a hand's second difference."""
+    """White noise of the cameras must not become jitter, measured by a hand's second difference."""
     truth = reaching(120)
     result, clocks = merged(truth, slack_m=0.0, slack_rad=0.0, noise_m=0.005)
     hand = truth.skeleton.index_of_role("LeftHand")
     rough = np.diff(project_motion(result, clocks).motion.world_from_joint()[:, hand, :3, 3], n=2, axis=0)
     smooth = np.diff(truth.world_from_joint()[:, hand, :3, 3], n=2, axis=0)
-    # white noise of 5 mm a coordinate has a second difference of 5 · √6 = 12 mm
+    # white noise of 5 mm per coordinate has a second difference of 5 · √6 = 12 mm
     assert np.std(rough - smooth) < 0.003
 
 
 @pytest.mark.parametrize("sigma_m", [None, 0.02, 0.001])
 def test_gradient_and_optimum(sigma_m: float | None) -> None:
-    """The analytic gradient is that of the cost, and no small step from the solution lowers it.
+    """The analytic gradient is that of the cost, and no small step from the solution reduces the cost.
 
     A hand is held over three of five steps, loosely and so tightly that it slips.
     """
     truth = reaching(6)
     result, clocks = merged(truth, noise_m=0.004)
-    problem = problem_of(result, clocks)
+    problem = projection_problem(result, clocks)
     if sigma_m is not None:
         hand = truth.skeleton.index_of_role("LeftHand")
         assert hand is not None
         held = np.array([True, True, False, False, True])
-        problem = replace(problem, planted=(StandingJoint(joint=hand, held=held, sigma_m=sigma_m),))
+        problem = replace(problem, standing=(StandingJoint(joint=hand, held=held, sigma_m=sigma_m),))
     rotation = result.graph_world_from_joint[..., :3, :3]
     local = rotation.copy()
     for joint in range(1, len(truth.skeleton.joints)):
         local[:, joint] = np.swapaxes(rotation[:, truth.skeleton.parents[joint]], -1, -2) @ rotation[:, joint]
     start = RigidMotion(root=truth.root_in_world_m.copy(), local=local)
     rng = np.random.default_rng(1)
-    # away from the graph, so that the change of the correction over time takes part
+    # a start away from the graph, so that the change of the correction over time contributes
     away = 3e-3 * rng.normal(size=(6, 3 + 3 * len(problem.solved)))
-    start = _retract(problem, start, away)
-    _, _, gradient = _normal_equations(problem, start, problem.reach())
+    start = retract(problem, start, away)
+    gradient = normal_equations(problem, start, problem.ancestor_matrix()).gradient
     for _ in range(5):
         step = rng.normal(size=gradient.shape)
-        change = _cost(problem, _retract(problem, start, 1e-6 * step)) - _cost(
-            problem, _retract(problem, start, -1e-6 * step)
+        change = cost(problem, retract(problem, start, 1e-6 * step)) - cost(
+            problem, retract(problem, start, -1e-6 * step)
         )
-        # logarithms' own derivative is taken as the identity: errors here are up to 0.03 rad
+        # The derivative of the logarithm is approximated by the identity; the errors here are up to 0.03 rad.
         assert change / 2e-6 == pytest.approx(2.0 * float((gradient * step).sum()), rel=0.03)
     found = solve_rigid_motion(problem, start)
-    best = _cost(problem, found)
-    assert best < _cost(problem, start)
+    best = cost(problem, found)
+    assert best < cost(problem, start)
     for _ in range(20):
         step = 1e-3 * rng.normal(size=gradient.shape)
-        assert _cost(problem, _retract(problem, found, step)) > best
+        assert cost(problem, retract(problem, found, step)) > best
 
 
 @pytest.mark.parametrize("standing", [False, True])
-def test_a_finer_timeline_corrects_alike(standing: bool) -> None:
-    """One capture at 30 and at 60 ticks a second, its cameras as slow as ever, is corrected to one motion.
+def test_the_correction_does_not_depend_on_the_rate(standing: bool) -> None:
+    """At 30 and at 60 ticks per second, with the same camera frames, the corrected motions are equal.
 
     The graph of a body that stands still sways by 2 cm; cameras, and a planted hand, say otherwise.
     """
@@ -184,11 +184,11 @@ def test_a_finer_timeline_corrects_alike(standing: bool) -> None:
     coarse, fine = motions
     moved = (coarse - coarse.mean(axis=0)).std()
     assert moved > 0.003
-    # What is left is how finely a sway of 0.6 Hz is cut: 0.01; counted by ticks it was 0.08 to 0.09.
+    # The sampling of a sway of 0.6 Hz leaves 0.01. With equal weights of all ticks it was 0.08 to 0.09.
     assert (fine[::2] - coarse).std() < 0.03 * moved
 
 
-def test_what_stands_in_the_graph_stands_in_the_file() -> None:
+def test_a_standing_foot_also_stands_in_the_rigid_motion() -> None:
     moving = reaching()
     count = len(moving.root_in_world_m)
     still = replace(
@@ -207,46 +207,35 @@ def test_what_stands_in_the_graph_stands_in_the_file() -> None:
         for each in (free, held)
     ]
     assert slide[1] < 0.5 * slide[0]
-    told = held.gap["feet"][still.skeleton.joints[hand]]
-    assert told["slide_p50_m_per_s"] == pytest.approx(still.fps * slide[1], rel=0.3)
+    feet = held.gap["feet"][still.skeleton.joints[hand]]
+    assert feet["slide_p50_m_per_s"] == pytest.approx(still.fps * slide[1], rel=0.3)
     assert "feet" not in free.gap
-    # The cameras are met as well as they were: their noise is no longer followed, that is all.
+    # The gap to the cameras grows only because the motion no longer follows their noise.
     assert held.gap["cameras"]["left_palm"]["p95_m"] < 1.2 * free.gap["cameras"]["left_palm"]["p95_m"]
 
 
-def test_a_long_motion_is_corrected_in_stretches_as_of_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_motion_is_solved_in_windows_as_in_one_piece() -> None:
     result, clocks = merged(reaching(120), noise_m=0.005)
     standing = np.zeros((120, len(result.skeleton.joints)), dtype=bool)
     standing[50:70, result.skeleton.index_of_role("LeftHand")] = True
     standing[10:30, result.skeleton.index_of_role("RightHand")] = True
     result = replace(result, standing=standing)
-    whole = project_motion(result, clocks).motion.world_from_joint()
-    solved: list[int] = []
-    equations = solver._normal_equations
-
-    def counted(problem, now, reach):  # type: ignore[no-untyped-def]
-        solved.append(len(now.root))
-        return equations(problem, now, reach)
-
-    monkeypatch.setattr(solver, "_normal_equations", counted)
-    monkeypatch.setattr(solver, "_WINDOW_TICKS", 40)
-    monkeypatch.setattr(solver, "_OVERLAP_S", 25 / 30)
-    pieces = project_motion(result, clocks).motion.world_from_joint()
-    # A correction is forgotten at a tenth a tick and faster where cameras measure.
-    assert np.abs(pieces - whole)[..., :3, 3].max() < 1e-4
-    assert set(solved) == {65, 90}
+    problem, start = projection_problem(result, clocks), initial_motion(result)
+    whole = solve_rigid_motion(problem, start)
+    # Three windows of 40 ticks, each with 25 ticks more on both sides: 65, 90 and 65 ticks.
+    pieces = solve_rigid_motion(problem, start, window_ticks=40, overlap_s=25 / 30)
+    centres = [
+        forward_kinematics(result.skeleton, motion.root, motion.local)[..., :3, 3]
+        for motion in (whole, pieces)
+    ]
+    # The influence of a tick falls by a tenth per tick, and faster at ticks with camera poses.
+    assert 0.0 < np.abs(centres[1] - centres[0]).max() < 1e-4
 
 
-def problem_of(result, clocks) -> ProjectionProblem:  # type: ignore[no-untyped-def]
-    from bodycap_batch.merging.projection.project import _camera_targets
-
-    return ProjectionProblem(
-        fps=result.fps,
-        skeleton=result.skeleton,
-        solved=np.flatnonzero(result.solved),
-        world_from_joint=result.graph_world_from_joint,
-        cameras=_camera_targets(result, clocks, {}),
-    )
+def test_windows_cover_all_ticks() -> None:
+    assert windows(120, 2000) == [(0, 120)]
+    assert windows(120, 40) == [(0, 40), (40, 80), (80, 120)]
+    assert windows(121, 40) == [(0, 30), (30, 60), (60, 91), (91, 121)]
 
 
 def test_no_camera_and_nothing_solved() -> None:

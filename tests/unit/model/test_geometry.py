@@ -1,4 +1,4 @@
-"""Transforms: against scipy, against their own inverses, and where they must refuse."""
+"""Transforms: against scipy, against their inverses, and errors for invalid input."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_rigid_alignment_keeps_scale_and_never_mirrors() -> None:
 
 
 def test_alignment_beats_any_other() -> None:
-    """Noisy points: no nearby similarity has a smaller residual."""
+    """For noisy points, no nearby similarity has a smaller residual."""
     rng = np.random.default_rng(3)
     points = rng.normal(size=(30, 3))
     target = random_similarity(1).apply(points) + rng.normal(scale=0.1, size=(30, 3))
@@ -175,7 +175,7 @@ def test_skew_is_the_cross_product(seed: int) -> None:
 
 
 def test_the_adjoint_moves_a_small_motion_to_other_axes() -> None:
-    """T exp(ξ) = exp(Ad ξ) T, to the square of a motion of 1e-6."""
+    """T exp(ξ) = exp(Ad ξ) T, up to the square of a motion of 1e-6."""
     pose = random_poses(1, 3)[0]
     motion = np.array([1.0, -2.0, 0.5, 3.0, 1.0, -1.0]) * 1e-6
 

@@ -1,4 +1,4 @@
-"""The body's types: what they refuse, and forward kinematics against plain multiplication."""
+"""The types of the body: invalid input, and forward kinematics against matrix products."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_zero_pose_is_the_sum_of_offsets() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"parents": np.array([-1, 2, 1, 0])}, "parent before its children"),
         ({"parents": np.array([0, 0, 1, 0])}, "parent before its children"),
@@ -55,8 +55,8 @@ def test_zero_pose_is_the_sum_of_offsets() -> None:
         ({"roles": ("Hips",)}, "one entry per joint"),
     ],
 )
-def test_what_is_no_tree_is_refused(change: dict[str, object], says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_an_invalid_tree_is_refused(change: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         replace(chain(), **change)  # type: ignore[arg-type]
 
 

@@ -1,4 +1,4 @@
-"""The standard body: heights add up, sides mirror, segments have the axes their rig rests in."""
+"""The preset skeleton: heights, mirrored sides, segment axes and nominal mounts."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _place(skeleton: SkeletonModel, role: str) -> np.ndarray:
 
 
 def _hanging(skeleton: SkeletonModel) -> SkeletonModel:
-    """The same body with arms that hang in the zero pose."""
+    """Return the same body with hanging arms in the zero pose."""
     offsets = np.array(skeleton.offsets_m)
     for role in ("LeftForeArm", "LeftHand", "RightForeArm", "RightHand"):
         joint = skeleton.roles.index(role)
@@ -107,13 +107,13 @@ def test_a_bent_elbow_moves_the_hand_only():
 
 
 @pytest.mark.parametrize(("side", "sign"), [("Left", 1.0), ("Right", -1.0)])
-def test_segment_axes_follow_the_rig(side, sign):
+def test_segment_axes_follow_the_skeleton(side, sign):
     stretched = load_skeleton("full_body", 1.8)
-    # T-pose, palms down: the hand's back looks up, the thumb forward.
+    # T-pose with the palms down: the back of the hand points up, the thumb forward.
     assert_allclose(
         segment_axes(stretched, side + "Hand").T, [[sign, 0, 0], [0, -1, 0], [0, 0, 1]], atol=1e-12
     )
-    # Hanging: the back looks outward, the thumb still forward.
+    # Hanging arms: the back of the hand points outward, the thumb still forward.
     hanging = _hanging(stretched)
     assert_allclose(
         segment_axes(hanging, side + "Hand").T, [[0, 0, -1], [0, -1, 0], [sign, 0, 0]], atol=1e-12
@@ -131,7 +131,7 @@ def test_nominal_mounts_are_poses_and_mirror(role):
     rotation = mount.joint_from_cam[:3, :3]
     assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1.0)
-    # Never looks into the body, never sits further off than an arm is thick and long.
+    # The camera never looks into the body, and it is near its bone.
     assert rotation[1, 2] < 0.0
     assert np.linalg.norm(mount.joint_from_cam[:3, 3]) < 0.3
     if role.startswith("Left"):
