@@ -13,12 +13,10 @@ import pytest
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping import build, build_map, extend, extend_map
-from bodycap_batch.mapping.reconstruction import reconstruct
+from bodycap_batch.mapping import build, build_map, extend_map
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import sub_model
-from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options
+from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
 from bodycap_batch.mapping.reconstruction.two_step_adjustment import adjust_in_two_steps
-from bodycap_batch.mapping.validation import repair
 from bodycap_batch.model.geometry import align_points
 from bodycap_batch.model.scene import KeyframeSelection, MapResult
 from tests.rooms import stroll
@@ -39,7 +37,7 @@ def _built(
     selections = [_selection(camera.name, frames) for camera in capture.cameras]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bodycap_batch.mapping.matching.pair_selection._EXHAUSTIVE_UP_TO", 10)
-        return build_map(capture, selections, options, surroundings, many=40)
+        return build_map(capture, selections, options, surroundings, skeletal_above=40)
 
 
 def _selection(name: str, frames: Sequence[int]) -> KeyframeSelection:
@@ -84,7 +82,7 @@ def test_keyframes_that_see_nothing_are_left_out(stroll_capture: Capture, tmp_pa
 def test_a_carrying_keyframe_that_was_cut_is_placed(
     stroll_capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mended, cut = build.repair, list[str]()
+    mended, cut = build.repair_model, list[str]()
 
     def cutting(*arguments: Any) -> tuple[Any, dict[str, object]]:
         model, log = mended(*arguments)
@@ -92,7 +90,7 @@ def test_a_carrying_keyframe_that_was_cut_is_placed(
         cut.append(model.image(number).name)
         return sub_model(model, set(model.reg_image_ids()) - {number}), log
 
-    monkeypatch.setattr(build, "repair", cutting)
+    monkeypatch.setattr(build, "repair_model", cutting)
     found = _built(stroll_capture, MapOptions(), context(tmp_path))
     told = found.log["placed"]
     assert told["carrying"] + told["placed"] == len(found.maps[0].keyframe_camera)
@@ -139,7 +137,9 @@ def test_a_large_map_is_adjusted_in_two_steps(result: MapResult, monkeypatch: py
         return create(options, config, part)
 
     monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", noted)
-    adjust_in_two_steps(model, mapper_options(MapOptions(), sorted(model.cameras), 1.0), sorted(model.cameras))
+    adjust_in_two_steps(
+        model, make_mapper_options(MapOptions(), sorted(model.cameras), 1.0), sorted(model.cameras)
+    )
     assert adjusted[0] + adjusted[2] == model.num_reg_images()
     assert before > 0.02
     assert _centres_off(model) < 0.005
@@ -161,8 +161,6 @@ def _centres_off(model: pycolmap.Reconstruction) -> float:
 def test_a_large_map_grows_without_adjusting_all_of_it_again_and_again(
     result: MapResult, stroll_capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (reconstruct, repair, extend):
-        monkeypatch.setattr(module, "MANY", 40)
     adjusted: list[int] = []
     create = pycolmap.create_default_bundle_adjuster
 
@@ -178,7 +176,7 @@ def test_a_large_map_grows_without_adjusting_all_of_it_again_and_again(
     monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", noted)
     monkeypatch.setattr(pycolmap.IncrementalMapper, "iterative_global_refinement", never)
     extra = {"torso": np.array([21, 31]), "left_palm": np.array([11])}
-    grown = extend_map(stroll_capture, result, extra, MapOptions(), context(tmp_path))
+    grown = extend_map(stroll_capture, result, extra, MapOptions(), context(tmp_path), skeletal_above=40)
     assert len(grown.maps[0].keyframe_camera) == len(result.maps[0].keyframe_camera) + 3
     assert adjusted == [3]
     assert _off(grown).max() < 0.03

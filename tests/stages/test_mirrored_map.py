@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from bodycap_batch.config import KeyframeOptions, MapOptions
 from bodycap_batch.config.job import load_job
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build, build_map
-from bodycap_batch.mapping.matching.flipped_cameras import UNDECIDED_GROUPS, FLIPPED_CAMERAS
+from bodycap_batch.mapping.matching.database import CameraKeyframes
+from bodycap_batch.mapping.matching.flipped_cameras import FLIPPED_CAMERAS, UNDECIDED_GROUPS
 from bodycap_batch.model.scene import KeyframeSelection
 from tests.rooms import stroll, write_capture
 from tests.stages.conftest import context
@@ -61,9 +63,9 @@ def test_without_the_flipped_camera_the_map_is_that_of_the_others(
     extracted: list[str] = []
     add = build.add_keyframes
 
-    def counted(workspace: Path, wanted: Sequence[tuple[object, int, np.ndarray]], *rest: object) -> None:
-        extracted.extend(f"{camera.name}:{frame}" for camera, _, frames in wanted for frame in frames)  # type: ignore[attr-defined]
-        add(workspace, wanted, *rest)  # type: ignore[arg-type]
+    def counted(workspace: Path, keyframes: Sequence[CameraKeyframes], *rest: Any) -> None:
+        extracted.extend(f"{item.camera.name}:{frame}" for item in keyframes for frame in item.frames)
+        add(workspace, keyframes, *rest)
 
     monkeypatch.setattr(build, "add_keyframes", counted)
     options = MapOptions(init_frames=("left_palm:3", "torso:20"))

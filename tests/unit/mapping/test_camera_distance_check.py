@@ -8,8 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.mapping.validation.camera_distance_check import find_best_scale, check_distances
-from bodycap_batch.mapping.validation.epipolar_consistency import PairConsistency, inconsistent_match_ratio, check_consistency
+from bodycap_batch.mapping.validation.camera_distance_check import check_distances, find_best_scale
+from bodycap_batch.mapping.validation.epipolar_consistency import (
+    PairConsistency,
+    check_consistency,
+    inconsistent_match_ratio,
+)
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.scene import Map
 from bodycap_batch.model.skeleton_presets import camera_reach, load_skeleton, nominal_mount
@@ -48,29 +52,29 @@ def _walk(units_per_metre: float = 1.0, shift_m: float = 0.0, rows: slice = slic
 @pytest.mark.parametrize("units_per_metre", [0.1, 1.0, 10.0])
 def test_scale_changes_no_verdict(units_per_metre: float) -> None:
     right = check_distances(_walk(units_per_metre), _TIMES, _REACH)
-    assert right.judged
-    assert right.explained == 1.0
-    assert not right.violating.any()
+    assert right.is_conclusive
+    assert right.within_reach == 1.0
+    assert not right.violations.any()
     # A hand 15 m off for four keyframes: 0.5 m and 15 m cannot both lie within a factor of ten.
     wrong = check_distances(_walk(units_per_metre, 15.0, slice(10, 14)), _TIMES, _REACH)
-    assert wrong.judged
-    assert np.flatnonzero(wrong.violating).tolist()[:4] == list(range(10, 14))
+    assert wrong.is_conclusive
+    assert np.flatnonzero(wrong.violations).tolist()[:4] == list(range(10, 14))
     assert wrong.to_log() == check_distances(_walk(1.0, 15.0, slice(10, 14)), _TIMES, _REACH).to_log()
 
 
 def test_one_keyframe_off_is_noise_and_half_of_them_no_body() -> None:
-    assert not check_distances(_walk(1.0, 15.0, slice(12, 13)), _TIMES, _REACH).violating.any()
+    assert not check_distances(_walk(1.0, 15.0, slice(12, 13)), _TIMES, _REACH).violations.any()
     folded = _walk(1.0, 15.0, slice(0, 15))
     verdict = check_distances(folded, _TIMES, _REACH)
-    assert not verdict.judged
-    assert not verdict.violating.any()
+    assert not verdict.is_conclusive
+    assert not verdict.violations.any()
     assert "no scale" in str(verdict.to_log()["reason"])
 
 
 def test_without_instants_in_common_nothing_is_said() -> None:
     later = {"hand": _TIMES["hand"], "torso": _TIMES["torso"] + 10**12}
-    assert not check_distances(_walk(), later, _REACH).judged
-    assert not check_distances(replace(_walk(), gauge="h"), _TIMES, {}).judged
+    assert not check_distances(_walk(), later, _REACH).is_conclusive
+    assert not check_distances(replace(_walk(), gauge="h"), _TIMES, {}).is_conclusive
 
 
 def test_the_best_scale_lies_in_most_intervals() -> None:

@@ -18,16 +18,22 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.mapping.matching.database import DATABASE_NAME, add_keyframes, read_image_ids, read_keypoint_colours
+from bodycap_batch.mapping.matching.database import (
+    DATABASE_NAME,
+    CameraKeyframes,
+    add_keyframes,
+    read_image_ids,
+    read_keypoint_colours,
+)
 from bodycap_batch.mapping.matching.flipped_cameras import (
-    UNDECIDED_GROUPS,
     FLIPPED_CAMERAS,
-    label_cameras,
+    UNDECIDED_GROUPS,
     add_flip_hint,
-    mirror_descriptors,
+    exclude_flipped_cameras,
     excluded_camera_note,
     flip_notes,
-    exclude_flipped_cameras,
+    label_cameras,
+    mirror_descriptors,
 )
 from bodycap_batch.mapping.matching.retrieval import count_ratio_test_matches, largest_descriptors
 from bodycap_batch.model.scene import KeyframeSelection
@@ -82,11 +88,11 @@ def _workspace(folder: Path, *cameras: _Pan) -> list[KeyframeSelection]:
             rig = pycolmap.Rig()
             rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, each))
             database.write_rig(rig)
-    wanted = [
-        (cast(CaptureCamera, camera), number, camera.frames)
+    keyframes = [
+        CameraKeyframes(cast(CaptureCamera, camera), number, camera.frames)
         for camera, number in zip(cameras, ids, strict=True)
     ]
-    add_keyframes(folder, wanted, MapOptions(), StageContext(work_dir=folder, threads=1))
+    add_keyframes(folder, keyframes, MapOptions(), StageContext(work_dir=folder, threads=1))
     chosen: list[Any] = [SimpleNamespace(camera=camera.name, frames=camera.frames) for camera in cameras]
     return cast(list[KeyframeSelection], chosen)
 
@@ -162,7 +168,7 @@ def test_two_that_see_mirror_images_are_both_kept_and_named(tmp_path: Path) -> N
     left, log = _left(tmp_path, _Pan("left", 0, mirrored=True), _Pan("torso", 150))
     assert (left, log) == (["left", "torso"], {UNDECIDED_GROUPS: [[["left"], ["torso"]]]})
     (note,) = flip_notes(log)
-    assert note.startswith("cameras left and torso see mirror images of each other: that is right where")
+    assert note.startswith("cameras left and torso see mirror images of each other: that is right if")
     assert note.count("wrong") == 1
     assert note.endswith("flip it back: ffmpeg -i in -vf hflip out.mp4")
     error = add_flip_hint(EstimationError("too few", hint="film more"), log)

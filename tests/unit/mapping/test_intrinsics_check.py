@@ -6,13 +6,13 @@ import pytest
 
 from bodycap_batch.config import MapOptions
 from bodycap_batch.mapping.intrinsics.intrinsics_check import (
-    select_camera_models,
-    misfit_note,
     find_misfit_intrinsics,
+    misfit_note,
     refine_principal_points,
+    select_camera_models,
 )
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import bundle_adjust
-from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options
+from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
 from bodycap_batch.model.geometry import so3_exp
 
 
@@ -29,7 +29,7 @@ def _model(factor, noise_px=0.5):
         params = np.array(camera.params)
         params[0] *= factor
         camera.params = params
-    settings = mapper_options(MapOptions(), list(model.cameras), 1.0)
+    settings = make_mapper_options(MapOptions(), list(model.cameras), 1.0)
     if factor != 1.0:
         bundle_adjust(model, settings, list(model.cameras), 60)
     return model, settings
@@ -109,7 +109,7 @@ def _guessed(model_name, params, wrong):
     pycolmap.synthesize_noise(noise, model)
     for camera in model.cameras.values():
         camera.model, camera.params = pycolmap.CameraModelId.SIMPLE_RADIAL, wrong
-    settings = mapper_options(MapOptions(), [], 1.0)
+    settings = make_mapper_options(MapOptions(), [], 1.0)
     bundle_adjust(model, settings, [], 60)
     return model, settings
 
@@ -168,7 +168,7 @@ def _wide(lens):
 
 def test_a_fisheye_lens_with_square_pixels_gets_a_second_radial_term():
     model = _wide([400, 400, 512, 384, -0.1, 0.06, 0.0, 0.0])
-    settings = mapper_options(MapOptions(), [], 1.0)
+    settings = make_mapper_options(MapOptions(), [], 1.0)
     model.camera(1).model, model.camera(1).params = pycolmap.CameraModelId.SIMPLE_RADIAL, [440, 512, 384, 0]
     bundle_adjust(model, settings, [], 60)
     found, decentred = select_camera_models(model, settings, set(model.cameras))
@@ -196,7 +196,7 @@ def test_a_few_keypoints_do_not_tell_that_pixels_are_not_square():
 def test_a_lens_that_was_given_stays_while_another_is_guessed():
     model, _ = _guessed("SIMPLE_RADIAL", [1280, 512, 384, 0.0], [1280, 512, 384, 0.0])
     guessed, given = sorted(model.cameras)
-    settings = mapper_options(MapOptions(), [given], 1.0)
+    settings = make_mapper_options(MapOptions(), [given], 1.0)
     model.camera(given).params = [1280, 640, 300, 0.0]
     bundle_adjust(model, settings, [given], 60)
     # The guess is right, and what is wrong was given: nothing of the guessed lens explains it.

@@ -52,7 +52,9 @@ def test_the_order_of_sums_does_not_matter() -> None:
     assert (first @ second.T == backwards).all()
 
 
-def _two_views(rng: np.random.Generator, *, calibrated: bool) -> tuple[KeyframeFeatures, KeyframeFeatures, IntArray, int]:
+def _two_views(
+    rng: np.random.Generator, *, calibrated: bool
+) -> tuple[KeyframeFeatures, KeyframeFeatures, IntArray, int]:
     """100 right matches between two views 0.5 apart with half a pixel of noise, then 100 wrong ones."""
     points = rng.uniform((-2, -1.5, 3), (2, 1.5, 6), (100, 3))
     turned = points @ so3_exp(np.array([0.02, 0.15, -0.03])).T + (0.5, 0.05, 0.1)
@@ -64,7 +66,9 @@ def _two_views(rng: np.random.Generator, *, calibrated: bool) -> tuple[KeyframeF
 
 def _view(pixels: FloatArray, calibrated: bool) -> KeyframeFeatures:
     rays = _LENS.unproject(pixels) if calibrated else pixels
-    return KeyframeFeatures(descriptors=_NONE, rays=rays, error=4 / 420 if calibrated else 4.0, calibrated=calibrated)
+    return KeyframeFeatures(
+        descriptors=_NONE, rays=rays, error=4 / 420 if calibrated else 4.0, calibrated=calibrated
+    )
 
 
 @pytest.mark.parametrize("calibrated", [True, False])

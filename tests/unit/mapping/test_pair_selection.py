@@ -13,7 +13,12 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef
 from bodycap_batch.mapping.matching.pair_selection import PairGenerator
-from bodycap_batch.mapping.matching.retrieval import MIN_RETRIEVAL_MATCHES, _count_matches, largest_descriptors, count_preemptive_matches
+from bodycap_batch.mapping.matching.retrieval import (
+    MIN_RETRIEVAL_MATCHES,
+    _count_matches,
+    count_preemptive_matches,
+    largest_descriptors,
+)
 
 
 def _keypoints(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -37,7 +42,9 @@ def test_two_views_of_a_place_are_alike_and_others_not(tmp_path: Path) -> None:
     rows = list(range(0, 80, 7))
     every = np.array(images)
     alike = count_preemptive_matches(every, rows, ["a"] * 80, StageContext(work_dir=tmp_path))
-    assert (count_preemptive_matches(every, rows, ["a"] * 80, StageContext(work_dir=tmp_path, threads=3)) == alike).all()
+    assert (
+        count_preemptive_matches(every, rows, ["a"] * 80, StageContext(work_dir=tmp_path, threads=3)) == alike
+    ).all()
     partner = np.array(rows) ^ 1
     assert (alike[np.arange(len(rows)), partner] >= 50).all()
     alike[np.arange(len(rows)), partner] = 0
@@ -110,7 +117,7 @@ def test_pairs_per_keyframe_are_bounded(tmp_path: Path, keyframes: int) -> None:
     refs = [ImageRef(camera, frame) for camera in times for frame in range(keyframes)]
     pairs = PairGenerator(
         tmp_path, refs, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
-    ).first()
+    ).initial_pairs()
     # Per keyframe: 14 neighbours (each pair counts twice), 2 at the same instant, up to 64 that look alike.
     assert len(pairs) <= (7 + 2 + 64) * len(refs)
     assert len(set(pairs)) == len(pairs)
@@ -118,7 +125,7 @@ def test_pairs_per_keyframe_are_bounded(tmp_path: Path, keyframes: int) -> None:
     assert (ImageRef("a", 7), ImageRef("a", 8)) in pairs
     every = PairGenerator(
         tmp_path, refs, times, MapOptions(pairs="exhaustive"), StageContext(work_dir=tmp_path)
-    ).first()
+    ).initial_pairs()
     assert len(every) == len(refs) * (len(refs) - 1) // 2
 
 
@@ -129,7 +136,7 @@ def test_few_keyframes_are_matched_exhaustively(tmp_path: Path) -> None:
         len(
             PairGenerator(
                 tmp_path, refs, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
-            ).first()
+            ).initial_pairs()
         )
         == 40 * 39 // 2
     )
@@ -138,24 +145,24 @@ def test_few_keyframes_are_matched_exhaustively(tmp_path: Path) -> None:
 def test_growing_matches_new_keyframes_only(tmp_path: Path) -> None:
     times = _database(tmp_path, 70)
     new = [ImageRef("a", 5), ImageRef("b", 30)]
-    chooser = PairGenerator(
+    generator = PairGenerator(
         tmp_path, new, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
     )
-    pairs = chooser.first()
+    pairs = generator.initial_pairs()
     assert all(a in new or b in new for a, b in pairs)
     assert len(pairs) <= (14 + 2 + 64) * len(new)
-    more = chooser.wider(dict.fromkeys(pairs, 50), set(pairs))
+    more = generator.expansion_pairs(dict.fromkeys(pairs, 50), set(pairs))
     assert all(a in new or b in new for a, b in more)
 
 
 def test_who_is_placed_is_matched_with_those_beside_it_and_some_of_the_map(tmp_path: Path) -> None:
     times = _database(tmp_path, 80)
     refs = [ImageRef(camera, frame) for camera in times for frame in range(80)]
-    chooser = PairGenerator(
+    generator = PairGenerator(
         tmp_path, refs, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
     )
     carrying = [ref for ref in refs if ref.frame % 5 == 0]
-    pairs = chooser.placing(carrying, [ImageRef("a", 42), ImageRef("a", 43)])
+    pairs = generator.resection_pairs(carrying, [ImageRef("a", 42), ImageRef("a", 43)])
     assert all(ImageRef("a", frame) in sum(pairs, ()) for frame in (41, 44))
     assert {(ImageRef("a", at), ImageRef("a", 42)) for at in (35, 40)} <= set(pairs)
     assert (ImageRef("a", 43), ImageRef("b", 45)) in pairs
@@ -168,7 +175,7 @@ def test_who_is_placed_is_matched_with_those_beside_it_and_some_of_the_map(tmp_p
 def test_what_hangs_by_few_links_is_matched_beside_what_held(tmp_path: Path) -> None:
     times = _database(tmp_path, 80)
     refs = [ImageRef(camera, frame) for camera in times for frame in range(80)]
-    chooser = PairGenerator(
+    generator = PairGenerator(
         tmp_path, refs, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
     )
     a, b = ImageRef("a", 40), ImageRef("b", 10)
@@ -179,12 +186,12 @@ def test_what_hangs_by_few_links_is_matched_beside_what_held(tmp_path: Path) -> 
         (a, ImageRef("b", 9)),
         (a, ImageRef("b", 11)),
     }
-    assert set(chooser.wider(held, {(a, b)})) == expected
-    assert chooser.wider({(a, b): 15}, {(a, b)}) == []  # too weak to lead further
+    assert set(generator.expansion_pairs(held, {(a, b)})) == expected
+    assert generator.expansion_pairs({(a, b): 15}, {(a, b)}) == []  # too weak to lead further
     tied = {(x, y): 50 for x in refs for y in refs if x.camera < y.camera}
-    assert chooser.wider(tied, set()) == []
-    assert chooser.unlinked(held, {(a, b)}) == []
-    assert len(chooser.unlinked({(a, ImageRef("a", 41)): 50}, set())) == 80 * 80
+    assert generator.expansion_pairs(tied, set()) == []
+    assert generator.unlinked_camera_pairs(held, {(a, b)}) == []
+    assert len(generator.unlinked_camera_pairs({(a, ImageRef("a", 41)): 50}, set())) == 80 * 80
 
 
 def test_a_long_camera_without_links_is_not_matched_with_everything(
@@ -193,11 +200,11 @@ def test_a_long_camera_without_links_is_not_matched_with_everything(
     monkeypatch.setattr("bodycap_batch.mapping.matching.pair_selection._MAX_RETRY_PAIRS", 500)
     times = _database(tmp_path, 80)
     refs = [ImageRef(camera, frame) for camera in times for frame in range(80)]
-    chooser = PairGenerator(
+    generator = PairGenerator(
         tmp_path, refs, times, MapOptions(pairs="retrieval"), StageContext(work_dir=tmp_path)
     )
-    pairs = chooser.unlinked({(refs[0], refs[1]): 50}, set())
+    pairs = generator.unlinked_camera_pairs({(refs[0], refs[1]): 50}, set())
     assert 200 < len(pairs) <= 500
     # From one end to the other of both.
     assert {a.frame // 20 for a, _ in pairs} == {b.frame // 20 for _, b in pairs} == {0, 1, 2, 3}
-    assert chooser.unlinked({(refs[0], refs[1]): 50}, set(pairs)) == []
+    assert generator.unlinked_camera_pairs({(refs[0], refs[1]): 50}, set(pairs)) == []

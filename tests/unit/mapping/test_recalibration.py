@@ -15,7 +15,11 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.mapping import build
-from bodycap_batch.mapping.intrinsics.recalibration import RECALIBRATED, with_map_intrinsics, recalibrate_if_misfit
+from bodycap_batch.mapping.intrinsics.recalibration import (
+    RECALIBRATED,
+    recalibrate_if_misfit,
+    with_map_intrinsics,
+)
 from bodycap_batch.model.scene import MapResult
 from tests.scenes import small_map
 

@@ -17,9 +17,11 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.mapping import build
-from bodycap_batch.mapping.build import reconstruct_with_intrinsics
+from bodycap_batch.mapping import initial_models
+from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
+from bodycap_batch.mapping.initial_models import reconstruct_with_intrinsics
 from bodycap_batch.mapping.intrinsics import intrinsics_check
+from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     ImageRef,
@@ -27,20 +29,24 @@ from bodycap_batch.mapping.matching.database import (
     read_image_ids,
     write_image,
 )
-from bodycap_batch.mapping.matching.pair_matching import match_pairs, find_mutual_matches
+from bodycap_batch.mapping.matching.pair_matching import find_mutual_matches, match_pairs
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, adjust_robustly
 from bodycap_batch.mapping.reconstruction.incremental_mapper import register_images
 from bodycap_batch.mapping.reconstruction.initial_pair import find_user_pair, rank_initial_pairs
-from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options, reconstruct
-from bodycap_batch.mapping.validation.epipolar_consistency import PairConsistency, find_misregistered_images, evaluate_pairs
-from bodycap_batch.mapping.validation.repair import remove_misregistered, re_register_images, repair_model
+from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
+from bodycap_batch.mapping.reconstruction.reconstruct import reconstruct
+from bodycap_batch.mapping.validation.epipolar_consistency import (
+    PairConsistency,
+    evaluate_pairs,
+    find_misregistered_images,
+)
+from bodycap_batch.mapping.validation.repair import re_register_images, remove_misregistered, repair_model
 from bodycap_batch.mapping.validation.transient_points import remove_transient_points
-from bodycap_batch.mapping.workspace import MappingContext
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import align_points, invert, make_transform, so3_exp
 
-_LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
-_LENSES = {"cam": (_LENS, True)}
+_CAMERA = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
+_INTRINSICS = {"cam": CameraIntrinsics(_CAMERA, calibrated=True)}
 _KEYFRAMES = 16
 _NUMBERS = {"cam": np.arange(30, 30 + _KEYFRAMES)}
 """Frames before start_s are counted, too: users name what they see in their video."""
@@ -75,7 +81,7 @@ def _workspace(folder: Path) -> FloatArray:
     camera = CaptureCamera(
         name="cam",
         chapters=(),
-        camera=_LENS,
+        camera=_CAMERA,
         calibrated=True,
         frame_numbers=np.arange(99),
         times_ns=np.arange(99) * 10**8,
@@ -87,7 +93,7 @@ def _workspace(folder: Path) -> FloatArray:
     with pycolmap.Database.open(str(folder / DATABASE_NAME)) as database:
         camera_id = add_camera(database, camera)
         for frame, pose in enumerate(poses):
-            pixels = _LENS.project(points @ pose[:3, :3].T + pose[:3, 3])
+            pixels = _CAMERA.project(points @ pose[:3, :3].T + pose[:3, 3])
             seen = np.flatnonzero(((pixels > 0) & (pixels < (640, 480))).all(axis=1))
             image_id = write_image(database, ImageRef("cam", frame), camera_id)
             noisy = pixels[seen] + rng.normal(0, 0.5, (len(seen), 2))
@@ -105,17 +111,17 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, FloatArray, Ma
     context = StageContext(work_dir=folder, threads=2)
     refs = [ImageRef("cam", frame) for frame in range(_KEYFRAMES)]
     pairs = [(a, b) for a in refs for b in refs if a < b and b.frame - a.frame <= 5]
-    assert len(match_pairs(folder, pairs, _LENSES, context)) > 50
-    shop = MappingContext(
+    assert len(match_pairs(folder, pairs, _INTRINSICS, context)) > 50
+    mapping = MappingContext(
         workspace=folder,
-        lenses=_LENSES,
-        settings=lambda: mapper_options(MapOptions(), [1], 1.0),
-        constant=[1],
-        context=context,
+        intrinsics=_INTRINSICS,
+        mapper_options=lambda: make_mapper_options(MapOptions(), [1], 1.0),
+        calibrated_ids=[1],
+        stage=context,
         frame_numbers=_NUMBERS,
     )
-    models, _ = reconstruct(folder, shop.settings(), context, _KEYFRAMES)
-    return models[0], poses, shop, set(pairs)
+    models, _ = reconstruct(folder, mapping.mapper_options(), context, _KEYFRAMES)
+    return models[0], poses, mapping, set(pairs)
 
 
 def _rms(model: Any, poses: FloatArray) -> float:
@@ -129,7 +135,7 @@ def _rms(model: Any, poses: FloatArray) -> float:
 def test_a_map_that_stands_is_adjusted_once_more(
     built: tuple[Any, FloatArray, MappingContext, set[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _, poses, shop, _ = built
+    _, poses, mapping, _ = built
     sizes: list[int] = []
     adjust_all = pycolmap.IncrementalMapper.iterative_global_refinement
 
@@ -138,10 +144,12 @@ def test_a_map_that_stands_is_adjusted_once_more(
         adjust_all(mapper, *arguments, **options)
 
     monkeypatch.setattr(pycolmap.IncrementalMapper, "iterative_global_refinement", counted)
-    settings, model = shop.settings(), pycolmap.Reconstruction()
-    settings.init_image_id1, settings.init_image_id2 = rank_initial_pairs(shop.workspace, shop.lenses)[0].ids
+    settings, model = mapping.mapper_options(), pycolmap.Reconstruction()
+    settings.init_image_id1, settings.init_image_id2 = rank_initial_pairs(
+        mapping.workspace, mapping.intrinsics
+    )[0].ids
     settings.mapper.init_min_tri_angle = 2.0
-    assert register_images(shop.workspace, settings, model, lambda: None)
+    assert register_images(mapping.workspace, settings, model, lambda: None)
     assert model.num_reg_images() == _KEYFRAMES
     assert _rms(model, poses) < 0.01
     assert sizes[-1] == _KEYFRAMES
@@ -152,14 +160,14 @@ def test_a_map_that_stands_is_adjusted_once_more(
 def test_an_empty_map_without_a_pair_to_begin_with_is_no_bug(tmp_path: Path) -> None:
     with pycolmap.Database.open(str(tmp_path / DATABASE_NAME)):
         pass
-    settings = mapper_options(MapOptions(), [], 1.0)
+    settings = make_mapper_options(MapOptions(), [], 1.0)
     assert not register_images(tmp_path, settings, pycolmap.Reconstruction(), lambda: None)
 
 
 def test_long_tracks_are_settled_by_conjugate_gradients_to_the_same_map(
     built: tuple[Any, FloatArray, MappingContext, set[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model, poses, shop, _ = built
+    model, poses, mapping, _ = built
     centres, solvers = [], []
     create = pycolmap.create_default_bundle_adjuster
 
@@ -169,9 +177,11 @@ def test_long_tracks_are_settled_by_conjugate_gradients_to_the_same_map(
 
     monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", noted)
     for limit in (0.0, np.inf):
-        monkeypatch.setattr("bodycap_batch.mapping.reconstruction.bundle_adjustment._MAX_DIRECT_TRACK_LENGTH", limit)
+        monkeypatch.setattr(
+            "bodycap_batch.mapping.reconstruction.bundle_adjustment._MAX_DIRECT_TRACK_LENGTH", limit
+        )
         settled = copy.deepcopy(model)
-        adjust_robustly(settled, shop.settings(), shop.constant)
+        adjust_robustly(settled, mapping.mapper_options(), mapping.calibrated_ids)
         assert _rms(settled, poses) < 0.01
         found = sorted(settled.reg_image_ids())
         centres.append(np.array([settled.image(image).projection_center() for image in found]))
@@ -182,11 +192,11 @@ def test_long_tracks_are_settled_by_conjugate_gradients_to_the_same_map(
 
 
 def test_a_right_map_is_left_alone(built: tuple[Any, FloatArray, MappingContext, set[Any]]) -> None:
-    model, poses, shop, pairs = built
+    model, poses, mapping, pairs = built
     assert model.num_reg_images() == _KEYFRAMES
     # Half a pixel at depth 4 and 420 px is 5 mm a point; a pose has dozens.
     assert _rms(model, poses) < 0.01
-    same, log = repair_model(model, set(pairs), shop)
+    same, log = repair_model(model, set(pairs), mapping)
     assert same is model
     assert log == {"rounds": [], "cut": [], "contradicted_share": 0.0}
 
@@ -194,12 +204,14 @@ def test_a_right_map_is_left_alone(built: tuple[Any, FloatArray, MappingContext,
 def test_a_misplaced_block_is_found_and_put_right(
     built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:
-    model, poses, shop, pairs = built
-    ids = {ref.frame: number for ref, number in _ids(shop).items()}
+    model, poses, mapping, pairs = built
+    ids = {ref.frame: number for ref, number in _ids(mapping).items()}
     wrong = _with_moved_block(model, ids)
     assert _rms(wrong, poses) > 0.1
-    assert find_misregistered_images(evaluate_pairs(shop.workspace, wrong)) == {ids[frame] for frame in _MOVED}
-    mended, log = repair_model(wrong, set(pairs), shop)
+    assert find_misregistered_images(evaluate_pairs(mapping.workspace, wrong)) == {
+        ids[frame] for frame in _MOVED
+    }
+    mended, log = repair_model(wrong, set(pairs), mapping)
     assert log["cut"] == []
     assert mended.num_reg_images() == _KEYFRAMES
     assert _rms(mended, poses) < 0.01
@@ -208,18 +220,18 @@ def test_a_misplaced_block_is_found_and_put_right(
 def test_what_cannot_be_put_right_is_cut_out(
     built: tuple[Any, FloatArray, MappingContext, set[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model, poses, shop, pairs = built
-    wrong = _with_moved_block(model, {ref.frame: number for ref, number in _ids(shop).items()})
+    model, poses, mapping, pairs = built
+    wrong = _with_moved_block(model, {ref.frame: number for ref, number in _ids(mapping).items()})
     # The mapper places it in the same wrong place again.
     module = sys.modules[repair_model.__module__]
-    monkeypatch.setattr(module, "extend", lambda *_: pycolmap.Reconstruction(wrong))
-    monkeypatch.setattr(module, "refine", lambda *_: None)
-    refs = sorted(_ids(shop))
-    alone, names = remove_misregistered(wrong, shop)
+    monkeypatch.setattr(module, "with_new_images", lambda *_, **__: pycolmap.Reconstruction(wrong))
+    monkeypatch.setattr(module, "adjust_and_filter", lambda *_: None)
+    refs = sorted(_ids(mapping))
+    alone, names = remove_misregistered(wrong, mapping)
     assert names == [f"cam/{frame:07d}" for frame in _MOVED]
     assert alone.num_reg_images() == _KEYFRAMES - len(_MOVED)
-    assert remove_misregistered(model, shop)[1] == []
-    cut, log = repair_model(wrong, pairs | {(a, b) for a in refs for b in refs if a < b}, shop)
+    assert remove_misregistered(model, mapping)[1] == []
+    cut, log = repair_model(wrong, pairs | {(a, b) for a in refs for b in refs if a < b}, mapping)
     assert log["cut"] == [f"cam/{frame:07d}" for frame in _MOVED]
     assert cut.num_reg_images() == _KEYFRAMES - len(_MOVED)
     assert _rms(cut, poses) < 0.01
@@ -228,10 +240,10 @@ def test_what_cannot_be_put_right_is_cut_out(
 def test_keyframes_are_placed_again_against_the_rest(
     built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:
-    model, poses, shop, _ = built
-    ids = {ref.frame: number for ref, number in _ids(shop).items()}
+    model, poses, mapping, _ = built
+    ids = {ref.frame: number for ref, number in _ids(mapping).items()}
     wrong = _with_moved_block(model, ids)
-    placed = re_register_images(wrong, {ids[frame] for frame in _MOVED}, shop, _KEYFRAMES)
+    placed = re_register_images(wrong, {ids[frame] for frame in _MOVED}, mapping, _KEYFRAMES)
     assert placed.num_reg_images() == _KEYFRAMES
     assert _rms(placed, poses) < 0.01
 
@@ -239,7 +251,7 @@ def test_keyframes_are_placed_again_against_the_rest(
 def test_points_of_a_moment_are_dropped_where_others_carry_the_keyframes(
     built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:
-    model, poses, shop, _ = built
+    model, poses, mapping, _ = built
     seen_ns = np.arange(_KEYFRAMES) * 300_000_000
     some = pycolmap.Reconstruction(model)
     before = {image: some.image(image).num_points3D for image in some.reg_image_ids()}
@@ -248,7 +260,7 @@ def test_points_of_a_moment_are_dropped_where_others_carry_the_keyframes(
     # Points seen in keyframes more than three apart are confirmed; all others that can be spared are gone.
     for image in some.reg_image_ids():
         assert some.image(image).num_points3D >= min(20, before[image])
-    adjust_and_filter(some, shop.settings(), shop.constant)
+    adjust_and_filter(some, mapping.mapper_options(), mapping.calibrated_ids)
     assert _rms(some, poses) < 0.01
     assert remove_transient_points(pycolmap.Reconstruction(model), {"cam": seen_ns * 10}) == 0
     # All in one moment: nothing is confirmed, so nothing can be spared.
@@ -259,7 +271,7 @@ def test_points_of_a_moment_are_dropped_where_others_carry_the_keyframes(
 def test_keypoints_that_lie_off_bend_no_settled_map(
     built: tuple[Any, FloatArray, MappingContext, set[Any]], share: float, gain: float
 ) -> None:
-    model, poses, shop, _ = built
+    model, poses, mapping, _ = built
     rng = np.random.default_rng(3)
     squared = pycolmap.Reconstruction(model)
     for image_id in squared.reg_image_ids():
@@ -268,8 +280,8 @@ def test_keypoints_that_lie_off_bend_no_settled_map(
             if point.has_point3D() and rng.random() < share:
                 point.xy = point.xy + rng.uniform(2.2, 3.2) * np.array([1.0, 0.5])
     settled = pycolmap.Reconstruction(squared)
-    adjust_and_filter(squared, shop.settings(), shop.constant)
-    adjust_robustly(settled, shop.settings(), shop.constant)
+    adjust_and_filter(squared, mapping.mapper_options(), mapping.calibrated_ids)
+    adjust_robustly(settled, mapping.mapper_options(), mapping.calibrated_ids)
     # Where noise is Gaussian throughout, a loss this narrow costs 1.4 times the error of squares.
     assert gain * _rms(settled, poses) < _rms(squared, poses)
     assert settled.num_points3D() > 0.9 * squared.num_points3D()
@@ -286,28 +298,30 @@ def _with_moved_block(model: Any, ids: dict[int, int]) -> Any:
     return wrong
 
 
-def _ids(shop: MappingContext) -> dict[ImageRef, int]:
-    with pycolmap.Database.open(str(shop.workspace / DATABASE_NAME)) as database:
+def _ids(mapping: MappingContext) -> dict[ImageRef, int]:
+    with pycolmap.Database.open(str(mapping.workspace / DATABASE_NAME)) as database:
         return read_image_ids(database)
 
 
 def test_starts_prefer_what_moved_sideways(built: tuple[Any, FloatArray, MappingContext, set[Any]]) -> None:
-    _, _, shop, _ = built
-    best = rank_initial_pairs(shop.workspace, _LENSES)
+    _, _, mapping, _ = built
+    best = rank_initial_pairs(mapping.workspace, _INTRINSICS)
     steps = [abs(int(a[-7:]) - int(b[-7:])) for a, b in (start.names for start in best)]
     # Neighbours 0.25 apart in front of a wall at 4 have 3.5 degrees of parallax, five steps more than 8.
     assert steps[0] >= 3
     assert best[-1].parallax_rad < best[0].parallax_rad
-    assert "parallax" in replace(best[0], parallax_rad=0.001).doubt
+    assert "parallax" in replace(best[0], parallax_rad=0.001).rejection_reason
 
 
 def test_keyframes_that_a_chosen_start_does_not_reach_make_a_model_of_their_own(tmp_path: Path) -> None:
     poses = _workspace(tmp_path)
     context = StageContext(work_dir=tmp_path, threads=1)
     halves = [[ImageRef("cam", frame) for frame in half] for half in (range(8), range(8, _KEYFRAMES))]
-    match_pairs(tmp_path, [(a, b) for half in halves for a in half for b in half if a < b], _LENSES, context)
-    start = rank_initial_pairs(tmp_path, _LENSES)[0]
-    settings = mapper_options(MapOptions(), [1], 1.0)
+    match_pairs(
+        tmp_path, [(a, b) for half in halves for a in half for b in half if a < b], _INTRINSICS, context
+    )
+    start = rank_initial_pairs(tmp_path, _INTRINSICS)[0]
+    settings = make_mapper_options(MapOptions(), [1], 1.0)
     models, ladder = reconstruct(tmp_path, settings, context, _KEYFRAMES, [start])
     assert ladder == [{**ladder[0], "models": [8, 8], "pair": list(start.names)}]
     held = [{model.image(number).name for number in model.reg_image_ids()} for model in models]
@@ -336,9 +350,9 @@ def test_a_start_on_the_side_that_leads_nowhere_loses_no_keyframes(tmp_path: Pat
     poses = _workspace(tmp_path)
     _link_one_way(tmp_path)
     context = StageContext(work_dir=tmp_path, threads=1)
-    start = find_user_pair(tmp_path, ("cam:31", "cam:35"), _LENSES, _NUMBERS)
+    start = find_user_pair(tmp_path, ("cam:31", "cam:35"), _INTRINSICS, _NUMBERS)
     assert start is not None
-    settings = mapper_options(MapOptions(), [1], 1.0)
+    settings = make_mapper_options(MapOptions(), [1], 1.0)
     models, _ = reconstruct(tmp_path, settings, context, _KEYFRAMES, [start])
     assert [model.num_reg_images() for model in models] == [_KEYFRAMES]
     assert _rms(models[0], poses) < 0.01
@@ -346,31 +360,33 @@ def test_a_start_on_the_side_that_leads_nowhere_loses_no_keyframes(tmp_path: Pat
 
 @pytest.mark.slow
 def test_a_named_start_is_used(built: tuple[Any, FloatArray, MappingContext, set[Any]]) -> None:
-    _, poses, shop, _ = built
-    start = find_user_pair(shop.workspace, ("cam:32", "cam:36"), _LENSES, _NUMBERS)
+    _, poses, mapping, _ = built
+    start = find_user_pair(mapping.workspace, ("cam:32", "cam:36"), _INTRINSICS, _NUMBERS)
     assert start is not None
     assert start.names == ("cam/0000002", "cam/0000006")
-    models, ladder = reconstruct(shop.workspace, shop.settings(), shop.context, _KEYFRAMES, [start])
+    models, ladder = reconstruct(
+        mapping.workspace, mapping.mapper_options(), mapping.stage, _KEYFRAMES, [start]
+    )
     assert ladder[-1]["pair"] == ["cam/0000002", "cam/0000006"]
     assert models[0].num_reg_images() == _KEYFRAMES
     assert _rms(models[0], poses) < 0.01
-    assert find_user_pair(shop.workspace, ("cam:30", "cam:45"), _LENSES, _NUMBERS) is None
+    assert find_user_pair(mapping.workspace, ("cam:30", "cam:45"), _INTRINSICS, _NUMBERS) is None
     with pytest.raises(JobError, match="one keyframe"):
-        find_user_pair(shop.workspace, ("cam:33", "cam:33"), _LENSES, _NUMBERS)
+        find_user_pair(mapping.workspace, ("cam:33", "cam:33"), _INTRINSICS, _NUMBERS)
     with pytest.raises(JobError, match="camera 'hat'"):
-        find_user_pair(shop.workspace, ("hat:33", "cam:33"), _LENSES, _NUMBERS)
+        find_user_pair(mapping.workspace, ("hat:33", "cam:33"), _INTRINSICS, _NUMBERS)
 
 
-def _guessed_shop(workspace: Path) -> MappingContext:
+def _uncalibrated_context(workspace: Path) -> MappingContext:
     """What maps the keyframes of `_workspace`, their lens being a guess."""
     _workspace(workspace)
     _link_one_way(workspace)
     return MappingContext(
         workspace=workspace,
-        lenses=_LENSES,
-        settings=lambda: mapper_options(MapOptions(), [], 1.0),
-        constant=[],
-        context=StageContext(work_dir=workspace, threads=1),
+        intrinsics=_INTRINSICS,
+        mapper_options=lambda: make_mapper_options(MapOptions(), [], 1.0),
+        calibrated_ids=[],
+        stage=StageContext(work_dir=workspace, threads=1),
         frame_numbers=_NUMBERS,
     )
 
@@ -382,12 +398,12 @@ def _radial() -> Camera:
 def test_a_named_start_is_used_again_where_a_guessed_lens_changes_its_model(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shop = _guessed_shop(tmp_path)
+    mapping = _uncalibrated_context(tmp_path)
     changed = _radial().to_pycolmap()
     changed.camera_id = 1
     monkeypatch.setattr(intrinsics_check, "select_camera_models", lambda *_: ({1: changed}, frozenset()))
     options = MapOptions(init_frames=("cam:31", "cam:35"))
-    models, log = reconstruct_with_intrinsics(shop, options, {1: "cam"}, _KEYFRAMES)
+    models, log = reconstruct_with_intrinsics(mapping, options, {1: "cam"}, _KEYFRAMES)
     assert log["better_lenses"] == {"cam": "RADIAL"}
     assert models[0].camera(1).model_name == "RADIAL"
     assert log["initial_pair_ladder"][0]["pair"] == ["cam/0000001", "cam/0000005"]
@@ -399,7 +415,7 @@ def test_only_a_centre_that_was_found_off_is_found_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, crop: float
 ) -> None:
     """A calibrated centre is hardly ever the very middle of the picture."""
-    shop = _guessed_shop(tmp_path)
+    mapping = _uncalibrated_context(tmp_path)
     with pycolmap.Database.open(str(tmp_path / DATABASE_NAME)) as database:
         camera = database.read_camera(1)
         camera.model, camera.params = pycolmap.CameraModelId.SIMPLE_RADIAL, [420.0, 321.5, 238.5, 0.0]
@@ -413,7 +429,9 @@ def test_only_a_centre_that_was_found_off_is_found_anew(
         return left * min(0.99, crop) if centre else left
 
     monkeypatch.setattr(intrinsics_check, "_adjustment_cost", cost)
-    _, log = reconstruct_with_intrinsics(shop, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam"}, _KEYFRAMES)
+    _, log = reconstruct_with_intrinsics(
+        mapping, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam"}, _KEYFRAMES
+    )
     assert log["better_lenses"] == {"cam": "RADIAL"}
     first_map = [False, False, False, True, False]
     assert freed_centre == first_map + ([False, True] if crop < 0.95 else [])
@@ -422,13 +440,15 @@ def test_only_a_centre_that_was_found_off_is_found_anew(
 def test_the_log_holds_what_both_looks_at_the_lenses_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shop = _guessed_shop(tmp_path)
+    mapping = _uncalibrated_context(tmp_path)
     looks = iter([({"cam": _radial(), "hat": _radial()}, {1}), ({"cam": _radial()}, {1})])
 
-    def change(*_: Any, **__: Any) -> tuple[dict[str, tuple[Camera, bool]], set[int]]:
+    def change(*_: Any, **__: Any) -> tuple[dict[str, CameraIntrinsics], set[int]]:
         found, decentred = next(looks)
-        return {name: (camera, False) for name, camera in found.items()}, decentred
+        return {name: CameraIntrinsics(camera, calibrated=False) for name, camera in found.items()}, decentred
 
-    monkeypatch.setattr(build, "change_lenses", change)
-    _, log = reconstruct_with_intrinsics(shop, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam", 2: "hat"}, _KEYFRAMES)
+    monkeypatch.setattr(initial_models, "update_camera_models", change)
+    _, log = reconstruct_with_intrinsics(
+        mapping, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam", 2: "hat"}, _KEYFRAMES
+    )
     assert log["better_lenses"] == {"cam": "RADIAL", "hat": "RADIAL"}

@@ -14,7 +14,7 @@ def _likeness(places: np.ndarray, reach: float) -> np.ndarray:
 
 
 def _spanning(places: np.ndarray, reach: float) -> np.ndarray:
-    return select_skeletal_keyframes(_likeness(places, reach), np.arange(len(places)), support=3)
+    return select_skeletal_keyframes(_likeness(places, reach), np.arange(len(places)), min_support=3)
 
 
 def test_a_room_seen_again_and_again_takes_no_more_than_once() -> None:
