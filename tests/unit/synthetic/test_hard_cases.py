@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from bodycap_batch.synthetic.filming import camera_at, joints_at
-from bodycap_batch.synthetic.making import build_films, draw_subject
+from bodycap_batch.synthetic.filming import camera_poses_at, joint_poses_at
+from bodycap_batch.synthetic.making import build_renderers, draw_subject
 from bodycap_batch.synthetic.options import SynthOptions
-from bodycap_batch.synthetic.render import View
+from bodycap_batch.synthetic.render import SceneRenderer
 from bodycap_batch.synthetic.room import build_room
 
 SMALL = {"width": 64, "height": 48, "seconds": 5.0, "body_in_view": True}
@@ -15,13 +15,15 @@ SMALL = {"width": 64, "height": 48, "seconds": 5.0, "body_in_view": True}
 def _body_shares(options, camera, times_s):
     """Share of a camera's picture that the wearer's own body covers, at each time."""
     subject = draw_subject(options)
-    film = next(film for film in build_films(options, subject) if film.mount.camera == camera)
+    renderer = next(
+        renderer for renderer in build_renderers(options, subject) if renderer.mount.camera == camera
+    )
     shares = []
     for t_s in times_s:
         at = np.array([t_s])
-        body = View(film.wearer.at(joints_at(film.motion, at)[0]), film.atlas)
-        pose = camera_at(film.motion, film.mount, at)[0]
-        image = body.image(film.grid, pose, slice(0, options.height))
+        body = SceneRenderer(renderer.wearer.at(joint_poses_at(renderer.motion, at)[0]), renderer.atlas)
+        pose = camera_poses_at(renderer.motion, renderer.mount, at)[0]
+        image = body.image(renderer.grid, pose, slice(0, options.height))
         shares.append(float((image.max(axis=-1) > 0).mean()))
     return np.array(shares)
 
@@ -47,7 +49,7 @@ def test_a_pressed_hand_moves_smoothly_and_changes_nothing_else():
     still = draw_subject(SynthOptions(**SMALL)).motion
     pressed = draw_subject(SynthOptions(**SMALL, pressed_s={"left_palm": (2.0, 3.0)})).motion
     t_s = np.arange(0.0, 5.0, 0.005)
-    joints = [joints_at(motion, t_s)[..., :3, 3] for motion in (still, pressed)]
+    joints = [joint_poses_at(motion, t_s)[..., :3, 3] for motion in (still, pressed)]
     moved = np.abs(joints[0] - joints[1]).max(axis=(0, 2))
     for name, most in zip(still.skeleton.joints, moved, strict=True):
         assert (most > 0.01) == (name in ("LeftForeArm", "LeftHand")), name

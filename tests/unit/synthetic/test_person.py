@@ -9,15 +9,15 @@ from bodycap_batch.model.geometry import invert, rotation_angle_rad
 from bodycap_batch.model.skeleton import Motion, forward_kinematics
 from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount, rest_positions
 from bodycap_batch.synthetic.clip import load_clip
-from bodycap_batch.synthetic.filming import camera_at
-from bodycap_batch.synthetic.gait import Habits, Walk
-from bodycap_batch.synthetic.person import draw_bearing, draw_body, draw_mounts
+from bodycap_batch.synthetic.filming import camera_poses_at
+from bodycap_batch.synthetic.gait import Walk, WalkStyle
+from bodycap_batch.synthetic.person import draw_body, draw_mounts, draw_posture
 
 
 @pytest.fixture(scope="module")
 def walk():
     body = draw_body(1.75, 0.05, np.random.default_rng(3))
-    return Walk(body, 12.0, Habits(), np.random.default_rng(4))
+    return Walk(body, 12.0, WalkStyle(), np.random.default_rng(4))
 
 
 def _poses(walk, t_s):
@@ -97,7 +97,7 @@ def test_the_walk_turns_steps_aside_and_reaches_at_human_rates(walk):
         ("torso", "left_palm", "right_palm"), walk.skeleton, (15.0, 0.05), np.random.default_rng(1)
     )
     for mount in mounts:
-        poses = camera_at(walk, mount, t_s)
+        poses = camera_poses_at(walk, mount, t_s)
         step = poses[:-1, :3, :3].transpose(0, 2, 1) @ poses[1:, :3, :3]
         rate = np.degrees(rotation_angle_rad(step)) * 120
         assert np.percentile(rate, 90) < 120
@@ -121,7 +121,7 @@ def test_the_motion_is_smooth(walk):
 def test_a_longer_capture_continues_the_same_walk():
     body = draw_body(1.75, 0.05, np.random.default_rng(3))
     t_s = np.linspace(0, 5, 20)
-    short, long = (Walk(body, s, Habits(), np.random.default_rng(4)).pose(t_s) for s in (6.0, 60.0))
+    short, long = (Walk(body, s, WalkStyle(), np.random.default_rng(4)).pose(t_s) for s in (6.0, 60.0))
     # The spline through more places differs by what reaches back over a lap: well below a millimetre.
     assert np.abs(short[0] - long[0]).max() < 1e-3
     assert np.abs(short[1] - long[1]).max() < 1e-3
@@ -129,7 +129,7 @@ def test_a_longer_capture_continues_the_same_walk():
 
 def test_somebody_who_turns_on_the_spot_hardly_travels():
     body = draw_body(1.75, 0.05, np.random.default_rng(3))
-    walk = Walk(body, 8.0, Habits(on_the_spot=True), np.random.default_rng(4))
+    walk = Walk(body, 8.0, WalkStyle(on_the_spot=True), np.random.default_rng(4))
     t_s = np.linspace(0, 8, 161)
     root = _poses(walk, t_s)[:, 0]
     assert np.ptp(root[:, :2, 3], axis=0).max() < 0.05
@@ -141,7 +141,7 @@ def test_somebody_who_turns_on_the_spot_hardly_travels():
 
 def test_a_t_pose_first():
     body = draw_body(1.75, 0.05, np.random.default_rng(3))
-    walk = Walk(body, 8.0, Habits(t_pose_s=2.0), np.random.default_rng(4))
+    walk = Walk(body, 8.0, WalkStyle(t_pose_s=2.0), np.random.default_rng(4))
     still = _poses(walk, np.linspace(0, 1.9, 10))
     left, right = (body.joints.index(f"{side}Hand") for side in ("Left", "Right"))
     span = still[:, left, :3, 3] - still[:, right, :3, 3]
@@ -196,10 +196,11 @@ def test_a_skeleton_without_motion_is_refused(tmp_path):
 
 def test_walkers_hold_their_joints_as_people_differ():
     body, t_s = draw_body(1.75, 0.05, np.random.default_rng(3)), np.array([3.0])
-    usual = Walk(body, 6.0, Habits(), np.random.default_rng(4)).pose(t_s)[1][0]
-    bearings = [draw_bearing(1.0, np.random.default_rng(seed)) for seed in range(60)]
+    usual = Walk(body, 6.0, WalkStyle(), np.random.default_rng(4)).pose(t_s)[1][0]
+    postures = [draw_posture(1.0, np.random.default_rng(seed)) for seed in range(60)]
     held = [
-        Walk(body, 6.0, Habits(bearing=each), np.random.default_rng(4)).pose(t_s)[1][0] for each in bearings
+        Walk(body, 6.0, WalkStyle(posture=each), np.random.default_rng(4)).pose(t_s)[1][0]
+        for each in postures
     ]
     turns = np.degrees(rotation_angle_rad(np.swapaxes(usual, -1, -2) @ np.array(held)))
     rms = np.sqrt((turns**2).mean(axis=0))
@@ -211,4 +212,4 @@ def test_walkers_hold_their_joints_as_people_differ():
     ):
         assert rms[body.joints.index(joint)] == pytest.approx(np.linalg.norm(sigmas), rel=0.2)
     assert rms[body.joints.index("LeftHand")] == 0.0
-    assert set(draw_bearing(0.0, np.random.default_rng(0)).values()) == {0.0}
+    assert set(draw_posture(0.0, np.random.default_rng(0)).values()) == {0.0}
