@@ -71,7 +71,7 @@ class SynthOptions(Options):
     on_the_spot: bool = Field(
         False, description="the built-in walker stands and turns to both sides: hardly any parallax"
     )
-    furnished: bool = Field(True, description="False: a bare room, with nothing but what hangs on its walls")
+    furnished: bool = Field(True, description="False: a bare room, with pictures on its walls only")
     repeated_posters: bool = Field(False, description="hang one and the same poster in several places")
     pressed_s: Mapping[str, tuple[float, float]] = Field(
         default_factory=dict,

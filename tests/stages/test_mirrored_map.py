@@ -1,4 +1,4 @@
-"""Maps of captures in which a camera's picture is flipped."""
+"""Maps of captures with a flipped picture."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FRAMES = 40
 
 @pytest.fixture(scope="module")
 def flipped_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    """Three cameras, of which the palm's picture is flipped."""
+    """Three cameras; the palm's picture is flipped."""
     folder = tmp_path_factory.mktemp("flipped")
     paths = stroll(FRAMES)
     head = paths["torso"].copy()
@@ -54,7 +54,7 @@ def _without(capture: Capture, name: str) -> Capture:
     return replace(capture, cameras=tuple(each for each in capture.cameras if each.name != name))
 
 
-def test_without_the_flipped_camera_the_map_is_that_of_the_others(
+def test_the_map_is_the_same_as_without_the_flipped_camera(
     flipped_capture: Capture,
     selections: dict[str, KeyframeSelection],
     tmp_path: Path,
@@ -81,7 +81,7 @@ def test_without_the_flipped_camera_the_map_is_that_of_the_others(
     assert {key: each for key, each in found.log.items() if key in alone.log} == alone.log
 
 
-def test_two_cameras_that_see_mirror_images_are_mapped_each_for_itself(
+def test_two_cameras_that_see_mirror_images_get_a_map_each(
     flipped_capture: Capture, selections: dict[str, KeyframeSelection], tmp_path: Path
 ) -> None:
     two = [each for each in selections.values() if each.camera != "head"]

@@ -1,4 +1,4 @@
-"""A final adjustment that fails is an error, never a map."""
+"""A failed adjustment is an error, never a map."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_opti
 
 
 class _Failing:
-    """An adjuster, and its summary, that found nothing usable."""
+    """An adjuster and its summary, without a usable solution."""
 
     def solve(self) -> _Failing:
         return self

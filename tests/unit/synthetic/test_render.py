@@ -1,4 +1,4 @@
-"""The renderer against OpenCV's projection: corners of a marker must appear where the truth says."""
+"""The renderer agrees with OpenCV's projection: corners of a marker appear at their true positions."""
 
 from dataclasses import replace
 
@@ -21,12 +21,12 @@ SQUARES, TEXELS = 6, 40
 SIDE_M = 1.2
 WIDTH, HEIGHT = 320, 240
 FOCAL = 210.0
-# Facing +Z of the world from 1.6 m: x right, y down, as the marker is drawn.
+# Looking along +Z of the world from 1.6 m: x right, y down, as the marker is drawn.
 LOOKING = make_transform(np.eye(3), [0.0, 0.0, -1.6])
 
 
 def _board():
-    """A checkerboard in the plane z = 0, its middle at the origin, seen upright from −z."""
+    """Return a checkerboard in the plane z = 0 with its middle at the origin, upright when seen from −z."""
     squares = np.indices((SQUARES, SQUARES)).sum(axis=0) % 2
     grey = np.kron(40 + 170 * squares, np.ones((TEXELS, TEXELS))).astype(np.uint8)
     half = SIDE_M / 2
@@ -39,7 +39,7 @@ def _board():
 
 
 def _corners():
-    """World positions (N,3) of the corners between squares."""
+    """Return the world positions (N,3) of the corners between squares."""
     ticks = (np.arange(1, SQUARES) / SQUARES - 0.5) * SIDE_M
     x, y = np.meshgrid(ticks, ticks)
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
@@ -61,7 +61,7 @@ def _lens(params=(FOCAL, FOCAL, 160.0, 120.0), model="PINHOLE"):
 
 
 def _predicted(world_from_cam, distortion=()):
-    """Where OpenCV puts the corners, in its own pixels (the first one's centre is 0, 0)."""
+    """Return the corners projected by OpenCV, in its pixels (the first one's centre is 0, 0)."""
     cam_from_world = invert(world_from_cam)
     matrix = np.array([[FOCAL, 0, 159.5], [0, FOCAL, 119.5], [0, 0, 1.0]])
     turn, _ = cv2.Rodrigues(cam_from_world[:3, :3])
@@ -72,7 +72,7 @@ def _predicted(world_from_cam, distortion=()):
 
 
 def _found(image, near):
-    """Corners measured in an image, from a start near them."""
+    """Return the corners measured in an image, given positions near them."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     start = np.ascontiguousarray(near[:, None], dtype=np.float32)
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
@@ -102,7 +102,7 @@ def test_marker_corners_appear_where_opencv_projects_them(board, turn_deg, centr
     seen = _inside(predicted)
     assert seen.sum() >= 9
     error = _found(image, predicted[seen]) - predicted[seen]
-    # A saddle is found to a few hundredths of a pixel; a wrong pixel origin would shift all by half a pixel.
+    # A corner is found to a few hundredths of a pixel; a wrong pixel origin would shift all by half a pixel.
     assert np.abs(error).max() < 0.1
     assert np.abs(error.mean(axis=0)).max() < 0.03
 
@@ -150,7 +150,7 @@ def test_rolling_shutter_exposes_each_row_at_its_own_time(board, shown):
     renderer = _renderer(board, speed, rolling_shutter_s=shutter, wearer=_nobody() if shown else None)
     image = renderer.render(0.0)
     still = _predicted(LOOKING)
-    # Row r sees the world from x = speed · (r/h − ½) · shutter: points move the other way. Row r's centre is
+    # Row r is exposed at x = speed · (r/h − ½) · shutter; points move the other way. Row r's centre is
     # r in OpenCV's pixels, r + ½ in COLMAP's.
     moved = speed * ((still[:, 1] + 0.5) / HEIGHT - 0.5) * shutter
     predicted = still - np.column_stack([moved * FOCAL / 1.6, 0 * moved])
@@ -160,7 +160,7 @@ def test_rolling_shutter_exposes_each_row_at_its_own_time(board, shown):
 
 
 def _nobody():
-    """A wearer far out of sight, so that the body's bands are rendered."""
+    """Return a wearer out of view; it makes the renderer use bands of rows."""
 
     class Nobody:
         def at(self, world_from_joint):
@@ -171,7 +171,7 @@ def _nobody():
     return Nobody()
 
 
-def test_what_is_nearer_hides_what_is_farther():
+def test_near_surfaces_hide_far_ones():
     near = replace(
         _board(),
         corner=np.array([-0.3, -0.3, -0.5]),
@@ -185,7 +185,7 @@ def test_what_is_nearer_hides_what_is_farther():
         ray_grid(_lens()), LOOKING, slice(0, HEIGHT)
     )
     assert (image[100:140, 140:180] == 250).all()
-    # 0.3 m at 1.1 m: 57.3 px from the middle. Its border falls inside the 218th pixel, which is a mixture.
+    # 0.3 m at 1.1 m is 57.3 px from the middle. The border lies inside the 218th pixel, which is a mixture.
     assert (image[120, 160:216] == 250).all()
     assert (image[120, 219:225] < 250).all()
 
@@ -214,11 +214,11 @@ def test_distant_fine_texture_averages_out():
         ray_grid(_lens()), looking, slice(0, HEIGHT)
     )
     inside = image[108:132, 148:172].astype(float)
-    # 15 texels a pixel: what is left of stripes of 0 and 200 is their mean, to rounding.
+    # With 15 texels per pixel, stripes of 0 and 200 appear as their mean, up to rounding.
     assert np.abs(inside - 100).max() <= 2
 
 
-def test_atlas_images_do_not_bleed_into_each_other():
+def test_images_in_the_atlas_do_not_mix():
     images = [np.full((h, w, 3), v, np.uint8) for h, w, v in ((5, 70, 10), (64, 3, 130), (33, 33, 250))]
     atlas = Atlas(images)
     for image, origin in zip(images, atlas.origins, strict=True):
@@ -229,7 +229,7 @@ def test_atlas_images_do_not_bleed_into_each_other():
             assert (atlas.sample(at, select_filter(footprint)) == image[0, 0]).all()
 
 
-def test_noise_has_the_strength_asked_for_and_differs_between_frames():
+def test_noise_has_the_requested_strength_and_differs_between_frames():
     grey = np.full((100, 100, 3), 128, np.uint8)
     sensor = Sensor(4.0, grey.size, np.random.SeedSequence(5))
     first, second = (sensor.record(grey, frame).astype(float) for frame in (0, 1))
@@ -244,7 +244,7 @@ def test_noise_has_the_strength_asked_for_and_differs_between_frames():
     assert len(np.unique(clean.reshape(-1, 3), axis=0)) == 1
 
 
-def test_the_wearers_arm_is_seen_where_its_joints_are():
+def test_the_wearers_arm_appears_at_its_joints():
     skeleton = load_skeleton("full_body", 1.75)
     wearer = Wearer(skeleton, np.random.SeedSequence(1))
     atlas = Atlas(wearer.images)
