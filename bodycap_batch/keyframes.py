@@ -1,4 +1,4 @@
-"""Stage 1: keyframes by rotation-free parallax, track survival and sharpness."""
+"""Stage 1: select keyframes by rotation-free parallax, track survival and sharpness."""
 
 from __future__ import annotations
 
@@ -27,17 +27,38 @@ from bodycap_batch.model.optical_flow import (
 from bodycap_batch.model.scene import KeyframeSelection
 
 _CORNERS = 120
+"""Corners that are tracked from each keyframe. Evidence: none."""
 _CORNER_SPACING_PX = 12.0
+"""Smallest distance of two corners, px at a long side of 640 px. Evidence: none."""
 _WINDOW_PX = 11
+"""Width of the tracker's window, px of the reduced image. Evidence: none."""
 _MIN_TRACKS = 12
-_PASSING = 0.05
-"""What the mere passing of `max_gap_s` counts for beside what is seen, where a budget has to choose."""
+"""Tracks that a parallax needs. Evidence: none."""
+_ROTATION_ROUNDS = 3
+"""Rounds of the robust rotation fit. Evidence: none."""
+_NOVELTY_PER_MAX_GAP = 0.05
+"""Novelty of a keyframe for each `max_gap_s` since the last one. It decides between keyframes that show
+equally little. Evidence: none."""
+_MIN_RELATIVE_SURVIVAL = 0.5
+"""Survival of a candidate's tracks, relative to the oldest candidate's, below which it is not selected.
+Evidence: none."""
 _NOISE_SAMPLES = 20_000
+"""Track steps that the noise is estimated from, about. More change nothing."""
+_RAYLEIGH_MEDIAN = 1.177
+"""Median of a Rayleigh distribution in its sigmas: sqrt(2 ln 2)."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
-    """A recent frame that may still become a keyframe."""
+    """A recent frame that may still become a keyframe.
+
+    Attributes:
+        index: Frame index.
+        image: The reduced image.
+        sharpness: Sharpness of the frame, arbitrary unit.
+        survival: Ratio of the last keyframe's corners that are still tracked.
+        shot: The frame as it was read.
+    """
 
     index: int
     image: GreyImage
@@ -47,10 +68,20 @@ class _Candidate:
 
 
 @dataclass(slots=True)
-class _Tracker:
-    """Tracks from the last keyframe to the newest frame, followed in reduced images.
+class _KeyframeTracker:
+    """Tracks corners from the last keyframe to the newest frame, in reduced images.
 
-    Their noise there is small beside a keyframe's parallax, and they cost a quarter.
+    Tracking in reduced images costs a quarter. Its noise is small compared with the parallax of a keyframe.
+
+    Attributes:
+        camera: Intrinsics of the full image.
+        mask: True where the reduced image shows the room; None: everywhere.
+        start_rays: (N,3) unit directions of the tracked corners in the last keyframe.
+        px: (N,2) their positions in the newest frame, px of the reduced image.
+        image: The newest reduced image.
+        started: Number of corners in the last keyframe.
+        round_trips: Errors of forward and backward tracking, px of the full image.
+        kept_samples: Number of these errors.
     """
 
     camera: Camera
@@ -63,7 +94,7 @@ class _Tracker:
     kept_samples: int = 0
 
     def restart(self, image: GreyImage) -> None:
-        """Begin at a new keyframe."""
+        """Detect corners in a new keyframe and forget all tracks."""
         spacing = _CORNER_SPACING_PX * pixel_scale(image.shape[1], image.shape[0])
         self.px = detect_corners(image, _CORNERS, spacing, self.mask)
         self.image = image
@@ -71,29 +102,33 @@ class _Tracker:
         self.started = len(self.px)
 
     def step(self, image: GreyImage) -> None:
-        """Follow the tracks into the next frame."""
+        """Track the corners into the next frame."""
         before = image if self.image is None else self.image
         flow = track_points(before, image, self.px, window_px=_WINDOW_PX)
         self.px, self.start_rays = flow.px[flow.ok], self.start_rays[flow.ok]
         if self.kept_samples < _NOISE_SAMPLES:
-            self.round_trips.append(flow.round_trip_px[flow.ok] * self._enlarged(image))
+            self.round_trips.append(flow.round_trip_px[flow.ok] * self._full_scale(image))
             self.kept_samples += int(flow.ok.sum())
         self.image = image
 
-    def _enlarged(self, image: GreyImage) -> float:
+    def _full_scale(self, image: GreyImage) -> float:
+        """Return the size of the full image relative to a reduced one."""
         return float(self.camera.width_px / image.shape[1])
 
     def _rays(self) -> FloatArray:
+        """Return the unit directions (N,3) of the tracked corners in the newest frame."""
         if self.image is None:
             return np.zeros((0, 3))
-        return unit_directions(self.camera.unproject(self.px.astype(np.float64) * self._enlarged(self.image)))
+        return unit_directions(
+            self.camera.unproject(self.px.astype(np.float64) * self._full_scale(self.image))
+        )
 
     def survival(self) -> float:
-        """Share of the keyframe's corners still tracked."""
+        """Return the ratio of the keyframe's corners that are still tracked."""
         return len(self.px) / self.started if self.started else 0.0
 
     def parallax_px(self) -> float:
-        """Median displacement that no rotation explains, in pixels at the image centre."""
+        """Return the median displacement that no rotation explains, in pixels at the image centre."""
         if len(self.px) < _MIN_TRACKS:
             return 0.0
         rays = self._rays()
@@ -101,15 +136,15 @@ class _Tracker:
         if usable.sum() < _MIN_TRACKS:
             return 0.0
         first, second = self.start_rays[usable], rays[usable]
-        rotation = fit_rotation(first, second, iterations=3)
+        rotation = fit_rotation(first, second, iterations=_ROTATION_ROUNDS)
         return float(np.median(np.linalg.norm(second - first @ rotation.T, axis=1))) * self.camera.focal_px
 
     def noise_px(self) -> float:
-        """One standard deviation, per axis, of a single track step."""
+        """Return the standard deviation of one track step along an axis, px of the full image."""
         if not self.kept_samples:
             return 0.0
-        # A Rayleigh variable's median is 1.177 σ; the round trip adds two steps' noise.
-        return float(np.median(np.concatenate(self.round_trips)) / (1.177 * np.sqrt(2.0)))
+        # The error of a round trip is a Rayleigh variable with the noise of two steps.
+        return float(np.median(np.concatenate(self.round_trips)) / (_RAYLEIGH_MEDIAN * np.sqrt(2.0)))
 
 
 def select_keyframes(
@@ -118,16 +153,16 @@ def select_keyframes(
     context: StageContext,
     keeper: FrameKeeper | None = None,
 ) -> KeyframeSelection:
-    """Choose the frames of one camera that the map is built from.
+    """Select the frames of one camera that the map is built from.
 
-    A keyframe is due once the scene moved by `parallax_px` beyond what a rotation explains, too few
-    tracks survive, or `max_gap_s` has passed; the sharpest of the last frames is then taken.
+    A keyframe is due once the image moved by `parallax_px` more than a rotation explains, too few tracks
+    survive, or `max_gap_s` has passed. Then the sharpest of the last frames is selected.
 
     Args:
-        camera: The camera's video, calibrated.
-        options: Thresholds; pixels are for a 640 px long side.
+        camera: The camera with its video.
+        options: Thresholds; pixels are for a long side of 640 px.
         context: Progress and cancellation.
-        keeper: Where given, it is shown every frame and those that are chosen.
+        keeper: Receives every frame and every keyframe, if given.
 
     Raises:
         CaptureError: The camera has no frames.
@@ -138,52 +173,52 @@ def select_keyframes(
         raise CaptureError("no frames to work on", path=camera.chapters[0], hint="check start_s and end_s")
     limit_px = options.parallax_px * pixel_scale(camera.camera.width_px, camera.camera.height_px)
     sharp = np.zeros(count)
-    chosen: list[int] = []
+    selected: list[int] = []
     novelty = [0.0]
-    tracker = _Tracker(camera.camera, _coarse_mask(camera))
+    tracker = _KeyframeTracker(camera.camera, _coarse_mask(camera))
     recent: deque[_Candidate] = deque(maxlen=options.window)
-    see, keep = (_no_keeping, _no_keeping) if keeper is None else (keeper.add_frame, keeper.add_keyframe)
+    see, keep = (_ignore, _ignore) if keeper is None else (keeper.add_frame, keeper.add_keyframe)
     for shot in camera.frame_candidates():
         context.check_cancelled()
         index = shot.index
         sharp[index] = sharpness(shot.grey)
         image = make_coarse_image(shot.grey)
         see(shot)
-        if not chosen:
-            chosen.append(index)
+        if not selected:
+            selected.append(index)
             keep(shot)
             tracker.restart(image)
         else:
             tracker.step(image)
             recent.append(_Candidate(index, image, sharp[index], tracker.survival(), shot))
-            gap_s = times_s[index] - times_s[chosen[-1]]
+            gap_s = times_s[index] - times_s[selected[-1]]
             if _is_due(tracker, gap_s, limit_px, options):
-                seen = max(1.0 - tracker.survival(), tracker.parallax_px() / limit_px)
-                novelty.append(seen + _PASSING * gap_s / options.max_gap_s)
-                best = _take_sharpest(recent, tracker)
-                chosen.append(best.index)
+                change = max(1.0 - tracker.survival(), tracker.parallax_px() / limit_px)
+                novelty.append(change + _NOVELTY_PER_MAX_GAP * gap_s / options.max_gap_s)
+                best = _restart_at_sharpest(recent, tracker)
+                selected.append(best.index)
                 keep(best.shot)
         if index % 30 == 0:
             context.progress(index, count, "frames")
-    if chosen[-1] != count - 1:
-        chosen.append(count - 1)
+    if selected[-1] != count - 1:
+        selected.append(count - 1)
         keep(shot)
         novelty.append(0.0)
     context.progress(count, count, "frames")
     if options.max_per_min is not None:
         minutes = (times_s[-1] - times_s[0]) / 60.0
-        chosen = _within_budget(chosen, novelty, max(2, int(np.ceil(options.max_per_min * minutes))))
+        selected = _limit_keyframes(selected, novelty, max(2, int(np.ceil(options.max_per_min * minutes))))
     return KeyframeSelection(
         camera=camera.name,
-        frames=np.array(chosen, dtype=np.int64),
+        frames=np.array(selected, dtype=np.int64),
         frame_count=count,
         sharpness=sharp,
         noise_px=tracker.noise_px(),
     )
 
 
-def _is_due(tracker: _Tracker, gap_s: float, limit_px: float, options: KeyframeOptions) -> bool:
-    """Whether a keyframe is due after so much time since the last one."""
+def _is_due(tracker: _KeyframeTracker, gap_s: float, limit_px: float, options: KeyframeOptions) -> bool:
+    """Return whether a keyframe is due, `gap_s` seconds after the last one."""
     return (
         gap_s >= options.max_gap_s
         or tracker.survival() < options.min_survival
@@ -191,36 +226,43 @@ def _is_due(tracker: _Tracker, gap_s: float, limit_px: float, options: KeyframeO
     )
 
 
-def _within_budget(chosen: list[int], novelty: list[float], most: int) -> list[int]:
-    """Leave out keyframes, never the first or last, until `most` are left.
+def _limit_keyframes(selected: list[int], novelty: list[float], limit: int) -> list[int]:
+    """Remove the least novel keyframes, never the first or the last, until `limit` are left.
 
     Args:
-        chosen: Frame indices.
-        novelty: How much each shows that the one before it did not; it adds up where one is left out.
-        most: How many may stay.
+        selected: Frame indices of the keyframes.
+        novelty: How much each keyframe shows that the one before it does not. If a keyframe is removed, its
+            novelty is added to the next one's.
+        limit: Largest number of keyframes; two are always kept.
     """
-    kept, news = list(chosen), list(novelty)
-    while len(kept) > max(2, most):
-        step = [news[at] + news[at + 1] for at in range(1, len(kept) - 1)]
-        least = int(np.argmin(step)) + 1
-        news[least + 1] += news[least]
-        del kept[least], news[least]
+    kept, remaining = list(selected), list(novelty)
+    while len(kept) > max(2, limit):
+        combined = [remaining[at] + remaining[at + 1] for at in range(1, len(kept) - 1)]
+        least = int(np.argmin(combined)) + 1
+        remaining[least + 1] += remaining[least]
+        del kept[least], remaining[least]
     return kept
 
 
 def _coarse_mask(camera: CaptureCamera) -> BoolArray | None:
+    """Return the camera's mask at the size of reduced images; None without a mask."""
     if camera.mask is None:
         return None
     return np.asarray(make_coarse_image(np.where(camera.mask, 255, 0).astype(np.uint8)) > 127)
 
 
-def _no_keeping(_: FrameCandidate) -> None:
-    """Keep nothing."""
+def _ignore(_: FrameCandidate) -> None:
+    """Do nothing."""
 
 
-def _take_sharpest(recent: deque[_Candidate], tracker: _Tracker) -> _Candidate:
-    """Pick the sharpest recent frame that still sees what the keyframe saw; restart the tracks there."""
-    usable = [frame for frame in recent if frame.survival >= 0.5 * recent[0].survival]
+def _restart_at_sharpest(recent: deque[_Candidate], tracker: _KeyframeTracker) -> _Candidate:
+    """Return the sharpest recent frame that still shows what the keyframe shows, and restart tracks there.
+
+    Args:
+        recent: Candidates in time order; those up to the returned one are removed.
+        tracker: Restarted at the returned frame and advanced to the newest one.
+    """
+    usable = [frame for frame in recent if frame.survival >= _MIN_RELATIVE_SURVIVAL * recent[0].survival]
     best = max(usable, key=lambda frame: frame.sharpness)
     tracker.restart(best.image)
     while recent and recent[0].index <= best.index:

@@ -29,7 +29,7 @@ class Room:
 
     @staticmethod
     def make(seed: int = 0) -> Room:
-        """Patterns of blobs at several scales, different on every face."""
+        """Return a room with patterns of blobs at several scales, different on every face."""
         rng = np.random.default_rng(seed)
         faces = np.zeros((6, TEXTURE_PX, TEXTURE_PX), np.float32)
         for face, cells in product(faces, (7, 17, 41, 90)):
@@ -42,7 +42,7 @@ class Room:
         return Room(np.stack([cv2.GaussianBlur(face, (0, 0), 1.2) for face in faces]) * 60 + 8)
 
     def view(self, camera: Camera, world_from_cam: np.ndarray) -> np.ndarray:
-        """Grey image (H,W) uint8 from a pose inside the room."""
+        """Return a grey image (H,W) uint8 from a pose inside the room."""
         column, row = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
         rays = camera.unproject(np.column_stack([column.ravel(), row.ravel()]))
         ray = np.column_stack([rays, np.ones(len(rays))]) @ world_from_cam[:3, :3].T
@@ -65,13 +65,13 @@ class Room:
 
 
 def look(forward_yaw_rad: float, pitch_rad: float = 0.0) -> np.ndarray:
-    """world_from_cam rotation (3,3): forward at a yaw about Z from +X, nose up by pitch; image down is −Z."""
+    """Return a rotation world_from_cam (3,3): forward at a yaw about Z from +X, upwards by the pitch."""
     level = np.column_stack([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
     return so3_exp([0, 0, forward_yaw_rad]) @ so3_exp([0, -pitch_rad, 0]) @ level
 
 
 def stroll(count: int) -> dict[str, np.ndarray]:
-    """Poses (N,4,4) of two body cameras at 30 Hz: the body walks and turns, the palm swings beside it."""
+    """Return poses (N,4,4) of two body cameras at 30 Hz: the body walks and turns, the palm swings."""
     t = np.arange(count) / 30.0
     body = np.stack([-1.2 + 0.7 * t, 0.5 * np.sin(1.3 * t), 0.05 * np.sin(7 * t)], axis=1)
     palm = body + np.stack([0.25 * np.sin(4 * t), -0.3 + 0 * t, -0.35 + 0.1 * np.cos(4 * t)], axis=1)
@@ -90,7 +90,7 @@ def write_capture(
     seed: int = 0,
     fps: int = 30,
 ) -> Capture:
-    """Render a folder capture and open it; frames in `black` are dark."""
+    """Render a capture into a folder and open it; frames in `black` are dark."""
     room = Room.make(seed)
     camera = Camera(model="PINHOLE", width_px=320, height_px=240, params=np.array(LENS["params"]))
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""Small exact scenes for tests of what comes after mapping."""
+"""Small exact maps for tests of the stages after mapping."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bodycap_batch.model.scene import Map
 
 
 def small_map(gauge: str = "map-0", *, seed: int = 11, points: int = 60, noise_px: float = 0.0) -> Map:
-    """Two cameras with three and two keyframes that look at one cloud; observations exact up to noise."""
+    """Return a map of two cameras with three and two keyframes and one cloud of points."""
     rng = np.random.default_rng(seed)
     lens = {
         "torso": Camera(

@@ -31,10 +31,11 @@ LAYERS = (
 
 SUBLAYERS: dict[str, Sequence[set[str]]] = {
     "mapping": (
+        {"camera_intrinsics"},
         {"matching"},
         {"reconstruction"},
-        {"intrinsics", "workspace"},
-        {"validation"},
+        {"intrinsics", "mapping_context"},
+        {"validation", "initial_models"},
         {"inputs"},
         {"results"},
         {"build", "extend", "refine"},

@@ -1,4 +1,4 @@
-"""Stage 2, again: add keyframes to a map."""
+"""Stage 2 again, after registration: add keyframes to a map."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.mapping.inputs import (
-    common_times_ns,
     calibrated_camera_ids,
+    common_times_ns,
     intrinsics_of,
     make_mapping_context,
 )
 from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
+    CameraKeyframes,
     ImageRef,
     add_keyframes,
     read_camera_ids,
@@ -27,9 +28,9 @@ from bodycap_batch.mapping.matching.database import (
 )
 from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_keyframes
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
-from bodycap_batch.mapping.reconstruction.reconstruct import MODELS_FOLDER, write_models
-from bodycap_batch.mapping.results import make_result, finalise_models
-from bodycap_batch.mapping.validation.repair import remove_misregistered, re_register_images
+from bodycap_batch.mapping.reconstruction.models import read_model, registered_ids, write_models
+from bodycap_batch.mapping.results import finalise_models, make_result
+from bodycap_batch.mapping.validation.repair import re_register_images, remove_misregistered
 from bodycap_batch.model.scene import MapResult
 
 
@@ -39,20 +40,23 @@ def extend_map(
     extra_frames: Mapping[str, IntArray],
     options: MapOptions,
     context: StageContext,
+    *,
+    skeletal_above: int = SKELETAL_ABOVE,
 ) -> MapResult:
-    """Add keyframes to a map: existing poses are held while the new ones register, then all are refined.
+    """Add keyframes to a map: existing poses stay while the new ones are registered, then all are adjusted.
 
-    Keyframes that contradict the map afterwards are cut out.
+    Keyframes that are misregistered afterwards are removed.
 
     Args:
         capture: All cameras.
         previous: The map so far; its workspace is copied, not changed.
-        extra_frames: Frame indices by camera: new keyframes, and old ones to be taken out and placed again.
+        extra_frames: Frame indices by camera: new keyframes, and old ones to be removed and registered again.
         options: The stage's options.
         context: Work folder, threads, progress.
+        skeletal_above: Number of keyframes above which only new keyframes are adjusted.
 
     Returns:
-        The grown models, each in a new gauge.
+        The extended models, each in a new gauge.
     """
     import pycolmap
 
@@ -60,40 +64,45 @@ def extend_map(
     workspace = context.work_dir / "workspace"
     shutil.copytree(previous.workspace, workspace)
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
-        known = read_image_ids(database)
-    cameras = read_camera_ids(workspace)
-    new = [ref for ref in _refs(extra_frames) if ref not in known]
-    wanted = [
-        (capture.camera(name), cameras[name], np.array(sorted(r.frame for r in new if r.camera == name)))
+        existing = read_image_ids(database)
+    ids = read_camera_ids(workspace)
+    new = [ref for ref in _image_refs(extra_frames) if ref not in existing]
+    keyframes = [
+        CameraKeyframes(
+            capture.camera(name), ids[name], np.array(sorted(ref.frame for ref in new if ref.camera == name))
+        )
         for name in sorted({ref.camera for ref in new})
     ]
-    add_keyframes(workspace, wanted, options, context)
-    chooser = PairGenerator(workspace, new, common_times_ns(capture), options, context)
-    _, linked = match_keyframes(chooser, workspace, intrinsics_of(capture), context)
-    constant = calibrated_camera_ids(capture, cameras)
-    doubted = {known[ref] for ref in _refs(extra_frames) if ref in known}
-    shop = make_mapping_context(workspace, capture, options, constant, context)
-    models, cut, placed = [], list[str](), list[set[int] | None]()
+    add_keyframes(workspace, keyframes, options, context)
+    generator = PairGenerator(workspace, new, common_times_ns(capture), options, context)
+    _, match_log = match_keyframes(generator, workspace, intrinsics_of(capture), context)
+    calibrated_ids = calibrated_camera_ids(capture, ids)
+    again = {existing[ref] for ref in _image_refs(extra_frames) if ref in existing}
+    mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, skeletal_above)
+    models, removed, resected = [], list[str](), list[set[int] | None]()
     for number in range(len(previous.maps)):
-        model = pycolmap.Reconstruction(str(workspace / MODELS_FOLDER / str(number)))
-        standing = set(map(int, model.reg_image_ids())) - doubted
-        inside = set(map(int, model.reg_image_ids())) & doubted
-        model, names = remove_misregistered(
-            re_register_images(model, inside, shop, len(known) + len(new)), shop
-        )
+        model = read_model(workspace, number)
+        kept = registered_ids(model) - again
+        inside = registered_ids(model) & again
+        extended = re_register_images(model, inside, mapping, len(existing) + len(new))
+        model, names = remove_misregistered(extended, mapping)
         models.append(model)
-        cut += names
-        placed.append(
-            set(map(int, model.reg_image_ids())) - standing if len(standing) > SKELETAL_ABOVE else None
-        )
-    dropped = finalise_models(models, shop, capture, placed)
+        removed += names
+        resected.append(registered_ids(model) - kept if mapping.is_large(len(kept)) else None)
+    transient = finalise_models(models, mapping, capture, resected)
     write_models(workspace, models)
-    told = {"placed_again": len(doubted), "cut": cut, "unconfirmed_points": dropped}
-    entry = {"new_keyframes": len(new), **told, **linked}
+    entry = {
+        "new_keyframes": len(new),
+        "placed_again": len(again),
+        "cut": removed,
+        "unconfirmed_points": transient,
+        **match_log,
+    }
     growth = [*previous.log.get("growth", []), entry]
-    log = {**previous.log, "keyframes": len(known) + len(new), "growth": growth}
+    log = {**previous.log, "keyframes": len(existing) + len(new), "growth": growth}
     return make_result(models, workspace, log)
 
 
-def _refs(frames: Mapping[str, IntArray]) -> list[ImageRef]:
-    return [ImageRef(name, int(frame)) for name, mine in sorted(frames.items()) for frame in mine]
+def _image_refs(frames: Mapping[str, IntArray]) -> list[ImageRef]:
+    """Return keyframes by camera, sorted by camera name."""
+    return [ImageRef(name, int(frame)) for name, indices in sorted(frames.items()) for frame in indices]

@@ -1,4 +1,4 @@
-"""Final adjustment of models, and the stage's result."""
+"""Finish models with a last adjustment, and make the stage's result."""
 
 from __future__ import annotations
 
@@ -8,33 +8,42 @@ from typing import Any
 
 from bodycap_batch.capture import Capture
 from bodycap_batch.mapping.inputs import common_times_ns
+from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_robustly
 from bodycap_batch.mapping.reconstruction.conversion import map_from_reconstruction
+from bodycap_batch.mapping.reconstruction.models import registered_ids
 from bodycap_batch.mapping.validation.transient_points import remove_transient_points
-from bodycap_batch.mapping.workspace import MappingContext
 from bodycap_batch.model.scene import MapResult
 
 
 def finalise_models(
-    models: Sequence[Any], shop: MappingContext, capture: Capture, placed: Sequence[set[int] | None]
+    models: Sequence[Any], context: MappingContext, capture: Capture, resected: Sequence[set[int] | None]
 ) -> int:
-    """Take unconfirmed points out of models, in place, and adjust what is left once more; how many.
+    """Remove transient points from models, in place, and adjust the models robustly.
 
-    Where it is told which images of a model were placed in it after it had settled, these alone.
+    Args:
+        models: Reconstructions.
+        context: Workspace, mapper options.
+        capture: All cameras.
+        resected: Of each model, the images that were resected after the last robust adjustment. Only these
+            are adjusted; None: all are.
+
+    Returns:
+        Number of points removed.
     """
     times_ns = common_times_ns(capture)
     total = 0
-    for number, (model, mine) in enumerate(zip(models, placed, strict=True)):
-        shop.context.progress(number, len(models), "maps adjusted")
+    for number, (model, image_ids) in enumerate(zip(models, resected, strict=True)):
+        context.stage.progress(number, len(models), "maps adjusted")
         total += remove_transient_points(model, times_ns)
-        only = None if mine is None else mine & set(map(int, model.reg_image_ids()))
+        only = None if image_ids is None else image_ids & registered_ids(model)
         if only is None or only:
-            adjust_robustly(model, shop.settings(), shop.constant, only)
+            adjust_robustly(model, context.mapper_options(), context.calibrated_ids, only)
     return total
 
 
 def make_result(models: Sequence[Any], workspace: Path, log: dict[str, Any]) -> MapResult:
-    """The stage's result, with the size and the mean reprojection error of each model in its log."""
+    """Return the stage's result, with the size and mean reprojection error of each model in its log."""
     maps = tuple(map_from_reconstruction(model, workspace) for model in models)
     log = {
         **log,

@@ -17,20 +17,21 @@ def synthesise(
 
     The folder holds ``<camera>.mp4`` (or ``poses/<camera>.tum``), ``calib.json``, ``skeleton.bvh`` (the true
     proportions) and the truth in ``gt/``: ``<camera>.tum``, ``joints.npz``, ``motion.bvh``, ``mounts.json``,
-    explained in ``gt/README.txt``. Mounts and proportions differ from what their names and the stature
-    promise; nothing outside ``gt/`` and ``skeleton.bvh`` tells. Same options, same files.
+    explained in ``gt/README.txt``. Mounts and proportions differ from those that the camera names and the
+    stature suggest; only ``gt/`` and ``skeleton.bvh`` hold the true ones. The same options give the same
+    files.
 
     Args:
-        options: What to make.
-        out_dir: A folder that does not exist or is empty. It appears complete, or not at all.
-        context: Threads, progress and cancelling.
+        options: The options of the capture.
+        out_dir: A folder that does not exist or is empty. It is written completely or not at all.
+        context: Threads, progress, cancellation.
         overwrite: Replace an earlier synthetic capture there.
 
     Raises:
-        JobError: The folder is in use, or the BVH file cannot be.
-        StoreError: The disk refuses.
-        Cancelled: On request.
+        JobError: The folder is not empty, or the BVH file cannot be used.
+        StoreError: The disk refuses a file.
+        Cancelled: The work was cancelled.
     """
-    from bodycap_batch.synthetic.making import make
+    from bodycap_batch.synthetic.making import write_synthetic_capture
 
-    make(options, out_dir, context, overwrite=overwrite)
+    write_synthetic_capture(options, out_dir, context, overwrite=overwrite)

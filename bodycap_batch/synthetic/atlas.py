@@ -12,18 +12,24 @@ import numpy.typing as npt
 from bodycap_batch.core.arrays import FloatArray
 
 _OCTAVES = 5
+"""Levels of the pyramid above the full size."""
 _STEPS = 2
-"""Degrees of blur per octave: a pyramid level, and the mean of two of them."""
+"""Degrees of blur for each octave: a pyramid level, and the mean of two levels."""
 _BORDER = 2**_OCTAVES
-"""Texels around an image: one of the coarsest level. Images lie on multiples of it: no box spans two."""
+"""Texels around an image: one texel of the coarsest level. Images lie at multiples of it, so that no texel of
+the coarsest level mixes two images."""
 _BATCH_COLUMNS = 1024
-"""Look-ups go through cv2.remap as an image of this width: it refuses more than 32,767 rows."""
+"""Width of the image in which look-ups are given to cv2.remap, which refuses more than 32,767 rows."""
 _MAX_TAPS = 6
-_SPREAD = np.float32(1.4)
-"""A lens and its pixels see a little more than a pixel; without it sharp edges shift by up to 0.1 px."""
+"""Look-ups for a pixel at most; limits time."""
+_FOOTPRINT_SCALE = np.float32(1.4)
+"""Size of a pixel's footprint relative to the pixel, because lens and sensor blur a little. Without it, sharp
+edges shift by up to 0.1 px."""
 
 Float32 = npt.NDArray[np.float32]
+"""An array of float32."""
 Bytes = npt.NDArray[np.uint8]
+"""An array of uint8: an image or a part of it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,7 +38,7 @@ class Filter:
 
     Attributes:
         kind: (N,) 16 · degree of blur (half octaves) + number of look-ups.
-        along: (2,N) the footprint's longer axis in texels of level 0; look-ups are spread over it.
+        along: (2,N) longer axis of the footprint, texels of level 0; look-ups are spaced along it.
     """
 
     kind: Bytes
@@ -40,10 +46,11 @@ class Filter:
 
 
 class Atlas:
-    """A pyramid of all images.
+    """An image pyramid that holds all textures.
 
     Args:
-        images: RGB images; each is surrounded by copies of its edge, so that filtering never mixes two.
+        images: RGB images. Each is surrounded by copies of its edge, so that filtering never mixes two
+            images.
 
     Attributes:
         origins: (N,2) texel (x, y) of each image's top left corner at level 0.
@@ -51,7 +58,7 @@ class Atlas:
 
     def __init__(self, images: Sequence[Bytes]) -> None:
         sizes = [tuple((-(-side // _BORDER) + 2) * _BORDER for side in image.shape[:2]) for image in images]
-        origins, width, height = _shelves(sizes)
+        origins, width, height = _pack_on_shelves(sizes)
         base = np.zeros((height, width, 3), np.uint8)
         for image, (tall, wide), (x, y) in zip(images, sizes, origins, strict=True):
             bottom, right = tall - _BORDER - image.shape[0], wide - _BORDER - image.shape[1]
@@ -59,65 +66,68 @@ class Atlas:
                 image, _BORDER, bottom, _BORDER, right, cv2.BORDER_REPLICATE
             )
         self.origins: FloatArray = np.array(origins, dtype=np.float64) + _BORDER
-        # Halved by boxes: any other ratio shifts sharp edges by a fraction of a texel.
+        # Each level is half of the last one. Any other ratio shifts sharp edges by a fraction of a texel.
         self._levels = [base]
         for _ in range(_OCTAVES):
             half = self._levels[-1].shape[1] // 2, self._levels[-1].shape[0] // 2
             self._levels.append(cv2.resize(self._levels[-1], half, interpolation=cv2.INTER_AREA))
 
-    def sample(self, at: Float32, chosen: Filter, cell: npt.NDArray[np.int64] | None = None) -> Bytes:
-        """Average the texture under pixels.
+    def sample(self, at: Float32, filters: Filter, cell: npt.NDArray[np.int64] | None = None) -> Bytes:
+        """Return the average of the texture under N pixels.
 
         Args:
-            at: (2,N) texel coordinates (x, y) at level 0 (the first texel's centre is 0.5, 0.5).
-            chosen: How, for each pixel or each cell of pixels.
-            cell: (N,) which of the filters is each pixel's; None where there is one for each.
+            at: (2,N) texel coordinates (x, y) at level 0; the first texel's centre is (0.5, 0.5).
+            filters: Filters of the pixels, or of cells of pixels.
+            cell: (N,) index of each pixel's filter; None if each pixel has its own.
 
         Returns:
             (N,3) RGB.
         """
-        kinds = chosen.kind if cell is None else chosen.kind[cell]
+        kinds = filters.kind if cell is None else filters.kind[cell]
         out = np.empty((at.shape[1], 3), np.uint8)
         for kind in np.flatnonzero(np.bincount(kinds, minlength=1)).tolist():
             pixels = np.flatnonzero(kinds == kind)
             parts = [at[0].take(pixels), at[1].take(pixels)]
             if kind % 16 > 1:
                 owner = pixels if cell is None else cell.take(pixels)
-                parts += [chosen.along[0].take(owner), chosen.along[1].take(owner)]
-            batch = [_batched(part) for part in parts]
+                parts += [filters.along[0].take(owner), filters.along[1].take(owner)]
+            batch = [_as_batch(part) for part in parts]
             out[pixels] = self._look_up(batch, kind // 16, kind % 16)[: len(pixels)]
         return out
 
     def _look_up(self, batch: list[Float32], degree: int, taps: int) -> Bytes:
-        """Mean of taps along the footprint's longer axis, in one level or in two."""
+        """Return the mean of `taps` look-ups along the footprint's longer axis, in one level or in two."""
         levels = range(degree // _STEPS, degree // _STEPS + 1 + degree % _STEPS)
         if taps == 1 and len(levels) == 1:
             return np.asarray(self._bilinear(levels[0], batch[0], batch[1]).reshape(-1, 3))
         total = np.zeros((*batch[0].shape, 3), np.float32)
         for tap in range(taps):
             shift = np.float32((tap + 0.5) / taps - 0.5)
-            place = batch[:2] if taps == 1 else [batch[0] + shift * batch[2], batch[1] + shift * batch[3]]
+            xy = batch[:2] if taps == 1 else [batch[0] + shift * batch[2], batch[1] + shift * batch[3]]
             for level in levels:
-                cv2.accumulate(self._bilinear(level, place[0], place[1]), total)
+                cv2.accumulate(self._bilinear(level, xy[0], xy[1]), total)
         return np.asarray(cv2.convertScaleAbs(total, alpha=1.0 / (taps * len(levels))).reshape(-1, 3))
 
     def _bilinear(self, level: int, x: Float32, y: Float32) -> Bytes:
+        """Return the bilinear look-ups in one level at texel coordinates of level 0."""
         scale, half = np.float32(0.5**level), np.float32(0.5)
-        there = x * scale - half, y * scale - half
-        found = cv2.remap(self._levels[level], *there, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        position = x * scale - half, y * scale - half
+        found = cv2.remap(self._levels[level], *position, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(found)
 
 
-def filter_for(footprint: Float32) -> Filter:
-    """Choose level and look-ups for pixels.
+def select_filter(footprint: Float32) -> Filter:
+    """Select the pyramid level and the number of look-ups for N pixels.
+
+    Elongated footprints are averaged from several look-ups along their longer axis.
 
     Args:
-        footprint: (4,N) derivatives of texel coordinates: of x and y one pixel to the right, then down.
+        footprint: (4,N) derivatives of the texel coordinates x and y: one pixel to the right, then down.
 
-    Source: elongated footprints are averaged from several look-ups along their longer axis, as in
+    Source:
         McCormack et al., "Feline: fast elliptical lines for anisotropic texture mapping", 1999.
     """
-    along, major, minor = _axes(_SPREAD * footprint)
+    along, major, minor = _ellipse_axes(_FOOTPRINT_SCALE * footprint)
     np.maximum(minor, 1.0, out=minor)
     taps = np.clip(np.rint(major / minor), 1, _MAX_TAPS)
     octave = np.log2(np.maximum(np.maximum(minor, major / taps), 1.0))
@@ -125,17 +135,17 @@ def filter_for(footprint: Float32) -> Filter:
     return Filter(kind=(degree * 16 + taps).astype(np.uint8), along=along)
 
 
-def _batched(values: Float32) -> Float32:
-    """Values (N,) as an image that cv2.remap takes, padded with zeros."""
+def _as_batch(values: Float32) -> Float32:
+    """Return values (N,) as an image for cv2.remap, padded with zeros."""
     out = np.zeros(-(-len(values) // _BATCH_COLUMNS) * _BATCH_COLUMNS, np.float32)
     out[: len(values)] = values
     return out.reshape(-1, _BATCH_COLUMNS)
 
 
-def _axes(footprint: Float32) -> tuple[Float32, Float32, Float32]:
-    """Longer axis (2,N) as a vector and the lengths (N,) of both axes of parallelograms (4,N)."""
+def _ellipse_axes(footprint: Float32) -> tuple[Float32, Float32, Float32]:
+    """Return the longer axis (2,N) as a vector and the lengths (N,) of both axes, of footprints (4,N)."""
     a, b, c, d = footprint
-    # The ellipse's matrix is F' F; its eigenvalues are the squared axes.
+    # The matrix of the ellipse is F' F. Its eigenvalues are the squared lengths of the axes.
     xx, yy, xy = a * a + c * c, b * b + d * d, a * b + c * d
     mean, half = np.float32(0.5) * (xx + yy), np.float32(0.5) * (xx - yy)
     spread = np.sqrt(half * half + xy * xy)
@@ -146,11 +156,11 @@ def _axes(footprint: Float32) -> tuple[Float32, Float32, Float32]:
     return np.stack([major * cosine, major * np.copysign(sine, xy)]), major, minor
 
 
-def _shelves(sizes: Sequence[tuple[int, ...]]) -> tuple[list[tuple[int, int]], int, int]:
-    """Place rectangles (height, width) on shelves, tallest first.
+def _pack_on_shelves(sizes: Sequence[tuple[int, ...]]) -> tuple[list[tuple[int, int]], int, int]:
+    """Pack rectangles (height, width) in rows, the tallest first.
 
     Returns:
-        (x, y) of each, and the width and height of the whole.
+        Origin (x, y) of each rectangle; width and height of the whole.
     """
     area = sum(tall * wide for tall, wide in sizes)
     width = max(*(wide for _, wide in sizes), -(-int(np.sqrt(area)) // _BORDER) * _BORDER)

@@ -1,4 +1,4 @@
-"""A recorded motion from a BVH file, at any time."""
+"""A motion from a BVH file, interpolated at any time."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from bodycap_batch.model.skeleton import Motion, SkeletonModel, forward_kinemati
 
 
 class Clip:
-    """A motion interpolated between its frames (slerp and linear), held at both ends.
+    """A motion interpolated between its frames (slerp and linear), constant beyond both ends.
 
     Args:
-        motion: What was recorded.
-        start_s: Its time at which the capture's clock reads zero.
-        length_s: Time the capture covers; that stretch is moved to the room's middle, its lowest joint to
-            the floor.
+        motion: The recorded motion.
+        start_s: Its time at which the capture's clock reads zero, seconds.
+        length_s: Duration of the capture, seconds. This part of the motion is moved to the room's middle, its
+            lowest joint to the floor.
     """
 
     def __init__(self, motion: Motion, start_s: float, length_s: float) -> None:
@@ -28,20 +28,20 @@ class Clip:
         first = int(start_s * motion.fps)
         used = slice(first, first + max(2, int(np.ceil(length_s * motion.fps)) + 1))
         poses = forward_kinematics(motion.skeleton, motion.root_in_world_m[used], motion.local_rotation[used])
-        travelled = poses[:, 0, :3, 3]
-        middle = (travelled.min(axis=0) + travelled.max(axis=0)) / 2
+        root_path = poses[:, 0, :3, 3]
+        middle = (root_path.min(axis=0) + root_path.max(axis=0)) / 2
         middle[2] = poses[:, :, 2, 3].min()
         self._start_s, self._fps = start_s, motion.fps
         self._local = make_transform(motion.local_rotation, np.zeros(3))
         self._local[:, 0, :3, 3] = motion.root_in_world_m - middle
 
     def pose(self, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Root positions (T,3) in the world (m) and local rotations (T,J,3,3) at times (T,)."""
+        """Return root positions (T,3) in the world (m) and local rotations (T,J,3,3) at times (T,)."""
         frame = np.clip((t_s + self._start_s) * self._fps, 0, len(self._local) - 1)
         before = np.minimum(frame.astype(np.int64), max(len(self._local) - 2, 0))
         after = np.minimum(before + 1, len(self._local) - 1)
-        share = np.broadcast_to((frame - before)[:, None], (len(frame), self._local.shape[1]))
-        poses = interpolate_pose(self._local[before], self._local[after], share)
+        alpha = np.broadcast_to((frame - before)[:, None], (len(frame), self._local.shape[1]))
+        poses = interpolate_pose(self._local[before], self._local[after], alpha)
         return np.asarray(poses[:, 0, :3, 3]), np.asarray(poses[..., :3, :3])
 
 
@@ -49,7 +49,7 @@ def load_clip(path: Path, start_s: float, length_s: float) -> Clip:
     """Read a BVH file as the motion of a capture.
 
     Raises:
-        JobError: The file cannot be read, holds no motion, or is over too early.
+        JobError: The file cannot be read, holds no motion, or is too short.
     """
     _, motion = read_bvh(path)
     if motion is None or len(motion.root_in_world_m) < 2:

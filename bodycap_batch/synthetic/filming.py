@@ -1,4 +1,4 @@
-"""What each camera records: poses over time, exposure, rolling shutter, noise."""
+"""Render what each camera records: poses over time, exposure, rolling shutter, noise."""
 
 from __future__ import annotations
 
@@ -13,65 +13,70 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.skeleton import Mount, SkeletonModel, forward_kinematics
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
 from bodycap_batch.synthetic.lens import RayGrid
-from bodycap_batch.synthetic.render import Triangles, View, joined
+from bodycap_batch.synthetic.render import SceneRenderer, Triangles, concatenate_triangles
 from bodycap_batch.synthetic.wearer import Wearer
 
 _BLUR_STEP_PX = 1.0
+"""Image motion between two sub-frames of a blurred frame, px."""
 _MAX_BLUR_STEPS = 24
+"""Sub-frames of a blurred frame at most; limits time."""
+_USUAL_DISTANCE_M = 0.5
+"""Distance of near objects, metres, that the number of sub-frames is for."""
 _NOISE_SURPLUS = 1 << 21
+"""Random numbers beyond one image's: each frame starts at another one of them."""
 _SHUTTER_BANDS = 16
-"""Stretches of a rolling-shutter image for which the wearer's body stands still."""
+"""Bands of rows of a rolling-shutter image; within each the wearer's body is at rest."""
 
 
-class Moving(Protocol):
-    """A body in motion."""
+class MovingBody(Protocol):
+    """A moving body."""
 
     skeleton: SkeletonModel
 
     def pose(self, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Root positions (T,3) in the world (m) and local rotations (T,J,3,3) at times (T,)."""
+        """Return root positions (T,3) in the world (m) and local rotations (T,J,3,3) at times (T,)."""
         ...
 
 
-def joints_at(motion: Moving, t_s: FloatArray) -> FloatArray:
-    """World poses (T,J,4,4) of all joints at common times (T,)."""
+def joint_poses_at(motion: MovingBody, t_s: FloatArray) -> FloatArray:
+    """Return world_from_joint (T,J,4,4) of all joints at common times (T,) in seconds."""
     return forward_kinematics(motion.skeleton, *motion.pose(np.asarray(t_s, dtype=np.float64)))
 
 
-def camera_at(motion: Moving, mount: Mount, t_s: FloatArray) -> FloatArray:
-    """world_from_cam (T,4,4) at common times (T,)."""
+def camera_poses_at(motion: MovingBody, mount: Mount, t_s: FloatArray) -> FloatArray:
+    """Return world_from_cam (T,4,4) at common times (T,) in seconds."""
     joint = motion.skeleton.index_of_role(mount.role)
-    return np.asarray(joints_at(motion, t_s)[:, joint] @ mount.joint_from_cam)
+    return np.asarray(joint_poses_at(motion, t_s)[:, joint] @ mount.joint_from_cam)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Film:
-    """A camera on a moving body in a room.
+class CameraRenderer:
+    """Renders the frames of a camera on a moving body in a room.
 
     Attributes:
-        motion: The body.
-        mount: Where the camera truly sits.
-        grid: Its lens.
+        motion: The moving body.
+        mount: True mount of the camera.
+        grid: Viewing rays of its lens.
         room: The room's triangles.
         atlas: All textures.
-        view: The room alone, ready to be looked at.
-        wearer: The body's surface, or None where it is not shown.
-        exposure_s: Exposure time.
-        rolling_shutter_s: Time from the first row to the last.
+        scene: Renders the room without the wearer.
+        wearer: The body's surface; None if it is not rendered.
+        exposure_s: Exposure time, seconds.
+        rolling_shutter_s: Time from the first row to the last, seconds.
     """
 
-    motion: Moving
+    motion: MovingBody
     mount: Mount
     grid: RayGrid
     room: Triangles
     atlas: Atlas
-    view: View
+    scene: SceneRenderer
     wearer: Wearer | None
     exposure_s: float
     rolling_shutter_s: float
 
-    def frame(self, t_s: float) -> Bytes:
-        """The image (H,W,3) whose exposure is centred on a common time, without noise."""
+    def render(self, t_s: float) -> Bytes:
+        """Return the image (H,W,3) without noise, with its exposure centred on a common time."""
         steps = self._blur_steps(t_s)
         shifts = self.exposure_s * ((np.arange(steps) + 0.5) / steps - 0.5)
         if steps == 1:
@@ -82,45 +87,45 @@ class Film:
         return np.asarray(cv2.convertScaleAbs(total, alpha=1.0 / steps))
 
     def _instant(self, t_s: float) -> Bytes:
-        """One image without motion blur."""
+        """Return an image without motion blur."""
         height = self.grid.in_cam.shape[0]
         if self.rolling_shutter_s == 0.0:
-            pose = camera_at(self.motion, self.mount, np.array([t_s]))
-            return self._view(t_s).image(self.grid, pose[0], slice(0, height))
+            pose = camera_poses_at(self.motion, self.mount, np.array([t_s]))
+            return self._scene_at(t_s).image(self.grid, pose[0], slice(0, height))
         rows_s = t_s + ((np.arange(height) + 0.5) / height - 0.5) * self.rolling_shutter_s
-        poses = camera_at(self.motion, self.mount, rows_s)
+        poses = camera_poses_at(self.motion, self.mount, rows_s)
         edges = np.linspace(0, height, min(_SHUTTER_BANDS, height) + 1).astype(int)
         bands = [slice(low, high) for low, high in pairwise(edges.tolist())]
-        views = [self._view(float(rows_s[band].mean())) for band in bands]
-        parts = [view.image(self.grid, poses[band], band) for view, band in zip(views, bands, strict=True)]
+        scenes = [self._scene_at(float(rows_s[band].mean())) for band in bands]
+        parts = [scene.image(self.grid, poses[band], band) for scene, band in zip(scenes, bands, strict=True)]
         return np.concatenate(parts)
 
-    def _view(self, t_s: float) -> View:
-        """The room, with the wearer in it as at that time."""
+    def _scene_at(self, t_s: float) -> SceneRenderer:
+        """Return a renderer of the room with the wearer at a common time."""
         if self.wearer is None:
-            return self.view
-        joints = joints_at(self.motion, np.array([t_s]))[0]
-        return View(joined(self.room, self.wearer.at(joints)), self.atlas)
+            return self.scene
+        joints = joint_poses_at(self.motion, np.array([t_s]))[0]
+        return SceneRenderer(concatenate_triangles(self.room, self.wearer.at(joints)), self.atlas)
 
     def _blur_steps(self, t_s: float) -> int:
-        """Sub-frames needed for a blur without visible steps."""
+        """Return the number of sub-frames for a blur without visible steps."""
         if self.exposure_s == 0.0:
             return 1
         half = self.exposure_s / 2
-        start, end = camera_at(self.motion, self.mount, np.array([t_s - half, t_s + half]))
+        start, end = camera_poses_at(self.motion, self.mount, np.array([t_s - half, t_s + half]))
         px_per_rad = 1.0 / float(np.linalg.norm(self.grid.per_px_x, axis=-1).max())
         cosine = (np.trace(start[:3, :3].T @ end[:3, :3]) - 1) / 2
-        # Things are rarely nearer than half a metre.
-        motion_rad = np.arccos(np.clip(cosine, -1, 1)) + 2.0 * np.linalg.norm(end[:3, 3] - start[:3, 3])
+        shift_m = np.linalg.norm(end[:3, 3] - start[:3, 3])
+        motion_rad = np.arccos(np.clip(cosine, -1, 1)) + 1.0 / _USUAL_DISTANCE_M * shift_m
         return int(np.clip(np.ceil(motion_rad * px_per_rad / _BLUR_STEP_PX), 2, _MAX_BLUR_STEPS))
 
 
 class Sensor:
-    """Turns ideal images into recorded ones: white balance, shot and read noise, 8 bits.
+    """Converts ideal images into recorded ones: white balance, shot and read noise, 8 bits.
 
     Args:
-        noise: Standard deviation at mid grey; half of its variance does not depend on the light.
-        size: Values of one image.
+        noise: Standard deviation at mid grey, grey levels; half of its variance does not depend on the light.
+        size: Number of values of one image.
         seed: Source of white balance and noise.
     """
 
@@ -130,11 +135,11 @@ class Sensor:
         gain = rng.uniform(0.94, 1.06, 3)
         self._mean = (np.arange(256)[:, None] * gain)[None].astype(np.float32)
         self._sigma = (noise * np.sqrt(0.5 + self._mean * (0.5 / 128.0))).astype(np.float32)
-        # Drawing a million numbers a frame costs as much as the frame: each takes a stretch of these.
+        # To draw a million numbers for a frame takes as long as to render it. Frames take parts of one array.
         self._normal = rng.standard_normal(size + _NOISE_SURPLUS if noise > 0 else 0, dtype=np.float32)
 
     def record(self, image: Bytes, frame: int) -> Bytes:
-        """The image (H,W,3) as this camera's frame of that number."""
+        """Return an ideal image (H,W,3) as the recorded frame of that number."""
         mean = cv2.LUT(image, self._mean)
         if len(self._normal):
             start = int(np.random.default_rng([frame, *self._seed]).integers(0, _NOISE_SURPLUS))

@@ -1,7 +1,8 @@
-"""A walking person, procedurally: a path with turns, gait phases, joint angles, reaching.
+"""A procedural walk: a path with turns, gait phases, joint angles, arms that reach out.
 
-Nothing here is drawn from the priors of the skeleton stage (no random walk on velocities): joint angles are
-periodic functions of a gait phase plus a few slow sinusoids, the path is a spline through chosen places.
+The motion does not follow the priors of the merging stage: there is no random walk of velocities. Joint
+angles are periodic functions of a gait phase plus a few slow sinusoids. The path is a spline through given
+positions.
 """
 
 from __future__ import annotations
@@ -18,8 +19,7 @@ from bodycap_batch.model.skeleton import SkeletonModel, forward_kinematics
 from bodycap_batch.synthetic.pressing import ArmAngles, Press
 
 _LAP_S = 13.0
-# One lap: seconds, x, y (m, room's middle = 0), direction of the face (degrees from +x, counter-clockwise).
-# It begins with steps to the right, facing a wall: the sideways movement from which a map starts well.
+"""Duration of one lap, seconds."""
 _LAP = np.array(
     [
         [0.0, -1.60, -1.00, 90.0],
@@ -35,38 +35,52 @@ _LAP = np.array(
         [11.8, -1.75, -0.40, 345.0],
     ]
 )
+"""One lap: seconds, x, y (m from the room's middle), direction of the face (degrees from +x,
+counter-clockwise). It begins with steps to the right while facing a wall: sideways movement is a good start
+for a map."""
 _TURN_S, _TURN_DEG, _SWAY_M = 5.0, 75.0, 0.02
-"""On the spot: there and back again in so long, so far to either side, swaying by so much."""
+"""A person who turns on the spot: period (s), angle to either side (degrees), amplitude of the sway (m)."""
 _ARM_PARTS = ("Lift", "Ahead", "Arm", "Out", "Spin", "Elbow", "Twist")
-_LATTICE_HZ = 50.0
+"""Parts of an arm's posture, see `WalkStyle`."""
+_SAMPLE_HZ = 50.0
+"""Rate at which phase and height are sampled for their splines."""
 _MARGIN_S = 4.0
+"""Time before and after the capture that the motion covers, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Wobble:
-    """A slow, band-limited change of an angle: a few sinusoids between 0.1 and 0.6 Hz."""
+class _SlowOscillation:
+    """A slow change of an angle: a few sinusoids between 0.1 and 0.6 Hz.
+
+    Attributes:
+        amplitude: (K,) degrees.
+        rate_hz: (K,) frequencies.
+        phase: (K,) radians.
+    """
 
     amplitude: FloatArray
     rate_hz: FloatArray
     phase: FloatArray
 
     def __call__(self, t_s: FloatArray) -> FloatArray:
+        """Return the angle (T,) at times (T,), degrees."""
         waves = np.sin(2 * np.pi * self.rate_hz * t_s[:, None] + self.phase)
         return np.asarray((self.amplitude * waves).sum(axis=1))
 
 
-def _wobble(degrees: float, rng: np.random.Generator) -> _Wobble:
-    share = rng.uniform(0.3, 1.0, 4)
-    return _Wobble(
-        degrees * share / np.linalg.norm(share) * np.sqrt(2.0),
+def _draw_oscillation(degrees: float, rng: np.random.Generator) -> _SlowOscillation:
+    """Draw an oscillation with a root mean square of about `degrees`."""
+    weight = rng.uniform(0.3, 1.0, 4)
+    return _SlowOscillation(
+        degrees * weight / np.linalg.norm(weight) * np.sqrt(2.0),
         rng.uniform(0.1, 0.6, 4),
         rng.uniform(0, 2 * np.pi, 4),
     )
 
 
 @dataclass(frozen=True, slots=True)
-class _Reach:
-    """One arm reaching out: when, how long each ramp takes, and the extra angles (degrees)."""
+class _ArmReach:
+    """One arm that reaches out: start, duration of each ramp and of the hold, additional angles (degrees)."""
 
     side: str
     start_s: float
@@ -78,72 +92,73 @@ class _Reach:
     pronation: float
 
     def weight(self, t_s: FloatArray) -> FloatArray:
-        """0 … 1, twice differentiable."""
+        """Return the weight (T,) of the additional angles, 0 … 1, twice differentiable."""
         up = np.clip((t_s - self.start_s) / self.ramp_s, 0, 1)
         down = np.clip((t_s - self.start_s - self.ramp_s - self.hold_s) / self.ramp_s, 0, 1)
-        return np.asarray(_smooth(up) - _smooth(down))
+        return np.asarray(_smooth_step(up) - _smooth_step(down))
 
 
-def _smooth(x: FloatArray) -> FloatArray:
-    """Step from 0 to 1 with vanishing first and second derivative at both ends."""
+def _smooth_step(x: FloatArray) -> FloatArray:
+    """Return a step from 0 to 1 whose first and second derivatives vanish at both ends."""
     return np.asarray(x**3 * (10 - 15 * x + 6 * x * x))
 
 
-def _bump(phase: FloatArray, centre_deg: float, width: float) -> FloatArray:
-    """A smooth periodic bump of height 1."""
+def _periodic_bump(phase: FloatArray, centre_deg: float, width: float) -> FloatArray:
+    """Return a smooth periodic bump of height 1 around a phase."""
     return np.asarray(np.exp((np.cos(phase - np.radians(centre_deg)) - 1.0) / width**2))
 
 
-def _about(axis: str, degrees: FloatArray) -> Rotation:
+def _rotation_about(axis: str, degrees: FloatArray) -> Rotation:
+    """Return rotations by Euler angles (T,len(axis)) about intrinsic axes, degrees."""
     return Rotation.from_euler(axis, degrees.reshape(-1, len(axis)), degrees=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Habits:
-    """What the walker does beside walking.
+class WalkStyle:
+    """How a person walks, and what the person does besides.
 
     Attributes:
-        t_pose_s: The walker first stands with arms stretched out until then, at most.
-        arms_ahead: 1 holds both forearms up before the chest, 0 lets them hang.
-        presses: Hands laid against the chest.
-        on_the_spot: Turns to both sides where it stands instead of walking.
-        bearing: Degrees by which joints are held other than everyone's, where not 0: ``Bend`` and ``Turn``
-            of the trunk, and with ``Left`` or ``Right`` before it ``Lift`` and ``Ahead`` of the shoulder,
-            ``Arm`` (flexion), ``Out`` (abduction), ``Spin`` of the upper arm, ``Elbow`` and ``Twist``
-            (pronation). Arms in a T-pose are stretched out all the same.
+        t_pose_s: Duration of the T-pose at the start, seconds.
+        arms_ahead: 1: both forearms are held up in front of the chest; 0: they hang.
+        presses: Hands that are laid against the chest.
+        on_the_spot: The person turns to both sides on the spot instead of walking.
+        posture: Offsets of joint angles from the mean of people, degrees; 0 if missing. ``Bend`` and ``Turn``
+            of the trunk. With ``Left`` or ``Right`` in front: ``Lift`` and ``Ahead`` of the shoulder, ``Arm``
+            (flexion), ``Out`` (abduction), ``Spin`` of the upper arm, ``Elbow`` and ``Twist`` (pronation).
+            They do not change the arms in a T-pose.
     """
 
     t_pose_s: float = 0.0
     arms_ahead: float = 0.0
     presses: tuple[Press, ...] = ()
     on_the_spot: bool = False
-    bearing: Mapping[str, float] = field(default_factory=dict)
+    posture: Mapping[str, float] = field(default_factory=dict)
 
 
 class Walk:
-    """The built-in walker: poses of every joint at any time.
+    """The built-in walk: rotations of all joints at any time.
 
     Args:
         skeleton: A body with HumanIK names.
-        length_s: Time to be covered, from a few seconds before 0.
-        habits: What it does beside walking.
-        rng: Source of the individual's gait.
+        length_s: End of the time that is covered, seconds; it starts a few seconds before 0.
+        style: How the person walks.
+        rng: Source of the individual gait.
     """
 
     def __init__(
-        self, skeleton: SkeletonModel, length_s: float, habits: Habits, rng: np.random.Generator
+        self, skeleton: SkeletonModel, length_s: float, style: WalkStyle, rng: np.random.Generator
     ) -> None:
         self.skeleton = skeleton
-        self._t_pose_s = habits.t_pose_s
-        self._arms_ahead = habits.arms_ahead
-        self._presses = habits.presses
-        self._bearing = habits.bearing
-        # Streams of their own: a longer capture is the same walk, continued.
+        self._t_pose_s = style.t_pose_s
+        self._arms_ahead = style.arms_ahead
+        self._presses = style.presses
+        self._posture = style.posture
+        # Separate random streams, so that a longer capture continues the same walk.
         for_path, for_reaches, rng = rng.spawn(3)
-        self._way = (_draw_turns if habits.on_the_spot else _draw_path)(length_s, for_path)
+        self._route = (_draw_turns if style.on_the_spot else _draw_path)(length_s, for_path)
         self._stride_gain = float(rng.uniform(0.92, 1.08))
-        self._wobbles = {
-            name: _wobble(degrees, rng)
+        self._oscillations = {
+            name: _draw_oscillation(degrees, rng)
             for name, degrees in (
                 ("LeftArm", 3.0), ("RightArm", 3.0), ("LeftOut", 3.0), ("RightOut", 3.0), ("LeftElbow", 4.0),
                 ("RightElbow", 4.0), ("LeftTwist", 5.0), ("RightTwist", 5.0), ("LeftWrist", 4.0),
@@ -151,30 +166,30 @@ class Walk:
                 ("Turn", 3.0), ("Look", 9.0), ("Nod", 4.0),
             )
         }  # fmt: skip
-        self._reaches = _draw_reaches(length_s, habits.t_pose_s, for_reaches)
-        lattice = np.arange(-_MARGIN_S, length_s + _MARGIN_S, 1.0 / _LATTICE_HZ)
-        speed = np.linalg.norm(self._path(lattice, 1)[:, :2], axis=1)
-        cycles = np.cumsum(0.32 * np.tanh(speed / 0.1) + 0.45 * speed) / _LATTICE_HZ
-        self._phase = CubicSpline(lattice, 2 * np.pi * (cycles + rng.uniform()))
-        self._height = CubicSpline(lattice, self._standing_height(lattice))
+        self._reaches = _draw_reaches(length_s, style.t_pose_s, for_reaches)
+        sample_s = np.arange(-_MARGIN_S, length_s + _MARGIN_S, 1.0 / _SAMPLE_HZ)
+        speed = np.linalg.norm(self._path(sample_s, 1)[:, :2], axis=1)
+        cycles = np.cumsum(0.32 * np.tanh(speed / 0.1) + 0.45 * speed) / _SAMPLE_HZ
+        self._phase = CubicSpline(sample_s, 2 * np.pi * (cycles + rng.uniform()))
+        self._height = CubicSpline(sample_s, self._standing_height(sample_s))
 
     def pose(self, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Root positions (T,3) in the world (m) and local rotations (T,J,3,3) at times (T,)."""
+        """Return root positions (T,3) in the world (m) and local rotations (T,J,3,3) at times (T,)."""
         path = self._path(t_s)
         root = np.column_stack([path[:, :2], self._height(t_s)])
         return root, self._rotations(t_s)
 
     def _path(self, t_s: FloatArray, derivative: int = 0) -> FloatArray:
-        """x, y (m) and heading (degrees), or their rates, (T,3); a T-pose comes first."""
+        """Return x, y (m) and heading (degrees), or their rates, (T,3); a T-pose comes first."""
         if self._t_pose_s == 0.0:
-            return np.asarray(self._way(t_s, derivative))
+            return np.asarray(self._route(t_s, derivative))
         x = np.clip(t_s - self._t_pose_s, 0, None)
-        rate = _smooth(np.minimum(x, 1.0))
+        rate = _smooth_step(np.minimum(x, 1.0))
         walked = np.where(x < 1, x**4 * (2.5 - 3 * x + x * x), x - 0.5)
-        return np.asarray(self._way(walked, 1) * rate[:, None] if derivative else self._way(walked))
+        return np.asarray(self._route(walked, 1) * rate[:, None] if derivative else self._route(walked))
 
     def _standing_height(self, t_s: FloatArray) -> FloatArray:
-        """Height of the root at which the lower foot touches the floor (soft minimum over the soles)."""
+        """Return the height (T,) of the root, metres, at which the lower foot touches the floor."""
         poses = forward_kinematics(self.skeleton, np.zeros((len(t_s), 3)), self._rotations(t_s))
         soles = []
         for joint, name in enumerate(self.skeleton.joints):
@@ -182,55 +197,64 @@ class Walk:
                 end = self.skeleton.end_offsets_m[joint]
                 sole = np.nan_to_num(end) if np.isfinite(end).all() else np.array([0.0, 0.0, -self._ankle_m])
                 soles.append((poses[:, joint, :3, :3] @ sole + poses[:, joint, :3, 3])[:, 2])
-        softness_m = 0.01
+        softness_m = 0.01  # a soft minimum over the soles
         lowest = -softness_m * np.log(np.exp(-np.array(soles) / softness_m).sum(axis=0))
         return np.asarray(-lowest)
 
     @property
     def _ankle_m(self) -> float:
+        """Height of the ankle over the sole, metres."""
         toe = self.skeleton.joints.index("LeftToeBase")
         return float(-self.skeleton.offsets_m[toe, 2] - self.skeleton.end_offsets_m[toe, 2])
 
     def _rotations(self, t_s: FloatArray) -> FloatArray:
-        """(T,J,3,3) parent_from_joint."""
+        """Return parent_from_joint (T,J,3,3) at times (T,)."""
         heading = self._path(t_s)[:, 2]
         velocity = self._path(t_s, 1)
-        phase, wave = self._phase(t_s), self._wobbles
+        phase, wave = self._phase(t_s), self._oscillations
         angle = np.radians(heading)
         ahead = np.cos(angle) * velocity[:, 0] + np.sin(angle) * velocity[:, 1]
         aside = -np.sin(angle) * velocity[:, 0] + np.cos(angle) * velocity[:, 1]
         stride = self._stride_gain * np.tanh(ahead / 0.8)
         sidestep = self._stride_gain * np.tanh(aside / 0.6)
-        alive = 1.0 - self._t_pose(t_s)
-        out = {"Hips": _about("Z", heading + 90.0 + alive * 3.0 * stride * np.cos(phase))
-               * _about("XY", np.column_stack([alive * 1.5 * np.cos(2 * phase) * np.abs(stride),
-                                               alive * 2.0 * np.sin(phase) * np.abs(stride)]))}  # fmt: skip
-        twist = alive * (wave["Turn"](t_s) - 3.0 * stride * np.cos(phase))
-        bend, turn = (self._bearing.get(part, 0.0) for part in ("Bend", "Turn"))
+        walk_weight = 1.0 - self._t_pose(t_s)
+        effort = np.abs(stride)
+        pelvis_yaw = heading + 90.0 + walk_weight * 3.0 * stride * np.cos(phase)
+        pelvis_tilt = [
+            walk_weight * 1.5 * np.cos(2 * phase) * effort,
+            walk_weight * 2.0 * np.sin(phase) * effort,
+        ]
+        out = {"Hips": _rotation_about("Z", pelvis_yaw) * _rotation_about("XY", np.column_stack(pelvis_tilt))}
+        twist = walk_weight * (wave["Turn"](t_s) - 3.0 * stride * np.cos(phase))
+        bend, turn = (self._posture.get(part, 0.0) for part in ("Bend", "Turn"))
         for share, name in ((0.45, "Spine"), (0.55, "Spine1")):
             angles = [
                 share * twist + share * turn,
-                share * alive * (2.0 + wave["Bend"](t_s)) + share * bend,
-                share * alive * wave["Lean"](t_s),
+                share * walk_weight * (2.0 + wave["Bend"](t_s)) + share * bend,
+                share * walk_weight * wave["Lean"](t_s),
             ]
-            out[name] = _about("ZXY", np.column_stack(angles))
-        look = [0.6 * alive * wave["Look"](t_s), 0.6 * alive * (wave["Nod"](t_s) + 3.0)]
-        out["Neck"] = out["Head"] = _about("ZX", np.column_stack(look))
+            out[name] = _rotation_about("ZXY", np.column_stack(angles))
+        look = [0.6 * walk_weight * wave["Look"](t_s), 0.6 * walk_weight * (wave["Nod"](t_s) + 3.0)]
+        out["Neck"] = out["Head"] = _rotation_about("ZX", np.column_stack(look))
         for side, leg_phase in (("Left", phase + np.pi), ("Right", phase)):
-            self._leg(side, leg_phase, (stride * alive, sidestep * alive), out)
-            self._arm(side, t_s, (stride * np.cos(leg_phase + np.pi), alive), out)
+            self._leg(side, leg_phase, (stride * walk_weight, sidestep * walk_weight), out)
+            self._arm(side, t_s, (stride * np.cos(leg_phase + np.pi), walk_weight), out)
         identity = Rotation.identity(len(t_s))
         return np.stack([out.get(name, identity).as_matrix() for name in self.skeleton.joints], axis=1)
 
     def _t_pose(self, t_s: FloatArray) -> FloatArray:
-        """1 while the arms are stretched out, 0 from a second later."""
-        return np.asarray(1.0 - _smooth(np.clip(t_s - self._t_pose_s, 0, 1))) if self._t_pose_s else 0.0 * t_s
+        """Return the weight (T,) of the T-pose: 1 during it, 0 from a second later on."""
+        return (
+            np.asarray(1.0 - _smooth_step(np.clip(t_s - self._t_pose_s, 0, 1)))
+            if self._t_pose_s
+            else 0.0 * t_s
+        )
 
     @staticmethod
     def _leg(
         side: str, phase: FloatArray, strides: tuple[FloatArray, FloatArray], out: dict[str, Rotation]
     ) -> None:
-        """Hip, knee and ankle over the gait cycle (phase 0: that heel strikes).
+        """Add hip, knee and ankle rotations over the gait cycle (phase 0: the heel of this leg strikes).
 
         Source: the shape of sagittal joint angles in level walking, Winter, "Biomechanics and Motor
             Control of Human Movement", 2009.
@@ -239,21 +263,23 @@ class Walk:
         effort = np.minimum(1.0, np.hypot(stride, sidestep))
         outward = 1.0 if side == "Left" else -1.0
         hip = stride * 20.0 * np.cos(phase) + 5.0 * effort
-        knee = 3.0 + effort * (10.0 * _bump(phase, 45.0, 0.6) + 42.0 * _bump(phase, 255.0, 0.75))
-        ankle = effort * (6.0 * _bump(phase, 150.0, 0.7) - 12.0 * _bump(phase, 225.0, 0.4))
+        knee = 3.0 + effort * (
+            10.0 * _periodic_bump(phase, 45.0, 0.6) + 42.0 * _periodic_bump(phase, 255.0, 0.75)
+        )
+        ankle = effort * (6.0 * _periodic_bump(phase, 150.0, 0.7) - 12.0 * _periodic_bump(phase, 225.0, 0.4))
         abduction = 2.0 + sidestep * outward * 9.0 * np.cos(phase)
-        # Abduction swings the left leg towards +X: a negative turn about +Y.
-        out[f"{side}UpLeg"] = _about("X", -hip) * _about("Y", -outward * abduction)
-        out[f"{side}Leg"] = _about("X", knee)
-        out[f"{side}Foot"] = _about("X", hip - knee - ankle)
+        # Abduction swings the left leg towards +X: a negative rotation about +Y.
+        out[f"{side}UpLeg"] = _rotation_about("X", -hip) * _rotation_about("Y", -outward * abduction)
+        out[f"{side}Leg"] = _rotation_about("X", knee)
+        out[f"{side}Foot"] = _rotation_about("X", hip - knee - ankle)
 
     def _arm(
         self, side: str, t_s: FloatArray, swing: tuple[FloatArray, FloatArray], out: dict[str, Rotation]
     ) -> None:
-        """Clavicle, shoulder, elbow and wrist: swing against the leg, slow habits, reaching."""
-        forth, alive = swing
-        wave, outward = self._wobbles, 1.0 if side == "Left" else -1.0
-        held = {part: self._bearing.get(side + part, 0.0) for part in _ARM_PARTS}
+        """Add clavicle, shoulder, elbow and wrist: swing against the leg, slow oscillations, reaching."""
+        forth, walk_weight = swing
+        wave, outward = self._oscillations, 1.0 if side == "Left" else -1.0
+        held = {part: self._posture.get(side + part, 0.0) for part in _ARM_PARTS}
         flexion = 4.0 + held["Arm"] + 11.0 * forth + wave[f"{side}Arm"](t_s)
         abduction = 10.0 + held["Out"] + wave[f"{side}Out"](t_s)
         elbow = 24.0 + held["Elbow"] + 7.0 * forth + wave[f"{side}Elbow"](t_s)
@@ -278,15 +304,15 @@ class Walk:
         for press in self._presses:
             if press.side == side:
                 angles, lift = press.blended(angles, t_s), lift * (1.0 - press.weight(t_s))
-        shoulder = _about("Y", -outward * (alive * lift + held["Lift"]))
+        shoulder = _rotation_about("Y", -outward * (walk_weight * lift + held["Lift"]))
         if held["Ahead"]:
-            shoulder = _about("Z", np.full_like(t_s, -outward * held["Ahead"])) * shoulder
+            shoulder = _rotation_about("Z", np.full_like(t_s, -outward * held["Ahead"])) * shoulder
         out[f"{side}Shoulder"] = shoulder
-        out.update(angles.rotations(side, alive))
+        out.update(angles.rotations(side, walk_weight))
 
 
 def _draw_path(length_s: float, rng: np.random.Generator) -> CubicSpline:
-    """x, y (m) and heading (degrees) over time: laps through slightly different places."""
+    """Return x, y (m) and heading (degrees) over time: laps through slightly different positions."""
     rows = []
     for lap in range(-1, int(np.ceil(length_s / _LAP_S)) + 2):
         places = _LAP + np.array([lap * _LAP_S, 0.0, 0.0, lap * 360.0])
@@ -298,7 +324,7 @@ def _draw_path(length_s: float, rng: np.random.Generator) -> CubicSpline:
 
 
 def _draw_turns(length_s: float, rng: np.random.Generator) -> CubicSpline:
-    """x, y (m) and heading (degrees) over time of somebody who stands and turns to both sides."""
+    """Return x, y (m) and heading (degrees) over time of a person who turns to both sides on the spot."""
     times = np.arange(-2.0 * _MARGIN_S, length_s + 2.0 * _MARGIN_S, 0.1)
     phase = rng.uniform(0, 2 * np.pi, 3)
     x, y = (_SWAY_M * np.sin(rate * times + phase[axis]) for axis, rate in enumerate((1.1, 0.9)))
@@ -306,15 +332,15 @@ def _draw_turns(length_s: float, rng: np.random.Generator) -> CubicSpline:
     return CubicSpline(times, np.column_stack([x, y, heading]))
 
 
-def _draw_reaches(length_s: float, t_pose_s: float, rng: np.random.Generator) -> tuple[_Reach, ...]:
-    """Arms reach in turn, forward or to the side, every two to four seconds."""
+def _draw_reaches(length_s: float, t_pose_s: float, rng: np.random.Generator) -> tuple[_ArmReach, ...]:
+    """Draw when arms reach out: in turn, forward or to the side, every two to four seconds."""
     out = []
     side = "Left" if rng.uniform() < 0.5 else "Right"
     start = 0.8 + (t_pose_s + 1.0 if t_pose_s > 0 else 0.0)
     while start < length_s:
         to_side = rng.uniform() < 0.4
         out.append(
-            _Reach(
+            _ArmReach(
                 side=side,
                 start_s=start,
                 ramp_s=float(rng.uniform(1.0, 1.3)),

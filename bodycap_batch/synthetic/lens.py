@@ -1,7 +1,7 @@
-"""Viewing rays of a lens, by inverting its distortion at every pixel.
+"""Viewing rays of a lens: its distortion is inverted at every pixel.
 
-Written from the models' published formulas and used by the renderer alone: the solver projects through
-another implementation, so a mistake in either shows.
+This follows the published formulas of the models, and only the renderer uses it. The estimators project with
+another implementation, so a mistake in either one shows in tests.
 """
 
 from __future__ import annotations
@@ -16,24 +16,31 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.model.camera import Camera
 
 _NEWTON_STEPS = 30
+"""Newton steps of an inversion at most."""
 _DERIVATIVE_STEP = 1e-6
+"""Half of the difference for a numerical derivative, at depth 1."""
 _CONVERGED = 1e-9
+"""Largest error of an inversion, at depth 1."""
 _BRANCH_SAMPLES = 8
+"""Points between the centre and a solution at which the distortion must keep its orientation."""
 _BLOCK = 1 << 13
+"""Points that are inverted together, so that the processor's cache holds them."""
 _SINGLE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+"""Models with one focal length for both axes."""
 
 Distortion = Callable[[FloatArray], FloatArray]
+"""Function from the ideal to the distorted image plane, both (...,2) at depth 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RayGrid:
-    """What every pixel of a lens looks at.
+    """The viewing rays of all pixels of a lens.
 
     Attributes:
         in_cam: (H,W,3) unit directions in the camera frame (x right, y down, z forward).
         per_px_x: (H,W,3) change of the direction one pixel to the right.
         per_px_y: (H,W,3) change of the direction one pixel down.
-        valid: (H,W) False where the lens shows nothing (the distortion has no inverse).
+        valid: (H,W) False if the lens shows nothing at a pixel: the distortion has no inverse there.
         planes: (9,H,W) components of the three vectors, float32, for the renderer.
     """
 
@@ -45,12 +52,12 @@ class RayGrid:
 
 
 def is_fisheye(model: str) -> bool:
-    """True where the model bends an equidistant image plane (angle · direction)."""
+    """Return whether the model distorts an equidistant image plane (angle · direction)."""
     return model.endswith("FISHEYE")
 
 
 def _rational(plane: FloatArray, radial: FloatArray, p1: float, p2: float) -> FloatArray:
-    """Brown's model with a rational radial term; `radial` holds k1 … k6.
+    """Return points under Brown's model with a rational radial term; `radial` holds k1 … k6.
 
     Source: Brown, "Decentering distortion of lenses", 1966; the rational term as in OpenCV.
     """
@@ -68,7 +75,7 @@ def _rational(plane: FloatArray, radial: FloatArray, p1: float, p2: float) -> Fl
 
 
 def _thin_prism(plane: FloatArray, params: FloatArray) -> FloatArray:
-    """Radial, tangential and thin-prism terms added on an equidistant plane.
+    """Return points of an equidistant plane with radial, tangential and thin-prism distortion.
 
     Source: Weng, Cohen, Herniou, "Camera calibration with distortion models", PAMI 1992.
     """
@@ -86,7 +93,7 @@ def _thin_prism(plane: FloatArray, params: FloatArray) -> FloatArray:
 
 
 def _field_of_view(plane: FloatArray, omega_rad: float) -> FloatArray:
-    """One-parameter wide-angle model on a perspective plane.
+    """Return points of a perspective plane under a wide-angle model with one parameter.
 
     Source: Devernay, Faugeras, "Straight lines have to be straight", MVA 2001.
     """
@@ -99,7 +106,7 @@ def _field_of_view(plane: FloatArray, omega_rad: float) -> FloatArray:
 
 
 def distortion_of(camera: Camera) -> Distortion:
-    """The model's map from the ideal to the distorted image plane, both (...,2) and free of pixels."""
+    """Return the distortion of a camera's model."""
     extra = camera.params[(3 if camera.model in _SINGLE_FOCAL else 4) :]
     if camera.model == "FOV":
         return lambda plane: _field_of_view(plane, float(extra[0]))
@@ -118,14 +125,14 @@ def distortion_of(camera: Camera) -> Distortion:
 
 
 def focal_and_centre(camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """Focal lengths (2,) and principal point (2,) in pixels."""
+    """Return the focal lengths (2,) and the principal point (2,) in pixels."""
     if camera.model in _SINGLE_FOCAL:
         return np.repeat(camera.params[:1], 2), np.asarray(camera.params[1:3])
     return np.asarray(camera.params[:2]), np.asarray(camera.params[2:4])
 
 
 def _jacobian(distort: Distortion, plane: FloatArray) -> FloatArray:
-    """(N,2,2) derivative of the distortion by central differences."""
+    """Return the derivative (N,2,2) of a distortion, by central differences."""
     columns = []
     for axis in range(2):
         step = np.zeros(2)
@@ -138,10 +145,11 @@ def undistort(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray, B
     """Invert a distortion for points (N,2) by Newton's method.
 
     Returns:
-        The ideal points (N,2), and (N,) True where the inverse exists on the branch around the centre.
+        The ideal points (N,2); a mask (N,) of those with an inverse on the branch around the centre.
     """
     found = [
-        _undistorted(distort, distorted[start : start + _BLOCK]) for start in range(0, len(distorted), _BLOCK)
+        _undistort_block(distort, distorted[start : start + _BLOCK])
+        for start in range(0, len(distorted), _BLOCK)
     ]
     if not found:
         return distorted.copy(), np.zeros(0, dtype=bool)
@@ -149,8 +157,8 @@ def undistort(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray, B
     return np.concatenate(planes), np.concatenate(valid)
 
 
-def _undistorted(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """`undistort` for so many points that the processor's cache holds them."""
+def _undistort_block(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Invert a distortion for a block of points (N,2); results as in `undistort`."""
     plane = distorted.copy()
     with np.errstate(all="ignore"):
         for _ in range(_NEWTON_STEPS):
@@ -172,14 +180,14 @@ def _undistorted(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray
 
 
 def _determinant(matrices: FloatArray) -> FloatArray:
-    """Determinants of (N,2,2)."""
+    """Return the determinants (N,) of matrices (N,2,2)."""
     return np.asarray(matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0])
 
 
 def ray_grid(camera: Camera) -> RayGrid:
-    """Directions through the centres of all pixels (COLMAP's origin: the first is 0.5, 0.5)."""
+    """Return the viewing rays through the centres of all pixels (COLMAP's origin: the first is 0.5, 0.5)."""
     focal, centre = focal_and_centre(camera)
-    # One ring of pixels around the image, so that the derivatives are central everywhere.
+    # One more ring of pixels around the image allows central derivatives everywhere.
     x, y = np.meshgrid(
         np.arange(-1, camera.width_px + 1) + 0.5, np.arange(-1, camera.height_px + 1) + 0.5, indexing="xy"
     )

@@ -1,4 +1,4 @@
-"""Light that falls on a room's surfaces, computed once and painted into their textures."""
+"""Compute the light on a room's surfaces once, and paint it into their textures."""
 
 from __future__ import annotations
 
@@ -11,28 +11,41 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.synthetic.raycast import RayScene
 from bodycap_batch.synthetic.surfaces import Surface
-from bodycap_batch.synthetic.textures import shaded
+from bodycap_batch.synthetic.textures import shade_image
 
 _CELL_M = 0.08
+"""Distance of the points of a surface at which light is computed, metres."""
 _AMBIENT = 0.60
+"""Irradiance without lamps, as a factor on the texture."""
 _LAMP_SAMPLES = 6
+"""Points of a lamp that shadow rays start from."""
 _LAMP_SIZE_M = 0.35
+"""Extent of a lamp along x and y, metres."""
 _LIFT_M = 0.004
+"""Distance from its surface at which a shadow ray starts, metres, so that the surface does not shade
+itself."""
+_LAMP_STRENGTH = 10.0
+"""Irradiance of all lamps together at 1 m, as a factor on the texture, about."""
+_MIN_EMISSION = 0.05
+"""Smallest emission of a lamp to the side, relative to straight down."""
+_RAY_LENGTH = 0.98
+"""Length of a shadow ray that is tested, relative to the distance of the lamp, whose housing must not shade
+it."""
 
 
 def light_surfaces(surfaces: Sequence[Surface], lamps: FloatArray, rng: np.random.Generator) -> list[Surface]:
     """Multiply every texture by its irradiance: ambient light plus lamps with soft shadows.
 
     Args:
-        surfaces: The room.
-        lamps: (L,3) centres of ceiling lamps (m), shining down.
-        rng: Jitters the shadow rays.
+        surfaces: All surfaces of the room.
+        lamps: (L,3) centres of ceiling lamps (m); they shine down.
+        rng: Source of the points of lamps that shadow rays start from.
     """
     corners = np.concatenate([surface.corners() for surface in surfaces])
     quads = np.arange(len(surfaces), dtype=np.uint32)[:, None] * 4
     triangles = np.concatenate([quads + np.array([0, 1, 2]), quads + np.array([0, 2, 3])]).astype(np.uint32)
     scene = RayScene(corners, triangles)
-    grids = [_cells(surface) for surface in surfaces]
+    grids = [_light_grid(surface) for surface in surfaces]
     points = np.concatenate([grid.reshape(-1, 3) for grid in grids])
     normals = np.concatenate(
         [
@@ -48,33 +61,33 @@ def light_surfaces(surfaces: Sequence[Surface], lamps: FloatArray, rng: np.rando
             ray = source - points
             distance = np.linalg.norm(ray, axis=1)
             cosine = np.clip((ray * normals).sum(axis=1) / distance, 0, None)
-            emitted = np.clip(ray[:, 2] / distance, 0.05, None)
+            emitted = np.clip(ray[:, 2] / distance, _MIN_EMISSION, None)
             lit = cosine > 0
             rays = np.concatenate([points + normals * _LIFT_M, ray], axis=1)[lit].astype(np.float32)
-            hidden = scene.hidden(rays, 0.98)
-            strength = 10.0 * cosine[lit] * emitted[lit] / (1.0 + distance[lit] ** 2)
+            hidden = scene.is_occluded(rays, _RAY_LENGTH)
+            strength = _LAMP_STRENGTH * cosine[lit] * emitted[lit] / (1.0 + distance[lit] ** 2)
             light[lit] += brightness * np.where(hidden, 0.0, strength)
     out, start = [], 0
     for surface, grid in zip(surfaces, grids, strict=True):
         stop = start + grid[..., 0].size
-        out.append(_paint(surface, light[start:stop].reshape(grid.shape[:2])))
+        out.append(_with_light(surface, light[start:stop].reshape(grid.shape[:2])))
         start = stop
     return out
 
 
-def _cells(surface: Surface) -> FloatArray:
-    """World positions (R,C,3) of a grid over a surface, both borders included."""
+def _light_grid(surface: Surface) -> FloatArray:
+    """Return world positions (R,C,3) of a grid of points on a surface."""
     rows = max(2, int(np.linalg.norm(surface.down) / _CELL_M) + 1)
     columns = max(2, int(np.linalg.norm(surface.across) / _CELL_M) + 1)
     v, u = np.meshgrid(np.linspace(0.02, 0.98, rows), np.linspace(0.02, 0.98, columns), indexing="ij")
     return np.asarray(surface.corner + u[..., None] * surface.across + v[..., None] * surface.down)
 
 
-def _paint(surface: Surface, light: FloatArray) -> Surface:
-    """The surface with its light multiplied in."""
+def _with_light(surface: Surface, light: FloatArray) -> Surface:
+    """Return the surface with its texture multiplied by the light (R,C)."""
     if surface.shines:
         return surface
     height, width = surface.image.shape[:2]
     smooth = cv2.GaussianBlur(light.astype(np.float32), (3, 3), 0.8)
     gain = cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR)
-    return replace(surface, image=shaded(surface.image, gain))
+    return replace(surface, image=shade_image(surface.image, gain))

@@ -1,4 +1,4 @@
-"""Put a synthetic capture together, in a folder that appears only when it is complete."""
+"""Write a synthetic capture into a folder that appears only when it is complete."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from bodycap_batch.formats.mp4 import VideoWriter
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
 from bodycap_batch.synthetic.clip import load_clip
-from bodycap_batch.synthetic.filming import Film, Moving, Sensor, camera_at
-from bodycap_batch.synthetic.gait import Habits, Walk
+from bodycap_batch.synthetic.filming import CameraRenderer, MovingBody, Sensor, camera_poses_at
+from bodycap_batch.synthetic.gait import Walk, WalkStyle
 from bodycap_batch.synthetic.lens import focal_and_centre, ray_grid
-from bodycap_batch.synthetic.measured import measure
+from bodycap_batch.synthetic.measured import disturb_poses
 from bodycap_batch.synthetic.options import SynthOptions
-from bodycap_batch.synthetic.person import draw_bearing, draw_body, draw_mounts
-from bodycap_batch.synthetic.pressing import press_of
-from bodycap_batch.synthetic.render import View, triangles_of
+from bodycap_batch.synthetic.person import draw_body, draw_mounts, draw_posture
+from bodycap_batch.synthetic.pressing import find_press
+from bodycap_batch.synthetic.render import SceneRenderer, triangles_from_surfaces
 from bodycap_batch.synthetic.room import build_room
 from bodycap_batch.synthetic.truth import (
     MARKER,
     common_ticks_ns,
-    in_seconds,
+    seconds_from_ns,
     write_calibration,
     write_path,
     write_timestamps,
@@ -43,21 +43,23 @@ from bodycap_batch.synthetic.truth import (
 from bodycap_batch.synthetic.wearer import Wearer
 
 _TEXELS_PER_PIXEL_M = 0.85
-"""Texture detail: at 1 m a texel covers a little more than a pixel."""
+"""Texture detail: texels per metre for each pixel of focal length. At 1 m a texel covers a little more than a
+pixel."""
 _MAX_TEXELS_PER_M = 500.0
+"""Largest texture detail, texels per metre; limits memory."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Subject:
-    """Who is filmed.
+    """The person who is filmed.
 
     Attributes:
-        motion: The body in motion, centred in the room.
-        mounts: Where its cameras truly sit.
+        motion: The moving body, centred in the room.
+        mounts: True mounts of its cameras.
         seeds: Independent sources of randomness for room, body, images, poses and lost frames.
     """
 
-    motion: Moving
+    motion: MovingBody
     mounts: tuple[Mount, ...]
     seeds: dict[str, np.random.SeedSequence]
 
@@ -68,13 +70,13 @@ def draw_subject(options: SynthOptions) -> Subject:
     Raises:
         JobError: The BVH file cannot be used.
     """
-    names = ("body", "walk", "mounts", "room", "clothes", "images", "poses", "drops", "bearing")
+    names = ("body", "walk", "mounts", "room", "clothes", "images", "poses", "drops", "posture")
     children = np.random.SeedSequence(options.seed).spawn(len(names))
     seeds = dict(zip(names, children, strict=True))
     length_s = options.seconds + max(0.0, *options.offsets_s.values(), 0.0)
     sigmas = options.mount_sigma_deg, options.mount_sigma_m
     mount_rng = np.random.default_rng(seeds["mounts"])
-    motion: Moving
+    motion: MovingBody
     if options.motion is not None:
         motion = load_clip(options.motion, options.motion_start_s, length_s - 1.0 / options.fps)
         mounts = draw_mounts(options.cameras, motion.skeleton, sigmas, mount_rng)
@@ -83,38 +85,40 @@ def draw_subject(options: SynthOptions) -> Subject:
             options.subject_height_m, options.proportion_range, np.random.default_rng(seeds["body"])
         )
         mounts = draw_mounts(options.cameras, body, sigmas, mount_rng)
-        habits = Habits(
+        style = WalkStyle(
             t_pose_s=options.t_pose_s,
             arms_ahead=options.arms_ahead,
             on_the_spot=options.on_the_spot,
             presses=tuple(
-                press_of(mount, body, *options.pressed_s[mount.camera])
+                find_press(mount, body, *options.pressed_s[mount.camera])
                 for mount in mounts
                 if mount.camera in options.pressed_s
             ),
-            bearing=draw_bearing(options.posture_spread, np.random.default_rng(seeds["bearing"])),
+            posture=draw_posture(options.posture_spread, np.random.default_rng(seeds["posture"])),
         )
-        motion = Walk(body, length_s, habits, np.random.default_rng(seeds["walk"]))
+        motion = Walk(body, length_s, style, np.random.default_rng(seeds["walk"]))
     return Subject(motion=motion, mounts=mounts, seeds=seeds)
 
 
-def make(options: SynthOptions, out_dir: Path, context: StageContext, *, overwrite: bool) -> None:
+def write_synthetic_capture(
+    options: SynthOptions, out_dir: Path, context: StageContext, *, overwrite: bool
+) -> None:
     """Write a capture to `out_dir`; see `bodycap_batch.synthetic.synthesise`."""
     out_dir = Path(out_dir)
-    _refuse_foreign(out_dir, overwrite)
+    _check_output_folder(out_dir, overwrite)
     subject = draw_subject(options)
-    with _appearing(out_dir) as folder:
+    with _atomic_folder(out_dir) as folder:
         write_calibration(folder, options)
-        kept = _kept_frames(options, subject)
+        kept = _draw_kept_frames(options, subject)
         for mount in subject.mounts:
             _write_camera_truth(folder, options, subject, mount, kept[mount.camera])
         if not options.poses_only:
-            _film(folder, options, subject, kept, context)
+            _write_videos(folder, options, subject, kept, context)
         write_truth(folder, options, subject.motion, subject.mounts)
 
 
-def _kept_frames(options: SynthOptions, subject: Subject) -> dict[str, BoolArray]:
-    """Which frames each camera delivers; the first and the last always."""
+def _draw_kept_frames(options: SynthOptions, subject: Subject) -> dict[str, BoolArray]:
+    """Return masks of the frames that each camera delivers; the first and the last one always are."""
     rng = np.random.default_rng(subject.seeds["drops"])
     out = {}
     for camera in options.cameras:
@@ -125,7 +129,7 @@ def _kept_frames(options: SynthOptions, subject: Subject) -> dict[str, BoolArray
 
 
 def frame_times_ns(options: SynthOptions, camera: str) -> IntArray:
-    """A camera's own time of each frame."""
+    """Return the time of each frame on the camera's own clock, nanoseconds."""
     rate = options.rate_fps(camera)
     count = max(1, round(options.seconds * rate))
     return np.asarray(np.round(np.arange(count) * (1e9 / rate)), dtype=np.int64)
@@ -134,66 +138,68 @@ def frame_times_ns(options: SynthOptions, camera: str) -> IntArray:
 def _write_camera_truth(
     folder: Path, options: SynthOptions, subject: Subject, mount: Mount, kept: BoolArray
 ) -> None:
-    """The camera's true path, its timestamps where frames are lost, and its measured poses."""
+    """Write a camera's true path, its timestamps if frames are lost, and its noisy poses if asked for."""
     camera = mount.camera
     times_ns = frame_times_ns(options, camera)[kept]
-    poses = camera_at(subject.motion, mount, in_seconds(times_ns) + options.offsets_s.get(camera, 0.0))
+    poses = camera_poses_at(
+        subject.motion, mount, seconds_from_ns(times_ns) + options.offsets_s.get(camera, 0.0)
+    )
     write_path(folder / "gt" / f"{camera}.tum", times_ns, poses, "world_from_camera, the camera's own clock")
     if not kept.all():
         write_timestamps(folder / f"{camera}.timestamps.txt", times_ns)
     if options.poses_only:
         seed = [options.cameras.index(camera), *subject.seeds["poses"].generate_state(4).tolist()]
-        seen = measure(poses, options, np.random.default_rng(seed))
+        measured = disturb_poses(poses, options, np.random.default_rng(seed))
         write_path(
             folder / "poses" / f"{camera}.tum",
-            times_ns[seen.present],
-            seen.world_from_cam[seen.present],
+            times_ns[measured.present],
+            measured.world_from_cam[measured.present],
             "world_from_camera with noise, gross errors and gaps; the camera's own clock",
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Shooting:
-    """One camera's frames, each a function of its number alone."""
+class _FrameRecorder:
+    """Renders the frames of one camera; a frame depends on its number alone."""
 
-    film: Film
+    renderer: CameraRenderer
     sensor: Sensor
     times_s: FloatArray
 
     def __call__(self, frame: int) -> Bytes:
-        return self.sensor.record(self.film.frame(float(self.times_s[frame])), frame)
+        return self.sensor.record(self.renderer.render(float(self.times_s[frame])), frame)
 
 
-def _film(
+def _write_videos(
     folder: Path, options: SynthOptions, subject: Subject, kept: dict[str, BoolArray], context: StageContext
 ) -> None:
-    """Render and encode every camera's video."""
+    """Render and encode the video of every camera."""
     total, done = sum(int(frames.sum()) for frames in kept.values()), 0
     context.progress(0, total, "room")
-    films = build_films(options, subject)
-    with _one_opencv_thread(), ThreadPoolExecutor(max_workers=max(1, context.threads)) as pool:
-        for film, seed in zip(films, subject.seeds["images"].spawn(len(films)), strict=True):
-            camera = film.mount.camera
-            shoot = _Shooting(
-                film=film,
+    renderers = build_renderers(options, subject)
+    with _single_opencv_thread(), ThreadPoolExecutor(max_workers=max(1, context.threads)) as pool:
+        for renderer, seed in zip(renderers, subject.seeds["images"].spawn(len(renderers)), strict=True):
+            camera = renderer.mount.camera
+            recorder = _FrameRecorder(
+                renderer=renderer,
                 sensor=Sensor(options.noise, 3 * options.width * options.height, seed),
-                times_s=in_seconds(frame_times_ns(options, camera)) + options.offsets_s.get(camera, 0.0),
+                times_s=seconds_from_ns(frame_times_ns(options, camera)) + options.offsets_s.get(camera, 0.0),
             )
             size = (options.width, options.height)
             with VideoWriter(folder / f"{camera}.mp4", options.fps, size, options.quality) as video:
-                for image in _in_order(pool, shoot, np.flatnonzero(kept[camera]).tolist(), context):
+                for image in _render_in_order(pool, recorder, np.flatnonzero(kept[camera]).tolist(), context):
                     video.add(image)
                     done += 1
                     context.progress(done, total, camera)
 
 
-def build_films(options: SynthOptions, subject: Subject) -> list[Film]:
-    """Build the room around the motion and point every camera at it."""
+def build_renderers(options: SynthOptions, subject: Subject) -> list[CameraRenderer]:
+    """Build the room around the motion, and a renderer for each camera."""
     camera = options.camera()
     focal, _ = focal_and_centre(camera)
     texels_per_m = min(_TEXELS_PER_PIXEL_M * float(focal.mean()), _MAX_TEXELS_PER_M)
-    travelled = subject.motion.pose(in_seconds(common_ticks_ns(options)))[0][:, :2]
-    extent_x, extent_y = np.abs(travelled).max(axis=0).tolist()
+    root_path = subject.motion.pose(seconds_from_ns(common_ticks_ns(options)))[0][:, :2]
+    extent_x, extent_y = np.abs(root_path).max(axis=0).tolist()
     surfaces = build_room(
         (extent_x, extent_y),
         texels_per_m,
@@ -206,17 +212,17 @@ def build_films(options: SynthOptions, subject: Subject) -> list[Film]:
     atlas = Atlas(images + (wearer.images if wearer else []))
     if wearer:
         wearer.place_textures(atlas.origins[len(images) :])
-    room = triangles_of(surfaces, atlas.origins[: len(images)])
-    view, grid = View(room, atlas), ray_grid(camera)
+    room = triangles_from_surfaces(surfaces, atlas.origins[: len(images)])
+    scene, grid = SceneRenderer(room, atlas), ray_grid(camera)
     return [
-        Film(
+        CameraRenderer(
             motion=subject.motion,
             mount=mount,
             grid=grid,
             room=room,
             atlas=atlas,
-            view=view,
-            wearer=wearer.seen_by(mount, subject.motion.skeleton) if wearer else None,
+            scene=scene,
+            wearer=wearer.visible_from(mount, subject.motion.skeleton) if wearer else None,
             exposure_s=options.exposure_s,
             rolling_shutter_s=options.rolling_shutter_s,
         )
@@ -224,14 +230,14 @@ def build_films(options: SynthOptions, subject: Subject) -> list[Film]:
     ]
 
 
-def _in_order(
-    pool: ThreadPoolExecutor, shoot: _Shooting, frames: list[int], context: StageContext
+def _render_in_order(
+    pool: ThreadPoolExecutor, recorder: _FrameRecorder, frames: list[int], context: StageContext
 ) -> Iterator[Bytes]:
-    """Render frames side by side and yield them one after the other; few wait at any time."""
+    """Render frames in several threads and yield them in order; only a few wait in memory."""
     waiting: deque[Future[Bytes]] = deque()
     try:
         for frame in frames:
-            waiting.append(pool.submit(shoot, frame))
+            waiting.append(pool.submit(recorder, frame))
             if len(waiting) > 2 * max(1, context.threads):
                 context.check_cancelled()
                 yield waiting.popleft().result()
@@ -244,8 +250,8 @@ def _in_order(
 
 
 @contextmanager
-def _one_opencv_thread() -> Iterator[None]:
-    """Keep OpenCV from spreading over all cores while frames are rendered side by side."""
+def _single_opencv_thread() -> Iterator[None]:
+    """Limit OpenCV to one thread while several threads render frames."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
@@ -254,11 +260,11 @@ def _one_opencv_thread() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def _refuse_foreign(out_dir: Path, overwrite: bool) -> None:
-    """Never replace anything but a synthetic capture, and that only when asked to.
+def _check_output_folder(out_dir: Path, overwrite: bool) -> None:
+    """Check that nothing is overwritten except a synthetic capture, and that only on request.
 
     Raises:
-        JobError: Something is there already.
+        JobError: The folder exists and must stay.
     """
     if not out_dir.exists() or (out_dir.is_dir() and not any(out_dir.iterdir())):
         return
@@ -269,11 +275,11 @@ def _refuse_foreign(out_dir: Path, overwrite: bool) -> None:
 
 
 @contextmanager
-def _appearing(out_dir: Path) -> Iterator[Path]:
-    """Yield a new folder beside `out_dir`; it takes that name when the block ends well, else it is deleted.
+def _atomic_folder(out_dir: Path) -> Iterator[Path]:
+    """Yield a temporary folder; rename it to `out_dir` if the block succeeds, else delete it.
 
     Raises:
-        StoreError: The disk refuses.
+        StoreError: The disk refuses a file.
     """
     folder = out_dir.with_name(f".{out_dir.name}.{secrets.token_hex(4)}")
     old = folder.with_name(folder.name + ".old")
@@ -286,7 +292,7 @@ def _appearing(out_dir: Path) -> Iterator[Path]:
     except OSError as error:
         raise store_error_from_os_error(error, out_dir) from error
     except StoreError as error:
-        # Speak of the folder that was asked for, not of the one that is gone by now.
+        # Name the requested folder, not the temporary one, which is deleted.
         path = Path(error.path or out_dir)
         named = out_dir / path.relative_to(folder) if path.is_relative_to(folder) else path
         raise StoreError(error.message, path=named, hint=error.hint) from error

@@ -1,4 +1,4 @@
-"""Camera poses as a localiser would deliver them: noise, gross errors in bursts, gaps."""
+"""Camera poses as a localisation would deliver them: noise, gross errors in bursts, gaps."""
 
 from __future__ import annotations
 
@@ -11,18 +11,21 @@ from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.synthetic.options import SynthOptions
 
 _BURST_FRAMES = (2, 7)
+"""Length of a burst of gross errors, frames: smallest and largest + 1."""
 _GROSS_M = 0.4
+"""Standard deviation of a gross error's shift along an axis, metres."""
 _GROSS_RAD = 0.5
+"""Standard deviation of a gross error's rotation about an axis, radians."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasuredPoses:
-    """What is left of a camera's true path.
+    """A camera's path with errors and gaps.
 
     Attributes:
         world_from_cam: (T,4,4) noisy poses.
         present: (T,) False in a gap.
-        outlier: (T,) True where the pose is grossly wrong.
+        outlier: (T,) True for a pose with a gross error.
     """
 
     world_from_cam: FloatArray
@@ -30,10 +33,12 @@ class MeasuredPoses:
     outlier: BoolArray
 
 
-def measure(world_from_cam: FloatArray, options: SynthOptions, rng: np.random.Generator) -> MeasuredPoses:
-    """Disturb true poses (T,4,4); the first and the last frame are never lost."""
+def disturb_poses(
+    world_from_cam: FloatArray, options: SynthOptions, rng: np.random.Generator
+) -> MeasuredPoses:
+    """Add noise, gross errors and gaps to true poses (T,4,4); the first and the last frame are never lost."""
     count = len(world_from_cam)
-    outlier = _stretches(count, round(options.outliers * count), _BURST_FRAMES, rng)
+    outlier = _draw_runs(count, round(options.outliers * count), _BURST_FRAMES, rng)
     sigma_rad = np.radians(options.pose_sigma_deg)
     turn = so3_exp(rng.normal(0.0, sigma_rad, (count, 3)))
     shift = rng.normal(0.0, options.pose_sigma_m, (count, 3))
@@ -42,14 +47,14 @@ def measure(world_from_cam: FloatArray, options: SynthOptions, rng: np.random.Ge
     shift = shift + outlier[:, None] * rng.normal(0.0, _GROSS_M, (count, 3))
     poses = make_transform(world_from_cam[:, :3, :3] @ turn, world_from_cam[:, :3, 3] + shift)
     present = np.ones(count, dtype=bool)
-    # The ends stay; the last gap is cut to reach the wanted share exactly.
+    # The ends stay. The last gap is shortened so that the ratio of lost frames is exact.
     shortest, longest = options.gap_frames
-    present[1:-1] = ~_stretches(max(count - 2, 0), round(options.lost * count), (shortest, longest + 1), rng)
+    present[1:-1] = ~_draw_runs(max(count - 2, 0), round(options.lost * count), (shortest, longest + 1), rng)
     return MeasuredPoses(world_from_cam=poses, present=present, outlier=outlier)
 
 
-def _stretches(count: int, wanted: int, lengths: tuple[int, int], rng: np.random.Generator) -> BoolArray:
-    """Mark exactly `wanted` of `count` frames, in stretches."""
+def _draw_runs(count: int, wanted: int, lengths: tuple[int, int], rng: np.random.Generator) -> BoolArray:
+    """Draw runs of frames until exactly `wanted` of `count` frames are marked; return the mask (count,)."""
     out = np.zeros(count, dtype=bool)
     while int(out.sum()) < min(wanted, count):
         start = int(rng.integers(0, count))

@@ -1,4 +1,4 @@
-"""What a synthetic capture may look like."""
+"""The options of a synthetic capture."""
 
 from __future__ import annotations
 
@@ -13,11 +13,15 @@ from bodycap_batch.config.options import Options
 from bodycap_batch.model.camera import CAMERA_MODELS, Camera, parameter_count
 
 _EARLIEST_S = 3.0
-"""The walk begins a little before the common clock's zero."""
+"""Time by which the walk begins before the common clock's zero, seconds."""
+_DEFAULT_FOCAL_PX = 420.0
+"""Focal length of the default lens at a width of 640 px: an angle of view of 75 degrees."""
+_DEFAULT_FOV_OMEGA_RAD = 0.8
+"""Parameter of the default lens of model FOV, radians. Evidence: none."""
 
 
 class SynthOptions(Options):
-    """A walker with body cameras in a textured room."""
+    """A person who walks with body cameras in a textured room."""
 
     seconds: float = Field(12.0, gt=0, le=3600, description="length of each camera's video")
     fps: float = Field(30.0, gt=0, le=240, description="frames per second of every camera")
@@ -38,13 +42,13 @@ class SynthOptions(Options):
     motion_start_s: float = Field(0.0, ge=0, description="where in the BVH file the capture begins")
     t_pose_s: float = Field(0.0, ge=0, description="seconds the built-in walker first stands in a T-pose")
     proportion_range: float = Field(
-        0.05, ge=0, lt=0.5, description="bones of the built-in walker differ by up to this share"
+        0.05, ge=0, lt=0.5, description="bone lengths of the built-in walker differ by up to this ratio"
     )
     posture_spread: float = Field(
         0.0,
         ge=0,
         le=3,
-        description="how far the built-in walker's usual posture is off everyone's mean; 1: as people differ",
+        description="offset of the built-in walker's posture from the mean of people; 1: as people differ",
     )
     mount_sigma_deg: float = Field(15.0, ge=0, description="how far mounts are turned off nominal, in all")
     mount_sigma_m: float = Field(0.05, ge=0, description="how far mounts sit off nominal, in all")
@@ -67,7 +71,7 @@ class SynthOptions(Options):
     on_the_spot: bool = Field(
         False, description="the built-in walker stands and turns to both sides: hardly any parallax"
     )
-    furnished: bool = Field(True, description="False: a bare room, with nothing but what hangs on its walls")
+    furnished: bool = Field(True, description="False: a bare room, with pictures on its walls only")
     repeated_posters: bool = Field(False, description="hang one and the same poster in several places")
     pressed_s: Mapping[str, tuple[float, float]] = Field(
         default_factory=dict,
@@ -107,7 +111,7 @@ class SynthOptions(Options):
         return self
 
     def _check_cameras_named(self) -> None:
-        """What is said by camera speaks of cameras that are there, and of poses where videos have none."""
+        """Check that options by camera name cameras of the capture, and that rates are for poses only."""
         for key, named in (("offsets_s", self.offsets_s), ("rates_fps", self.rates_fps)):
             unknown = sorted(set(named) - set(self.cameras))
             if unknown:
@@ -120,7 +124,7 @@ class SynthOptions(Options):
             raise ValueError("gap_frames: shortest first, one frame or more")
 
     def _check_pressed(self) -> None:
-        """Only the built-in walker's hands can be led to the chest, and it has to be there."""
+        """Check that only hands of the built-in walker touch the chest, and that the chest is rendered."""
         for name, (start_s, end_s) in self.pressed_s.items():
             place = mount_of(name)
             if name not in self.cameras or place is None or not place[1].endswith("Hand"):
@@ -134,28 +138,34 @@ class SynthOptions(Options):
 
     @property
     def frame_count(self) -> int:
-        """Frames a camera at the common rate exposes (dropped ones included)."""
+        """Number of frames of a camera at the common rate, dropped ones included."""
         return max(1, round(self.seconds * self.fps))
 
     def rate_fps(self, camera: str) -> float:
-        """Frames per second of one camera."""
+        """Return the frames per second of one camera."""
         return self.rates_fps.get(camera, self.fps)
 
     def camera(self) -> Camera:
-        """The lens that every camera of the capture has."""
+        """Return the intrinsics of all cameras of the capture."""
         params = self.lens_params
         if params is None:
-            params = _plain_lens(self.lens, self.width, self.height)
+            params = _default_lens_params(self.lens, self.width, self.height)
         return Camera(model=self.lens, width_px=self.width, height_px=self.height, params=list(params))  # type: ignore[arg-type]
 
 
-def _plain_lens(model: str, width: int, height: int) -> tuple[float, ...]:
-    """Parameters of an undistorted lens of usual width; 640 px wide gives a focal length of 420 px."""
-    focal = width * 420.0 / 640.0
-    single = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-    head = [focal] if single else [focal, focal]
+def _default_lens_params(model: str, width: int, height: int) -> tuple[float, ...]:
+    """Return the parameters of an undistorted lens with a usual angle of view."""
+    focal = width * _DEFAULT_FOCAL_PX / 640.0
+    has_one_focal = model in (
+        "SIMPLE_PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "SIMPLE_RADIAL_FISHEYE",
+        "RADIAL_FISHEYE",
+    )
+    head = [focal] if has_one_focal else [focal, focal]
     head += [width / 2.0, height / 2.0]
     rest = [0.0] * (parameter_count(model) - len(head))
     if model == "FOV":
-        rest = [0.8]
+        rest = [_DEFAULT_FOV_OMEGA_RAD]
     return tuple(head + rest)

@@ -1,4 +1,4 @@
-"""The person who wears the cameras: true proportions and true mounts, both off nominal."""
+"""Draw the person who wears the cameras: true proportions and mounts, which differ from nominal ones."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount, r
 
 
 def draw_body(height_m: float, proportion_range: float, rng: np.random.Generator) -> SkeletonModel:
-    """A body of the given stature whose bones differ from the textbook's.
+    """Draw a body of a given stature with other proportions than the nominal body.
 
-    Each bone's length changes by up to ±`proportion_range` (left and right alike), then the whole body is
-    scaled so that its stature stays what a tape would read.
+    The length of each bone changes by a ratio of up to ±`proportion_range`, equally on both sides. Then the
+    whole body is scaled to the stature.
     """
     nominal = load_skeleton("full_body", height_m)
     factors: dict[str, float] = {}
@@ -26,7 +26,7 @@ def draw_body(height_m: float, proportion_range: float, rng: np.random.Generator
     ends = nominal.end_offsets_m * gain[:, None]
     offsets[0] = 0.0
     body = _with_bones(nominal, offsets, ends)
-    low, high = _extent(body)
+    low, high = _height_range(body)
     scale = height_m / (high - low)
     offsets, ends = offsets * scale, ends * scale
     offsets[0] = (0.0, 0.0, -low * scale)
@@ -34,6 +34,7 @@ def draw_body(height_m: float, proportion_range: float, rng: np.random.Generator
 
 
 def _with_bones(model: SkeletonModel, offsets_m: FloatArray, end_offsets_m: FloatArray) -> SkeletonModel:
+    """Return a skeleton with other bone vectors, metres."""
     return SkeletonModel(
         name="synthetic",
         joints=model.joints,
@@ -45,15 +46,15 @@ def _with_bones(model: SkeletonModel, offsets_m: FloatArray, end_offsets_m: Floa
     )
 
 
-def _extent(body: SkeletonModel) -> tuple[float, float]:
-    """Height of the sole and of the crown over the root, zero pose (m)."""
+def _height_range(body: SkeletonModel) -> tuple[float, float]:
+    """Return the heights of the soles and of the crown over the root in the zero pose, metres."""
     joints = rest_positions(body)
     tips = joints + np.nan_to_num(body.end_offsets_m)
     height = np.concatenate([joints[:, 2], tips[:, 2]])
     return float(height.min()), float(height.max())
 
 
-_BEARING_DEG = {
+_POSTURE_SIGMA_DEG = {
     "Bend": 3.2,
     "Turn": 3.2,
     "Lift": 5.4,
@@ -64,24 +65,25 @@ _BEARING_DEG = {
     "Elbow": 3.6,
     "Twist": 14.7,
 }
-"""Standard deviation between people of how they hold a joint at ease. Shoulder girdle, shoulder and elbow:
-interquartile ranges over 1.349 of 158 arms of people standing, Y. Yoshida et al., "Three-dimensional
-alignment of the upper extremity in the standing neutral position in healthy subjects", J. Orthop. Surg. Res.
-17, 2022. The chest: turned as shoulder blades are (3.18 degrees, table 1 of "Standard reference values of the
-upper body posture in healthy middle-aged female adults in Germany", Scientific Reports 11, 2021), inclined
-by half of the spread of the kyphosis whose upper half it is (6.4 degrees, Abrisham et al., as cited in
-https://www.nature.com/articles/s41598-023-27976-8, Scientific Reports 13, 2023)."""
+"""Standard deviation between people of the joint angles when they stand relaxed, degrees. Shoulder girdle,
+shoulder and elbow: interquartile ranges divided by 1.349, of 158 arms of standing people, Y. Yoshida et al.,
+"Three-dimensional alignment of the upper extremity in the standing neutral position in healthy subjects", J.
+Orthop. Surg. Res. 17, 2022. Trunk: turned like the shoulder blades (3.18 degrees, table 1 of "Standard
+reference values of the upper body posture in healthy middle-aged female adults in Germany", Scientific
+Reports 11, 2021), inclined by half of the standard deviation of the kyphosis, whose upper half it is (6.4
+degrees, Abrisham et al., as cited in https://www.nature.com/articles/s41598-023-27976-8, Scientific Reports
+13, 2023)."""
 
 
-def draw_bearing(spread: float, rng: np.random.Generator) -> dict[str, float]:
-    """How one person holds the joints, degrees beside everyone's mean, by the names of `Habits.bearing`.
+def draw_posture(spread: float, rng: np.random.Generator) -> dict[str, float]:
+    """Draw one person's offsets of joint angles from the mean of people, degrees, as in `WalkStyle.posture`.
 
     Args:
-        spread: Times as much as people differ; both sides are drawn apart.
-        rng: Source of the draws.
+        spread: Factor on the standard deviation between people. Both sides are drawn independently.
+        rng: Source of randomness.
     """
     drawn = {}
-    for part, degrees in _BEARING_DEG.items():
+    for part, degrees in _POSTURE_SIGMA_DEG.items():
         for side in ("",) if part in ("Bend", "Turn") else ("Left", "Right"):
             drawn[side + part] = spread * degrees * float(rng.normal())
     return drawn
@@ -93,13 +95,14 @@ def draw_mounts(
     sigmas: tuple[float, float],
     rng: np.random.Generator,
 ) -> tuple[Mount, ...]:
-    """True mounts: nominal ones turned and shifted at random.
+    """Draw true mounts: nominal ones, rotated and shifted at random.
 
     Args:
         cameras: Mount names.
-        skeleton: The body that wears them.
-        sigmas: Degrees and metres, all three axes together (each axis gets 1/√3 of it).
-        rng: Source of the draws.
+        skeleton: The body that wears the cameras.
+        sigmas: Standard deviations in degrees and metres, of all three axes together; each axis gets 1/√3 of
+            it.
+        rng: Source of randomness.
 
     Raises:
         JobError: The skeleton has no joint for a camera.
@@ -107,7 +110,7 @@ def draw_mounts(
     out = []
     for camera in cameras:
         place = mount_of(camera)
-        assert place is not None  # SynthOptions refuses other names
+        assert place is not None  # `SynthOptions` refuses other names.
         nominal = nominal_mount(camera, place[1], skeleton)
         turn = so3_exp(rng.normal(0.0, np.radians(sigmas[0]) / np.sqrt(3.0), 3))
         shift = rng.normal(0.0, sigmas[1] / np.sqrt(3.0), 3)

@@ -1,4 +1,4 @@
-"""Procedural pictures, papers and shelves: what hangs and stands in a laboratory."""
+"""Procedural textures of pictures, papers, books and boxes in a laboratory."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ import numpy as np
 from bodycap_batch.synthetic.textures import Image, Texture, colour, fractal
 
 _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"
+"""Characters of random words."""
 
 
 def _word(rng: np.random.Generator) -> str:
+    """Return a random word."""
     return "".join(rng.choice(list(_LETTERS), int(rng.integers(3, 9))))
 
 
 def _write(image: Image, x: float, y: float, size: float, rng: np.random.Generator) -> None:
-    """A word, its letters about `size` texels tall."""
+    """Write a word with letters about `size` texels tall; x, y (texels) is its top left corner."""
     at = (round(x), round(y + size))
     thickness = max(1, round(size / 9))
     ink = colour(rng, 0.9, (0.05, 0.5)).tolist()
@@ -23,12 +25,14 @@ def _write(image: Image, x: float, y: float, size: float, rng: np.random.Generat
 
 
 def _paper(height: int, width: int, rng: np.random.Generator) -> Image:
+    """Return a sheet of nearly white paper."""
     out = np.empty((height, width, 3), np.uint8)
     out[:] = np.clip(225 + 0.12 * (colour(rng) - 128), 0, 255)
     return out
 
 
 def _framed(image: Image, rng: np.random.Generator) -> Image:
+    """Draw a frame around an image and return the image."""
     edge = max(2, min(image.shape[:2]) // 40)
     cv2.rectangle(
         image, (0, 0), (image.shape[1] - 1, image.shape[0] - 1), colour(rng, 0.5, (0.1, 0.5)).tolist(), edge
@@ -37,13 +41,13 @@ def _framed(image: Image, rng: np.random.Generator) -> Image:
 
 
 def abstract(height: int, width: int, _scale: float, rng: np.random.Generator) -> Image:
-    """Overlapping shapes from large to small."""
+    """Return overlapping shapes, from large to small."""
     out = np.empty((height, width, 3), np.uint8)
     out[:] = colour(rng)
-    for share, count in ((0.35, 7), (0.15, 22), (0.06, 70), (0.025, 120)):
+    for ratio, count in ((0.35, 7), (0.15, 22), (0.06, 70), (0.025, 120)):
         for _ in range(count):
             centre = (int(rng.uniform(0, width)), int(rng.uniform(0, height)))
-            size = max(2, int(share * min(height, width) * rng.uniform(0.4, 1.2)))
+            size = max(2, int(ratio * min(height, width) * rng.uniform(0.4, 1.2)))
             tint, kind = colour(rng, 0.9, (0.05, 1.0)).tolist(), rng.integers(4)
             if kind == 0:
                 cv2.circle(out, centre, size, tint, -1, cv2.LINE_AA)
@@ -59,7 +63,7 @@ def abstract(height: int, width: int, _scale: float, rng: np.random.Generator) -
 
 
 def landscape(height: int, width: int, _scale: float, rng: np.random.Generator) -> Image:
-    """Ridges behind each other under a cloudy sky."""
+    """Return ridges, one behind the other, under a cloudy sky."""
     clouds = fractal(height, width, width / 3, rng, 5)
     out = np.clip(colour(rng, 0.5, (0.7, 0.95)) + 22.0 * clouds[..., None], 0, 255)
     for ridge in range(6):
@@ -74,7 +78,7 @@ def landscape(height: int, width: int, _scale: float, rng: np.random.Generator) 
 
 
 def research_poster(height: int, width: int, _scale: float, rng: np.random.Generator) -> Image:
-    """Title, columns of text, plots."""
+    """Return a poster with a title, columns of text and plots."""
     out = _paper(height, width, rng)
     unit = min(height, width) / 36.0
     cv2.rectangle(out, (0, 0), (width, int(4 * unit)), colour(rng, 0.9, (0.2, 0.6)).tolist(), -1)
@@ -96,7 +100,7 @@ def research_poster(height: int, width: int, _scale: float, rng: np.random.Gener
 
 
 def _plot(out: Image, box: tuple[int, int, int, int], rng: np.random.Generator) -> None:
-    """A chart: bars, curves or an image."""
+    """Draw a chart into a box: bars, curves or an image."""
     left, top, wide, tall = box
     if wide < 8 or tall < 8:
         return
@@ -123,7 +127,7 @@ def _plot(out: Image, box: tuple[int, int, int, int], rng: np.random.Generator) 
 
 
 def street_map(height: int, width: int, _scale: float, rng: np.random.Generator) -> Image:
-    """Blocks of different colours between streets, with names."""
+    """Return a map: blocks of different colours between streets, with names."""
     count = 90
     seeds = rng.uniform(0, 1, (count, 2)) * [width, height]
     y, x = np.mgrid[0:height:3, 0:width:3].astype(np.float32)
@@ -145,7 +149,7 @@ def street_map(height: int, width: int, _scale: float, rng: np.random.Generator)
 
 
 def notes(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """A cork board with sheets of paper pinned on it."""
+    """Return a cork board with sheets of paper pinned to it."""
     cork = 1.0 + 0.16 * np.tanh(fractal(height, width, 0.012 * scale, rng, 3))
     out = np.clip(cork[..., None] * np.array([185, 140, 95], np.float32), 0, 255).astype(np.uint8)
     for _ in range(int(14 * height * width / scale**2) + 4):
@@ -165,7 +169,7 @@ def notes(height: int, width: int, scale: float, rng: np.random.Generator) -> Im
 
 
 def _paste(out: Image, sheet: Image, corner: tuple[float, float], degrees: float) -> None:
-    """Put a sheet on an image, turned about its centre."""
+    """Put a sheet on an image, rotated about the sheet's centre."""
     tall, wide = sheet.shape[:2]
     matrix = cv2.getRotationMatrix2D((wide / 2, tall / 2), degrees, 1.0)
     matrix[:, 2] += corner
@@ -176,7 +180,7 @@ def _paste(out: Image, sheet: Image, corner: tuple[float, float], degrees: float
 
 
 def books(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Spines of books of all sizes, titles, gaps and binders."""
+    """Return spines of books of all sizes, with titles, gaps and binders."""
     out = np.full((height, width, 3), 25, np.uint8)
     x = 0
     while x < width:
@@ -198,7 +202,7 @@ def books(height: int, width: int, scale: float, rng: np.random.Generator) -> Im
 
 
 def whiteboard(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Scribbles, boxes and arrows on white."""
+    """Return a whiteboard with scribbles, boxes and arrows."""
     out = np.full((height, width, 3), 238, np.uint8)
     pens = [(30, 30, 160), (170, 30, 30), (20, 110, 40), (30, 30, 30)]
     for _ in range(int(30 * height * width / scale**2)):
@@ -216,7 +220,7 @@ def whiteboard(height: int, width: int, scale: float, rng: np.random.Generator) 
 
 
 def cardboard(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """A packing box: tape, print, a label."""
+    """Return a cardboard box with tape, print and a label."""
     shade = 1.0 + 0.05 * fractal(height, width, 0.1 * scale, rng, 4)
     out = np.clip(shade[..., None] * np.array([188, 150, 105], np.float32), 0, 255).astype(np.uint8)
     middle = int(rng.uniform(0.3, 0.7) * width)
@@ -234,7 +238,7 @@ def cardboard(height: int, width: int, scale: float, rng: np.random.Generator) -
 
 
 def screen(height: int, width: int, _scale: float, rng: np.random.Generator) -> Image:
-    """A monitor full of windows."""
+    """Return a monitor full of windows."""
     out = np.full((height, width, 3), 35, np.uint8)
     for _ in range(6):
         left, top = int(rng.uniform(0, 0.6) * width), int(rng.uniform(0, 0.6) * height)

@@ -1,4 +1,4 @@
-"""A hand laid against the chest: the joint angles at which its camera sees nothing but the wearer."""
+"""A hand laid against the chest: joint angles at which its camera sees only the wearer."""
 
 from __future__ import annotations
 
@@ -14,20 +14,25 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import segment_axes
 
 RAMP_S = 0.5
-"""From walking to the chest and back: an unhurried hand."""
+"""Time that a hand takes from walking to the chest, and back, seconds."""
 _CHEST_RADIUS_M = 0.125
-_CHEST_SHARE = 0.45
+"""Distance of the chest's surface from the bone, metres."""
+_CHEST_HEIGHT_RATIO = 0.45
+"""Height of the touched point, relative to the bone from Spine1 to the neck."""
 _OFF_CHEST_M = 0.045
-"""Lens to cloth: farther than the renderer's nearest distance, near enough to fill a usual lens."""
+"""Distance of the lens from the cloth, metres: above the renderer's nearest distance, and near enough that
+the chest fills the image."""
 _LOW_DEG = np.array([-10.0, -40.0, 0.0, -80.0, -80.0, -80.0, -40.0])
 _HIGH_DEG = np.array([110.0, 100.0, 150.0, 90.0, 80.0, 80.0, 40.0])
+"""Limits of the angles of `ArmAngles`, degrees. Evidence: none."""
 _COMFORT = 0.002
-"""Of 1 cm or 6 degrees, a degree away from the middle of a joint's range."""
+"""Cost of a degree away from the middle of a joint's range, relative to that of 1 cm or 6 degrees of
+misfit."""
 
 
 @dataclass(frozen=True, slots=True)
 class ArmAngles:
-    """Angles of one arm (degrees), each (T,): what `Walk` turns into rotations."""
+    """Angles of one arm over time, each (T,) in degrees."""
 
     flexion: FloatArray
     abduction: FloatArray
@@ -37,20 +42,30 @@ class ArmAngles:
     wrist: FloatArray
     radial: FloatArray
 
-    def rotations(self, side: str, alive: FloatArray) -> dict[str, Rotation]:
-        """Rotations of upper arm, forearm and hand; at `alive` = 0 they are stretched out to the side."""
+    def rotations(self, side: str, walk_weight: FloatArray) -> dict[str, Rotation]:
+        """Return the rotations of upper arm, forearm and hand by joint name.
+
+        Args:
+            side: ``Left`` or ``Right``.
+            walk_weight: (T,) 1 while walking; at 0 the arm is stretched out to the side.
+        """
         outward = 1.0 if side == "Left" else -1.0
-        hang = alive * (90.0 - self.abduction)
-        arm = _about("X", -alive * self.flexion) * _about("Y", outward * hang)
+        hang = walk_weight * (90.0 - self.abduction)
+        arm = _rotation_about("X", -walk_weight * self.flexion) * _rotation_about("Y", outward * hang)
         if np.any(self.spin):
-            arm = arm * _about("X", alive * self.spin)
-        # The hand's thumb side turns from ahead towards the body: about the bone, left positive.
-        forearm = _about("Z", -outward * alive * self.elbow) * _about("X", alive * self.pronation)
-        hand = _about("YZ", np.column_stack([alive * self.wrist, -outward * alive * self.radial]))
+            arm = arm * _rotation_about("X", walk_weight * self.spin)
+        # Pronation turns the thumb from the front towards the body: about the bone, positive on the left.
+        forearm = _rotation_about("Z", -outward * walk_weight * self.elbow) * _rotation_about(
+            "X", walk_weight * self.pronation
+        )
+        hand = _rotation_about(
+            "YZ", np.column_stack([walk_weight * self.wrist, -outward * walk_weight * self.radial])
+        )
         return {f"{side}Arm": arm, f"{side}ForeArm": forearm, f"{side}Hand": hand}
 
 
-def _about(axis: str, degrees: FloatArray) -> Rotation:
+def _rotation_about(axis: str, degrees: FloatArray) -> Rotation:
+    """Return rotations by Euler angles (T,len(axis)) about intrinsic axes, degrees."""
     return Rotation.from_euler(axis, degrees.reshape(-1, len(axis)), degrees=True)
 
 
@@ -60,9 +75,9 @@ class Press:
 
     Attributes:
         side: ``Left`` or ``Right``.
-        start_s: When its camera is at the chest.
-        end_s: When it leaves.
-        degrees: (7,) the angles of `ArmAngles` meanwhile.
+        start_s: Time at which its camera is at the chest, seconds.
+        end_s: Time at which it leaves, seconds.
+        degrees: (7,) angles of `ArmAngles` in between.
     """
 
     side: str
@@ -71,14 +86,14 @@ class Press:
     degrees: FloatArray
 
     def weight(self, t_s: FloatArray) -> FloatArray:
-        """0 … 1 at times (T,), twice differentiable, 1 from start to end."""
+        """Return the weight (T,) of the press at times (T,): 1 from start to end, twice differentiable."""
         up = np.clip((t_s - self.start_s) / RAMP_S + 1.0, 0, 1)
         down = np.clip((t_s - self.end_s) / RAMP_S, 0, 1)
         smooth = [x**3 * (10 - 15 * x + 6 * x * x) for x in (up, down)]
         return np.asarray(smooth[0] - smooth[1])
 
     def blended(self, angles: ArmAngles, t_s: FloatArray) -> ArmAngles:
-        """The walker's angles, drawn to the chest for the while."""
+        """Return the angles of the walk, blended with those of the press."""
         weight = self.weight(t_s)
         names = ArmAngles.__slots__
         values = {
@@ -88,19 +103,19 @@ class Press:
         return ArmAngles(**values)
 
 
-def press_of(mount: Mount, skeleton: SkeletonModel, start_s: float, end_s: float) -> Press:
-    """Find how a hand reaches the chest so that its camera looks straight into it.
+def find_press(mount: Mount, skeleton: SkeletonModel, start_s: float, end_s: float) -> Press:
+    """Find joint angles at which the camera on a hand looks straight into the chest.
 
     Args:
-        mount: Where the camera truly sits on the hand.
+        mount: True mount of the camera on the hand.
         skeleton: The true body.
-        start_s: When the camera is at the chest.
-        end_s: When it leaves.
+        start_s: Time at which the camera is at the chest, seconds.
+        end_s: Time at which it leaves, seconds.
     """
     side = mount.role.removesuffix("Hand")
     bone = skeleton.offsets_m[skeleton.joints.index("Neck")]
     forward = segment_axes(skeleton, "Spine1")[:, 1]
-    target = _CHEST_SHARE * bone + forward * (_CHEST_RADIUS_M + _OFF_CHEST_M)
+    target = _CHEST_HEIGHT_RATIO * bone + forward * (_CHEST_RADIUS_M + _OFF_CHEST_M)
     middle = 0.5 * (_LOW_DEG + _HIGH_DEG)
 
     def misfit(degrees: FloatArray) -> FloatArray:
@@ -121,7 +136,7 @@ def press_of(mount: Mount, skeleton: SkeletonModel, start_s: float, end_s: float
 
 
 def _chest_from_cam(degrees: FloatArray, side: str, mount: Mount, skeleton: SkeletonModel) -> FloatArray:
-    """(4,4) pose of the camera in the frame of the joint that carries the chest."""
+    """Return the pose (4,4) of the camera in the frame of the joint of the chest."""
     turns = ArmAngles(*degrees.reshape(7, 1)).rotations(side, np.ones(1))
     joint = skeleton.index_of_role(mount.role)
     chest = skeleton.index_of_role("Spine1")

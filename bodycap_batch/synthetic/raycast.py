@@ -1,4 +1,4 @@
-"""Which triangle a ray meets first: Embree, through Open3D."""
+"""Find the triangle that a ray meets first, with Embree through Open3D."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _Float32 = npt.NDArray[np.float32]
 
 
 class RayScene:
-    """Triangles to shoot at; one thread a call, calls may run side by side.
+    """Triangles that rays are cast at. A call uses one thread; several threads may call at the same time.
 
     Args:
         vertices: (V,3) positions.
@@ -29,13 +29,13 @@ class RayScene:
         self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(faces))
 
     def first_face(self, rays: _Float32) -> IntArray:
-        """(N,) the face each ray (origin and direction, (N,6)) meets first, or `NOTHING`."""
+        """Return the face (N,) that each ray (N,6; origin and direction) meets first, or `NOTHING`."""
         answer = self._scene.cast_rays(self._tensor.from_numpy(rays), nthreads=1)
         faces = np.asarray(answer["primitive_ids"].numpy(), dtype=np.int64)
         faces[~np.isfinite(answer["t_hit"].numpy())] = NOTHING
         return faces
 
-    def hidden(self, rays: _Float32, reach: float) -> BoolArray:
-        """(N,) True where something lies on a ray within `reach` direction lengths."""
-        found = self._scene.test_occlusions(self._tensor.from_numpy(rays), tnear=0.0, tfar=reach, nthreads=1)
+    def is_occluded(self, rays: _Float32, limit: float) -> BoolArray:
+        """Return a mask (N,) of the rays (N,6) that meet a face within `limit` lengths of their direction."""
+        found = self._scene.test_occlusions(self._tensor.from_numpy(rays), tnear=0.0, tfar=limit, nthreads=1)
         return np.asarray(found.numpy(), dtype=np.bool_)

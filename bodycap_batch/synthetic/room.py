@@ -1,7 +1,7 @@
-"""A laboratory: walls, floor, ceiling, furniture and everything that hangs on the walls.
+"""A laboratory: walls, floor, ceiling, furniture, and pictures on the walls.
 
-No two surfaces share a texture (each draws from a random stream of its own) unless repeated posters are
-asked for; stretches of plain wall and most of the ceiling carry little to hold on to, as in a real room.
+Each surface has its own texture from its own random stream, unless repeated posters are asked for. As in a
+real room, parts of the walls and most of the ceiling have little texture.
 """
 
 from __future__ import annotations
@@ -18,34 +18,49 @@ from bodycap_batch.synthetic.surfaces import UINT8, Surface, box_faces, surface_
 from bodycap_batch.synthetic.textures import Texture
 
 _PICTURE_DETAIL = 1.3
-"""Pictures and books get that many times the texels of walls and furniture."""
+"""Detail of pictures and books, relative to that of walls and furniture."""
 _EDGE_M = 0.06
-"""Narrower faces are the painted edge of a board, whatever its front shows."""
+"""Width below which a face shows the painted edge of a board instead of its texture, metres."""
 _MAX_TEXELS = 6000
+"""Longer side of a texture at most, texels; limits memory."""
 HEIGHT_M = 2.8
+"""Height of the room, metres."""
 MARGIN_M = 1.7
-"""Between the walk and the walls: furniture is up to 0.7 m deep."""
+"""Distance between the walk and the walls, metres: furniture is up to 0.7 m deep."""
 _MIN_HALF_M = (3.4, 3.0)
+"""Half of the room's extent along x and y at least, metres."""
+_CARPETS = ((-0.38, -0.35), (0.42, 0.30), (-0.25, 0.45), (0.4, -0.5))
+"""Centres of the carpets, relative to half of the room's extent."""
+_PICTURE_BASES_M = (2.05, 1.25, 1.55, 1.10)
+"""Height of the pictures' lower edge on each wall, metres: above its furniture."""
 
 
 @dataclass(slots=True)
 class _Builder:
-    """Collects surfaces; each gets the next child of one seed sequence."""
+    """Collects surfaces; each one gets the next child of one seed sequence.
+
+    Attributes:
+        seeds: Source of all random streams.
+        texels_per_m: Detail of the textures.
+        surfaces: The surfaces so far.
+    """
 
     seeds: np.random.SeedSequence
     texels_per_m: float
     surfaces: list[Surface] = field(default_factory=list)
 
     def rng(self) -> np.random.Generator:
+        """Return the next random stream."""
         return np.random.default_rng(self.seeds.spawn(1)[0])
 
     def image(self, size_m: tuple[float, float], texture: Texture, detail: float = 1.0) -> UINT8:
-        """Draw a texture for a rectangle of (width, height) metres."""
+        """Return a new texture for a rectangle of (width, height) metres."""
         scale = min(self.texels_per_m * detail, _MAX_TEXELS / max(size_m))
         width, height = (max(8, round(side * scale)) for side in size_m)
         return np.asarray(texture(height, width, scale, self.rng()), dtype=np.uint8)
 
     def textured(self, face: Surface, texture: Texture, detail: float = 1.0) -> None:
+        """Add a face with a new texture."""
         size = float(np.linalg.norm(face.across)), float(np.linalg.norm(face.down))
         if min(size) < _EDGE_M:
             texture = textures.metal
@@ -54,7 +69,7 @@ class _Builder:
     def box(
         self, centre: FloatArray, size_m: tuple[float, float, float], yaw_deg: float, texture: Texture
     ) -> None:
-        """A box with a texture of its own on each visible face."""
+        """Add a box with a new texture on each visible face."""
         for index, face in enumerate(box_faces(centre, size_m, yaw_deg)):
             if index < 5 or centre[2] - size_m[2] / 2 > 0.05:
                 self.textured(face, texture)
@@ -62,20 +77,28 @@ class _Builder:
 
 @dataclass(frozen=True, slots=True)
 class _Wall:
-    """One wall: its middle at floor height, direction along it (to the right), the way it faces."""
+    """One wall.
+
+    Attributes:
+        middle: (3,) its middle at floor height (m).
+        right: (3,) unit vector along it, to the right for a person who looks at it.
+        normal: (3,) unit vector into the room.
+        length_m: Its length.
+    """
 
     middle: FloatArray
     right: FloatArray
     normal: FloatArray
     length_m: float
 
-    def place(self, along_m: float, height_m: float, off_m: float) -> FloatArray:
-        """A point `along_m` right of the middle, `off_m` in front of the wall."""
+    def point_at(self, along_m: float, height_m: float, off_m: float) -> FloatArray:
+        """Return a point `along_m` to the right of the middle and `off_m` in front of the wall."""
         point = self.middle + along_m * self.right + off_m * self.normal
         return np.asarray(point + np.array([0.0, 0.0, height_m]))
 
     @property
     def yaw_deg(self) -> float:
+        """Direction of the wall about the vertical, degrees."""
         return float(np.degrees(np.arctan2(self.right[1], self.right[0])))
 
 
@@ -87,40 +110,46 @@ def build_room(
     furnished: bool = True,
     repeated_posters: bool = False,
 ) -> list[Surface]:
-    """Furnish and light a room around a walk.
+    """Build a furnished and lit room around a walk.
 
     Args:
-        half_extent_m: How far the walk goes from the room's middle along x and y.
+        half_extent_m: Extent of the walk from the room's middle along x and y, metres.
         texels_per_m: Detail of the textures.
-        seed: Source of all textures and placements.
-        furnished: False leaves it bare: plain walls, floor and ceiling, and what hangs on the walls.
-        repeated_posters: Hang the same three pictures again and again.
+        seed: Source of all textures and positions.
+        furnished: False: plain walls, floor and ceiling, with pictures on the walls only.
+        repeated_posters: True: the same three pictures hang in many positions.
     """
     half = [max(low, extent + MARGIN_M) for low, extent in zip(_MIN_HALF_M, half_extent_m, strict=True)]
     build = _Builder(seed, texels_per_m)
-    walls = _shell(build, half, bare=not furnished)
-    furnish = (_shelves, _desk, _cupboards, _sofa)
+    walls = _build_shell(build, half, bare=not furnished)
+    furnish = (_add_shelves, _add_desks, _add_cupboards, _add_sofa)
     for wall, furniture in zip(walls, furnish if furnished else (), strict=furnished):
         furniture(build, wall)
-    _pictures(build, walls, repeated_posters)
+    _add_pictures(build, walls, repeated_posters)
     if furnished:
-        _ceiling(build, half)
+        _add_ceiling_fittings(build, half)
     rng = build.rng()
     count = max(2, round(half[0] / 1.7)), max(2, round(half[1] / 1.7))
     grid = np.meshgrid(*(np.linspace(-0.6, 0.6, n) * side for n, side in zip(count, half, strict=True)))
     lamps = np.stack([grid[0].ravel(), grid[1].ravel(), np.full(grid[0].size, HEIGHT_M - 0.12)], axis=-1)
-    _lamp_housings(build, lamps)
+    _add_lamp_housings(build, lamps)
     return light_surfaces(build.surfaces, lamps, rng)
 
 
-def _shell(build: _Builder, half: list[float], *, bare: bool) -> list[_Wall]:
-    """Floor with carpets, ceiling and four walls, each of its own material; bare: all of them plain."""
+def _build_shell(build: _Builder, half: list[float], *, bare: bool) -> list[_Wall]:
+    """Add floor, carpets, ceiling and four walls, and return the walls.
+
+    Args:
+        build: Collects the surfaces.
+        half: Half of the room's extent along x and y, metres.
+        bare: True: all surfaces are plain.
+    """
     up = np.array([0.0, 0.0, 1.0])
     floor, ceiling = box_faces([0, 0, HEIGHT_M / 2], [2 * half[0], 2 * half[1], HEIGHT_M], 0.0)[4:][::-1]
-    build.textured(_flipped(floor), textures.plaster if bare else textures.planks)
-    build.textured(_flipped(ceiling), textures.plaster if bare else textures.ceiling_panels)
+    build.textured(_seen_from_behind(floor), textures.plaster if bare else textures.planks)
+    build.textured(_seen_from_behind(ceiling), textures.plaster if bare else textures.ceiling_panels)
     rng = build.rng()
-    for x, y in () if bare else ((-0.38, -0.35), (0.42, 0.30), (-0.25, 0.45), (0.4, -0.5)):
+    for x, y in () if bare else _CARPETS:
         size = (rng.uniform(1.3, 2.2), rng.uniform(1.0, 1.6), 0.012)
         centre = np.array([x * half[0], y * half[1], size[2] / 2])
         texture = textures.carpet if rng.uniform() < 0.75 else textures.tiles
@@ -133,109 +162,113 @@ def _shell(build: _Builder, half: list[float], *, bare: bool) -> list[_Wall]:
         textures.plaster,
     )
     for angle, texture in zip((90, 0, 270, 180), materials, strict=True):
-        # The wall stands in this direction and faces the middle.
+        # The wall is in this direction and faces the middle.
         outward = np.round([np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0.0], 12)
         axis = int(np.argmax(np.abs(outward)))
         wall = _Wall(outward * half[axis], np.cross(up, -outward), -outward, 2 * half[1 - axis])
         walls.append(wall)
-        middle = wall.place(0.0, HEIGHT_M / 2, 0.0)
+        middle = wall.point_at(0.0, HEIGHT_M / 2, 0.0)
         face = surface_facing(middle, wall.normal, (wall.length_m, HEIGHT_M), np.zeros((1, 1, 3), np.uint8))
         build.textured(face, texture)
     return walls
 
 
-def _flipped(face: Surface) -> Surface:
-    """The same rectangle seen from its other side."""
+def _seen_from_behind(face: Surface) -> Surface:
+    """Return the same rectangle, facing the other way."""
     return replace(face, corner=face.corner + face.across, across=-face.across)
 
 
-def _shelves(build: _Builder, wall: _Wall) -> None:
-    """Open shelves full of books along a wall."""
+def _add_shelves(build: _Builder, wall: _Wall) -> None:
+    """Add open shelves full of books along a wall."""
     rng = build.rng()
     for along in np.arange(-wall.length_m / 2 + 0.9, wall.length_m / 2 - 0.8, 1.75):
         wide, deep, tall = rng.uniform(0.9, 1.3), 0.32, rng.uniform(1.3, 2.1)
         for side in (-1, 1):
-            upright = wall.place(along + side * wide / 2, tall / 2, deep / 2)
+            upright = wall.point_at(along + side * wide / 2, tall / 2, deep / 2)
             build.box(upright, (0.03, deep, tall), wall.yaw_deg, textures.planks)
         boards = np.linspace(0.06, tall - 0.02, int(tall / 0.36) + 1)
         for low, high in pairwise(boards):
-            build.box(wall.place(along, low, deep / 2), (wide, deep, 0.03), wall.yaw_deg, textures.planks)
+            build.box(wall.point_at(along, low, deep / 2), (wide, deep, 0.03), wall.yaw_deg, textures.planks)
             space = high - low - 0.05
             depth = rng.uniform(0.16, 0.28)
             face = surface_facing(
-                wall.place(along, low + 0.02 + space / 2, depth), wall.normal, (wide - 0.05, space), _BLANK
+                wall.point_at(along, low + 0.02 + space / 2, depth), wall.normal, (wide - 0.05, space), _BLANK
             )
             build.textured(face, pictures.books, _PICTURE_DETAIL)
-        build.box(wall.place(along, boards[-1], deep / 2), (wide, deep, 0.03), wall.yaw_deg, textures.planks)
+        build.box(
+            wall.point_at(along, boards[-1], deep / 2), (wide, deep, 0.03), wall.yaw_deg, textures.planks
+        )
         if rng.uniform() < 0.7:
             size = (rng.uniform(0.25, 0.5), 0.26, rng.uniform(0.18, 0.35))
-            centre = wall.place(along + rng.uniform(-0.2, 0.2), tall + size[2] / 2, deep / 2)
+            centre = wall.point_at(along + rng.uniform(-0.2, 0.2), tall + size[2] / 2, deep / 2)
             build.box(centre, size, wall.yaw_deg + rng.uniform(-15, 15), pictures.cardboard)
 
 
-def _desk(build: _Builder, wall: _Wall) -> None:
-    """Desks with monitors, boxes and papers."""
+def _add_desks(build: _Builder, wall: _Wall) -> None:
+    """Add desks with monitors and boxes along a wall."""
     rng = build.rng()
     for along in np.arange(-wall.length_m / 2 + 1.2, wall.length_m / 2 - 0.9, 2.0):
         wide, deep = rng.uniform(1.4, 1.7), 0.68
         top = textures.granite if rng.uniform() < 0.5 else textures.planks
-        build.box(wall.place(along, 0.72, deep / 2), (wide, deep, 0.04), wall.yaw_deg, top)
+        build.box(wall.point_at(along, 0.72, deep / 2), (wide, deep, 0.04), wall.yaw_deg, top)
         for side in (-1, 1):
-            leg = wall.place(along + side * (wide / 2 - 0.25), 0.35, deep / 2)
+            leg = wall.point_at(along + side * (wide / 2 - 0.25), 0.35, deep / 2)
             build.box(leg, (0.42, deep - 0.1, 0.70), wall.yaw_deg, textures.metal)
         size = (rng.uniform(0.5, 0.65), rng.uniform(0.3, 0.38))
         turn = wall.yaw_deg + rng.uniform(-20, 20)
-        centre = wall.place(along + rng.uniform(-0.25, 0.25), 0.86 + size[1] / 2, 0.3)
+        centre = wall.point_at(along + rng.uniform(-0.25, 0.25), 0.86 + size[1] / 2, 0.3)
         build.box(centre, (size[0], 0.04, size[1]), turn, pictures.screen)
         build.box(centre - [0, 0, 0.06 + size[1] / 2], (0.2, 0.2, 0.12), turn, textures.metal)
         for _ in range(3):
             block = rng.uniform(0.10, 0.24, 3)
-            spot = wall.place(
+            spot = wall.point_at(
                 along + rng.uniform(-0.5, 0.5) * wide, 0.74 + block[2] / 2, rng.uniform(0.35, 0.6)
             )
             build.box(spot, (block[0], block[1], block[2]), float(rng.uniform(0, 90)), pictures.cardboard)
 
 
-def _cupboards(build: _Builder, wall: _Wall) -> None:
-    """Cupboards of different height with things on top."""
+def _add_cupboards(build: _Builder, wall: _Wall) -> None:
+    """Add cupboards of different heights with boxes on top along a wall."""
     rng = build.rng()
     for along in np.arange(-wall.length_m / 2 + 0.7, wall.length_m / 2 - 0.6, 1.25):
         wide, deep, tall = rng.uniform(0.7, 1.0), rng.uniform(0.4, 0.6), rng.uniform(0.7, 1.5)
         texture = (textures.metal, textures.planks, pictures.whiteboard)[int(rng.integers(3))]
-        build.box(wall.place(along, tall / 2, deep / 2), (wide, deep, tall), wall.yaw_deg, texture)
+        build.box(wall.point_at(along, tall / 2, deep / 2), (wide, deep, tall), wall.yaw_deg, texture)
         size = (rng.uniform(0.25, 0.5), rng.uniform(0.2, 0.35), rng.uniform(0.15, 0.4))
-        spot = wall.place(along + rng.uniform(-0.2, 0.2), tall + size[2] / 2, deep / 2)
+        spot = wall.point_at(along + rng.uniform(-0.2, 0.2), tall + size[2] / 2, deep / 2)
         build.box(spot, size, wall.yaw_deg + rng.uniform(-30, 30), pictures.cardboard)
 
 
-def _sofa(build: _Builder, wall: _Wall) -> None:
-    """A sofa, crates and a partition."""
+def _add_sofa(build: _Builder, wall: _Wall) -> None:
+    """Add a sofa, boxes and a partition at a wall."""
     rng = build.rng()
-    build.box(wall.place(-0.9, 0.22, 0.42), (1.9, 0.8, 0.42), wall.yaw_deg, textures.fabric)
-    build.box(wall.place(-0.9, 0.62, 0.12), (1.9, 0.22, 0.40), wall.yaw_deg, textures.fabric)
+    build.box(wall.point_at(-0.9, 0.22, 0.42), (1.9, 0.8, 0.42), wall.yaw_deg, textures.fabric)
+    build.box(wall.point_at(-0.9, 0.62, 0.12), (1.9, 0.22, 0.40), wall.yaw_deg, textures.fabric)
     for side in (-1, 1):
-        build.box(wall.place(-0.9 + side * 0.85, 0.53, 0.45), (0.2, 0.75, 0.2), wall.yaw_deg, textures.fabric)
+        build.box(
+            wall.point_at(-0.9 + side * 0.85, 0.53, 0.45), (0.2, 0.75, 0.2), wall.yaw_deg, textures.fabric
+        )
     height = 0.0
     for _ in range(4):
         size = (rng.uniform(0.45, 0.65), rng.uniform(0.4, 0.55), rng.uniform(0.25, 0.4))
-        spot = wall.place(0.75 + rng.uniform(-0.05, 0.05), height + size[2] / 2, 0.35)
+        spot = wall.point_at(0.75 + rng.uniform(-0.05, 0.05), height + size[2] / 2, 0.35)
         build.box(spot, size, wall.yaw_deg + rng.uniform(-12, 12), pictures.cardboard)
         height += size[2]
-    partition = wall.place(min(2.0, wall.length_m / 2 - 0.9), 0.85, 0.35)
+    partition = wall.point_at(min(2.0, wall.length_m / 2 - 0.9), 0.85, 0.35)
     build.box(partition, (1.1, 0.05, 1.7), wall.yaw_deg + 15.0, pictures.notes)
 
 
-def _pictures(build: _Builder, walls: list[_Wall], repeated: bool) -> None:
-    """Boards, posters and paintings, above the furniture; some stretches stay bare."""
+def _add_pictures(build: _Builder, walls: list[_Wall], repeated: bool) -> None:
+    """Add boards, posters and paintings above the furniture; some parts of the walls stay bare."""
     rng = build.rng()
     kinds = list(pictures.WALL_PICTURES)
-    again = [build.image((0.6, 0.8), kind, _PICTURE_DETAIL) for kind in kinds[:3]]
+    repeats = [build.image((0.6, 0.8), kind, _PICTURE_DETAIL) for kind in kinds[:3]]
     for index, wall in enumerate(walls):
-        # Shelves reach up to 2.1 m, so that wall gets fewer and higher ones.
+        # The first wall has shelves up to 2.1 m, so its pictures are fewer and higher.
         along = -wall.length_m / 2 + 0.3
         while along < wall.length_m / 2 - 0.7:
             wide, tall = float(rng.uniform(0.45, 1.1)), float(rng.uniform(0.45, 0.95))
-            base = (2.05, 1.25, 1.55, 1.10)[index] + float(rng.uniform(0, 0.25))
+            base = _PICTURE_BASES_M[index] + float(rng.uniform(0, 0.25))
             tall = min(tall, HEIGHT_M - 0.08 - base)
             if along + wide > wall.length_m / 2 - 0.1:
                 break
@@ -245,14 +278,14 @@ def _pictures(build: _Builder, walls: list[_Wall], repeated: bool) -> None:
                     kind = pictures.whiteboard
                 image = build.image((wide, tall), kind, _PICTURE_DETAIL)
                 if repeated:
-                    image, (wide, tall) = again[int(rng.integers(len(again)))], (0.6, 0.8)
-                centre = wall.place(along + wide / 2, base + tall / 2, 0.012)
+                    image, (wide, tall) = repeats[int(rng.integers(len(repeats)))], (0.6, 0.8)
+                centre = wall.point_at(along + wide / 2, base + tall / 2, 0.012)
                 build.surfaces.append(surface_facing(centre, wall.normal, (wide, tall), image))
             along += wide + float(rng.uniform(0.12, 0.5))
 
 
-def _ceiling(build: _Builder, half: list[float]) -> None:
-    """Ducts, beams and cable trays below the ceiling."""
+def _add_ceiling_fittings(build: _Builder, half: list[float]) -> None:
+    """Add ducts, beams and cable trays below the ceiling."""
     rng = build.rng()
     for along, texture in ((-0.55, textures.metal), (0.1, textures.planks), (0.7, textures.fabric)):
         size = (2 * half[0] - 0.02, rng.uniform(0.14, 0.28), rng.uniform(0.10, 0.2))
@@ -270,8 +303,8 @@ def _ceiling(build: _Builder, half: list[float]) -> None:
         )
 
 
-def _lamp_housings(build: _Builder, lamps: FloatArray) -> None:
-    """Bright panels where the lamps are."""
+def _add_lamp_housings(build: _Builder, lamps: FloatArray) -> None:
+    """Add bright panels at the lamps' positions (L,3)."""
     for lamp in lamps:
         tint = build.rng().uniform(0.94, 1.0, 3)
         face = box_faces(lamp + np.array([0, 0, 0.03]), (0.9, 0.3, 0.02), 0.0)[5]
@@ -281,3 +314,4 @@ def _lamp_housings(build: _Builder, lamps: FloatArray) -> None:
 
 
 _BLANK: UINT8 = np.zeros((1, 1, 3), np.uint8)
+"""Image of a face before its texture is drawn."""

@@ -1,4 +1,4 @@
-"""Flat, textured rectangles: all that a room is made of."""
+"""Flat, textured rectangles, which a room is made of."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import so3_exp
 
 UINT8 = npt.NDArray[np.uint8]
+"""An image (H,W,3)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Surface:
-    """A rectangle that carries an image.
+    """A rectangle with an image on it.
 
     Attributes:
         corner: (3,) world position of the image's top left corner (m).
-        across: (3,) from there to the top right corner.
-        down: (3,) from there to the bottom left corner.
+        across: (3,) vector from there to the top right corner (m).
+        down: (3,) vector from there to the bottom left corner (m).
         image: (H,W,3) RGB texture.
-        shines: True for a lamp: light falling on it changes nothing.
+        shines: True for a lamp: no other light is painted on it.
     """
 
     corner: FloatArray
@@ -33,12 +34,12 @@ class Surface:
 
     @property
     def normal(self) -> FloatArray:
-        """Unit vector towards whoever sees the image the right way round."""
+        """Unit vector (3,) towards the side from which the image is not mirrored."""
         normal = np.cross(self.down, self.across)
         return np.asarray(normal / np.linalg.norm(normal))
 
     def corners(self) -> FloatArray:
-        """(4,3) corners: top left, top right, bottom right, bottom left."""
+        """Return the corners (4,3): top left, top right, bottom right, bottom left."""
         edges = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) @ np.stack([self.across, self.down])
         return np.asarray(self.corner + edges)
 
@@ -46,7 +47,7 @@ class Surface:
 def surface_facing(
     centre: npt.ArrayLike, normal: npt.ArrayLike, size_m: tuple[float, float], image: UINT8
 ) -> Surface:
-    """An upright rectangle (width, height) about `centre` facing a horizontal direction."""
+    """Return an upright rectangle around a centre (3,) that faces a horizontal direction (3,)."""
     normal = np.asarray(normal, dtype=np.float64)
     up = np.array([0.0, 0.0, 1.0])
     across = np.cross(up, normal) * size_m[0]
@@ -56,12 +57,12 @@ def surface_facing(
 
 
 def box_faces(centre: npt.ArrayLike, size_m: npt.ArrayLike, yaw_deg: float) -> list[Surface]:
-    """The six faces of a box without images (1×1 texels): four sides, top, bottom.
+    """Return the six faces of a box with black images of 1×1 texels: four sides, top, bottom.
 
     Args:
         centre: (3,) middle of the box (m).
-        size_m: (3,) extents along its own x, y and the vertical.
-        yaw_deg: Turn about the vertical.
+        size_m: (3,) extents along its own x and y axes and the vertical.
+        yaw_deg: Rotation about the vertical.
     """
     centre, size = np.asarray(centre, dtype=np.float64), np.asarray(size_m, dtype=np.float64)
     turn = so3_exp(np.array([0.0, 0.0, np.radians(yaw_deg)]))

@@ -1,6 +1,6 @@
 """Procedural textures of building materials and furniture: RGB uint8 images of any size.
 
-Sizes are in texels; `scale` is texels per metre, so that a brick is a brick on every wall.
+Sizes are in texels. `scale` is in texels per metre, so that bricks have the same size on every wall.
 """
 
 from __future__ import annotations
@@ -12,21 +12,24 @@ import numpy as np
 import numpy.typing as npt
 
 Image = npt.NDArray[np.uint8]
+"""(H,W,3) RGB."""
 Grey = npt.NDArray[np.float32]
+"""(H,W) brightness, or (3,) a colour."""
 Texture = Callable[[int, int, float, np.random.Generator], Image]
-"""(height, width, texels per metre, rng) -> RGB image."""
+"""Function of height and width (texels), texels per metre and a random generator that returns an RGB
+image."""
 
 
 def colour(
     rng: np.random.Generator, saturation: float = 0.6, value: tuple[float, float] = (0.3, 0.95)
 ) -> Grey:
-    """A random RGB colour (3,) in 0 … 255."""
+    """Return a random RGB colour (3,), 0 … 255."""
     hsv = np.array([[[rng.uniform(0, 360), rng.uniform(0.2, 1.0) * saturation, rng.uniform(*value)]]])
     return np.asarray(cv2.cvtColor(hsv.astype(np.float32), cv2.COLOR_HSV2RGB)[0, 0] * 255.0, dtype=np.float32)
 
 
 def fractal(height: int, width: int, cell: float, rng: np.random.Generator, octaves: int = 4) -> Grey:
-    """Smooth noise about 0 with unit-like amplitude, its largest features `cell` texels wide."""
+    """Return smooth noise (H,W) about 0, amplitude near 1, with features up to `cell` texels wide."""
     out = np.zeros((height, width), np.float32)
     for octave in range(octaves):
         size = max(cell / 2**octave, 1.0)
@@ -38,26 +41,26 @@ def fractal(height: int, width: int, cell: float, rng: np.random.Generator, octa
     return out
 
 
-def tinted(shade: Grey, base: Grey) -> Image:
-    """A colour image from a shade around 1 and one colour."""
+def tint_shade(shade: Grey, base: Grey) -> Image:
+    """Return a colour (3,) multiplied by a shade (H,W) around 1."""
     np.maximum(shade, 0, out=shade)
     return np.asarray(cv2.merge([cv2.convertScaleAbs(shade, alpha=float(part)) for part in base]))
 
 
-def shaded(image: Image, shade: Grey) -> Image:
-    """An image multiplied by a shade (H,W) around 1."""
+def shade_image(image: Image, shade: Grey) -> Image:
+    """Return an image multiplied by a shade (H,W) around 1."""
     return np.asarray(cv2.multiply(image, cv2.merge([shade.astype(np.float32)] * 3), dtype=cv2.CV_8U))
 
 
 def plaster(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """A painted wall: almost plain."""
+    """Return a painted wall, almost plain."""
     shade = 1.0 + 0.012 * fractal(height, width, scale * 0.8, rng, 3)
     shade += 0.008 * rng.standard_normal((height, width), dtype=np.float32)
-    return tinted(shade, 0.35 * colour(rng, 0.5, (0.75, 0.9)) + np.float32(0.6 * 225.0))
+    return tint_shade(shade, 0.35 * colour(rng, 0.5, (0.75, 0.9)) + np.float32(0.6 * 225.0))
 
 
 def bricks(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Courses of bricks, each of its own tint, with mortar between them."""
+    """Return courses of bricks, each with its own tint, with mortar between them."""
     tall, long, gap = 0.075 * scale, 0.22 * scale, max(1, round(0.009 * scale))
     out = np.full((height, width, 3), 170, np.uint8)
     base = 0.5 * colour(rng, 0.5) + np.float32(0.5) * np.array([165, 90, 70], np.float32)
@@ -70,11 +73,11 @@ def bricks(height: int, width: int, scale: float, rng: np.random.Generator) -> I
             cv2.rectangle(out, *corners, np.clip(tint, 0, 255).tolist(), -1)
             left = right
     grain = 1.0 + 0.10 * fractal(height, width, 0.03 * scale, rng, 3)
-    return shaded(out, grain)
+    return shade_image(out, grain)
 
 
 def planks(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Wooden boards with grain, knots and joints, lying along the width."""
+    """Return wooden boards along the width, with grain, knots and joints."""
     board = max(8, round(rng.uniform(0.10, 0.16) * scale))
     base = np.array([[205, 165, 115], [150, 105, 70], [120, 75, 50], [185, 150, 120]], np.float32)
     tint = base[rng.integers(len(base))] * np.float32(rng.uniform(0.85, 1.1))
@@ -90,11 +93,11 @@ def planks(height: int, width: int, scale: float, rng: np.random.Generator) -> I
                 grain[top : top + rows, right - 2 : right] = 0.45
             left = right
         grain[top : top + 2] = 0.5
-    return tinted(grain, tint)
+    return tint_shade(grain, tint)
 
 
 def _grain(rows: int, columns: int, scale: float, rng: np.random.Generator) -> Grey:
-    """One board: warped rings, brightness of its own."""
+    """Return one board with warped rings and its own brightness."""
     y = np.linspace(0, rows / scale, rows, dtype=np.float32)[:, None]
     warp = fractal(rows, columns, 0.25 * scale, rng, 3)
     rings = np.sin((y * rng.uniform(250, 420) + 2.2 * warp) + rng.uniform(0, 6))
@@ -108,7 +111,7 @@ def _grain(rows: int, columns: int, scale: float, rng: np.random.Generator) -> G
 
 
 def carpet(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """A woven carpet: irregular medallions, stripes and pile."""
+    """Return a woven carpet with irregular medallions, stripes and pile."""
     out = np.full((height, width, 3), 0, np.uint8)
     out[:] = np.clip(colour(rng, 0.7, (0.3, 0.6)), 0, 255)
     for size, count in ((0.22, 3.5), (0.10, 14.0), (0.045, 50.0)):
@@ -121,11 +124,11 @@ def carpet(height: int, width: int, scale: float, rng: np.random.Generator) -> I
         line = np.clip(colour(rng), 0, 255).tolist()
         cv2.rectangle(out, (inset, inset), (width - inset, height - inset), line, max(2, border // 6))
     pile = 1.0 + 0.09 * rng.standard_normal((height, width), dtype=np.float32)
-    return shaded(out, pile)
+    return shade_image(out, pile)
 
 
 def _blot(out: Image, x: float, y: float, size: float, rng: np.random.Generator) -> None:
-    """An irregular polygon of one colour."""
+    """Draw an irregular polygon of one colour."""
     corners = int(rng.integers(3, 8))
     angle = np.sort(rng.uniform(0, 2 * np.pi, corners))
     radius = size * rng.uniform(0.4, 1.0, corners)
@@ -134,17 +137,17 @@ def _blot(out: Image, x: float, y: float, size: float, rng: np.random.Generator)
 
 
 def granite(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Speckled stone: worktops and some floors."""
+    """Return speckled stone, for worktops."""
     noise = fractal(height, width, 0.05 * scale, rng, 4) + 0.8 * fractal(height, width, 0.012 * scale, rng, 2)
     shade = 0.85 + 0.18 * np.tanh(1.5 * noise)
     for level, depth in ((1.7, 0.4), (-1.9, 1.5)):
         spots = fractal(height, width, 0.02 * scale, rng, 2)
         shade = np.where(spots > level if level > 0 else spots < level, shade * depth, shade)
-    return tinted(shade.astype(np.float32), colour(rng, 0.3, (0.5, 0.8)))
+    return tint_shade(shade.astype(np.float32), colour(rng, 0.3, (0.5, 0.8)))
 
 
 def tiles(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Floor tiles of varied tone, chipped and stained."""
+    """Return floor tiles of different tones, chipped and stained."""
     side = rng.uniform(0.28, 0.36) * scale
     base = colour(rng, 0.3, (0.5, 0.8))
     shade = np.ones((height, width), np.float32)
@@ -163,11 +166,11 @@ def tiles(height: int, width: int, scale: float, rng: np.random.Generator) -> Im
         cv2.ellipse(
             shade, spot, (size, max(1, size // 2)), rng.uniform(0, 180), 0, 360, rng.uniform(0.4, 0.8), -1
         )
-    return tinted(shade, base)
+    return tint_shade(shade, base)
 
 
 def fabric(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Upholstery: woven threads, stripes of random width and a few folds."""
+    """Return upholstery with woven threads, stripes of random width and a few folds."""
     out = np.empty((height, width, 3), np.uint8)
     stop = 0
     while stop < width:
@@ -175,11 +178,11 @@ def fabric(height: int, width: int, scale: float, rng: np.random.Generator) -> I
         out[:, start:stop] = colour(rng, 0.6, (0.3, 0.8))
     weave = 1.0 + 0.10 * rng.standard_normal((height, width), dtype=np.float32)
     folds = 1.0 + 0.10 * fractal(height, width, 0.25 * scale, rng, 3)
-    return shaded(out, weave * folds)
+    return shade_image(out, weave * folds)
 
 
 def ceiling_panels(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Acoustic panels: faint holes, stained here and there, with grilles and a hatch."""
+    """Return acoustic panels with faint holes, some stains, grilles and a hatch."""
     side = 0.6 * scale
     shade = np.full((height, width), 1.0, np.float32)
     holes = rng.uniform(size=(height // 4 + 1, width // 4 + 1)).astype(np.float32)
@@ -201,11 +204,11 @@ def ceiling_panels(height: int, width: int, scale: float, rng: np.random.Generat
     for at in np.arange(0, max(height, width) + side, side).astype(int):
         shade[at : at + line] = 0.72
         shade[:, at : at + line] = 0.72
-    return tinted(shade, np.array([222, 222, 216], np.float32))
+    return tint_shade(shade, np.array([222, 222, 216], np.float32))
 
 
 def _grille(panel: Grey, scale: float, rng: np.random.Generator) -> None:
-    """Slots of an air outlet."""
+    """Draw the slots of an air outlet."""
     margin = int(rng.uniform(0.06, 0.14) * scale)
     pitch = max(4, int(rng.uniform(0.025, 0.04) * scale))
     for top in range(margin, panel.shape[0] - margin, pitch):
@@ -213,7 +216,7 @@ def _grille(panel: Grey, scale: float, rng: np.random.Generator) -> None:
 
 
 def metal(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Painted sheet metal with scratches, dents and a label."""
+    """Return painted sheet metal with scratches, dents and a label."""
     shade = np.ones((height, width), np.float32) + 0.03 * fractal(height, width, 0.2 * scale, rng, 3)
     for _ in range(int(30 * height * width / scale**2) + 3):
         start = np.array([rng.uniform(0, width), rng.uniform(0, height)])
@@ -221,4 +224,4 @@ def metal(height: int, width: int, scale: float, rng: np.random.Generator) -> Im
         cv2.line(
             shade, tuple(start.astype(int)), tuple(end.astype(int)), rng.uniform(0.5, 1.2), 1, cv2.LINE_AA
         )
-    return tinted(shade, colour(rng, 0.4, (0.4, 0.75)))
+    return tint_shade(shade, colour(rng, 0.4, (0.4, 0.75)))

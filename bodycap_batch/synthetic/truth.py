@@ -1,4 +1,4 @@
-"""The files beside the videos: calibration, true paths, joints, body, motion and mounts."""
+"""Write the files beside the videos: calibration, true paths, joints, body, motion and mounts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bodycap_batch.formats.bvh import write_bvh
 from bodycap_batch.formats.tum import TimedPoses, seconds_text, write_tum
 from bodycap_batch.model.geometry import quat_xyzw_from_rotation
 from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
-from bodycap_batch.synthetic.filming import Moving, joints_at
+from bodycap_batch.synthetic.filming import MovingBody, joint_poses_at
 from bodycap_batch.synthetic.options import SynthOptions
 
 JOINT_ROLES = {
@@ -23,7 +23,7 @@ JOINT_ROLES = {
     "right_shoulder": "RightArm", "left_knee": "LeftLeg", "right_knee": "RightLeg", "left_hip": "LeftUpLeg",
     "right_hip": "RightUpLeg", "left_ankle": "LeftFoot", "right_ankle": "RightFoot",
 }  # fmt: skip
-"""Names in ``gt/joints.npz`` and the joints they stand for."""
+"""Names in ``gt/joints.npz`` and the roles of the joints they mean."""
 
 _README = """Ground truth of a synthetic capture. Metres, Z up, floor at z = 0.
 
@@ -33,17 +33,17 @@ _README = """Ground truth of a synthetic capture. Metres, Z up, floor at z = 0.
                of the middle of the exposure.
 joints.npz     names (J,), t (T,) s on the common clock, world (T,J,3) m: joint centres.
 motion.bvh     the motion on the common clock, at the cameras' rate; frame 0 is the earliest frame.
-mounts.json    joint_from_cam of each camera: where it truly sits. Not what its name promises.
+mounts.json    joint_from_cam of each camera: its true mount. It differs from the nominal one of its name.
 synth.json     the options the capture was made with.
 
-The body's true proportions are those of ../skeleton.bvh, the motion's too.
+The body's true proportions are those of ../skeleton.bvh and of motion.bvh.
 """
 MARKER = Path("gt", "synth.json")
-"""Present in every capture that was written to its end."""
+"""File that every completely written capture has."""
 
 
 def write_calibration(folder: Path, options: SynthOptions) -> None:
-    """Write ``calib.json``: one lens for all cameras, and their clocks."""
+    """Write ``calib.json``: the intrinsics of all cameras, and their clocks."""
     content: dict[str, Any] = {
         "width": options.width,
         "height": options.height,
@@ -60,12 +60,12 @@ def write_calibration(folder: Path, options: SynthOptions) -> None:
     _write_json(folder / "calib.json", content)
 
 
-def write_truth(folder: Path, options: SynthOptions, motion: Moving, mounts: tuple[Mount, ...]) -> None:
-    """Write everything below ``gt/`` but the cameras' paths, and ``skeleton.bvh``."""
+def write_truth(folder: Path, options: SynthOptions, motion: MovingBody, mounts: tuple[Mount, ...]) -> None:
+    """Write ``skeleton.bvh`` and everything in ``gt/`` except the cameras' paths."""
     truth = folder / "gt"
     ticks = common_ticks_ns(options)
-    root, local = motion.pose(in_seconds(ticks))
-    moved = Motion(
+    root, local = motion.pose(seconds_from_ns(ticks))
+    true_motion = Motion(
         skeleton=motion.skeleton,
         fps=options.fps,
         start_ns=int(ticks[0]),
@@ -73,8 +73,8 @@ def write_truth(folder: Path, options: SynthOptions, motion: Moving, mounts: tup
         local_rotation=local,
         observed=np.ones(local.shape[:2], dtype=bool),
     )
-    write_bvh(truth / "motion.bvh", moved)
-    write_bvh(folder / "skeleton.bvh", _standing(motion.skeleton, options.fps))
+    write_bvh(truth / "motion.bvh", true_motion)
+    write_bvh(folder / "skeleton.bvh", _rest_pose_motion(motion.skeleton, options.fps))
     _write_joints(truth / "joints.npz", motion, ticks)
     content = {
         mount.camera: {
@@ -93,13 +93,13 @@ def write_truth(folder: Path, options: SynthOptions, motion: Moving, mounts: tup
     _write_json(folder / MARKER, settings)
 
 
-def in_seconds(times_ns: IntArray) -> FloatArray:
-    """Nanoseconds as seconds."""
+def seconds_from_ns(times_ns: IntArray) -> FloatArray:
+    """Return times in nanoseconds as seconds."""
     return np.asarray(times_ns * 1e-9, dtype=np.float64)
 
 
 def common_ticks_ns(options: SynthOptions) -> IntArray:
-    """Ticks of the capture on the common clock: from the earliest timestamp to the latest."""
+    """Return the ticks of the capture on the common clock (ns), from the earliest timestamp to the latest."""
     offsets = [options.offsets_s.get(name, 0.0) for name in options.cameras]
     lasts_s = (options.frame_count - 1) / options.fps + max(offsets) - min(offsets)
     ticks = np.arange(int(np.floor(lasts_s * options.fps + 1e-6)) + 1)
@@ -107,18 +107,18 @@ def common_ticks_ns(options: SynthOptions) -> IntArray:
 
 
 def write_path(path: Path, times_ns: IntArray, world_from_cam: FloatArray, note: str) -> None:
-    """Write a camera's path on its own clock."""
+    """Write a camera's path on its own clock, with a note in the header."""
     poses = TimedPoses(times_ns=times_ns, world_from_cam=world_from_cam)
     write_tum(path, poses, (note,))
 
 
 def write_timestamps(path: Path, times_ns: IntArray) -> None:
-    """Write the times of a video's frames: seconds, one a line."""
+    """Write the times of a video's frames: seconds, one in each line."""
     write_text(path, "".join(f"{seconds_text(int(time))}\n" for time in times_ns))
 
 
-def _standing(skeleton: SkeletonModel, fps: float) -> Motion:
-    """The zero pose as a motion of one frame."""
+def _rest_pose_motion(skeleton: SkeletonModel, fps: float) -> Motion:
+    """Return the zero pose as a motion of one frame."""
     count = len(skeleton.joints)
     return Motion(
         skeleton=skeleton,
@@ -130,13 +130,15 @@ def _standing(skeleton: SkeletonModel, fps: float) -> Motion:
     )
 
 
-def _write_joints(path: Path, motion: Moving, ticks_ns: IntArray) -> None:
+def _write_joints(path: Path, motion: MovingBody, ticks_ns: IntArray) -> None:
+    """Write the positions of named joints at the ticks."""
     indices = {name: motion.skeleton.index_of_role(role) for name, role in JOINT_ROLES.items()}
     present = {name: index for name, index in indices.items() if index is not None}
-    world = joints_at(motion, in_seconds(ticks_ns))[:, list(present.values())][..., :3, 3]
+    world = joint_poses_at(motion, seconds_from_ns(ticks_ns))[:, list(present.values())][..., :3, 3]
     with atomic_replacement(path) as temporary:
-        np.savez(temporary, names=np.array(list(present)), t=in_seconds(ticks_ns), world=world)
+        np.savez(temporary, names=np.array(list(present)), t=seconds_from_ns(ticks_ns), world=world)
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a JSON file."""
     write_text(path, json.dumps(content, indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""The wearer's body as the cameras see it: rounded limbs that follow the joints."""
+"""The wearer's body as its cameras see it: rounded limbs that follow the joints."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from bodycap_batch.synthetic import textures
 from bodycap_batch.synthetic.render import Triangles
 from bodycap_batch.synthetic.surfaces import UINT8
 
-# Radii at both ends of the bone that starts at a joint (m).
 _RADII = {
     "Hips": (0.15, 0.14),
     "Spine": (0.14, 0.145),
@@ -28,17 +27,24 @@ _RADII = {
     "Foot": (0.035, 0.035),
     "ToeBase": (0.03, 0.02),
 }
+"""Radii at both ends of the bone that starts at a joint, metres. Evidence: none."""
 _SKIN = ("Hand", "Neck", "Head")
+"""Body parts without clothes."""
 _TROUSERS = ("Hips", "UpLeg", "Leg")
+"""Body parts in trousers; all others wear a shirt."""
 _AROUND = 14
+"""Faces around a limb."""
 _CAP_RINGS = 3
+"""Rings of faces of a limb's rounded end."""
 _TEXELS_PER_M = 300.0
+"""Detail of the body's textures, texels per metre."""
 _CLEARANCE_M = 0.02
+"""Distance outside a limb's surface up to which a camera counts as inside, metres."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Limb:
-    """One rounded cone in its joint's frame."""
+    """One rounded cone, in the frame of its joint."""
 
     joint: int
     triangles: Triangles
@@ -49,11 +55,11 @@ class Wearer:
 
     Args:
         skeleton: The true body.
-        seed: Source of clothes and skin.
+        seed: Seed of clothes and skin.
     """
 
     def __init__(self, skeleton: SkeletonModel, seed: np.random.SeedSequence) -> None:
-        self._bones = _bones(skeleton)
+        self._bones = _find_bones(skeleton)
         self.images: list[UINT8] = []
         dyes = np.random.default_rng(seed.spawn(1)[0])
         shirt, trousers = (textures.colour(dyes, 0.5, (0.3, 0.6)) for _ in range(2))
@@ -68,16 +74,19 @@ class Wearer:
         self._limbs: list[_Limb] = []
 
     def place_textures(self, origins: FloatArray) -> None:
-        """Build the limbs once their images (N) have their places (N,2) in the atlas."""
+        """Build the limbs, given the origins (N,2) of their N images in the atlas, in texels."""
         self._limbs = [
-            _Limb(joint=joint, triangles=_mesh(start, end, radii, image, origin, index))
+            _Limb(joint=joint, triangles=_rounded_cone(start, end, radii, image, origin, index))
             for index, ((joint, start, end, radii, _), image, origin) in enumerate(
                 zip(self._bones, self.images, origins, strict=True)
             )
         ]
 
-    def seen_by(self, mount: Mount, skeleton: SkeletonModel) -> Wearer:
-        """The same body without the limb a camera sits inside of (its housing would press the cloth in)."""
+    def visible_from(self, mount: Mount, skeleton: SkeletonModel) -> Wearer:
+        """Return the same body without the limb that a camera is inside of.
+
+        A real camera's housing would press the cloth in.
+        """
         joint = skeleton.index_of_role(mount.role)
         centre = mount.joint_from_cam[:3, 3]
         kept = object.__new__(Wearer)
@@ -85,13 +94,13 @@ class Wearer:
         kept._limbs = [
             limb
             for limb, (_, start, end, radii, _) in zip(self._limbs, self._bones, strict=True)
-            if limb.joint != joint or _distance(centre, start, end) > max(radii) + _CLEARANCE_M
+            if limb.joint != joint or _distance_to_segment(centre, start, end) > max(radii) + _CLEARANCE_M
         ]
         return kept
 
     def at(self, world_from_joint: FloatArray) -> Triangles:
-        """All limbs in the world, for joint poses (J,4,4)."""
-        parts = [_moved(limb.triangles, world_from_joint[limb.joint]) for limb in self._limbs]
+        """Return all limbs in the world, given the joint poses (J,4,4)."""
+        parts = [_triangles_in_world(limb.triangles, world_from_joint[limb.joint]) for limb in self._limbs]
         starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
         return Triangles(
             vertices=np.concatenate([part.vertices for part in parts]),
@@ -109,10 +118,11 @@ class Wearer:
 
 
 _Bone = tuple[int, FloatArray, FloatArray, tuple[float, float], str]
+"""Joint index, start and end in the joint's frame (m), radii at both ends (m), body part."""
 
 
-def _bones(skeleton: SkeletonModel) -> list[_Bone]:
-    """Joint, start and end in the joint's frame, radii and body part of each limb."""
+def _find_bones(skeleton: SkeletonModel) -> list[_Bone]:
+    """Return the bones of a body that have a surface."""
     rest, out = rest_positions(skeleton), []
     for joint, role in enumerate(skeleton.roles):
         part = split_side(role)[1]
@@ -121,7 +131,7 @@ def _bones(skeleton: SkeletonModel) -> list[_Bone]:
         end = skeleton.end_offsets_m[joint]
         children = np.flatnonzero(skeleton.parents == joint)
         if len(children):
-            # A trunk's bone goes to the child straight above it, a limb's to its only child.
+            # A bone of the trunk ends at the child straight above it, a bone of a limb at its only child.
             ahead = rest[children] - rest[joint]
             end = ahead[np.argmin(np.abs(ahead[:, 0]))]
         if np.isfinite(end).all() and np.linalg.norm(end) > 0.01:
@@ -129,13 +139,13 @@ def _bones(skeleton: SkeletonModel) -> list[_Bone]:
     return out
 
 
-def _distance(point: FloatArray, start: FloatArray, end: FloatArray) -> float:
-    """From a point to a segment."""
-    share = np.clip((point - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
-    return float(np.linalg.norm(point - start - share * (end - start)))
+def _distance_to_segment(point: FloatArray, start: FloatArray, end: FloatArray) -> float:
+    """Return the distance of a point (3,) to the segment between two points (3,)."""
+    ratio = np.clip((point - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
+    return float(np.linalg.norm(point - start - ratio * (end - start)))
 
 
-def _mesh(
+def _rounded_cone(
     start: FloatArray,
     end: FloatArray,
     radii: tuple[float, float],
@@ -143,7 +153,7 @@ def _mesh(
     origin: FloatArray,
     index: int,
 ) -> Triangles:
-    """Triangles of a rounded cone, its image wrapped around it."""
+    """Return the triangles of a rounded cone with an image wrapped around it."""
     axis = (end - start) / np.linalg.norm(end - start)
     side = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
@@ -162,11 +172,11 @@ def _mesh(
     ids = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]
     faces = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
-    return _textured(vertices.reshape(-1, 3), texels.reshape(-1, 2), faces, index)
+    return _textured_triangles(vertices.reshape(-1, 3), texels.reshape(-1, 2), faces, index)
 
 
-def _textured(vertices: FloatArray, texels: FloatArray, faces: FloatArray, index: int) -> Triangles:
-    """Planes and texture gradients from positions and atlas coordinates at vertices."""
+def _textured_triangles(vertices: FloatArray, texels: FloatArray, faces: FloatArray, index: int) -> Triangles:
+    """Return triangles with planes and texture gradients, given the atlas coordinates of the vertices."""
     corner = vertices[faces]
     first, second = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     normal = np.cross(first, second)
@@ -190,8 +200,8 @@ def _textured(vertices: FloatArray, texels: FloatArray, faces: FloatArray, index
     )
 
 
-def _moved(limb: Triangles, world_from_joint: FloatArray) -> Triangles:
-    """A limb in the world, lit from above."""
+def _triangles_in_world(limb: Triangles, world_from_joint: FloatArray) -> Triangles:
+    """Return a limb in the world, lit from above."""
     turn, shift = world_from_joint[:3, :3], world_from_joint[:3, 3]
     normal = limb.normal @ turn.T
     return Triangles(
@@ -208,11 +218,13 @@ def _moved(limb: Triangles, world_from_joint: FloatArray) -> Triangles:
 
 
 def _skin(height: int, width: int, rng: np.random.Generator) -> UINT8:
+    """Return a texture of skin."""
     shade = 0.85 + 0.03 * textures.fractal(height, width, 20.0, rng, 3)
-    return textures.tinted(shade, np.array([222, 170, 140], np.float32))
+    return textures.tint_shade(shade, np.array([222, 170, 140], np.float32))
 
 
 def _cloth(height: int, width: int, dye: textures.Grey, rng: np.random.Generator) -> UINT8:
+    """Return a texture of cloth in a colour."""
     folds = 0.9 + 0.12 * textures.fractal(height, width, 40.0, rng, 4)
     weave = 0.05 * rng.standard_normal((height, width), dtype=np.float32)
-    return textures.tinted(folds + weave, dye)
+    return textures.tint_shade(folds + weave, dye)

@@ -13,11 +13,11 @@ from bodycap_batch.model.merge_data import CameraClock, MergeInputs
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import nominal_mount
-from bodycap_batch.synthetic.filming import Moving, camera_at, joints_at
+from bodycap_batch.synthetic.filming import MovingBody, camera_poses_at, joint_poses_at
 from bodycap_batch.synthetic.making import Subject, draw_subject, frame_times_ns
-from bodycap_batch.synthetic.measured import measure
+from bodycap_batch.synthetic.measured import disturb_poses
 from bodycap_batch.synthetic.options import SynthOptions
-from bodycap_batch.synthetic.truth import common_ticks_ns, in_seconds
+from bodycap_batch.synthetic.truth import common_ticks_ns, seconds_from_ns
 
 GAUGE = "map-0"
 
@@ -37,7 +37,7 @@ class Posed:
     inputs: MergeInputs
     gauges: Mapping[str, Similarity]
     mounts: tuple[Mount, ...]
-    motion: Moving
+    motion: MovingBody
     options: SynthOptions = field(repr=False)
 
     def by_mount(self, mounts: Sequence[Mount]) -> list[Trajectory]:
@@ -47,7 +47,7 @@ class Posed:
 
     def world_from_joint(self) -> FloatArray:
         """True (T,J,4,4) at the merge's ticks."""
-        return joints_at(self.motion, in_seconds(common_ticks_ns(self.options)))
+        return joint_poses_at(self.motion, seconds_from_ns(common_ticks_ns(self.options)))
 
 
 def posed(options: SynthOptions, maps: Mapping[str, str] | None = None) -> Posed:
@@ -92,9 +92,11 @@ def _trajectory(
 ) -> Trajectory:
     name, map_from_world = gauge
     times_ns = frame_times_ns(options, mount.camera)
-    true = camera_at(subject.motion, mount, in_seconds(times_ns) + options.offsets_s.get(mount.camera, 0.0))
+    true = camera_poses_at(
+        subject.motion, mount, seconds_from_ns(times_ns) + options.offsets_s.get(mount.camera, 0.0)
+    )
     seed = [options.cameras.index(mount.camera), *subject.seeds["poses"].generate_state(4).tolist()]
-    seen = measure(true, options, np.random.default_rng(seed))
+    seen = disturb_poses(true, options, np.random.default_rng(seed))
     hidden = ~seen.present[:, None, None]
     sigmas = np.repeat(
         [np.radians(options.pose_sigma_deg), options.pose_sigma_m * map_from_world.scale], 3

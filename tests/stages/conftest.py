@@ -21,12 +21,12 @@ from tests.rooms import stroll, write_capture
 
 FRAMES = 60
 DARK = range(34, 40)
-"""Frames of the palm in which the light is off."""
+"""Frames of the palm's camera with the light off."""
 
 
 @dataclass(frozen=True)
 class Estimated:
-    """A capture with all that the first three stages made of it."""
+    """A capture with the results of the first three stages."""
 
     capture: Capture
     truth: dict[str, np.ndarray]
@@ -36,14 +36,14 @@ class Estimated:
 
 
 def context(folder: Path) -> StageContext:
-    """A stage context with its own folder."""
+    """Return a stage context with its own folder."""
     folder.mkdir(parents=True, exist_ok=True)
     return StageContext(work_dir=folder, threads=2)
 
 
 @pytest.fixture(scope="session")
 def stroll_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    """Two cameras, two seconds; the palm's light goes off for a moment."""
+    """Two cameras, two seconds; the palm's camera is dark for a moment."""
     return write_capture(tmp_path_factory.mktemp("stroll"), stroll(FRAMES), black={"left_palm": DARK})
 
 
@@ -65,5 +65,5 @@ def estimated(stroll_capture: Capture, tmp_path_factory: pytest.TempPathFactory)
 
 @pytest.fixture(scope="session")
 def inputs() -> ReportInputs:
-    """What a report is made of: a whole job's results, without videos."""
+    """The inputs of a report: the results of a whole job, without videos."""
     return report_inputs()

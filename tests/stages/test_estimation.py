@@ -20,13 +20,13 @@ from bodycap_batch.registration import register_frames
 from tests.rooms import look, make_transform, write_capture
 from tests.stages.conftest import DARK, FRAMES, Estimated, context
 
-# 320 px and 210 px focal length at about 3 m: one pixel is 14 mm, a pose of 100 points at 0.6 px about
-# 3 mm with tracking drift; three times that bounds the RMS, and nothing can be below a tenth of it.
+# With a focal length of 210 px at about 3 m, one pixel is 14 mm. A pose of 100 points at 0.6 px has an error
+# of about 3 mm, with tracking drift. Three times that bounds the RMS; no error can be below a tenth of it.
 MAX_ATE_M, MIN_ATE_M = 0.012, 0.0003
 
 
 def _errors(estimated: Estimated) -> tuple[np.ndarray, Similarity]:
-    """Camera centre errors in metres, all cameras under one similarity."""
+    """Return the position errors in metres, with all cameras under one similarity."""
     mine, theirs = [], []
     for item in estimated.registrations:
         known = item.trajectory.localised
@@ -52,14 +52,14 @@ def test_every_lit_frame_is_localised_to_a_centimetre(estimated: Estimated) -> N
         poses = world_from_map.apply_to_poses(item.trajectory.gauge_from_cam[known])
         truth = estimated.truth[item.trajectory.camera][known]
         turn = poses[:, :3, :3] @ np.swapaxes(truth[:, :3, :3], 1, 2)
-        # A common turn is the alignment's: millimetres over a stroll of a metre. What is left is the frames'.
+        # A common rotation comes from the alignment: millimetres over a path of a metre.
         u, _, vt = np.linalg.svd(turn.mean(axis=0))
         own = rotation_angle_rad(turn @ (u @ vt).T)
         assert np.degrees(np.median(own)) < 0.2
         assert np.degrees(own.max()) < 1.0
 
 
-def test_dark_frames_say_why_and_ask_for_keyframes(estimated: Estimated) -> None:
+def test_dark_frames_give_a_reason_and_request_keyframes(estimated: Estimated) -> None:
     palm = next(item for item in estimated.registrations if item.trajectory.camera == "left_palm")
     reasons = {palm.trajectory.status[frame] for frame in DARK}
     assert reasons <= {FrameStatus.FEW_TRACKS, FrameStatus.BLUR, FrameStatus.FEW_INLIERS}
@@ -69,9 +69,9 @@ def test_dark_frames_say_why_and_ask_for_keyframes(estimated: Estimated) -> None
 
 
 def test_a_new_gauge_is_followed_without_a_step_at_keyframes(estimated: Estimated, tmp_path: Path) -> None:
-    """The map is turned, moved and scaled between two rounds, as a refinement does."""
+    """The map is rotated, moved and scaled between two rounds, as by a refinement."""
     world = Similarity(3.7, so3_exp([0.4, 1.0, -0.3]), np.array([5.0, -2.0, 0.7]))
-    moved = tuple(_moved(item, world) for item in estimated.result.maps)
+    moved = tuple(_transformed(item, world) for item in estimated.result.maps)
     for camera, selection, before in zip(
         estimated.capture.cameras, estimated.selections, estimated.registrations, strict=True
     ):
@@ -85,7 +85,7 @@ def test_a_new_gauge_is_followed_without_a_step_at_keyframes(estimated: Estimate
         got = after.trajectory.gauge_from_cam[known]
         sigma = np.sqrt(np.trace(before.trajectory.covariance[known][:, 3:, 3:], axis1=1, axis2=2))
         change = np.linalg.norm(got[:, :3, 3] - expected[:, :3, 3], axis=1) / 3.7
-        # The same observations: only which points RANSAC sampled may differ, a part of the pose's noise.
+        # The observations are the same. Only RANSAC's samples may differ, by a part of the pose's noise.
         assert np.median(change / sigma) < 0.1
         assert (change / sigma).max() < 2.0
         scaled = after.trajectory.covariance[known][:, 3:, 3:] / 3.7**2
@@ -94,11 +94,11 @@ def test_a_new_gauge_is_followed_without_a_step_at_keyframes(estimated: Estimate
     steps = np.diff(got[:, :3, 3], axis=0)
     jump = np.linalg.norm(np.diff(steps, axis=0), axis=1) / 3.7
     consecutive = np.diff(np.flatnonzero(known)) == 1
-    # The stroll's own second difference is below 4.6 m/s² · (1/30 s)² = 5 mm; noise triples it at most.
+    # The second difference of the true path is below 4.6 m/s² · (1/30 s)² = 5 mm; noise triples it at most.
     assert jump[consecutive[1:] & consecutive[:-1]].max() * _errors(estimated)[1].scale < 0.03
 
 
-def _moved(scene_map: Map, world: Similarity) -> Map:
+def _transformed(scene_map: Map, world: Similarity) -> Map:
     return replace(
         scene_map,
         gauge="moved",
@@ -107,7 +107,7 @@ def _moved(scene_map: Map, world: Similarity) -> Map:
     )
 
 
-def test_unchanged_stretches_are_not_tracked_again(estimated: Estimated, tmp_path: Path) -> None:
+def test_unchanged_intervals_are_not_tracked_again(estimated: Estimated, tmp_path: Path) -> None:
     camera, selection, before = (
         estimated.capture.cameras[0],
         estimated.selections[0],
@@ -121,7 +121,7 @@ def test_unchanged_stretches_are_not_tracked_again(estimated: Estimated, tmp_pat
     assert "frames tracked" not in decoded
 
 
-def test_a_map_grows_and_keeps_its_keyframes(estimated: Estimated, tmp_path: Path) -> None:
+def test_an_extended_map_keeps_its_keyframes(estimated: Estimated, tmp_path: Path) -> None:
     known = set(estimated.selections[0].frames)
     extra = [frame for frame in (11, 25, 47) if frame not in known]
     name = estimated.capture.cameras[0].name
@@ -146,14 +146,14 @@ def test_the_same_capture_gives_the_same_map(estimated: Estimated, tmp_path: Pat
         assert np.array_equal(getattr(first, field), getattr(second, field))
 
 
-def test_points_carry_the_walls_grey(estimated: Estimated) -> None:
+def test_points_have_the_grey_of_the_walls(estimated: Estimated) -> None:
     colors = estimated.result.maps[0].colors.astype(int)
     # The room is grey; H.264 chroma may shift a channel by a few levels.
     assert np.abs(colors - colors.mean(axis=1, keepdims=True)).max() < 12
     assert np.ptp(colors) > 80
 
 
-def test_turning_on_the_spot_asks_for_few_keyframes(tmp_path: Path) -> None:
+def test_turning_on_the_spot_needs_few_keyframes(tmp_path: Path) -> None:
     count = 40
     turning = {"torso": np.array([make_transform(look(0.012 * k), [0, 0, 0]) for k in range(count)])}
     moving = {"torso": np.array([make_transform(look(0.0), [0, 0.03 * k - 0.6, 0]) for k in range(count)])}
@@ -175,12 +175,12 @@ def test_motion_decides_on_keyframes_not_the_number_of_frames(tmp_path: Path) ->
         options = KeyframeOptions(max_gap_s=10.0, min_survival=0.05, parallax_px=3.0, window=1)
         counts.append(len(select_keyframes(capture.cameras[0], options, context(tmp_path)).frames))
     assert counts[0] >= 5
-    # A keyframe at 30 fps comes up to a frame later than it is due: one in five here.
+    # At 30 fps a keyframe can be up to one frame late: here one in five.
     assert counts[0] <= counts[1] <= 1.5 * counts[0]
 
 
-def test_a_budget_leaves_the_keyframes_that_show_most(tmp_path: Path) -> None:
-    # Still, then quick: the second half shows all that is new.
+def test_a_budget_keeps_the_keyframes_that_show_most(tmp_path: Path) -> None:
+    # At rest, then fast: only the second half shows anything new.
     metres = np.concatenate([np.zeros(20), np.linspace(0.0, 1.2, 20)])
     paths = {"torso": np.array([make_transform(look(0.0), [0, at - 0.6, 0]) for at in metres])}
     camera = write_capture(tmp_path, paths).cameras[0]

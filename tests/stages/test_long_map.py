@@ -1,4 +1,4 @@
-"""A map of very many keyframes: built from some of them, the others placed in it."""
+"""A large map: built from skeletal keyframes, the other keyframes are resected."""
 
 from __future__ import annotations
 
@@ -13,12 +13,10 @@ import pytest
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping import build, build_map, extend, extend_map
-from bodycap_batch.mapping.reconstruction import reconstruct
+from bodycap_batch.mapping import build, build_map, extend_map
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import sub_model
-from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options
+from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
 from bodycap_batch.mapping.reconstruction.two_step_adjustment import adjust_in_two_steps
-from bodycap_batch.mapping.validation import repair
 from bodycap_batch.model.geometry import align_points
 from bodycap_batch.model.scene import KeyframeSelection, MapResult
 from tests.rooms import stroll
@@ -29,7 +27,7 @@ _EVERY = [frame for frame in range(0, FRAMES, 2) if frame not in DARK]
 
 @pytest.fixture(scope="module")
 def result(stroll_capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> MapResult:
-    """The stroll's map, as of a capture of more than 40 keyframes."""
+    """The stroll's map, built as a large one: with a limit of 40 keyframes."""
     return _built(stroll_capture, MapOptions(), context(tmp_path_factory.mktemp("long")))
 
 
@@ -39,7 +37,7 @@ def _built(
     selections = [_selection(camera.name, frames) for camera in capture.cameras]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bodycap_batch.mapping.matching.pair_selection._EXHAUSTIVE_UP_TO", 10)
-        return build_map(capture, selections, options, surroundings, many=40)
+        return build_map(capture, selections, options, surroundings, skeletal_above=40)
 
 
 def _selection(name: str, frames: Sequence[int]) -> KeyframeSelection:
@@ -52,11 +50,11 @@ def _selection(name: str, frames: Sequence[int]) -> KeyframeSelection:
     )
 
 
-def test_some_carry_the_map_and_all_others_are_placed_in_it(result: MapResult) -> None:
-    told = result.log["placed"]
+def test_some_keyframes_are_skeletal_and_all_others_are_resected(result: MapResult) -> None:
+    log = result.log["placed"]
     count = 2 * len(_EVERY)
-    assert told["carrying"] + told["placed"] == len(result.maps[0].keyframe_camera) == count
-    assert told["carrying"] < 0.8 * count
+    assert log["carrying"] + log["placed"] == len(result.maps[0].keyframe_camera) == count
+    assert log["carrying"] < 0.8 * count
 
 
 def test_one_thread_gives_the_same_map(result: MapResult, stroll_capture: Capture, tmp_path: Path) -> None:
@@ -65,14 +63,14 @@ def test_one_thread_gives_the_same_map(result: MapResult, stroll_capture: Captur
     assert (again.maps[0].points == result.maps[0].points).all()
 
 
-def test_who_wants_every_pair_gets_every_pair(stroll_capture: Capture, tmp_path: Path) -> None:
+def test_exhaustive_matching_matches_every_pair(stroll_capture: Capture, tmp_path: Path) -> None:
     every = _built(stroll_capture, MapOptions(pairs="exhaustive"), context(tmp_path))
     count = 2 * len(_EVERY)
     assert every.log["pairs"] == count * (count - 1) // 2
     assert "placed" not in every.log
 
 
-def test_keyframes_that_see_nothing_are_left_out(stroll_capture: Capture, tmp_path: Path) -> None:
+def test_dark_keyframes_are_left_out(stroll_capture: Capture, tmp_path: Path) -> None:
     with_dark = list(range(0, FRAMES, 2))
     found = _built(stroll_capture, MapOptions(), context(tmp_path), with_dark)
     inside = zip(found.maps[0].keyframe_camera, found.maps[0].keyframe_frame.tolist(), strict=True)
@@ -81,28 +79,28 @@ def test_keyframes_that_see_nothing_are_left_out(stroll_capture: Capture, tmp_pa
     assert set(inside) == wanted - dark
 
 
-def test_a_carrying_keyframe_that_was_cut_is_placed(
+def test_a_skeletal_keyframe_that_was_removed_is_resected(
     stroll_capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mended, cut = build.repair, list[str]()
+    repair, removed = build.repair_model, list[str]()
 
     def cutting(*arguments: Any) -> tuple[Any, dict[str, object]]:
-        model, log = mended(*arguments)
+        model, log = repair(*arguments)
         number = sorted(model.reg_image_ids())[-1]
-        cut.append(model.image(number).name)
+        removed.append(model.image(number).name)
         return sub_model(model, set(model.reg_image_ids()) - {number}), log
 
-    monkeypatch.setattr(build, "repair", cutting)
+    monkeypatch.setattr(build, "repair_model", cutting)
     found = _built(stroll_capture, MapOptions(), context(tmp_path))
-    told = found.log["placed"]
-    assert told["carrying"] + told["placed"] == len(found.maps[0].keyframe_camera)
-    camera, frame = cut[0].split("/")
+    log = found.log["placed"]
+    assert log["carrying"] + log["placed"] == len(found.maps[0].keyframe_camera)
+    camera, frame = removed[0].split("/")
     inside = zip(found.maps[0].keyframe_camera, found.maps[0].keyframe_frame.tolist(), strict=True)
     assert (camera, int(frame)) in set(inside)
 
 
-def _off(result: MapResult) -> np.ndarray:
-    """How far each keyframe of the map stands from where it was."""
+def _position_errors(result: MapResult) -> np.ndarray:
+    """Return the position error of each keyframe after alignment, metres."""
     found = result.maps[0]
     mine = found.map_from_cam[:, :3, 3]
     poses = stroll(FRAMES)
@@ -111,11 +109,11 @@ def _off(result: MapResult) -> np.ndarray:
     return np.asarray(np.linalg.norm(align_points(mine, true).apply(mine) - true, axis=1))
 
 
-def test_who_was_placed_stands_as_right_as_who_carries(result: MapResult) -> None:
-    off = _off(result)
-    # A quarter of a pixel at 3 m and 240 px is 3 mm a point; a pose has dozens, not all well spread.
-    assert np.sqrt((off**2).mean()) < 0.01
-    assert off.max() < 0.03
+def test_resected_keyframes_are_as_accurate_as_skeletal_ones(result: MapResult) -> None:
+    errors = _position_errors(result)
+    # A quarter of a pixel at 3 m and 240 px makes 3 mm for each point; a pose has dozens.
+    assert np.sqrt((errors**2).mean()) < 0.01
+    assert errors.max() < 0.03
 
 
 def test_a_large_map_is_adjusted_in_two_steps(result: MapResult, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,7 +128,7 @@ def test_a_large_map_is_adjusted_in_two_steps(result: MapResult, monkeypatch: py
         pose = model.image(number).cam_from_world()
         moved = pycolmap.Rigid3d(pose.rotation, pose.translation + rng.normal(0.0, 0.01 * spread, 3))
         model.frame(model.image(number).frame_id).set_cam_from_world(model.image(number).camera_id, moved)
-    before = _centres_off(model)
+    before = _centres_position_errors(model)
     adjusted: list[int] = []
     create = pycolmap.create_default_bundle_adjuster
 
@@ -140,15 +138,15 @@ def test_a_large_map_is_adjusted_in_two_steps(result: MapResult, monkeypatch: py
 
     monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", noted)
     adjust_in_two_steps(
-        model, mapper_options(MapOptions(), sorted(model.cameras), 1.0), sorted(model.cameras)
+        model, make_mapper_options(MapOptions(), sorted(model.cameras), 1.0), sorted(model.cameras)
     )
     assert adjusted[0] + adjusted[2] == model.num_reg_images()
     assert before > 0.02
-    assert _centres_off(model) < 0.005
+    assert _centres_position_errors(model) < 0.005
 
 
-def _centres_off(model: pycolmap.Reconstruction) -> float:
-    """How far a model's keyframes stand from where they were, root mean square."""
+def _centres_position_errors(model: pycolmap.Reconstruction) -> float:
+    """Return the position error of a model's keyframes after alignment, root mean square."""
     poses = stroll(FRAMES)
     found, true = [], []
     for number in sorted(model.reg_image_ids()):
@@ -160,11 +158,9 @@ def _centres_off(model: pycolmap.Reconstruction) -> float:
     return float(np.sqrt(((align_points(mine, right).apply(mine) - right) ** 2).sum(axis=1).mean()))
 
 
-def test_a_large_map_grows_without_adjusting_all_of_it_again_and_again(
+def test_a_large_map_is_extended_without_global_adjustments(
     result: MapResult, stroll_capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (reconstruct, repair, extend):
-        monkeypatch.setattr(module, "MANY", 40)
     adjusted: list[int] = []
     create = pycolmap.create_default_bundle_adjuster
 
@@ -175,12 +171,12 @@ def test_a_large_map_grows_without_adjusting_all_of_it_again_and_again(
         return create(options, config, model)
 
     def never(*_: object, **__: object) -> None:
-        raise AssertionError("what stands was adjusted while keyframes came to it")
+        raise AssertionError("the whole map was adjusted while keyframes were added")
 
     monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", noted)
     monkeypatch.setattr(pycolmap.IncrementalMapper, "iterative_global_refinement", never)
     extra = {"torso": np.array([21, 31]), "left_palm": np.array([11])}
-    grown = extend_map(stroll_capture, result, extra, MapOptions(), context(tmp_path))
+    grown = extend_map(stroll_capture, result, extra, MapOptions(), context(tmp_path), skeletal_above=40)
     assert len(grown.maps[0].keyframe_camera) == len(result.maps[0].keyframe_camera) + 3
     assert adjusted == [3]
-    assert _off(grown).max() < 0.03
+    assert _position_errors(grown).max() < 0.03

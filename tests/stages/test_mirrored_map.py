@@ -1,10 +1,11 @@
-"""Maps of captures in which a camera's picture is flipped."""
+"""Maps of captures with a flipped picture."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from bodycap_batch.config import KeyframeOptions, MapOptions
 from bodycap_batch.config.job import load_job
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build, build_map
+from bodycap_batch.mapping.matching.database import CameraKeyframes
 from bodycap_batch.mapping.matching.flipped_cameras import FLIPPED_CAMERAS, UNDECIDED_GROUPS
 from bodycap_batch.model.scene import KeyframeSelection
 from tests.rooms import stroll, write_capture
@@ -25,7 +27,7 @@ FRAMES = 40
 
 @pytest.fixture(scope="module")
 def flipped_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    """Three cameras, of which the palm's picture is flipped."""
+    """Three cameras; the palm's picture is flipped."""
     folder = tmp_path_factory.mktemp("flipped")
     paths = stroll(FRAMES)
     head = paths["torso"].copy()
@@ -52,7 +54,7 @@ def _without(capture: Capture, name: str) -> Capture:
     return replace(capture, cameras=tuple(each for each in capture.cameras if each.name != name))
 
 
-def test_without_the_flipped_camera_the_map_is_that_of_the_others(
+def test_the_map_is_the_same_as_without_the_flipped_camera(
     flipped_capture: Capture,
     selections: dict[str, KeyframeSelection],
     tmp_path: Path,
@@ -61,9 +63,9 @@ def test_without_the_flipped_camera_the_map_is_that_of_the_others(
     extracted: list[str] = []
     add = build.add_keyframes
 
-    def counted(workspace: Path, wanted: Sequence[tuple[object, int, np.ndarray]], *rest: object) -> None:
-        extracted.extend(f"{camera.name}:{frame}" for camera, _, frames in wanted for frame in frames)  # type: ignore[attr-defined]
-        add(workspace, wanted, *rest)  # type: ignore[arg-type]
+    def counted(workspace: Path, keyframes: Sequence[CameraKeyframes], *rest: Any) -> None:
+        extracted.extend(f"{item.camera.name}:{frame}" for item in keyframes for frame in item.frames)
+        add(workspace, keyframes, *rest)
 
     monkeypatch.setattr(build, "add_keyframes", counted)
     options = MapOptions(init_frames=("left_palm:3", "torso:20"))
@@ -79,7 +81,7 @@ def test_without_the_flipped_camera_the_map_is_that_of_the_others(
     assert {key: each for key, each in found.log.items() if key in alone.log} == alone.log
 
 
-def test_two_cameras_that_see_mirror_images_are_mapped_each_for_itself(
+def test_two_cameras_that_see_mirror_images_get_a_map_each(
     flipped_capture: Capture, selections: dict[str, KeyframeSelection], tmp_path: Path
 ) -> None:
     two = [each for each in selections.values() if each.camera != "head"]

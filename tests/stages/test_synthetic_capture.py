@@ -1,4 +1,4 @@
-"""Whole synthetic captures, small ones: layout, clocks, determinism, failures."""
+"""Small synthetic captures: layout, clocks, determinism, failures."""
 
 import errno
 import hashlib
@@ -73,7 +73,7 @@ def test_a_job_opens_the_folder(capture):
         assert camera.calibrated
         truth = read_tum(capture / "gt" / f"{camera.name}.tum")
         assert len(camera.times_ns) == 9
-        # The container counts in 1/15360 s: exact for 30 frames a second up to the rounding of a nanosecond.
+        # The container counts in 1/15360 s: exact at 30 frames per second, up to a nanosecond.
         assert np.abs(camera.times_ns - truth.times_ns).max() <= 1
 
 
@@ -85,7 +85,7 @@ def test_truth_agrees_with_itself(capture):
     data = np.load(capture / "gt" / "joints.npz")
     assert data["world"].shape == (9, 15, 3)
     names = data["names"].tolist()
-    # BVH angles have 6 decimals in degrees, lengths 1e-8 m: micrometres at an arm's length.
+    # BVH angles have 6 decimals in degrees, lengths 8 in metres: micrometres at an arm's length.
     for name, role in (("torso", "Spine1"), ("left_palm", "LeftHand"), ("right_ankle", "RightFoot")):
         bone = joints[:, skeleton.index_of_role(role), :3, 3]
         assert np.abs(data["world"][:, names.index(name)] - bone).max() < 1e-5
@@ -159,7 +159,7 @@ def test_poses_only(tmp_path):
         assert (truth.times_ns[index] == seen.times_ns).all()
         assert 1200 - len(seen.times_ns) == 24  # 2 % of 1,200, the default
         missing = np.setdiff1d(np.arange(1200), index)
-        # Two gaps of 10 to 20 (or one and the rest of another); they may touch.
+        # Two gaps of 10 to 20 frames, or one and the rest of another; they may touch.
         assert (np.diff(missing) > 1).sum() <= 2
         off = invert(truth.world_from_cam[index]) @ seen.world_from_cam
         shift = np.linalg.norm(seen.world_from_cam[:, :3, 3] - truth.world_from_cam[index, :3, 3], axis=1)
@@ -190,14 +190,14 @@ def test_a_motion_file_is_followed(capture, tmp_path):
     folder = _make(tmp_path / "moved", motion=capture / "gt" / "motion.bvh", seconds=0.2, cameras=("torso",))
     _, given = read_bvh(capture / "gt" / "motion.bvh")
     _, followed = read_bvh(folder / "gt" / "motion.bvh")
-    # The same turns (6 decimals of a degree each way), moved to the room's middle.
+    # The same rotations (6 decimals of a degree), moved to the middle of the room.
     assert np.abs(followed.local_rotation - given.local_rotation[:6]).max() < 1e-6
     moved = followed.root_in_world_m - given.root_in_world_m[:6]
     assert np.ptp(moved, axis=0).max() < 1e-6
     assert json.loads((folder / "gt" / "synth.json").read_text())["motion"] == "motion.bvh"
 
 
-def test_blur_shutter_body_and_fisheye_in_one(tmp_path):
+def test_blur_rolling_shutter_body_and_fisheye_together(tmp_path):
     folder = _make(
         tmp_path / "all",
         seconds=0.1,
@@ -227,13 +227,13 @@ def test_progress_counts_every_frame(tmp_path):
     assert calls[1:] == [(n, 6, "torso" if n <= 3 else "left_palm") for n in range(1, 7)]
 
 
-def test_cancelling_leaves_nothing(tmp_path):
+def test_cancelling_leaves_no_files(tmp_path):
     with pytest.raises(Cancelled):
         _make(tmp_path / "c", cancelled=lambda: True)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_in_use_is_left_alone(capture, tmp_path):
+def test_a_folder_in_use_is_not_changed(capture, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("important")
     with pytest.raises(JobError, match="exists already"):
@@ -243,7 +243,7 @@ def test_a_folder_in_use_is_left_alone(capture, tmp_path):
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
 
 
-def test_an_earlier_capture_is_replaced_when_asked(tmp_path):
+def test_an_earlier_capture_is_replaced_on_request(tmp_path):
     _make(tmp_path / "c", poses_only=True)
     with pytest.raises(JobError, match="exists already"):
         _make(tmp_path / "c", poses_only=True)
@@ -252,7 +252,7 @@ def test_an_earlier_capture_is_replaced_when_asked(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["c"]
 
 
-def test_a_disk_that_refuses_is_named(tmp_path):
+def test_a_disk_that_refuses_a_file_is_reported(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match="cannot write"):
         _make(tmp_path / "file" / "capture", poses_only=True)
@@ -265,7 +265,7 @@ def test_frames_lie_between_their_neighbours(capture):
     assert np.abs(middle[:, :3, 3] - truth[1:-1, :3, 3]).max() < 0.006
 
 
-def test_a_disk_that_fills_up_is_named_and_nothing_stays(tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_and_leaves_no_files(tmp_path, monkeypatch):
     class Full:
         def __init__(self, *arguments):
             self.path = arguments[0]

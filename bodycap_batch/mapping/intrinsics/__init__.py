@@ -1,1 +1,1 @@
-"""Camera intrinsics and shutter readout times, checked and refined against the map."""
+"""Camera intrinsics and shutter readout times: check them against the map and refine them."""

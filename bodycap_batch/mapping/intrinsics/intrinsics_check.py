@@ -1,4 +1,4 @@
-"""Do the lenses fit the pictures? Cropped videos give themselves away; guessed lenses get a fitting model."""
+"""Check calibrated intrinsics against the map, and select camera models for uncalibrated cameras."""
 
 from __future__ import annotations
 
@@ -9,228 +9,243 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bodycap_batch.core.arrays import evenly_spaced
+from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.matching.database import DATABASE_NAME
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import sub_model
 from bodycap_batch.mapping.reconstruction.conversion import camera_from_pycolmap
-from bodycap_batch.model.camera import Camera
 
 if TYPE_CHECKING:
     import pycolmap
 
 _MAX_KEYFRAMES = 40
+"""Keyframes of the model that the checks adjust, evenly spaced. Evidence: none."""
 _ITERATIONS = 40
+"""Iterations of such an adjustment at most. Evidence: none."""
 _MIN_KEYFRAMES = 10
+"""Keyframes that a check needs. Evidence: none."""
 _TOLERANCE = 1e-4
+"""Relative change of the cost that ends such an adjustment. Evidence: none."""
 _LOSS_PX = 1.0
+"""Width of the Cauchy loss of such an adjustment, px. Evidence: none."""
 _MAX_FOCAL_CHANGE = 0.06
-_MIN_REDUCTION_MISFIT = 0.05
-"""On four captures, real and rendered, a right lens was found again to 0.3 % (3 % with a rolling shutter
-still in the map) and freeing it lowered the cost by 1 % at most; a lens 7 % off was found to be that to 0.5 %
-(3 %), and the cost fell by 10 to 50 %."""
+"""Relative change of the focal length above which a given calibration is a misfit.
+Evidence: docs/decisions/mapping.md."""
 _MAX_CENTRE_CHANGE = 0.03
-"""Right centres of six captures were found again to 0.5 % of the long side; one stated 9 % off was found to
-half a percent (the cost fell by 51 %), and had put the cameras 16 cm off."""
+"""The same for the principal point, as a ratio of the image's long side. Evidence:
+docs/decisions/mapping.md."""
+_MIN_REDUCTION_MISFIT = 0.05
+"""Relative reduction of the cost that free focal lengths and centres must give for a misfit.
+Evidence: docs/decisions/mapping.md."""
 _FISHEYE, _FISHEYE_TWO_TERMS = "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"
-"""A second radial term, for what one finds to be a fisheye lens: the focal lengths of two made-up
-ones were found to 0.1 and 0.4 % instead of 1.8 and 1.2."""
+"""The fisheye candidate, and the same with a second radial term. The second term is tried only if the first
+model was selected. Evidence: docs/decisions/mapping.md."""
 _CANDIDATES = ("RADIAL", _FISHEYE)
+"""Camera models that are tried for uncalibrated cameras instead of one radial term."""
 _MIN_REDUCTION_MODEL = 0.15
-"""A fisheye lens guessed as a usual one: the cost falls by 75 % with the fisheye model (and the focal length
-from 25 % wrong to 0.4 %), by 52 % with a second radial term. A usual lens: by 1 % at most, or it rises."""
+"""Relative reduction of the cost that another camera model must give. Evidence: docs/decisions/mapping.md."""
 _PRINCIPAL_POINT, _PIXEL_ASPECT = "decentred", "stretched"
-"""A picture that was cropped off its centre, and one whose pixels are not square. Right centres of seven
-guessed lenses, two of them real: the cost falls by 2 % at most with the principal point free, by 14 % with a
-focal length for each axis (a fisheye lens's second radial term among it). Cropped to a corner, three videos:
-by 9 to 51 % (the real one least), and their error from 2.0, 31 and 32 cm to 0.9, 0.5 and 0.9. Squeezed to 3/4
-of its width, one: by 56 %."""
+"""Two more candidates: a free principal point, for a cropped picture, and a focal length for each axis, for
+pixels that are not square."""
 _MIN_ASPECT_CHANGE = 0.02
-"""Its model bends in more ways than that: the cost falls for distortion that is not along the radius,
-too, with focal lengths that agree to 0.1 %."""
+"""Relative difference of two focal lengths above which pixels are not square. The model with two focal
+lengths also has tangential distortion, so a lower cost alone is no evidence. Evidence:
+docs/decisions/mapping.md."""
 _OBSERVATIONS_PER_PARAMETER = 10
-"""Mapped keypoints of a lens for each of its parameters, at least."""
+"""Observations of a camera for each of its parameters, at least, to decide on its pixel aspect. Evidence:
+none."""
 _MIN_REDUCTION_CENTRE = 0.05
+"""Relative reduction of the cost that a free principal point must give. Evidence:
+docs/decisions/mapping.md."""
 _MIN_REDUCTION_RECENTRED = 0.005
-"""Once it is known to be off, all that a second map tells is taken: 1.6 to 0.9 cm, for 0.9 % of the cost."""
+"""The same for a principal point that was moved before: a second map shows its position better.
+Evidence: docs/decisions/mapping.md."""
 _TANGENT_CUBIC = 1.0 / 3.0
+"""Cubic coefficient of the tangent's Taylor series."""
 
 
 def find_misfit_intrinsics(
-    model: Any, settings: pycolmap.IncrementalPipelineOptions, given: Mapping[int, str]
+    model: Any, settings: pycolmap.IncrementalPipelineOptions, calibrated: Mapping[int, str]
 ) -> dict[str, float]:
-    """Given lenses that the map contradicts.
+    """Return the calibrated cameras whose given intrinsics the map contradicts.
 
-    A part of the map is adjusted twice, with the lenses as given and with focal lengths and centres free.
+    A part of the map is adjusted twice: with the intrinsics held constant, and with free focal lengths and
+    principal points.
 
     Args:
-        model: The reconstruction; stays as it is.
-        settings: The mapper's settings.
-        given: Names of the calibrated cameras by id.
+        model: The reconstruction; not changed.
+        settings: The mapper's options.
+        calibrated: Names of the calibrated cameras by id.
 
     Returns:
-        By camera name, the focal length that fits over the one that was given, where it differs or the
-        principal point lies elsewhere.
+        By camera name, the ratio of the focal length that fits to the given one. Only cameras are named of
+        which the focal length or the principal point changes much.
 
     Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999.
     """
     part = _subsample(model)
-    given = {number: name for number, name in given.items() if part.exists_camera(number)}
-    if not given or part.num_reg_images() < _MIN_KEYFRAMES:
+    calibrated = {number: name for number, name in calibrated.items() if part.exists_camera(number)}
+    if not calibrated or part.num_reg_images() < _MIN_KEYFRAMES:
         return {}
-    stated = {number: copy.deepcopy(part.camera(number)) for number in given}
-    held = _adjustment_cost(part, settings, free=False)
-    freed = _adjustment_cost(part, settings, free=True, centre=True)
-    if held is None or freed is None or freed > (1.0 - _MIN_REDUCTION_MISFIT) * held:
+    given = {number: copy.deepcopy(part.camera(number)) for number in calibrated}
+    held_cost = _adjustment_cost(part, settings, free=False)
+    free_cost = _adjustment_cost(part, settings, free=True, centre=True)
+    if held_cost is None or free_cost is None or free_cost > (1.0 - _MIN_REDUCTION_MISFIT) * held_cost:
         return {}
     factors = {
-        number: part.camera(number).mean_focal_length() / stated[number].mean_focal_length()
-        for number in given
+        number: part.camera(number).mean_focal_length() / given[number].mean_focal_length()
+        for number in calibrated
     }
     return {
-        given[number]: round(value, 3)
-        for number, value in factors.items()
-        if abs(value - 1.0) > _MAX_FOCAL_CHANGE
-        or _principal_point_distance(stated[number], part.camera(number)) > _MAX_CENTRE_CHANGE
+        calibrated[number]: round(factor, 3)
+        for number, factor in factors.items()
+        if abs(factor - 1.0) > _MAX_FOCAL_CHANGE
+        or _principal_point_distance(given[number], part.camera(number)) > _MAX_CENTRE_CHANGE
     }
 
 
 def _principal_point_distance(one: Any, other: Any) -> float:
-    """How far the principal points of two lenses of one picture lie apart, as a share of its long side."""
-    apart = np.subtract(
+    """Return the distance of two principal points of the same picture, as a ratio of its long side."""
+    offset = np.subtract(
         [one.principal_point_x, one.principal_point_y], [other.principal_point_x, other.principal_point_y]
     )
-    return float(np.hypot(*apart)) / float(max(one.width, one.height))
+    return float(np.hypot(*offset)) / float(max(one.width, one.height))
 
 
 def select_camera_models(
-    model: Any, settings: pycolmap.IncrementalPipelineOptions, guessed: Collection[int]
+    model: Any, settings: pycolmap.IncrementalPipelineOptions, uncalibrated: Collection[int]
 ) -> tuple[dict[int, pycolmap.Camera], frozenset[int]]:
-    """Lenses that explain the pictures of guessed ones much better than one radial term about the centre.
+    """Select camera models that explain the pictures of uncalibrated cameras much better.
 
-    A part of the map is adjusted with each candidate in turn, for all guessed lenses alike: another model,
-    then a principal point off the centre, then pixels that are not square.
+    The current model has one radial term and a centred principal point. A part of the map is adjusted with
+    each candidate in turn, for all uncalibrated cameras at once: another distortion model, then a free
+    principal point, then pixels that are not square.
 
     Args:
-        model: The reconstruction; stays as it is.
-        settings: The mapper's settings.
-        guessed: Ids of the cameras whose lens was not given.
+        model: The reconstruction; not changed.
+        settings: The mapper's options.
+        uncalibrated: Ids of the uncalibrated cameras.
 
     Returns:
         Adjusted cameras by id, for those that need another model or centre; the ids of those whose principal
-        point was found to lie off where it was.
+        point moved.
     """
     import pycolmap
 
     part = _subsample(model)
     out: dict[int, pycolmap.Camera] = {}
     decentred: frozenset[int] = frozenset()
-    wanted = [number for number in sorted(guessed) if part.exists_camera(number)]
-    if not wanted or part.num_reg_images() < _MIN_KEYFRAMES:
+    numbers = [number for number in sorted(uncalibrated) if part.exists_camera(number)]
+    if not numbers or part.num_reg_images() < _MIN_KEYFRAMES:
         return out, decentred
-    held = set(part.cameras) - set(wanted)
-    best = _adjustment_cost(part, settings, free=True, distortion=True, held=held)
+    constant = set(part.cameras) - set(numbers)
+    best = _adjustment_cost(part, settings, free=True, distortion=True, constant=constant)
     plain = chosen = part
     for name in (*_CANDIDATES, _FISHEYE_TWO_TERMS, _PRINCIPAL_POINT, _PIXEL_ASPECT):
         centre = name == _PRINCIPAL_POINT
-        if name == _FISHEYE_TWO_TERMS and chosen.camera(wanted[0]).model_name != _FISHEYE:
+        if name == _FISHEYE_TWO_TERMS and chosen.camera(numbers[0]).model_name != _FISHEYE:
             continue
-        # All at once: while one lens is wrong the map is bent, and no other fits it.
+        # All cameras change at once: one wrong camera bends the map, and no other one fits a bent map.
         trial = copy.deepcopy(plain if name in _CANDIDATES else chosen)
-        for number in wanted:
+        for number in numbers:
             _change_model(trial.camera(number), name)
-        cost = _adjustment_cost(trial, settings, free=True, distortion=True, centre=centre, held=held)
-        worth = _MIN_REDUCTION_CENTRE if centre else _MIN_REDUCTION_MODEL
-        if best is None or cost is None or cost >= (1.0 - worth) * best:
+        cost = _adjustment_cost(trial, settings, free=True, distortion=True, centre=centre, constant=constant)
+        reduction = _MIN_REDUCTION_CENTRE if centre else _MIN_REDUCTION_MODEL
+        if best is None or cost is None or cost >= (1.0 - reduction) * best:
             continue
         taken = [
-            number for number in wanted if name != _PIXEL_ASPECT or _has_unequal_focal_lengths(trial, number)
+            number for number in numbers if name != _PIXEL_ASPECT or _has_unequal_focal_lengths(trial, number)
         ]
         out |= {number: pycolmap.Camera(trial.camera(number).todict()) for number in taken}
         best, chosen = cost, trial
-        decentred = frozenset(wanted) if centre else decentred
+        decentred = frozenset(numbers) if centre else decentred
     return out, decentred
 
 
 def _has_unequal_focal_lengths(part: Any, number: int) -> bool:
-    """Whether the two focal lengths of a camera differ, by keypoints enough to tell."""
+    """Return whether a camera's two focal lengths differ and enough keypoints determine them."""
     camera = part.camera(number)
-    mine = (image for image in map(part.image, part.reg_image_ids()) if image.camera_id == number)
-    seen = sum(int(image.num_points3D) for image in mine)
+    images = (image for image in map(part.image, part.reg_image_ids()) if image.camera_id == number)
+    observations = sum(int(image.num_points3D) for image in images)
     aspect = camera.focal_length_x / camera.focal_length_y
-    return bool(
-        abs(aspect - 1.0) > _MIN_ASPECT_CHANGE and seen >= _OBSERVATIONS_PER_PARAMETER * len(camera.params)
-    )
+    enough = observations >= _OBSERVATIONS_PER_PARAMETER * len(camera.params)
+    return bool(abs(aspect - 1.0) > _MIN_ASPECT_CHANGE and enough)
 
 
 def refine_principal_points(
     model: Any, settings: pycolmap.IncrementalPipelineOptions, decentred: Collection[int]
 ) -> dict[int, pycolmap.Camera]:
-    """Lenses found off the centre of the picture, found anew where the map built with them tells more.
+    """Refine principal points again, with a map that was built with their first estimates.
 
-    Points that suited the first map held them back: 17 px off where the picture was cropped by a third,
-    1 px the second time.
+    The points of the first map fit its wrong principal points and hold the estimates back.
+    Evidence: docs/decisions/mapping.md.
 
     Args:
-        model: The reconstruction; stays as it is.
-        settings: The mapper's settings.
-        decentred: Ids of the cameras whose principal point was found off (`select_camera_models`).
+        model: The reconstruction; not changed.
+        settings: The mapper's options.
+        decentred: Ids of the cameras whose principal point moved (`select_camera_models`).
 
     Returns:
-        Adjusted cameras by id, where the cost falls.
+        Adjusted cameras by id, if the cost falls enough.
     """
     import pycolmap
 
     part = _subsample(model)
-    wanted = [number for number in sorted(decentred) if part.exists_camera(number)]
-    held = set(part.cameras) - set(wanted)
-    best = _adjustment_cost(part, settings, free=True, distortion=True, held=held) if wanted else None
+    numbers = [number for number in sorted(decentred) if part.exists_camera(number)]
+    constant = set(part.cameras) - set(numbers)
+    best = (
+        _adjustment_cost(part, settings, free=True, distortion=True, constant=constant) if numbers else None
+    )
     if best is None:
         return {}
-    cost = _adjustment_cost(part, settings, free=True, distortion=True, centre=True, held=held)
+    cost = _adjustment_cost(part, settings, free=True, distortion=True, centre=True, constant=constant)
     if cost is None or cost >= (1.0 - _MIN_REDUCTION_RECENTRED) * best:
         return {}
-    return {number: pycolmap.Camera(part.camera(number).todict()) for number in wanted}
+    return {number: pycolmap.Camera(part.camera(number).todict()) for number in numbers}
 
 
 def update_camera_models(
     workspace: Path,
     models: Sequence[Any],
     settings: pycolmap.IncrementalPipelineOptions,
-    guessed: Mapping[int, str],
+    uncalibrated: Mapping[int, str],
     decentred: Collection[int] | None = None,
-) -> tuple[dict[str, tuple[Camera, bool]], Collection[int]]:
-    """Write the better lenses of guessed cameras into the database.
+) -> tuple[dict[str, CameraIntrinsics], Collection[int]]:
+    """Write better intrinsics of uncalibrated cameras into the database.
 
     Args:
         workspace: Folder of the database.
-        models: Reconstructions, the one to tell from first; they stay as they are.
-        settings: The mapper's settings.
-        guessed: Names of the cameras whose lens was not given, by id.
-        decentred: The models were built with what this found before, and these are the lenses it then found
-            off the centre: only what is told better of them is of interest.
+        models: Reconstructions, the most reliable first; not changed.
+        settings: The mapper's options.
+        uncalibrated: Names of the uncalibrated cameras by id.
+        decentred: None at first. Afterwards the ids that an earlier call returned, with models that were
+            built with what it wrote; then only their principal points are refined.
 
     Returns:
-        By camera name the lens that was written, and that it is none that was given (`select_camera_models`); the
-        ids of the lenses that were found off the centre.
+        By camera name, the intrinsics that were written; the ids of the cameras whose principal point moved.
     """
     import pycolmap
 
-    lenses: dict[int, pycolmap.Camera] = {}
+    cameras: dict[int, pycolmap.Camera] = {}
     if models and decentred is not None:
-        lenses = refine_principal_points(models[0], settings, decentred)
+        cameras = refine_principal_points(models[0], settings, decentred)
     elif models:
-        lenses, decentred = select_camera_models(models[0], settings, guessed)
-    if lenses:
+        cameras, decentred = select_camera_models(models[0], settings, uncalibrated)
+    if cameras:
         with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
-            for lens in lenses.values():
-                # COLMAP looks for no initial pair among fisheye cameras whose focal length is a mere guess.
-                lens.has_prior_focal_length = True
-                database.update_camera(lens)
-    found = {guessed[number]: (camera_from_pycolmap(lens), False) for number, lens in sorted(lenses.items())}
-    return found, decentred or ()
+            for camera in cameras.values():
+                # COLMAP seeks no initial pair among fisheye cameras without a prior focal length.
+                camera.has_prior_focal_length = True
+                database.update_camera(camera)
+    written = {
+        uncalibrated[number]: CameraIntrinsics(camera_from_pycolmap(camera), calibrated=False)
+        for number, camera in sorted(cameras.items())
+    }
+    return written, decentred or ()
 
 
 def _change_model(camera: Any, name: str) -> None:
-    """Give a camera with one focal length another model that agrees with it near the image's middle."""
+    """Change a camera with one focal length to a candidate model that agrees near the image's middle."""
     import pycolmap
 
     if name == _PRINCIPAL_POINT:
@@ -243,7 +258,7 @@ def _change_model(camera: Any, name: str) -> None:
         return
     cubic = radial[0] if radial else 0.0
     if camera.model_name.endswith("FISHEYE") != name.endswith("FISHEYE"):
-        # tan θ = θ + θ³/3 + …: what is no distortion for one kind is a third for the other.
+        # tan θ = θ + θ³/3 + …: no distortion of a pinhole model is a cubic term of 1/3 in a fisheye model.
         cubic += _TANGENT_CUBIC if name.endswith("FISHEYE") else -_TANGENT_CUBIC
     extra = [cubic, 0.0] if name.startswith("RADIAL") else [cubic]
     camera.model = getattr(pycolmap.CameraModelId, name)
@@ -251,7 +266,13 @@ def _change_model(camera: Any, name: str) -> None:
 
 
 def misfit_note(camera: str, factor: float, *, freed: bool = False) -> str:
-    """What a misfit means and what to do; `freed`: what fits was used instead of what was given."""
+    """Return the note for the user on a misfit: its likely cause and what to do.
+
+    Args:
+        camera: Camera name.
+        factor: Focal length that fits, relative to the given one.
+        freed: True if the fitting intrinsics were used instead of the given ones.
+    """
     instead = "; what fits was used instead" if freed else ""
     if abs(factor - 1.0) > _MAX_FOCAL_CHANGE:
         longer = "longer" if factor > 1.0 else "shorter"
@@ -260,20 +281,16 @@ def misfit_note(camera: str, factor: float, *, freed: bool = False) -> str:
             "stabilisation or digital zoom on, or another lens mode or size calibrated? Film with these off"
         )
     else:
-        # What was freed had its distortion found as well; else the centre alone can have told.
+        # Refined intrinsics include distortion; otherwise the check frees the principal point alone.
         fits = "another centre or distortion than" if freed else "a centre that lies elsewhere than where"
         cause = "the picture cropped, or another lens mode or size calibrated? Film the whole picture"
-    return (
-        f"{camera}: the pictures fit {fits} the calibration says{instead}: "
-        f"was {cause}, calibrate in the same mode, or use calibration: auto"
-    )
+    return f"{camera}: the pictures fit {fits} the calibration says{instead}: was {cause}, calibrate in the same mode, or use calibration: auto"
 
 
 def _subsample(model: Any) -> Any:
-    """A copy of the model with at most so many keyframes, evenly spread."""
+    """Return a copy of a model with at most `_MAX_KEYFRAMES` evenly spaced keyframes."""
     images = sorted(model.reg_image_ids())
-    rows = np.linspace(0, len(images) - 1, min(_MAX_KEYFRAMES, len(images))).round().astype(int)
-    return sub_model(model, {images[row] for row in rows})
+    return sub_model(model, {images[row] for row in evenly_spaced(len(images), _MAX_KEYFRAMES)})
 
 
 def _adjustment_cost(
@@ -283,17 +300,17 @@ def _adjustment_cost(
     free: bool,
     distortion: bool = False,
     centre: bool = False,
-    held: Collection[int] = (),
+    constant: Collection[int] = (),
 ) -> float | None:
-    """Adjust a model with its lenses held or free; the cost that is left, None where that fails.
+    """Adjust a model with free or constant intrinsics and return the final cost; None if that fails.
 
     Args:
         part: The model; it is changed.
-        settings: The mapper's settings.
-        free: Focal lengths.
-        distortion: Distortion as well.
-        centre: Principal points as well.
-        held: Ids of cameras whose lenses stay as they are all the same.
+        settings: The mapper's options.
+        free: Whether focal lengths are free.
+        distortion: Whether distortion is free.
+        centre: Whether principal points are free.
+        constant: Ids of cameras whose intrinsics stay constant in any case.
     """
     import pycolmap
 
@@ -307,7 +324,7 @@ def _adjustment_cost(
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in part.reg_image_ids():
         config.add_image(image_id)
-    for number in sorted(held):
+    for number in sorted(constant):
         config.set_constant_cam_intrinsics(number)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     summary = pycolmap.create_default_bundle_adjuster(options, config, part).solve()

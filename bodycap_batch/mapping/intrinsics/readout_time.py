@@ -1,4 +1,4 @@
-"""Find a rolling shutter's readout time in the data, and take its bending out of the map."""
+"""Estimate rolling-shutter readout times from the map, and correct the map for them."""
 
 from __future__ import annotations
 
@@ -23,17 +23,25 @@ if TYPE_CHECKING:
     import pycolmap
 
 _TRIAL_STEP_S = 0.01
+"""First step of the readout time, and the largest step, seconds. Evidence: none."""
 _TRIAL_ITERATIONS = 40
+"""Iterations of a trial adjustment at most. Evidence: none."""
 _TRIAL_KEYFRAMES = 24
-"""The readout time is looked for in so many successive keyframes, those that move most."""
+"""Successive keyframes of each camera that trial adjustments use: those that move most. Evidence: none."""
 _MAX_TRIALS = 4
+"""Trial values at most. Evidence: none."""
 _CONVERGED_S = 0.001
+"""Step of the readout time below which the search ends, seconds. Evidence: none."""
 _MAX_READOUT_FRAMES = 1.1
-"""A readout takes at most the time between two frames."""
+"""Largest readout time in frame intervals. The true limit is 1; the rest is for its uncertainty."""
 _MIN_READOUT_S = 0.002
+"""Readout time below which a shutter counts as global, seconds. Evidence: none."""
 _MIN_SIGMAS = 5.0
+"""Standard deviations by which an estimate must differ from zero. Evidence: none."""
 _LOSS_PX = 1.0
+"""Width of the robust weight of a residual, px. Evidence: none."""
 _MAX_RESIDUAL_PX = 8.0
+"""Residual above which an observation is ignored, px. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +49,11 @@ class Readout:
     """A camera's readout time.
 
     Attributes:
-        seconds: From the first row's exposure to the last's; 0 for a global shutter.
-        sigma_s: Standard deviation; 0 where it was stated.
+        seconds: Time from the first row's exposure to the last row's; 0 for a global shutter.
+        sigma_s: Standard deviation; 0 if the time was stated.
         source: "stated", "estimated", "none found", or why it could not be determined.
-        best_s: Where the residuals are smallest, found or not.
-        sideways: The sensor's rows run along the picture's columns.
+        best_s: Readout time with the smallest residuals, even if it is not significant.
+        sideways: True if the sensor's rows are the picture's columns.
     """
 
     seconds: float
@@ -55,8 +63,8 @@ class Readout:
     sideways: bool = False
 
     @property
-    def clearness(self) -> float:
-        """How many standard deviations the readout time is off none; 0 where none was found."""
+    def significance(self) -> float:
+        """Readout time in standard deviations; 0 if none was found."""
         return abs(self.seconds) / self.sigma_s if self.sigma_s else 0.0
 
 
@@ -65,10 +73,10 @@ class _Keypoints:
     """The observations of one keyframe.
 
     Attributes:
-        image_id: Its image in the model.
-        camera: Its camera's name.
-        feature: (N,) point indices in the image.
-        px: (N,2) as detected.
+        image_id: Id of its image in the model.
+        camera: Name of its camera.
+        feature: (N,) indices of features in the image.
+        px: (N,2) as detected, px.
         velocity: (N,2) px/s.
     """
 
@@ -80,13 +88,13 @@ class _Keypoints:
 
 
 class RollingShutterModel:
-    """A model whose keypoints can be moved to the instant of the middle row.
+    """A model whose keypoints can be moved to where they are at the instant of the middle row.
 
     Args:
-        model: COLMAP's reconstruction, left as it is.
-        trajectories: Every frame's pose in the model's gauge, by camera; a camera whose frames were solved in
-            another map has none here, and its keypoints stay.
-        cameras: The capture's cameras, by name.
+        model: COLMAP's reconstruction; not changed.
+        trajectories: Poses of every frame in the model's gauge, by camera. Keypoints of a camera without a
+            trajectory stay; its frames were registered against another map.
+        cameras: The capture's cameras by name.
     """
 
     def __init__(
@@ -98,7 +106,7 @@ class RollingShutterModel:
         self._model = model
         self._trajectories = trajectories
         self._cameras = cameras
-        self._lenses = {
+        self._intrinsics = {
             ImageRef.parse(model.image(image_id).name).camera: camera_from_pycolmap(
                 model.image(image_id).camera
             )
@@ -108,50 +116,63 @@ class RollingShutterModel:
             self._keypoints_of(image_id, trajectories) for image_id in sorted(model.reg_image_ids())
         ]
 
-    def moved(self, readout_s: Mapping[str, float]) -> pycolmap.Reconstruction:
-        """A copy of the model, its keypoints where they are at the instant of the middle row."""
+    def corrected(self, readout_s: Mapping[str, float]) -> pycolmap.Reconstruction:
+        """Return a copy of the model with all keypoints at the instant of the middle row."""
         out = copy.deepcopy(self._model)
-        self.move(out, readout_s)
+        self.move_keypoints(out, readout_s)
         return out
 
-    def move(self, model: pycolmap.Reconstruction, readout_s: Mapping[str, float]) -> None:
-        """Move the keypoints of a copy of the model; a readout of 0 puts them back where they were found."""
+    def move_keypoints(self, model: pycolmap.Reconstruction, readout_s: Mapping[str, float]) -> None:
+        """Move the keypoints of a copy of the model, in place.
+
+        Args:
+            model: The copy.
+            readout_s: Readout time by camera, seconds. With 0 the keypoints are where they were detected.
+        """
         for item in self._keypoints:
             px = px_at_mid_row(
-                self._lenses[item.camera], item.px, item.velocity, readout_s.get(item.camera, 0.0)
+                self._intrinsics[item.camera], item.px, item.velocity, readout_s.get(item.camera, 0.0)
             )
             points = model.image(item.image_id).points2D
             for feature, xy in zip(item.feature.tolist(), px, strict=True):
                 points[feature].xy = xy
 
-    def fastest(self) -> RollingShutterModel:
-        """A model of each camera's successive keyframes that move most, without all others."""
+    def most_dynamic_subset(self) -> RollingShutterModel:
+        """Return a model of the successive keyframes of each camera that move most, without all others."""
         kept: set[int] = set()
-        for name in self._lenses:
-            mine = [item for item in self._keypoints if item.camera == name]
-            mine.sort(key=lambda item: ImageRef.parse(self._model.image(item.image_id).name).frame)
-            speed = [float(np.median(np.abs(item.velocity))) if len(item.velocity) else 0.0 for item in mine]
+        for name in self._intrinsics:
+            keyframes = [item for item in self._keypoints if item.camera == name]
+            keyframes.sort(key=lambda item: ImageRef.parse(self._model.image(item.image_id).name).frame)
+            speed = [
+                float(np.median(np.abs(item.velocity))) if len(item.velocity) else 0.0 for item in keyframes
+            ]
             total = np.concatenate([[0.0], np.cumsum(speed)])
-            size = min(_TRIAL_KEYFRAMES, len(mine))
+            size = min(_TRIAL_KEYFRAMES, len(keyframes))
             start = int(np.argmax(total[size:] - total[: len(total) - size]))
-            kept |= {item.image_id for item in mine[start : start + size]}
+            kept |= {item.image_id for item in keyframes[start : start + size]}
         part = sub_model(self._model, kept)
-        sideways = [name for name, lens in self._lenses.items() if lens.sideways]
-        return RollingShutterModel(part, self._trajectories, self._cameras).read_along(sideways)
+        sideways = [name for name, camera in self._intrinsics.items() if camera.sideways]
+        return RollingShutterModel(part, self._trajectories, self._cameras).with_sideways(sideways)
 
-    def read_along(self, sideways: Collection[str]) -> RollingShutterModel:
-        """The same model, these cameras' sensors read along the picture's columns, all others' along rows."""
+    def with_sideways(self, sideways: Collection[str]) -> RollingShutterModel:
+        """Return the same model; only in these cameras are the sensor's rows the picture's columns."""
         out = copy.copy(self)
-        out._lenses = {name: replace(lens, sideways=name in sideways) for name, lens in self._lenses.items()}
+        out._intrinsics = {
+            name: replace(camera, sideways=name in sideways) for name, camera in self._intrinsics.items()
+        }
         return out
 
-    def find(
-        self, settings: pycolmap.IncrementalPipelineOptions, constant: Sequence[int]
+    def estimate(
+        self, settings: pycolmap.IncrementalPipelineOptions, calibrated_ids: Sequence[int]
     ) -> dict[str, Readout]:
-        """Readout times from a few adjustments of the map with trial values.
+        """Estimate readout times by camera, from adjustments of the map with a few trial values.
 
-        After poses and points are adjusted, the residuals are close to linear in the readout time: their
-        change from one trial to the next says how far to go.
+        After poses and points are adjusted, the residuals are almost linear in the readout time. Their change
+        from one trial to the next gives the next step.
+
+        Args:
+            settings: The mapper's options.
+            calibrated_ids: Ids of the calibrated cameras.
 
         Raises:
             EstimationError: An adjustment failed.
@@ -159,39 +180,41 @@ class RollingShutterModel:
         Source: secant steps on the reduced functional of Golub, Pereyra, "The differentiation of
             pseudo-inverses and nonlinear least squares problems whose variables separate", 1973.
         """
-        moving = [name for name in self._lenses if name in self._trajectories]
-        wanted = [name for name in moving if not self._cameras[name].rolling_shutter_known]
+        names = [name for name in self._intrinsics if name in self._trajectories]
+        unknown = [name for name in names if not self._cameras[name].rolling_shutter_known]
         out = {
             name: _stated_readout(self._cameras[name].rolling_shutter_s)
-            for name in moving
-            if name not in wanted
+            for name in names
+            if name not in unknown
         }
-        if not wanted:
+        if not unknown:
             return out
-        frame_s = {name: float(np.median(np.diff(self._cameras[name].times_ns))) * 1e-9 for name in wanted}
-        times = {name: readout.seconds for name, readout in out.items()} | dict.fromkeys(wanted, 0.0)
-        model = self.moved(times)
-        bundle_adjust(model, settings, constant, _TRIAL_ITERATIONS)
+        frame_s = {name: float(np.median(np.diff(self._cameras[name].times_ns))) * 1e-9 for name in unknown}
+        readout_s = {name: readout.seconds for name, readout in out.items()} | dict.fromkeys(unknown, 0.0)
+        model = self.corrected(readout_s)
+        bundle_adjust(model, settings, calibrated_ids, _TRIAL_ITERATIONS)
         before = self._residuals(model)
-        step = dict.fromkeys(wanted, _TRIAL_STEP_S)
+        step_s = dict.fromkeys(unknown, _TRIAL_STEP_S)
         for _ in range(_MAX_TRIALS):
-            times = times | {name: times[name] + step[name] for name in wanted}
-            self.move(model, times)
-            bundle_adjust(model, settings, constant, _TRIAL_ITERATIONS)
+            readout_s = readout_s | {name: readout_s[name] + step_s[name] for name in unknown}
+            self.move_keypoints(model, readout_s)
+            bundle_adjust(model, settings, calibrated_ids, _TRIAL_ITERATIONS)
             after = self._residuals(model)
-            for name in wanted:
-                slope = _ResidualSlope.of(before[name], after[name], step[name])
-                out[name] = slope.readout(times[name], frame_s[name])
-                step[name] = float(np.clip(out[name].best_s - times[name], -_TRIAL_STEP_S, _TRIAL_STEP_S))
-            if max(map(abs, step.values())) < _CONVERGED_S:
+            for name in unknown:
+                slope = _ResidualSlope.of(before[name], after[name], step_s[name])
+                out[name] = slope.readout(readout_s[name], frame_s[name])
+                step_s[name] = float(
+                    np.clip(out[name].best_s - readout_s[name], -_TRIAL_STEP_S, _TRIAL_STEP_S)
+                )
+            if max(map(abs, step_s.values())) < _CONVERGED_S:
                 break
             before = after
         return out
 
     def undetermined(self, reason: str) -> dict[str, Readout]:
-        """The stated readout times alone; the others are not known for a reason."""
+        """Return the stated readout times; those of other cameras are 0 and carry the reason."""
         out = {}
-        for name in self._lenses:
+        for name in self._intrinsics:
             camera = self._cameras[name]
             if camera.rolling_shutter_known:
                 out[name] = _stated_readout(camera.rolling_shutter_s)
@@ -200,16 +223,17 @@ class RollingShutterModel:
         return out
 
     def _keypoints_of(self, image_id: int, trajectories: Mapping[str, Trajectory]) -> _Keypoints:
+        """Return the observations of one image, with their velocities."""
         image = self._model.image(image_id)
         ref = ImageRef.parse(image.name)
         feature = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
         px = np.array([image.points2D[index].xy for index in feature.tolist()]).reshape(-1, 2)
         x_in_map = self._points(image, feature)
         path = trajectories.get(ref.camera)
-        if path is None:  # registered against another map: how it moves is not known in this gauge
+        if path is None:  # Registered against another map: its motion in this gauge is unknown.
             return _Keypoints(image_id, ref.camera, feature, px, np.zeros_like(px))
         velocity = image_velocity(
-            self._lenses[ref.camera],
+            self._intrinsics[ref.camera],
             path.gauge_from_cam,
             path.times_ns,
             np.full(len(feature), ref.frame, dtype=np.int64),
@@ -218,17 +242,18 @@ class RollingShutterModel:
         return _Keypoints(image_id, ref.camera, feature, px, velocity)
 
     def _points(self, image: Any, feature: IntArray) -> FloatArray:
+        """Return the points (N,3) that features of an image observe, in the map."""
         points = image.points2D
         return np.array(
             [self._model.point3D(points[index].point3D_id).xyz for index in feature.tolist()]
         ).reshape(-1, 3)
 
     def _residuals(self, model: pycolmap.Reconstruction) -> dict[str, FloatArray]:
-        """Observed minus projected, in the same order for every copy, by camera."""
-        out: dict[str, list[FloatArray]] = {name: [] for name in self._lenses}
+        """Return observed minus projected pixels by camera, in the same order for every copy of the model."""
+        out: dict[str, list[FloatArray]] = {name: [] for name in self._intrinsics}
         for item in self._keypoints:
-            found = image_residuals_px(model, model.image(item.image_id), item.feature)
-            out[item.camera].append(found.ravel())
+            residuals = image_residuals_px(model, model.image(item.image_id), item.feature)
+            out[item.camera].append(residuals.ravel())
         return {name: np.concatenate([np.zeros(0), *parts]) for name, parts in out.items()}
 
 
@@ -237,35 +262,45 @@ class _ResidualSlope:
     """How the residuals of an adjusted map change with the readout time.
 
     Attributes:
-        correlation: Of the residuals with their change by a second more.
-        information: Of that change with itself.
-        spread: Variance of the residuals about the line.
+        correlation: Weighted product of the residuals with their derivative by the readout time, px²/s.
+        information: Weighted square of the derivative, px²/s².
+        variance: Variance of the residuals about the line, px².
     """
 
     correlation: float
     information: float
-    spread: float
+    variance: float
 
     @staticmethod
     def of(before: FloatArray, after: FloatArray, step_s: float) -> _ResidualSlope:
-        """From the residuals of two adjustments, `step_s` apart; taken at the second."""
+        """Return the slope at the second of two adjustments.
+
+        Args:
+            before: (N,) residuals of the first adjustment, px.
+            after: (N,) residuals of the second adjustment, px.
+            step_s: Difference of their readout times, seconds.
+        """
         change = (after - before) / (step_s if step_s else np.inf)
-        # A point that an adjustment throws far away says nothing of the shutter.
-        sane = np.maximum(np.abs(after), np.abs(before)) < _MAX_RESIDUAL_PX
-        weight = np.where(sane, 1.0 / (1.0 + (after / _LOSS_PX) ** 2), 0.0)
+        # Points that an adjustment moves far away carry no information on the shutter.
+        small = np.maximum(np.abs(after), np.abs(before)) < _MAX_RESIDUAL_PX
+        weight = np.where(small, 1.0 / (1.0 + (after / _LOSS_PX) ** 2), 0.0)
         information = float((weight * change * change).sum())
         correlation = float((weight * change * after).sum())
         best = after - change * (correlation / information if information else 0.0)
-        return _ResidualSlope(
-            correlation, information, float((weight * best**2).sum() / max(weight.sum(), 1.0))
-        )
+        variance = float((weight * best**2).sum() / max(weight.sum(), 1.0))
+        return _ResidualSlope(correlation, information, variance)
 
     def readout(self, at_s: float, frame_s: float) -> Readout:
-        """The readout time at which the residuals are smallest, if it stands out."""
+        """Return the readout time with the smallest residuals, or 0 if it is not significant.
+
+        Args:
+            at_s: Readout time at which the slope was taken, seconds.
+            frame_s: Frame interval, seconds.
+        """
         if self.information <= 0.0:
             return Readout(0.0, float("inf"), "none found", at_s)
         best_s = at_s - self.correlation / self.information
-        sigma_s = float(np.sqrt(self.spread / self.information))
+        sigma_s = float(np.sqrt(self.variance / self.information))
         found = max(_MIN_READOUT_S, _MIN_SIGMAS * sigma_s) < abs(best_s) < _MAX_READOUT_FRAMES * frame_s
         return Readout(best_s if found else 0.0, sigma_s, "estimated" if found else "none found", best_s)
 
@@ -274,40 +309,54 @@ def estimate_readouts(
     rolling: RollingShutterModel,
     cameras: Mapping[str, CaptureCamera],
     settings: pycolmap.IncrementalPipelineOptions,
-    constant: Sequence[int],
+    calibrated_ids: Sequence[int],
 ) -> tuple[RollingShutterModel, dict[str, Readout]]:
-    """Readout times by camera, and the model read the way its cameras' sensors turn out to lie.
+    """Estimate readout times by camera, and whether the sensors' rows are the pictures' columns.
 
-    Where trial adjustments fail none is used, and the log says so.
+    If a trial adjustment fails, only stated readout times are used, and the result gives the reason.
+
+    Args:
+        rolling: The model.
+        cameras: The capture's cameras by name.
+        settings: The mapper's options.
+        calibrated_ids: Ids of the calibrated cameras.
+
+    Returns:
+        The model with the row directions that fit best, and the readout times.
     """
     stated = {name for name, camera in cameras.items() if camera.camera.sideways}
-    rolling = rolling.read_along(stated)
+    rolling = rolling.with_sideways(stated)
     try:
-        part = rolling.fastest()
-        found = part.find(settings, constant)
+        part = rolling.most_dynamic_subset()
+        readouts = part.estimate(settings, calibrated_ids)
         turned = {
             name
-            for name in found
+            for name in readouts
             if cameras[name].may_be_sideways and not cameras[name].rolling_shutter_known
         }
-        across = part.read_along(stated | turned).find(settings, constant) if turned else {}
+        sideways = part.with_sideways(stated | turned).estimate(settings, calibrated_ids) if turned else {}
     except EstimationError as error:
-        found, turned, across = rolling.undetermined(error.message), set(), {}
-    better = {name for name in turned if across[name].clearness > found[name].clearness}
-    found |= {name: across[name] for name in better}
-    found = {name: replace(each, sideways=name in stated | better) for name, each in found.items()}
-    return rolling.read_along(stated | better), found
-
-
-def map_with_readouts(scene: Map, found: Mapping[str, Readout]) -> Map:
-    """A map of the cameras' middle rows that says how long their sensors took, and which way they lie."""
-    read = {name: each for name, each in found.items() if each.seconds}
-    cameras = {
-        name: replace(lens, sideways=name in read and read[name].sideways)
-        for name, lens in scene.cameras.items()
+        readouts, turned, sideways = rolling.undetermined(error.message), set(), {}
+    better = {name for name in turned if sideways[name].significance > readouts[name].significance}
+    readouts |= {name: sideways[name] for name in better}
+    readouts = {
+        name: replace(readout, sideways=name in stated | better) for name, readout in readouts.items()
     }
-    return replace(scene, cameras=cameras, readout_s={name: each.seconds for name, each in read.items()})
+    return rolling.with_sideways(stated | better), readouts
+
+
+def map_with_readouts(scene: Map, readouts: Mapping[str, Readout]) -> Map:
+    """Return a corrected map with the readout times and row directions it was corrected for."""
+    nonzero = {name: readout for name, readout in readouts.items() if readout.seconds}
+    cameras = {
+        name: replace(camera, sideways=name in nonzero and nonzero[name].sideways)
+        for name, camera in scene.cameras.items()
+    }
+    return replace(
+        scene, cameras=cameras, readout_s={name: readout.seconds for name, readout in nonzero.items()}
+    )
 
 
 def _stated_readout(readout_s: float) -> Readout:
+    """Return the readout time that the job states."""
     return Readout(readout_s, 0.0, "stated", readout_s)

@@ -1,4 +1,4 @@
-"""Given lenses that the map contradicts: the map is built again with these to be found."""
+"""Build the map again with refined intrinsics if it contradicts the given calibration."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.scene import Map, MapResult
 
 RECALIBRATED = "freed_lenses"
-"""The log's list of cameras whose given lens was replaced by what fits the pictures."""
+"""Key of the log: names of the cameras whose given intrinsics were replaced by refined ones."""
 
 _INTRINSICS = "found_lenses"
-"""The log's account of these cameras' lenses: a map that grows may lose all keyframes of one."""
+"""Key of the log: the refined intrinsics of these cameras. A later map may hold no keyframe of such a
+camera."""
 _MIN_KEYFRAME_RATIO = 0.95
+"""Ratio of a map's keyframes, in total and of each camera, that a better map must hold. Evidence: none."""
 
 
 def recalibrate_if_misfit(
@@ -28,114 +30,121 @@ def recalibrate_if_misfit(
     build: Callable[[Capture], MapResult],
     refused: EstimationError | None = None,
 ) -> MapResult:
-    """The map with misfitting lenses found along with it, where that is the better map.
+    """Return the map with the misfit intrinsics refined if that is the better map, else the given map.
 
-    Cameras 31 % off (digital zoom in one of three) put all three 41 cm off, 25 % in all of them 9 cm.
+    Evidence: docs/decisions/mapping.md.
 
     Args:
-        result: The map with all lenses held as given; ``misfitting_lenses`` of its log says which it
-            contradicts.
+        result: The map with all calibrated intrinsics held constant. ``misfitting_lenses`` in its log names
+            the cameras that it contradicts.
         capture: All cameras.
-        build: Builds a map of the capture with other lenses.
-        refused: Why that map cannot be used as it is, if it cannot: wrong lenses break maps, too.
+        build: Builds a map of the capture with other intrinsics.
+        refused: Why that map cannot be used, if it cannot: wrong intrinsics may be the cause.
 
     Raises:
-        EstimationError: `refused`, where no other lenses give a better map.
+        EstimationError: `refused`, if refined intrinsics give no better map.
     """
-    freed = _recalibrate(result, capture, build, usable=refused is None)
-    if refused is not None and RECALIBRATED not in freed.log:
+    refined = _recalibrate(result, capture, build, usable=refused is None)
+    if refused is not None and RECALIBRATED not in refined.log:
         raise refused
-    return freed
+    return refined
 
 
 def _recalibrate(
     result: MapResult, capture: Capture, build: Callable[[Capture], MapResult], *, usable: bool
 ) -> MapResult:
+    """Return the map with refined intrinsics if it is better, else the given map; the log says which."""
     misfits: Mapping[str, float] = result.log["misfitting_lenses"]
     if not misfits:
         return result
     given = {name: capture.camera(name).camera for name in misfits}
+    guesses = {name: _initial_guess(given[name], misfits[name]) for name in misfits}
     try:
-        again = build(
-            with_intrinsics_to_refine(
-                capture, {name: _initial_guess(given[name], misfits[name]) for name in misfits}
-            )
-        )
+        again = build(with_intrinsics_to_refine(capture, guesses))
     except EstimationError as error:
         return replace(result, log={**result.log, "freeing_failed": error.message})
     other = again.maps[0]
     if not (misfits.keys() <= other.cameras.keys() and (not usable or _is_better_map(other, result.maps[0]))):
-        told = {"keyframes": _count_keyframes(other), "mean_error_px": round(other.mean_error_px(), 4)}
-        return replace(result, log={**result.log, "freeing_refused": told})
-    lenses = {name: other.cameras[name] for name in sorted(misfits)}
-    factors = {name: round(lens.focal_px / given[name].focal_px, 3) for name, lens in lenses.items()}
+        comparison = {"keyframes": _count_keyframes(other), "mean_error_px": round(other.mean_error_px(), 4)}
+        return replace(result, log={**result.log, "freeing_refused": comparison})
+    cameras = {name: other.cameras[name] for name in sorted(misfits)}
+    factors = {name: round(camera.focal_px / given[name].focal_px, 3) for name, camera in cameras.items()}
     log = {
         **again.log,
         "misfitting_lenses": {**again.log["misfitting_lenses"], **factors},
-        RECALIBRATED: list(lenses),
+        RECALIBRATED: list(cameras),
         _INTRINSICS: {
-            name: {"model": lens.model, "params": lens.params.tolist()} for name, lens in lenses.items()
+            name: {"model": camera.model, "params": camera.params.tolist()}
+            for name, camera in cameras.items()
         },
     }
     return replace(again, log=log)
 
 
 def with_map_intrinsics(capture: Capture, previous: MapResult) -> Capture:
-    """The capture with the lenses that an earlier map of it freed as that map found them.
+    """Return the capture with the intrinsics that an earlier map of it refined.
 
-    Of a camera that has no keyframes in it any more, as they were when it was freed.
+    If a camera has no keyframes in that map any more, its intrinsics at the time of refinement are used.
     """
-    held = previous.maps[0].cameras
-    lenses = {
-        name: held[name]
-        if name in held
-        else replace(capture.camera(name).camera, **_camera_params_from_log(told))
-        for name, told in previous.log.get(_INTRINSICS, {}).items()
+    mapped = previous.maps[0].cameras
+    cameras = {
+        name: mapped[name]
+        if name in mapped
+        else replace(capture.camera(name).camera, **_camera_params_from_log(logged))
+        for name, logged in previous.log.get(_INTRINSICS, {}).items()
     }
-    return with_intrinsics_to_refine(capture, lenses)
+    return with_intrinsics_to_refine(capture, cameras)
 
 
-def _camera_params_from_log(told: Mapping[str, Any]) -> dict[str, Any]:
-    """A lens that the log tells of."""
-    return {"model": told["model"], "params": np.array(told["params"])}
+def _camera_params_from_log(logged: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a `Camera` that the log holds."""
+    return {"model": logged["model"], "params": np.array(logged["params"])}
 
 
-def with_intrinsics_to_refine(capture: Capture, lenses: Mapping[str, Camera]) -> Capture:
-    """The capture with some cameras' lenses as a start that mapping refines."""
-    cameras = tuple(
-        replace(
-            each,
-            camera=replace(lenses[each.name], sideways=each.camera.sideways),
-            calibrated=False,
-        )
-        if each.name in lenses
-        else each
-        for each in capture.cameras
+def with_intrinsics_to_refine(capture: Capture, cameras: Mapping[str, Camera]) -> Capture:
+    """Return the capture with other intrinsics of some cameras, as initial values that mapping refines."""
+    return replace(
+        capture,
+        cameras=tuple(
+            replace(item, camera=replace(cameras[item.name], sideways=item.camera.sideways), calibrated=False)
+            if item.name in cameras
+            else item
+            for item in capture.cameras
+        ),
     )
-    return replace(capture, cameras=cameras)
 
 
-def _initial_guess(lens: Camera, factor: float) -> Camera:
-    """A lens of which only the focal length that fits is known: its distortion is not believed either.
+def _initial_guess(camera: Camera, factor: float) -> Camera:
+    """Return initial intrinsics with the focal length that fits and without distortion.
 
-    A barrel lens given as a pinhole seemed 1.6 to 1.9 times as long; from there focal length and both radial
-    terms were found to half a percent (53 cm to 1 cm), while a longer pinhole fitted nothing.
+    The given distortion is not trusted either. A longer pinhole does not fit the pictures of a lens with
+    barrel distortion. Evidence: docs/decisions/mapping.md.
+
+    Args:
+        camera: The given intrinsics.
+        factor: Focal length that fits, relative to the given one.
     """
-    centre_x, centre_y = lens.principal_point_px
-    params = np.array([factor * lens.focal_px, centre_x, centre_y, 0.0])
+    centre_x, centre_y = camera.principal_point_px
+    params = np.array([factor * camera.focal_px, centre_x, centre_y, 0.0])
     return Camera(
-        model="SIMPLE_RADIAL", width_px=lens.width_px, height_px=lens.height_px, params=params, refine=True
+        model="SIMPLE_RADIAL",
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        params=params,
+        refine=True,
     )
 
 
 def _is_better_map(other: Map, one: Map) -> bool:
-    """Whether another map holds hardly fewer keyframes, of any camera, and lies nearer to what they see."""
-    have, had = _count_keyframes(other), _count_keyframes(one)
-    many = sum(have.values()) >= _MIN_KEYFRAME_RATIO * sum(had.values())
-    each = all(have.get(name, 0) >= max(1, int(_MIN_KEYFRAME_RATIO * count)) for name, count in had.items())
-    return many and each and other.mean_error_px() < one.mean_error_px()
+    """Return whether `other` has hardly fewer keyframes of any camera and smaller residuals than `one`."""
+    counts, before = _count_keyframes(other), _count_keyframes(one)
+    enough = sum(counts.values()) >= _MIN_KEYFRAME_RATIO * sum(before.values())
+    enough_of_each = all(
+        counts.get(name, 0) >= max(1, int(_MIN_KEYFRAME_RATIO * count)) for name, count in before.items()
+    )
+    return enough and enough_of_each and other.mean_error_px() < one.mean_error_px()
 
 
 def _count_keyframes(scene_map: Map) -> dict[str, int]:
-    """How many keyframes of each camera a map holds."""
+    """Return the number of keyframes of each camera in a map."""
     return dict(sorted(Counter(scene_map.keyframe_camera).items()))

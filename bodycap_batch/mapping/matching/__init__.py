@@ -1,1 +1,1 @@
-"""SIFT features of the keyframes, and verified matches between pairs of them."""
+"""SIFT features of the keyframes, and verified matches between pairs of keyframes."""

@@ -1,4 +1,4 @@
-"""Cameras whose picture is flipped: they see the room's mirror image, which has no place in the room."""
+"""Find cameras with a horizontally flipped picture: they see the room's mirror image and fit no map of it."""
 
 from __future__ import annotations
 
@@ -15,46 +15,46 @@ from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     ImageRef,
-    rewrite_without_cameras,
     read_image_ids,
+    rewrite_without_cameras,
 )
-from bodycap_batch.mapping.matching.retrieval import (
-    Descriptors,
-    count_ratio_test_matches,
-    largest_descriptors,
-)
+from bodycap_batch.mapping.matching.descriptors import ByteDescriptors
+from bodycap_batch.mapping.matching.retrieval import count_ratio_test_matches, largest_descriptors
 from bodycap_batch.model.scene import KeyframeSelection
 
 CameraDescriptors = npt.NDArray[np.float32]
-"""(K,F,128) descriptors of the largest features of some pictures."""
+"""(K,128,128) `largest_descriptors` of K keyframes of one camera."""
 
 FLIPPED_CAMERAS = "mirrored_cameras"
-"""The log's list of cameras that were left out for it."""
+"""Key of the log: names of the cameras that were left out because their picture is flipped."""
 
 UNDECIDED_GROUPS = "mirror_images"
-"""The log's list of pairs of sides (camera names each) that see mirror images of each other, all kept."""
+"""Key of the log: pairs of groups (camera names each) that see mirror images of each other, all kept."""
 
 _NAMED, _LEFT_OUT = "named_initial_pair", "left_out"
+"""Keys of the log: the user's initial pair, and the flipped cameras in it."""
 
 _KEYFRAMES_PER_CAMERA = 12
-"""Keyframes of each camera, evenly spread."""
-_ALIKE, _SURELY = 14, 3.0
-"""Pictures with so many features alike count; all of theirs the one way are so many times those of the other.
-Between 13 pairs of cameras of three captures 10 times and more, symmetrical posters and all;
-counting pictures with 6 features alike it would be 1.8."""
-_LEAST = 60
+"""Keyframes of each camera that are compared, evenly spaced. Evidence: none."""
+_MIN_MATCHES = 14
+"""Image pairs with fewer matches are ignored. Evidence: docs/decisions/mapping.md."""
+_MIN_RATIO = 3.0
+"""Matches in one orientation must exceed those in the other by this factor. Evidence:
+docs/decisions/mapping.md."""
+_MIN_TOTAL_MATCHES = 60
+"""Matches of two cameras, over all their image pairs, below which they give no evidence. Evidence: none."""
 _HINT = (
     "a front camera's setting, or an app, may flip the picture; flip it back: ffmpeg -i in -vf hflip out.mp4"
 )
 
-_MAYBE = (
-    "that is right where one of them films a wall mirror, or where the room's halves are mirror images of "
-    "each other; else the picture in which text reads backwards is flipped, and what comes of it is wrong"
-)
+_UNDECIDED_HINT = "that is right if one of them films a wall mirror, or if the room's halves are mirror images of each other; else the picture in which text reads backwards is flipped, and the result is wrong"
 
 
-def mirror_descriptors(descriptors: Descriptors) -> Descriptors:
-    """SIFT descriptors (N,128) as the mirrored picture has them: rows and turns the other way round."""
+def mirror_descriptors(descriptors: ByteDescriptors) -> ByteDescriptors:
+    """Return SIFT descriptors (N,128) as they would be in the mirrored picture.
+
+    The rows of cells are reversed, and the gradient directions are mirrored.
+    """
     cells = descriptors.reshape(-1, 4, 4, 8)[:, ::-1]
     return np.ascontiguousarray(cells[..., (8 - np.arange(8)) % 8].reshape(-1, 128))
 
@@ -62,93 +62,100 @@ def mirror_descriptors(descriptors: Descriptors) -> Descriptors:
 def exclude_flipped_cameras(
     workspace: Path, selections: Sequence[KeyframeSelection], options: MapOptions
 ) -> tuple[list[KeyframeSelection], MapOptions, dict[str, Any]]:
-    """Take the cameras that see the room the wrong way round out of the database: the smaller part.
+    """Remove cameras with a flipped picture from the database: the smaller of two groups of cameras.
 
-    Pictures alone do not tell a flipped one from one that shows a mirror, or the other half of a room whose
-    halves are mirror images. So nobody is left out where as many cameras see it one way round as the other,
-    or where what tells who is mirrored contradicts itself.
+    Pictures alone cannot distinguish a flipped picture from one of a wall mirror, or of the other half of
+    a symmetric room. So no camera is left out if both groups are equally large, or if the evidence
+    contradicts itself.
 
     Args:
-        workspace: Folder of the database, features extracted; it is written anew where cameras are left out.
+        workspace: Folder of the database with extracted features; it is rewritten if cameras are left out.
         selections: Keyframes of each camera.
         options: The stage's options.
 
     Returns:
-        The selections of the cameras that are left; the options, without a first pair of which a picture is
-        left out; for the log, who was left out (`FLIPPED_CAMERAS`), and who sees mirror images of whom where that
-        is left open (`UNDECIDED_GROUPS`).
+        The selections of the remaining cameras. The options, without an initial pair that names a camera
+        that is left out. Entries for the log: `FLIPPED_CAMERAS` and `UNDECIDED_GROUPS`, if any.
     """
     if len(selections) < 2:
         return list(selections), options, {}
-    wrong, open_ = label_cameras([item.camera for item in selections], _pair_evidence(workspace, selections))
-    log: dict[str, Any] = {UNDECIDED_GROUPS: open_} if open_ else {}
-    if not wrong:
+    cameras = [item.camera for item in selections]
+    flipped, undecided = label_cameras(cameras, _pair_evidence(workspace, selections))
+    log: dict[str, Any] = {UNDECIDED_GROUPS: undecided} if undecided else {}
+    if not flipped:
         return list(selections), options, log
-    rewrite_without_cameras(workspace, wrong)
-    log[FLIPPED_CAMERAS] = sorted(wrong)
-    if lost := wrong & {name.rpartition(":")[0] for name in options.init_frames or ()}:
+    rewrite_without_cameras(workspace, flipped)
+    log[FLIPPED_CAMERAS] = sorted(flipped)
+    if lost := flipped & {name.rpartition(":")[0] for name in options.init_frames or ()}:
         options = options.model_copy(update={"init_frames": None})
         log[_NAMED] = {"failed": "a mirrored camera was left out", _LEFT_OUT: sorted(lost)}
-    return [item for item in selections if item.camera not in wrong], options, log
+    return [item for item in selections if item.camera not in flipped], options, log
 
 
 def flip_notes(log: Mapping[str, Any]) -> list[str]:
-    """What to say of mirrored cameras, from a map's log."""
+    """Return the notes for the user on flipped cameras, given a map's log."""
     named = log.get(_NAMED, {}).get(_LEFT_OUT, ())
     return [
         *map(excluded_camera_note, log.get(FLIPPED_CAMERAS, ())),
         *(f"map.init_frames names camera {name}, which is left out: it is not used" for name in named),
-        *(f"{_undecided_sentence(each)}: {_MAYBE}; {_HINT}" for each in log.get(UNDECIDED_GROUPS, ())),
+        *(
+            f"{_undecided_sentence(groups)}: {_UNDECIDED_HINT}; {_HINT}"
+            for groups in log.get(UNDECIDED_GROUPS, ())
+        ),
     ]
 
 
 def excluded_camera_note(camera: str) -> str:
-    """What to say of a camera that was left out."""
+    """Return the note for the user on a camera that was left out."""
     return f"camera {camera} shows the room mirrored (left and right exchanged) and is left out: {_HINT}"
 
 
 def add_flip_hint(error: EstimationError | None, log: Mapping[str, Any]) -> EstimationError | None:
-    """The same error; its hint begins with who sees mirror images of whom, where the log leaves that open."""
+    """Return the same error; put undecided groups of cameras, if the log has any, in front of its hint."""
     if error is not None and log.get(UNDECIDED_GROUPS):
-        error.hint = "; ".join(
-            [*map(_undecided_sentence, log[UNDECIDED_GROUPS]), _MAYBE, _HINT, *filter(None, [error.hint])]
-        )
+        groups = map(_undecided_sentence, log[UNDECIDED_GROUPS])
+        error.hint = "; ".join([*groups, _UNDECIDED_HINT, _HINT, *filter(None, [error.hint])])
     return error
 
 
-def _undecided_sentence(sides: Sequence[Sequence[str]]) -> str:
-    one, other = (", ".join(names) for names in sides)
+def _undecided_sentence(groups: Sequence[Sequence[str]]) -> str:
+    """Return the sentence that names two groups of cameras."""
+    one, other = (", ".join(names) for names in groups)
     return f"cameras {one} and {other} see mirror images of each other"
 
 
 def _pair_evidence(workspace: Path, selections: Sequence[KeyframeSelection]) -> dict[tuple[str, str], int]:
-    """By pair of cameras how many more features are alike as they see it than mirrored.
+    """Return, by pair of cameras, how many more features match in the same than in mirrored orientation.
 
-    Negative where they see mirror images of each other; nothing of pairs where nothing tells.
+    A negative number means that the cameras see mirror images of each other. Pairs without clear evidence
+    are left out.
     """
     straight, mirrored = _sample_descriptors(workspace, selections)
     out = {}
     for one, other in combinations(sorted(straight), 2):
-        same, turned = (_count_similar_features(straight[one], each[other]) for each in (straight, mirrored))
-        if max(same, turned) >= max(_LEAST, _SURELY * min(same, turned)):
-            out[one, other] = same - turned
+        same, opposite = (
+            _count_similar_features(straight[one], orientation[other]) for orientation in (straight, mirrored)
+        )
+        if max(same, opposite) >= max(_MIN_TOTAL_MATCHES, _MIN_RATIO * min(same, opposite)):
+            out[one, other] = same - opposite
     return out
 
 
 def _count_similar_features(one: CameraDescriptors, other: CameraDescriptors) -> int:
-    """How many features are alike, in pairs of pictures that show the same."""
+    """Return the number of matches of two cameras, over the image pairs that show the same."""
     counts = [count_ratio_test_matches(image, other) for image in one]
-    return int(sum(each[each >= _ALIKE].sum() for each in counts))
+    return int(sum(count[count >= _MIN_MATCHES].sum() for count in counts))
 
 
 def _stack(images: Sequence[CameraDescriptors]) -> CameraDescriptors:
+    """Return the descriptors of all images as one array (K,128,128), K may be 0."""
     return np.array(images, dtype=np.float32).reshape(-1, 128, 128)
 
 
 def _sample_descriptors(
     workspace: Path, selections: Sequence[KeyframeSelection]
 ) -> tuple[dict[str, CameraDescriptors], dict[str, CameraDescriptors]]:
-    """By camera the largest features (K,F,128) of some keyframes, as they are and flipped."""
+    """Return, by camera, the largest descriptors of some keyframes, as they are and mirrored."""
     import pycolmap
 
     straight, mirrored = {}, {}
@@ -156,16 +163,14 @@ def _sample_descriptors(
         ids = read_image_ids(database)
         for item in selections:
             count = len(item.frames)
-            some = item.frames[
-                np.unique(np.linspace(0, count - 1, min(count, _KEYFRAMES_PER_CAMERA)).astype(int))
-            ]
-            images = [ids[ImageRef(item.camera, int(frame))] for frame in some]
-            points = [np.asarray(database.read_keypoints(image)) for image in images]
-            found = [np.asarray(database.read_descriptors(image).data) for image in images]
-            pairs = list(zip(found, points, strict=True))
-            straight[item.camera] = _stack([largest_descriptors(each, where) for each, where in pairs])
+            spaced = np.linspace(0, count - 1, min(count, _KEYFRAMES_PER_CAMERA)).astype(int)
+            images = [ids[ImageRef(item.camera, int(frame))] for frame in item.frames[np.unique(spaced)]]
+            keypoints = [np.asarray(database.read_keypoints(image)) for image in images]
+            descriptors = [np.asarray(database.read_descriptors(image).data) for image in images]
+            features = list(zip(descriptors, keypoints, strict=True))
+            straight[item.camera] = _stack([largest_descriptors(found, at) for found, at in features])
             mirrored[item.camera] = _stack(
-                [largest_descriptors(mirror_descriptors(each), where) for each, where in pairs]
+                [largest_descriptors(mirror_descriptors(found), at) for found, at in features]
             )
     return straight, mirrored
 
@@ -173,38 +178,48 @@ def _sample_descriptors(
 def label_cameras(
     cameras: Sequence[str], evidence: Mapping[tuple[str, str], int]
 ) -> tuple[set[str], list[list[list[str]]]]:
-    """The cameras of each group's smaller side, and the two sides where that is left open.
+    """Label each camera as one orientation or the other, given signed evidence on pairs of cameras.
 
-    Groups are joined by the strongest evidence first. Evidence against what stronger evidence says leaves
-    its group open, unless that is `_SURELY` times as strong.
+    Cameras are joined into components, the strongest evidence first. Later evidence that contradicts a
+    component leaves it undecided, unless all evidence in the component is `_MIN_RATIO` times as strong.
+
+    Args:
+        cameras: Camera names.
+        evidence: By pair of cameras, positive for equal orientation, negative for opposite orientation.
+
+    Returns:
+        The cameras of the smaller group of each decided component, and the two groups of each undecided one.
     """
-    groups = {name: {name: 1} for name in cameras}
-    held: dict[tuple[str, str], int] = {}
+    components = {name: {name: 1} for name in cameras}
+    strength: dict[tuple[str, str], int] = {}
     contradicted = set[str]()
-    for (one, other), found in sorted(evidence.items(), key=lambda each: (-abs(each[1]), each[0])):
-        mine, theirs, way = groups[one], groups[other], 1 if found > 0 else -1
-        if mine is theirs:
-            if mine[one] * mine[other] != way and _SURELY * abs(found) > held[one, other]:
+    for (one, other), found in sorted(evidence.items(), key=lambda item: (-abs(item[1]), item[0])):
+        first, second, sign = components[one], components[other], 1 if found > 0 else -1
+        if first is second:
+            if first[one] * first[other] != sign and _MIN_RATIO * abs(found) > strength[one, other]:
                 contradicted.add(one)
             continue
-        across = [*product(mine, theirs), *product(theirs, mine)]
-        held |= dict.fromkeys(across, abs(found))
-        turn = way * mine[one] * theirs[other]
-        mine |= {name: turn * side for name, side in theirs.items()}
-        groups |= dict.fromkeys(theirs, mine)
-    wrong, open_ = set[str](), []
-    for group in sorted({tuple(sorted(each.items())) for each in groups.values()}):
-        sides = sorted(([name for name, side in group if side == way] for way in (1, -1)), key=_size)
-        names = {name for name, _ in group}
+        across = [*product(first, second), *product(second, first)]
+        strength |= dict.fromkeys(across, abs(found))
+        change = sign * first[one] * second[other]
+        first |= {name: change * label for name, label in second.items()}
+        components |= dict.fromkeys(second, first)
+    flipped, undecided = set[str](), []
+    for component in sorted({tuple(sorted(labels.items())) for labels in components.values()}):
+        groups = sorted(
+            ([name for name, label in component if label == sign] for sign in (1, -1)), key=_size_and_names
+        )
+        names = {name for name, _ in component}
         if names & contradicted:
-            apart = {pair: found for pair, found in evidence.items() if names.issuperset(pair)}
-            open_.append([[name] for name in min(apart, key=lambda pair: (apart[pair], pair))])
-        elif len(sides[0]) == len(sides[1]):
-            open_.append(sides)
+            inside = {pair: found for pair, found in evidence.items() if names.issuperset(pair)}
+            undecided.append([[name] for name in min(inside, key=lambda pair: (inside[pair], pair))])
+        elif len(groups[0]) == len(groups[1]):
+            undecided.append(groups)
         else:
-            wrong.update(sides[0])
-    return wrong, open_
+            flipped.update(groups[0])
+    return flipped, undecided
 
 
-def _size(names: Sequence[str]) -> tuple[int, Sequence[str]]:
+def _size_and_names(names: Sequence[str]) -> tuple[int, Sequence[str]]:
+    """Return the sort key that puts the smaller group first."""
     return len(names), names

@@ -1,4 +1,4 @@
-"""Which keyframe pairs are matched: a number for each keyframe that does not grow with their number."""
+"""Select the pairs of keyframes to match: per keyframe, a number that does not grow with their total."""
 
 from __future__ import annotations
 
@@ -14,49 +14,54 @@ import numpy as np
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pair, read_image_ids
 from bodycap_batch.mapping.matching.pair_matching import match_pairs
 from bodycap_batch.mapping.matching.retrieval import (
+    LIKELY_RETRIEVAL_MATCHES,
     MIN_RETRIEVAL_MATCHES,
     RETRIEVAL_FEATURES,
-    LIKELY_RETRIEVAL_MATCHES,
-    largest_descriptors,
     count_preemptive_matches,
+    largest_descriptors,
 )
 from bodycap_batch.mapping.matching.skeletal_set import select_skeletal_keyframes
-from bodycap_batch.model.camera import Camera
 
 _NEIGHBOUR_STEPS = (1, 2, 3, 4, 6, 9, 14)
-"""Steps along a camera's own keyframes."""
-_SAME_INSTANT = 2
+"""Distances, in keyframes of one camera, at which a keyframe is matched with its neighbours in time.
+Evidence: none."""
+_SIMULTANEOUS = 2
+"""Keyframes of each other camera, nearest in time, that a keyframe is matched with. Evidence: none."""
 _RETRIEVED = 64
-"""Most alike partners of a keyframe: of what exhaustive matching verifies this leaves 99 % on room131 (with
-30 % of the pairs) and 73 % on walk131 (with 34 %; there a keyframe sees what half of the others see)."""
+"""Retrieved partners of a keyframe. Evidence: docs/decisions/mapping.md."""
 _RETRIEVED_PER_CAMERA = 8
-"""Of each camera, however alike the others are."""
+"""Retrieved partners of a keyframe in each camera, even if those in other cameras are more similar.
+Evidence: none."""
 _MIN_LINKS = 24
-"""Links to another camera or another time that tie a keyframe well, and the matches each must have: one with
-fewer is matched with the neighbours of what it was matched with. With 12 instead of 24 a keyframe of walk131
-stood 15 cm off."""
+"""Links to another camera or another time that a keyframe needs. A keyframe with fewer is also matched with
+the neighbours of its partners. Evidence: docs/decisions/mapping.md."""
 _MIN_LINK_MATCHES = 20
+"""Matches that a pair needs to count as a link. Evidence: docs/decisions/mapping.md."""
 _NEAR_KEYFRAMES = 4
-"""Keyframes of one camera nearer than this show the same; a hand is back within a second."""
+"""Keyframes of one camera up to this distance, in keyframes, show the same and are no links. A hand is back
+within a second."""
 _MAX_RETRY_PAIRS = 50_000
-"""Pairs that are tried at most of a camera without any link: some minutes; what holds beside them follows."""
+"""Pairs that are tried at most for a camera without any link: some minutes of computing."""
 _EXHAUSTIVE_UP_TO = 120
-"""Keyframes up to which every pair is matched."""
+"""Number of keyframes up to which every pair is matched. Evidence: none."""
 _RESECTION_RETRIEVALS = 8
-"""Most alike keyframes of the map that one that is placed in it is matched with."""
+"""Most similar keyframes of the map that a keyframe is matched with before its resection.
+Evidence: docs/decisions/mapping.md."""
 
 
 class PairGenerator:
-    """Chooses pairs with at least one new keyframe; their number grows with that of the new keyframes only.
+    """Generates pairs that hold a new keyframe; their number grows with that of the new keyframes only.
 
     Args:
-        workspace: Folder of the database, features extracted.
-        new: Keyframes not matched yet.
-        common_ns: Common time of every frame, by camera.
-        options: ``pairs``: "retrieval" or "exhaustive"; few keyframes are always matched exhaustively.
+        workspace: Folder of the database with extracted features.
+        new: Keyframes that are not matched yet.
+        common_ns: Common time of every frame, by camera, nanoseconds.
+        options: The stage's options; ``pairs`` is "retrieval" or "exhaustive". Few keyframes are always
+            matched exhaustively.
         context: Threads, progress, cancellation.
     """
 
@@ -73,118 +78,126 @@ class PairGenerator:
         with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
             ids = read_image_ids(database)
             self._images = sorted(ids)
-            wanted = set(new)
-            self._new = [row for row, ref in enumerate(self._images) if ref in wanted]
+            new_refs = set(new)
+            self._new = [row for row, ref in enumerate(self._images) if ref in new_refs]
             self.exhaustive = options.pairs == "exhaustive" or len(self._images) <= _EXHAUSTIVE_UP_TO
             if not self.exhaustive:
                 images = np.empty((len(self._images), RETRIEVAL_FEATURES, 128), np.float32)
                 for row, ref in enumerate(self._images):
-                    found = np.asarray(database.read_descriptors(ids[ref]).data)
-                    images[row] = largest_descriptors(found, np.asarray(database.read_keypoints(ids[ref])))
-                alike = count_preemptive_matches(
-                    images, self._new, [ref.camera for ref in self._images], context
-                )
-                self._alike = dict(zip(self._new, alike, strict=True))
+                    descriptors = np.asarray(database.read_descriptors(ids[ref]).data)
+                    keypoints = np.asarray(database.read_keypoints(ids[ref]))
+                    images[row] = largest_descriptors(descriptors, keypoints)
+                cameras = [ref.camera for ref in self._images]
+                counts = count_preemptive_matches(images, self._new, cameras, context)
+                self._matches = dict(zip(self._new, counts, strict=True))
         self._times = np.array([common_ns[ref.camera][ref.frame] for ref in self._images], dtype=np.int64)
-        self._number()
+        self._index_images()
 
-    def _number(self) -> None:
+    def _index_images(self) -> None:
+        """Prepare the look-up of rows by keyframe and by camera."""
         self._cameras = np.array([ref.camera for ref in self._images])
         self._row = {ref: row for row, ref in enumerate(self._images)}
         self._rows_of = {name: np.flatnonzero(self._cameras == name) for name in np.unique(self._cameras)}
 
-    def spanning(self) -> PairGenerator:
-        """The same among keyframes that carry a map of all; of all of them where every pair is matched."""
+    def reduced(self) -> PairGenerator:
+        """Return a generator of the skeletal keyframes alone; `self` if every pair is matched."""
         if self.exhaustive:
             return self
-        rows = select_skeletal_keyframes(np.array([self._alike[row] for row in self._new]), self._times)
+        rows = select_skeletal_keyframes(np.array([self._matches[row] for row in self._new]), self._times)
         out = copy.copy(self)
         out.exhaustive = len(rows) <= _EXHAUSTIVE_UP_TO
         out._images = [self._images[row] for row in rows]
         out._new = list(range(len(rows)))
-        out._alike = {new: self._alike[row][rows] for new, row in enumerate(rows)}
+        out._matches = {new: self._matches[row][rows] for new, row in enumerate(rows)}
         out._times = self._times[rows]
-        out._number()
+        out._index_images()
         return out
 
     @property
     def refs(self) -> list[ImageRef]:
-        """The keyframes among which pairs are chosen."""
+        """The keyframes among which pairs are generated."""
         return list(self._images)
 
-    def placing(self, carrying: Collection[ImageRef], wanted: Collection[ImageRef]) -> list[Pair]:
-        """Pairs that place keyframes in a map of others: neighbours in time and what looks most alike.
+    def resection_pairs(self, registered: Collection[ImageRef], missing: Collection[ImageRef]) -> list[Pair]:
+        """Return the pairs that a resection needs: neighbours in time and similar keyframes of the map.
 
         Args:
-            carrying: Keyframes of the map.
-            wanted: Keyframes to be placed.
+            registered: Keyframes of the map.
+            missing: Keyframes to be resected.
         """
         inside = np.zeros(len(self._images), dtype=bool)
-        inside[[self._row[ref] for ref in carrying]] = True
+        inside[[self._row[ref] for ref in registered]] = True
         pairs = set[tuple[int, int]]()
-        for row in sorted(self._row[ref] for ref in wanted):
+        for row in sorted(self._row[ref] for ref in missing):
             for rows in self._rows_of.values():
-                mine = rows[inside[rows]]
-                apart = np.abs(self._times[mine] - self._times[row])
-                own = self._cameras[rows[0]] == self._cameras[row]
-                near = mine[np.argsort(apart, kind="stable")[: _NEAR_KEYFRAMES if own else 1]]
+                candidates = rows[inside[rows]]
+                time_apart = np.abs(self._times[candidates] - self._times[row])
+                same_camera = self._cameras[rows[0]] == self._cameras[row]
+                count = _NEAR_KEYFRAMES if same_camera else 1
+                near = candidates[np.argsort(time_apart, kind="stable")[:count]]
                 pairs |= {(row, int(other)) for other in near}
-            likely = np.flatnonzero(inside & (self._alike[row] >= MIN_RETRIEVAL_MATCHES))
-            best = likely[np.argsort(-self._alike[row][likely], kind="stable")[:_RESECTION_RETRIEVALS]]
-            pairs |= {(row, int(other)) for other in best} | set(self._beside(row, row))
+            likely = np.flatnonzero(inside & (self._matches[row] >= MIN_RETRIEVAL_MATCHES))
+            best = likely[np.argsort(-self._matches[row][likely], kind="stable")[:_RESECTION_RETRIEVALS]]
+            pairs |= {(row, int(other)) for other in best} | set(self._adjacent_pairs(row, row))
         return self._sorted(pairs)
 
-    def first(self) -> list[Pair]:
-        """Neighbours in time, the same instant of other cameras, and what looks most alike."""
+    def initial_pairs(self) -> list[Pair]:
+        """Return pairs of neighbours in time, of simultaneous keyframes, and of retrieved keyframes."""
         if self.exhaustive:
             return self._sorted({(row, other) for row in self._new for other in range(len(self._images))})
         return self._sorted({(row, other) for row in self._new for other in self._partners(row)})
 
-    def wider(self, held: Mapping[Pair, int], tried: Collection[Pair]) -> list[Pair]:
-        """Neighbours of pairs that hold well, for keyframes that hang by few links.
+    def expansion_pairs(self, verified: Mapping[Pair, int], tried: Collection[Pair]) -> list[Pair]:
+        """Return the neighbours of verified pairs, for keyframes with few links.
 
-        Two places that share a view do so over some time on both sides: from one pair that was found the
-        others follow. A block that hangs by few links can stand metres off.
+        Two views of one place overlap over some time on both sides, so one verified pair leads to others.
+        A block of keyframes with few links can be metres off in the map.
 
         Args:
-            held: Matches of every pair that was verified.
+            verified: Number of matches of every verified pair.
             tried: Pairs that were matched.
         """
         if self.exhaustive:
             return []
-        far: Counter[int] = Counter()
+        links: Counter[int] = Counter()
         strong = [
             (self._row[a], self._row[b])
-            for (a, b), count in sorted(held.items())
+            for (a, b), count in sorted(verified.items())
             if count >= _MIN_LINK_MATCHES
         ]
         for a, b in strong:
-            if self._is_far(a, b):
-                far.update((a, b))
+            if self._is_link(a, b):
+                links.update((a, b))
         new = set(self._new)
-        beside = {
+        expanded = {
             (min(pair), max(pair))
             for a, b in strong
-            for pair in self._beside(a, b)
-            if not new.isdisjoint(pair) and min(far[pair[0]], far[pair[1]]) < _MIN_LINKS
+            for pair in self._adjacent_pairs(a, b)
+            if not new.isdisjoint(pair) and min(links[pair[0]], links[pair[1]]) < _MIN_LINKS
         }
-        return [pair for pair in self._sorted(beside) if pair not in tried]
+        return [pair for pair in self._sorted(expanded) if pair not in tried]
 
-    def unlinked(self, held: Mapping[Pair, int], tried: Collection[Pair]) -> list[Pair]:
-        """Every pair of a camera that has no link to any other camera; of very many evenly spread ones."""
-        tied = {ref.camera for a, b in held if a.camera != b.camera for ref in (a, b)}
-        alone = [row for row in self._new if self._images[row].camera not in tied]
+    def unlinked_camera_pairs(self, verified: Mapping[Pair, int], tried: Collection[Pair]) -> list[Pair]:
+        """Return all pairs of the cameras without links to other cameras; evenly spaced ones if too many.
+
+        Args:
+            verified: Number of matches of every verified pair.
+            tried: Pairs that were matched.
+        """
+        linked = {ref.camera for a, b in verified if a.camera != b.camera for ref in (a, b)}
+        unlinked = [row for row in self._new if self._images[row].camera not in linked]
         if self.exhaustive or len(set(self._cameras)) == 1:
             return []
-        every = set[tuple[int, int]]()
-        for camera in sorted({self._images[row].camera for row in alone}):
-            mine = [row for row in alone if self._images[row].camera == camera]
+        pairs = set[tuple[int, int]]()
+        for camera in sorted({self._images[row].camera for row in unlinked}):
+            own = [row for row in unlinked if self._images[row].camera == camera]
             others = np.flatnonzero(self._cameras != camera)
-            step = math.ceil(math.sqrt(len(mine) * len(others) / _MAX_RETRY_PAIRS))
-            every |= set(product(mine[::step], others[::step].tolist()))
-        return [pair for pair in self._sorted(every) if pair not in tried]
+            step = math.ceil(math.sqrt(len(own) * len(others) / _MAX_RETRY_PAIRS))
+            pairs |= set(product(own[::step], others[::step].tolist()))
+        return [pair for pair in self._sorted(pairs) if pair not in tried]
 
-    def _beside(self, a: int, b: int) -> Iterator[tuple[int, int]]:
+    def _adjacent_pairs(self, a: int, b: int) -> Iterator[tuple[int, int]]:
+        """Yield the pairs in which one of two rows is replaced by its neighbour in the same camera."""
         for x, y in ((a - 1, b), (a + 1, b), (a, b - 1), (a, b + 1)):
             inside = min(x, y) >= 0 and max(x, y) < len(self._images)
             if (
@@ -195,63 +208,74 @@ class PairGenerator:
             ):
                 yield x, y
 
-    def _is_far(self, a: int, b: int) -> bool:
+    def _is_link(self, a: int, b: int) -> bool:
+        """Return whether two rows are of different cameras or of different times."""
         return bool(self._cameras[a] != self._cameras[b]) or abs(a - b) > _NEAR_KEYFRAMES
 
     def _sorted(self, rows: Collection[tuple[int, int]]) -> list[Pair]:
+        """Return pairs of rows as pairs of keyframes, each pair once, in a fixed order."""
         ordered = sorted({(min(pair), max(pair)) for pair in rows if pair[0] != pair[1]})
         return [(self._images[a], self._images[b]) for a, b in ordered]
 
     def _partners(self, row: int) -> set[int]:
-        """Rows of the keyframes that one keyframe is matched with."""
+        """Return the rows of the keyframes that one keyframe is matched with."""
         own = self._rows_of[self._cameras[row]]
-        place = int(np.searchsorted(own, row))
+        position = int(np.searchsorted(own, row))
         steps = [step * sign for step in _NEIGHBOUR_STEPS for sign in (-1, 1)]
-        out = {int(own[place + step]) for step in steps if 0 <= place + step < len(own)}
+        out = {int(own[position + step]) for step in steps if 0 <= position + step < len(own)}
         for camera, rows in self._rows_of.items():
             if camera == self._cameras[row]:
                 continue
-            apart = np.abs(self._times[rows] - self._times[row])
-            out |= set(rows[np.argsort(apart, kind="stable")[:_SAME_INSTANT]].tolist())
-        return out | self._look_alikes(row)
+            time_apart = np.abs(self._times[rows] - self._times[row])
+            out |= set(rows[np.argsort(time_apart, kind="stable")[:_SIMULTANEOUS]].tolist())
+        return out | self._retrieved(row)
 
-    def _look_alikes(self, row: int) -> set[int]:
-        """The most alike of each camera, and the most alike of all."""
-        alike = self._alike[row]
-        likely = np.argsort(-alike, kind="stable")[: int((alike >= MIN_RETRIEVAL_MATCHES).sum())].tolist()
-        order = [other for other in likely if self._is_far(row, other)]
+    def _retrieved(self, row: int) -> set[int]:
+        """Return the most similar keyframes of each camera, and the most similar ones of all."""
+        matches = self._matches[row]
+        count = int((matches >= MIN_RETRIEVAL_MATCHES).sum())
+        likely = np.argsort(-matches, kind="stable")[:count].tolist()
+        order = [other for other in likely if self._is_link(row, other)]
         taken: Counter[str] = Counter()
         out: set[int] = set()
         for other in order:
             taken[self._cameras[other]] += 1
             if taken[self._cameras[other]] <= _RETRIEVED_PER_CAMERA:
                 out.add(other)
-        rest = (other for other in order if other not in out and alike[other] >= LIKELY_RETRIEVAL_MATCHES)
+        rest = (other for other in order if other not in out and matches[other] >= LIKELY_RETRIEVAL_MATCHES)
         return out | set(islice(rest, max(0, _RETRIEVED - len(out))))
 
 
 def match_keyframes(
-    chooser: PairGenerator,
+    generator: PairGenerator,
     workspace: Path,
-    lenses: Mapping[str, tuple[Camera, bool]],
+    intrinsics: Mapping[str, CameraIntrinsics],
     context: StageContext,
 ) -> tuple[set[Pair], dict[str, object]]:
-    """Match the chosen pairs, then more for what hangs by few links or by none.
+    """Match the initial pairs, then more pairs for keyframes and cameras with few links.
+
+    Args:
+        generator: Generates the pairs.
+        workspace: Folder of the database.
+        intrinsics: Intrinsics by camera name.
+        context: Threads, progress, cancellation.
 
     Returns:
-        The pairs tried, and an account for the log: pairs, verified pairs, links between cameras.
+        The pairs that were matched, and entries for the log: pairs, verified pairs, links between cameras.
     """
-    pairs = chooser.first()
-    held = match_pairs(workspace, pairs, lenses, context)
+    pairs = generator.initial_pairs()
+    verified = match_pairs(workspace, pairs, intrinsics, context)
     tried = set(pairs)
-    while fresh := chooser.wider(held, tried) or chooser.unlinked(held, tried):
-        held |= match_pairs(workspace, fresh, lenses, context)
-        tried |= set(fresh)
-    between = Counter(f"{a.camera} - {b.camera}" for a, b in held if a.camera != b.camera)
+    while more := (
+        generator.expansion_pairs(verified, tried) or generator.unlinked_camera_pairs(verified, tried)
+    ):
+        verified |= match_pairs(workspace, more, intrinsics, context)
+        tried |= set(more)
+    between = Counter(f"{a.camera} - {b.camera}" for a, b in verified if a.camera != b.camera)
     log = {
         "pairs": len(tried),
         "widened_pairs": len(tried) - len(pairs),
-        "verified_pairs": len(held),
+        "verified_pairs": len(verified),
         "linked_cameras": dict(sorted(between.items())),
     }
     return tried, log

@@ -1,4 +1,4 @@
-"""Which keyframes look alike: a match of their largest features alone."""
+"""Retrieve keyframes that show the same: match their largest features alone, among shortlisted pairs."""
 
 from __future__ import annotations
 
@@ -10,42 +10,47 @@ import numpy.typing as npt
 
 from bodycap_batch.core.arrays import BoolArray, IntArray
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.mapping.matching.descriptors import (
+    DESCRIPTOR_NORM,
+    MAX_MATCH_ANGLE_RAD,
+    MAX_RATIO,
+    ByteDescriptors,
+)
 
 RETRIEVAL_FEATURES = 128
-"""Features of an image that are looked at. Large ones survive blur and distance; with 64 and the threshold of
-`MIN_RETRIEVAL_MATCHES` one pair in forty is missed that the full match would hold, with 128 one in a hundred."""
-_MAX_RATIO = 0.8
-_MAX_ANGLE_RAD = 0.7
-_NORM = 512.0
+"""Features of an image that retrieval matches: the largest ones, which survive blur and distance.
+Evidence: docs/decisions/mapping.md."""
 _BLOCK_SIZE = 32
+"""Images that one matrix product compares; limits memory only."""
 _VISUAL_WORDS = 64
+"""Visual words of a VLAD descriptor. Evidence: none."""
 _SHORTLIST_SIZE = 128
+"""Images whose features are matched with those of one image, by VLAD similarity among all images: twice as
+many as pair selection takes at most. Evidence: docs/decisions/mapping.md."""
 _SHORTLIST_SIZE_PER_CAMERA = 24
-"""Images that are looked at closely, of all and of each camera: two and three times what may be matched. On
-walk131 (288 keyframes, 48 % of the pairs looked at) 96 % as many of the chosen pairs hold as when all are;
-with 96 and 16 91 %, with 64 and 16 80 %. Pooling and ranking cost a hundredth of looking."""
+"""The same among the images of each camera: three times as many as pair selection takes.
+Evidence: docs/decisions/mapping.md."""
 _QUANTISATION_STEPS = 2048.0
-"""Of a pooled feature's unit vector: products stay below 2^23, which a float32 holds exactly."""
+"""Steps that a component of a unit VLAD vector is rounded to. Sums of products stay below 2^23, which a
+float32 holds exactly."""
 _EPSILON = 1e-9
+"""Added to a norm so that the division is defined for a zero vector."""
 
 MIN_RETRIEVAL_MATCHES = 4
-"""Likeness below which two images share nothing: of pairs that hold, 97 to 99.3 % reach it (walk131, room131
-and a rendered walk), of those with 30 matches or more 99.6 to 100 %."""
+"""Matches below which two images are taken to share nothing. Evidence: docs/decisions/mapping.md."""
 
 LIKELY_RETRIEVAL_MATCHES = 6
-"""Likeness of which most hold: 96 to 98 % of the pairs that hold have it (92 % on the rendered walk)."""
-
-Descriptors = npt.NDArray[np.uint8]
+"""Matches that nearly all pairs have which verification accepts. Evidence: docs/decisions/mapping.md."""
 
 
 def largest_descriptors(
-    descriptors: Descriptors, keypoints: npt.NDArray[np.float32]
+    descriptors: ByteDescriptors, keypoints: npt.NDArray[np.float32]
 ) -> npt.NDArray[np.float32]:
-    """Descriptors (128,128) of an image's largest features, zeros where it has fewer.
+    """Return the descriptors (128,128) of an image's largest features, padded with zeros.
 
     Args:
         descriptors: (N,128) root-normalised bytes.
-        keypoints: (N,4) as `Features` has them.
+        keypoints: (N,4) as in `SiftFeatures`.
     """
     out = np.zeros((RETRIEVAL_FEATURES, 128), dtype=np.float32)
     picked = np.argsort(-keypoints[:, 2], kind="stable")[:RETRIEVAL_FEATURES]
@@ -56,109 +61,127 @@ def largest_descriptors(
 def count_preemptive_matches(
     images: npt.NDArray[np.float32], rows: Sequence[int], cameras: Sequence[str], context: StageContext
 ) -> npt.NDArray[np.int16]:
-    """Clear mutual matches among the largest features of some images and those that could be alike.
+    """Count the mutual matches among the largest features of some images and the images on their shortlists.
 
     Args:
         images: (N,128,128) `largest_descriptors` of every image.
-        rows: R of them.
-        cameras: N images' cameras.
-        context: Threads (what is found is the same with any number of them), progress, cancellation.
+        rows: R rows of `images`.
+        cameras: Camera name of each of the N images.
+        context: Threads, progress, cancellation. The result does not depend on the number of threads.
 
     Returns:
-        (R,N); 0 with itself and with those whose pooled features already say that others are more alike.
+        (R,N) number of matches; 0 of an image with itself and with images that are not on its shortlist.
 
     Source: Wu, "Towards linear-time incremental structure from motion", 3DV 2013 (preemptive matching).
     """
-    short = _vlad_shortlists(_vlad_descriptors(images), rows, np.array(cameras), context)
+    shortlists = _vlad_shortlists(_vlad_descriptors(images), rows, np.array(cameras), context)
     out = np.zeros((len(rows), len(images)), dtype=np.int16)
-    place = {row: number for number, row in enumerate(rows)}
-    todo = _images_to_compare(short, rows, place)
+    number_of_row = {row: number for number, row in enumerate(rows)}
+    partners = _images_to_compare(shortlists, rows, number_of_row)
 
     def work(number: int) -> IntArray:
         context.check_cancelled()
-        return count_ratio_test_matches(images[rows[number]], images[todo[number]])
+        return count_ratio_test_matches(images[rows[number]], images[partners[number]])
 
     with ThreadPoolExecutor(context.threads) as pool:
-        for number, found in enumerate(pool.map(work, range(len(rows)))):
+        for number, counts in enumerate(pool.map(work, range(len(rows)))):
             context.progress(number, len(rows), "keyframes compared")
-            out[number, todo[number]] = found
-            for other, count in zip(todo[number].tolist(), found.tolist(), strict=True):
-                if other in place:
-                    out[place[other], rows[number]] = count
+            out[number, partners[number]] = counts
+            for other, count in zip(partners[number].tolist(), counts.tolist(), strict=True):
+                if other in number_of_row:
+                    out[number_of_row[other], rows[number]] = count
     return out
 
 
-def _images_to_compare(short: BoolArray, rows: Sequence[int], place: Mapping[int, int]) -> list[IntArray]:
-    """For each of the rows the images it is held against: a pair of two of them is looked at once."""
-    left = short.copy()
+def _images_to_compare(
+    shortlists: BoolArray, rows: Sequence[int], number_of_row: Mapping[int, int]
+) -> list[IntArray]:
+    """Return the images to compare with each of the rows; a pair of two rows is compared once."""
+    left = shortlists.copy()
     for number, row in enumerate(rows):
         listed = np.flatnonzero(left[number]).tolist()
-        done = (other for other in listed if place.get(other, number) < number)
-        left[number, [row, *(other for other in done if left[place[other], row])]] = False
-    return [np.flatnonzero(each) for each in left]
+        earlier = (other for other in listed if number_of_row.get(other, number) < number)
+        done = (other for other in earlier if left[number_of_row[other], row])
+        left[number, [row, *done]] = False
+    return [np.flatnonzero(partners) for partners in left]
 
 
 def count_ratio_test_matches(image: npt.NDArray[np.float32], others: npt.NDArray[np.float32]) -> IntArray:
-    """Clear mutual matches (K,) of an image's `largest_descriptors` features with those (K,F,128) of some others."""
+    """Count the mutual matches (K,) that pass the ratio test, of one image with each of K others.
+
+    Args:
+        image: (128,128) `largest_descriptors` of the image.
+        others: (K,128,128) those of the other images.
+    """
     parts = [np.zeros(0, dtype=np.int64)]
     for start in range(0, len(others), _BLOCK_SIZE):
-        some = others[start : start + _BLOCK_SIZE]
-        alike = image @ some.reshape(-1, 128).T
-        parts.append(_count_matches(alike.reshape(RETRIEVAL_FEATURES, len(some), RETRIEVAL_FEATURES)))
+        block = others[start : start + _BLOCK_SIZE]
+        products = image @ block.reshape(-1, 128).T
+        parts.append(_count_matches(products.reshape(RETRIEVAL_FEATURES, len(block), RETRIEVAL_FEATURES)))
     return np.concatenate(parts)
 
 
 def _vlad_shortlists(
-    pooled: npt.NDArray[np.float32],
+    vlad: npt.NDArray[np.float32],
     rows: Sequence[int],
     cameras: npt.NDArray[np.str_],
     context: StageContext,
 ) -> BoolArray:
-    """(R,N) the most alike of all images, and of each camera's, for each of the rows."""
-    out = np.zeros((len(rows), len(pooled)), dtype=bool)
+    """Return a mask (R,N): the most similar of all images and of each camera's images, for each of R rows."""
+    out = np.zeros((len(rows), len(vlad)), dtype=bool)
     groups = [np.flatnonzero(cameras == name) for name in np.unique(cameras)]
-    # Whole numbers, whose sums are exact: the last digits of a sum of floats depend on the machine.
-    whole = np.round(_QUANTISATION_STEPS * pooled)
+    # Sums of whole numbers are exact. The last digits of a sum of other floats depend on the machine.
+    whole = np.round(_QUANTISATION_STEPS * vlad)
     for start in range(0, len(rows), _BLOCK_SIZE):
         context.check_cancelled()
-        for number, far in enumerate(-whole[rows[start : start + _BLOCK_SIZE]] @ whole.T, start):
-            out[number, np.argsort(far, kind="stable")[:_SHORTLIST_SIZE]] = True
+        for number, distance in enumerate(-whole[rows[start : start + _BLOCK_SIZE]] @ whole.T, start):
+            out[number, np.argsort(distance, kind="stable")[:_SHORTLIST_SIZE]] = True
             for group in groups:
-                out[number, group[np.argsort(far[group], kind="stable")[:_SHORTLIST_SIZE_PER_CAMERA]]] = True
+                nearest = np.argsort(distance[group], kind="stable")[:_SHORTLIST_SIZE_PER_CAMERA]
+                out[number, group[nearest]] = True
     return out
 
 
-def _vlad_descriptors(every: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """One unit vector (N,D) an image: its features' differences from the nearest of some words, added up.
+def _vlad_descriptors(images: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Return a VLAD descriptor (N,D) of each image: a unit vector.
 
-    The words are features of the images themselves, evenly spaced among them.
+    It adds up the differences of the features from their nearest visual words. The words are evenly spaced
+    among the features of the images themselves.
+
+    Args:
+        images: (N,128,128) `largest_descriptors` of every image.
 
     Source: Jégou et al., "Aggregating local descriptors into a compact image representation", CVPR 2010, with
         the normalisation of each word of Arandjelović, Zisserman, "All about VLAD", CVPR 2013.
     """
-    flat = every.reshape(-1, 128)
-    there = np.flatnonzero(flat.any(axis=1))
-    if len(there) == 0:
-        return np.zeros((len(every), 128), dtype=np.float32)
-    words = flat[there[np.linspace(0, len(there) - 1, _VISUAL_WORDS).astype(int)]]
-    out = np.zeros((len(every), *words.shape), dtype=np.float32)
-    for image, features in zip(out, every, strict=True):
-        mine = features[features.any(axis=1)]
-        nearest = (mine @ words.T).argmax(axis=1)
-        np.add.at(image, nearest, mine - words[nearest])
+    flat = images.reshape(-1, 128)
+    existing = np.flatnonzero(flat.any(axis=1))
+    if len(existing) == 0:
+        return np.zeros((len(images), 128), dtype=np.float32)
+    words = flat[existing[np.linspace(0, len(existing) - 1, _VISUAL_WORDS).astype(int)]]
+    out = np.zeros((len(images), *words.shape), dtype=np.float32)
+    for vlad, padded in zip(out, images, strict=True):
+        features = padded[padded.any(axis=1)]
+        nearest = (features @ words.T).argmax(axis=1)
+        np.add.at(vlad, nearest, features - words[nearest])
     out /= np.linalg.norm(out, axis=2, keepdims=True) + _EPSILON
-    flat = out.reshape(len(every), -1)
+    flat = out.reshape(len(images), -1)
     return np.asarray(flat / (np.linalg.norm(flat, axis=1, keepdims=True) + _EPSILON), dtype=np.float32)
 
 
-def _count_matches(alike: npt.NDArray[np.float32]) -> IntArray:
-    """Matches (B,) in products (F,B,F) of one image's features with those of B images."""
+def _count_matches(products: npt.NDArray[np.float32]) -> IntArray:
+    """Count the matches (B,) in the scalar products (F,B,F) of one image's features with those of B images.
+
+    The products are changed.
+    """
     features = np.arange(RETRIEVAL_FEATURES)[:, None]
-    others = np.arange(alike.shape[1])[None, :]
-    nearest = alike.argmax(axis=2)
-    best = alike[features, others, nearest]
-    mutual = best >= alike.max(axis=0)[others, nearest]
-    alike[features, others, nearest] = -1.0
-    angle, next_angle = (np.arccos(np.clip(each / _NORM**2, 0.0, 1.0)) for each in (best, alike.max(axis=2)))
-    clear = (angle < _MAX_ANGLE_RAD) & (angle < _MAX_RATIO * next_angle)
+    others = np.arange(products.shape[1])[None, :]
+    nearest = products.argmax(axis=2)
+    best = products[features, others, nearest]
+    mutual = best >= products.max(axis=0)[others, nearest]
+    products[features, others, nearest] = -1.0
+    angle, next_angle = (
+        np.arccos(np.clip(product / DESCRIPTOR_NORM**2, 0.0, 1.0)) for product in (best, products.max(axis=2))
+    )
+    clear = (angle < MAX_MATCH_ANGLE_RAD) & (angle < MAX_RATIO * next_angle)
     return np.asarray((mutual & clear).sum(axis=0), dtype=np.int64)

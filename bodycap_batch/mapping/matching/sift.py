@@ -1,4 +1,4 @@
-"""SIFT features of keyframes, found side by side while the next frames decode."""
+"""Extract SIFT features of keyframes in several threads while the next frames are decoded."""
 
 from __future__ import annotations
 
@@ -15,29 +15,28 @@ import numpy.typing as npt
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.mapping.matching.descriptors import DESCRIPTOR_NORM
 from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX
 
 _DETECTION_SCALE = 0.6
-"""OpenCV's detector starts on the image at twice its size. On 0.6 of it, 1.2 times the frame, it takes
-half the time of a detector on the frame's own pixels, and the map's keyframes are as exact (walk12 0.55 and
-0.51 cm, room12 0.69 and 0.69); on 0.5 walk12 goes to 0.9."""
+"""Size of the image that features are detected in, relative to the frame. OpenCV's detector doubles this
+image first. Detection takes half the time of full size, and the map is as accurate. Evidence:
+docs/decisions/mapping.md."""
 _MIN_LONG_SIDE_PX = 384
-"""Long side below which an image is not shrunk further."""
+"""Long side below which an image is not reduced further, px. Evidence: none."""
 _CONTRAST_THRESHOLD = 0.02
-"""Half of OpenCV's: blurred walls and ceilings have little else (room12 0.84 cm with the usual 0.04). The
-strongest 512 of what is found make as exact a map (keyframes of walk12 0.49 and 0.55 cm, room12 0.70 and
-0.69, tum_fr1_xyz 0.87 and 0.84), at half the matching."""
-_NORM = 512.0
+"""Contrast threshold of the detector: half of OpenCV's default, because blurred walls and ceilings have
+little contrast. Evidence: docs/decisions/mapping.md."""
 
 
 @dataclass(frozen=True, slots=True)
 class SiftFeatures:
-    """One image's features.
+    """The features of one image.
 
     Attributes:
-        keypoints: (N,4) float32: x, y (COLMAP's origin), scale, orientation (rad).
+        keypoints: (N,4) float32: x, y (px, COLMAP's origin), scale (px), orientation (rad).
         descriptors: (N,128) uint8, root-normalised.
-        rgb: (N,3) uint8 colour at each.
+        rgb: (N,3) uint8 colour of the image at each keypoint.
     """
 
     keypoints: npt.NDArray[np.float32]
@@ -48,7 +47,14 @@ class SiftFeatures:
 def extract_features(
     camera: CaptureCamera, frames: IntArray, count: int, context: StageContext
 ) -> Iterator[tuple[int, SiftFeatures]]:
-    """Yield (frame, features) in frame order, at most `count` features a frame, none where a mask says so."""
+    """Yield the index and the features of each frame, in frame order.
+
+    Args:
+        camera: Camera to read frames from; features outside its mask are dropped.
+        frames: (K,) frame indices, increasing.
+        count: Largest number of features of a frame.
+        context: Threads and cancellation.
+    """
     import cv2
 
     detectors = [
@@ -84,6 +90,7 @@ def extract_features(
 
 
 def _detect_features(detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.uint8]) -> SiftFeatures:
+    """Return the features of one image (H,W,3) that lie inside the camera's mask."""
     import cv2
 
     height, width = rgb.shape[:2]
@@ -96,8 +103,8 @@ def _detect_features(detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.u
             np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.uint8)
         )
     scale = np.array([width / size[0], height / size[1]])
-    pixels = (np.array([each.pt for each in found]) + CV2_PIXEL_OFFSET_PX) * scale
-    shape = np.array([(each.size * scale[0] / 2.0, np.radians(each.angle)) for each in found])
+    pixels = (np.array([keypoint.pt for keypoint in found]) + CV2_PIXEL_OFFSET_PX) * scale
+    shape = np.array([(keypoint.size * scale[0] / 2.0, np.radians(keypoint.angle)) for keypoint in found])
     keypoints = np.column_stack([pixels, shape]).astype(np.float32)
     keep = (
         camera.is_unmasked(keypoints[:, :2]) if camera.mask is not None else np.ones(len(found), dtype=bool)
@@ -109,10 +116,10 @@ def _detect_features(detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.u
 
 
 def _root_sift(raw: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-    """Square roots of descriptors that sum to one, as bytes of length 512.
+    """Return the square roots of L1-normalised descriptors (N,128) as bytes.
 
     Source: Arandjelović, Zisserman, "Three things everyone should know to improve object
         retrieval", CVPR 2012.
     """
-    share = raw / np.maximum(raw.sum(axis=1, keepdims=True), 1e-9)
-    return np.asarray(np.clip(np.round(_NORM * np.sqrt(share)), 0, 255), dtype=np.uint8)
+    normalised = raw / np.maximum(raw.sum(axis=1, keepdims=True), 1e-9)
+    return np.asarray(np.clip(np.round(DESCRIPTOR_NORM * np.sqrt(normalised)), 0, 255), dtype=np.uint8)

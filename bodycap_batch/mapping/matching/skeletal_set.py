@@ -1,4 +1,4 @@
-"""Which keyframes carry the map of a long capture: enough of them that every other one sees some again."""
+"""Select the keyframes that a large map is built from: every other keyframe shows what some of them show."""
 
 from __future__ import annotations
 
@@ -10,40 +10,50 @@ import numpy.typing as npt
 from bodycap_batch.core.arrays import IntArray
 
 SKELETAL_ABOVE = 1000
-"""Keyframes beyond which the map is built from some of them, and the others are placed in it."""
+"""Number of keyframes above which a map is built from a skeletal set and the other keyframes are resected.
+Adjusting that many keyframes together again and again would take hours.
+Evidence: docs/decisions/mapping.md."""
 _MIN_MATCHES = 16
+"""Matches above which two keyframes surely show the same: four times `MIN_RETRIEVAL_MATCHES`.
+Evidence: docs/decisions/mapping.md."""
 _MIN_SUPPORT = 6
-"""Of 608 keyframes of three cameras, a minute in one room, 91 are chosen, and all stand 0.25 cm off (rms)
-after 35 CPU seconds; 0.17 after 39 with all adjusted together, 0.14 after 95 with the map built from all."""
+"""Selected keyframes that every other keyframe must match. Evidence: docs/decisions/mapping.md."""
 
 
 def select_skeletal_keyframes(
-    alike: npt.NDArray[np.int16], times: IntArray, *, sure: int = _MIN_MATCHES, support: int = _MIN_SUPPORT
+    matches: npt.NDArray[np.int16],
+    times: IntArray,
+    *,
+    min_matches: int = _MIN_MATCHES,
+    min_support: int = _MIN_SUPPORT,
 ) -> IntArray:
-    """Rows of keyframes that see all there is: each of the others is surely alike to some of them.
+    """Select keyframes that together show everything, so that the others can be resected against them.
 
-    In order of time who is alike to too few of those chosen before is chosen, so that what is chosen hangs
-    together; and so are some of those that show two parts together which nothing joined yet.
+    Keyframes are processed in time order. A keyframe is selected if it matches fewer than `min_support`
+    selected keyframes; this keeps the selection connected. Up to `min_support` keyframes that link the same
+    unconnected components are selected too.
 
     Args:
-        alike: (N,N) `likeness` of all keyframes, symmetric.
-        times: (N,) when each was taken.
-        sure: Likeness from which two keyframes surely show the same.
-        support: How many of the chosen each of the others is to be alike to, and how many join two parts.
+        matches: (N,N) number of matches of all pairs of keyframes, symmetric.
+        times: (N,) time of each keyframe, any unit.
+        min_matches: Matches above which two keyframes surely show the same.
+        min_support: Selected keyframes that each other keyframe must match, and links between components.
 
     Returns:
-        Increasing rows.
+        Rows of the selected keyframes, increasing.
+
+    Source: Snavely et al., "Skeletal graphs for efficient structure from motion", CVPR 2008, for the idea.
     """
-    tied = alike >= sure
-    part = np.full(len(times), -1)
-    joints = Counter[tuple[int, ...]]()
+    matched = matches >= min_matches
+    component = np.full(len(times), -1)
+    links = Counter[tuple[int, ...]]()
     for row in np.argsort(times, kind="stable"):
-        parts = part[tied[row] & (part >= 0)]
-        found = np.unique(parts)
-        if len(parts) >= support and len(found) == 1:
+        components = component[matched[row] & (component >= 0)]
+        linked = np.unique(components)
+        if len(components) >= min_support and len(linked) == 1:
             continue
-        part[row] = row if len(found) == 0 else found[0]
-        joints[tuple(found)] += 1
-        if len(parts) < support or joints[tuple(found)] >= support:
-            part[np.isin(part, found)] = part[row]
-    return np.flatnonzero(part >= 0)
+        component[row] = row if len(linked) == 0 else linked[0]
+        links[tuple(linked)] += 1
+        if len(components) < min_support or links[tuple(linked)] >= min_support:
+            component[np.isin(component, linked)] = component[row]
+    return np.flatnonzero(component >= 0)

@@ -1,4 +1,4 @@
-"""From COLMAP's reconstruction to our `Map`."""
+"""Convert COLMAP's reconstruction and cameras into a `Map` and `Camera`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,12 @@ if TYPE_CHECKING:
 
 
 def map_from_reconstruction(model: pycolmap.Reconstruction, workspace: Path) -> Map:
-    """Turn a reconstruction into a `Map`, keyframes and points in a fixed order."""
+    """Convert a reconstruction into a `Map`, with keyframes and points in a fixed order.
+
+    Args:
+        model: The reconstruction.
+        workspace: Folder of its database, for the colours of the keypoints.
+    """
     images = sorted(
         ((ImageRef.parse(model.image(image_id).name), image_id) for image_id in model.reg_image_ids()),
     )
@@ -33,12 +38,12 @@ def map_from_reconstruction(model: pycolmap.Reconstruction, workspace: Path) -> 
         poses.append(make_transform(cam_from_map[:, :3], cam_from_map[:, 3]))
         colours = read_keypoint_colours(workspace, image_id)
         feature = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
-        seen = [image.point2D(index) for index in feature.tolist()]
-        rows = np.array([row_of_point[point.point3D_id] for point in seen], dtype=np.int64)
+        observations = [image.point2D(index) for index in feature.tolist()]
+        rows = np.array([row_of_point[point.point3D_id] for point in observations], dtype=np.int64)
         keyframe_rows.append(np.full(len(rows), row))
         point_rows.append(rows)
         features.append(feature)
-        pixels.append(np.array([point.xy for point in seen]).reshape(-1, 2))
+        pixels.append(np.array([point.xy for point in observations]).reshape(-1, 2))
         np.add.at(colour_sum, rows, colours[feature])
     obs_point = _concatenate(point_rows)
     counts = np.bincount(obs_point, minlength=len(point_ids))
@@ -60,16 +65,17 @@ def map_from_reconstruction(model: pycolmap.Reconstruction, workspace: Path) -> 
 
 
 def _concatenate(parts: list[IntArray]) -> IntArray:
+    """Return all parts as one array; there may be none."""
     return np.concatenate([np.zeros(0, dtype=np.int64), *parts])
 
 
 def _gauge_id(map_from_cam: FloatArray) -> str:
-    """Name a gauge by what defines it: the keyframes' poses."""
+    """Return the id of a gauge: a digest of the keyframe poses (K,4,4) that define it."""
     return hashlib.sha256(np.ascontiguousarray(map_from_cam).tobytes()).hexdigest()[:12]
 
 
 def camera_from_pycolmap(camera: Any) -> Camera:
-    """A reconstruction's camera as ours."""
+    """Convert a camera of a reconstruction into a `Camera`."""
     return Camera(
         model=camera.model.name,
         width_px=int(camera.width),

@@ -1,4 +1,4 @@
-"""The mapper's loop: register the next keyframe, adjust around it, adjust everything as the map grows."""
+"""Run COLMAP's incremental mapper step by step: register images, adjust locally, adjust globally."""
 
 from __future__ import annotations
 
@@ -7,90 +7,140 @@ from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.mapping.matching.database import DATABASE_NAME
 
 if TYPE_CHECKING:
     import pycolmap
 
 _INITIAL_PAIR_RELAXATIONS = 2
-"""How often COLMAP eases its demands on the initial pair before it gives up."""
+"""How often the demands on the initial pair are relaxed before it is given up; COLMAP's number."""
+
+
+def progress_counter(
+    context: StageContext, total: int, stop: Callable[[], None], done: int = 0
+) -> Callable[[], None]:
+    """Return a function that reports one more keyframe in the map on each call.
+
+    Args:
+        context: Progress and cancellation.
+        total: Number of keyframes.
+        stop: Called once the work is cancelled.
+        done: Keyframes in the map at the start.
+    """
+
+    def count_one() -> None:
+        nonlocal done
+        done += 1
+        context.progress(min(done, total), total, "keyframes in the map")
+        if context.cancelled():
+            stop()
+
+    return count_one
 
 
 def register_images(
     workspace: Path,
     settings: pycolmap.IncrementalPipelineOptions,
     model: pycolmap.Reconstruction,
-    tick: Callable[[], None],
+    count_one: Callable[[], None],
     *,
-    whole: bool = True,
+    adjust_globally: bool = True,
 ) -> bool:
-    """Put the database's keyframes into a model, which may be empty, until no further one finds a place.
+    """Register the database's images in a model, which may be empty, until none of the others fits.
 
-    COLMAP's pipeline, but for its end: where no further keyframe finds a place it adjusts everything, tries
-    once more, and then adjusts everything again although nothing was added. Without that walk131 takes 17.5
-    instead of 22.9 CPU seconds, and its keyframes are as exact (0.304 cm both).
+    This is COLMAP's pipeline, except for its end. If no further image fits, COLMAP adjusts everything, tries
+    once more, and then adjusts everything again although nothing was added. This function leaves out the last
+    adjustment. Evidence: docs/decisions/mapping.md.
 
     Args:
         workspace: Folder of the database.
-        settings: The mapper's settings; the initial pair is theirs where the model is empty.
-        model: What there is, changed in place.
-        tick: Called after each keyframe; what it raises ends the run.
-        whole: False: what stands is left as it is, only what comes to it is adjusted.
+        settings: The mapper's options; they name the initial pair of an empty model.
+        model: The model so far, changed in place.
+        count_one: Called after each registered image. What it raises ends the run.
+        adjust_globally: False: only new images are adjusted, the model so far stays.
 
     Returns:
-        False where the model was empty and there is no initial pair, or it does not hold.
+        False if the model was empty and there is no usable initial pair.
 
-    Source: Schönberger, Frahm, "Structure-from-motion revisited", CVPR 2016, as COLMAP has it.
+    Source: Schönberger, Frahm, "Structure-from-motion revisited", CVPR 2016, as implemented in COLMAP.
     """
     mapper = _open_mapper(workspace, settings)
     mapper.begin_reconstruction(model)
-    run = _MapperRun(mapper, settings, whole=whole)
-    if not model.num_reg_frames() and not run.start():
+    run = _MapperRun(mapper, settings, adjust_globally=adjust_globally)
+    if not model.num_reg_frames() and not run.initialise():
         mapper.end_reconstruction(True)
         return False
-    tick()
-    run.to_the_end(tick)
+    count_one()
+    run.register_all(count_one)
     model.update_point_3d_errors()
     mapper.end_reconstruction(False)
     return True
+
+
+def with_new_images(
+    workspace: Path,
+    model: Any,
+    settings: pycolmap.IncrementalPipelineOptions,
+    context: StageContext,
+    total: int,
+    *,
+    adjust_globally: bool,
+) -> Any:
+    """Return a copy of a model with the database's new images registered; its existing poses stay.
+
+    Args:
+        workspace: Folder of the database.
+        model: A reconstruction; not changed.
+        settings: The mapper's options; changed.
+        context: Progress and cancellation.
+        total: Number of keyframes, for the progress.
+        adjust_globally: False: only the new images are adjusted.
+    """
+    settings.fix_existing_frames = True
+    extended = copy.deepcopy(model)
+    count_one = progress_counter(context, total, context.check_cancelled)
+    register_images(workspace, settings, extended, count_one, adjust_globally=adjust_globally)
+    return extended
 
 
 def resect_images(
     workspace: Path,
     settings: pycolmap.IncrementalPipelineOptions,
     model: pycolmap.Reconstruction,
-    wanted: Collection[int],
-    tick: Callable[[], None],
+    image_ids: Collection[int],
+    count_one: Callable[[], None],
 ) -> set[int]:
-    """Put keyframes into a model that shows what they see: nothing is adjusted, its poses stay.
+    """Register images in a model that shows what they see; nothing is adjusted, existing poses stay.
 
     Args:
         workspace: Folder of the database.
-        settings: The mapper's settings.
-        model: What there is, changed in place: poses and observations are added, points where they see more.
-        wanted: Ids of the keyframes' images; who matches none has no place.
-        tick: Called after each keyframe that found a place; what it raises ends the run.
+        settings: The mapper's options.
+        model: The model so far, changed in place: poses, observations and new points are added.
+        image_ids: Ids of the images to register; images without matches are skipped.
+        count_one: Called after each registered image. What it raises ends the run.
 
     Returns:
-        Ids of those that found a place.
+        Ids of the registered images.
     """
     mapper = _open_mapper(workspace, settings)
     mapper.begin_reconstruction(model)
     options, triangulation = settings.get_mapper(), settings.get_triangulation()
-    placed = set[int]()
-    for image_id in sorted(number for number in wanted if model.exists_image(number)):
+    registered = set[int]()
+    for image_id in sorted(number for number in image_ids if model.exists_image(number)):
         if mapper.register_next_image(options, image_id):
             mapper.triangulate_image(triangulation, image_id)
-            placed.add(image_id)
-            tick()
+            registered.add(image_id)
+            count_one()
     model.update_point_3d_errors()
     mapper.end_reconstruction(False)
-    return placed
+    return registered
 
 
 def _open_mapper(
     workspace: Path, settings: pycolmap.IncrementalPipelineOptions
 ) -> pycolmap.IncrementalMapper:
+    """Return a mapper over the database of a workspace."""
     import pycolmap
 
     options = pycolmap.DatabaseCacheOptions()
@@ -101,27 +151,27 @@ def _open_mapper(
 
 
 def _relaxed_options(options: Any) -> Iterator[Any]:
-    """Demands on the initial pair, eased as COLMAP does: half the inliers, then half the angle, twice."""
-    eased = copy.deepcopy(options)
-    yield eased
+    """Yield demands on the initial pair, relaxed as in COLMAP: half the inliers, half the angle, twice."""
+    relaxed = copy.deepcopy(options)
+    yield relaxed
     for _ in range(_INITIAL_PAIR_RELAXATIONS):
-        eased.init_min_num_inliers //= 2
-        yield eased
-        eased.init_min_tri_angle /= 2
-        yield eased
+        relaxed.init_min_num_inliers //= 2
+        yield relaxed
+        relaxed.init_min_tri_angle /= 2
+        yield relaxed
 
 
 class _MapperRun:
-    """One model's growth."""
+    """The reconstruction of one model."""
 
     def __init__(
         self,
         mapper: pycolmap.IncrementalMapper,
         settings: pycolmap.IncrementalPipelineOptions,
         *,
-        whole: bool = True,
+        adjust_globally: bool = True,
     ) -> None:
-        self._whole = whole
+        self._adjust_globally = adjust_globally
         self._mapper = mapper
         self._settings = settings
         self._model: Any = mapper.reconstruction
@@ -130,10 +180,10 @@ class _MapperRun:
         self._local = settings.get_local_bundle_adjustment()
         self._global = settings.get_global_bundle_adjustment()
 
-    def start(self) -> bool:
-        """Begin with the settings' initial pair; False where there is none, or it does not hold."""
+    def initialise(self) -> bool:
+        """Start with the initial pair of the options; return False if there is none or it is unusable."""
         pair = (self._settings.init_image_id1, self._settings.init_image_id2)
-        if min(pair) < 0:  # none was chosen
+        if min(pair) < 0:  # COLMAP's mark for no pair
             return False
         for options in _relaxed_options(self._options):
             geometry = self._mapper.estimate_initial_two_view_geometry(options, *pair)
@@ -152,26 +202,26 @@ class _MapperRun:
         self._mapper.filter_frames(self._options)
         return bool(self._model.num_reg_frames() and self._model.num_points3D())
 
-    def to_the_end(self, tick: Callable[[], None]) -> None:
-        """Add keyframes until none finds a place, not even after everything was adjusted."""
+    def register_all(self, count_one: Callable[[], None]) -> None:
+        """Register images until no further one fits, not even after a global adjustment."""
         adjusted, last_try = self._size(), False
         while True:
-            image_id = self._next()
+            image_id = self._register_next()
             if image_id is not None:
                 last_try = False
-                self._place(image_id)
-                if self._has_grown(adjusted):
+                self._extend_from(image_id)
+                if self._needs_global_adjustment(adjusted):
                     self._adjust_all()
                     adjusted = self._size()
-                tick()
+                count_one()
             elif last_try or self._size() == adjusted:
                 return
             else:
                 self._adjust_all()
                 adjusted, last_try = self._size(), True
 
-    def _next(self) -> int | None:
-        """Register the keyframe that sees most of the map; None where none can be."""
+    def _register_next(self) -> int | None:
+        """Register the image that observes most of the map; return None if no image fits."""
         for image_id in self._mapper.find_next_images(self._options, structure_less=False):
             if self._mapper.register_next_image(self._options, image_id):
                 return int(image_id)
@@ -182,7 +232,8 @@ class _MapperRun:
                 return int(image_id)
         return None
 
-    def _place(self, image_id: int) -> None:
+    def _extend_from(self, image_id: int) -> None:
+        """Triangulate the points of a new image and adjust the map around it."""
         self._triangulate(self._triangulation, image_id)
         self._mapper.iterative_local_refinement(
             self._settings.ba_local_max_refinements,
@@ -198,9 +249,11 @@ class _MapperRun:
             self._mapper.triangulate_image(options, item.id)
 
     def _size(self) -> tuple[int, int]:
+        """Return the number of registered frames and of points."""
         return self._model.num_reg_frames(), self._model.num_points3D()
 
-    def _has_grown(self, adjusted: tuple[int, int]) -> bool:
+    def _needs_global_adjustment(self, adjusted: tuple[int, int]) -> bool:
+        """Return whether the model grew much since its size was `adjusted`; the same test as COLMAP's."""
         frames, points = self._size()
         return bool(
             frames >= self._settings.ba_global_frames_ratio * adjusted[0]
@@ -210,7 +263,8 @@ class _MapperRun:
         )
 
     def _adjust_all(self) -> None:
-        if not self._whole:
+        """Adjust the whole model, unless the run was asked not to."""
+        if not self._adjust_globally:
             return
         self._mapper.iterative_global_refinement(
             self._settings.ba_global_max_refinements,

@@ -1,71 +1,70 @@
-"""Place keyframes in a map that stands: the many of a long capture that see nothing new."""
+"""Resect the keyframes of a long capture that are not among its skeletal keyframes."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
 from typing import Any
 
+from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, Pair, read_image_ids
 from bodycap_batch.mapping.matching.pair_matching import match_pairs
 from bodycap_batch.mapping.matching.pair_selection import PairGenerator
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, adjust_robustly
-from bodycap_batch.mapping.reconstruction.incremental_mapper import resect_images
-from bodycap_batch.mapping.reconstruction.reconstruct import model_order, progress_counter
+from bodycap_batch.mapping.reconstruction.incremental_mapper import progress_counter, resect_images
+from bodycap_batch.mapping.reconstruction.models import model_order, registered_ids
 from bodycap_batch.mapping.validation.repair import remove_without_adjustment
-from bodycap_batch.mapping.workspace import MappingContext
 
 
 def resect_remaining(
-    models: list[Any], chooser: PairGenerator, tried: Collection[Pair], shop: MappingContext
+    models: list[Any], generator: PairGenerator, tried: Collection[Pair], context: MappingContext
 ) -> tuple[list[set[int]], dict[str, object]]:
-    """Settle maps, and place the keyframes in them, in place, that carry none; no pose that stands is moved.
+    """Adjust models robustly, then resect the keyframes that are in none of them; existing poses stay.
 
-    All at once would be adjusted by passes over millions of observations, hundreds of them: so who was placed
-    is adjusted alone, to points that stay.
+    To adjust all keyframes together would take hundreds of passes over millions of observations. So only the
+    resected keyframes are adjusted, against points that stay constant.
 
     Args:
-        models: Reconstructions from some of the chooser's keyframes; changed in place, and put in order, the
-            largest first.
-        chooser: Of all keyframes.
+        models: Reconstructions from some of the keyframes; changed in place and sorted, the largest first.
+        generator: Generates pairs among all keyframes.
         tried: Pairs that were matched.
-        shop: Workspace, lenses, settings.
+        context: Workspace, intrinsics, mapper options.
 
     Returns:
-        Ids of the images placed in each of the models, and an account for the log; ``contradicted_share`` in
-        it is the largest model's.
+        Ids of the images that were resected in each of the models, and entries for the log.
+        ``contradicted_share`` in the log is that of the largest model.
     """
     import pycolmap
 
-    with pycolmap.Database.open(str(shop.workspace / DATABASE_NAME)) as database:
+    with pycolmap.Database.open(str(context.workspace / DATABASE_NAME)) as database:
         ids = read_image_ids(database)
-    carrying = {int(number) for model in models for number in model.reg_image_ids()}
-    wanted = [ref for ref in chooser.refs if ids[ref] not in carrying]
-    chosen = chooser.placing([ref for ref in chooser.refs if ids[ref] in carrying], wanted)
+    registered = {int(number) for model in models for number in model.reg_image_ids()}
+    missing = [ref for ref in generator.refs if ids[ref] not in registered]
+    chosen = generator.resection_pairs([ref for ref in generator.refs if ids[ref] in registered], missing)
     pairs = [pair for pair in chosen if pair not in tried]
-    held = match_pairs(shop.workspace, pairs, shop.lenses, shop.context)
-    left = {ids[ref] for ref in wanted}
-    tick = progress_counter(shop.context, len(ids), shop.context.check_cancelled, len(carrying))
-    cut = list[str]()
-    made = list[tuple[Any, set[int], float]]()
+    verified = match_pairs(context.workspace, pairs, context.intrinsics, context.stage)
+    left = {ids[ref] for ref in missing}
+    count_one = progress_counter(context.stage, len(ids), context.stage.check_cancelled, len(registered))
+    removed = list[str]()
+    extended = list[tuple[Any, set[int], float]]()
     for model in models:
-        adjust_robustly(model, shop.settings(), shop.constant)
-        found = resect_images(shop.workspace, shop.settings(), model, left, tick)
-        kept, names, share = model, list[str](), 0.0
-        if found:
-            adjust_and_filter(model, shop.settings(), shop.constant, found)
-            kept, names, share = remove_without_adjustment(model, shop)
-        cut += names
-        found &= set(map(int, kept.reg_image_ids()))
-        left -= found
-        made.append((kept, found, share))
-    made.sort(key=lambda item: model_order(item[0]))
-    models[:] = [model for model, _, _ in made]
-    placed = [found for _, found, _ in made]
-    return placed, {
-        "carrying": sum(model.num_reg_images() - len(found) for model, found, _ in made),
-        "placed": sum(map(len, placed)),
-        "cut": cut,
-        "contradicted_share": made[0][2] if made else 0.0,
+        adjust_robustly(model, context.mapper_options(), context.calibrated_ids)
+        resected = resect_images(context.workspace, context.mapper_options(), model, left, count_one)
+        kept, names, ratio = model, list[str](), 0.0
+        if resected:
+            adjust_and_filter(model, context.mapper_options(), context.calibrated_ids, resected)
+            kept, names, ratio = remove_without_adjustment(model, context)
+        removed += names
+        resected &= registered_ids(kept)
+        left -= resected
+        extended.append((kept, resected, ratio))
+    extended.sort(key=lambda item: model_order(item[0]))
+    models[:] = [model for model, _, _ in extended]
+    all_resected = [resected for _, resected, _ in extended]
+    return all_resected, {
+        "carrying": sum(model.num_reg_images() - len(resected) for model, resected, _ in extended),
+        "placed": sum(map(len, all_resected)),
+        "cut": removed,
+        "contradicted_share": extended[0][2] if extended else 0.0,
         "placing_pairs": len(pairs),
-        "placing_pairs_verified": len(held),
+        "placing_pairs_verified": len(verified),
     }

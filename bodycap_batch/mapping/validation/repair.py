@@ -1,138 +1,156 @@
-"""Find keyframes in the wrong place or left out, match them again, place them again, or cut them out."""
+"""Find misregistered and missing keyframes, match and register them again, or remove them."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pair, read_image_ids
 from bodycap_batch.mapping.matching.pair_matching import match_pairs
-from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
-from bodycap_batch.mapping.reconstruction.bundle_adjustment import sub_model, adjust_and_filter
-from bodycap_batch.mapping.reconstruction.reconstruct import register_new_images
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, sub_model
+from bodycap_batch.mapping.reconstruction.incremental_mapper import with_new_images
+from bodycap_batch.mapping.reconstruction.models import registered_ids
 from bodycap_batch.mapping.validation.epipolar_consistency import (
-    inconsistent_match_ratio,
-    find_misregistered_images,
     evaluate_pairs,
+    find_misregistered_images,
+    inconsistent_match_ratio,
 )
-from bodycap_batch.mapping.workspace import MappingContext
 
 if TYPE_CHECKING:
     import pycolmap
 
 _ROUNDS = 2
+"""Rounds of a repair at most. Evidence: none."""
 _MIN_PAIR_BUDGET = 2000
-"""Pairs that may be matched again, where fewer were matched in the first place."""
+"""Pairs that a repair may match again even if fewer were matched before. Evidence: none."""
 
 
 def repair_model(
     model: pycolmap.Reconstruction,
     tried: set[Pair],
-    shop: MappingContext,
-    among: Collection[ImageRef] | None = None,
+    context: MappingContext,
+    keyframes: Collection[ImageRef] | None = None,
 ) -> tuple[Any, dict[str, object]]:
-    """Take doubtful keyframes out, match them and the unregistered ones again, place them again or cut them.
+    """Match misregistered and missing keyframes again, register them again, and remove what stays wrong.
 
     Args:
         model: The largest model; not changed.
-        tried: Pairs that were matched; those matched here are added.
-        shop: Workspace, lenses, settings.
-        among: Keyframes that belong in it; by default all of the database.
+        tried: Pairs that were matched; the pairs matched here are added.
+        context: Workspace, intrinsics, mapper options.
+        keyframes: Keyframes that belong in the model; by default all of the database.
 
     Returns:
-        The better of the old and the new model without what is doubtful still, and an account for the log.
+        The better one of the old and the new model, without misregistered keyframes, and entries for the log.
     """
     import pycolmap
 
     log: list[dict[str, object]] = []
-    with pycolmap.Database.open(str(shop.workspace / DATABASE_NAME)) as database:
+    with pycolmap.Database.open(str(context.workspace / DATABASE_NAME)) as database:
         ids = read_image_ids(database)
-    if among is not None:
-        ids = {ref: ids[ref] for ref in among}
-    links = evaluate_pairs(shop.workspace, model)
-    suspects = find_misregistered_images(links)
+    if keyframes is not None:
+        ids = {ref: ids[ref] for ref in keyframes}
+    pairs = evaluate_pairs(context.workspace, model)
+    wrong = find_misregistered_images(pairs)
     for _ in range(_ROUNDS):
-        placed = set(map(int, model.reg_image_ids()))
-        missing = set(ids.values()) - placed
-        if not suspects | missing:
+        registered = registered_ids(model)
+        missing = set(ids.values()) - registered
+        if not wrong | missing:
             break
-        fresh = _untried_pairs(ids, suspects | missing, tried)
-        if len(fresh) > max(_MIN_PAIR_BUDGET, len(tried)):
-            # Where many are missing they saw too little: matching them with all would cost the most.
-            fresh = _untried_pairs(ids, suspects, tried)
-        tried |= set(fresh)
-        held = match_pairs(shop.workspace, fresh, shop.lenses, shop.context)
+        untried = _untried_pairs(ids, wrong | missing, tried)
+        if len(untried) > max(_MIN_PAIR_BUDGET, len(tried)):
+            # If many keyframes are missing, they show too little. To match them with all others costs most.
+            untried = _untried_pairs(ids, wrong, tried)
+        tried |= set(untried)
+        verified = match_pairs(context.workspace, untried, context.intrinsics, context.stage)
         entry: dict[str, object] = {
-            "doubtful": [ref.name for ref, number in sorted(ids.items()) if number in suspects],
+            "doubtful": [ref.name for ref, number in sorted(ids.items()) if number in wrong],
             "unregistered": len(missing),
-            "pairs": len(fresh),
-            "verified_pairs": len(held),
+            "pairs": len(untried),
+            "verified_pairs": len(verified),
         }
         log.append(entry)
-        if not held and not suspects:
+        if not verified and not wrong:
             break
-        other = re_register_images(model, suspects, shop, len(ids))
-        other_links = evaluate_pairs(shop.workspace, other)
-        left = find_misregistered_images(other_links)
-        sound_before = len(placed - suspects)
-        sound_after = len(set(map(int, other.reg_image_ids())) - left)
+        other = re_register_images(model, wrong, context, len(ids))
+        other_pairs = evaluate_pairs(context.workspace, other)
+        still_wrong = find_misregistered_images(other_pairs)
+        sound_before = len(registered - wrong)
+        sound_after = len(registered_ids(other) - still_wrong)
         entry |= {"sound_before": sound_before, "sound_after": sound_after}
-        if sound_after < sound_before or (sound_after == sound_before and len(left) >= len(suspects)):
+        if sound_after < sound_before or (sound_after == sound_before and len(still_wrong) >= len(wrong)):
             break
-        model, suspects, links = other, left, other_links
-    share = round(inconsistent_match_ratio(links), 4)
-    model, cut = _remove_images(model, suspects)
-    if cut:
-        _adjust_unless_large(model, shop)
-    return model, {"rounds": log, "cut": cut, "contradicted_share": share}
+        model, wrong, pairs = other, still_wrong, other_pairs
+    ratio = round(inconsistent_match_ratio(pairs), 4)
+    model, removed = _remove_images(model, wrong)
+    if removed:
+        _adjust_unless_large(model, context)
+    return model, {"rounds": log, "cut": removed, "contradicted_share": ratio}
 
 
-def remove_misregistered(model: pycolmap.Reconstruction, shop: MappingContext) -> tuple[Any, list[str]]:
-    """The model without keyframes that contradict it, adjusted then, and their names."""
-    kept, cut, _ = remove_without_adjustment(model, shop)
-    if cut:
-        _adjust_unless_large(kept, shop)
-    return kept, cut
+def remove_misregistered(model: pycolmap.Reconstruction, context: MappingContext) -> tuple[Any, list[str]]:
+    """Return the model without misregistered keyframes, adjusted if any was removed, and their names."""
+    kept, removed, _ = remove_without_adjustment(model, context)
+    if removed:
+        _adjust_unless_large(kept, context)
+    return kept, removed
 
 
 def remove_without_adjustment(
-    model: pycolmap.Reconstruction, shop: MappingContext
+    model: pycolmap.Reconstruction, context: MappingContext
 ) -> tuple[Any, list[str], float]:
-    """`remove_misregistered` with all poses left as they are, and the share of links that contradicted the model."""
-    links = evaluate_pairs(shop.workspace, model)
-    return *_remove_images(model, find_misregistered_images(links)), round(inconsistent_match_ratio(links), 4)
+    """Remove misregistered keyframes and leave all other poses as they are.
+
+    Returns:
+        The model without these keyframes; their image names; the ratio of inconsistent matches before.
+    """
+    pairs = evaluate_pairs(context.workspace, model)
+    kept, removed = _remove_images(model, find_misregistered_images(pairs))
+    return kept, removed, round(inconsistent_match_ratio(pairs), 4)
 
 
-def _remove_images(model: Any, suspects: set[int]) -> tuple[Any, list[str]]:
-    """Points that only suspects see go with them; tracking finds their frames' poses from what is left."""
-    cut = sorted(model.image(number).name for number in suspects)
-    return sub_model(model, set(map(int, model.reg_image_ids())) - suspects) if cut else model, cut
+def _remove_images(model: Any, image_ids: set[int]) -> tuple[Any, list[str]]:
+    """Return the model without some images, and their names.
+
+    Points that only these images observe go with them. Registration finds the poses of their frames from the
+    remaining points.
+    """
+    removed = sorted(model.image(number).name for number in image_ids)
+    return sub_model(model, registered_ids(model) - image_ids) if removed else model, removed
 
 
 def _untried_pairs(ids: Mapping[ImageRef, int], images: set[int], tried: set[Pair]) -> list[Pair]:
+    """Return all pairs of some images with any other image that were not matched yet."""
     refs: Sequence[ImageRef] = sorted(ids)
     chosen = [ref for ref in refs if ids[ref] in images]
     return sorted({(min(a, b), max(a, b)) for a in chosen for b in refs if a != b} - tried)
 
 
 def re_register_images(
-    model: pycolmap.Reconstruction, suspects: Collection[int], shop: MappingContext, total: int
+    model: pycolmap.Reconstruction, image_ids: Collection[int], context: MappingContext, total: int
 ) -> Any:
-    """The model with suspects taken out, they and new keyframes registered against what is left, all refined.
+    """Return the model after some of its images, and new ones, are registered against the rest.
 
     Args:
         model: A reconstruction; not changed.
-        suspects: Ids of images.
-        shop: Workspace, lenses, settings.
-        total: Keyframes there are.
+        image_ids: Ids of the images to remove and to register again.
+        context: Workspace, intrinsics, mapper options.
+        total: Number of keyframes, for the progress.
     """
-    rest = sub_model(model, set(model.reg_image_ids()) - set(suspects))
-    grown = register_new_images(shop.workspace, rest, shop.settings(), shop.context, total)
-    _adjust_unless_large(grown, shop)
-    return grown
+    rest = sub_model(model, set(model.reg_image_ids()) - set(image_ids))
+    extended = with_new_images(
+        context.workspace,
+        rest,
+        context.mapper_options(),
+        context.stage,
+        total,
+        adjust_globally=not context.is_large(rest.num_reg_frames()),
+    )
+    _adjust_unless_large(extended, context)
+    return extended
 
 
-def _adjust_unless_large(model: pycolmap.Reconstruction, shop: MappingContext) -> None:
-    """Refine a model in place; in one of very many keyframes only what is new to it is, at the end."""
-    if model.num_reg_images() <= SKELETAL_ABOVE:
-        adjust_and_filter(model, shop.settings(), shop.constant)
+def _adjust_unless_large(model: pycolmap.Reconstruction, context: MappingContext) -> None:
+    """Adjust a model in place; in a large one, only new images are adjusted, at the end of the stage."""
+    if not context.is_large(model.num_reg_images()):
+        adjust_and_filter(model, context.mapper_options(), context.calibrated_ids)

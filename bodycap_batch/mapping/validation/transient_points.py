@@ -1,4 +1,4 @@
-"""Points that one glance of one camera saw: the wearer's sleeve, and room that bends a map like it."""
+"""Remove points that one camera saw for a moment only: the wearer's sleeve, and points as unreliable."""
 
 from __future__ import annotations
 
@@ -13,42 +13,43 @@ if TYPE_CHECKING:
     import pycolmap
 
 _MIN_STATIC_POINTS = 20
-"""Confirmed points that carry a keyframe without the others. With 15 and 30 the first capture told of below
-has 0.93 and 0.99 cm."""
+"""Static points that are enough for the pose of a keyframe. Evidence: docs/decisions/mapping.md."""
 
 
 def remove_transient_points(model: pycolmap.Reconstruction, times_ns: Mapping[str, IntArray]) -> int:
-    """Take points out of a model that no other camera and no other time confirms; how many.
+    """Remove points that neither another camera nor another time confirms, and return their number.
 
-    What moves with a camera is a still room to that camera, for a moment, and pulls its keyframes along.
-    Points stay where a keyframe that sees them has too few others. Without them two rendered captures with
-    textured sleeves in view went from 1.21 and 0.41 to 0.66 and 0.41 cm (all frames), the worst frame of the
-    first from 8.3 to 4.3; room12 from 0.54 to 0.55, a rendered brown-lens walk from 0.28 to 0.29. Putting
-    back what agrees with the poses found without them changed none of it by more than 0.01.
+    What moves with a camera looks like static room to that camera for a moment, and it bends the map. Points
+    are kept if one of their keyframes observes too few static points. Evidence: docs/decisions/mapping.md.
 
     Args:
-        model: A reconstruction, changed in place; to be refined afterwards.
-        times_ns: Time of every frame, by camera.
+        model: A reconstruction, changed in place; to be adjusted afterwards.
+        times_ns: Time of every frame, by camera, nanoseconds.
     """
     refs = {int(i): ImageRef.parse(model.image(i).name) for i in model.reg_image_ids()}
-    seen = {
-        int(point): [int(each.image_id) for each in model.point3D(point).track.elements]
+    images_of = {
+        int(point): [int(element.image_id) for element in model.point3D(point).track.elements]
         for point in model.point3D_ids()
     }
-    doubted = [point for point, images in sorted(seen.items()) if not _is_static(images, refs, times_ns)]
-    carrying = dict.fromkeys(refs, 0)
-    for point in seen.keys() - set(doubted):
-        for image in set(seen[point]):
-            carrying[image] += 1
-    dropped = [
-        point for point in doubted if all(carrying[image] >= _MIN_STATIC_POINTS for image in seen[point])
+    transient = [
+        point for point, images in sorted(images_of.items()) if not _is_static(images, refs, times_ns)
     ]
-    for point in dropped:
+    static_points = dict.fromkeys(refs, 0)
+    for point in images_of.keys() - set(transient):
+        for image in set(images_of[point]):
+            static_points[image] += 1
+    removed = [
+        point
+        for point in transient
+        if all(static_points[image] >= _MIN_STATIC_POINTS for image in images_of[point])
+    ]
+    for point in removed:
         model.delete_point3D(point)
-    return len(dropped)
+    return len(removed)
 
 
 def _is_static(images: list[int], refs: Mapping[int, Any], times_ns: Mapping[str, IntArray]) -> bool:
+    """Return whether two cameras observe a point, or one camera at two different times."""
     if len({refs[image].camera for image in images}) > 1:
         return True
     times = [int(times_ns[refs[image].camera][refs[image].frame]) for image in images]

@@ -1,4 +1,4 @@
-"""A final adjustment that fails is an error, never a map."""
+"""A failed adjustment is an error, never a map."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import pytest
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter
-from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options
+from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
 
 
 class _Failing:
-    """An adjuster, and its summary, that found nothing usable."""
+    """An adjuster and its summary, without a usable solution."""
 
     def solve(self) -> _Failing:
         return self
@@ -32,4 +32,4 @@ def test_an_adjustment_that_fails_is_reported(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", failing)
     with pytest.raises(EstimationError, match="0 keyframes could not be refined: no convergence"):
-        adjust_and_filter(pycolmap.Reconstruction(), mapper_options(MapOptions(), [], 1.0), [])
+        adjust_and_filter(pycolmap.Reconstruction(), make_mapper_options(MapOptions(), [], 1.0), [])

@@ -1,4 +1,4 @@
-"""The body's reach as a check of a map without scale."""
+"""The distances between cameras are checked in a map without a metric scale."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _REACH = {("hand", "torso"): (0.1, 1.0)}
 
 
 def _walk(units_per_metre: float = 1.0, shift_m: float = 0.0, rows: slice = slice(0, 0)) -> Map:
-    """A torso that walks at 1 m/s and a hand that swings half a metre off; `rows` of it are moved."""
+    """Return a map of a torso that walks at 1 m/s and of a hand; `rows` of the hand are moved."""
     t = _TIMES["hand"] * 1e-9
     torso = np.column_stack([t, 0 * t, 0 * t + 1.2])
     hand = torso + np.column_stack([0.2 * np.sin(2 * t), 0 * t + 0.4, 0 * t - 0.3])
@@ -50,31 +50,31 @@ def _walk(units_per_metre: float = 1.0, shift_m: float = 0.0, rows: slice = slic
 
 
 @pytest.mark.parametrize("units_per_metre", [0.1, 1.0, 10.0])
-def test_scale_changes_no_verdict(units_per_metre: float) -> None:
+def test_the_result_does_not_depend_on_the_scale(units_per_metre: float) -> None:
     right = check_distances(_walk(units_per_metre), _TIMES, _REACH)
-    assert right.judged
-    assert right.explained == 1.0
-    assert not right.violating.any()
+    assert right.is_conclusive
+    assert right.within_reach == 1.0
+    assert not right.violations.any()
     # A hand 15 m off for four keyframes: 0.5 m and 15 m cannot both lie within a factor of ten.
     wrong = check_distances(_walk(units_per_metre, 15.0, slice(10, 14)), _TIMES, _REACH)
-    assert wrong.judged
-    assert np.flatnonzero(wrong.violating).tolist()[:4] == list(range(10, 14))
+    assert wrong.is_conclusive
+    assert np.flatnonzero(wrong.violations).tolist()[:4] == list(range(10, 14))
     assert wrong.to_log() == check_distances(_walk(1.0, 15.0, slice(10, 14)), _TIMES, _REACH).to_log()
 
 
-def test_one_keyframe_off_is_noise_and_half_of_them_no_body() -> None:
-    assert not check_distances(_walk(1.0, 15.0, slice(12, 13)), _TIMES, _REACH).violating.any()
+def test_one_keyframe_off_is_noise_and_half_of_them_off_is_inconclusive() -> None:
+    assert not check_distances(_walk(1.0, 15.0, slice(12, 13)), _TIMES, _REACH).violations.any()
     folded = _walk(1.0, 15.0, slice(0, 15))
-    verdict = check_distances(folded, _TIMES, _REACH)
-    assert not verdict.judged
-    assert not verdict.violating.any()
-    assert "no scale" in str(verdict.to_log()["reason"])
+    result = check_distances(folded, _TIMES, _REACH)
+    assert not result.is_conclusive
+    assert not result.violations.any()
+    assert "no scale" in str(result.to_log()["reason"])
 
 
-def test_without_instants_in_common_nothing_is_said() -> None:
+def test_without_common_instants_the_check_is_inconclusive() -> None:
     later = {"hand": _TIMES["hand"], "torso": _TIMES["torso"] + 10**12}
-    assert not check_distances(_walk(), later, _REACH).judged
-    assert not check_distances(replace(_walk(), gauge="h"), _TIMES, {}).judged
+    assert not check_distances(_walk(), later, _REACH).is_conclusive
+    assert not check_distances(replace(_walk(), gauge="h"), _TIMES, {}).is_conclusive
 
 
 def test_the_best_scale_lies_in_most_intervals() -> None:
@@ -91,17 +91,17 @@ def test_reach_of_the_standard_body() -> None:
     far = {(a, b): high for a, b, _, high in rows}
     assert len(rows) == 6
     assert all(0 < low < high for _, _, low, high in rows)
-    # Arm span is stature, wrists 11 % of it inside on either side; 15 % and 5 cm of slack, and the mounts.
+    # The arm span equals the stature; wrists are 11 % inside on either side. Add 15 %, 5 cm and the mounts.
     assert 1.4 < far["left_palm", "right_palm"] < 2.4
     assert far["left_arm", "torso"] < far["left_palm", "torso"] < far["left_palm", "right_palm"]
 
 
-def test_a_map_that_its_pairs_contradict_is_refused() -> None:
-    links = [PairConsistency(0, other, 50, 1.0) for other in range(1, 8)] + [
+def test_a_map_that_contradicts_its_pairs_is_refused() -> None:
+    pairs = [PairConsistency(0, other, 50, 1.0) for other in range(1, 8)] + [
         PairConsistency(0, other, 50, 0.1) for other in (8, 9, 10)
     ]
-    assert inconsistent_match_ratio(links) == pytest.approx(0.3)
+    assert inconsistent_match_ratio(pairs) == pytest.approx(0.3)
     assert check_consistency(0.05, None) is None
-    error = check_consistency(inconsistent_match_ratio(links), {"reason": "no scale fits"})
+    error = check_consistency(inconsistent_match_ratio(pairs), {"reason": "no scale fits"})
     assert error is not None
     assert re.search(r"30% .* look the same .* no scale fits", error.message)

@@ -1,4 +1,4 @@
-"""A camera whose picture is flipped is found out by what it shares with the others."""
+"""A camera with a flipped picture is found by its matches with other cameras."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
+    CameraKeyframes,
     add_keyframes,
     read_image_ids,
     read_keypoint_colours,
@@ -41,7 +42,7 @@ from bodycap_batch.tasks.inputs import ArtefactRef
 
 
 def _wall() -> np.ndarray:
-    """A wall (480,1600) of blots that are the same in no mirror."""
+    """Return a wall (480,1600) of irregular blots, which differ from their mirror images."""
     rng = np.random.default_rng(5)
     wall = np.full((480, 1600), 120, np.uint8)
     for x, y, shade in zip(
@@ -56,7 +57,7 @@ WALL = _wall()
 
 
 class _Pan:
-    """A camera that pans along the wall, from somewhere, perhaps mirrored; or sees another wall."""
+    """A camera that pans along the wall from `start`; its picture may be mirrored or upside down."""
 
     mask = None
 
@@ -79,7 +80,7 @@ class _Pan:
 
 
 def _workspace(folder: Path, *cameras: _Pan) -> list[KeyframeSelection]:
-    """A database of the cameras' keyframes in a folder, and what was selected."""
+    """Write a database of the cameras' keyframes into a folder, and return the selections."""
     folder.mkdir(exist_ok=True)
     with pycolmap.Database.open(str(folder / DATABASE_NAME)) as database:
         lens = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[420.0, 420.0, 320.0, 240.0])
@@ -88,23 +89,23 @@ def _workspace(folder: Path, *cameras: _Pan) -> list[KeyframeSelection]:
             rig = pycolmap.Rig()
             rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, each))
             database.write_rig(rig)
-    wanted = [
-        (cast(CaptureCamera, camera), number, camera.frames)
+    keyframes = [
+        CameraKeyframes(cast(CaptureCamera, camera), number, camera.frames)
         for camera, number in zip(cameras, ids, strict=True)
     ]
-    add_keyframes(folder, wanted, MapOptions(), StageContext(work_dir=folder, threads=1))
+    add_keyframes(folder, keyframes, MapOptions(), StageContext(work_dir=folder, threads=1))
     chosen: list[Any] = [SimpleNamespace(camera=camera.name, frames=camera.frames) for camera in cameras]
     return cast(list[KeyframeSelection], chosen)
 
 
-def _left(folder: Path, *cameras: _Pan) -> tuple[list[str], dict[str, Any]]:
-    """Names of the cameras that are not left out, and the log."""
+def _remaining(folder: Path, *cameras: _Pan) -> tuple[list[str], dict[str, Any]]:
+    """Return the names of the remaining cameras, and the log."""
     left, _, log = exclude_flipped_cameras(folder, _workspace(folder, *cameras), MapOptions())
     return [item.camera for item in left], log
 
 
 def _content(folder: Path) -> list[tuple[Any, ...]]:
-    """All that a database holds of its images."""
+    """Return everything that a database holds about its images."""
     with pycolmap.Database.open(str(folder / DATABASE_NAME)) as database:
         assert database.num_cameras() == database.num_rigs()
         assert database.num_images() == database.num_frames()
@@ -121,7 +122,7 @@ def _content(folder: Path) -> list[tuple[Any, ...]]:
         ]
 
 
-def test_descriptors_of_a_mirrored_picture_are_known_without_it() -> None:
+def test_descriptors_of_a_mirrored_picture_can_be_computed() -> None:
     sift = cv2.SIFT_create(500)
     image = WALL[:, :640]
 
@@ -138,15 +139,15 @@ def test_descriptors_of_a_mirrored_picture_are_known_without_it() -> None:
     assert count_ratio_test_matches(found(image, mirrored=False), there[None])[0] < 15
 
 
-def test_the_mirrored_one_of_three_is_left_out(tmp_path: Path) -> None:
+def test_the_flipped_one_of_three_cameras_is_left_out(tmp_path: Path) -> None:
     cameras = _Pan("head", 300), _Pan("left", 0, mirrored=True), _Pan("torso", 150, upside_down=True)
-    assert _left(tmp_path, *cameras) == (["head", "torso"], {FLIPPED_CAMERAS: ["left"]})
+    assert _remaining(tmp_path, *cameras) == (["head", "torso"], {FLIPPED_CAMERAS: ["left"]})
     assert "camera left shows the room mirrored" in excluded_camera_note("left")
 
 
-def test_the_database_is_then_as_if_it_had_never_been_there(tmp_path: Path) -> None:
+def test_the_database_is_the_same_as_without_the_flipped_camera(tmp_path: Path) -> None:
     head, left, torso = _Pan("head", 300), _Pan("left", 0, mirrored=True), _Pan("torso", 150)
-    _left(tmp_path / "all", left, head, torso)
+    _remaining(tmp_path / "all", left, head, torso)
     _workspace(tmp_path / "two", head, torso)
     assert _content(tmp_path / "all") == _content(tmp_path / "two")
     for folder in ("all", "two"):
@@ -154,21 +155,21 @@ def test_the_database_is_then_as_if_it_had_never_been_there(tmp_path: Path) -> N
         assert files == sorted([*(f"{number}.npy" for number in range(1, 13)), DATABASE_NAME])
 
 
-def test_cameras_that_see_the_same_way_round_are_kept(tmp_path: Path) -> None:
+def test_cameras_with_equal_orientation_are_kept(tmp_path: Path) -> None:
     cameras = _Pan("head", 300), _Pan("left", 0), _Pan("torso", 150)
-    assert _left(tmp_path, *cameras) == (["head", "left", "torso"], {})
+    assert _remaining(tmp_path, *cameras) == (["head", "left", "torso"], {})
 
 
 def test_a_camera_without_keyframes_is_kept(tmp_path: Path) -> None:
     cameras = _Pan("head", 300, count=0), _Pan("left", 0), _Pan("torso", 150)
-    assert _left(tmp_path, *cameras)[0] == ["head", "left", "torso"]
+    assert _remaining(tmp_path, *cameras)[0] == ["head", "left", "torso"]
 
 
-def test_two_that_see_mirror_images_are_both_kept_and_named(tmp_path: Path) -> None:
-    left, log = _left(tmp_path, _Pan("left", 0, mirrored=True), _Pan("torso", 150))
+def test_two_cameras_that_see_mirror_images_are_both_kept_and_named(tmp_path: Path) -> None:
+    left, log = _remaining(tmp_path, _Pan("left", 0, mirrored=True), _Pan("torso", 150))
     assert (left, log) == (["left", "torso"], {UNDECIDED_GROUPS: [[["left"], ["torso"]]]})
     (note,) = flip_notes(log)
-    assert note.startswith("cameras left and torso see mirror images of each other: that is right where")
+    assert note.startswith("cameras left and torso see mirror images of each other: that is right if")
     assert note.count("wrong") == 1
     assert note.endswith("flip it back: ffmpeg -i in -vf hflip out.mp4")
     error = add_flip_hint(EstimationError("too few", hint="film more"), log)
@@ -178,7 +179,7 @@ def test_two_that_see_mirror_images_are_both_kept_and_named(tmp_path: Path) -> N
     assert error.hint.endswith("; film more")
 
 
-def test_a_body_that_cannot_be_solved_then_tells_of_the_mirror(
+def test_the_hint_of_a_failed_merge_names_the_mirror_images(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object) -> None:
@@ -201,7 +202,7 @@ def test_a_body_that_cannot_be_solved_then_tells_of_the_mirror(
     assert str(caught.value.hint).endswith("film more")
 
 
-def test_a_first_pair_of_a_camera_that_is_left_out_is_not_used(tmp_path: Path) -> None:
+def test_an_initial_pair_of_an_excluded_camera_is_not_used(tmp_path: Path) -> None:
     cameras = _Pan("head", 300), _Pan("left", 0, mirrored=True), _Pan("torso", 150)
     named = MapOptions(init_frames=("left:1", "torso:2"))
     _, options, log = exclude_flipped_cameras(tmp_path, _workspace(tmp_path, *cameras), named)
@@ -210,8 +211,8 @@ def test_a_first_pair_of_a_camera_that_is_left_out_is_not_used(tmp_path: Path) -
     assert "map.init_frames names camera left, which is left out: it is not used" in flip_notes(log)
 
 
-def _told(evidence: dict[str, int]) -> tuple[set[str], list[list[list[str]]]]:
-    """The judgement on five cameras of one letter; it is the same in whatever order they come."""
+def _labels(evidence: dict[str, int]) -> tuple[set[str], list[list[list[str]]]]:
+    """Label five cameras with names of one letter; the result must not depend on their order."""
     found = [
         label_cameras(cameras, {(pair[0], pair[1]): each for pair, each in evidence.items()})
         for cameras in permutations("abcde")
@@ -220,14 +221,14 @@ def _told(evidence: dict[str, int]) -> tuple[set[str], list[list[list[str]]]]:
     return found[0]
 
 
-def test_a_tie_of_two_leaves_the_other_cameras_judged() -> None:
-    assert _told({"ab": 90, "ae": -80, "cd": -300}) == ({"e"}, [[["c"], ["d"]]])
-    assert _told({"ab": 90, "cd": 80, "ac": -70}) == (set(), [[["a", "b"], ["c", "d"]]])
+def test_a_tie_of_two_cameras_does_not_affect_the_others() -> None:
+    assert _labels({"ab": 90, "ae": -80, "cd": -300}) == ({"e"}, [[["c"], ["d"]]])
+    assert _labels({"ab": 90, "cd": 80, "ac": -70}) == (set(), [[["a", "b"], ["c", "d"]]])
 
 
-def test_evidence_that_contradicts_itself_leaves_nobody_out() -> None:
-    assert _told({"ab": 100, "bc": 100, "ac": -90, "cd": 100}) == (set(), [[["a"], ["c"]]])
-    # Three times as strong is believed: b, c and d agree with a, whatever a and c seem to say.
-    assert _told({"ab": 300, "bc": 300, "ac": -90, "cd": 100, "ae": -100}) == ({"e"}, [])
-    assert _told({"ab": -300, "bc": -290, "ac": -100}) == (set(), [[["a"], ["b"]]])
-    assert _told({"ab": -300, "bc": -290, "ac": -70}) == ({"b"}, [])
+def test_contradictory_evidence_excludes_no_camera() -> None:
+    assert _labels({"ab": 100, "bc": 100, "ac": -90, "cd": 100}) == (set(), [[["a"], ["c"]]])
+    # Evidence three times as strong wins: b, c and d agree with a, in spite of the pair of a and c.
+    assert _labels({"ab": 300, "bc": 300, "ac": -90, "cd": 100, "ae": -100}) == ({"e"}, [])
+    assert _labels({"ab": -300, "bc": -290, "ac": -100}) == (set(), [[["a"], ["b"]]])
+    assert _labels({"ab": -300, "bc": -290, "ac": -70}) == ({"b"}, [])

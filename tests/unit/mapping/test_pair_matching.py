@@ -1,4 +1,4 @@
-"""Matching and verification of keyframe pairs on drawn features."""
+"""Matching and verification of pairs of keyframes with synthetic features."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _NONE = np.zeros((0, 128), np.uint8)
 
 
 def _unit_bytes(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Descriptors of length 512, as extraction writes them."""
+    """Return descriptors of length 512, like those of the feature extraction."""
     raw = rng.exponential(1.0, (count, 128))
     return np.round(512 * np.sqrt(raw / raw.sum(axis=1, keepdims=True))).clip(0, 255).astype(np.float32)
 
@@ -29,7 +29,7 @@ def test_features_seen_twice_are_matched_and_nothing_else() -> None:
     assert found.tolist() == [[60 + row, row] for row in range(60)]
 
 
-def test_a_feature_with_two_likenesses_is_left_out() -> None:
+def test_an_ambiguous_feature_is_left_out() -> None:
     rng = np.random.default_rng(1)
     first = _unit_bytes(rng, 40)
     twice = np.concatenate([first, first[:10]])
@@ -37,7 +37,7 @@ def test_a_feature_with_two_likenesses_is_left_out() -> None:
     assert sorted(found[:, 0]) == list(range(10, 40))
 
 
-def test_of_two_features_equally_near_to_a_third_the_first_has_it() -> None:
+def test_of_two_features_equally_near_to_a_third_the_first_is_matched() -> None:
     rng = np.random.default_rng(4)
     second = _unit_bytes(rng, 40)
     first = np.concatenate([second[:1], second])
@@ -55,7 +55,7 @@ def test_the_order_of_sums_does_not_matter() -> None:
 def _two_views(
     rng: np.random.Generator, *, calibrated: bool
 ) -> tuple[KeyframeFeatures, KeyframeFeatures, IntArray, int]:
-    """100 right matches between two views 0.5 apart with half a pixel of noise, then 100 wrong ones."""
+    """Return two views 0.5 apart with 100 right matches (half a pixel of noise), then 100 wrong ones."""
     points = rng.uniform((-2, -1.5, 3), (2, 1.5, 6), (100, 3))
     turned = points @ so3_exp(np.array([0.02, 0.15, -0.03])).T + (0.5, 0.05, 0.1)
     pixels = [_LENS.project(each) + rng.normal(0, 0.5, (100, 2)) for each in (points, turned)]
@@ -72,24 +72,24 @@ def _view(pixels: FloatArray, calibrated: bool) -> KeyframeFeatures:
 
 
 @pytest.mark.parametrize("calibrated", [True, False])
-def test_verification_keeps_what_one_motion_explains(calibrated: bool) -> None:
+def test_verification_keeps_the_matches_of_one_motion(calibrated: bool) -> None:
     a, b, matches, right = _two_views(np.random.default_rng(3), calibrated=calibrated)
     kept = verify_pair(matches, a, b)
-    # 4 px is 8 sigma: nothing right is lost. A stray match hits a band of 8 px out of 480 by chance 2 %
-    # of the time; 12 of 100 would be five sigma above that.
+    # 4 px is 8 sigma, so no right match is lost. A wrong match lies in a band of 8 of 480 px with a
+    # probability of 2 %; 12 of 100 would be five sigma above that.
     assert set(range(right)) <= set(kept[:, 0].tolist())
     assert len(kept) <= right + 12
     assert kept.tolist() == verify_pair(matches, a, b).tolist()
 
 
-def test_unrelated_views_do_not_hold() -> None:
+def test_unrelated_views_are_not_verified() -> None:
     a, b, matches, right = _two_views(np.random.default_rng(4), calibrated=True)
-    # Of 100 strays, one essential matrix picked among 400 explains a dozen or two; a hundred never.
+    # The best of 400 essential matrices explains a dozen or two of 100 wrong matches, never all.
     assert len(verify_pair(matches[right:], a, b)) < 40
     assert len(verify_pair(matches[:14], a, b)) == 0
 
 
-def test_a_known_lens_beside_an_unknown_one_is_verified_in_pixels() -> None:
+def test_a_calibrated_and_an_uncalibrated_camera_are_verified_in_pixels() -> None:
     a, _, matches, right = _two_views(np.random.default_rng(3), calibrated=True)
     _, b, _, _ = _two_views(np.random.default_rng(3), calibrated=False)
     kept = verify_pair(matches, a, b)
@@ -98,7 +98,7 @@ def test_a_known_lens_beside_an_unknown_one_is_verified_in_pixels() -> None:
 
 
 @pytest.mark.parametrize("calibrated", [True, False])
-def test_a_fit_that_fails_inside_opencv_does_not_hold(
+def test_a_fit_that_fails_inside_opencv_verifies_nothing(
     calibrated: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def failing(*_: object) -> None:

@@ -1,4 +1,4 @@
-"""Given lenses that the map contradicts are found along with it, where that gives the better map."""
+"""Given intrinsics that the map contradicts are refined if that gives a better map."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ CAPTURE = Capture(
 
 
 def _mapped(error_px: float, misfits: dict[str, float], zoom: float = 1.0) -> MapResult:
-    """A map with that error; the palm's lens is off by a factor."""
+    """Return a map with a mean error; the focal length of the palm's camera is off by a factor."""
     scene = small_map(noise_px=error_px)
     lens = scene.cameras["left_palm"]
     zoomed = replace(lens, params=lens.params * [zoom, zoom, 1.0, 1.0])
@@ -50,7 +50,7 @@ def _mapped(error_px: float, misfits: dict[str, float], zoom: float = 1.0) -> Ma
     return MapResult(maps=(scene,), workspace=Path(), log={"misfitting_lenses": misfits})
 
 
-def test_a_sensor_that_lies_sideways_does_so_behind_any_lens() -> None:
+def test_new_intrinsics_keep_the_direction_of_the_sensor() -> None:
     palm = CAPTURE.camera("left_palm")
     turned = replace(palm, camera=replace(palm.camera, sideways=True))
     capture = replace(CAPTURE, cameras=(turned, CAPTURE.camera("torso")))
@@ -59,7 +59,7 @@ def test_a_sensor_that_lies_sideways_does_so_behind_any_lens() -> None:
     assert {each.name: each.camera.sideways for each in later.cameras} == {"left_palm": True, "torso": False}
 
 
-def test_a_contradicted_lens_starts_from_what_fits_and_is_refined() -> None:
+def test_misfit_intrinsics_start_from_the_focal_length_that_fits() -> None:
     seen = []
 
     def build(capture: Capture) -> MapResult:
@@ -70,7 +70,7 @@ def test_a_contradicted_lens_starts_from_what_fits_and_is_refined() -> None:
     (capture,) = seen
     assert not capture.camera("left_palm").calibrated
     start = capture.camera("left_palm").camera
-    # As if the lens were not given: mapping looks for its kind, too.
+    # As for an uncalibrated camera: mapping selects the camera model, too.
     assert (start.model, start.refine) == ("SIMPLE_RADIAL", True)
     assert np.allclose(start.params, [1.31 * 485, 318, 242, 0])
     assert capture.camera("torso") is CAPTURE.camera("torso")
@@ -84,7 +84,7 @@ def test_a_contradicted_lens_starts_from_what_fits_and_is_refined() -> None:
 
 
 @pytest.mark.parametrize("again", [_mapped(1.0, {}), None], ids=["a worse map", "no map"])
-def test_the_given_lens_stays_where_freeing_it_gives_no_better_map(again: MapResult | None) -> None:
+def test_the_given_intrinsics_stay_if_refinement_gives_no_better_map(again: MapResult | None) -> None:
     def build(capture: Capture) -> MapResult:
         if again is None:
             raise EstimationError("nothing holds", hint="x")
@@ -99,7 +99,7 @@ def test_the_given_lens_stays_where_freeing_it_gives_no_better_map(again: MapRes
 
 
 def _without_palm(mapped: MapResult) -> MapResult:
-    """The same after all keyframes of the palm's camera were cut out."""
+    """Return the same map without the keyframes of the palm's camera."""
     scene = mapped.maps[0]
     rows = [row for row, name in enumerate(scene.keyframe_camera) if name == "torso"]
     seen = np.isin(scene.obs_keyframe, rows)
@@ -117,7 +117,7 @@ def _without_palm(mapped: MapResult) -> MapResult:
     return replace(mapped, maps=(less,))
 
 
-def test_a_freed_lens_outlives_its_cameras_keyframes() -> None:
+def test_refined_intrinsics_outlast_the_keyframes_of_their_camera() -> None:
     found = recalibrate_if_misfit(
         _mapped(0.9, {"left_palm": 1.31}), CAPTURE, lambda capture: _mapped(0.5, {}, zoom=1.33)
     )
@@ -127,7 +127,7 @@ def test_a_freed_lens_outlives_its_cameras_keyframes() -> None:
     assert json.loads(json.dumps(found.log)) == found.log
 
 
-def test_a_map_that_loses_the_contradicted_camera_is_no_better() -> None:
+def test_a_map_that_loses_the_misfit_camera_is_not_better() -> None:
     first = _mapped(0.9, {"left_palm": 1.31})
     found = recalibrate_if_misfit(first, CAPTURE, lambda capture: _without_palm(_mapped(0.5, {})))
     assert found.maps == first.maps
@@ -135,7 +135,7 @@ def test_a_map_that_loses_the_contradicted_camera_is_no_better() -> None:
     assert found.log["freeing_refused"] == {"keyframes": {"torso": 3}, "mean_error_px": 0.5}
 
 
-def test_a_map_that_cannot_be_used_is_refused_after_its_lenses_were_freed() -> None:
+def test_an_unusable_map_is_refused_only_after_refinement() -> None:
     refused = EstimationError("30% of the matches contradict the map", hint="x")
     bad = _mapped(0.4, {"left_palm": 1.31})
     found = recalibrate_if_misfit(bad, CAPTURE, lambda capture: _mapped(0.5, {}, zoom=1.33), refused)
@@ -146,7 +146,9 @@ def test_a_map_that_cannot_be_used_is_refused_after_its_lenses_were_freed() -> N
         recalibrate_if_misfit(_mapped(0.4, {}), CAPTURE, lambda capture: pytest.fail("built"), refused)
 
 
-def test_freeing_is_tried_before_a_map_is_given_up(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_refinement_is_tried_before_a_map_is_given_up(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     refused = EstimationError("30% of the matches contradict the map", hint="x")
 
     def built(capture: Capture, *_: object) -> tuple[MapResult, EstimationError | None]:
@@ -162,6 +164,6 @@ def test_freeing_is_tried_before_a_map_is_given_up(monkeypatch: pytest.MonkeyPat
         build.build_map(CAPTURE, [], MapOptions(), StageContext(work_dir=tmp_path))
 
 
-def test_lenses_that_fit_cost_no_second_map() -> None:
+def test_intrinsics_that_fit_cost_no_second_map() -> None:
     first = _mapped(0.5, {})
     assert recalibrate_if_misfit(first, CAPTURE, lambda capture: pytest.fail("built again")) is first

@@ -1,4 +1,4 @@
-"""A block of keyframes in the wrong place is found through the pairs it contradicts, and put right."""
+"""Misregistered keyframes are found through inconsistent pairs, and repaired."""
 
 from __future__ import annotations
 
@@ -17,9 +17,11 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.mapping import build
-from bodycap_batch.mapping.build import reconstruct_with_intrinsics
+from bodycap_batch.mapping import initial_models
+from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
+from bodycap_batch.mapping.initial_models import reconstruct_with_intrinsics
 from bodycap_batch.mapping.intrinsics import intrinsics_check
+from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     ImageRef,
@@ -31,7 +33,8 @@ from bodycap_batch.mapping.matching.pair_matching import find_mutual_matches, ma
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, adjust_robustly
 from bodycap_batch.mapping.reconstruction.incremental_mapper import register_images
 from bodycap_batch.mapping.reconstruction.initial_pair import find_user_pair, rank_initial_pairs
-from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options, reconstruct
+from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
+from bodycap_batch.mapping.reconstruction.reconstruct import reconstruct
 from bodycap_batch.mapping.validation.epipolar_consistency import (
     PairConsistency,
     evaluate_pairs,
@@ -39,30 +42,29 @@ from bodycap_batch.mapping.validation.epipolar_consistency import (
 )
 from bodycap_batch.mapping.validation.repair import re_register_images, remove_misregistered, repair_model
 from bodycap_batch.mapping.validation.transient_points import remove_transient_points
-from bodycap_batch.mapping.workspace import MappingContext
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import align_points, invert, make_transform, so3_exp
 
-_LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
-_LENSES = {"cam": (_LENS, True)}
+_CAMERA = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
+_INTRINSICS = {"cam": CameraIntrinsics(_CAMERA, calibrated=True)}
 _KEYFRAMES = 16
 _NUMBERS = {"cam": np.arange(30, 30 + _KEYFRAMES)}
-"""Frames before start_s are counted, too: users name what they see in their video."""
+"""Frame numbers of the whole video, also before start_s: users name the frames that they see."""
 _MOVED = (6, 7, 8)
 
 
-def test_the_misplaced_are_doubted_not_their_partners() -> None:
-    links = [PairConsistency(a, b, 100, 1.0) for a in range(10) for b in range(a)]
-    assert find_misregistered_images(links) == set()
+def test_misregistered_images_are_found_but_not_their_partners() -> None:
+    pairs = [PairConsistency(a, b, 100, 1.0) for a in range(10) for b in range(a)]
+    assert find_misregistered_images(pairs) == set()
     wrong = [
         PairConsistency(x.first, x.second, 100, 0.1 if (x.first in (4, 5)) != (x.second in (4, 5)) else 1.0)
-        for x in links
+        for x in pairs
     ]
     assert find_misregistered_images(wrong) == {4, 5}
 
 
 def _poses() -> FloatArray:
-    """cam_from_map of keyframes that go sideways along a wall 4 ahead."""
+    """Return cam_from_map of keyframes that move sideways along a wall at a distance of 4."""
     out = []
     for step in range(_KEYFRAMES):
         turn = so3_exp(np.array([0.0, 0.1 * np.sin(step), 0.02 * step]))
@@ -71,7 +73,7 @@ def _poses() -> FloatArray:
 
 
 def _workspace(folder: Path) -> FloatArray:
-    """Keyframes with features of a bumpy wall, half a pixel of noise; true poses."""
+    """Write keyframes with features of a bumpy wall (half a pixel of noise), and return their true poses."""
     rng = np.random.default_rng(0)
     points = rng.uniform((-3, -3, 3), (7, 3, 5), (900, 3))
     raw = rng.exponential(1.0, (len(points), 128))
@@ -79,7 +81,7 @@ def _workspace(folder: Path) -> FloatArray:
     camera = CaptureCamera(
         name="cam",
         chapters=(),
-        camera=_LENS,
+        camera=_CAMERA,
         calibrated=True,
         frame_numbers=np.arange(99),
         times_ns=np.arange(99) * 10**8,
@@ -91,7 +93,7 @@ def _workspace(folder: Path) -> FloatArray:
     with pycolmap.Database.open(str(folder / DATABASE_NAME)) as database:
         camera_id = add_camera(database, camera)
         for frame, pose in enumerate(poses):
-            pixels = _LENS.project(points @ pose[:3, :3].T + pose[:3, 3])
+            pixels = _CAMERA.project(points @ pose[:3, :3].T + pose[:3, 3])
             seen = np.flatnonzero(((pixels > 0) & (pixels < (640, 480))).all(axis=1))
             image_id = write_image(database, ImageRef("cam", frame), camera_id)
             noisy = pixels[seen] + rng.normal(0, 0.5, (len(seen), 2))
@@ -109,31 +111,31 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, FloatArray, Ma
     context = StageContext(work_dir=folder, threads=2)
     refs = [ImageRef("cam", frame) for frame in range(_KEYFRAMES)]
     pairs = [(a, b) for a in refs for b in refs if a < b and b.frame - a.frame <= 5]
-    assert len(match_pairs(folder, pairs, _LENSES, context)) > 50
-    shop = MappingContext(
+    assert len(match_pairs(folder, pairs, _INTRINSICS, context)) > 50
+    mapping = MappingContext(
         workspace=folder,
-        lenses=_LENSES,
-        settings=lambda: mapper_options(MapOptions(), [1], 1.0),
-        constant=[1],
-        context=context,
+        intrinsics=_INTRINSICS,
+        mapper_options=lambda: make_mapper_options(MapOptions(), [1], 1.0),
+        calibrated_ids=[1],
+        stage=context,
         frame_numbers=_NUMBERS,
     )
-    models, _ = reconstruct(folder, shop.settings(), context, _KEYFRAMES)
-    return models[0], poses, shop, set(pairs)
+    models, _ = reconstruct(folder, mapping.mapper_options(), context, _KEYFRAMES)
+    return models[0], poses, mapping, set(pairs)
 
 
 def _rms(model: Any, poses: FloatArray) -> float:
-    """Error of the keyframes' centres after alignment, in the scene's unit."""
+    """Return the error of the keyframe positions after alignment, in the scene's unit."""
     refs = {ImageRef.parse(model.image(i).name).frame: i for i in model.reg_image_ids()}
     found = np.array([model.image(refs[frame]).projection_center() for frame in sorted(refs)])
     true = invert(poses)[sorted(refs), :3, 3]
     return float(np.sqrt(((align_points(found, true).apply(found) - true) ** 2).sum(axis=1).mean()))
 
 
-def test_a_map_that_stands_is_adjusted_once_more(
+def test_a_complete_map_is_adjusted_once(
     built: tuple[Any, FloatArray, MappingContext, set[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _, poses, shop, _ = built
+    _, poses, mapping, _ = built
     sizes: list[int] = []
     adjust_all = pycolmap.IncrementalMapper.iterative_global_refinement
 
@@ -142,28 +144,30 @@ def test_a_map_that_stands_is_adjusted_once_more(
         adjust_all(mapper, *arguments, **options)
 
     monkeypatch.setattr(pycolmap.IncrementalMapper, "iterative_global_refinement", counted)
-    settings, model = shop.settings(), pycolmap.Reconstruction()
-    settings.init_image_id1, settings.init_image_id2 = rank_initial_pairs(shop.workspace, shop.lenses)[0].ids
+    settings, model = mapping.mapper_options(), pycolmap.Reconstruction()
+    settings.init_image_id1, settings.init_image_id2 = rank_initial_pairs(
+        mapping.workspace, mapping.intrinsics
+    )[0].ids
     settings.mapper.init_min_tri_angle = 2.0
-    assert register_images(shop.workspace, settings, model, lambda: None)
+    assert register_images(mapping.workspace, settings, model, lambda: None)
     assert model.num_reg_images() == _KEYFRAMES
     assert _rms(model, poses) < 0.01
     assert sizes[-1] == _KEYFRAMES
-    # No size twice: nothing is adjusted again where nothing was added.
+    # No size occurs twice: nothing is adjusted again if nothing was added.
     assert len(set(sizes)) == len(sizes)
 
 
-def test_an_empty_map_without_a_pair_to_begin_with_is_no_bug(tmp_path: Path) -> None:
+def test_an_empty_map_without_an_initial_pair_is_no_bug(tmp_path: Path) -> None:
     with pycolmap.Database.open(str(tmp_path / DATABASE_NAME)):
         pass
-    settings = mapper_options(MapOptions(), [], 1.0)
+    settings = make_mapper_options(MapOptions(), [], 1.0)
     assert not register_images(tmp_path, settings, pycolmap.Reconstruction(), lambda: None)
 
 
-def test_long_tracks_are_settled_by_conjugate_gradients_to_the_same_map(
+def test_conjugate_gradients_give_the_same_map_as_the_direct_solver(
     built: tuple[Any, FloatArray, MappingContext, set[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model, poses, shop, _ = built
+    model, poses, mapping, _ = built
     centres, solvers = [], []
     create = pycolmap.create_default_bundle_adjuster
 
@@ -176,113 +180,113 @@ def test_long_tracks_are_settled_by_conjugate_gradients_to_the_same_map(
         monkeypatch.setattr(
             "bodycap_batch.mapping.reconstruction.bundle_adjustment._MAX_DIRECT_TRACK_LENGTH", limit
         )
-        settled = copy.deepcopy(model)
-        adjust_robustly(settled, shop.settings(), shop.constant)
-        assert _rms(settled, poses) < 0.01
-        found = sorted(settled.reg_image_ids())
-        centres.append(np.array([settled.image(image).projection_center() for image in found]))
+        adjusted = copy.deepcopy(model)
+        adjust_robustly(adjusted, mapping.mapper_options(), mapping.calibrated_ids)
+        assert _rms(adjusted, poses) < 0.01
+        found = sorted(adjusted.reg_image_ids())
+        centres.append(np.array([adjusted.image(image).projection_center() for image in found]))
     assert solvers[0] < _KEYFRAMES < solvers[1]
-    # Half a pixel makes 5 mm a point: a hundredth of what the noise leaves open.
+    # Half a pixel makes 5 mm for each point. This is a hundredth of the uncertainty from noise.
     off = align_points(centres[0], centres[1]).apply(centres[0]) - centres[1]
     assert np.linalg.norm(off, axis=1).max() < 1e-4
 
 
-def test_a_right_map_is_left_alone(built: tuple[Any, FloatArray, MappingContext, set[Any]]) -> None:
-    model, poses, shop, pairs = built
+def test_a_right_map_is_not_changed(built: tuple[Any, FloatArray, MappingContext, set[Any]]) -> None:
+    model, poses, mapping, pairs = built
     assert model.num_reg_images() == _KEYFRAMES
-    # Half a pixel at depth 4 and 420 px is 5 mm a point; a pose has dozens.
+    # Half a pixel at depth 4 and 420 px makes 5 mm for each point; a pose has dozens.
     assert _rms(model, poses) < 0.01
-    same, log = repair_model(model, set(pairs), shop)
+    same, log = repair_model(model, set(pairs), mapping)
     assert same is model
     assert log == {"rounds": [], "cut": [], "contradicted_share": 0.0}
 
 
-def test_a_misplaced_block_is_found_and_put_right(
+def test_a_misregistered_block_is_found_and_repaired(
     built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:
-    model, poses, shop, pairs = built
-    ids = {ref.frame: number for ref, number in _ids(shop).items()}
+    model, poses, mapping, pairs = built
+    ids = {ref.frame: number for ref, number in _ids(mapping).items()}
     wrong = _with_moved_block(model, ids)
     assert _rms(wrong, poses) > 0.1
-    assert find_misregistered_images(evaluate_pairs(shop.workspace, wrong)) == {
+    assert find_misregistered_images(evaluate_pairs(mapping.workspace, wrong)) == {
         ids[frame] for frame in _MOVED
     }
-    mended, log = repair_model(wrong, set(pairs), shop)
+    repaired, log = repair_model(wrong, set(pairs), mapping)
     assert log["cut"] == []
-    assert mended.num_reg_images() == _KEYFRAMES
-    assert _rms(mended, poses) < 0.01
+    assert repaired.num_reg_images() == _KEYFRAMES
+    assert _rms(repaired, poses) < 0.01
 
 
-def test_what_cannot_be_put_right_is_cut_out(
+def test_keyframes_that_cannot_be_repaired_are_removed(
     built: tuple[Any, FloatArray, MappingContext, set[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model, poses, shop, pairs = built
-    wrong = _with_moved_block(model, {ref.frame: number for ref, number in _ids(shop).items()})
-    # The mapper places it in the same wrong place again.
+    model, poses, mapping, pairs = built
+    wrong = _with_moved_block(model, {ref.frame: number for ref, number in _ids(mapping).items()})
+    # The mapper registers the block with the same wrong poses again.
     module = sys.modules[repair_model.__module__]
-    monkeypatch.setattr(module, "extend", lambda *_: pycolmap.Reconstruction(wrong))
-    monkeypatch.setattr(module, "refine", lambda *_: None)
-    refs = sorted(_ids(shop))
-    alone, names = remove_misregistered(wrong, shop)
+    monkeypatch.setattr(module, "with_new_images", lambda *_, **__: pycolmap.Reconstruction(wrong))
+    monkeypatch.setattr(module, "adjust_and_filter", lambda *_: None)
+    refs = sorted(_ids(mapping))
+    alone, names = remove_misregistered(wrong, mapping)
     assert names == [f"cam/{frame:07d}" for frame in _MOVED]
     assert alone.num_reg_images() == _KEYFRAMES - len(_MOVED)
-    assert remove_misregistered(model, shop)[1] == []
-    cut, log = repair_model(wrong, pairs | {(a, b) for a in refs for b in refs if a < b}, shop)
+    assert remove_misregistered(model, mapping)[1] == []
+    cut, log = repair_model(wrong, pairs | {(a, b) for a in refs for b in refs if a < b}, mapping)
     assert log["cut"] == [f"cam/{frame:07d}" for frame in _MOVED]
     assert cut.num_reg_images() == _KEYFRAMES - len(_MOVED)
     assert _rms(cut, poses) < 0.01
 
 
-def test_keyframes_are_placed_again_against_the_rest(
+def test_keyframes_are_registered_again_against_the_rest(
     built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:
-    model, poses, shop, _ = built
-    ids = {ref.frame: number for ref, number in _ids(shop).items()}
+    model, poses, mapping, _ = built
+    ids = {ref.frame: number for ref, number in _ids(mapping).items()}
     wrong = _with_moved_block(model, ids)
-    placed = re_register_images(wrong, {ids[frame] for frame in _MOVED}, shop, _KEYFRAMES)
+    placed = re_register_images(wrong, {ids[frame] for frame in _MOVED}, mapping, _KEYFRAMES)
     assert placed.num_reg_images() == _KEYFRAMES
     assert _rms(placed, poses) < 0.01
 
 
-def test_points_of_a_moment_are_dropped_where_others_carry_the_keyframes(
+def test_transient_points_are_removed_if_enough_others_remain(
     built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:
-    model, poses, shop, _ = built
+    model, poses, mapping, _ = built
     seen_ns = np.arange(_KEYFRAMES) * 300_000_000
     some = pycolmap.Reconstruction(model)
     before = {image: some.image(image).num_points3D for image in some.reg_image_ids()}
-    dropped = remove_transient_points(some, {"cam": seen_ns})
-    assert 0 < dropped == model.num_points3D() - some.num_points3D()
-    # Points seen in keyframes more than three apart are confirmed; all others that can be spared are gone.
+    removed = remove_transient_points(some, {"cam": seen_ns})
+    assert 0 < removed == model.num_points3D() - some.num_points3D()
+    # Points in keyframes more than three apart are static. Others are removed if enough static ones remain.
     for image in some.reg_image_ids():
         assert some.image(image).num_points3D >= min(20, before[image])
-    adjust_and_filter(some, shop.settings(), shop.constant)
+    adjust_and_filter(some, mapping.mapper_options(), mapping.calibrated_ids)
     assert _rms(some, poses) < 0.01
     assert remove_transient_points(pycolmap.Reconstruction(model), {"cam": seen_ns * 10}) == 0
-    # All in one moment: nothing is confirmed, so nothing can be spared.
+    # All keyframes at nearly one time: no point is static, so none can be removed.
     assert remove_transient_points(pycolmap.Reconstruction(model), {"cam": seen_ns // 100}) == 0
 
 
 @pytest.mark.parametrize(("share", "gain"), [(0.0, 0.6), (0.25, 1.4)])
-def test_keypoints_that_lie_off_bend_no_settled_map(
+def test_outlying_keypoints_do_not_bend_a_robustly_adjusted_map(
     built: tuple[Any, FloatArray, MappingContext, set[Any]], share: float, gain: float
 ) -> None:
-    model, poses, shop, _ = built
+    model, poses, mapping, _ = built
     rng = np.random.default_rng(3)
     squared = pycolmap.Reconstruction(model)
     for image_id in squared.reg_image_ids():
         for point in squared.image(image_id).points2D:
-            # Off by less than the 4 px at which observations are taken out.
+            # By less than the 4 px at which observations are removed.
             if point.has_point3D() and rng.random() < share:
                 point.xy = point.xy + rng.uniform(2.2, 3.2) * np.array([1.0, 0.5])
-    settled = pycolmap.Reconstruction(squared)
-    adjust_and_filter(squared, shop.settings(), shop.constant)
-    adjust_robustly(settled, shop.settings(), shop.constant)
-    # Where noise is Gaussian throughout, a loss this narrow costs 1.4 times the error of squares.
-    assert gain * _rms(settled, poses) < _rms(squared, poses)
-    assert settled.num_points3D() > 0.9 * squared.num_points3D()
+    adjusted = pycolmap.Reconstruction(squared)
+    adjust_and_filter(squared, mapping.mapper_options(), mapping.calibrated_ids)
+    adjust_robustly(adjusted, mapping.mapper_options(), mapping.calibrated_ids)
+    # If all noise is Gaussian, so narrow a loss costs 1.4 times the error of a squared loss.
+    assert gain * _rms(adjusted, poses) < _rms(squared, poses)
+    assert adjusted.num_points3D() > 0.9 * squared.num_points3D()
     for image_id, image in model.images.items():
-        assert settled.image(image_id).num_points3D > 0.8 * image.num_points3D
+        assert adjusted.image(image_id).num_points3D > 0.8 * image.num_points3D
 
 
 def _with_moved_block(model: Any, ids: dict[int, int]) -> Any:
@@ -294,37 +298,41 @@ def _with_moved_block(model: Any, ids: dict[int, int]) -> Any:
     return wrong
 
 
-def _ids(shop: MappingContext) -> dict[ImageRef, int]:
-    with pycolmap.Database.open(str(shop.workspace / DATABASE_NAME)) as database:
+def _ids(mapping: MappingContext) -> dict[ImageRef, int]:
+    with pycolmap.Database.open(str(mapping.workspace / DATABASE_NAME)) as database:
         return read_image_ids(database)
 
 
-def test_starts_prefer_what_moved_sideways(built: tuple[Any, FloatArray, MappingContext, set[Any]]) -> None:
-    _, _, shop, _ = built
-    best = rank_initial_pairs(shop.workspace, _LENSES)
-    steps = [abs(int(a[-7:]) - int(b[-7:])) for a, b in (start.names for start in best)]
-    # Neighbours 0.25 apart in front of a wall at 4 have 3.5 degrees of parallax, five steps more than 8.
+def test_initial_pairs_with_sideways_movement_rank_first(
+    built: tuple[Any, FloatArray, MappingContext, set[Any]],
+) -> None:
+    _, _, mapping, _ = built
+    best = rank_initial_pairs(mapping.workspace, _INTRINSICS)
+    steps = [abs(int(a[-7:]) - int(b[-7:])) for a, b in (pair.names for pair in best)]
+    # Neighbours 0.25 apart at a distance of 4 from the wall have 3.5 degrees of parallax, five steps over 8.
     assert steps[0] >= 3
     assert best[-1].parallax_rad < best[0].parallax_rad
-    assert "parallax" in replace(best[0], parallax_rad=0.001).doubt
+    assert "parallax" in replace(best[0], parallax_rad=0.001).rejection_reason
 
 
-def test_keyframes_that_a_chosen_start_does_not_reach_make_a_model_of_their_own(tmp_path: Path) -> None:
+def test_keyframes_that_an_initial_pair_does_not_reach_make_another_model(tmp_path: Path) -> None:
     poses = _workspace(tmp_path)
     context = StageContext(work_dir=tmp_path, threads=1)
     halves = [[ImageRef("cam", frame) for frame in half] for half in (range(8), range(8, _KEYFRAMES))]
-    match_pairs(tmp_path, [(a, b) for half in halves for a in half for b in half if a < b], _LENSES, context)
-    start = rank_initial_pairs(tmp_path, _LENSES)[0]
-    settings = mapper_options(MapOptions(), [1], 1.0)
-    models, ladder = reconstruct(tmp_path, settings, context, _KEYFRAMES, [start])
-    assert ladder == [{**ladder[0], "models": [8, 8], "pair": list(start.names)}]
+    match_pairs(
+        tmp_path, [(a, b) for half in halves for a in half for b in half if a < b], _INTRINSICS, context
+    )
+    pair = rank_initial_pairs(tmp_path, _INTRINSICS)[0]
+    settings = make_mapper_options(MapOptions(), [1], 1.0)
+    models, ladder = reconstruct(tmp_path, settings, context, _KEYFRAMES, [pair])
+    assert ladder == [{**ladder[0], "models": [8, 8], "pair": list(pair.names)}]
     held = [{model.image(number).name for number in model.reg_image_ids()} for model in models]
     assert sorted(map(sorted, held)) == [[ref.name for ref in half] for half in halves]
     assert max(_rms(model, poses) for model in models) < 0.01
 
 
 def _link_one_way(folder: Path) -> None:
-    """Two halves of the walk; two keyframes of the first half see points that only the second half places."""
+    """Match two halves of the walk; two keyframes of the first observe points of the second only."""
     with pycolmap.Database.open(str(folder / DATABASE_NAME)) as database:
         ids = {ref.frame: number for ref, number in read_image_ids(database).items()}
         seen = {frame: np.asarray(database.read_descriptors(number).data) for frame, number in ids.items()}
@@ -335,50 +343,52 @@ def _link_one_way(folder: Path) -> None:
             matches = find_mutual_matches(seen[a].astype(np.float32), seen[b].astype(np.float32))
             odd = seen[a][matches[:, 0]].astype(int).sum(axis=1) % 2 == 1
             geometry: Any = pycolmap.TwoViewGeometry()
-            geometry.config = 2
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
             geometry.inlier_matches = matches[odd == (b >= 8) if a < 8 else slice(None)].astype(np.uint32)
             database.write_two_view_geometry(ids[a], ids[b], geometry)
 
 
-def test_a_start_on_the_side_that_leads_nowhere_loses_no_keyframes(tmp_path: Path) -> None:
+def test_an_initial_pair_in_the_unconnected_half_loses_no_keyframes(tmp_path: Path) -> None:
     poses = _workspace(tmp_path)
     _link_one_way(tmp_path)
     context = StageContext(work_dir=tmp_path, threads=1)
-    start = find_user_pair(tmp_path, ("cam:31", "cam:35"), _LENSES, _NUMBERS)
-    assert start is not None
-    settings = mapper_options(MapOptions(), [1], 1.0)
-    models, _ = reconstruct(tmp_path, settings, context, _KEYFRAMES, [start])
+    pair = find_user_pair(tmp_path, ("cam:31", "cam:35"), _INTRINSICS, _NUMBERS)
+    assert pair is not None
+    settings = make_mapper_options(MapOptions(), [1], 1.0)
+    models, _ = reconstruct(tmp_path, settings, context, _KEYFRAMES, [pair])
     assert [model.num_reg_images() for model in models] == [_KEYFRAMES]
     assert _rms(models[0], poses) < 0.01
 
 
 @pytest.mark.slow
-def test_a_named_start_is_used(built: tuple[Any, FloatArray, MappingContext, set[Any]]) -> None:
-    _, poses, shop, _ = built
-    start = find_user_pair(shop.workspace, ("cam:32", "cam:36"), _LENSES, _NUMBERS)
-    assert start is not None
-    assert start.names == ("cam/0000002", "cam/0000006")
-    models, ladder = reconstruct(shop.workspace, shop.settings(), shop.context, _KEYFRAMES, [start])
+def test_the_users_initial_pair_is_used(built: tuple[Any, FloatArray, MappingContext, set[Any]]) -> None:
+    _, poses, mapping, _ = built
+    pair = find_user_pair(mapping.workspace, ("cam:32", "cam:36"), _INTRINSICS, _NUMBERS)
+    assert pair is not None
+    assert pair.names == ("cam/0000002", "cam/0000006")
+    models, ladder = reconstruct(
+        mapping.workspace, mapping.mapper_options(), mapping.stage, _KEYFRAMES, [pair]
+    )
     assert ladder[-1]["pair"] == ["cam/0000002", "cam/0000006"]
     assert models[0].num_reg_images() == _KEYFRAMES
     assert _rms(models[0], poses) < 0.01
-    assert find_user_pair(shop.workspace, ("cam:30", "cam:45"), _LENSES, _NUMBERS) is None
+    assert find_user_pair(mapping.workspace, ("cam:30", "cam:45"), _INTRINSICS, _NUMBERS) is None
     with pytest.raises(JobError, match="one keyframe"):
-        find_user_pair(shop.workspace, ("cam:33", "cam:33"), _LENSES, _NUMBERS)
+        find_user_pair(mapping.workspace, ("cam:33", "cam:33"), _INTRINSICS, _NUMBERS)
     with pytest.raises(JobError, match="camera 'hat'"):
-        find_user_pair(shop.workspace, ("hat:33", "cam:33"), _LENSES, _NUMBERS)
+        find_user_pair(mapping.workspace, ("hat:33", "cam:33"), _INTRINSICS, _NUMBERS)
 
 
-def _guessed_shop(workspace: Path) -> MappingContext:
-    """What maps the keyframes of `_workspace`, their lens being a guess."""
+def _uncalibrated_context(workspace: Path) -> MappingContext:
+    """Return a context for the keyframes of `_workspace` with an uncalibrated camera."""
     _workspace(workspace)
     _link_one_way(workspace)
     return MappingContext(
         workspace=workspace,
-        lenses=_LENSES,
-        settings=lambda: mapper_options(MapOptions(), [], 1.0),
-        constant=[],
-        context=StageContext(work_dir=workspace, threads=1),
+        intrinsics=_INTRINSICS,
+        mapper_options=lambda: make_mapper_options(MapOptions(), [], 1.0),
+        calibrated_ids=[],
+        stage=StageContext(work_dir=workspace, threads=1),
         frame_numbers=_NUMBERS,
     )
 
@@ -387,15 +397,15 @@ def _radial() -> Camera:
     return Camera(model="RADIAL", width_px=640, height_px=480, params=np.array([421.0, 320, 240, 0, 0]))
 
 
-def test_a_named_start_is_used_again_where_a_guessed_lens_changes_its_model(
+def test_the_users_initial_pair_is_used_again_if_the_camera_model_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shop = _guessed_shop(tmp_path)
+    mapping = _uncalibrated_context(tmp_path)
     changed = _radial().to_pycolmap()
     changed.camera_id = 1
     monkeypatch.setattr(intrinsics_check, "select_camera_models", lambda *_: ({1: changed}, frozenset()))
     options = MapOptions(init_frames=("cam:31", "cam:35"))
-    models, log = reconstruct_with_intrinsics(shop, options, {1: "cam"}, _KEYFRAMES)
+    models, log = reconstruct_with_intrinsics(mapping, options, {1: "cam"}, _KEYFRAMES)
     assert log["better_lenses"] == {"cam": "RADIAL"}
     assert models[0].camera(1).model_name == "RADIAL"
     assert log["initial_pair_ladder"][0]["pair"] == ["cam/0000001", "cam/0000005"]
@@ -403,11 +413,11 @@ def test_a_named_start_is_used_again_where_a_guessed_lens_changes_its_model(
 
 
 @pytest.mark.parametrize("crop", [1.0, 0.9])
-def test_only_a_centre_that_was_found_off_is_found_anew(
+def test_only_a_principal_point_that_moved_is_refined_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, crop: float
 ) -> None:
-    """A calibrated centre is hardly ever the very middle of the picture."""
-    shop = _guessed_shop(tmp_path)
+    """A calibrated principal point is hardly ever exactly in the middle of the picture."""
+    mapping = _uncalibrated_context(tmp_path)
     with pycolmap.Database.open(str(tmp_path / DATABASE_NAME)) as database:
         camera = database.read_camera(1)
         camera.model, camera.params = pycolmap.CameraModelId.SIMPLE_RADIAL, [420.0, 321.5, 238.5, 0.0]
@@ -415,32 +425,32 @@ def test_only_a_centre_that_was_found_off_is_found_anew(
     freed_centre = []
 
     def cost(part: Any, settings: Any, *, centre: bool = False, **_: Any) -> float:
-        """The second radial term halves what is left; a free centre takes a hundredth, or `crop` of it."""
+        """Return a cost: a second radial term halves it, a free centre reduces it to 99 % or to `crop`."""
         freed_centre.append(centre)
         left = 50.0 if part.camera(1).model_name == "RADIAL" else 100.0
         return left * min(0.99, crop) if centre else left
 
     monkeypatch.setattr(intrinsics_check, "_adjustment_cost", cost)
     _, log = reconstruct_with_intrinsics(
-        shop, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam"}, _KEYFRAMES
+        mapping, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam"}, _KEYFRAMES
     )
     assert log["better_lenses"] == {"cam": "RADIAL"}
     first_map = [False, False, False, True, False]
     assert freed_centre == first_map + ([False, True] if crop < 0.95 else [])
 
 
-def test_the_log_holds_what_both_looks_at_the_lenses_found(
+def test_the_log_holds_the_camera_models_of_both_updates(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shop = _guessed_shop(tmp_path)
-    looks = iter([({"cam": _radial(), "hat": _radial()}, {1}), ({"cam": _radial()}, {1})])
+    mapping = _uncalibrated_context(tmp_path)
+    updates = iter([({"cam": _radial(), "hat": _radial()}, {1}), ({"cam": _radial()}, {1})])
 
-    def change(*_: Any, **__: Any) -> tuple[dict[str, tuple[Camera, bool]], set[int]]:
-        found, decentred = next(looks)
-        return {name: (camera, False) for name, camera in found.items()}, decentred
+    def change(*_: Any, **__: Any) -> tuple[dict[str, CameraIntrinsics], set[int]]:
+        found, decentred = next(updates)
+        return {name: CameraIntrinsics(camera, calibrated=False) for name, camera in found.items()}, decentred
 
-    monkeypatch.setattr(build, "change_lenses", change)
+    monkeypatch.setattr(initial_models, "update_camera_models", change)
     _, log = reconstruct_with_intrinsics(
-        shop, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam", 2: "hat"}, _KEYFRAMES
+        mapping, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam", 2: "hat"}, _KEYFRAMES
     )
     assert log["better_lenses"] == {"cam": "RADIAL", "hat": "RADIAL"}

@@ -1,4 +1,4 @@
-"""SIFT features of keyframes: where they are, in what order, and that threads change nothing."""
+"""SIFT features of keyframes: position, order, independence of the number of threads."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _CENTRES = np.array([(x, y) for y in range(40, 460, 70) for x in range(45, 620, 
 
 
 class _Blobs:
-    """A camera whose frames show dark blobs at whole pixels, each frame shifted by one more."""
+    """A camera with dark blobs at whole pixels; each frame is shifted by one pixel more."""
 
     def __init__(self, hidden_left_px: float = 0.0) -> None:
         self.mask = object() if hidden_left_px else None
@@ -50,14 +50,14 @@ def test_features_sit_on_the_blobs(tmp_path: Path, frame: int) -> None:
     (found,) = _features(tmp_path, [frame])
     true = _CENTRES + frame + 0.5  # OpenCV's pixel (0, 0) has its centre at (0.5, 0.5)
     away = np.linalg.norm(found.keypoints[None, :, :2] - true[:, None], axis=2)
-    # A blob of noise-free pixels is found to a tenth of a pixel of the shrunk image.
+    # A blob without noise is found to a tenth of a pixel of the reduced image.
     assert away.min(axis=1).max() < 0.25
     nearest = away.argmin(axis=1)
     assert np.abs(found.rgb[nearest].astype(int) - (20, 90, 160)).max() < 60
     assert np.abs(np.linalg.norm(found.descriptors.astype(float), axis=1) - 512).max() < 8
 
 
-def test_threads_and_company_change_nothing(tmp_path: Path) -> None:
+def test_threads_and_other_frames_change_nothing(tmp_path: Path) -> None:
     many = _features(tmp_path, list(range(8)), threads=3)
     for frame in (0, 5):
         (alone,) = _features(tmp_path, [frame], threads=1)

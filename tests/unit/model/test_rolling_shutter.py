@@ -20,7 +20,7 @@ from bodycap_batch.mapping.intrinsics.readout_time import (
     estimate_readouts,
     map_with_readouts,
 )
-from bodycap_batch.mapping.reconstruction.reconstruct import mapper_options
+from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
 from bodycap_batch.model import rolling_shutter
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp
@@ -145,13 +145,15 @@ def readouts_of(film: Film, camera: Any) -> tuple[Any, Any]:
     model = RollingShutterModel(
         the_map(film, range(1, FRAMES, 5)), {"head": film.trajectory()}, {"head": camera}
     )
-    model, reported = estimate_readouts(model, {"head": camera}, mapper_options(MapOptions(), [1], 1.0), [1])
+    model, reported = estimate_readouts(
+        model, {"head": camera}, make_mapper_options(MapOptions(), [1], 1.0), [1]
+    )
     return model, reported["head"]
 
 
 def found(readout_s: float, *, known: bool = False, stated_s: float = 0.0) -> Any:
     rolling = rolling_model(Film(readout_s), known=known, stated_s=stated_s)
-    return rolling.find(mapper_options(MapOptions(), [1], 1.0), [1])["head"]
+    return rolling.estimate(make_mapper_options(MapOptions(), [1], 1.0), [1])["head"]
 
 
 @pytest.mark.parametrize("readout_s", [0.02, -0.012])
@@ -183,8 +185,8 @@ def test_the_direction_of_a_turned_sensor_is_estimated(readout_s: float, sideway
     assert abs(reported.seconds - readout_s) <= 0.1 * abs(readout_s)
     assert reported.sideways == (sideways and readout_s != 0.0)
     # Moved pixels lie where the true poses see their points, but for noise and the velocities' curvature.
-    assert misfit_px(model.moved({"head": reported.seconds}), film) < 1.0
-    assert readout_s == 0.0 or misfit_px(model.moved({}), film) > 1.5
+    assert misfit_px(model.corrected({"head": reported.seconds}), film) < 1.0
+    assert readout_s == 0.0 or misfit_px(model.corrected({}), film) > 1.5
 
 
 def test_a_stated_readout_runs_the_way_the_video_is_turned() -> None:
@@ -199,7 +201,7 @@ def test_a_stated_readout_keeps_its_way_where_none_could_be_looked_for(
     def fails(*_: Any) -> None:
         raise EstimationError("no convergence")
 
-    monkeypatch.setattr(RollingShutterModel, "find", fails)
+    monkeypatch.setattr(RollingShutterModel, "estimate", fails)
     film = Film(0.02, sideways=True)
     _, reported = readouts_of(film, camera_of(film, known=True, stated_s=0.02, may_be_sideways=True))
     assert (reported.seconds, reported.sideways) == (0.02, True)
@@ -239,8 +241,8 @@ def test_a_map_says_which_way_its_sensors_are_read() -> None:
 
 def test_a_camera_whose_frames_lie_in_another_map_is_left_alone() -> None:
     rolling = rolling_model(Film(0.02), posed=False)
-    assert rolling.fastest().find(mapper_options(MapOptions(), [1], 1.0), [1]) == {}
-    before, after = the_map(Film(0.02), range(1, FRAMES, 5)), rolling.moved({"head": 0.02})
+    assert rolling.most_dynamic_subset().estimate(make_mapper_options(MapOptions(), [1], 1.0), [1]) == {}
+    before, after = the_map(Film(0.02), range(1, FRAMES, 5)), rolling.corrected({"head": 0.02})
     for image_id in before.reg_image_ids():
         pairs = zip(before.image(image_id).points2D, after.image(image_id).points2D, strict=True)
         assert all((one.xy == other.xy).all() for one, other in pairs)
@@ -260,7 +262,7 @@ def test_the_fastest_keyframes_are_looked_at() -> None:
         {"head": film.trajectory()},
         {"head": SimpleNamespace(rolling_shutter_known=False, rolling_shutter_s=0.0)},  # type: ignore[dict-item]
     )
-    part = rolling.fastest()._model
+    part = rolling.most_dynamic_subset()._model
     frames = sorted(int(part.image(number).name[-7:]) for number in part.reg_image_ids())
     assert len(frames) == 24
     assert set(np.diff(frames)) == {2}, "one run of successive keyframes"

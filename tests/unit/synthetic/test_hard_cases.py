@@ -1,27 +1,29 @@
-"""What makes a capture hard: a hand at the chest, own arms in view, a bare room."""
+"""Hard captures: a hand at the chest, the wearer's arms in view, a bare room."""
 
 import numpy as np
 import pytest
 
-from bodycap_batch.synthetic.filming import camera_at, joints_at
-from bodycap_batch.synthetic.making import build_films, draw_subject
+from bodycap_batch.synthetic.filming import camera_poses_at, joint_poses_at
+from bodycap_batch.synthetic.making import build_renderers, draw_subject
 from bodycap_batch.synthetic.options import SynthOptions
-from bodycap_batch.synthetic.render import View
+from bodycap_batch.synthetic.render import SceneRenderer
 from bodycap_batch.synthetic.room import build_room
 
 SMALL = {"width": 64, "height": 48, "seconds": 5.0, "body_in_view": True}
 
 
-def _body_shares(options, camera, times_s):
-    """Share of a camera's picture that the wearer's own body covers, at each time."""
+def _body_ratios(options, camera, times_s):
+    """Return the ratio of a camera's picture that the wearer's body covers, at each time."""
     subject = draw_subject(options)
-    film = next(film for film in build_films(options, subject) if film.mount.camera == camera)
+    renderer = next(
+        renderer for renderer in build_renderers(options, subject) if renderer.mount.camera == camera
+    )
     shares = []
     for t_s in times_s:
         at = np.array([t_s])
-        body = View(film.wearer.at(joints_at(film.motion, at)[0]), film.atlas)
-        pose = camera_at(film.motion, film.mount, at)[0]
-        image = body.image(film.grid, pose, slice(0, options.height))
+        body = SceneRenderer(renderer.wearer.at(joint_poses_at(renderer.motion, at)[0]), renderer.atlas)
+        pose = camera_poses_at(renderer.motion, renderer.mount, at)[0]
+        image = body.image(renderer.grid, pose, slice(0, options.height))
         shares.append(float((image.max(axis=-1) > 0).mean()))
     return np.array(shares)
 
@@ -37,9 +39,9 @@ def _body_shares(options, camera, times_s):
 )
 def test_a_camera_pressed_to_the_chest_sees_the_wearer_alone(seed, camera):
     options = SynthOptions(**SMALL, seed=seed, pressed_s={camera: (2.0, 3.0)})
-    shares = _body_shares(options, camera, [0.5, 2.0, 2.5, 3.0, 4.5])
+    shares = _body_ratios(options, camera, [0.5, 2.0, 2.5, 3.0, 4.5])
     assert (shares[1:4] == 1.0).all()
-    # Before and after, the walk is the usual one: mostly room.
+    # Before and after that, the picture shows mostly the room.
     assert (shares[[0, 4]] < 0.3).all()
 
 
@@ -47,19 +49,19 @@ def test_a_pressed_hand_moves_smoothly_and_changes_nothing_else():
     still = draw_subject(SynthOptions(**SMALL)).motion
     pressed = draw_subject(SynthOptions(**SMALL, pressed_s={"left_palm": (2.0, 3.0)})).motion
     t_s = np.arange(0.0, 5.0, 0.005)
-    joints = [joints_at(motion, t_s)[..., :3, 3] for motion in (still, pressed)]
+    joints = [joint_poses_at(motion, t_s)[..., :3, 3] for motion in (still, pressed)]
     moved = np.abs(joints[0] - joints[1]).max(axis=(0, 2))
     for name, most in zip(still.skeleton.joints, moved, strict=True):
         assert (most > 0.01) == (name in ("LeftForeArm", "LeftHand")), name
     assert np.abs(joints[0] - joints[1])[t_s < 1.4].max() < 1e-12
     hand = joints[1][:, still.skeleton.joints.index("LeftHand")]
-    # Half a metre within half a second, eased: 5.8 · 0.5 m / (0.5 s)² and the walk's own 20 m/s² at most.
+    # A smooth step of 0.5 m in 0.5 s: 5.8 · 0.5 m / (0.5 s)², and at most 20 m/s² from the walk.
     assert np.linalg.norm(np.diff(hand, 2, axis=0), axis=1).max() / 0.005**2 < 32
 
 
-def test_arms_held_ahead_come_into_view():
+def test_arms_held_ahead_are_in_view():
     shares = {
-        ahead: _body_shares(
+        ahead: _body_ratios(
             SynthOptions(**SMALL, seed=4, arms_ahead=ahead), "torso", np.arange(0.0, 5.0, 0.5)
         )
         for ahead in (0.0, 1.0)
@@ -68,7 +70,7 @@ def test_arms_held_ahead_come_into_view():
     assert np.median(shares[1.0]) > 0.03
 
 
-def test_a_bare_room_has_nothing_but_what_hangs_on_its_walls():
+def test_a_bare_room_has_pictures_on_its_walls_only():
     seed = np.random.SeedSequence(1)
     surfaces = build_room((1.0, 1.0), 20.0, seed, furnished=False, repeated_posters=True)
     hanging = [surface for surface in surfaces[6:] if not surface.shines]
@@ -88,6 +90,6 @@ def test_a_bare_room_has_nothing_but_what_hangs_on_its_walls():
         ({"pressed_s": {"left_palm": (1.0, 2.0)}}, "needs body_in_view"),
     ],
 )
-def test_presses_that_make_no_sense_are_refused(values, message):
+def test_invalid_presses_are_refused(values, message):
     with pytest.raises(ValueError, match=message):
         SynthOptions.model_validate(values)

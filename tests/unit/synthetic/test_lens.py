@@ -1,4 +1,4 @@
-"""The renderer's rays against OpenCV's projection, or the solver's where OpenCV has no such model."""
+"""The renderer's rays agree with OpenCV's projection, or with the solver's if OpenCV lacks the model."""
 
 import cv2
 import numpy as np
@@ -10,7 +10,7 @@ from bodycap_batch.synthetic.lens import ray_grid
 WIDTH, HEIGHT = 96, 72
 HEAD = [70.0, 68.0, 47.0, 37.5]
 SINGLE = [70.0, 47.0, 37.5]
-# Newton stops at 1e-14 on the image plane; 1e-9 of it is what a pixel may be off, times the focal length.
+# Newton's method stops at 1e-14 on the image plane. A pixel may be off by 1e-9 times the focal length.
 TOLERANCE_PX = 70 * 1e-8
 
 
@@ -75,17 +75,17 @@ def test_rays_agree_with_the_solvers_projection(model, params):
     assert np.abs(pixels - _pixels())[seen].max() < TOLERANCE_PX
 
 
-def test_rays_are_unit_vectors_and_their_steps_lead_to_the_next_pixel():
+def test_rays_are_unit_vectors_with_right_derivatives():
     grid = ray_grid(_camera("OPENCV", [*HEAD, -0.2, 0.05, 0.001, 0.001]))
     assert np.abs(np.linalg.norm(grid.in_cam, axis=-1) - 1).max() < 1e-12
-    # Central differences miss the next pixel by half a second derivative: (1/f)² · ½ ≈ 1e-4.
+    # Central differences are off the next pixel by half a second derivative: (1/f)² · ½ ≈ 1e-4.
     step = grid.in_cam[:, 1:] - grid.in_cam[:, :-1] - grid.per_px_x[:, :-1]
     assert np.abs(step).max() < 2e-4
     step = grid.in_cam[1:] - grid.in_cam[:-1] - grid.per_px_y[:-1]
     assert np.abs(step).max() < 2e-4
 
 
-def test_pixels_beyond_the_fold_of_a_strong_barrel_see_nothing():
+def test_pixels_beyond_the_fold_of_strong_barrel_distortion_are_invalid():
     # r (1 - 0.4 r²) grows until r = 0.913, where it is 0.609: 42.6 px from the centre.
     grid = ray_grid(_camera("SIMPLE_RADIAL", [70.0, 48.0, 36.0, -0.4]))
     radius = np.linalg.norm(_pixels() - [48.0, 36.0], axis=1).reshape(HEIGHT, WIDTH)

@@ -5,7 +5,7 @@ from bodycap_batch.model.camera import CAMERA_MODELS
 from bodycap_batch.synthetic import SynthOptions
 
 
-def test_the_default_is_the_papers_three_cameras():
+def test_the_default_is_three_cameras_as_in_the_paper():
     options = SynthOptions()
     assert options.cameras == ("torso", "left_palm", "right_palm")
     assert options.frame_count == 360
@@ -13,7 +13,7 @@ def test_the_default_is_the_papers_three_cameras():
 
 
 @pytest.mark.parametrize("model", CAMERA_MODELS)
-def test_every_lens_has_a_default(model):
+def test_every_camera_model_has_default_parameters(model):
     camera = SynthOptions(lens=model, width=320, height=240).camera()
     assert camera.focal_px == 210.0
     assert camera.principal_point_px == (160.0, 120.0)
@@ -36,7 +36,7 @@ def test_every_lens_has_a_default(model):
         ({"width": 641}, "multiple of 2"),
     ],
 )
-def test_what_makes_no_sense_is_refused(values, message):
+def test_invalid_options_are_refused(values, message):
     with pytest.raises(ValidationError, match=message):
         SynthOptions.model_validate(values)
 

@@ -9,15 +9,15 @@ from bodycap_batch.model.geometry import invert, rotation_angle_rad
 from bodycap_batch.model.skeleton import Motion, forward_kinematics
 from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount, rest_positions
 from bodycap_batch.synthetic.clip import load_clip
-from bodycap_batch.synthetic.filming import camera_at
-from bodycap_batch.synthetic.gait import Habits, Walk
-from bodycap_batch.synthetic.person import draw_bearing, draw_body, draw_mounts
+from bodycap_batch.synthetic.filming import camera_poses_at
+from bodycap_batch.synthetic.gait import Walk, WalkStyle
+from bodycap_batch.synthetic.person import draw_body, draw_mounts, draw_posture
 
 
 @pytest.fixture(scope="module")
 def walk():
     body = draw_body(1.75, 0.05, np.random.default_rng(3))
-    return Walk(body, 12.0, Habits(), np.random.default_rng(4))
+    return Walk(body, 12.0, WalkStyle(), np.random.default_rng(4))
 
 
 def _poses(walk, t_s):
@@ -25,13 +25,13 @@ def _poses(walk, t_s):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_bones_differ_from_the_textbook_but_stature_holds(seed):
+def test_bones_differ_from_nominal_but_the_stature_is_exact(seed):
     body, nominal = draw_body(1.8, 0.05, np.random.default_rng(seed)), load_skeleton("full_body", 1.8)
     heights = rest_positions(body)[:, 2] + np.nan_to_num(body.end_offsets_m)[:, 2]
     assert heights.max() - heights.min() == pytest.approx(1.8, abs=1e-9)
     assert heights.min() == pytest.approx(0.0, abs=1e-9)
     lengths = np.linalg.norm(body.offsets_m[1:], axis=1) / np.linalg.norm(nominal.offsets_m[1:], axis=1)
-    # ±5 % for each bone and at most ±5 % for the stature they are scaled back to.
+    # ±5 % for each bone, and at most ±5 % for the scaling to the stature.
     assert 0.95 / 1.05 <= lengths.min() < 0.99
     assert 1.01 < lengths.max() <= 1.05 / 0.95
     left = [i for i, name in enumerate(body.joints) if name.startswith("Left")]
@@ -39,7 +39,7 @@ def test_bones_differ_from_the_textbook_but_stature_holds(seed):
     assert np.allclose(body.offsets_m[left], body.offsets_m[right] * [-1, 1, 1])
 
 
-def test_mounts_scatter_about_nominal_by_the_sigmas_asked_for():
+def test_mounts_have_the_requested_sigmas():
     body, rng = load_skeleton("full_body", 1.75), np.random.default_rng(0)
     nominal = nominal_mount("left_palm", "LeftHand", body).joint_from_cam
     drawn = [draw_mounts(("left_palm",), body, (15.0, 0.05), rng)[0].joint_from_cam for _ in range(600)]
@@ -77,7 +77,7 @@ def test_the_walker_stands_on_the_floor(walk):
         soles.append(tip[:, 2])
         soles.append(poses[:, walk.skeleton.joints.index(f"{side}Foot"), 2, 3] - walk._ankle_m)
     lowest = np.min(soles, axis=0)
-    # The soft minimum of four soles lies up to 1 cm · ln 4 below them; a tilted foot's heel adds a little.
+    # The soft minimum of four soles is up to 1 cm · ln 4 below them; the heel of a tilted foot adds a little.
     assert lowest.min() > -0.01
     assert lowest.max() < 0.035
 
@@ -97,7 +97,7 @@ def test_the_walk_turns_steps_aside_and_reaches_at_human_rates(walk):
         ("torso", "left_palm", "right_palm"), walk.skeleton, (15.0, 0.05), np.random.default_rng(1)
     )
     for mount in mounts:
-        poses = camera_at(walk, mount, t_s)
+        poses = camera_poses_at(walk, mount, t_s)
         step = poses[:-1, :3, :3].transpose(0, 2, 1) @ poses[1:, :3, :3]
         rate = np.degrees(rotation_angle_rad(step)) * 120
         assert np.percentile(rate, 90) < 120
@@ -114,34 +114,34 @@ def test_the_motion_is_smooth(walk):
     t_s = np.arange(0, 12, 0.005)
     hands = _poses(walk, t_s)[:, [walk.skeleton.joints.index(f"{s}Hand") for s in ("Left", "Right")]]
     acceleration = np.linalg.norm(np.diff(hands[..., :3, 3], 2, axis=0), axis=-1) / 0.005**2
-    # Arms swing and reach with a few m/s²; a jump of 1 cm between ticks would be 400.
+    # Arms accelerate by a few m/s²; a jump of 1 cm between ticks would be 400.
     assert acceleration.max() < 20
 
 
 def test_a_longer_capture_continues_the_same_walk():
     body = draw_body(1.75, 0.05, np.random.default_rng(3))
     t_s = np.linspace(0, 5, 20)
-    short, long = (Walk(body, s, Habits(), np.random.default_rng(4)).pose(t_s) for s in (6.0, 60.0))
-    # The spline through more places differs by what reaches back over a lap: well below a millimetre.
+    short, long = (Walk(body, s, WalkStyle(), np.random.default_rng(4)).pose(t_s) for s in (6.0, 60.0))
+    # More positions change the spline a lap earlier by well below a millimetre.
     assert np.abs(short[0] - long[0]).max() < 1e-3
     assert np.abs(short[1] - long[1]).max() < 1e-3
 
 
-def test_somebody_who_turns_on_the_spot_hardly_travels():
+def test_a_person_who_turns_on_the_spot_hardly_moves():
     body = draw_body(1.75, 0.05, np.random.default_rng(3))
-    walk = Walk(body, 8.0, Habits(on_the_spot=True), np.random.default_rng(4))
+    walk = Walk(body, 8.0, WalkStyle(on_the_spot=True), np.random.default_rng(4))
     t_s = np.linspace(0, 8, 161)
     root = _poses(walk, t_s)[:, 0]
     assert np.ptp(root[:, :2, 3], axis=0).max() < 0.05
     heading = np.degrees(np.unwrap(np.arctan2(root[:, 1, 0], root[:, 0, 0])))
-    # 75 degrees to either side within 5 s, give or take a gait that stands still.
+    # 75 degrees to either side within 5 s, and a little from the gait.
     assert 145 < np.ptp(heading) < 155
     assert np.abs(np.diff(heading)).max() / 0.05 < 100
 
 
-def test_a_t_pose_first():
+def test_a_t_pose_comes_first():
     body = draw_body(1.75, 0.05, np.random.default_rng(3))
-    walk = Walk(body, 8.0, Habits(t_pose_s=2.0), np.random.default_rng(4))
+    walk = Walk(body, 8.0, WalkStyle(t_pose_s=2.0), np.random.default_rng(4))
     still = _poses(walk, np.linspace(0, 1.9, 10))
     left, right = (body.joints.index(f"{side}Hand") for side in ("Left", "Right"))
     span = still[:, left, :3, 3] - still[:, right, :3, 3]
@@ -173,7 +173,7 @@ def test_a_recorded_motion_is_centred_and_interpolated(tmp_path):
     _clip_file(tmp_path / "walk.bvh")
     clip = load_clip(tmp_path / "walk.bvh", 0.5, 1.0)
     root, local = clip.pose(np.array([0.0, 0.525, 1.0]))
-    # 1 m/s along x; the stretch 0.5 … 1.5 s is centred. File digits: 1e-8 m.
+    # 1 m/s along x; the part from 0.5 to 1.5 s is centred. The file has 8 digits: 1e-8 m.
     assert np.allclose(root[:, 0], [-0.5, 0.025, 0.5], atol=1e-6)
     assert np.allclose(root[:, 1], 0.0, atol=1e-6)
     assert np.allclose(local, np.eye(3))
@@ -194,16 +194,17 @@ def test_a_skeleton_without_motion_is_refused(tmp_path):
         load_clip(tmp_path / "pose.bvh", 0.0, 0.01)
 
 
-def test_walkers_hold_their_joints_as_people_differ():
+def test_postures_differ_as_between_people():
     body, t_s = draw_body(1.75, 0.05, np.random.default_rng(3)), np.array([3.0])
-    usual = Walk(body, 6.0, Habits(), np.random.default_rng(4)).pose(t_s)[1][0]
-    bearings = [draw_bearing(1.0, np.random.default_rng(seed)) for seed in range(60)]
+    usual = Walk(body, 6.0, WalkStyle(), np.random.default_rng(4)).pose(t_s)[1][0]
+    postures = [draw_posture(1.0, np.random.default_rng(seed)) for seed in range(60)]
     held = [
-        Walk(body, 6.0, Habits(bearing=each), np.random.default_rng(4)).pose(t_s)[1][0] for each in bearings
+        Walk(body, 6.0, WalkStyle(posture=each), np.random.default_rng(4)).pose(t_s)[1][0]
+        for each in postures
     ]
     turns = np.degrees(rotation_angle_rad(np.swapaxes(usual, -1, -2) @ np.array(held)))
     rms = np.sqrt((turns**2).mean(axis=0))
-    # Two or three independent turns each; the spread of 60 draws of two is known to 6 %, three times.
+    # Two or three independent rotations each. The spread of 60 draws of two is known to 6 %.
     for joint, sigmas in (
         ("LeftShoulder", (5.4, 6.2)),
         ("RightArm", (4.2, 5.1, 12.5)),
@@ -211,4 +212,4 @@ def test_walkers_hold_their_joints_as_people_differ():
     ):
         assert rms[body.joints.index(joint)] == pytest.approx(np.linalg.norm(sigmas), rel=0.2)
     assert rms[body.joints.index("LeftHand")] == 0.0
-    assert set(draw_bearing(0.0, np.random.default_rng(0)).values()) == {0.0}
+    assert set(draw_posture(0.0, np.random.default_rng(0)).values()) == {0.0}

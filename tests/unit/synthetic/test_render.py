@@ -1,4 +1,4 @@
-"""The renderer against OpenCV's projection: corners of a marker must appear where the truth says."""
+"""The renderer agrees with OpenCV's projection: corners of a marker appear at their true positions."""
 
 from dataclasses import replace
 
@@ -10,10 +10,10 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import load_skeleton
-from bodycap_batch.synthetic.atlas import Atlas, filter_for
-from bodycap_batch.synthetic.filming import Film, Sensor, camera_at
+from bodycap_batch.synthetic.atlas import Atlas, select_filter
+from bodycap_batch.synthetic.filming import CameraRenderer, Sensor, camera_poses_at
 from bodycap_batch.synthetic.lens import ray_grid
-from bodycap_batch.synthetic.render import View, triangles_of
+from bodycap_batch.synthetic.render import SceneRenderer, triangles_from_surfaces
 from bodycap_batch.synthetic.surfaces import Surface, box_faces, surface_facing
 from bodycap_batch.synthetic.wearer import Wearer
 
@@ -21,12 +21,12 @@ SQUARES, TEXELS = 6, 40
 SIDE_M = 1.2
 WIDTH, HEIGHT = 320, 240
 FOCAL = 210.0
-# Facing +Z of the world from 1.6 m: x right, y down, as the marker is drawn.
+# Looking along +Z of the world from 1.6 m: x right, y down, as the marker is drawn.
 LOOKING = make_transform(np.eye(3), [0.0, 0.0, -1.6])
 
 
 def _board():
-    """A checkerboard in the plane z = 0, its middle at the origin, seen upright from −z."""
+    """Return a checkerboard in the plane z = 0 with its middle at the origin, upright when seen from −z."""
     squares = np.indices((SQUARES, SQUARES)).sum(axis=0) % 2
     grey = np.kron(40 + 170 * squares, np.ones((TEXELS, TEXELS))).astype(np.uint8)
     half = SIDE_M / 2
@@ -39,7 +39,7 @@ def _board():
 
 
 def _corners():
-    """World positions (N,3) of the corners between squares."""
+    """Return the world positions (N,3) of the corners between squares."""
     ticks = (np.arange(1, SQUARES) / SQUARES - 0.5) * SIDE_M
     x, y = np.meshgrid(ticks, ticks)
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
@@ -52,8 +52,8 @@ def board():
         surface_facing([0, 0, 1.0], [0, -1, 0], (0.2, 0.2), np.full((9, 9, 3), 90, np.uint8)),
     ]
     atlas = Atlas([surface.image for surface in surfaces])
-    room = triangles_of(surfaces, atlas.origins)
-    return room, atlas, View(room, atlas)
+    room = triangles_from_surfaces(surfaces, atlas.origins)
+    return room, atlas, SceneRenderer(room, atlas)
 
 
 def _lens(params=(FOCAL, FOCAL, 160.0, 120.0), model="PINHOLE"):
@@ -61,7 +61,7 @@ def _lens(params=(FOCAL, FOCAL, 160.0, 120.0), model="PINHOLE"):
 
 
 def _predicted(world_from_cam, distortion=()):
-    """Where OpenCV puts the corners, in its own pixels (the first one's centre is 0, 0)."""
+    """Return the corners projected by OpenCV, in its pixels (the first one's centre is 0, 0)."""
     cam_from_world = invert(world_from_cam)
     matrix = np.array([[FOCAL, 0, 159.5], [0, FOCAL, 119.5], [0, 0, 1.0]])
     turn, _ = cv2.Rodrigues(cam_from_world[:3, :3])
@@ -72,7 +72,7 @@ def _predicted(world_from_cam, distortion=()):
 
 
 def _found(image, near):
-    """Corners measured in an image, from a start near them."""
+    """Return the corners measured in an image, given positions near them."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     start = np.ascontiguousarray(near[:, None], dtype=np.float32)
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
@@ -102,7 +102,7 @@ def test_marker_corners_appear_where_opencv_projects_them(board, turn_deg, centr
     seen = _inside(predicted)
     assert seen.sum() >= 9
     error = _found(image, predicted[seen]) - predicted[seen]
-    # A saddle is found to a few hundredths of a pixel; a wrong pixel origin would shift all by half a pixel.
+    # A corner is found to a few hundredths of a pixel; a wrong pixel origin would shift all by half a pixel.
     assert np.abs(error).max() < 0.1
     assert np.abs(error.mean(axis=0)).max() < 0.03
 
@@ -121,22 +121,22 @@ class _Straight:
         return root, np.tile(np.eye(3), (len(t_s), joints, 1, 1))
 
 
-def _film(board, speed, **values):
+def _renderer(board, speed, **values):
     motion, settings = (
         _Straight(speed),
         {"exposure_s": 0.0, "rolling_shutter_s": 0.0, "wearer": None, **values},
     )
     mount = Mount(camera="hips", role="Hips", joint_from_cam=LOOKING, sigma_rad=0.0, sigma_m=0.0)
     room, atlas, view = board
-    return Film(
-        motion=motion, mount=mount, grid=ray_grid(_lens()), room=room, atlas=atlas, view=view, **settings
+    return CameraRenderer(
+        motion=motion, mount=mount, grid=ray_grid(_lens()), room=room, atlas=atlas, scene=view, **settings
     )
 
 
 def test_motion_blur_is_centred_on_the_timestamp(board):
-    film = _film(board, 3.0, exposure_s=0.02)
-    pose = camera_at(film.motion, film.mount, np.array([0.01]))[0]
-    image, sharp = film.frame(0.01), board[2].image(film.grid, pose, slice(0, HEIGHT))
+    renderer = _renderer(board, 3.0, exposure_s=0.02)
+    pose = camera_poses_at(renderer.motion, renderer.mount, np.array([0.01]))[0]
+    image, sharp = renderer.render(0.01), board[2].image(renderer.grid, pose, slice(0, HEIGHT))
     predicted = _predicted(pose)
     # 3 m/s · 0.02 s · 210 px / 1.6 m = 7.9 px of blur; symmetric, so the corners stay.
     assert np.abs(_found(image, predicted) - predicted).max() < 0.15
@@ -147,10 +147,10 @@ def test_motion_blur_is_centred_on_the_timestamp(board):
 @pytest.mark.parametrize("shown", [False, True])
 def test_rolling_shutter_exposes_each_row_at_its_own_time(board, shown):
     speed, shutter = 2.0, 0.03
-    film = _film(board, speed, rolling_shutter_s=shutter, wearer=_nobody() if shown else None)
-    image = film.frame(0.0)
+    renderer = _renderer(board, speed, rolling_shutter_s=shutter, wearer=_nobody() if shown else None)
+    image = renderer.render(0.0)
     still = _predicted(LOOKING)
-    # Row r sees the world from x = speed · (r/h − ½) · shutter: points move the other way. Row r's centre is
+    # Row r is exposed at x = speed · (r/h − ½) · shutter; points move the other way. Row r's centre is
     # r in OpenCV's pixels, r + ½ in COLMAP's.
     moved = speed * ((still[:, 1] + 0.5) / HEIGHT - 0.5) * shutter
     predicted = still - np.column_stack([moved * FOCAL / 1.6, 0 * moved])
@@ -160,18 +160,18 @@ def test_rolling_shutter_exposes_each_row_at_its_own_time(board, shown):
 
 
 def _nobody():
-    """A wearer far out of sight, so that the body's bands are rendered."""
+    """Return a wearer out of view; it makes the renderer use bands of rows."""
 
     class Nobody:
         def at(self, world_from_joint):
             atlas = Atlas([np.full((8, 8, 3), 9, np.uint8)])
             faces = box_faces([0, 0, -30], [1, 1, 1], 0.0)
-            return triangles_of(faces, np.repeat(atlas.origins, len(faces), axis=0))
+            return triangles_from_surfaces(faces, np.repeat(atlas.origins, len(faces), axis=0))
 
     return Nobody()
 
 
-def test_what_is_nearer_hides_what_is_farther():
+def test_near_surfaces_hide_far_ones():
     near = replace(
         _board(),
         corner=np.array([-0.3, -0.3, -0.5]),
@@ -181,11 +181,11 @@ def test_what_is_nearer_hides_what_is_farther():
     near = replace(near, image=np.full((20, 20, 3), 250, np.uint8))
     surfaces = [_board(), near]
     atlas = Atlas([surface.image for surface in surfaces])
-    image = View(triangles_of(surfaces, atlas.origins), atlas).image(
+    image = SceneRenderer(triangles_from_surfaces(surfaces, atlas.origins), atlas).image(
         ray_grid(_lens()), LOOKING, slice(0, HEIGHT)
     )
     assert (image[100:140, 140:180] == 250).all()
-    # 0.3 m at 1.1 m: 57.3 px from the middle. Its border falls inside the 218th pixel, which is a mixture.
+    # 0.3 m at 1.1 m is 57.3 px from the middle. The border lies inside the 218th pixel, which is a mixture.
     assert (image[120, 160:216] == 250).all()
     assert (image[120, 219:225] < 250).all()
 
@@ -195,7 +195,7 @@ def test_a_pixel_on_an_edge_is_a_mixture():
     dark = surface_facing([0, -0.5, 0], [0, -1, 0], (1.0, 1.0), np.full((16, 16, 3), 20, np.uint8))
     atlas = Atlas([bright.image, dark.image])
     looking = make_transform(so3_exp([-np.pi / 2, 0, 0]) @ so3_exp([0, 0, 0.2]), [0.0, -2.5, 0.0])
-    image = View(triangles_of([bright, dark], atlas.origins), atlas).image(
+    image = SceneRenderer(triangles_from_surfaces([bright, dark], atlas.origins), atlas).image(
         ray_grid(_lens()), looking, slice(0, HEIGHT)
     )
     values = np.unique(image)
@@ -210,15 +210,15 @@ def test_distant_fine_texture_averages_out():
     wall = surface_facing([0, 0, 0], [0, -1, 0], (1.0, 1.0), stripes)
     atlas = Atlas([wall.image])
     looking = make_transform(so3_exp([-np.pi / 2, 0, 0]), [0.0, -6.0, 0.0])
-    image = View(triangles_of([wall], atlas.origins), atlas).image(
+    image = SceneRenderer(triangles_from_surfaces([wall], atlas.origins), atlas).image(
         ray_grid(_lens()), looking, slice(0, HEIGHT)
     )
     inside = image[108:132, 148:172].astype(float)
-    # 15 texels a pixel: what is left of stripes of 0 and 200 is their mean, to rounding.
+    # With 15 texels per pixel, stripes of 0 and 200 appear as their mean, up to rounding.
     assert np.abs(inside - 100).max() <= 2
 
 
-def test_atlas_images_do_not_bleed_into_each_other():
+def test_images_in_the_atlas_do_not_mix():
     images = [np.full((h, w, 3), v, np.uint8) for h, w, v in ((5, 70, 10), (64, 3, 130), (33, 33, 250))]
     atlas = Atlas(images)
     for image, origin in zip(images, atlas.origins, strict=True):
@@ -226,10 +226,10 @@ def test_atlas_images_do_not_bleed_into_each_other():
         at = np.ascontiguousarray((origin + corners).T, dtype=np.float32)
         for size in (0.3, 2.0, 11.0, 32.0):
             footprint = np.tile(np.array([[size], [0], [0], [size]], np.float32), (1, 4))
-            assert (atlas.sample(at, filter_for(footprint)) == image[0, 0]).all()
+            assert (atlas.sample(at, select_filter(footprint)) == image[0, 0]).all()
 
 
-def test_noise_has_the_strength_asked_for_and_differs_between_frames():
+def test_noise_has_the_requested_strength_and_differs_between_frames():
     grey = np.full((100, 100, 3), 128, np.uint8)
     sensor = Sensor(4.0, grey.size, np.random.SeedSequence(5))
     first, second = (sensor.record(grey, frame).astype(float) for frame in (0, 1))
@@ -244,7 +244,7 @@ def test_noise_has_the_strength_asked_for_and_differs_between_frames():
     assert len(np.unique(clean.reshape(-1, 3), axis=0)) == 1
 
 
-def test_the_wearers_arm_is_seen_where_its_joints_are():
+def test_the_wearers_arm_appears_at_its_joints():
     skeleton = load_skeleton("full_body", 1.75)
     wearer = Wearer(skeleton, np.random.SeedSequence(1))
     atlas = Atlas(wearer.images)
@@ -253,7 +253,7 @@ def test_the_wearers_arm_is_seen_where_its_joints_are():
     for joint, parent in enumerate(skeleton.parents):
         start = np.zeros(3) if parent < 0 else joints[parent, :3, 3]
         joints[joint, :3, 3] = start + skeleton.offsets_m[joint]
-    view = View(wearer.at(joints), atlas)
+    view = SceneRenderer(wearer.at(joints), atlas)
     # From the front: OpenCV axes with z along +y, x along −x... the body's left is on the right.
     front = make_transform(np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]), [0.0, -2.5, 1.2])
     image = view.image(ray_grid(_lens()), front, slice(0, HEIGHT))

@@ -1,0 +1,78 @@
+"""Reconstruct the first models: from the best initial pairs, with camera models that fit the pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from bodycap_batch.config import MapOptions
+from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
+from bodycap_batch.mapping.intrinsics.intrinsics_check import update_camera_models
+from bodycap_batch.mapping.mapping_context import MappingContext
+from bodycap_batch.mapping.reconstruction.initial_pair import (
+    InitialPair,
+    find_user_pair,
+    rank_initial_pairs,
+)
+from bodycap_batch.mapping.reconstruction.reconstruct import reconstruct
+
+_INITIAL_PAIRS = 3
+"""Ranked pairs that are tried before COLMAP's own search, which verifies hundreds of pairs if few have its 16
+degrees between rays. The maps are as accurate. Evidence: docs/decisions/mapping.md."""
+
+_LOGGED_CANDIDATES = 5
+"""Ranked pairs in the log, with the reasons against them, if the first attempt failed."""
+
+
+def reconstruct_with_intrinsics(
+    context: MappingContext, options: MapOptions, uncalibrated: Mapping[int, str], total: int
+) -> tuple[list[Any], dict[str, Any]]:
+    """Reconstruct models; reconstruct them again if uncalibrated cameras need other intrinsics.
+
+    Args:
+        context: Workspace, intrinsics, mapper options.
+        options: The stage's options.
+        uncalibrated: Names of the cameras with intrinsics to refine, by database id.
+        total: Number of keyframes.
+
+    Returns:
+        The models, largest first, and entries for the log.
+    """
+    models, log = _reconstruct_from_pairs(context, options, total)
+    changed, decentred = dict[str, CameraIntrinsics](), None
+    for _ in range(2 if uncalibrated else 0):
+        better, decentred = update_camera_models(
+            context.workspace, models, context.mapper_options(), uncalibrated, decentred
+        )
+        if not better:
+            break
+        changed |= better
+        context = replace(context, intrinsics={**context.intrinsics, **changed})
+        models, log = _reconstruct_from_pairs(context, options, total)
+        log["better_lenses"] = {name: item.camera.model for name, item in sorted(changed.items())}
+    return models, log
+
+
+def _reconstruct_from_pairs(
+    context: MappingContext, options: MapOptions, total: int
+) -> tuple[list[Any], dict[str, Any]]:
+    """Return models from the user's pair or the best ranked pairs, and the result of each for the log."""
+    pairs, log = _initial_pairs(context, options)
+    models, attempts = reconstruct(context.workspace, context.mapper_options(), context.stage, total, pairs)
+    log["initial_pair_ladder"] = attempts
+    if len(attempts) > 1:
+        best = rank_initial_pairs(context.workspace, context.intrinsics)[:_LOGGED_CANDIDATES]
+        log["initial_candidates"] = [{**pair.to_log(), "doubt": pair.rejection_reason} for pair in best]
+    return models, log
+
+
+def _initial_pairs(context: MappingContext, options: MapOptions) -> tuple[list[InitialPair], dict[str, Any]]:
+    """Return the user's pair, if it is usable, then the best ranked pairs; the user's pair for the log."""
+    ranking = rank_initial_pairs(context.workspace, context.intrinsics)
+    ranked = [pair for pair in ranking[:_INITIAL_PAIRS] if pair.is_usable]
+    if options.init_frames is None:
+        return ranked, {}
+    pair = find_user_pair(context.workspace, options.init_frames, context.intrinsics, context.frame_numbers)
+    logged = {"failed": "no verified matches"} if pair is None else pair.to_log()
+    return ranked if pair is None else [pair, *ranked], {"named_initial_pair": logged}

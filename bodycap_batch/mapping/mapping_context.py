@@ -1,0 +1,43 @@
+"""What the steps of one mapping run share: workspace, camera intrinsics, mapper options."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
+from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MappingContext:
+    """What the steps of one mapping run share.
+
+    Attributes:
+        workspace: Folder of the database.
+        intrinsics: Intrinsics by camera name.
+        mapper_options: Makes new options of COLMAP's mapper; a caller may change what it gets.
+        calibrated_ids: Database ids of the calibrated cameras; their intrinsics stay constant.
+        stage: Threads, progress, cancellation.
+        frame_numbers: `CaptureCamera.frame_numbers` by camera name.
+        skeletal_above: Number of keyframes above which a map is large.
+    """
+
+    workspace: Path
+    intrinsics: Mapping[str, CameraIntrinsics]
+    mapper_options: Callable[[], Any]
+    calibrated_ids: Collection[int]
+    stage: StageContext
+    frame_numbers: Mapping[str, IntArray]
+    skeletal_above: int = SKELETAL_ABOVE
+
+    def is_large(self, keyframes: int) -> bool:
+        """Return whether a map of so many keyframes is too large for repeated global adjustments.
+
+        A large map is built from its skeletal keyframes. New keyframes are adjusted alone.
+        """
+        return keyframes > self.skeletal_above
