@@ -117,7 +117,7 @@ def take_snapshot(entry: InboxEntry, max_files: int) -> EntrySnapshot:
         ready=ready,
         unfinished=unfinished,
         special=special,
-        undecodable=garbled,
+        undecodable=undecodable,
     )
 
 
@@ -138,7 +138,7 @@ class CompletionTracker:
     def __init__(
         self, unchanged_s: float, max_files: int, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._settle_s = unchanged_s
+        self._unchanged_s = unchanged_s
         self._most = max_files
         self._clock = clock
         self._seen: dict[Path, tuple[str, float]] = {}
@@ -157,7 +157,7 @@ class CompletionTracker:
             last_state, since = previous.get(entry.path, ("", now))
             since = since if last_state == state else now
             self._seen[entry.path] = (state, since)
-            still = now - since >= self._settle_s
+            still = now - since >= self._unchanged_s
             if snapshot is not None and (snapshot.ready or (still and not snapshot.incomplete_reason)):
                 found.append((since, entry, snapshot))
             elif still and (reason := error or (snapshot.incomplete_reason if snapshot is not None else "")):

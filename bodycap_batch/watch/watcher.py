@@ -84,7 +84,7 @@ class Watcher:
         self._worst_exit_code = 0
 
     def stop(self) -> None:
-        """End the watcher; may be called from any thread. Running jobs stop and continue at the next start."""
+        """End the watcher; running jobs continue at the next start. May be called from any thread."""
         self._stop.set()
         self._woken.set()
 

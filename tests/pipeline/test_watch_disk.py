@@ -371,7 +371,7 @@ def test_who_watches_and_what_holds_it_up_is_told_with_the_jobs(
 
 def test_a_killed_watcher_is_not_taken_for_one_at_work(bench: SpoolBench) -> None:
     presence = WatcherStatusFile(bench.spool)
-    presence.tell("")
+    presence.write("")
     (mine,) = bench.spool.running.glob(".watcher-*")
     machine, pid, start, *rest = mine.name.removeprefix(".watcher-").split("-")
     text = mine.read_text()

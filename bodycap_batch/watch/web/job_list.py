@@ -39,8 +39,9 @@ class JobList:
         self._ended: dict[Path, tuple[int, dict[str, Any]]] = {}
 
     def json_text(self) -> str:
-        """Return all jobs as JSON text, at most a second old. While the disk is missing, return the last
-        known jobs.
+        """Return all jobs as JSON text, at most a second old.
+
+        While the disk is missing, return the last known jobs.
         """
         with self._lock:
             now = time.monotonic()

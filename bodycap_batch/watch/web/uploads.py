@@ -1,4 +1,4 @@
-"""Receive videos from browsers: each upload is written to a hidden folder of the inbox until it is complete."""
+"""Receive videos from browsers in hidden folders of the inbox, until they are complete."""
 
 from __future__ import annotations
 
@@ -202,7 +202,7 @@ class Uploads:
         if not 0 < size <= most:
             hint = "cut the recording, or ask the operator to raise --limit video_gb"
             raise CaptureError(f"{size / 1e9:.3g} GB, the limit is {most / 1e9:.3g}", path=name, hint=hint)
-        # Other uploads may not have received all their bytes yet; count them so that the disk does not fill up.
+        # Other uploads may not have received all their bytes yet. Count them, so that the disk does not fill.
         coming = sum(sum(other.coming.values()) for other in self._open.values())
         if shutil.disk_usage(upload.folder).free - coming - size < _MIN_FREE_BYTES:
             raise StoreError(
