@@ -50,7 +50,7 @@ def _drop(bench: SpoolBench, sound_folder: Path, name: str, case: Case | None) -
 
 
 @pytest.mark.parametrize("name", [FIRST, LAST])
-def test_the_sound_jobs_are_done(worked_off: SpoolBench, name: str) -> None:
+def test_the_valid_jobs_are_done(worked_off: SpoolBench, name: str) -> None:
     assert worked_off.status(name)["state"] == "done"
     assert (worked_off.job(name).result / "metrics.json").is_file()
 

@@ -36,7 +36,7 @@ def leftovers(bench: SpoolBench) -> list[str]:
     return sorted(path.name for path in bench.spool.running.iterdir())
 
 
-def test_a_dropped_folder_ends_in_done_with_results_footage_and_a_status(bench: SpoolBench) -> None:
+def test_a_dropped_folder_ends_in_done_with_results_videos_and_a_status(bench: SpoolBench) -> None:
     bench.drop("küchen gang 1")
     assert bench.work_off() == 0, bench.told
     job = bench.job("küchen gang 1")
@@ -56,7 +56,7 @@ def test_a_dropped_folder_ends_in_done_with_results_footage_and_a_status(bench: 
 
 
 @pytest.mark.slow
-def test_the_job_of_the_results_runs_again_from_where_it_lies(bench: SpoolBench) -> None:
+def test_the_job_file_of_the_results_can_be_run_again(bench: SpoolBench) -> None:
     bench.drop("walk")
     bench.work_off()
     for file in (bench.job("walk").result / "job.yaml", bench.job("walk").job):
@@ -70,7 +70,7 @@ def test_the_job_of_the_results_runs_again_from_where_it_lies(bench: SpoolBench)
     assert "results:" in out
 
 
-def test_a_job_file_in_the_folder_decides_and_is_resolved_where_it_lay(bench: SpoolBench) -> None:
+def test_a_job_file_in_the_folder_is_used_and_resolved_in_the_inbox(bench: SpoolBench) -> None:
     dropped = bench.spool.inbox / "walk"
     torso, palm = "{name: torso, video: torso.mp4}", f"{{name: left_palm, video: {dropped}/left_palm.mp4}}"
     job = (
@@ -89,7 +89,7 @@ def test_a_job_file_in_the_folder_decides_and_is_resolved_where_it_lay(bench: Sp
     assert not (bench.folder / "somewhere").exists()
 
 
-def test_a_job_file_alone_names_footage_below_an_opened_folder(bench: SpoolBench) -> None:
+def test_a_single_job_file_may_name_videos_below_a_permitted_folder(bench: SpoolBench) -> None:
     footage = bench.drop("walk").rename(bench.folder / "footage")
     text = f"capture: {{cameras: [{{name: torso, video: {footage}/torso.mp4}}]}}"
     (bench.spool.inbox / "evening.yaml").write_text(text)
@@ -133,7 +133,7 @@ ONE = "capture: {{cameras: [{{name: torso, video: {}}}]}}"
     ],
     ids=lambda value: value[:60],
 )
-def test_a_job_that_names_what_it_may_not_is_refused_with_the_reason(
+def test_a_job_with_a_path_that_is_not_permitted_is_refused(
     bench: SpoolBench, make: str, words: str
 ) -> None:
     (bench.folder / "secret.mp4").write_text("not yours")
@@ -160,7 +160,7 @@ def test_a_video_that_is_a_link_outside_is_refused_in_a_folder_without_a_job(ben
 
 
 @pytest.mark.slow
-def test_a_link_to_an_opened_folder_is_worked_on_where_it_leads(bench: SpoolBench) -> None:
+def test_a_link_to_a_permitted_folder_is_processed(bench: SpoolBench) -> None:
     footage = bench.drop("walk").rename(bench.folder / "footage")
     (bench.spool.inbox / "linked").symlink_to(Path("../../footage"))
     assert bench.work_off(roots=(bench.folder / "footage",)) == 0, bench.told
@@ -170,7 +170,7 @@ def test_a_link_to_an_opened_folder_is_worked_on_where_it_leads(bench: SpoolBenc
     assert bench.job("linked-2").path.parent == bench.spool.failed
 
 
-def test_limits_hold_back_what_is_too_large(bench: SpoolBench) -> None:
+def test_jobs_beyond_the_limits_are_refused(bench: SpoolBench) -> None:
     (bench.drop("large") / "head.mp4").write_bytes(bytes(3000))
     many = bench.drop("many")
     for number in range(20):
@@ -183,7 +183,7 @@ def test_limits_hold_back_what_is_too_large(bench: SpoolBench) -> None:
     assert "pipe.mp4 is neither" in bench.status("odd")["error"]["message"]
 
 
-def test_names_that_come_again_get_a_number_and_no_job_is_lost(bench: SpoolBench) -> None:
+def test_repeated_names_get_a_number_and_no_job_is_lost(bench: SpoolBench) -> None:
     for _ in range(3):
         bench.drop("walk")
         bench.work_off()
@@ -194,7 +194,7 @@ def test_names_that_come_again_get_a_number_and_no_job_is_lost(bench: SpoolBench
 
 
 @pytest.mark.parametrize("name", ["a\nb", "-rf", "n" * 250, "ü" * 120, "e\u0301te", " lead"])
-def test_odd_names_are_worked_on(bench: SpoolBench, name: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_jobs_with_unusual_names_are_processed(bench: SpoolBench, name: str, capfd: pytest.CaptureFixture[str]) -> None:
     capture = bench.drop("walk").rename(bench.spool.inbox / name)
     assert bench.work_off() == 0, bench.told
     assert not capture.exists()
@@ -205,7 +205,7 @@ def test_odd_names_are_worked_on(bench: SpoolBench, name: str, capfd: pytest.Cap
     assert "done" in capfd.readouterr().out
 
 
-def test_names_that_are_no_text_are_refused(bench: SpoolBench) -> None:
+def test_names_that_are_not_utf8_are_refused(bench: SpoolBench) -> None:
     bench.drop("walk").rename(bench.spool.inbox / os.fsdecode(b"walk \xff"))
     torso = bench.drop("other") / "torso.mp4"
     torso.rename(torso.with_name(os.fsdecode(b"torso \xfe.mp4")))
@@ -236,7 +236,7 @@ def test_a_job_waits_while_the_store_is_cleaned(bench: SpoolBench) -> None:
     assert bench.told == ["walk: started", message, f"walk: done -> {bench.spool.done / 'walk'}"]
 
 
-def test_a_job_that_waits_for_a_cleaner_says_so_once(bench: SpoolBench) -> None:
+def test_waiting_for_gc_is_reported_once(bench: SpoolBench) -> None:
     bench.drop("walk")
     watcher = bench.watcher(once=False)
     thread = threading.Thread(target=watcher.run)
@@ -252,7 +252,7 @@ def test_a_job_that_waits_for_a_cleaner_says_so_once(bench: SpoolBench) -> None:
     assert [line.partition(": goes on")[0] for line in told] == ["walk: started", "walk: stopped"]
 
 
-def test_a_watcher_that_works_off_what_is_there_leaves_no_job_behind(bench: SpoolBench) -> None:
+def test_a_watcher_with_once_leaves_no_job_behind(bench: SpoolBench) -> None:
     for name in ("one", "two"):  # left by a watcher that had room for both
         bench.drop(name)
     bench.work_off()
@@ -272,7 +272,7 @@ def test_a_watcher_that_works_off_what_is_there_leaves_no_job_behind(bench: Spoo
     assert leftovers(bench) == []
 
 
-def test_folders_that_were_cleared_away_are_made_again(bench: SpoolBench) -> None:
+def test_removed_folders_are_created_again(bench: SpoolBench) -> None:
     watcher = bench.watcher()
     shutil.rmtree(bench.spool.done)
     shutil.rmtree(bench.spool.running)
@@ -282,7 +282,7 @@ def test_folders_that_were_cleared_away_are_made_again(bench: SpoolBench) -> Non
 
 
 @pytest.mark.slow
-def test_a_job_that_cannot_be_filed_away_is_told_and_filed_later(bench: SpoolBench) -> None:
+def test_a_job_that_cannot_be_filed_is_reported_and_filed_later(bench: SpoolBench) -> None:
     bench.drop("walk")
     watcher = bench.watcher(stale_s=1.0, once=False)
     bench.spool.done.rmdir()
@@ -299,7 +299,7 @@ def test_a_job_that_cannot_be_filed_away_is_told_and_filed_later(bench: SpoolBen
         thread.join()
 
 
-def test_a_drop_that_cannot_be_taken_is_told_once_and_tried_again(bench: SpoolBench) -> None:
+def test_an_entry_that_cannot_be_moved_is_reported_once_and_tried_again(bench: SpoolBench) -> None:
     bench.drop("walk")
     watcher = bench.watcher(stale_s=1.0, once=False)
     shutil.rmtree(bench.spool.running)
@@ -317,7 +317,7 @@ def test_a_drop_that_cannot_be_taken_is_told_once_and_tried_again(bench: SpoolBe
         thread.join()
 
 
-def test_footage_is_given_back_where_it_cannot_be_looked_at_any_more(
+def test_an_entry_is_returned_if_it_cannot_be_read_any_more(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = {path.name: path.read_bytes() for path in bench.drop("walk").iterdir()}
@@ -337,7 +337,7 @@ def test_footage_is_given_back_where_it_cannot_be_looked_at_any_more(
     assert leftovers(bench) == []
 
 
-def test_an_abandoned_claim_is_removed_only_while_nothing_is_in_it(bench: SpoolBench) -> None:
+def test_an_abandoned_claim_is_removed_only_if_it_is_empty(bench: SpoolBench) -> None:
     for name, dropped in (("empty", False), ("full", True)):
         place = JobDir(bench.spool.running / f"{CLAIM_PREFIX}{name}")
         place.path.mkdir()
@@ -366,7 +366,7 @@ def test_a_job_that_cannot_be_taken_over_stops_no_watcher(
     assert any(line.startswith("left: cannot be taken over") for line in bench.told)
 
 
-def test_what_is_no_job_stays_in_the_inbox_and_is_told(bench: SpoolBench) -> None:
+def test_paths_that_are_not_jobs_stay_in_the_inbox_and_are_listed(bench: SpoolBench) -> None:
     (bench.spool.inbox / "torso.mp4").write_text("a video without a folder")
     (bench.spool.inbox / ".hidden").mkdir()
     (bench.spool.inbox / "copying.part").mkdir()
@@ -375,7 +375,7 @@ def test_what_is_no_job_stays_in_the_inbox_and_is_told(bench: SpoolBench) -> Non
     assert states == {"torso.mp4": "ignored", "copying.part": "ignored"}
 
 
-def test_a_failed_job_says_why_keeps_what_there_is_and_can_be_retried(bench: SpoolBench) -> None:
+def test_a_failed_job_keeps_partial_results_and_can_be_retried(bench: SpoolBench) -> None:
     bench.order(fail="merge")
     bench.drop("walk")
     assert bench.work_off() == 4
@@ -397,7 +397,7 @@ def test_a_failed_job_says_why_keeps_what_there_is_and_can_be_retried(bench: Spo
     assert fresh.isdisjoint({"check", "keyframes", "map", "registration"})
 
 
-def test_a_job_file_comes_back_as_a_file_when_it_is_retried(bench: SpoolBench) -> None:
+def test_a_retried_job_file_is_a_file_again(bench: SpoolBench) -> None:
     (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
     assert bench.work_off() == 2
     assert retry_job(bench.spool, "walk") == bench.spool.inbox / "walk.yaml"
@@ -405,7 +405,7 @@ def test_a_job_file_comes_back_as_a_file_when_it_is_retried(bench: SpoolBench) -
     assert list(bench.spool.jobs()) == []
 
 
-def test_a_bug_fails_its_job_alone(bench: SpoolBench) -> None:
+def test_a_bug_fails_only_its_job(bench: SpoolBench) -> None:
     bench.orders.write_text("no JSON")
     bench.drop("first")
     assert bench.work_off() == 70
@@ -415,7 +415,7 @@ def test_a_bug_fails_its_job_alone(bench: SpoolBench) -> None:
     assert bench.work_off() == 0
 
 
-def test_a_copy_in_progress_is_left_alone_until_it_is_complete(bench: SpoolBench) -> None:
+def test_a_copy_in_progress_stays_in_the_inbox_until_it_is_complete(bench: SpoolBench) -> None:
     dropped = bench.drop("walk", ready=False)
     (dropped / "head.mp4.part").write_text("half")
     watcher = bench.watcher(once=False)
@@ -436,7 +436,7 @@ def test_a_copy_in_progress_is_left_alone_until_it_is_complete(bench: SpoolBench
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow)]
 )
-def test_a_stopped_watcher_leaves_its_job_and_the_next_one_goes_on(
+def test_the_next_watcher_continues_the_job_of_a_stopped_one(
     bench: SpoolBench, number: signal.Signals, code: int
 ) -> None:
     bench.drop("walk")
@@ -477,7 +477,7 @@ def test_a_killed_watcher_is_replaced_at_once_on_the_same_machine(bench: SpoolBe
 
 
 @pytest.mark.slow
-def test_a_job_is_cancelled_within_five_seconds_and_goes_on_when_retried(bench: SpoolBench) -> None:
+def test_a_job_is_cancelled_within_five_seconds_and_continues_when_retried(bench: SpoolBench) -> None:
     bench.drop("walk")
     bench.order(hang="map")
     process = bench.start("watch", "jobs/inbox", "--threads", "1")
@@ -494,7 +494,7 @@ def test_a_job_is_cancelled_within_five_seconds_and_goes_on_when_retried(bench: 
     assert {"stage": "check", "reused": True}.items() <= bench.status("walk")["finished_stages"][0].items()
 
 
-def test_what_done_and_failed_jobs_were_made_from_is_not_taken_for_garbage(bench: SpoolBench) -> None:
+def test_artefacts_of_done_and_failed_jobs_are_not_garbage(bench: SpoolBench) -> None:
     bench.drop("good")
     bench.work_off()
     bench.order(fail="merge")
@@ -507,7 +507,7 @@ def test_what_done_and_failed_jobs_were_made_from_is_not_taken_for_garbage(bench
     assert {"keyframes", "map", "registration", "export"} <= unused
 
 
-def test_a_waiting_job_is_cancelled_where_it_lies(bench: SpoolBench) -> None:
+def test_a_waiting_job_can_be_cancelled(bench: SpoolBench) -> None:
     bench.drop("walk")
     job = cancel_job(bench.spool, "walk")
     assert job is not None
@@ -538,7 +538,7 @@ def test_two_watchers_share_the_work_and_never_a_job(bench: SpoolBench) -> None:
 
 
 @pytest.mark.slow
-def test_a_watcher_that_was_suspended_gives_up_when_it_wakes(bench: SpoolBench) -> None:
+def test_a_suspended_watcher_gives_up_a_lost_job_when_it_resumes(bench: SpoolBench) -> None:
     bench.drop("walk")
     bench.order(hang="map")
     process = bench.start("watch", "jobs/inbox", "--threads", "1")
@@ -567,7 +567,7 @@ def test_a_watcher_that_was_suspended_gives_up_when_it_wakes(bench: SpoolBench) 
     assert leftovers(bench) == []
 
 
-def test_an_owner_that_was_replaced_writes_nothing_more(bench: SpoolBench) -> None:
+def test_a_replaced_owner_writes_nothing_more(bench: SpoolBench) -> None:
     job = JobDir(bench.drop("walk").rename(bench.spool.running / "walk"))
     first = create_claim(job)
     status = JobStatusFile(job, None, first.ownership.is_held)
@@ -581,7 +581,7 @@ def test_an_owner_that_was_replaced_writes_nothing_more(bench: SpoolBench) -> No
     assert {path: path.read_bytes() for path in before} == before
 
 
-def test_only_one_takes_a_job_over(bench: SpoolBench) -> None:
+def test_only_one_watcher_takes_a_job_over(bench: SpoolBench) -> None:
     job = JobDir(bench.drop("walk").rename(bench.spool.running / "walk"))
     first = create_claim(job)
     claims: list[object] = []
@@ -604,7 +604,7 @@ def test_only_one_takes_a_job_over(bench: SpoolBench) -> None:
     assert first.lost.is_set()
 
 
-def test_a_watcher_that_ends_between_the_last_word_and_the_move_is_finished_by_the_next(
+def test_a_job_with_a_final_status_is_filed_by_the_next_watcher(
     bench: SpoolBench,
 ) -> None:
     bench.drop("walk")
@@ -618,7 +618,7 @@ def test_a_watcher_that_ends_between_the_last_word_and_the_move_is_finished_by_t
     assert bench.job("walk").path.parent == bench.spool.done
 
 
-def test_folders_on_different_disks_are_refused_with_the_remedy(
+def test_folders_on_different_disks_are_refused_with_a_remedy(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = Path("/dev/shm") / f"bodycap-{os.getpid()}"  # noqa: S108
@@ -638,7 +638,7 @@ def test_folders_on_different_disks_are_refused_with_the_remedy(
         shutil.rmtree(other)
 
 
-def test_the_table_of_jobs_is_for_people_and_for_programs(
+def test_jobs_are_listed_as_a_table_and_as_json(
     bench: SpoolBench, capfd: pytest.CaptureFixture[str]
 ) -> None:
     bench.drop("good")

@@ -54,7 +54,7 @@ def failing(times: int, function: Callable[..., Any], number: int = errno.EIO) -
 
 
 @pytest.mark.parametrize("name", ["entries_in", "visible_entries", "ignored_paths_in"])
-def test_a_folder_that_cannot_be_read_for_a_while_is_waited_for(
+def test_the_watcher_waits_for_a_folder_that_cannot_be_read(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     """`visible_entries` lists the running jobs, `entries_in` and `ignored_paths_in` list the inbox."""
@@ -70,7 +70,7 @@ def test_a_folder_that_cannot_be_read_for_a_while_is_waited_for(
     assert any("answers again" in line for line in bench.told)
 
 
-def test_an_inbox_that_vanishes_is_waited_for_and_not_made_anew(bench: SpoolBench) -> None:
+def test_the_watcher_waits_for_a_missing_inbox_and_does_not_create_it(bench: SpoolBench) -> None:
     away = bench.folder / "unmounted"
     with running(bench.watcher(once=False)) as watcher:
         bench.spool.inbox.rename(away)
@@ -83,14 +83,14 @@ def test_an_inbox_that_vanishes_is_waited_for_and_not_made_anew(bench: SpoolBenc
     assert sum("the inbox is gone" in line for line in bench.told) == 1
 
 
-def test_a_watcher_that_is_to_leave_does_not_wait_for_ever(bench: SpoolBench) -> None:
+def test_a_watcher_with_once_does_not_wait_for_ever(bench: SpoolBench) -> None:
     watcher = bench.watcher(stale_s=1.0)
     bench.spool.inbox.rmdir()
     assert watcher.run() == StoreError.exit_code
     assert any("the inbox is gone" in line for line in bench.told)
 
 
-def test_pauses_grow_and_each_cause_is_told_once(bench: SpoolBench) -> None:
+def test_pauses_grow_and_each_cause_is_reported_once(bench: SpoolBench) -> None:
     now = [0.0]
     trouble = AccessFailures(bench.spool, bench.told.append, lambda: now[0])
     pauses = [trouble.record(OSError(errno.EIO, "x", "a")) for _ in range(9)]
@@ -104,7 +104,7 @@ def test_pauses_grow_and_each_cause_is_told_once(bench: SpoolBench) -> None:
     assert trouble.record(OSError(errno.EIO, "x", "a")) == 1
 
 
-def test_trouble_that_ends_while_it_is_asked_for_stops_no_heartbeat(bench: SpoolBench) -> None:
+def test_a_failure_that_ends_while_it_is_read_stops_no_heartbeat(bench: SpoolBench) -> None:
     trouble = AccessFailures(bench.spool, bench.told.append)
     trouble.record(OSError(errno.EIO, "x", "a"))
 
@@ -122,7 +122,7 @@ def test_trouble_that_ends_while_it_is_asked_for_stops_no_heartbeat(bench: Spool
     assert Over(bench.spool, bench.told.append).text == "a: Input/output error"
 
 
-def test_a_watcher_that_is_told_to_stop_at_any_moment_does_not_sleep(
+def test_a_stop_at_any_moment_ends_the_wait(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     watcher = bench.watcher(once=False)
@@ -158,7 +158,7 @@ def test_a_full_disk_while_the_store_is_cleaned_stops_no_watcher(
     assert worker.process(claim).path == bench.spool.done / "walk"
 
 
-def test_a_job_that_ends_while_the_store_is_cleaned_holds_nobody_up(bench: SpoolBench) -> None:
+def test_a_job_that_ends_while_the_store_is_cleaned_is_filed_later(bench: SpoolBench) -> None:
     (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
     drop = inbox_transfer.InboxEntry(bench.spool.inbox / "walk.yaml")
     claimed = inbox_transfer.claim_entry(
@@ -179,7 +179,7 @@ def test_a_job_that_ends_while_the_store_is_cleaned_holds_nobody_up(bench: Spool
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["in the watcher", "in a stage"])
-def test_a_job_whose_disk_goes_away_goes_on_later(
+def test_a_job_with_a_missing_disk_continues_later(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     from bodycap_batch.watch import job_worker
@@ -202,7 +202,7 @@ def test_a_job_whose_disk_goes_away_goes_on_later(
     assert bench.status("walk")["attempts"] == 2
 
 
-def test_a_job_whose_disk_never_answers_has_failed_in_the_end(
+def test_a_job_with_repeated_disk_failures_fails(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: Any, **__: Any) -> None:
@@ -224,7 +224,7 @@ def test_a_job_whose_disk_never_answers_has_failed_in_the_end(
 
 
 @pytest.mark.parametrize("away", [True, False])
-def test_a_job_whose_footage_is_away_waits_as_long_as_that_takes(
+def test_a_job_waits_for_missing_videos_without_a_limit(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], away: bool
 ) -> None:
     """While the disk answers a fault counts, unless the job has come further since the one before."""
@@ -259,7 +259,7 @@ def test_a_job_whose_footage_is_away_waits_as_long_as_that_takes(
     assert bench.status("walk")["state"] == "cancelled"
 
 
-def test_what_holds_a_job_up_again_and_again_is_told_once(
+def test_a_repeated_disk_failure_is_reported_once(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from bodycap_batch.watch import job_worker
@@ -272,7 +272,7 @@ def test_what_holds_a_job_up_again_and_again_is_told_once(
     assert bench.told.count("walk: started") == 1
 
 
-def test_footage_is_never_removed_because_the_disk_did_not_answer(
+def test_videos_are_never_removed_because_the_disk_did_not_answer(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place = JobDir(bench.spool.running / ".claim-1")
@@ -285,7 +285,7 @@ def test_footage_is_never_removed_because_the_disk_did_not_answer(
     assert inbox_transfer.return_to_inbox(bench.spool, place) == bench.spool.inbox / ".claim-1"
 
 
-def test_what_stays_in_the_inbox_is_told_when_a_watcher_leaves(bench: SpoolBench) -> None:
+def test_paths_left_in_the_inbox_are_reported_when_a_watcher_ends(bench: SpoolBench) -> None:
     (bench.spool.inbox / "empty").mkdir()
     (bench.drop("copied", ready=False) / "head.mp4.part").touch()
     (bench.spool.inbox / "torso.mp4").touch()
@@ -301,7 +301,7 @@ def test_what_stays_in_the_inbox_is_told_when_a_watcher_leaves(bench: SpoolBench
     assert (bench.spool.inbox / "copied" / "head.mp4.part").exists()
 
 
-def test_a_folder_that_cannot_be_looked_at_is_told_and_holds_nobody_up(
+def test_an_unreadable_entry_is_reported_and_delays_no_other(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.drop("locked")
@@ -327,7 +327,7 @@ def test_a_folder_that_cannot_be_looked_at_is_told_and_holds_nobody_up(
         '{"attempts": "many", "notes": 3, "error": "x", "active": 1, "dropped": 5, "progress": "a"}',
     ],
 )
-def test_a_status_that_somebody_garbled_harms_nothing(bench: SpoolBench, text: str) -> None:
+def test_a_damaged_status_file_does_no_harm(bench: SpoolBench, text: str) -> None:
     bench.drop("walk")
     bench.work_off()
     job = bench.job("walk")
@@ -345,7 +345,7 @@ def test_a_status_that_somebody_garbled_harms_nothing(bench: SpoolBench, text: s
     assert Store(bench.spool.root / ".store").root.is_dir()
 
 
-def test_who_watches_and_what_holds_it_up_is_told_with_the_jobs(
+def test_watchers_and_their_failures_are_listed_with_the_jobs(
     bench: SpoolBench, capfd: pytest.CaptureFixture[str]
 ) -> None:
     def told() -> list[str]:
@@ -369,7 +369,7 @@ def test_who_watches_and_what_holds_it_up_is_told_with_the_jobs(
     assert list(bench.spool.running.iterdir()) == []
 
 
-def test_a_killed_watcher_is_not_taken_for_one_at_work(bench: SpoolBench) -> None:
+def test_a_killed_watcher_is_not_listed(bench: SpoolBench) -> None:
     presence = WatcherStatusFile(bench.spool)
     presence.write("")
     (mine,) = bench.spool.running.glob(".watcher-*")

@@ -77,7 +77,7 @@ def test_jobs_logs_and_results_are_shown(bench: SpoolBench, client: Client) -> N
     assert "allow-same-origin" not in headers["content-security-policy"]
 
 
-def test_a_disk_that_does_not_answer_is_told_and_the_jobs_stay_in_sight(
+def test_a_missing_disk_is_reported_and_the_last_jobs_stay_listed(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.drop("walk")
@@ -135,7 +135,7 @@ def test_requests_of_other_pages_are_refused(bench: SpoolBench, client: Client) 
     assert json.loads(data)["hint"]
 
 
-def test_a_token_is_asked_for_and_remembered_in_a_cookie(bench: SpoolBench) -> None:
+def test_a_token_is_required_and_stored_in_a_cookie(bench: SpoolBench) -> None:
     token = "0123456789abcdef0123"  # noqa: S105
     with LivePage(bench.spool, Access(host="127.0.0.1", port=0, token=token), Limits()) as page:
         client = Client(page)
@@ -149,7 +149,7 @@ def test_a_token_is_asked_for_and_remembered_in_a_cookie(bench: SpoolBench) -> N
         assert client.ask("GET", "/", cookie=headers["set-cookie"].split(";")[0])[0] == 200
 
 
-def test_a_folder_that_is_sent_becomes_a_job(bench: SpoolBench, client: Client) -> None:
+def test_an_uploaded_folder_becomes_a_job(bench: SpoolBench, client: Client) -> None:
     key = client.begin("kitchen walk")
     client.json("PUT", f"/api/uploads/{key}/torso.mp4", b"frames of torso")
     client.json("PUT", f"/api/uploads/{key}/left_palm/GX010001.MP4", b"frames of left_palm")
@@ -176,7 +176,7 @@ def test_a_folder_that_is_sent_becomes_a_job(bench: SpoolBench, client: Client) 
     ],
     ids=lambda value: str(value)[:30],
 )
-def test_what_is_sent_is_checked(
+def test_uploaded_files_are_checked(
     bench: SpoolBench, client: Client, name: str, body: bytes, code: tuple[int, ...]
 ) -> None:
     key = client.begin("walk")
@@ -187,7 +187,7 @@ def test_what_is_sent_is_checked(
     assert files == [bench.orders]
 
 
-def test_uploads_are_counted_and_swept(bench: SpoolBench, client: Client) -> None:
+def test_the_number_of_uploads_is_limited(bench: SpoolBench, client: Client) -> None:
     keys = [client.begin(f"walk {number}") for number in range(8)]
     assert client.ask("POST", "/api/uploads", {"name": "one more"})[0] == 400
     assert client.ask("DELETE", f"/api/uploads/{keys[0]}")[0] == 200
@@ -217,7 +217,7 @@ class Slow:
 
 
 @pytest.mark.parametrize("name", ["torso.mp4", "TORSO.mp4"])
-def test_a_file_that_is_being_sent_is_not_sent_by_another_request(
+def test_a_file_cannot_be_sent_by_two_requests(
     bench: SpoolBench, client: Client, name: str
 ) -> None:
     key = client.begin("walk")
@@ -247,7 +247,7 @@ def test_a_folder_is_not_finished_while_a_file_is_being_sent(bench: SpoolBench, 
     assert files == ["READY", "head.mp4", "torso.mp4"]
 
 
-def test_a_folder_that_is_dropped_while_a_file_is_being_sent_is_gone(
+def test_a_discarded_upload_is_removed_while_a_file_is_being_sent(
     bench: SpoolBench, client: Client
 ) -> None:
     key = client.begin("walk")
@@ -259,7 +259,7 @@ def test_a_folder_that_is_dropped_while_a_file_is_being_sent_is_gone(
     assert list(bench.spool.inbox.iterdir()) == []
 
 
-def test_what_is_left_of_a_broken_upload_vanishes_with_the_page(bench: SpoolBench) -> None:
+def test_an_interrupted_upload_is_removed_with_the_page(bench: SpoolBench) -> None:
     with LivePage(bench.spool, Access(host="127.0.0.1", port=0), Limits()) as page:
         client = Client(page)
         key = client.begin("walk")
@@ -270,7 +270,7 @@ def test_what_is_left_of_a_broken_upload_vanishes_with_the_page(bench: SpoolBenc
     assert list(bench.spool.inbox.iterdir()) == []
 
 
-def test_a_page_that_starts_removes_only_what_killed_pages_left(bench: SpoolBench, client: Client) -> None:
+def test_a_starting_page_removes_only_uploads_of_killed_pages(bench: SpoolBench, client: Client) -> None:
     client.begin("walk")
     (mine,) = bench.spool.inbox.glob(".upload-*")
     machine, pid, start, key = mine.name.removeprefix(".upload-").split("-")
@@ -317,7 +317,7 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.mark.browser
-def test_the_page_follows_the_jobs_and_takes_videos_in(
+def test_the_page_shows_the_jobs_and_accepts_videos(
     bench: SpoolBench, page: LivePage, browser: Any
 ) -> None:
     told: list[str] = []

@@ -37,7 +37,7 @@ def between(function: Callable[..., Any], action: Callable[[], None]) -> Callabl
     return both
 
 
-def test_a_retried_jobs_finished_stages_are_kept_until_it_has_run_again(bench: SpoolBench) -> None:
+def test_finished_stages_of_a_retried_job_are_kept_until_it_has_run_again(bench: SpoolBench) -> None:
     bench.order(fail="merge")
     bench.drop("walk")
     bench.work_off()
@@ -81,7 +81,7 @@ def test_the_store_is_not_cleaned_in_the_middle_of_a_retry(
     assert kept(bench)
 
 
-def test_of_two_who_retry_a_job_one_is_told(bench: SpoolBench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_second_of_two_retries_is_an_error(bench: SpoolBench, monkeypatch: pytest.MonkeyPatch) -> None:
     (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
     assert bench.work_off() == 2
     rename = commands.os.rename  # type: ignore[attr-defined]
@@ -98,7 +98,7 @@ def test_of_two_who_retry_a_job_one_is_told(bench: SpoolBench, monkeypatch: pyte
     assert first[0].read_text() == "capture: {}"
 
 
-def test_a_watcher_that_starts_leaves_a_retry_under_way_alone_and_ends_a_killed_one(
+def test_a_watcher_finishes_a_killed_retry_but_not_a_running_one(
     bench: SpoolBench,
 ) -> None:
     (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
@@ -114,7 +114,7 @@ def test_a_watcher_that_starts_leaves_a_retry_under_way_alone_and_ends_a_killed_
     assert list(bench.spool.failed.iterdir()) == []
 
 
-def test_a_retry_that_is_killed_while_a_watcher_runs_is_ended_by_it(
+def test_a_running_watcher_finishes_a_killed_retry(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
@@ -131,7 +131,7 @@ def test_a_retry_that_is_killed_while_a_watcher_runs_is_ended_by_it(
     assert sum(line.startswith("walk: failed") for line in bench.told) == 2
 
 
-def test_two_who_put_a_drop_back_do_it_once(bench: SpoolBench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_processes_return_an_entry_once(bench: SpoolBench, monkeypatch: pytest.MonkeyPatch) -> None:
     place = JobDir(bench.spool.failed / f"{RETRY_PREFIX}1")
     place.path.mkdir()
     bench.drop("walk").rename(place.input)
@@ -150,7 +150,7 @@ def test_two_who_put_a_drop_back_do_it_once(bench: SpoolBench, monkeypatch: pyte
 
 
 @pytest.mark.parametrize("moment", ["before it is taken", "while it has no name"])
-def test_a_job_that_is_claimed_while_it_is_cancelled_is_cancelled(
+def test_a_job_that_is_claimed_during_the_cancellation_is_cancelled(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, moment: str
 ) -> None:
     drop = InboxEntry(bench.drop("walk"))
@@ -186,7 +186,7 @@ def test_a_job_that_is_claimed_while_it_is_cancelled_is_cancelled(
     assert [path.name for path in bench.spool.running.iterdir()] == ["walk"]
 
 
-def test_a_job_whose_watcher_was_killed_while_it_claimed_it_can_be_cancelled(bench: SpoolBench) -> None:
+def test_a_half_claimed_job_can_be_cancelled(bench: SpoolBench) -> None:
     place = JobDir(bench.spool.running / f"{CLAIM_PREFIX}1")
     place.path.mkdir()
     inbox_transfer.create_claim(place).release()
@@ -198,7 +198,7 @@ def test_a_job_whose_watcher_was_killed_while_it_claimed_it_can_be_cancelled(ben
     assert (bench.job("walk").input / "torso.mp4").is_file()
 
 
-def test_a_job_that_ends_while_it_is_cancelled_is_not_called_cancelled(
+def test_a_job_that_ends_during_the_cancellation_is_done(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     bench.drop("walk")
@@ -216,7 +216,7 @@ def test_a_job_that_ends_while_it_is_cancelled_is_not_called_cancelled(
     assert "it ended before it could be stopped: done" in capfd.readouterr().out
 
 
-def test_jobs_side_by_side_do_not_make_the_same_twice(
+def test_parallel_jobs_share_their_stage_turns(
     bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shared: list[object] = []

@@ -273,7 +273,7 @@ def test_readers_answer_or_refuse_thousands_of_inputs(name: str) -> None:
     run(name, round(float(os.environ.get(SHARE, USUAL_SHARE)) * CASES[name][2]))
 
 
-def test_the_sound_files_are_read() -> None:
+def test_the_valid_files_are_read() -> None:
     """What is mutated is accepted as it is, so that mutations reach behind the first check."""
     (FOLDER / "torso.mp4").write_bytes(b"")
     for name in ("a.mp4", "b.mp4"):
