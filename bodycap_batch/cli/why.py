@@ -78,7 +78,7 @@ def gc(
     delete: Annotated[bool, typer.Option("--delete", help="Remove the listed artefacts.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """List the artefacts that no job uses; with --delete, remove them.
+    """List the artefacts that no job uses, or remove them.
 
     The artefacts of each job's last run are kept as long as its results folder exists. Results are never
     removed.

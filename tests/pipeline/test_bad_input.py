@@ -83,7 +83,7 @@ def partly_black(root: Path) -> None:
         (dropped, "15 frames were dropped"),
         (frozen, "the picture stands still"),
         (no_contrast, "hardly any contrast"),
-        (partly_black, "pictures looked at are black"),
+        (partly_black, "inspected pictures are black"),
         (edit("capture:", "skeleton: none\ncapture:"), "ready to run"),
         (lambda root: (root / "calib.json").unlink() or edit("calib.json", "auto")(root), "not calibrated"),
     ],

@@ -27,7 +27,7 @@ BODYCAP = (sys.executable, str(Path(__file__).with_name("fake_bodycap.py")))
 
 
 class Bench:
-    """A folder with two videos to run `bodycap` in."""
+    """A folder with two videos in which `bodycap` runs."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -92,7 +92,7 @@ def test_the_second_run_has_nothing_to_do(bench: Bench) -> None:
     bench.run("run", "my walk")
     code, out, _ = bench.run("run", "my walk")
     assert code == 0
-    assert "nothing to do, all 10 stages were done before" in out
+    assert "nothing to do, all 10 stages were finished before" in out
 
 
 def test_results_elsewhere_have_their_store_beside_them(bench: Bench) -> None:
@@ -112,18 +112,21 @@ def test_the_store_can_be_named_by_option_or_variable(bench: Bench) -> None:
 def test_a_run_until_registration_names_that_stage(bench: Bench) -> None:
     bench.order(localised=[40], lost={"torso": 3})
     code, out, _ = bench.run("run", "my walk", "--until", "registration")
-    assert (code, out) == (0, "my_walk: stopped after registration, as asked; run it again for the rest\n")
+    assert (code, out) == (
+        0,
+        "my_walk: stopped after registration, as requested; run it again for the rest\n",
+    )
 
 
 @pytest.mark.slow
 def test_stages_are_repeated_skipped_explained_and_removed(bench: Bench) -> None:
     code, out, _ = bench.run("run", "my walk", "--until", "keyframes")
-    assert (code, out) == (0, "my_walk: stopped after keyframes, as asked; run it again for the rest\n")
+    assert (code, out) == (0, "my_walk: stopped after keyframes, as requested; run it again for the rest\n")
     code, out, _ = bench.run("why", "my walk")
     assert code == 0
-    said = [" ".join(line.split()) for line in out.splitlines()]
-    assert "map would run: not computed before" in said
-    assert "merge would run: after map" in said
+    lines = [" ".join(line.split()) for line in out.splitlines()]
+    assert "map would run: not computed before" in lines
+    assert "merge would run: after map" in lines
     bench.run("run", "my walk")
     assert bench.run("why", "my walk")[1].splitlines()[-1] == "nothing to do"
     _, _, err = bench.run("run", "my walk", "--from", "merge")
@@ -137,7 +140,7 @@ def test_stages_are_repeated_skipped_explained_and_removed(bench: Bench) -> None
     code, out, _ = bench.run("gc")
     assert code == 0
     assert "would remove" in out
-    assert "(--delete does it)" in out
+    assert "(--delete removes them)" in out
     assert out.replace("would remove", "removed").partition(" (")[0] in bench.run("gc", "--delete")[1]
     assert json.loads(bench.run("gc", "--json")[1])["artefacts"] == []
 
@@ -346,10 +349,10 @@ def test_a_disk_that_does_not_answer_is_not_a_bug(
 
     monkeypatch.setattr(Path, "resolve", stale)
     assert main(["check", "walk"]) == 5
-    told = capfd.readouterr().err
-    assert "error: walk: Stale file handle" in told
-    assert "mounted" in told
-    assert "bug" not in told
+    output = capfd.readouterr().err
+    assert "error: walk: Stale file handle" in output
+    assert "mounted" in output
+    assert "bug" not in output
 
 
 def test_the_version_is_printed(capfd: pytest.CaptureFixture[str]) -> None:

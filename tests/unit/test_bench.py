@@ -1,4 +1,4 @@
-"""The benchmark's own parts: the peers' pairs, stopping them, reading a job's events."""
+"""Parts of the benchmarks: the peers' pairs, their time limit, reading a job's events."""
 
 import av
 import numpy as np
@@ -43,7 +43,7 @@ def test_peer_pairs_grow_with_the_frames_not_their_square():
         counts.append(len(pairs_of(names, times, rng.uniform(size=(2 * length, 2 * length)))))
     most = len(STEPS) + OWN_AGAIN + FROM_OTHER + 1
     assert counts[1] <= most * 800
-    # Twice the frames, twice the pairs; pairs found from both sides vary by some percent.
+    # Twice the frames give twice the pairs; pairs found from both sides vary by some percent.
     assert 1.9 < counts[1] / counts[0] < 2.2
 
 
@@ -153,7 +153,7 @@ def test_keyframes_are_evaluated_after_one_similarity():
 
 
 def _poses_with_noise(rng, count, sigma):
-    """Random true poses, what was measured of them in another gauge, and the covariances it states."""
+    """Return random true poses, noisy measurements of them in another gauge, and their covariances."""
     true = make_transform(so3_exp(rng.normal(0.0, 0.5, (count, 3))), rng.normal(0.0, 1.0, (count, 3)))
     gauge = Similarity(3.0, so3_exp(np.array([0.4, -0.2, 1.0])), np.array([1.0, 2.0, 3.0]))
     noise = rng.normal(0.0, sigma, (count, 6))
@@ -162,14 +162,14 @@ def _poses_with_noise(rng, count, sigma):
 
 
 def test_correct_covariances_of_poses_give_one_in_any_gauge():
-    mine, true, stated = _poses_with_noise(np.random.default_rng(4), 400, 0.01)
-    mine[:8, :3, 3] += 0.5  # gross errors count as such and pull at nothing
-    found = poses.figures(poses.least_errors(mine, true, stated), stated)
+    estimates, true, stated = _poses_with_noise(np.random.default_rng(4), 400, 0.01)
+    estimates[:8, :3, 3] += 0.5  # gross errors must not change the alignment
+    found = poses.figures(poses.least_errors(estimates, true, stated), stated)
     for part in ("rotation", "centre", "pose"):
-        # A median of 400 draws of chi-squared (3) is good to 6 %, three sigmas of that and some for 8 gross.
+        # The median of 400 draws of chi-squared (3) has a sigma of 6 %; three sigmas and a margin.
         assert 0.8 < found[part] < 1.25
         assert found[f"{part}_inside"] > 0.9
-    wide = poses.figures(poses.least_errors(mine, true, 4.0 * stated), 4.0 * stated)
+    wide = poses.figures(poses.least_errors(estimates, true, 4.0 * stated), 4.0 * stated)
     assert np.isclose(wide["centre"], found["centre"] / 4.0, rtol=0.02)
     assert wide["centre_inside"] > 0.97
 
@@ -193,5 +193,5 @@ def test_a_long_capture_is_a_short_one_played_forwards_and_backwards(tmp_path):
         seen = [frame.to_ndarray(format="gray").mean() for frame in opened.decode(opened.streams.video[0])]
     assert len(seen) == 10
     assert np.argmax(seen[:4]) == 3
-    # Brighter by a tenth the second time, with noise of its own.
+    # The second time the picture is brighter by a tenth and has other noise.
     assert 1.05 < seen[5] / seen[1] < 1.2

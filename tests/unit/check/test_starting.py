@@ -104,9 +104,7 @@ def test_every_option_of_every_stage_is_listed_with_its_default(folder: Path) ->
     assert set(found) == {"keyframes", "map", "registration", "merge", "export"}
 
 
-def test_an_existing_job_file_is_kept_without_force(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_existing_job_file_is_kept_without_force(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "job.yaml").write_text("mine")
     assert main(["init", str(folder)]) == 2
     assert "--force" in capsys.readouterr().err
