@@ -110,7 +110,7 @@ def test_a_missing_chapter_is_no_matter_where_the_times_are_stated(capture: Path
 @pytest.mark.parametrize(
     ("break_it", "code", "message"),
     [
-        (black, 3, "torso.mp4: camera torso shows black pictures only"),
+        (black, 3, "torso.mp4: camera torso shows only black pictures"),
         (edit("capture:", "hight_m: 1\ncapture:"), 2, "job.yaml:1: hight_m: unknown key"),
     ],
 )
