@@ -10,7 +10,8 @@ from bodycap_batch.config.models import SKELETON_PRESETS, Job
 _LOW_FPS = 24.0
 """Frames a second below which swinging arms are poorly sampled; cinema cameras run at 24. Evidence: none."""
 _MAX_MISSING_S = 3.0
-"""Seconds by which a camera may start later or end earlier than the others without advice. Evidence: none."""
+"""A camera gives no advice if it starts later or ends earlier than the others by fewer seconds. Evidence:
+none."""
 _MAX_MISSING_RATIO = 0.1
 """The same as a fraction of the capture's duration; the larger of both counts. Evidence: none."""
 _SECONDS_PER_VIDEO_SECOND = (1.3, 5.0)

@@ -17,7 +17,7 @@ def require_distinct_videos(job: Job) -> None:
     """Refuse a video that belongs to two cameras, and a list of chapters with a missing one.
 
     Raises:
-        CaptureError: There is such a video or a missing chapter; the error names the file.
+        CaptureError: Two cameras share a video, or a chapter is missing; the error names the file.
     """
     for camera in job.capture.cameras:
         _require_all_chapters(camera)

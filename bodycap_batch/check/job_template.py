@@ -25,7 +25,7 @@ from bodycap_batch.formats.files import write_text
 
 JOB_FILE = "job.yaml"
 UNKNOWN_MOUNT = "<where on the body?>"
-"""Placeholder for the mount of a camera whose file name does not state it."""
+"""Placeholder for a mount that the camera's file name does not state."""
 _STAGES = ("keyframes", "map", "registration", "merge", "export")
 _OPTION_WIDTH = 34
 """Characters of an option before its meaning."""
@@ -115,9 +115,9 @@ def _calibration_lines(folder: Path) -> list[str]:
 
 
 def _mount_lines() -> list[str]:
-    """Return the names of mounts, for cameras whose file names do not state the mount."""
+    """Return the possible mounts as comments, for cameras with file names that do not state the mount."""
     listed = textwrap.wrap(", ".join(MOUNT_NAMES), 90)
-    return ["  # Where a camera can be on the body (`mount:`):", *(f"  #   {line}" for line in listed)]
+    return ["  # Places of a camera on the body (`mount:`):", *(f"  #   {line}" for line in listed)]
 
 
 def _camera_lines(safe: str, name: str, files: Sequence[Path], folder: Path) -> list[str]:

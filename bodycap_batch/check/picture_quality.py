@@ -141,16 +141,16 @@ def sample_indices(camera: CaptureCamera, count: int) -> IntArray:
     return np.unique(np.concatenate([picked, _frames_between_keys(far, keys, last, max_decoded), [0, end]]))
 
 
-def _frames_between_keys(wanted: IntArray, keys: IntArray, last: int, max_decoded: int) -> IntArray:
-    """Return frames for the wanted indices that are far from a key frame.
+def _frames_between_keys(far_indices: IntArray, keys: IntArray, last: int, max_decoded: int) -> IntArray:
+    """Return frames to replace sample frames that are far from a key frame.
 
     Args:
-        wanted: (N,) wanted frame indices.
+        far_indices: (N,) indices of the frames to replace.
         keys: (K,) indices of the key frames.
         last: Index of the last frame.
         max_decoded: Number of frames that may be decoded in all.
     """
-    before = np.searchsorted(keys, wanted, side="right") - 1
+    before = np.searchsorted(keys, far_indices, side="right") - 1
     starts, counts = np.unique(before[before >= 0], return_counts=True)
     out = [np.zeros(0, dtype=np.int64)]
     for start, frames in zip(starts.tolist(), counts.tolist(), strict=True):

@@ -45,8 +45,8 @@ _ExecutorOption = Annotated[
     str,
     typer.Option(
         metavar="local|ADDRESS|slurm|pbs",
-        help="Where tasks run: on this machine, on the workers of a Dask scheduler (tcp://HOST:8786), "
-        "or in a queue.",
+        help="Place of the tasks: this machine, the workers of a Dask scheduler (tcp://HOST:8786), "
+        "or a queue.",
     ),
 ]
 
@@ -147,7 +147,7 @@ def _executor(kind: str, threads: int, workers: int, memory_mb: int) -> Iterator
 
 
 def _with_worker_note(cluster: Cluster) -> Cluster:
-    """Return the cluster, and tell the user if it has no worker yet.
+    """Return the cluster, after a note to the user if it has no worker yet.
 
     Dask's messages about a lost connection are switched off: they are long tracebacks, and each job reports
     its end.

@@ -73,7 +73,7 @@ def evaluate(
     if not reports:
         raise JobError(
             f"nothing in {estimate} can be compared with {truth}",
-            hint="give two .tum files, two .bvh files, or two folders whose .tum files have the same names",
+            hint="name two .tum files, two .bvh files, or two folders with .tum files of the same names",
         )
     values = {name: report.to_dict() for name, report in reports.items()}
     typer.echo(json.dumps(values, indent=1) if as_json else "\n".join(_table_lines(values)))
@@ -161,7 +161,9 @@ _MOTION_ROWS = (
     ("angle_deg", "angles, degrees", 1),
     ("angle_offset_free_deg", "angles less a constant, degrees", 1),
 )
+"""Key of a figure, its label with the unit, and the factor to that unit."""
 _RELATIVE_ROWS = (("vector_m", "vector, cm"), ("in_reference_m", "in its frame, cm"))
+"""Key of a figure, and its label with the unit."""
 
 
 def _camera_line(name: str, score: dict[str, Any]) -> str:

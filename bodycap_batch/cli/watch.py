@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 RootOption = Annotated[
     list[Path] | None,
-    typer.Option(metavar="DIR", help="A folder whose files every job may name. Repeatable."),
+    typer.Option(metavar="DIR", help="A folder with files that every job may name. Repeatable."),
 ]
 LimitOption = Annotated[
     list[str] | None,

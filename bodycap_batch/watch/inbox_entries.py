@@ -197,7 +197,7 @@ def _is_special_file(path: Path) -> bool:
 
 
 def _is_utf8(name: str) -> bool:
-    """Return False for bytes that are not UTF-8: such a name cannot be written to a text file."""
+    """Return False for a name with bytes that are not UTF-8. It cannot be written to a text file."""
     try:
         name.encode()
     except UnicodeEncodeError:

@@ -1,4 +1,4 @@
-"""The `bodycap` command that is killed, or whose disk becomes full, at a chosen moment.
+"""The `bodycap` command that is killed, or that gets a full disk, at a chosen moment.
 
 The environment names a JSON file with the orders:
 

@@ -59,7 +59,7 @@ class Uploads:
     """The folders that browsers are uploading.
 
     Args:
-        spool: Spool whose inbox gets the complete folders.
+        spool: Complete folders are moved to its inbox.
         limits: Largest files and their number.
     """
 
@@ -150,7 +150,7 @@ class Uploads:
                 self._remove(upload)
 
     def clear(self) -> None:
-        """Remove all incomplete uploads: nobody can continue them after the page ends."""
+        """Remove all incomplete uploads, because they cannot be continued after the page ends."""
         for key in list(self._open):
             self.discard(key)
 
