@@ -1,4 +1,4 @@
-"""Captures with truth, altered as the field alters them: codecs, rates, light, what covers a lens."""
+"""Captures with truth, altered as in practice: codecs, rates, light, covered lenses."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _SOUND_HZ = 16_000
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """How one camera's video comes out.
+    """How one camera's video is recorded.
 
     Attributes:
-        kept: (N,) which frames, given their times (s) and a source of chance.
-        look: What a frame (H,W,3) at a time (s) looks like.
-        turn: Quarter turns counter-clockwise that the picture is stored by; a player turns it back.
+        kept: Returns which frames (N,) are kept, given their times (s) and a random generator.
+        look: Returns the frame (H,W,3) at a time (s) as it is recorded.
+        turn: Quarter turns counter-clockwise by which the picture is stored; a player turns it back.
         sound: With a sound track.
         codec: FFmpeg's name of the encoder.
-        options: Its options.
+        options: Options of the encoder.
     """
 
     kept: Callable[[FloatArray, np.random.Generator], Any] = lambda times_s, rng: times_s >= 0.0
@@ -43,12 +43,12 @@ class Recording:
 
 
 def exposed(image: Image, gain: float) -> Image:
-    """The picture with more or less light."""
+    """Return the picture with more or less light."""
     return cv2.convertScaleAbs(image, alpha=gain).astype(np.uint8)
 
 
 def phone(image: Image, time_s: float) -> Image:
-    """An exposure that swings by a factor of three, burnt out at its height."""
+    """Return the picture with an exposure that varies by a factor of three and saturates at its maximum."""
     return exposed(image, 1.0 + 0.5 * float(np.sin(2.0 * np.pi * time_s / 1.7)))
 
 
@@ -60,11 +60,11 @@ AS_A_PHONE = Recording(
     codec="libx265",
     options={"crf": "32", "preset": "ultrafast", "x265-params": "log-level=none"},
 )
-"""Upright in the hand, a frame in seven lost, strongly compressed, with sound."""
+"""Upright in the hand, one frame in seven lost, strongly compressed, with sound."""
 
 
 def covered(*spans_s: tuple[float, float]) -> Recording:
-    """Something dark before the lens from when to when."""
+    """Return a recording in which the lens is covered during the given intervals."""
 
     def look(image: Image, time_s: float) -> Image:
         if not any(start <= time_s < end for start, end in spans_s):
@@ -75,12 +75,17 @@ def covered(*spans_s: tuple[float, float]) -> Recording:
     return Recording(look=look)
 
 
-def zoomed(share: float) -> Recording:
-    """The middle of the picture, enlarged: digital zoom, which no calibration of the lens knows of."""
+def zoomed(fraction: float) -> Recording:
+    """Return a recording of the enlarged middle of the picture: a digital zoom that the calibration does not
+    know.
+
+    Args:
+        fraction: Side of the middle over the side of the picture.
+    """
 
     def look(image: Image, time_s: float) -> Image:
         height, width = image.shape[:2]
-        top, left = (round(side * (1.0 - share) / 2.0) for side in (height, width))
+        top, left = (round(side * (1.0 - fraction) / 2.0) for side in (height, width))
         middle = image[top : height - top, left : width - left]
         return cv2.resize(middle, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.uint8)
 
@@ -88,7 +93,7 @@ def zoomed(share: float) -> Recording:
 
 
 def slower(every: int, size: tuple[int, int]) -> Recording:
-    """One frame in so many, in another size."""
+    """Return a recording of every n-th frame in another size."""
     return Recording(
         kept=lambda times_s, rng: np.arange(len(times_s)) % every == 0,
         look=lambda image, time_s: cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8),
@@ -96,12 +101,12 @@ def slower(every: int, size: tuple[int, int]) -> Recording:
 
 
 def alter(source: Path, target: Path, recordings: Mapping[str, Recording]) -> Path:
-    """Record a capture anew; its truth keeps the frames that are left, times stay as they were.
+    """Record a capture again. Its truth keeps the remaining frames; times do not change.
 
     Args:
         source: ``<camera>.mp4``, ``calib.json`` and ``gt/``, as `bodycap synth` writes them.
         target: A new folder.
-        recordings: By camera; the others are copied.
+        recordings: Per camera; the other cameras are copied.
     """
     (target / "gt").mkdir(parents=True)
     for path in [*source.glob("*.json"), *(source / "gt").iterdir()]:

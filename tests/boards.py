@@ -1,4 +1,4 @@
-"""Clips of calibration boards, drawn ray by ray through a known lens."""
+"""Clips of calibration boards, rendered ray by ray with known intrinsics."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ _FINER = 2
 
 
 def chessboard_picture(columns, rows):
-    """A board with that many inner corners, black square first."""
+    """Return the picture of a chessboard with that many inner corners; the first square is black."""
     squares = (np.indices((rows + 1, columns + 1)).sum(axis=0) % 2).astype(np.uint8)
     return np.kron(25 + 205 * squares, np.ones((SQUARE_TEXELS, SQUARE_TEXELS), np.uint8)).astype(np.uint8)
 
 
 def with_margin(picture):
-    """White paper around a board, one square wide."""
+    """Return a board with a margin of white paper, one square wide."""
     return cv2.copyMakeBorder(picture, *[SQUARE_TEXELS] * 4, cv2.BORDER_CONSTANT, value=235)
 
 
 def board_clip(camera, picture, views, rng, *, whole):
-    """Pictures (H,W) of a board moved about before a lens.
+    """Render pictures (H,W) of a board that moves before a camera.
 
     Args:
-        camera: The lens.
-        picture: The board with its margin, `SQUARE_TEXELS` a square.
-        views: How many pictures; each shows the board elsewhere, tilted otherwise.
-        rng: Source of poses and noise.
-        whole: True keeps the board inside the picture, False lets its edges leave it.
+        camera: The intrinsics.
+        picture: The board with its margin, `SQUARE_TEXELS` per square.
+        views: Number of pictures; each shows the board at another position and tilt.
+        rng: Random generator of poses and noise.
+        whole: True keeps the board inside the picture, False lets its edges leave the picture.
     """
     fine = camera.scaled(camera.width_px * _FINER, camera.height_px * _FINER)
     rays = _rays(fine.model, fine.width_px, fine.height_px, tuple(fine.params.tolist()))
@@ -44,13 +44,13 @@ def board_clip(camera, picture, views, rng, *, whole):
     out = []
     for index in range(views):
         turn = so3_exp(np.append(rng.uniform(-0.6, 0.6, 2), rng.uniform(-0.3, 0.3)))
-        # Towards nine places of the picture in turn, as one is told to film.
+        # Towards nine positions in the picture in turn, as the instructions demand.
         place = away * np.array([index % 3 - 1, 0.8 * (index // 3 % 3 - 1)])
         toward = place * [camera.width_px, camera.height_px]
         middle = camera.unproject(np.array(camera.principal_point_px) + toward[None])[0]
         depth = width / SQUARE_TEXELS * rng.uniform(1.0, 1.5) * nearest * camera.focal_px / camera.width_px
         centre = np.append(middle, 1.0) * depth
-        # Ray · s meets the plane through the centre: board coordinates are squares from its middle.
+        # Intersect each ray with the board's plane. Board coordinates are squares from the board's middle.
         facing = (rays @ turn[:, 2:].astype(np.float32))[:, 0]
         scale = np.float32(turn[:, 2] @ centre) / facing
         texel = rays @ turn[:, :2].astype(np.float32) * scale[:, None] * np.float32(SQUARE_TEXELS)
@@ -66,7 +66,7 @@ def board_clip(camera, picture, views, rng, *, whole):
 
 @cache
 def _rays(model, width_px, height_px, params):
-    """(H·W,3) viewing rays; clips through the same lens share them."""
+    """Return viewing rays (H·W,3); clips with the same intrinsics share them."""
     lens = Camera(model=model, width_px=width_px, height_px=height_px, params=params)
     return ray_grid(lens).in_cam.reshape(-1, 3).astype(np.float32)
 

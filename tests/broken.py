@@ -1,4 +1,4 @@
-"""Broken captures and jobs: how each is made, and what a user is told of it."""
+"""Broken captures and jobs: how each is made, and the message that a user gets."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ROOT Hips
 
 
 def sound(root: Path) -> Path:
-    """Make a sound job of two cameras in a folder; return its file."""
+    """Make a valid job of two cameras in a folder; return its file."""
     write_video(root / "torso.mp4", FRAMES)
     write_video(root / "head.mp4", MIRRORED)
     cameras = "".join(f"    - {{name: {name}, video: {name}.mp4}}\n" for name in ("torso", "head"))
@@ -41,14 +41,14 @@ def sound(root: Path) -> Path:
 
 @dataclass(frozen=True)
 class Case:
-    """One way to break the sound job.
+    """One way to break the valid job.
 
     Attributes:
-        name: For the test's title.
+        name: Title of the test.
         break_it: Called with the job's folder.
         code: Exit code.
-        file: Name of the file that is at fault.
-        message: Part of what is said about it.
+        file: Name of the file that the message names.
+        message: Part of the message.
     """
 
     name: str
@@ -71,13 +71,13 @@ def not_a_video(root: Path) -> None:
 
 
 def truncated_index_last(root: Path) -> None:
-    """The camera lost power: the index, written last, is not there."""
+    """Cut off the index at the end of the file, as after a power failure of the camera."""
     data = (root / "torso.mp4").read_bytes()
     (root / "torso.mp4").write_bytes(data[: len(data) // 2])
 
 
 def truncated_index_first(root: Path) -> None:
-    """A copy that broke off, of a file whose index stands first."""
+    """Cut off a file with its index at the start, as after an interrupted copy."""
     import av
 
     with (
@@ -95,7 +95,7 @@ def truncated_index_first(root: Path) -> None:
 
 
 def zero_frames(root: Path) -> None:
-    """A container with a video stream and nothing in it."""
+    """Write a container with a video stream and without frames."""
     import av
 
     with av.open(str(root / "torso.mp4"), "w", format="avi") as container:
@@ -110,12 +110,12 @@ def audio_only(root: Path) -> None:
 
 def black(root: Path) -> None:
     rng = np.random.default_rng(1)
-    # A covered lens is not quite black: sensor noise of a few grey levels.
+    # The picture of a covered lens has sensor noise of a few grey levels.
     write_video(root / "torso.mp4", [rng.integers(0, 8, (48, 64)).astype(np.uint8) for _ in range(20)])
 
 
 def corrupt_in_the_middle(root: Path) -> None:
-    """Zeroes over whole access units: no frame can come of them."""
+    """Overwrite whole access units with zeroes, so that no frame can be decoded from them."""
     path = root / "torso.mp4"
     data = bytearray(path.read_bytes())
     start = data.index(b"mdat") + 4
@@ -137,7 +137,7 @@ def few_timestamps(root: Path) -> None:
 
 
 def edit(old: str, new: str) -> Callable[[Path], None]:
-    """Change the job's text."""
+    """Return a function that replaces text in the job file."""
 
     def change(root: Path) -> None:
         path = root / "job.yaml"
@@ -149,7 +149,7 @@ def edit(old: str, new: str) -> Callable[[Path], None]:
 
 
 def replace_text(name: str, text: str | bytes) -> Callable[[Path], None]:
-    """Give a file another content."""
+    """Return a function that replaces the content of a file."""
 
     def change(root: Path) -> None:
         (root / name).write_bytes(text.encode() if isinstance(text, str) else text)
@@ -158,12 +158,12 @@ def replace_text(name: str, text: str | bytes) -> Callable[[Path], None]:
 
 
 def calibrated(**changes: object) -> Callable[[Path], None]:
-    """Change values of the calibration."""
+    """Return a function that changes values of the calibration."""
     return replace_text("calib.json", json.dumps({**LENS, **changes}))
 
 
 def unknown_codec(root: Path) -> None:
-    """A phone's newest format, which this decoder has never heard of."""
+    """Change the codec to one that the decoder does not know."""
     data = (root / "torso.mp4").read_bytes()
     (root / "torso.mp4").write_bytes(data.replace(b"avc1", b"zz99"))
 
@@ -184,7 +184,7 @@ def a_photo(root: Path) -> None:
 
 
 def chapters(*names: str, size: tuple[int, int] = (64, 48)) -> Callable[[Path], None]:
-    """The torso's video as a folder of chapters; the second at another size where asked."""
+    """Return a function that makes the torso's video a folder of chapters; all but the first have `size`."""
 
     def change(root: Path) -> None:
         (root / "torso.mp4").unlink()
@@ -208,7 +208,7 @@ def out_is_a_file(root: Path) -> None:
 
 
 def skeleton(text: str) -> Callable[[Path], None]:
-    """Ask for the subject's own skeleton, with this content."""
+    """Return a function that makes the job use a skeleton file with this content."""
 
     def change(root: Path) -> None:
         (root / "subject.bvh").write_text(text)
@@ -231,7 +231,7 @@ CASES = (
     Case("copy broken off", truncated_index_first, 3, VIDEO, "cut short"),
     Case("zero frames", zero_frames, 3, VIDEO, "no frame"),
     Case("sound only", audio_only, 3, VIDEO, "sound only"),
-    Case("lens covered", black, 3, VIDEO, "black pictures only"),
+    Case("lens covered", black, 3, VIDEO, "only black pictures"),
     Case("damaged in the middle", corrupt_in_the_middle, 3, VIDEO, "decod"),
     Case("unknown codec", unknown_codec, 3, VIDEO, "no decoder for this kind"),
     Case("one frame", one_frame, 3, VIDEO, "single frame"),
@@ -296,4 +296,4 @@ CASES = (
     Case("a Python object", replace_text(JOB, "capture: !!python/object:os.system {}\n"), 2, JOB, "tag"),
     Case("nested without end", replace_text(JOB, "[" * 5000), 2, JOB, "deep"),
 )
-"""The sound job broken in every way we know; `file` is what the message names."""
+"""The valid job, broken in every way that we know."""

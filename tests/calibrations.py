@@ -1,4 +1,4 @@
-"""Mounts of a simulated capture, ready to be calibrated at its true scale."""
+"""A simulated capture, ready for body calibration at its true scale."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from tests.bench.posed import GAUGE, posed
 
 
 def calibration_of(options: SynthOptions) -> tuple[CalibrationSamples, CalibrationGraph, float]:
-    """Sixty samples of a walk in one map, their calibration, not yet solved, and metres per map unit."""
+    """Return sixty samples of a walk in one map, their unsolved calibration, and metres per map unit."""
     capture = posed(options)
     inputs, roles = capture.inputs, {mount.camera: mount.role for mount in capture.mounts}
     bones = kinematic_chain(inputs.skeleton, set(roles.values()))
-    index = {bone.role: place for place, bone in enumerate(bones)}
-    tracks = [make_track(inputs, each, index[roles[each.camera]]) for each in inputs.trajectories]
+    index = {bone.role: number for number, bone in enumerate(bones)}
+    tracks = [make_track(inputs, path, index[roles[path.camera]]) for path in inputs.trajectories]
     metric = 1.0 / capture.gauges[GAUGE].scale
     samples = take_samples(tracks, metric, 60)
     mounts = {mount.camera: mount for mount in inputs.mounts}

@@ -5,4 +5,4 @@ from __future__ import annotations
 import shutil
 
 END_WITH_PARENT = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
-"""Before a command: it gets SIGKILL when the test that started it ends, however that ends (Linux)."""
+"""Put before a command: the process gets SIGKILL when the test that started it ends (Linux)."""

@@ -1,4 +1,4 @@
-"""Small videos for tests, encoded on the spot."""
+"""Small videos for tests, encoded when they are needed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Image = npt.NDArray[np.uint8]
 
 
 def textured_frame(index: int, width: int = 64, height: int = 48) -> Image:
-    """A grey image whose mean says its index (40 + 4·index) and whose top left quarter is brighter."""
+    """Return a grey image with a mean of about 40 + 4·index and a brighter top left quarter."""
     image = np.full((height, width), 40 + 4 * index, dtype=np.uint8)
     image[: height // 2, : width // 2] += 60
     return image
@@ -38,8 +38,8 @@ def write_video(
     """Encode grey (H,W) or RGB (H,W,3) images; `pts` in units of 1/(ticks·fps) s.
 
     Args:
-        rotation: Counter-clockwise degrees a player turns the stored frames by.
-        pixel_aspect: Width of a pixel over its height, as the file tells players.
+        rotation: Counter-clockwise degrees by which a player turns the stored frames.
+        pixel_aspect: Width of a pixel over its height, as stored in the file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
@@ -67,7 +67,7 @@ def write_video(
 
 
 def write_tone(path: Path, seconds: float = 0.2) -> Path:
-    """A file with sound only."""
+    """Write a file with sound only."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("aac", rate=16000)
         for start in range(0, int(16000 * seconds), 1024):

@@ -1,4 +1,4 @@
-"""A lens from a clip of a calibration board."""
+"""Camera calibration: intrinsics from a clip of a calibration board."""
 
 from bodycap_batch.calibration.boards import CalibrationBoard
 from bodycap_batch.calibration.calibration_files import write_calibration, write_preview

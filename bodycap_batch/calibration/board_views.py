@@ -1,4 +1,4 @@
-"""A board that stands in the room: where keyframes see it."""
+"""Find a marker board that stands in the room, in keyframes."""
 
 from __future__ import annotations
 
@@ -19,30 +19,33 @@ from bodycap_batch.model.merge_data import BoardView
 def find_board_views(
     capture: Capture,
     frames: Mapping[str, IntArray],
-    lenses: Mapping[str, Camera],
-    wanted: MarkerBoard,
+    cameras: Mapping[str, Camera],
+    marker_board: MarkerBoard,
     context: StageContext,
 ) -> tuple[BoardView, ...]:
-    """Look for a board in chosen frames.
+    """Search for a board in selected frames.
 
     Args:
         capture: The videos.
-        frames: By camera, increasing indices of the frames to look at.
-        lenses: By camera, the lens at the work size, as the map has it.
-        wanted: The board.
+        frames: Per camera, increasing indices of the frames to inspect.
+        cameras: Per camera, the intrinsics of the map at the work size.
+        marker_board: The board.
         context: Cancellation.
 
+    Returns:
+        One view for each frame in which the board was found and its pose estimated.
+
     Raises:
-        JobError: There is no such board.
+        JobError: The board is not valid.
         CaptureError: A frame cannot be decoded.
     """
     board = CalibrationBoard(
-        kind=wanted.kind,
-        columns=wanted.columns,
-        rows=wanted.rows,
-        dictionary=wanted.dictionary,
-        marker=wanted.marker,
-        legacy=wanted.legacy,
+        kind=marker_board.kind,
+        columns=marker_board.columns,
+        rows=marker_board.rows,
+        dictionary=marker_board.dictionary,
+        marker=marker_board.marker,
+        legacy=marker_board.legacy,
     )
     out = []
     for camera, indices in sorted(frames.items()):
@@ -51,17 +54,17 @@ def find_board_views(
             seen = board.find(image)
             if seen is None:
                 continue
-            corners = wanted.square_m * seen.board_m
-            rays = lenses[camera].unproject(seen.px + CV2_PIXEL_OFFSET_PX)
-            known = np.isfinite(rays).all(axis=1)
-            pose = _estimate_board_pose(corners[known], rays[known]) if known.sum() >= 4 else None
+            corners = marker_board.square_m * seen.board_m
+            rays = cameras[camera].unproject(seen.px + CV2_PIXEL_OFFSET_PX)
+            valid = np.isfinite(rays).all(axis=1)
+            pose = _estimate_board_pose(corners[valid], rays[valid]) if valid.sum() >= 4 else None
             if pose is not None:
                 out.append(
                     BoardView(
                         camera=camera,
                         frame=frame,
-                        board_m=corners[known],
-                        rays=rays[known],
+                        board_m=corners[valid],
+                        rays=rays[valid],
                         cam_from_board=pose,
                     )
                 )
@@ -69,10 +72,15 @@ def find_board_views(
 
 
 def _estimate_board_pose(board_m: FloatArray, rays: FloatArray) -> FloatArray | None:
-    """cam_from_board (4,4) of a flat board, None where OpenCV finds none."""
+    """Return cam_from_board (4,4) of a flat board, or None if OpenCV finds no pose.
+
+    Args:
+        board_m: (N,3) corners on the board, metres, z = 0.
+        rays: (N,2) the same corners as normalised image coordinates.
+    """
     import cv2
 
-    found, turn, shift = cv2.solvePnP(board_m, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+    found, rotation, translation = cv2.solvePnP(board_m, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
     if not found:
         return None
-    return make_transform(cv2.Rodrigues(turn)[0], shift[:, 0])
+    return make_transform(cv2.Rodrigues(rotation)[0], translation[:, 0])

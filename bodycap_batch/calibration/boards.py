@@ -13,9 +13,13 @@ from bodycap_batch.core.errors import JobError
 
 GreyImage = npt.NDArray[np.uint8]
 MIN_CORNERS = 8
-"""Fewer corners than these say next to nothing about a lens once the board's pose is taken out."""
+"""Corners of a view. The board's pose takes six of their coordinates; fewer say little about the intrinsics.
+Evidence: none."""
 _WINDOW_RATIO = 0.3
+"""Half side of the sub-pixel window as a fraction of the corner distance, so that it holds no second
+corner."""
 _MAX_WINDOW_PX = 15
+"""Largest half side of that window, pixels. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,8 +27,8 @@ class BoardCorners:
     """A board's corners in one picture.
 
     Attributes:
-        board_m: (N,3) corners on the board, z = 0, in its squares' unit.
-        px: (N,2) where they were seen, OpenCV's pixel origin.
+        board_m: (N,3) corners on the board, z = 0, in units of a square's side.
+        px: (N,2) their pixels, OpenCV's pixel origin.
     """
 
     board_m: FloatArray
@@ -33,15 +37,15 @@ class BoardCorners:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationBoard:
-    """A flat board that was filmed.
+    """A flat calibration board.
 
     Attributes:
-        kind: A plain chessboard, or a ChArUco board (chessboard with markers in its white squares).
-        columns: Chessboard: inner corners in a row; ChArUco: squares in a row.
-        rows: The same down a column.
-        dictionary: ChArUco: family of its markers, as OpenCV names it without ``DICT_``.
+        kind: A plain chessboard, or a ChArUco board (a chessboard with markers in its white squares).
+        columns: Chessboard: inner corners of a row. ChArUco: squares of a row.
+        rows: The same for a column.
+        dictionary: ChArUco: dictionary of its markers, as OpenCV names it without ``DICT_``.
         marker: ChArUco: side of a marker over the side of a square.
-        legacy: ChArUco: drawn by an OpenCV older than 4.6 (differs for an even number of rows).
+        legacy: ChArUco: drawn by an OpenCV before 4.6 (differs for an even number of rows).
     """
 
     kind: Literal["chessboard", "charuco"]
@@ -53,8 +57,8 @@ class CalibrationBoard:
     _charuco: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        least = 3 if self.kind == "chessboard" else 4
-        if min(self.columns, self.rows) < least:
+        min_size = 3 if self.kind == "chessboard" else 4
+        if min(self.columns, self.rows) < min_size:
             raise JobError(
                 f"a {self.kind} of {self.columns}x{self.rows} is too small",
                 field=f"--{self.kind}",
@@ -71,7 +75,7 @@ class CalibrationBoard:
         return f"ChArUco board of {self.columns}x{self.rows} squares ({self.dictionary})"
 
     def find(self, image: GreyImage) -> BoardCorners | None:
-        """Find the board's corners in a grey picture (H,W), None where too few of them are seen."""
+        """Return the board's corners in a grey picture (H,W), or None if too few are visible."""
         if self.kind == "chessboard":
             return self._find_chessboard(image)
         detector, board = self._detector()
@@ -85,7 +89,7 @@ class CalibrationBoard:
         )
 
     def picture(self, square_px: int) -> GreyImage:
-        """The ChArUco board as it is printed, `square_px` a square, without margin."""
+        """Return the ChArUco board as it is printed, without margin; a square has `square_px` pixels."""
         _, board = self._detector()
         size = (self.columns * square_px, self.rows * square_px)
         return np.asarray(board.generateImage(size), dtype=np.uint8)
@@ -105,7 +109,7 @@ class CalibrationBoard:
         )
 
     def _detector(self) -> tuple[Any, Any]:
-        """OpenCV's detector and board, made once."""
+        """Return OpenCV's detector and board, created at the first call."""
         import cv2
 
         if not self._charuco:
@@ -125,15 +129,15 @@ class CalibrationBoard:
 
 
 def _refine_corners(image: GreyImage, corners: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Corners (R,C,2) to sub-pixels, in windows that hold no second corner.
+    """Refine corners (R,C,2) to sub-pixels, in windows that hold no second corner.
 
-    The detector's own are off by a tenth of a pixel, all to one side: a principal point 1 px wrong, measured
-    on rendered boards; with this it is right to 0.1 px.
+    The detector's corners have a common bias of about 0.1 px, which moves the principal point by 1 px.
+    Evidence: docs/decisions/calibration.md.
     """
     import cv2
 
-    apart = min(float(np.linalg.norm(np.diff(corners, axis=axis), axis=-1).min()) for axis in (0, 1))
-    half = int(np.clip(_WINDOW_RATIO * apart, 2, _MAX_WINDOW_PX))
+    distance_px = min(float(np.linalg.norm(np.diff(corners, axis=axis), axis=-1).min()) for axis in (0, 1))
+    half = int(np.clip(_WINDOW_RATIO * distance_px, 2, _MAX_WINDOW_PX))
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-3)
-    start = np.ascontiguousarray(corners.reshape(-1, 1, 2), dtype=np.float32)
-    return np.asarray(cv2.cornerSubPix(image, start, (half, half), (-1, -1), criteria), dtype=np.float32)
+    initial = np.ascontiguousarray(corners.reshape(-1, 1, 2), dtype=np.float32)
+    return np.asarray(cv2.cornerSubPix(image, initial, (half, half), (-1, -1), criteria), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""What a calibration leaves behind: the file that jobs read, and a picture to look at."""
+"""Write the results of a calibration: the file that jobs read, and a preview picture."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from bodycap_batch.formats.atomic_files import atomic_replacement, write_text
 
 
 def write_calibration(result: CalibrationResult, path: Path, camera: str | None) -> None:
-    """Write ``calib.json`` as jobs read it, in COLMAP's pixel origin, with the error beside the lens.
+    """Write ``calib.json`` as jobs read it, in COLMAP's pixel origin, together with the error of the fit.
 
     Args:
-        result: The lens.
-        path: The file. With `camera` it may exist: that camera's entry is added or replaced.
-        camera: Name of the camera it holds for; None: for all.
+        result: The calibration.
+        path: The file. With `camera` it may exist: the entry of that camera is added or replaced.
+        camera: Name of the camera that the calibration belongs to; None for all cameras.
 
     Raises:
-        JobError: The file that is there holds something else.
-        StoreError: It cannot be written.
+        JobError: The existing file has other content.
+        StoreError: The file cannot be written.
     """
     entry = _calibration_entry(result)
     content = entry
@@ -55,40 +55,42 @@ def _calibration_entry(result: CalibrationResult) -> dict[str, Any]:
 
 
 def _read_camera_entries(path: Path) -> dict[str, Any]:
-    """The file's content where it holds several cameras, empty where there is no file."""
+    """Return the content of a file with several cameras; empty if there is no file."""
     if not path.exists():
         return {}
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise JobError(f"cannot be added to ({error})", path=path, hint="another --out") from error
+        raise JobError(
+            f"the file cannot be read ({error})", path=path, hint="choose another file with --out"
+        ) from error
     if not isinstance(content, dict) or not isinstance(content.get("cameras"), dict):
         raise JobError(
-            "holds one calibration for all cameras; a camera's own cannot be added",
+            "the file holds one calibration for all cameras, so a camera cannot be added",
             path=path,
             field="--camera",
-            hint="another --out, or delete the file",
+            hint="choose another file with --out, or delete this one",
         )
     return content
 
 
 def write_preview(result: CalibrationResult, path: Path) -> None:
-    """Write a picture of the clip (left) and the same without distortion (right): lines must be straight.
+    """Write a preview: the clip's picture (left) and the undistorted picture (right) with straight lines.
 
     Raises:
-        StoreError: It cannot be written.
+        StoreError: The file cannot be written.
     """
     fit, (width, height) = result.fit, result.size
-    matrix, straight = fit.matrix, fit.matrix.copy()
+    matrix, undistorted_matrix = fit.matrix, fit.matrix.copy()
     if fit.model == "OPENCV_FISHEYE":
-        # A flat picture of all that a fisheye sees is endless: show its middle.
-        straight[:2, :2] *= 0.6
+        # An undistorted picture of a fisheye's full view would be unbounded: show its middle.
+        undistorted_matrix[:2, :2] *= 0.6
         maps = cv2.fisheye.initUndistortRectifyMap(
-            matrix, fit.distortion, np.eye(3), straight, (width, height), cv2.CV_32FC1
+            matrix, fit.distortion, np.eye(3), undistorted_matrix, (width, height), cv2.CV_32FC1
         )
     else:
         maps = cv2.initUndistortRectifyMap(
-            matrix, fit.distortion, np.eye(3), straight, (width, height), cv2.CV_32FC1
+            matrix, fit.distortion, np.eye(3), undistorted_matrix, (width, height), cv2.CV_32FC1
         )
     flat = cv2.remap(result.preview, maps[0], maps[1], cv2.INTER_LINEAR)
     with atomic_replacement(path) as temporary:

@@ -1,4 +1,4 @@
-"""Fit a lens to views of a board. Pixels here have OpenCV's origin."""
+"""Fit intrinsics to views of a board. Pixels here have OpenCV's origin."""
 
 from __future__ import annotations
 
@@ -14,25 +14,28 @@ from bodycap_batch.core.arrays import FloatArray
 
 ImageSize = tuple[int, int]
 _FISHEYE_INITIAL_FOCALS = (0.5, 0.35, 0.7)
-"""Focal lengths over the long side from which the fisheye model is tried, best first."""
+"""Initial focal lengths of the fisheye model, as fractions of the long side. Evidence: none."""
 _MAX_VIEW_ERROR_RATIO = 3.0
-"""A view whose error is that many times the median's was blurred, or found wrongly."""
+"""A view is an outlier if its error exceeds this multiple of the median: it is blurred or misdetected.
+Evidence: none."""
 _MIN_OUTLIER_ERROR_PX = 0.3
+"""An error below this is never an outlier, pixels of a picture that is 640 pixels wide. Evidence: none."""
 _MIN_FIT_VIEWS = 6
+"""Views that must remain when outliers are removed. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IntrinsicsFit:
-    """A lens fitted to views.
+    """Intrinsics fitted to views of a board.
 
     Attributes:
-        model: COLMAP's name: PINHOLE, OPENCV or OPENCV_FISHEYE.
-        matrix: (3,3) focal lengths and principal point.
-        distortion: Coefficients in OpenCV's order, those of the model.
-        rms_px: Error over all corners.
-        view_rms_px: Error of each view kept.
-        focal_sigma_px: Standard deviation of both focal lengths.
-        kept: Which of the given views were used.
+        model: COLMAP's name of the camera model: PINHOLE, OPENCV or OPENCV_FISHEYE.
+        matrix: (3,3) focal lengths and principal point, pixels.
+        distortion: Coefficients of the model in OpenCV's order.
+        rms_px: Root mean square reprojection error over all corners.
+        view_rms_px: The same for each view used.
+        focal_sigma_px: Standard deviations of both focal lengths.
+        kept: Indices of the views that were used.
     """
 
     model: str
@@ -52,18 +55,19 @@ class IntrinsicsFit:
 
 
 def fit_intrinsics(model: str, views: Sequence[BoardCorners], size: ImageSize) -> IntrinsicsFit | None:
-    """Fit a lens, leave out views that do not fit, and fit again.
+    """Fit intrinsics, remove outlier views, and fit again.
 
     Args:
         model: PINHOLE, OPENCV or OPENCV_FISHEYE.
-        views: Corners of the board.
+        views: Corners of the board in each view.
         size: Width and height of the pictures.
 
     Returns:
-        The lens, or None where the model cannot be fitted to these views.
+        The fit, or None if the model cannot be fitted to these views.
 
-    Source: Z. Zhang, "A flexible new technique for camera calibration", PAMI 2000; the fisheye model is
-        Kannala, Brandt, "A generic camera model and calibration method", PAMI 2006; both as in OpenCV.
+    Source: Z. Zhang, "A flexible new technique for camera calibration", PAMI 2000. The fisheye model is from
+        Kannala, Brandt, "A generic camera model and calibration method", PAMI 2006. Both as implemented in
+        OpenCV.
     """
     kept = list(range(len(views)))
     fit = None
@@ -85,6 +89,7 @@ def fit_intrinsics(model: str, views: Sequence[BoardCorners], size: ImageSize) -
 
 
 def _with_kept_views(fit: IntrinsicsFit, kept: Sequence[int]) -> IntrinsicsFit:
+    """Return the fit with the indices of its views."""
     return IntrinsicsFit(
         model=fit.model,
         matrix=fit.matrix,
@@ -96,9 +101,9 @@ def _with_kept_views(fit: IntrinsicsFit, kept: Sequence[int]) -> IntrinsicsFit:
     )
 
 
-def _opencv_points(views: Sequence[BoardCorners], *, wide: bool) -> tuple[list[Any], list[Any]]:
-    """Corner lists as OpenCV takes them: single precision, or (1,N,·) double for the fisheye functions."""
-    if wide:
+def _opencv_points(views: Sequence[BoardCorners], *, fisheye: bool) -> tuple[list[Any], list[Any]]:
+    """Return corner lists for OpenCV: single precision, or double (1,N,...) for fisheye functions."""
+    if fisheye:
         return [view.board_m[None] for view in views], [view.px[None] for view in views]
     return [view.board_m.astype(np.float32) for view in views], [view.px.astype(np.float32) for view in views]
 
@@ -107,9 +112,9 @@ def _fit_pinhole(model: str, views: Sequence[BoardCorners], size: ImageSize) -> 
     flags = cv2.CALIB_FIX_K3
     if model == "PINHOLE":
         flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_ZERO_TANGENT_DIST
-    on_board, px = _opencv_points(views, wide=False)
+    on_board, px = _opencv_points(views, fisheye=False)
     try:
-        rms, matrix, distortion, _, _, sigmas, _, each = cv2.calibrateCameraExtended(
+        rms, matrix, distortion, _, _, sigmas, _, view_errors = cv2.calibrateCameraExtended(
             on_board, px, size, None, None, flags=flags
         )
     except cv2.error:
@@ -123,35 +128,40 @@ def _fit_pinhole(model: str, views: Sequence[BoardCorners], size: ImageSize) -> 
         matrix=np.asarray(matrix, dtype=np.float64),
         distortion=np.asarray(distortion, dtype=np.float64).ravel()[:count],
         rms_px=float(rms),
-        view_rms_px=tuple(float(value) for value in np.asarray(each).ravel()),
+        view_rms_px=tuple(float(value) for value in np.asarray(view_errors).ravel()),
         focal_sigma_px=(float(deviation[0]), float(deviation[1])),
         kept=(),
     )
 
 
 def _fit_fisheye(views: Sequence[BoardCorners], size: ImageSize) -> IntrinsicsFit | None:
-    """The best of several starts: the model's own start is for half a sphere along the long side."""
-    tries = [_fit_fisheye_from(start * max(size), views, size) for start in _FISHEYE_INITIAL_FOCALS]
-    found = [fit for fit in tries if fit is not None]
+    """Return the best fit from several initial focal lengths.
+
+    OpenCV's own initial value assumes a view of 180 degrees along the long side.
+    """
+    fits = [_fit_fisheye_from(start * max(size), views, size) for start in _FISHEYE_INITIAL_FOCALS]
+    found = [fit for fit in fits if fit is not None]
     return min(found, key=lambda fit: fit.rms_px) if found else None
 
 
 def _fit_fisheye_from(
     focal_px: float, views: Sequence[BoardCorners], size: ImageSize
 ) -> IntrinsicsFit | None:
-    on_board, px = _opencv_points(views, wide=True)
+    on_board, px = _opencv_points(views, fisheye=True)
     matrix = np.array([[focal_px, 0, 0.5 * size[0] - 0.5], [0, focal_px, 0.5 * size[1] - 0.5], [0, 0, 1]])
     flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW | cv2.CALIB_USE_INTRINSIC_GUESS
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)
     try:
-        _, matrix, distortion, turns, shifts = cv2.fisheye.calibrate(
+        _, matrix, distortion, rotations, translations = cv2.fisheye.calibrate(
             on_board, px, size, matrix, np.zeros(4), flags=flags, criteria=criteria
         )
     except cv2.error:
         return None
     if not _is_plausible(matrix, size) or not np.isfinite(distortion).all():
         return None
-    return _fisheye_fit_with_errors(views, matrix, distortion, list(zip(turns, shifts, strict=True)))
+    return _fisheye_fit_with_errors(
+        views, matrix, distortion, list(zip(rotations, translations, strict=True))
+    )
 
 
 def _fisheye_fit_with_errors(
@@ -160,13 +170,15 @@ def _fisheye_fit_with_errors(
     distortion: FloatArray,
     poses: Sequence[tuple[Any, Any]],
 ) -> IntrinsicsFit:
-    """Errors of a fisheye fit, and its focal sigma from the normal equations with the poses taken out.
+    """Compute the errors of a fisheye fit, and its focal sigma from the normal equations without the poses.
 
     Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999 (the Schur complement).
     """
     errors, reduced, total, count = [], np.zeros((8, 8)), 0.0, 0
-    for view, (turn, shift) in zip(views, poses, strict=True):
-        projected, jacobian = cv2.fisheye.projectPoints(view.board_m[None], turn, shift, matrix, distortion)
+    for view, (rotation, translation) in zip(views, poses, strict=True):
+        projected, jacobian = cv2.fisheye.projectPoints(
+            view.board_m[None], rotation, translation, matrix, distortion
+        )
         difference = projected.reshape(-1, 2) - view.px
         errors.append(float(np.sqrt((difference**2).sum(axis=1).mean())))
         total, count = total + float((difference**2).sum()), count + len(difference)
@@ -187,7 +199,7 @@ def _fisheye_fit_with_errors(
 
 
 def _is_plausible(matrix: Any, size: ImageSize) -> bool:
-    """A focal length between a 170° and a 5° lens, equal in both directions, and a centre in the picture."""
+    """Check that the view is 5 to 170 degrees, the focal lengths are similar and the centre is plausible."""
     focal = np.array([matrix[0, 0], matrix[1, 1]])
     centre = np.array([matrix[0, 2], matrix[1, 2]]) / np.array(size)
     sane = np.isfinite(matrix).all() and (focal > 0.1 * max(size)).all() and (focal < 12 * max(size)).all()

@@ -1,4 +1,7 @@
-"""Camera settings that spoil a capture, as far as the files tell: stabilisation, zoom, a varying rate."""
+"""Find camera settings that spoil a capture: stabilisation, zoom, a variable rate.
+
+Only settings that the video files state can be found.
+"""
 
 from __future__ import annotations
 
@@ -16,30 +19,33 @@ from bodycap_batch.core.arrays import IntArray
 _CONTAINER_BOXES = (b"moov", b"udta")
 _GOPRO_BOX = b"GPMF"
 _MAX_BOX_BYTES = 1 << 20
+"""Largest settings box that is read, bytes; a larger one is damaged. Evidence: none."""
 _OFF_VALUES = ("", "N", "N/A", "NA", "OFF", "NONE")
+"""Values of a setting that is switched off."""
 _PHONE_KEYS = {
     "com.apple.quicktime.model": "com.apple.quicktime.make",
     "com.android.model": "com.android.manufacturer",
 }
-"""Keys of a phone's model and of its maker."""
+"""Metadata key of a phone's model, and the key of its maker."""
 _MAX_RATE_RATIO = 1.5
-"""The slowest of 20 frames takes so many times as long as the fastest: more than jitter."""
+"""The 95th percentile of the frame steps over the 5th; jitter stays below it. Evidence: none."""
 _DROPPED_STEP_RATIO = 1.75
-"""A step of so many usual ones has a lost frame in it ..."""
+"""A step longer than this multiple of the median contains a dropped frame. The next note limits this."""
 _MIN_REGULAR_RATIO = 0.75
-"""... unless every fourth is like that."""
+"""If a smaller fraction of the steps is regular, long steps belong to a variable rate and are not dropped
+frames. Evidence: none."""
 
 
 def setting_notes(camera: CaptureCamera) -> list[str]:
-    """What the first chapter's metadata and the frame times say of the camera's settings."""
+    """Return notes on the camera's settings, from the first chapter's metadata and the frame times."""
     path = camera.chapters[0]
     return [*_gopro_notes(gopro_settings(path)), *_phone_notes(path), *_rate_notes(camera.times_ns)]
 
 
 def gopro_settings(path: Path) -> dict[str, str]:
-    """A GoPro's settings by four-letter key, empty for another camera's file.
+    """Return a GoPro's settings by four-letter key; empty for the file of another camera.
 
-    Source: the GPMF key-length-value format as GoPro publishes it; the box ``moov/udta/GPMF`` of an MP4.
+    Source: the GPMF key-length-value format, published by GoPro; the box ``moov/udta/GPMF`` of an MP4.
     """
     with path.open("rb") as handle:
         handle.seek(0, 2)
@@ -48,7 +54,7 @@ def gopro_settings(path: Path) -> dict[str, str]:
 
 
 def _find_box(handle: BinaryIO, start: int, end: int) -> bytes | None:
-    """Content of the first settings box between two places of an MP4, None where there is none."""
+    """Return the content of the first settings box between two offsets of an MP4, or None."""
     while start + 8 <= end:
         handle.seek(start)
         header = handle.read(16)
@@ -73,33 +79,33 @@ def _find_box(handle: BinaryIO, start: int, end: int) -> bytes | None:
 
 
 def _text_items(data: bytes) -> Iterator[tuple[str, str]]:
-    """Texts among the key-length-value items, nested ones too; each is padded to four bytes."""
-    place = 0
-    while place + 8 <= len(data):
-        key, kind, size, repeat = struct.unpack(">4sBBH", data[place : place + 8])
+    """Yield the texts among the key-length-value items, also the nested ones.
+
+    Each item is padded to four bytes.
+    """
+    offset = 0
+    while offset + 8 <= len(data):
+        key, kind, size, repeat = struct.unpack(">4sBBH", data[offset : offset + 8])
         length = size * repeat
-        content = data[place + 8 : place + 8 + length]
+        content = data[offset + 8 : offset + 8 + length]
         if kind == 0:
             yield from _text_items(content)
         elif kind == ord("c"):
             yield key.decode("ascii", "replace"), content.decode("latin-1").strip("\0 ")
-        place += 8 + (length + 3) // 4 * 4
+        offset += 8 + (length + 3) // 4 * 4
 
 
 def _gopro_notes(settings: dict[str, str]) -> list[str]:
     notes = []
     mode = settings.get("EISA", "")
     if settings.get("EISE", mode).upper() not in _OFF_VALUES:
-        told = f" ({mode})" if mode.upper() not in (*_OFF_VALUES, "Y") else ""
+        level = f" ({mode})" if mode.upper() not in (*_OFF_VALUES, "Y") else ""
         notes.append(
-            f"stabilised in the camera{told}: the picture moves against the lens and no calibration fits it; "
-            "film again with HyperSmooth off"
+            f"stabilised in the camera{level}: the picture moves relative to the lens, so no calibration "
+            "fits; film again with HyperSmooth off"
         )
     if settings.get("DZOM", "N").upper() not in _OFF_VALUES:
-        notes.append(
-            "filmed with digital zoom: the calibration has to be of the same zoom; film without, "
-            "or calibrate with it"
-        )
+        notes.append("filmed with digital zoom: film without zoom, or calibrate the camera at the same zoom")
     return notes
 
 
@@ -117,7 +123,7 @@ def _phone_notes(path: Path) -> list[str]:
 
 
 def _rate_notes(times_ns: IntArray) -> list[str]:
-    """A rate that varies, beyond frames that were dropped."""
+    """Return a note if the rate varies; dropped frames do not count."""
     steps = np.diff(times_ns)
     if len(steps) < 20:
         return []

@@ -1,4 +1,4 @@
-"""What a pre-flight finds, and how it is told."""
+"""The result of a check, as data and as text."""
 
 from __future__ import annotations
 
@@ -12,29 +12,31 @@ from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import BodycapError
 
 _MAX_SHOWN_FILES = 3
+"""Number of a camera's files that are listed."""
 _LINE_WIDTH = 100
+"""Characters of a line of advice."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraSummary:
-    """One camera as its files show it.
+    """What the files of one camera contain.
 
     Attributes:
         name: Camera name.
-        role: Bone that carries it, None where there is none.
+        role: Bone that carries the camera, or None.
         files: Names of its video files.
-        frames: Frames in all.
-        used_frames: Frames between start_s and end_s.
-        used_runs: First and last number, in the joined video, of each stretch of used frames without a hole.
+        frames: Number of frames in all.
+        used_frames: Number of frames between start_s and end_s.
+        used_runs: First and last number, in the joined video, of each run of successive used frames.
         start_s: Common time of the first used frame.
         end_s: Common time of the last used frame.
         fps: Nominal rate.
-        variable_rate: True where frames are not evenly spaced.
-        size_px: Width and height as a player shows it.
-        work_size_px: Width and height frames are worked at.
-        lens: Calibration in words.
-        notes: Worth telling, no error.
-        guessed_lens: True where there is no calibration.
+        variable_rate: True if frames are not evenly spaced.
+        size_px: Width and height as a player shows the video.
+        work_size_px: Width and height at which frames are processed.
+        lens: Intrinsics as text.
+        notes: Notes for the user that are not errors.
+        guessed_lens: True if there is no calibration.
     """
 
     name: str
@@ -55,18 +57,18 @@ class CameraSummary:
 
     @property
     def large_frames(self) -> int:
-        """Frames of which copies at the work size are kept: all of a video that is much larger, else none."""
+        """Number of frames that are also stored at the work size: all of a much larger video, else 0."""
         return self.used_frames if should_keep_all(self.size_px, self.work_size_px) else 0
 
     def lines(self) -> list[str]:
-        """The finding as a person reads it."""
+        """Return the summary as text for the user."""
         files = ", ".join(self.files[:_MAX_SHOWN_FILES])
         if len(self.files) > _MAX_SHOWN_FILES:
             files += f" … ({len(self.files)} chapters)"
         width, height = self.size_px
         size = f"{width}×{height}"
         if self.work_size_px != self.size_px:
-            size += f" (worked at {self.work_size_px[0]}×{self.work_size_px[1]})"
+            size += f" (processed at {self.work_size_px[0]}×{self.work_size_px[1]})"
         rate = f"{self.fps:.2f} fps{', variable rate' if self.variable_rate else ''}"
         used = "" if self.used_frames == self.frames else f" ({self.used_frames} used)"
         span = (
@@ -82,14 +84,14 @@ class CameraSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CheckReport:
-    """Everything a pre-flight found.
+    """Everything that a check found.
 
     Attributes:
-        job: The resolved job, None where it could not be loaded that far.
-        cameras: One finding per camera that opened.
-        notes: Worth telling about the job as a whole.
-        errors: What stops the job.
-        advice: What would make it better; none where something stops it.
+        job: The resolved job; None if it could not be resolved.
+        cameras: One summary per camera that could be opened.
+        notes: Notes about the job as a whole.
+        errors: What prevents the job from running.
+        advice: What would improve the result; empty if there are errors.
     """
 
     job: Job | None = None
@@ -100,16 +102,16 @@ class CheckReport:
 
     @property
     def ready(self) -> bool:
-        """True where nothing stops the job."""
+        """True if the job can run."""
         return not self.errors
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the first error, 0 where there is none."""
+        """Exit code of the first error; 0 if there is none."""
         return self.errors[0].exit_code if self.errors else 0
 
     def lines(self) -> list[str]:
-        """The report as a person reads it."""
+        """Return the report as text for the user."""
         out = [line for camera in self.cameras for line in camera.lines()]
         out += [f"note: {note}" for note in self.notes]
         out += [f"problem: {error}" for error in self.errors]
@@ -123,14 +125,14 @@ class CheckReport:
                 break_on_hyphens=False,
             )
         if self.ready:
-            out.append("ready to run" if self.cameras else "nothing stands in the way")
+            out.append("ready to run" if self.cameras else "no problems found")
         else:
             count = len(self.errors)
             out.append(f"not ready: {count} problem{'s' if count > 1 else ''}")
         return out
 
     def to_dict(self) -> dict[str, Any]:
-        """The report as plain JSON values."""
+        """Return the report as plain JSON values."""
         return {
             "ready": self.ready,
             "cameras": [dataclasses.asdict(camera) for camera in self.cameras],

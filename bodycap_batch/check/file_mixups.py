@@ -1,4 +1,4 @@
-"""Files that were mixed up: one video for two cameras, a chapter that was not copied."""
+"""Find video files that were mixed up: one video for two cameras, or a missing chapter."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ _GOPRO_CHAPTER = re.compile(r"G[HXL](?P<chapter>[0-9]{2})(?P<video>[0-9]{4})", r
 
 
 def require_distinct_videos(job: Job) -> None:
-    """Refuse a video that two cameras share, and chapters with one missing between them.
+    """Refuse a video that belongs to two cameras, and a list of chapters with a missing one.
 
     Raises:
-        CaptureError: One of these; names the file.
+        CaptureError: Two cameras share a video, or a chapter is missing; the error names the file.
     """
     for camera in job.capture.cameras:
         _require_all_chapters(camera)
     for first, second in combinations(job.capture.cameras, 2):
         for video in second.video:
-            twin = next((other for other in first.video if _is_same_content(other, video)), None)
-            if twin is not None:
+            same_video = next((other for other in first.video if _is_same_content(other, video)), None)
+            if same_video is not None:
                 raise CaptureError(
-                    f"camera {second.name} shows the same video as camera {first.name} ({twin.name})",
+                    f"camera {second.name} shows the same video as camera {first.name} ({same_video.name})",
                     path=video,
                     hint=f"copy the video of {second.name} again, or leave that camera out",
                 )
 
 
 def _is_same_content(first: Path, second: Path) -> bool:
-    """Whether two files hold the same bytes; other sizes answer at once. Missing files are told elsewhere."""
+    """Return True if two files hold the same bytes. A missing file is reported by another check."""
     try:
         size = first.stat().st_size
         return size > 0 and size == second.stat().st_size and filecmp.cmp(first, second, shallow=False)
@@ -42,7 +42,10 @@ def _is_same_content(first: Path, second: Path) -> bool:
 
 
 def _require_all_chapters(camera: CameraConfig) -> None:
-    """A GoPro numbers the chapters of a recording; without one, all that follows would be too early."""
+    """Raise `CaptureError` if a GoPro chapter is missing.
+
+    Without it, all later frames would get times that are too early.
+    """
     if camera.timestamps:
         return
     for before, after in pairwise(camera.video):
@@ -55,6 +58,6 @@ def _require_all_chapters(camera: CameraConfig) -> None:
                 f"chapter {last + 1} of recording {numbers[1]['video']} is missing between {before.name} and "
                 f"{after.name}",
                 path=after,
-                hint="copy it from the card, too; if it is lost, end before it with end_s and list only the "
-                "chapters up to there",
+                hint="copy it from the card; if it is lost, list only the chapters before it, and set end_s "
+                "to their end",
             )

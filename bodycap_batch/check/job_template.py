@@ -1,4 +1,7 @@
-"""A first job file for a folder of videos: what was found, what to fill in, every option explained."""
+"""Write a first job file for a folder of videos.
+
+It lists the cameras that were found, what the user must fill in, and every option with its meaning.
+"""
 
 from __future__ import annotations
 
@@ -22,41 +25,47 @@ from bodycap_batch.formats.atomic_files import write_text
 
 JOB_FILE = "job.yaml"
 UNKNOWN_MOUNT = "<where on the body?>"
+"""Placeholder for a mount that the camera's file name does not state."""
 _STAGES = ("keyframes", "map", "registration", "merge", "export")
 _OPTION_WIDTH = 34
+"""Characters of an option before its meaning."""
 _MAX_NAME_LENGTH = 60
-"""A camera's name may have 64 characters, and a number may follow."""
+"""Characters. A camera's name may have 64, and a number may follow."""
 
 
 def write_job_template(folder: Path, *, replace: bool = False) -> Path:
-    """Write ``job.yaml`` for the videos found in a folder.
+    """Write ``job.yaml`` for the videos of a folder.
 
     Args:
-        folder: Holds videos, folders of chapters, perhaps ``calib.json`` and a skeleton (``*.bvh``).
-        replace: Overwrite a job file that is there.
+        folder: Holds videos or folders of chapters, and optionally ``calib.json`` and a skeleton (``*.bvh``).
+        replace: Overwrite an existing job file.
 
     Returns:
-        The file.
+        The path of the file.
 
     Raises:
-        JobError: There is a job file already.
+        JobError: A job file exists already.
         CaptureError: There are no videos, or one cannot be opened.
         StoreError: The file cannot be written.
     """
     path = folder / JOB_FILE
     if path.exists() and not replace:
-        raise JobError("there is a job file already", path=path, hint="--force writes a new one over it")
+        raise JobError("there is a job file already", path=path, hint="--force overwrites it")
     write_text(path, job_template(folder))
     return path
 
 
 def job_template(folder: Path) -> str:
-    """The text of such a file. Raises as `write_job_template`, but for what is there already."""
+    """Return the text of a job file for the videos of a folder.
+
+    Raises:
+        CaptureError: There are no videos, or one cannot be opened.
+    """
     recordings = recordings_in(folder)
     lines = [
-        "# A job for bodycap. Paths are relative to this file; lines that begin with # are off.",
-        "#   bodycap check job.yaml    says what would be used, and what is wrong with it",
-        "#   bodycap run job.yaml      computes it",
+        "# A job for bodycap. Paths are relative to this file. Lines that begin with # have no effect.",
+        "#   bodycap check job.yaml    shows what the job uses, and its problems",
+        "#   bodycap run job.yaml      computes the results",
         "",
         f"name: {_yaml_text(_safe_name(folder.resolve().name))}",
         "",
@@ -64,7 +73,7 @@ def job_template(folder: Path) -> str:
         "",
         "capture:",
         *_calibration_lines(folder),
-        "  # The stretch to use, in seconds on the common clock: cuts off the strapping-on.",
+        "  # The part to use, in seconds on the common clock: it excludes putting on the cameras.",
         "  # start_s: 12.0",
         "  # end_s: 95.5",
         *(_mount_lines() if any(mount_of(name) is None for name, _ in recordings) else ()),
@@ -74,7 +83,7 @@ def job_template(folder: Path) -> str:
         lines += _camera_lines(safe, name, files, folder)
     lines += [
         "",
-        "# What follows are the defaults of every stage: change what you need, leave the rest.",
+        "# The defaults of every stage follow: change what you need, leave the rest.",
         *_option_lines(),
     ]
     return "\n".join(lines) + "\n"
@@ -83,32 +92,32 @@ def job_template(folder: Path) -> str:
 def _body_lines(folder: Path) -> list[str]:
     rigs = sorted(path.name for path in folder.glob("*.bvh"))
     lines = [
-        "# Who was filmed. The height gives the metric scale; the subject's own skeleton gives it better."
+        "# The filmed person. The height gives the metric scale; the person's own skeleton is more accurate."
     ]
     if rigs:
         lines += [f"skeleton: {_yaml_text(rigs[0])}", "# height_m: 1.75"]
     else:
         lines += [
             "# height_m: 1.75",
-            "# skeleton: subject.bvh     # or none: only the map and the cameras' paths",
+            "# skeleton: subject.bvh     # or none: only the map and the camera paths",
         ]
-    return [*lines, "# activity: walk             # walking's soft rules; default generic"]
+    return [*lines, "# activity: walk             # soft limits for walking; default: generic"]
 
 
 def _calibration_lines(folder: Path) -> list[str]:
     if (folder / "calib.json").is_file():
         return ["  calibration: calib.json"]
     return [
-        "  # The lens is guessed and refined while mapping. Better: film a board, then",
+        "  # The lens is estimated together with the map. Better: film a board, then",
         "  #   bodycap calibrate board.mp4 --charuco 7x5 --out calib.json",
         "  calibration: auto            # or calib.json",
     ]
 
 
 def _mount_lines() -> list[str]:
-    """What a mount can be called, for those whose file's name does not say."""
+    """Return the possible mounts as comments, for cameras with file names that do not state the mount."""
     listed = textwrap.wrap(", ".join(MOUNT_NAMES), 90)
-    return ["  # Where a camera can be worn (`mount:`):", *(f"  #   {line}" for line in listed)]
+    return ["  # Places of a camera on the body (`mount:`):", *(f"  #   {line}" for line in listed)]
 
 
 def _camera_lines(safe: str, name: str, files: Sequence[Path], folder: Path) -> list[str]:
@@ -119,23 +128,23 @@ def _camera_lines(safe: str, name: str, files: Sequence[Path], folder: Path) -> 
     if found is None or mount_of(safe) != found:
         lines.append(f"      mount: {_yaml_text(UNKNOWN_MOUNT if found is None else found[0])}")
     if not list(folder.glob(f"{name}.timestamps.txt")):
-        lines.append("      # offset_s: 0.0          # common time = camera time + offset_s: from the clap")
+        lines.append("      # offset_s: 0.0          # common time = camera time + offset_s, from a clap")
     return lines
 
 
 def _video_summary(files: Sequence[Path]) -> str:
-    """What the files of one camera are, in a line."""
+    """Return one line about the files of a camera."""
     if files[0].is_dir():
         return f"chapters in {files[0].name}/"
     videos = [index_video(path) for path in files]
     width, height = videos[0].shown_size
-    seconds = sum(float((int(each.pts[-1]) - int(each.pts[0])) * each.time_base) for each in videos)
+    seconds = sum(float((int(video.pts[-1]) - int(video.pts[0])) * video.time_base) for video in videos)
     chapters = f", {len(files)} chapters" if len(files) > 1 else ""
     return f"{width}×{height}, {videos[0].fps:.4g} fps, {seconds:.1f} s{chapters}"
 
 
 def _option_lines() -> Iterable[str]:
-    """All options with their defaults and meanings, switched off."""
+    """Yield all options with their defaults and meanings, as comments."""
     for stage in _STAGES:
         model = Job.model_fields[stage].annotation
         assert isinstance(model, type)
@@ -149,7 +158,7 @@ def _option_lines() -> Iterable[str]:
 
 
 def _choices_text(annotation: Any) -> str:
-    """The words an option takes, where it takes words of a list."""
+    """Return the permitted words of an option; "" if any value is permitted."""
     if typing.get_origin(annotation) is Literal:
         return "one of " + ", ".join(map(str, typing.get_args(annotation)))
     inner = [words for argument in typing.get_args(annotation) if (words := _choices_text(argument))]
@@ -162,24 +171,24 @@ def _default_text(field: FieldInfo) -> str:
 
 
 def _yaml_text(text: str) -> str:
-    """Text as a YAML value: quoted where YAML would take it for something else."""
+    """Return text as a YAML value, quoted if YAML would read it as another type."""
     plain = re.fullmatch(r"[A-Za-z][\w./\-]*", text) and text.lower() not in {"null", "true", "false"}
     return text if plain else json.dumps(text, ensure_ascii=False)
 
 
 def _unique_names(found: Sequence[str]) -> list[str]:
-    """A name for each camera, none of them twice: "cam 1" and "cam_1" would be one folder of results."""
+    """Return a different name for each camera: "cam 1" and "cam_1" would share one folder of results."""
     out: list[str] = []
-    taken: set[str] = set()
+    used_names: set[str] = set()
     for plain in map(_safe_name, found):
         name, number = plain, 2
-        while name.lower() in taken:
+        while name.lower() in used_names:
             name, number = f"{plain}_{number}", number + 1
-        taken.add(name.lower())
+        used_names.add(name.lower())
         out.append(name)
     return out
 
 
 def _safe_name(text: str) -> str:
-    """A name that the results' files can carry."""
+    """Return a name that can be part of the results' file names."""
     return re.sub(r"[^A-Za-z0-9_\-]+", "_", text).strip("_-")[:_MAX_NAME_LENGTH] or "walk"

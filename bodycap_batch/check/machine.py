@@ -1,4 +1,4 @@
-"""Is this machine fit for the work? What `bodycap doctor` looks at."""
+"""Check whether this machine can run jobs, for `bodycap doctor`."""
 
 from __future__ import annotations
 
@@ -18,9 +18,12 @@ from typing import Literal
 State = Literal["ok", "note", "problem"]
 
 _PYTHON_VERSIONS = ((3, 11), (3, 14))
+"""Supported versions of Python: from the first, below the second."""
 _ENOUGH_MEMORY_MB = 4000
-"""Three cameras, ten minutes: the map's stage takes 2 to 3 GB."""
+"""Megabytes for three cameras and ten minutes; their map stage takes 2 to 3 GB. Evidence:
+docs/decisions/check.md."""
 _ENOUGH_DISK_MB = 5000
+"""Megabytes of free disk space for a usual job. Evidence: none."""
 _LIBRARIES = {
     "numpy": "numpy",
     "scipy": "scipy.optimize",
@@ -40,17 +43,18 @@ _EXTRAS = {
 }
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox", "microsoft-edge")
 _CHILD_TIMEOUT_S = 60
+"""Seconds for the import of one library; open3d takes some seconds on a slow disk. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MachineFinding:
-    """One thing looked at.
+    """The result of one check.
 
     Attributes:
-        what: Its name.
-        state: "ok"; "note" where something optional is missing; "problem" where jobs will fail.
-        found: What is there.
-        remedy: What to do, "" where nothing has to be done.
+        what: What was checked.
+        state: "ok"; "note" if something optional is missing; "problem" if jobs will fail.
+        found: What was found.
+        remedy: What to do; "" if nothing has to be done.
     """
 
     what: str
@@ -59,21 +63,21 @@ class MachineFinding:
     remedy: str = ""
 
     def line(self) -> str:
-        """The finding as a person reads it."""
+        """Return the finding as text for the user."""
         text = f"{self.state:8} {self.what}: {self.found}"
         return f"{text}\n         -> {self.remedy}" if self.remedy else text
 
 
 def examine_machine(folder: Path) -> Iterator[MachineFinding]:
-    """Look at Python, processors, memory, libraries, disk, extras and programs, one after the other.
+    """Check Python, processors, memory, libraries, disk, extras and programs, one after the other.
 
     Args:
-        folder: Where results will be written.
+        folder: Folder for the results.
     """
     yield _python_finding()
     yield _processor_finding()
     yield _memory_finding()
-    # Each in a process of its own: a library that crashes when it is loaded takes no other with it.
+    # Each import runs in a process of its own, so that a library that crashes does not end this one.
     with ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1)) as pool:
         yield from pool.map(_library_finding, _LIBRARIES)
     yield _video_finding()
@@ -81,16 +85,16 @@ def examine_machine(folder: Path) -> Iterator[MachineFinding]:
     yield _writing_finding(folder)
     for extra in _EXTRAS:
         yield _extra_finding(extra)
-    yield _program_finding("Blender", ("blender",), "opens every result; not needed to compute")
+    yield _program_finding("Blender", ("blender",), "it opens every result; not needed for jobs")
     yield _program_finding(
-        "a browser", _BROWSERS, "opens report.html and plays preview.mp4; any other will do"
+        "a browser", _BROWSERS, "opens report.html and plays preview.mp4; any other browser will do"
     )
 
 
 def _python_finding() -> MachineFinding:
-    here = sys.version_info[:2]
+    version = sys.version_info[:2]
     found = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
-    if _PYTHON_VERSIONS[0] <= here < _PYTHON_VERSIONS[1]:
+    if _PYTHON_VERSIONS[0] <= version < _PYTHON_VERSIONS[1]:
         return MachineFinding(what="Python", state="ok", found=found)
     return MachineFinding(what="Python", state="problem", found=found, remedy="use Python 3.11, 3.12 or 3.13")
 
@@ -100,7 +104,7 @@ def _processor_finding() -> MachineFinding:
     if count > 1:
         return MachineFinding(what="processors", state="ok", found=f"{count}; no GPU is used")
     return MachineFinding(
-        what="processors", state="note", found="one", remedy="it works, at half the speed of two"
+        what="processors", state="note", found="one", remedy="jobs run at half the speed of two processors"
     )
 
 
@@ -113,7 +117,10 @@ def _memory_finding() -> MachineFinding:
     found = f"{total_mb / 1024:.1f} GB"
     if total_mb >= _ENOUGH_MEMORY_MB:
         return MachineFinding(what="memory", state="ok", found=found)
-    remedy = f"long captures take {_ENOUGH_MEMORY_MB / 1000:g} GB: cut them with start_s and end_s, or lower work_px"
+    remedy = (
+        f"long captures need {_ENOUGH_MEMORY_MB / 1000:g} GB: cut them with start_s and end_s, "
+        "or lower work_px"
+    )
     return MachineFinding(what="memory", state="note", found=found, remedy=remedy)
 
 
@@ -135,7 +142,7 @@ def _library_finding(name: str) -> MachineFinding:
 
 
 def _error_of_code(code: str) -> str | None:
-    """The last line of what a child says that runs this code, None where it goes well."""
+    """Run code in a child process; return the last line of its error output, or None if it succeeds."""
     try:
         done = subprocess.run(
             [sys.executable, "-c", code],
@@ -148,17 +155,17 @@ def _error_of_code(code: str) -> str | None:
         return str(error).splitlines()[0]
     if done.returncode == 0:
         return None
-    said = done.stderr.strip().splitlines()
-    return said[-1] if said else f"ended with {done.returncode}"
+    lines = done.stderr.strip().splitlines()
+    return lines[-1] if lines else f"ended with exit code {done.returncode}"
 
 
 def _installed_version(name: str) -> str:
-    for each in (name, name.removesuffix("-cpu"), name.removesuffix("-headless")):
+    for distribution in (name, name.removesuffix("-cpu"), name.removesuffix("-headless")):
         try:
-            return metadata.version(each)
+            return metadata.version(distribution)
         except metadata.PackageNotFoundError:
             continue
-    return "there"
+    return "installed"
 
 
 def _video_finding() -> MachineFinding:
@@ -176,14 +183,16 @@ def _disk_finding(folder: Path) -> MachineFinding:
     found = f"{free_mb / 1024:.1f} GB free at {place}"
     if free_mb >= _ENOUGH_DISK_MB:
         return MachineFinding(what="disk", state="ok", found=found)
-    remedy = "free some, or name another place with --out and --store; `bodycap gc` drops what no job needs"
+    remedy = (
+        "free some space, or name another disk with --out and --store; `bodycap gc` removes old artefacts"
+    )
     return MachineFinding(
         what="disk", state="note" if free_mb > 500 else "problem", found=found, remedy=remedy
     )
 
 
 def _writing_finding(folder: Path) -> MachineFinding:
-    """Results come by hard link and rename: what the file system can do decides how fast."""
+    """Check whether the file system has renames and hard links, which results are published with."""
     place = _nearest_existing(folder)
     try:
         with tempfile.TemporaryDirectory(dir=place, prefix=".bodycap-doctor-") as scratch:
@@ -198,9 +207,9 @@ def _writing_finding(folder: Path) -> MachineFinding:
         )
     if linked:
         return MachineFinding(
-            what="writing", state="ok", found=f"{place} takes files, renames and hard links"
+            what="writing", state="ok", found=f"{place} supports files, renames and hard links"
         )
-    remedy = "nothing has to be done: results are copied from the store and take twice the room"
+    remedy = "no action needed: results are copied from the store and take twice the space"
     return MachineFinding(what="writing", state="note", found=f"{place} has no hard links", remedy=remedy)
 
 
@@ -213,7 +222,7 @@ def _can_hard_link(source: Path, target: Path) -> bool:
 
 
 def _nearest_existing(folder: Path) -> Path:
-    """The folder, or the nearest one above it that exists."""
+    """Return the folder, or its nearest existing parent."""
     folder = folder.resolve()
     while not folder.exists():
         folder = folder.parent

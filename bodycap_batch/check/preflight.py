@@ -1,4 +1,4 @@
-"""The checks in order: job, cameras, clocks, skeleton, disk."""
+"""Run the checks of a job in order: cameras, files, clocks, skeleton, formats, disk."""
 
 from __future__ import annotations
 
@@ -26,32 +26,38 @@ from bodycap_batch.formats.bvh import RigOptions, read_rig
 from bodycap_batch.formats.optional_libraries import require_libraries
 from bodycap_batch.store.disk_space import require_room
 
-# Frames whose distance differs by more than this share from the usual one make a variable rate.
 _RATE_TOLERANCE = 0.2
+"""A rate is variable if a frame step differs from the median by more than this fraction. Evidence: none."""
 _MIN_DURATION_S = 2.0
+"""Seconds of video below which there is hardly enough motion for a map. Evidence: none."""
 _MIN_UNIX_TIME_S = 1e8
+"""Seconds. A larger time is a Unix time (this one is in 1973) and not a time since the start of the video."""
 _TRUNK_ROLES = ("Hips", "Spine", "Spine1", "Neck", "Head")
+"""Bones of the trunk and the head."""
 
 
 def check_path(path: Path, overrides: Overrides | None = None) -> CheckReport:
-    """Check a job file or a folder of videos. All errors are in the report, none is raised."""
+    """Check a job file or a folder of videos. Errors are stored in the report; none is raised."""
     try:
         job = load_job(path, overrides)
     except (JobError, CaptureError) as error:
         if error.field == "capture.synthetic":
-            note = f"a sample capture: `bodycap run {path.name}` renders its videos first"
+            note = f"this is a sample capture: `bodycap run {path.name}` renders its videos first"
             return CheckReport(notes=(note,))
         return CheckReport(errors=(error,))
     report = check_job(job)
-    decides = job_file_in(path) if path.is_dir() else None
-    return report if decides is None else replace(report, notes=(f"as {decides} says", *report.notes))
+    job_file = job_file_in(path) if path.is_dir() else None
+    return report if job_file is None else replace(report, notes=(f"as {job_file} says", *report.notes))
 
 
 def require_ready(job: Job, threads: int = 1) -> CheckReport:
-    """Check a resolved job and raise its first error, if any (before hours of work).
+    """Check a resolved job before hours of work, and raise its first error, if any.
 
-    The room on the disk is left out: it is another one at any moment. As many cameras are looked at side by
-    side as there are threads.
+    Disk space is not checked, because it changes while the job runs.
+
+    Args:
+        job: The job.
+        threads: Number of cameras that are inspected at the same time.
     """
     report = _run_checks(job, _CHECKS, threads)
     if report.errors:
@@ -60,7 +66,7 @@ def require_ready(job: Job, threads: int = 1) -> CheckReport:
 
 
 def check_job(job: Job) -> CheckReport:
-    """Check a resolved job: every video opened and looked at, calibration, clocks, skeleton, disk."""
+    """Check a resolved job: inspect every video, and check calibration, clocks, skeleton and disk space."""
     report = _run_checks(job, (*_CHECKS, _check_disk), os.cpu_count() or 1)
     return replace(report, advice=tuple(advise(job, report.cameras))) if report.ready else report
 
@@ -69,23 +75,23 @@ def _run_checks(
     job: Job, checks: Iterable[Callable[[Job, list[CameraSummary]], list[str]]], threads: int
 ) -> CheckReport:
     errors: list[BodycapError] = []
-    findings: list[CameraSummary] = []
+    summaries: list[CameraSummary] = []
     pool = ThreadPoolExecutor(max_workers=threads)
     try:
         for look in [pool.submit(_check_camera, job.capture, config) for config in job.capture.cameras]:
             try:
-                findings.append(look.result())
+                summaries.append(look.result())
             except CaptureError as error:
                 errors.append(error)
-    finally:  # who stops it does not wait for the cameras that are left
+    finally:  # on an interruption, do not wait for the remaining cameras
         pool.shutdown(cancel_futures=True)
     notes = _body_notes(job)
     for check in checks:
         try:
-            notes += check(job, findings)
+            notes += check(job, summaries)
         except BodycapError as error:
             errors.append(error)
-    return CheckReport(job=job, cameras=tuple(findings), notes=tuple(notes), errors=tuple(errors))
+    return CheckReport(job=job, cameras=tuple(summaries), notes=tuple(notes), errors=tuple(errors))
 
 
 def _check_camera(capture: CaptureConfig, config: CameraConfig) -> CameraSummary:
@@ -96,8 +102,8 @@ def _check_camera(capture: CaptureConfig, config: CameraConfig) -> CameraSummary
 def _summarise_camera(camera: CaptureCamera, config: CameraConfig, notes: list[str]) -> CameraSummary:
     times_s = camera.common_times_ns() / 1e9
     steps = np.diff(camera.times_ns)
-    usual = float(np.median(steps)) if len(steps) else 0.0
-    variable = len(steps) > 0 and bool((np.abs(steps - usual) > _RATE_TOLERANCE * usual).any())
+    median_ns = float(np.median(steps)) if len(steps) else 0.0
+    variable = len(steps) > 0 and bool((np.abs(steps - median_ns) > _RATE_TOLERANCE * median_ns).any())
     duration = float(times_s[-1] - times_s[0])
     return CameraSummary(
         name=camera.name,
@@ -117,7 +123,7 @@ def _summarise_camera(camera: CaptureCamera, config: CameraConfig, notes: list[s
         notes=(
             *camera.notes,
             *notes,
-            *_dropped_frame_notes(camera, usual),
+            *_dropped_frame_notes(camera, median_ns),
             *setting_notes(camera),
             *_intrinsics_notes(camera),
             *_duration_notes(duration),
@@ -126,7 +132,7 @@ def _summarise_camera(camera: CaptureCamera, config: CameraConfig, notes: list[s
 
 
 def _frame_runs(numbers: IntArray) -> tuple[tuple[int, int], ...]:
-    """First and last of each run of successive numbers."""
+    """Return the first and last number of each run of successive numbers."""
     runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
     return tuple((int(run[0]), int(run[-1])) for run in runs)
 
@@ -136,7 +142,7 @@ def _intrinsics_text(camera: CaptureCamera) -> str:
     view = 2.0 * np.degrees(np.arctan(0.5 * width / focal))
     if camera.calibrated:
         return f"calibrated: {camera.camera.model}, focal length {focal:.0f} px at the work size"
-    return f"not calibrated: starts from a guess of {view:.0f}° along the long side, refined while mapping"
+    return f"not calibrated: starts at a guess of {view:.0f}° along the long side, refined with the map"
 
 
 def _intrinsics_notes(camera: CaptureCamera) -> list[str]:
@@ -145,21 +151,24 @@ def _intrinsics_notes(camera: CaptureCamera) -> list[str]:
     notes = []
     if any(video.is_interlaced for video in camera.videos):
         notes.append(
-            "interlaced: make whole pictures of it first (ffmpeg -i in -vf bwdif=send_frame out.mp4)"
+            "interlaced: convert it to full frames first (ffmpeg -i in -vf bwdif=send_frame out.mp4)"
         )
     if not 0.2 < lens.focal_px / long_side < 3.0:
         notes.append(
-            f"a focal length of {lens.focal_px / long_side:.2f} image widths is unusual; right calibration?"
+            f"a focal length of {lens.focal_px / long_side:.2f} image widths is unusual; is it the "
+            "calibration of this camera?"
         )
     centre_x, centre_y = lens.principal_point_px
     off = max(abs(centre_x / lens.width_px - 0.5), abs(centre_y / lens.height_px - 0.5))
     if off > 0.15:
-        notes.append(f"the principal point lies {100 * off:.0f} % off the centre; right calibration?")
+        notes.append(
+            f"the principal point is {100 * off:.0f} % off the centre; is it the calibration of this camera?"
+        )
     return notes
 
 
 def _dropped_frame_notes(camera: CaptureCamera, usual_ns: float) -> list[str]:
-    """Frames a recording dropped: times say so, whatever the nominal rate."""
+    """Return a note on dropped frames, found from the frame times and not from the nominal rate."""
     if usual_ns <= 0.0:
         return []
     lost = np.round(np.diff(camera.times_ns) / usual_ns) - 1
@@ -168,7 +177,7 @@ def _dropped_frame_notes(camera: CaptureCamera, usual_ns: float) -> list[str]:
         return []
     longest = (lost.max() + 1) * usual_ns / 1e9
     return [
-        f"{int(lost.sum())} frames were dropped at {len(lost)} places, the longest hole is {longest:.2f} s"
+        f"{int(lost.sum())} frames were dropped at {len(lost)} places, the longest gap is {longest:.2f} s"
     ]
 
 
@@ -184,23 +193,25 @@ def _body_notes(job: Job) -> list[str]:
     roles = {camera.role for camera in job.capture.cameras}
     notes = []
     if not roles & set(_TRUNK_ROLES):
-        notes.append("no camera on the trunk or head: where the body is can only be inferred from the limbs")
+        notes.append(
+            "no camera on the trunk or head: the body's position can only be inferred from the limbs"
+        )
     if job.height_m is None and job.skeleton in SKELETON_PRESETS:
-        notes.append("no height_m: a mean adult's is assumed, and distances scale with it")
+        notes.append("no height_m: a mean adult's height is assumed, and distances scale with it")
     return notes
 
 
-def _check_clocks(job: Job, findings: list[CameraSummary]) -> list[str]:
-    """Cameras of one body must be running at the same time."""
-    if len(findings) < 2:
+def _check_clocks(job: Job, summaries: list[CameraSummary]) -> list[str]:
+    """Check that the cameras ran at the same time."""
+    if len(summaries) < 2:
         return []
-    for camera in findings:
-        others = [other for other in findings if other is not camera]
+    for camera in summaries:
+        others = [other for other in summaries if other is not camera]
         if all(other.end_s <= camera.start_s or camera.end_s <= other.start_s for other in others):
             raise _no_common_time_error(job, camera, others)
-    start, end = max(c.start_s for c in findings), min(c.end_s for c in findings)
+    start, end = max(c.start_s for c in summaries), min(c.end_s for c in summaries)
     if end <= start:
-        return ["there is no moment that all cameras saw"]
+        return ["there is no moment at which all cameras ran"]
     return [
         f"all cameras run together for {end - start:.1f} s, {start:.2f} to {end:.2f} s on the common clock"
     ]
@@ -223,7 +234,7 @@ def _no_common_time_error(job: Job, camera: CameraSummary, others: list[CameraSu
 
 
 def _check_skeleton(job: Job, _findings: list[CameraSummary]) -> list[str]:
-    """A skeleton file must be readable and have the bones the cameras ride on."""
+    """Check that a skeleton file can be read and has the bones that carry cameras."""
     if job.skeleton is None or job.skeleton in SKELETON_PRESETS:
         return []
     path = Path(job.skeleton)
@@ -231,36 +242,36 @@ def _check_skeleton(job: Job, _findings: list[CameraSummary]) -> list[str]:
     for camera in job.capture.cameras:
         if camera.role is not None and skeleton.index_of_role(camera.role) is None:
             raise JobError(
-                f"no joint of it is recognised as {camera.role}, which carries camera {camera.name}",
+                f"no joint is recognised as {camera.role}, which carries camera {camera.name}",
                 path=path,
                 field="skeleton",
-                hint=f"`bodycap skeleton {path.name}` shows the mapping, skeleton_map mends it; its joints: "
-                + ", ".join(skeleton.joints[:30]),
+                hint=f"`bodycap skeleton {path.name}` shows the mapping, skeleton_map changes it; "
+                "the file's joints: " + ", ".join(skeleton.joints[:30]),
             )
     return [f"skeleton {path.name}: {len(skeleton.joints)} joints"]
 
 
 def _check_formats(job: Job, _findings: list[CameraSummary]) -> list[str]:
-    """What the files take must be installed, and a rig of the user's own keeps its names."""
+    """Check that the libraries of the formats are installed, and that a user's rig keeps its names."""
     if job.skeleton == NO_SKELETON:
         return []
     require_libraries(job.export.formats)
     if "fbx" in job.export.formats:
-        from bodycap_batch.formats.fbx import require_blender  # its writer takes as long to load as all else
+        from bodycap_batch.formats.fbx import require_blender  # loading it takes as long as everything else
 
         require_blender()
     if job.export.names != "hik" and job.skeleton not in SKELETON_PRESETS:
         raise JobError(
-            f"names: {job.export.names} does not go with a skeleton file: its joints keep their names",
+            f"names: {job.export.names} cannot be used with a skeleton file: its joints keep their names",
             field="export.names",
             hint="leave names out, or use the skeleton upper_body or full_body",
         )
     return []
 
 
-def _check_named_frames(job: Job, findings: list[CameraSummary]) -> list[str]:
-    """Frames that the job names must be there and used; else a map would be made before they are missed."""
-    known = {camera.name: camera for camera in findings}
+def _check_named_frames(job: Job, summaries: list[CameraSummary]) -> list[str]:
+    """Check that the frames that the job names exist and are used, before a map is computed."""
+    known = {camera.name: camera for camera in summaries}
     for (block, field, _), camera, number in named_frames(job):
         finding = known.get(camera)
         if finding is None or any(first <= number <= last for first, last in finding.used_runs):
@@ -275,21 +286,24 @@ def _check_named_frames(job: Job, findings: list[CameraSummary]) -> list[str]:
         raise JobError(
             f"frame {number} of camera {camera} is not used",
             field=f"{block}.{field}",
-            hint=f"of its frames, counted from the video's first as 0, {first} to {last} lie between start_s "
-            "and end_s (those with unusable times left out)",
+            hint=f"frames {first} to {last}, counted from 0 at the start of the video, lie between start_s "
+            "and end_s, except those with unusable times",
         )
     return []
 
 
 def _check_files(job: Job, _findings: list[CameraSummary]) -> list[str]:
-    """No video twice, no chapter missing."""
+    """Check that no video is used twice and no chapter is missing."""
     require_distinct_videos(job)
     return []
 
 
-def _check_disk(job: Job, findings: list[CameraSummary]) -> list[str]:
-    """Room for the job's results and intermediate files, and the right to write them."""
-    frames, large = sum(each.used_frames for each in findings), sum(each.large_frames for each in findings)
+def _check_disk(job: Job, summaries: list[CameraSummary]) -> list[str]:
+    """Check that the disk has space for the results and intermediate files, and can be written."""
+    frames, large = (
+        sum(camera.used_frames for camera in summaries),
+        sum(camera.large_frames for camera in summaries),
+    )
     return require_room(job.out or Path("out").resolve(), frames, large)
 
 

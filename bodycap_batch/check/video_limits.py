@@ -11,10 +11,10 @@ from bodycap_batch.core.errors import CaptureError
 
 
 def require_within_limits(job: Job, limits: Limits) -> None:
-    """Look at what every video's container says of its size and duration.
+    """Compare the size and the duration of each video, as its container states them, with the limits.
 
     Raises:
-        CaptureError: One of them is larger or longer than allowed, or no readable video.
+        CaptureError: A video is larger or longer than permitted, or cannot be read.
     """
     for index, camera in enumerate(job.capture.cameras):
         for path in camera.video:

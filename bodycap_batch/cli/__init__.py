@@ -1,4 +1,4 @@
-"""The `bodycap` command: where errors become messages and exit codes."""
+"""The `bodycap` command: turns errors into messages and exit codes."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Args:
-        arguments: The words after ``bodycap``; default those of the process.
+        arguments: The words after ``bodycap``; None for those of this process.
 
     Returns:
-        The exit code. Without `arguments` the process is left with it.
+        The exit code. If `arguments` is None, the process exits with it instead.
     """
     with raise_on_signal():
         code = _run(sys.argv[1:] if arguments is None else list(arguments))
@@ -76,9 +76,9 @@ def _run(arguments: Sequence[str]) -> int:
             _write_error(note)
         return error.exit_code
     except Exception as error:  # noqa: BLE001 - the one place where bugs are caught
-        if (away := _disk_error(error)) is not None:
-            _write_error(f"error: {away}")
-            return away.exit_code
+        if (disk_error := _disk_error(error)) is not None:
+            _write_error(f"error: {disk_error}")
+            return disk_error.exit_code
         _write_error(traceback.format_exc())
         _write_error("This is a bug in bodycap. Please report the lines above, the command and the job file.")
         return EXIT_BUG
@@ -86,10 +86,10 @@ def _run(arguments: Sequence[str]) -> int:
 
 
 def _disk_error(error: Exception) -> BodycapError | None:
-    """A disk that does not answer, which no look at a path expects; None for anything else."""
+    """Return the error of a disk that does not answer; None for any other error."""
     if not isinstance(error, OSError):
         return None
-    from bodycap_batch.store.artefacts import store_error  # takes longer than all else about `--help`
+    from bodycap_batch.store.artefacts import store_error  # slow to import, and not needed for `--help`
 
     found = store_error(error, Path.cwd())
     return found if isinstance(found, DiskAway) else None

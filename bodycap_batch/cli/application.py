@@ -8,7 +8,7 @@ import typer
 
 import bodycap_batch
 
-# Help is plain text: rich's rendering would take as long again as everything else about `--help`.
+# Help is plain text: rendering it with rich would double the time of `--help`.
 app = typer.Typer(
     name="bodycap",
     no_args_is_help=True,
@@ -19,8 +19,8 @@ app = typer.Typer(
 )
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(is_requested: bool) -> None:
+    if is_requested:
         typer.echo(f"bodycap {bodycap_batch.__version__}")
         raise typer.Exit
 
@@ -33,18 +33,18 @@ def _options(
 ) -> None:
     """Body motion and a map of the room from body-worn cameras.
 
-    Videos in; out come the room (PLY), the motion (BVH), camera paths (TUM) and figures.
+    The input is videos. The results are the room (PLY), the motion (BVH), camera paths (TUM) and figures.
 
     \b
     Try it:
       bodycap run my_walk/            a folder with torso.mp4, left_palm.mp4, right_palm.mp4
-      bodycap check my_walk/          what would be used, and what is wrong with it
-      bodycap run jobs/cpl_lab.yaml   the shipped example
+      bodycap check my_walk/          show what the job uses, and its problems
+      make job                        run the example, in a clone of the repository
 
     \b
     Exit codes:
       0 done            3 unusable video or calibration    70 a bug
-      2 wrong job or    4 the videos did not support       130 or 143 stopped; run it
-        command line      an answer                          again to go on
+      2 wrong job or    4 the videos are not sufficient    130 or 143 stopped; run it
+        command line      for a result                       again to continue
                         5 disk or store
     """  # noqa: D301 - \b keeps lines as they are

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from bodycap_batch.runner.dask_cluster import Cluster
 
 _MAX_CLUSTER_JOBS = 32
-"""A job at work is a thread that waits; its tasks wait at the scheduler, in order of priority."""
+"""Jobs at the same time on a cluster. A job is a waiting thread; the scheduler orders its tasks by priority.
+Evidence: none."""
 
 
 _INTEGER = re.compile(r"-?[0-9]{1,9}")
@@ -44,7 +45,8 @@ _ExecutorOption = Annotated[
     str,
     typer.Option(
         metavar="local|ADDRESS|slurm|pbs",
-        help="Where tasks run: here, on a Dask scheduler's workers (tcp://HOST:8786), or in a queue.",
+        help="Place of the tasks: this machine, the workers of a Dask scheduler (tcp://HOST:8786), "
+        "or a queue.",
     ),
 ]
 
@@ -56,24 +58,26 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
     out: BatchOutOption = None,
     store: BatchStoreOption = None,
     max_jobs: Annotated[
-        int | None, typer.Option(min=1, help="Most jobs at work at once.", show_default=False)
+        int | None, typer.Option(min=1, help="Maximum number of jobs at the same time.", show_default=False)
     ] = None,
-    threads: Annotated[int, typer.Option(min=1, max=1024, help="Threads of one task.")] = 1,
-    workers: Annotated[int, typer.Option(min=1, help="Workers to ask a queue for.")] = 2,
+    threads: Annotated[int, typer.Option(min=1, max=1024, help="Number of threads of one task.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Number of workers to request from a queue.")] = 2,
     worker_memory: Annotated[
-        int, typer.Option(min=500, metavar="MB", help="Memory of each worker of a queue.")
+        int, typer.Option(min=500, metavar="MB", help="Memory of each worker in a queue.")
     ] = 4000,
     priority: Annotated[
         list[str] | None,
-        typer.Option(metavar="JOB=NUMBER", help="Jobs of higher numbers go first; may be repeated."),
+        typer.Option(metavar="JOB=NUMBER", help="Priority of a job; higher numbers run first. Repeatable."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON line an event and a job.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON line per event and per job.")
+    ] = False,
 ) -> None:
-    """Run many jobs, on this machine or on many.
+    """Run many jobs, on one machine or on several.
 
-    A job that fails does not stop the others; the exit code is the worst job's. Started again, the batch goes
-    on from finished stages. On a cluster the jobs, their videos, the store and the results lie on
-    a disk that all machines mount at the same place.
+    A failed job does not stop the others; the exit code is that of the worst job. If the batch is started
+    again, it continues after the finished stages. On a cluster, the jobs, their videos, the store and the
+    results must be on a disk that all machines mount under the same path.
 
     \b
     Examples:
@@ -84,33 +88,36 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
     from bodycap_batch.pipeline import Batch, Settings
     from bodycap_batch.store.artefacts import Store
 
-    wanted = _batch_jobs(list(dict.fromkeys(jobs)), priority or [])
+    batch_jobs = _batch_jobs(list(dict.fromkeys(jobs)), priority or [])
     folder = (out or default_out()).resolve()
-    teller = _BatchReporter(as_json=as_json)
-    kept = Store(store or folder / ".store")
-    with event_on_signal() as stop, _executor(executor, threads, workers, worker_memory) as (shared, usual):
+    reporter = _BatchReporter(as_json=as_json)
+    artefact_store = Store(store or folder / ".store")
+    with (
+        event_on_signal() as stop,
+        _executor(executor, threads, workers, worker_memory) as (shared, busy_jobs),
+    ):
 
         def settings(job: BatchJob, _: Path | None) -> Settings:
             return Settings(
-                store=kept,
+                store=artefact_store,
                 threads=threads,
-                listener=teller.listener(job.path),
+                listener=reporter.listener(job.path),
                 cancelled=stop.is_set,
                 executor=shared,
                 priority=job.priority,
             )
 
-        work = Batch(settings, lambda job: _batch_results_folder(job, folder), max_jobs or usual)
-        outcomes = [teller.ended(outcome) for outcome in work.run(wanted)]
+        work = Batch(settings, lambda job: _batch_results_folder(job, folder), max_jobs or busy_jobs)
+        outcomes = [reporter.report_outcome(outcome) for outcome in work.run(batch_jobs)]
         if stop.is_set():
-            raise Cancelled("stopped on request; finished stages are kept", hint="run it again to go on")
-    teller.summarise(wanted, outcomes)
+            raise Cancelled("stopped on request; finished stages are kept", hint="run it again to continue")
+    reporter.print_summary(batch_jobs, outcomes)
     raise typer.Exit(max(outcome.exit_code for outcome in outcomes))
 
 
 @contextmanager
 def _executor(kind: str, threads: int, workers: int, memory_mb: int) -> Iterator[tuple[Executor, int]]:
-    """Yield what makes the tasks, and how many jobs keep it busy."""
+    """Yield the executor of the tasks, and the number of jobs that keep it busy."""
     if kind == "local":
         from bodycap_batch.runner.pool import LocalPool
 
@@ -140,91 +147,92 @@ def _executor(kind: str, threads: int, workers: int, memory_mb: int) -> Iterator
 
 
 def _with_worker_note(cluster: Cluster) -> Cluster:
-    """Say so where nobody is there to work yet.
+    """Return the cluster, after a note to the user if it has no worker yet.
 
-    What becomes of the jobs is told; Dask's own view of a lost connection is a page of traceback.
+    Dask's messages about a lost connection are switched off: they are long tracebacks, and each job reports
+    its end.
     """
     if not cluster.workers():
-        sys.stderr.write("no worker is there yet; the batch begins when one is\n")
+        sys.stderr.write("no worker is connected yet; the batch starts when one connects\n")
     for name in ("distributed", "distributed.client", "distributed.core"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # Dask sets their levels when it is loaded
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # Dask sets the levels when it is imported
     return cluster
 
 
 def _batch_results_folder(job: Job, folder: Path) -> Path:
-    """A job that names no folder of its own has one of its name in the batch's."""
-    usual = default_out() / job.name
-    return folder / job.name if job.out in (None, usual) else results_folder(job)
+    """Return the results folder of a job; by default one of its name in the batch's folder."""
+    busy_jobs = default_out() / job.name
+    return folder / job.name if job.out in (None, busy_jobs) else results_folder(job)
 
 
 def _batch_jobs(jobs: Sequence[Path], priorities: Sequence[str]) -> list[BatchJob]:
     from bodycap_batch.pipeline import BatchJob
 
-    known: dict[Path, int] = {}
+    priority_of_job: dict[Path, int] = {}
     for text in priorities:
         name, _, number = text.rpartition("=")
         if Path(name) not in jobs or not _INTEGER.fullmatch(number):
             raise JobError(
-                f"{text!r} is no JOB=NUMBER of a job of this batch",
+                f"{text!r} is not JOB=NUMBER for a job of this batch",
                 field="--priority",
-                hint="as in --priority monday.yaml=5, with the job as it stands on the command line",
+                hint="for example --priority monday.yaml=5, with the job as written on the command line",
             )
-        known[Path(name)] = int(number)
-    return [BatchJob(path=path, priority=known.get(path, 0)) for path in jobs]
+        priority_of_job[Path(name)] = int(number)
+    return [BatchJob(path=path, priority=priority_of_job.get(path, 0)) for path in jobs]
 
 
 class _BatchReporter:
-    """Tells what happens in all jobs, as lines or JSON."""
+    """Print the events of all jobs, as lines or JSON."""
 
     def __init__(self, *, as_json: bool) -> None:
         self._as_json = as_json
         self._lock = threading.Lock()
 
     def listener(self, job: Path) -> Callable[[Event], None]:
-        """What listens to one job."""
+        """Return a function that prints the events of one job."""
 
         def listen(event: Event) -> None:
             if self._as_json:
-                self._line({"job": str(job), **event.to_dict()})
+                self._write_json({"job": str(job), **event.to_dict()})
             elif event.kind != "progress":
-                self._say(f"{_shown_name(job)}: {text_from_event(event)}")
+                self._write_line(f"{_shown_name(job)}: {text_from_event(event)}")
 
         return listen
 
-    def ended(self, outcome: Outcome) -> Outcome:
-        """Tell how a job ended; gives it back."""
+    def report_outcome(self, outcome: Outcome) -> Outcome:
+        """Print how a job ended; return the outcome."""
         if self._as_json:
-            self._line({"kind": "job", **outcome.to_dict()})
+            self._write_json({"kind": "job", **outcome.to_dict()})
         elif outcome.error is not None:
-            self._say(f"{_shown_name(outcome.job.path)}: {outcome.error}")
+            self._write_line(f"{_shown_name(outcome.job.path)}: {outcome.error}")
             for note in getattr(outcome.error, "__notes__", []):
-                self._say(note)
+                self._write_line(note)
         return outcome
 
-    def summarise(self, jobs: Sequence[BatchJob], outcomes: Sequence[Outcome]) -> None:
-        """A table of all jobs, in the order they were given."""
+    def print_summary(self, jobs: Sequence[BatchJob], outcomes: Sequence[Outcome]) -> None:
+        """Print a table of all jobs, in the order of the command line."""
         if self._as_json:
             return
         found = {outcome.job: outcome for outcome in outcomes}
         width = max(len(_shown_name(job.path)) for job in jobs)
         for job in jobs:
-            typer.echo(f"{_called(job.path):{width}}  {_outcome_text(found[job])}")
+            typer.echo(f"{_shown_name(job.path):{width}}  {_outcome_text(found[job])}")
         failed = sum(outcome.exit_code != 0 for outcome in outcomes)
         typer.echo(f"{len(jobs) - failed} of {len(jobs)} jobs done")
 
-    def _say(self, text: str) -> None:
+    def _write_line(self, text: str) -> None:
         with self._lock:
             sys.stderr.write(f"{time.strftime('%H:%M:%S')} {text}\n")
             sys.stderr.flush()
 
-    def _line(self, values: dict[str, Any]) -> None:
+    def _write_json(self, values: dict[str, Any]) -> None:
         with self._lock:
             sys.stdout.write(json.dumps(values) + "\n")
             sys.stdout.flush()
 
 
 def _shown_name(job: Path) -> str:
-    """What a job is called where many are told of: each folder may hold a ``job.yaml``."""
+    """Return a job's name in a list of jobs. A ``job.yaml`` is shown with its folder."""
     from bodycap_batch.config.folder import JOB_FILES
 
     return f"{job.resolve().parent.name}/{job.name}" if job.name in JOB_FILES else job.name

@@ -19,7 +19,7 @@ from bodycap_batch.core.progress import Event
 
 
 class CameraModelOption(StrEnum):
-    """Which camera model is fitted."""
+    """Camera model to fit."""
 
     AUTO = "auto"
     PINHOLE = "pinhole"
@@ -31,37 +31,42 @@ class CameraModelOption(StrEnum):
 def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
     video: Annotated[Path, typer.Argument(metavar="VIDEO", help="A clip of the board.")],
     chessboard: Annotated[
-        str | None, typer.Option(metavar="CxR", help="A chessboard with that many inner corners: 9x6.")
+        str | None, typer.Option(metavar="CxR", help="A chessboard, by its inner corners, for example 9x6.")
     ] = None,
     charuco: Annotated[
-        str | None, typer.Option(metavar="CxR", help="A ChArUco board with that many squares: 7x5.")
+        str | None, typer.Option(metavar="CxR", help="A ChArUco board, by its squares, for example 7x5.")
     ] = None,
-    dictionary: Annotated[str, typer.Option(help="ChArUco: the family of its markers.")] = "4X4_50",
+    dictionary: Annotated[str, typer.Option(help="ChArUco: dictionary of its markers.")] = "4X4_50",
     marker: Annotated[
         float, typer.Option(help="ChArUco: side of a marker over the side of a square.")
     ] = 0.75,
-    legacy: Annotated[
-        bool, typer.Option("--legacy", help="ChArUco: drawn by an OpenCV older than 4.6.")
-    ] = False,
+    legacy: Annotated[bool, typer.Option("--legacy", help="ChArUco: drawn by an OpenCV before 4.6.")] = False,
     lens: Annotated[
-        CameraModelOption, typer.Option(help="The camera model; auto: opencv, or fisheye if it fits better.")
+        CameraModelOption,
+        typer.Option(help="Camera model; auto selects opencv, or fisheye if it fits better."),
     ] = (CameraModelOption.AUTO),
     camera: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Add it to the file under this camera (default: for all cameras)."),
+        typer.Option(
+            metavar="NAME", help="Add the result to the file for this camera (default: for all cameras)."
+        ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE", help="The file (default: calib.json beside the video)."),
+        typer.Option(
+            "--out", metavar="FILE", help="File for the result (default: calib.json beside the video)."
+        ),
     ] = None,
-    json_progress: Annotated[bool, typer.Option("--json-progress", help="Progress as JSON lines.")] = False,
+    json_progress: Annotated[
+        bool, typer.Option("--json-progress", help="Print progress as JSON lines.")
+    ] = False,
 ) -> None:
     """Calibrate a camera from a clip of a board.
 
-    Print a board, glue it on something flat, film it with the camera in the mode you will film in:
+    Print a board, and glue it on something flat. Film it with the camera settings of your captures:
     stabilisation off, the same size, zoom and lens mode. Move it slowly to every corner of the picture, near
-    and far, tilted to all sides; half a minute is enough. Writes calib.json and a preview of the picture
-    without distortion.
+    and far, tilted to all sides; half a minute is enough. The command writes calib.json and a preview of the
+    picture without distortion.
 
     \b
     Examples:
@@ -73,8 +78,8 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
     from bodycap_batch.core.context import StageContext
 
     kind, columns, rows = _board_size(chessboard, charuco)
-    printed = {"dictionary": dictionary, "marker": marker, "legacy": legacy}
-    board = CalibrationBoard(kind=kind, columns=columns, rows=rows, **printed)  # type: ignore[arg-type]
+    marker_options = {"dictionary": dictionary, "marker": marker, "legacy": legacy}
+    board = CalibrationBoard(kind=kind, columns=columns, rows=rows, **marker_options)  # type: ignore[arg-type]
     target = out or video.parent / "calib.json"
     with (
         event_on_signal() as stop,
@@ -98,16 +103,16 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
 def _board_size(
     chessboard: str | None, charuco: str | None
 ) -> tuple[Literal["chessboard", "charuco"], int, int]:
-    """Kind, columns and rows of the one board that is named."""
+    """Return the kind, columns and rows of the board that the options name."""
     if charuco is not None and chessboard is None:
         return ("charuco", *_parse_size(charuco, "--charuco"))
     if chessboard is not None and charuco is None:
         return ("chessboard", *_parse_size(chessboard, "--chessboard"))
-    raise JobError("which board?", field="--charuco or --chessboard", hint="--charuco 7x5")
+    raise JobError("name one board", field="--charuco or --chessboard", hint="for example --charuco 7x5")
 
 
 def _parse_size(text: str, flag: str) -> tuple[int, int]:
     found = re.fullmatch(r"(\d{1,3})[xX×](\d{1,3})", text.strip())
     if found is None:
-        raise JobError(f"no board size: {text!r}", field=flag, hint="columns x rows, for example 7x5")
+        raise JobError(f"not a board size: {text!r}", field=flag, hint="columns x rows, for example 7x5")
     return int(found[1]), int(found[2])

@@ -19,10 +19,10 @@ def check(
     height: HeightOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
 ) -> None:
-    """Say what a job would use, and what is wrong with it.
+    """Show what a job uses, and its problems.
 
-    Opens every video and prints which file became which camera; looks at calibration, mounts, clocks and disk
-    space. Nothing is computed or written.
+    Opens every video and prints which file belongs to which camera. Checks calibration, mounts, clocks and
+    disk space. Nothing is computed or written.
 
     \b
     Example:

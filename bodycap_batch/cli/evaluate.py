@@ -22,7 +22,7 @@ _TRUTH_FILES = ("joints.npz", "motion.bvh")
 
 
 class Align(StrEnum):
-    """How the estimate may be moved onto the truth."""
+    """How the estimate may be aligned with the truth."""
 
     SIM3 = "sim3"
     SE3 = "se3"
@@ -33,29 +33,30 @@ class Align(StrEnum):
 def evaluate(
     estimate: Annotated[
         Path,
-        typer.Argument(metavar="ESTIMATE", help="Results of a run, a folder of .tum files, a .tum or .bvh."),
+        typer.Argument(
+            metavar="ESTIMATE", help="Results of a run, a folder of .tum files, or a .tum or .bvh file."
+        ),
     ],
     truth: Annotated[
         Path,
-        typer.Argument(
-            metavar="TRUTH", help="The same for the truth: a gt/ folder, a .tum, a .bvh or joints.npz."
-        ),
+        typer.Argument(metavar="TRUTH", help="The truth: a gt/ folder, or a .tum, .bvh or joints.npz file."),
     ],
     align: Annotated[
-        Align, typer.Option(help="One alignment for all cameras: similarity, rigid, or none.")
+        Align, typer.Option(help="Alignment of all cameras together: similarity, rigid, or none.")
     ] = Align.SIM3,
     reference: Annotated[
         str | None,
         typer.Option(
-            metavar="CAMERA", help="Also every camera against this one (torso), metric, no scaling."
+            metavar="CAMERA",
+            help="Also compare every camera relative to this one, in metres without scaling.",
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print all figures as JSON.")] = False,
 ) -> None:
     """Compare results with the truth.
 
-    Camera paths: ATE, RPE and coverage; a motion: joint error. Cameras are paired by file name and aligned
-    together; a frame without a pose counts against coverage.
+    For camera paths: ATE, RPE and coverage. For a motion: joint errors. Cameras are paired by file name and
+    aligned together. A frame without a pose reduces the coverage.
 
     \b
     Examples:
@@ -72,7 +73,7 @@ def evaluate(
     if not reports:
         raise JobError(
             f"nothing in {estimate} can be compared with {truth}",
-            hint="give two .tum files, two .bvh files, or two folders whose .tum files have the same names",
+            hint="name two .tum files, two .bvh files, or two folders with .tum files of the same names",
         )
     values = {name: report.to_dict() for name, report in reports.items()}
     typer.echo(json.dumps(values, indent=1) if as_json else "\n".join(_table_lines(values)))
@@ -84,27 +85,27 @@ def _evaluate_trajectories(
     from bodycap_batch.evaluate import TrajectoryOptions, relative_camera_error, score_trajectories
     from bodycap_batch.formats.tum import read_tum
 
-    mine = {name: read_tum(pair[0]) for name, pair in pairs.items()}
-    theirs = {name: read_tum(pair[1]) for name, pair in pairs.items()}
+    estimates = {name: read_tum(pair[0]) for name, pair in pairs.items()}
+    truths = {name: read_tum(pair[1]) for name, pair in pairs.items()}
     frames = _frame_counts(results) if results.is_dir() else {}
     reports: dict[str, Any] = {
-        "trajectories": score_trajectories(mine, theirs, TrajectoryOptions(align=align), frames)  # type: ignore[arg-type]
+        "trajectories": score_trajectories(estimates, truths, TrajectoryOptions(align=align), frames)  # type: ignore[arg-type]
     }
     if reference is not None:
         for name in sorted(set(pairs) - {reference}):
-            reports[f"{name} from {reference}"] = relative_camera_error(mine, theirs, name, reference)
+            reports[f"{name} from {reference}"] = relative_camera_error(estimates, truths, name, reference)
     return reports
 
 
 def _evaluate_motion(estimate: Path, truth: Path) -> dict[str, Any]:
-    """All joints, and those that a run's own figures call measured."""
+    """Evaluate all joints, and the joints that the run's metrics.json lists as measured."""
     from bodycap_batch.evaluate import MotionOptions, evaluate_motion
 
-    told = _motion_figures(estimate.parent)
-    # A BVH file starts at zero; the joints of a capture are on its common clock.
-    offset_s = float(told.get("start_s", 0.0)) if truth.suffix == ".npz" else 0.0
+    figures = _motion_figures(estimate.parent)
+    # A BVH file starts at time zero; the joints of a capture are on the common clock.
+    offset_s = float(figures.get("start_s", 0.0)) if truth.suffix == ".npz" else 0.0
     reports = {"motion": evaluate_motion(estimate, truth, MotionOptions(offset_s=offset_s))}
-    joints = told.get("joints", {}).values()
+    joints = figures.get("joints", {}).values()
     roles = tuple(joint["role"] for joint in joints if joint["observed"] and joint["role"])
     if roles:
         options = MotionOptions(offset_s=offset_s, roles=roles)
@@ -113,7 +114,7 @@ def _evaluate_motion(estimate: Path, truth: Path) -> dict[str, Any]:
 
 
 def _motion_figures(results: Path) -> dict[str, Any]:
-    """The block about the motion in the results' metrics.json."""
+    """Return the block of the motion in the results' metrics.json; empty if there is none."""
     try:
         return dict(json.loads((results / "metrics.json").read_text(encoding="utf-8"))["motion"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -121,7 +122,7 @@ def _motion_figures(results: Path) -> dict[str, Any]:
 
 
 def _frame_counts(results: Path) -> dict[str, int]:
-    """Frames of each camera's video, from the results' frames.csv."""
+    """Return the number of frames of each camera's video, from the results' frames.csv."""
     try:
         with (results / "frames.csv").open(newline="", encoding="utf-8") as stream:
             rows = csv.DictReader(line for line in stream if not line.startswith("#"))
@@ -131,7 +132,7 @@ def _frame_counts(results: Path) -> dict[str, int]:
 
 
 def _table_lines(reports: dict[str, Any]) -> list[str]:
-    """The figures as a person reads them."""
+    """Return the figures as text for the user."""
     lines: list[str] = []
     for name, report in reports.items():
         if name == "trajectories":
@@ -160,7 +161,9 @@ _MOTION_ROWS = (
     ("angle_deg", "angles, degrees", 1),
     ("angle_offset_free_deg", "angles less a constant, degrees", 1),
 )
+"""Key of a figure, its label with the unit, and the factor to that unit."""
 _RELATIVE_ROWS = (("vector_m", "vector, cm"), ("in_reference_m", "in its frame, cm"))
+"""Key of a figure, and its label with the unit."""
 
 
 def _camera_line(name: str, score: dict[str, Any]) -> str:
@@ -180,31 +183,34 @@ def _statistics_text(summary: dict[str, float], factor: float) -> str:
 
 
 def _trajectory_pairs(estimate: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
-    """Estimate and truth of each camera that both sides have."""
+    """Return the files of the estimate and of the truth, for each camera that both have."""
     if estimate.is_file() and truth.is_file():
         both = estimate.suffix in TUM_SUFFIXES and truth.suffix in TUM_SUFFIXES
         return {estimate.stem: (estimate, truth)} if both else {}
     if not estimate.is_dir():
         return {}
-    mine = _by_stem([*estimate.glob("*.tum"), *(estimate / "trajectories").glob("*.tum")])
+    estimates = _by_stem([*estimate.glob("*.tum"), *(estimate / "trajectories").glob("*.tum")])
     if truth.is_file():
-        single = truth.suffix in TUM_SUFFIXES and len(mine) == 1
-        return {name: (path, truth) for name, path in mine.items()} if single else {}
-    theirs = _by_stem([*truth.glob("*.tum"), *(truth / "gt").glob("*.tum")])
-    return {name: (mine[name], theirs[name]) for name in sorted(mine.keys() & theirs.keys())}
+        single = truth.suffix in TUM_SUFFIXES and len(estimates) == 1
+        return {name: (path, truth) for name, path in estimates.items()} if single else {}
+    truths = _by_stem([*truth.glob("*.tum"), *(truth / "gt").glob("*.tum")])
+    return {name: (estimates[name], truths[name]) for name in sorted(estimates.keys() & truths.keys())}
 
 
 def _motion_pair(estimate: Path, truth: Path) -> tuple[Path, Path] | None:
-    """A motion and its truth, if both sides have one."""
-    mine = estimate / _MOTION_FILE if estimate.is_dir() else estimate
-    theirs = truth
+    """Return the files of the motion and of its truth; None unless both exist."""
+    estimates = estimate / _MOTION_FILE if estimate.is_dir() else estimate
+    truths = truth
     if truth.is_dir():
         found = [truth / part / name for part in ("", "gt") for name in _TRUTH_FILES]
-        theirs = next((path for path in found if path.is_file()), truth)
+        truths = next((path for path in found if path.is_file()), truth)
     usable = (
-        mine.suffix == ".bvh" and mine.is_file() and theirs.suffix in (".bvh", ".npz") and theirs.is_file()
+        estimates.suffix == ".bvh"
+        and estimates.is_file()
+        and truths.suffix in (".bvh", ".npz")
+        and truths.is_file()
     )
-    return (mine, theirs) if usable else None
+    return (estimates, truths) if usable else None
 
 
 def _by_stem(paths: Iterable[Path]) -> dict[str, Path]:

@@ -14,11 +14,12 @@ from bodycap_batch.cli.application import app
 @app.command()
 def init(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="A folder of videos.")],
-    force: Annotated[bool, typer.Option("--force", help="Write over a job file that is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite an existing job file.")] = False,
 ) -> None:
     """Write a commented job.yaml for the videos found in a folder.
 
-    Every camera, every option with its default and meaning; what the files do not tell is left to fill in.
+    The file lists every camera, and every option with its default and meaning. You fill in what the videos do
+    not state.
 
     \b
     Example:
@@ -33,6 +34,6 @@ def init(
     missing = text.count(UNKNOWN_MOUNT)
     if missing:
         typer.echo(
-            f"fill in where {missing} camera{'s were' if missing > 1 else ' was'} worn (`mount:`), then"
+            f"fill in `mount:`, the place on the body, of {missing} camera{'s' if missing > 1 else ''}, then"
         )
     typer.echo(f"next: bodycap check {shlex.quote(str(path))}")

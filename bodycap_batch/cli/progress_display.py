@@ -1,4 +1,4 @@
-"""Progress for people at a terminal, for logs, and for machines."""
+"""Show progress: bars on a terminal, lines in a log, JSON for other programs."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ if TYPE_CHECKING:
     from rich.progress import Progress, Task, TaskID
 
 _LINE_PERIOD_S = 5.0
+"""A line is printed after this time, seconds. Evidence: none."""
 _LINE_PAUSE_S = 1.0
+"""Lines are at least this far apart, seconds. Evidence: none."""
 _LINE_PROGRESS = 0.1
-"""A line every five seconds, or every tenth of a stage but not more often than once a second."""
+"""A line is printed after this fraction of a stage. Evidence: none."""
 
 
 class ProgressDisplay(Protocol):
-    """Shows events; a context manager."""
+    """Show events; a context manager."""
 
     def __enter__(self) -> Self: ...
 
@@ -35,14 +37,14 @@ class ProgressDisplay(Protocol):
 
 
 def make_progress_display(*, as_json: bool) -> ProgressDisplay:
-    """Bars on a terminal, JSON lines when asked for, else plain lines."""
+    """Return bars on a terminal, plain lines elsewhere, or JSON lines if `as_json` is True."""
     if as_json:
         return JsonLines()
     return ProgressBars() if sys.stderr.isatty() else ProgressLines()
 
 
 class JsonLines:
-    """One JSON object a line on standard output."""
+    """Print one JSON object per line on standard output."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -51,17 +53,17 @@ class JsonLines:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Nothing is left open."""
+        """Do nothing: there is nothing to close."""
 
     def __call__(self, event: Event) -> None:
-        """Write one event."""
+        """Print one event."""
         with self._lock:
             sys.stdout.write(json.dumps(event.to_dict()) + "\n")
             sys.stdout.flush()
 
 
 class ProgressLines:
-    """Plain lines on standard error, every few seconds or every tenth of a stage."""
+    """Print plain lines on standard error, every few seconds or every tenth of a stage."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -71,10 +73,10 @@ class ProgressLines:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Nothing is left open."""
+        """Do nothing: there is nothing to close."""
 
     def __call__(self, event: Event) -> None:
-        """Write one event, unless the stage has just been heard of."""
+        """Print one event, unless the last line of its stage is too recent."""
         with self._lock:
             if event.kind == "progress":
                 pace = self._pace.setdefault(f"{event.label} {event.what}", _LinePacer())
@@ -89,27 +91,29 @@ class ProgressLines:
 
 
 class _LinePacer:
-    """When a stage was last written about, and how fast it goes."""
+    """Decide when a stage prints its next line, and measure its speed."""
 
     def __init__(self) -> None:
         self._first: tuple[float, int] | None = None
         self._written, self._share = time.monotonic(), 0.0
 
     def line(self, event: Event) -> str | None:
-        """The line to write now, or None."""
-        now, share = time.monotonic(), event.done / event.total if event.total else 0.0
+        """Return the line to print now, or None."""
+        now, progress = time.monotonic(), event.done / event.total if event.total else 0.0
         self._first = self._first or (now, event.done)
         waited = now - self._written
         if waited < _LINE_PERIOD_S and not (
-            waited >= _LINE_PAUSE_S and share - self._share >= _LINE_PROGRESS
+            waited >= _LINE_PAUSE_S and progress - self._share >= _LINE_PROGRESS
         ):
             return None
-        self._written, self._share = now, share
+        self._written, self._share = now, progress
         seconds, done = now - self._first[0], event.done - self._first[1]
         rate = done / seconds if seconds > 0 and done > 0 else None
         text = f"{event.label}: {event.done}"
         text += (
-            f" of {event.total} {event.what} ({format_percent(share)})" if event.total else f" {event.what}"
+            f" of {event.total} {event.what} ({format_percent(progress)})"
+            if event.total
+            else f" {event.what}"
         )
         if rate is not None:
             text += f", {rate:.3g}/s"
@@ -119,7 +123,7 @@ class _LinePacer:
 
 
 class ProgressBars:
-    """A bar per stage and camera, with rate and time left, on standard error."""
+    """Show a bar per stage and camera on standard error, with the speed and the time left."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -131,11 +135,11 @@ class ProgressBars:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave the terminal as it was."""
+        """Restore the terminal."""
         self._progress.stop()
 
     def __call__(self, event: Event) -> None:
-        """Move the event's bar."""
+        """Update the bar of one event."""
         with self._lock:
             if event.kind == "note":
                 self._progress.console.print(event.what, highlight=False)
@@ -169,18 +173,18 @@ def _make_rich_progress() -> Progress:
     from rich.text import Text
 
     class Rate(ProgressColumn):
-        """Units per second."""
+        """Column with the units per second."""
 
         def render(self, task: Task) -> Text:
-            """Show the rate once there is one."""
+            """Return the speed as soon as it is known."""
             speed = task.finished_speed or task.speed
             return Text("" if speed is None or task.finished else f"{speed:.3g}/s", style="dim")
 
     class Count(ProgressColumn):
-        """Units done, of all."""
+        """Column with the number of units done."""
 
         def render(self, task: Task) -> Text:
-            """Show the count where the total is known."""
+            """Return the count if the total is known."""
             known = task.total is not None and not task.finished
             return Text(f"{int(task.completed)}/{int(task.total or 0)}" if known else "")
 
@@ -196,7 +200,7 @@ def _make_rich_progress() -> Progress:
 
 
 def text_from_event(event: Event) -> str:
-    """An event as one reads it."""
+    """Return an event as a sentence for the user."""
     if event.kind == "note":
         return event.what
     words = {

@@ -31,10 +31,11 @@ def report(
     threads: ThreadsOption = None,
     store: StoreOption = None,
 ) -> None:
-    """Write a job's report.html anew, from what the store holds.
+    """Write a job's report.html again, from the content of the store.
 
-    Every run writes it; this does it again, with a newer bodycap for instance. JOB may also be the folder of
-    the results. No other stage is computed; of a job that broke off, the report says how far it came.
+    Every run writes the report. This command repeats that, for example with a newer bodycap. The job may also
+    be given by its results folder. No other stage is computed. The report of an interrupted job states how
+    far it got.
 
     \b
     Examples:
@@ -59,8 +60,8 @@ def report(
     typer.echo(f"report: {path}")
 
 
-def job_from_path(named: Path) -> tuple[Path, Path | None]:
-    """The job to load, and the results' folder where that is what was named."""
-    if (named / "run.json").is_file() and (named / "job.yaml").is_file():
-        return named / "job.yaml", named.resolve()
-    return named, None
+def job_from_path(path_argument: Path) -> tuple[Path, Path | None]:
+    """Return the job file to load, and the results folder if the path is one."""
+    if (path_argument / "run.json").is_file() and (path_argument / "job.yaml").is_file():
+        return path_argument / "job.yaml", path_argument.resolve()
+    return path_argument, None

@@ -44,30 +44,30 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
     threads: ThreadsOption = None,
     store: StoreOption = None,
     from_: Annotated[
-        StageName | None, typer.Option("--from", help="Do this stage and all after it again.")
+        StageName | None, typer.Option("--from", help="Repeat this stage and all later ones.")
     ] = None,
     until: Annotated[
-        StageName | None, typer.Option(help="Stop after this stage; no results are written before the last.")
+        StageName | None, typer.Option(help="Stop after this stage. Only the last stage writes results.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Do every stage again.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Repeat every stage.")] = False,
     json_progress: Annotated[
-        bool, typer.Option("--json-progress", help="Progress as JSON lines on standard output.")
+        bool, typer.Option("--json-progress", help="Print progress as JSON lines on standard output.")
     ] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Say what each stage cost at the end.")
+        bool, typer.Option("--verbose", "-v", help="Print time and memory of each stage at the end.")
     ] = False,
 ) -> None:
-    """Turn a capture into its map, camera paths and motion.
+    """Compute the map, the camera paths and the motion of a capture.
 
-    Finished stages are kept: a run that was stopped, or is started again with other options, goes on from
-    what is already there. The last line printed names the folder of the results.
+    Finished stages are kept. A run that was stopped, or is started again with other options, continues after
+    them. The last printed line names the results folder.
 
     \b
     Examples:
       bodycap run my_walk/ --height 1.75
       bodycap run my_walk/ --skeleton subject.bvh --out results/my_walk
       bodycap run single_camera/ --skeleton none
-      bodycap run jobs/cpl_lab.yaml
+      bodycap run jobs/my_walk.yaml
       bodycap run my_walk/ --from merge
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.config.folder import job_file_in
@@ -76,9 +76,9 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
     from bodycap_batch.store.artefacts import Store
 
     if force and from_ is not None:
-        raise JobError("--force does every stage again, --from some of them", hint="leave one of them out")
-    first: StageName | None = "check" if force else from_
-    redo = frozenset[str]() if first is None else stages_from(first)
+        raise JobError("--force repeats every stage, --from some of them", hint="leave one of them out")
+    first_repeated: StageName | None = "check" if force else from_
+    redo = frozenset[str]() if first_repeated is None else stages_from(first_repeated)
     overrides = Overrides(out=out, skeleton=skeleton, height_m=height)
     with (
         event_on_signal() as stop,
@@ -94,17 +94,17 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
                 cancelled=stop.is_set,
                 redo=redo,
                 until=until or "",
-                results_ready=tell_results,
+                results_ready=announce_results,
             )
 
-        def tell_results(folder: Path) -> None:
-            display(Event(kind="note", stage="", what=f"results are in {folder}, preview.mp4 follows"))
+        def announce_results(folder: Path) -> None:
+            display(Event(kind="note", stage="", what=f"the results are in {folder}, preview.mp4 follows"))
 
         def prepare(options: Mapping[str, Any], folder: Path) -> None:
             prepare_capture(options, folder, settings(default_store(out or default_out())))
 
-        if job.is_dir() and (decides := job_file_in(job)) is not None:
-            display(Event(kind="note", stage="", what=f"as {decides} says"))
+        if job.is_dir() and (job_file := job_file_in(job)) is not None:
+            display(Event(kind="note", stage="", what=f"as {job_file} says"))
         resolved = load_job(job, overrides, prepare=prepare)
         out_dir = results_folder(resolved)
         summary = run_job(resolved, out_dir=out_dir, settings=settings(default_store(out_dir)))
@@ -113,7 +113,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
 
 @contextmanager
 def _report_errors_as_json(display: ProgressDisplay) -> Iterator[None]:
-    """Tell a failure to a machine that follows the progress, too."""
+    """Also print an error as JSON, for a program that follows the progress."""
     try:
         yield
     except BodycapError as error:
@@ -132,10 +132,10 @@ def _print_summary(summary: RunSummary, job: Job, display: ProgressDisplay, *, v
             cost = f"{stage.seconds:8.1f} s {stage.peak_memory_mb:7.0f} MB"
             typer.echo(f"{cost}  {stage.stage} {stage.camera}{' (kept)' if stage.reused else ''}".rstrip())
     if not summary.files:
-        # What is done while frames are registered is no stage that can be asked for.
-        reached = next(each.stage for each in reversed(summary.stages) if each.stage in STAGE_ORDER)
-        typer.echo(f"{job.name}: stopped after {reached}, as asked; run it again for the rest")
+        # The steps within registration are not stages that the user can name.
+        reached = next(stage.stage for stage in reversed(summary.stages) if stage.stage in STAGE_ORDER)
+        typer.echo(f"{job.name}: stopped after {reached}, as requested; run it again for the rest")
         return
     if summary.executed == 0:
-        typer.echo(f"{job.name}: nothing to do, all {len(summary.stages)} stages were done before")
+        typer.echo(f"{job.name}: nothing to do, all {len(summary.stages)} stages were finished before")
     typer.echo(f"results: {summary.out_dir}")

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the work is asked to stop, and the process leaves with the signal's exit code."""
+"""Handle Ctrl-C and SIGTERM: stop the work, and exit with the exit code of the signal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _received: list[int] = []
 
 @contextmanager
 def raise_on_signal() -> Iterator[None]:
-    """Let SIGINT and SIGTERM raise `Cancelled` in the main thread."""
+    """Make SIGINT and SIGTERM raise `Cancelled` in the main thread."""
 
     def stop() -> None:
         raise Cancelled("stopped on request")
@@ -26,19 +26,21 @@ def raise_on_signal() -> Iterator[None]:
 
 @contextmanager
 def event_on_signal() -> Iterator[threading.Event]:
-    """Yield an event that SIGINT and SIGTERM set, for work that ends itself in good order."""
+    """Yield an event that SIGINT and SIGTERM set, for work that ends itself in an orderly way."""
     event = threading.Event()
     with _handle_signals(event.set):
         yield event
 
 
 def signal_exit_code() -> int:
-    """128 + the signal that stopped the work."""
+    """Return 128 plus the number of the signal that stopped the work."""
     return 128 + (_received[-1] if _received else signal.SIGINT)
 
 
 @contextmanager
 def _handle_signals(action: Callable[[], None]) -> Iterator[None]:
+    """Call `action` on SIGINT and SIGTERM; restore the earlier handlers at the end."""
+
     def handle(number: int, _: FrameType | None) -> None:
         _received.append(number)
         action()
@@ -46,9 +48,9 @@ def _handle_signals(action: Callable[[], None]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous_handlers = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in previous_handlers.items():
             signal.signal(number, handler)

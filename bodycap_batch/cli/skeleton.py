@@ -22,21 +22,21 @@ def skeleton(
     file: Annotated[Path, typer.Argument(metavar="FILE.bvh", help="A character's rig.")],
     roles: Annotated[
         list[str] | None,
-        typer.Option(
-            "--map", metavar="JOINT=ROLE", help="The joint plays that role (none: no role). Repeatable."
-        ),
+        typer.Option("--map", metavar="JOINT=ROLE", help="Role of a joint (none: no role). Repeatable."),
     ] = None,
     tpose_frame: Annotated[
         int | None,
-        typer.Option(metavar="N", help="The frame, counted from 0, that holds the T-pose, if zero is none."),
+        typer.Option(
+            metavar="N", help="Frame with the T-pose, counted from 0, if the zero pose is not a T-pose."
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the mapping as JSON.")] = False,
 ) -> None:
-    """Show how a rig is understood before a job is solved onto it.
+    """Show how a rig is interpreted, before a job uses it.
 
-    Which joint plays which role, how long its bone is and where it points, and what is missing. Joints
-    without a role (fingers, twist bones, helpers) stay at zero. The file's hierarchy, OFFSETs, channel order
-    and zero pose are kept in the results.
+    Lists the role of each joint, the length and direction of its bone, and the missing roles. Joints without
+    a role (fingers, twist bones, helpers) stay at zero. The results keep the file's hierarchy, OFFSETs,
+    channel order and zero pose.
 
     \b
     Examples:
@@ -67,14 +67,14 @@ def skeleton(
 
 
 def _parse_roles(words: list[str]) -> dict[str, str]:
-    """``JOINT=ROLE`` as a mapping."""
+    """Return ``JOINT=ROLE`` words as a mapping."""
     pairs = [word.rpartition("=") for word in words]
     bad = next(
         (word for word, (name, _, role) in zip(words, pairs, strict=True) if not (name and role)), None
     )
     if bad is not None:
         raise JobError(
-            f"no mapping: {bad!r}", field="--map", hint="JOINT=ROLE, for example --map Bip_Chest=Spine1"
+            f"not a mapping: {bad!r}", field="--map", hint="JOINT=ROLE, for example --map Bip_Chest=Spine1"
         )
     return {name: role for name, _, role in pairs}
 

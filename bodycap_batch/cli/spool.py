@@ -18,20 +18,24 @@ if TYPE_CHECKING:
 SpoolArgument = Annotated[
     Path,
     typer.Argument(
-        metavar="[DIR]", help="The watched folder, or the one that holds inbox/, running/, done/."
+        metavar="[DIR]", help="The watched folder, or its parent with inbox/, running/ and done/."
     ),
 ]
-NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="The job, as `bodycap status` lists it.")]
+NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Name of the job in `bodycap status`.")]
 _AGE_UNITS = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
+"""Seconds of a unit of age, and its symbol."""
 _MAX_CAUSE_LENGTH = 200
+"""Characters of a cause in the table, so that a row stays readable."""
 
 
-@app.command(short_help="List the jobs of a watched folder and how they are.")
+@app.command(short_help="List the jobs of a watched folder and their states.")
 def status(
     spool: SpoolArgument = Path("jobs"),
     as_json: Annotated[bool, typer.Option("--json", help="Print jobs and watchers as JSON.")] = False,
 ) -> None:
-    """List the jobs of a watched folder: state, stage, progress, age, cause of failure; and who watches it.
+    """List the jobs of a watched folder with state, stage, progress, age and cause of failure.
+
+    Also lists the watchers of the folder.
 
     \b
     Examples:
@@ -41,26 +45,29 @@ def status(
     from bodycap_batch.store.artefacts import disk_errors
     from bodycap_batch.watch import active_watchers, job_rows
 
-    place = _find_spool(spool)
-    with disk_errors(place.root):
-        rows, watchers = job_rows(place), active_watchers(place)
+    watched = _find_spool(spool)
+    with disk_errors(watched.root):
+        rows, watchers = job_rows(watched), active_watchers(watched)
     if as_json:
-        found = {"jobs": [row.to_dict() for row in rows], "watchers": [each.to_dict() for each in watchers]}
+        found = {
+            "jobs": [row.to_dict() for row in rows],
+            "watchers": [watcher.to_dict() for watcher in watchers],
+        }
         _print(json.dumps(found, indent=1))
         return
     for line in _job_table(rows):
         _print(line)
-    for watching in watchers:
-        _print(str(watching))
+    for watcher in watchers:
+        _print(str(watcher))
     if not watchers and any(row.state in ("waiting", "interrupted", "stopped") for row in rows):
-        _print(f"no watcher is at work here: `bodycap watch {place.inbox}` starts one")
+        _print(f"no watcher runs here: `bodycap watch {watched.inbox}` starts one")
 
 
 @app.command()
 def retry(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
-    """Put a failed or cancelled job back into the inbox.
+    """Move a failed or cancelled job back to the inbox.
 
-    Its folder may be mended first (failed/NAME/input/). Stages that were finished are not computed again.
+    You may correct its folder before that (failed/NAME/input/). Finished stages are not computed again.
 
     \b
     Example:
@@ -73,7 +80,7 @@ def retry(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
 
 @app.command()
 def cancel(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
-    """Cancel a job that waits or runs, within five seconds. Its finished stages are kept for a retry.
+    """Cancel a waiting or running job within five seconds. Its finished stages are kept for a retry.
 
     \b
     Example:
@@ -83,7 +90,7 @@ def cancel(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
 
     place = cancel_job(_find_spool(spool), name)
     if place is None:
-        _print(f"{name}: no watcher has stopped it yet; it is cancelled when one looks")
+        _print(f"{name}: no watcher has stopped it yet; the next active watcher cancels it")
     elif (state := read_status(place).get("state")) != "cancelled":
         _print(f"{name}: it ended before it could be stopped: {state}, {place.path}")
     else:
@@ -95,7 +102,9 @@ def _find_spool(path: Path) -> Spool:
     from bodycap_batch.watch import spool_from_path
 
     if not path.is_dir():
-        raise JobError("no such folder", path=path, hint="name the watched folder, for example jobs/inbox")
+        raise JobError(
+            "there is no such folder", path=path, hint="name the watched folder, for example jobs/inbox"
+        )
     return spool_from_path(path)
 
 
@@ -104,10 +113,10 @@ def _job_table(rows: list[JobRow]) -> list[str]:
         return ["no jobs"]
     cells = [("JOB", "STATE", "STAGE", "PROGRESS", "AGE", "")]
     for row in rows:
-        share = "" if row.progress is None else format_percent(row.progress)
+        progress = "" if row.progress is None else format_percent(row.progress)
         cause = " ".join(row.cause.split())
         cause = cause if len(cause) <= _MAX_CAUSE_LENGTH else f"{cause[: _MAX_CAUSE_LENGTH - 1]}…"
-        cells.append((row.name, row.state, row.stage, share, _age_text(row.age_s), cause))
+        cells.append((row.name, row.state, row.stage, progress, _age_text(row.age_s), cause))
     widths = [max(len(line[column]) for line in cells) for column in range(5)]
     lines = [
         "  ".join(f"{part:{width}}" for part, width in zip(line, widths, strict=False)) for line in cells

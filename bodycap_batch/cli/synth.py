@@ -21,33 +21,41 @@ from bodycap_batch.core.progress import Event
 @app.command()
 def synth(  # noqa: PLR0913, PLR0917 - the flags a user types
     out: Annotated[Path, typer.Argument(metavar="DIR", help="A new folder for the videos and the truth.")],
-    seconds: Annotated[float | None, typer.Option(help="Length of each video (default: 12).")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Duration of each video (default: 12).")] = None,
     cameras: Annotated[
         str | None,
-        typer.Option(metavar="NAMES", help="Mounts, with commas (default: torso,left_palm,right_palm)."),
+        typer.Option(
+            metavar="NAMES", help="Mounts, separated by commas (default: torso,left_palm,right_palm)."
+        ),
     ] = None,
     size: Annotated[
         str | None, typer.Option(metavar="WxH", help="Image size in pixels (default: 640x480).")
     ] = None,
     fps: Annotated[float | None, typer.Option(help="Frames per second (default: 30).")] = None,
-    seed: Annotated[int | None, typer.Option(help="Another body, walk and room (default: 0).")] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of the random body, walk and room (default: 0).")
+    ] = None,
     motion: Annotated[
-        Path | None, typer.Option(metavar="FILE.bvh", help="Follow this motion instead of the built-in walk.")
+        Path | None, typer.Option(metavar="FILE.bvh", help="Use this motion instead of the built-in walk.")
     ] = None,
     poses: Annotated[bool, typer.Option("--poses", help="Write noisy camera poses only, no videos.")] = False,
     more: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Any other option of the renderer, in YAML."),
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Another option of the renderer, with a YAML value. Repeatable.",
+        ),
     ] = None,
     threads: ThreadsOption = None,
     json_progress: Annotated[
-        bool, typer.Option("--json-progress", help="Progress as JSON lines on standard output.")
+        bool, typer.Option("--json-progress", help="Print progress as JSON lines on standard output.")
     ] = False,
 ) -> None:
     """Render a sample capture with its exact truth.
 
-    A person with body cameras walks through a textured room. Writes <camera>.mp4 and calib.json, and the
-    truth below gt/ (camera paths, joints, skeleton, motion).
+    A person with body cameras walks through a textured room. The command writes <camera>.mp4, calib.json, and
+    the truth in gt/ (camera paths, joints, skeleton, motion).
 
     \b
     Examples:
@@ -85,7 +93,7 @@ def _parse_size(text: str | None) -> dict[str, int]:
         return {}
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal()):
-        raise JobError(f"no image size: {text!r}", field="--size", hint="for example 640x480")
+        raise JobError(f"not an image size: {text!r}", field="--size", hint="for example 640x480")
     return {"width": int(width), "height": int(height)}
 
 
@@ -96,12 +104,12 @@ def _parse_settings(settings: list[str]) -> dict[str, Any]:
     for setting in settings:
         key, equals, value = setting.partition("=")
         if not equals:
-            raise JobError(f"no KEY=VALUE: {setting!r}", field="--set", hint="for example --set noise=4")
+            raise JobError(f"not KEY=VALUE: {setting!r}", field="--set", hint="for example --set noise=4")
         try:
             found[key.strip()] = yaml.safe_load(value)
         except yaml.YAMLError as error:
             hint = "a number, a word, or a list in brackets"
-            raise JobError(f"no value: {value!r}", field=f"--set {key}", hint=hint) from error
+            raise JobError(f"not a YAML value: {value!r}", field=f"--set {key}", hint=hint) from error
     return found
 
 

@@ -28,23 +28,28 @@ if TYPE_CHECKING:
 _REPORT_FILES = ("report.html", "partial/report.html")
 
 
-@app.command(short_help="Look at a finished job beside its real videos.")
+@app.command(short_help="Show a finished job together with its videos.")
 def view(
     job: JobArgument,
     out: OutOption = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port (default: a free one).")] = 0,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port of the server (default: a free one).")
+    ] = 0,
     browser: Annotated[bool, typer.Option(help="Open the browser.")] = True,
     rerun: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.rrd", help="Write a recording for the Rerun viewer instead, and end."),
+        typer.Option(
+            metavar="FILE.rrd", help="Write a recording for the Rerun viewer instead of starting a server."
+        ),
     ] = None,
     store: StoreOption = None,
 ) -> None:
-    """Look at a finished job in the browser, with its real videos in sync.
+    """Show a finished job in the browser, synchronised with its videos.
 
-    Serves the report on this machine alone (127.0.0.1) until Ctrl-C. JOB may be the folder of the results.
-    The report itself, report.html, needs no server; it shows small pictures in the place of the videos.
-    What is drawn over every frame comes from the store; without it, over the stored pictures only.
+    Serves the report on this machine only (127.0.0.1) until Ctrl-C. The job may also be given by its results
+    folder. The report itself, report.html, needs no server; it shows small pictures instead of the videos.
+    Points and skeleton are drawn over every frame if the store still holds them, otherwise over the small
+    pictures only.
 
     \b
     Examples:
@@ -66,13 +71,15 @@ def view(
         return
     page = next((out_dir / name for name in _REPORT_FILES if (out_dir / name).is_file()), None)
     if page is None:
-        raise JobError("there is no report", path=out_dir, hint="run the job, or `bodycap report` it")
+        raise JobError(
+            "there is no report", path=out_dir, hint="run the job, or write the report with `bodycap report`"
+        )
     server = make_server(
         make_served_content(page, open_capture(resolved.capture), _StoredMarks(resolved, out_dir, store)),
         port,
     )
     address = f"http://{LOOPBACK}:{server.server_port}/report.html?videos"
-    typer.echo(f"{address}  (Ctrl-C ends)")
+    typer.echo(f"{address}  (Ctrl-C ends the server)")
     if browser:
         webbrowser.open(address)
     with server:
@@ -80,7 +87,7 @@ def view(
 
 
 def _stored_inputs(job: Job, out_dir: Path, store: Path) -> ReportInputs:
-    """What the store holds of a job."""
+    """Return the inputs of a job's report from the store."""
     from bodycap_batch.pipeline import Settings, stored_for_report
     from bodycap_batch.store.artefacts import Store
     from bodycap_batch.tasks.report import load_inputs
@@ -90,7 +97,7 @@ def _stored_inputs(job: Job, out_dir: Path, store: Path) -> ReportInputs:
 
 
 class _StoredMarks:
-    """What is drawn over any frame, read from the store when it is first asked for."""
+    """Points and skeleton to draw over any frame, read from the store at the first call."""
 
     def __init__(self, job: Job, out_dir: Path, store: Path) -> None:
         self._of = (job, out_dir, store)
@@ -99,7 +106,7 @@ class _StoredMarks:
         self._looked = False
 
     def __call__(self, camera: str, first: int) -> list[dict[str, Any]]:
-        """Marks of a part of a camera's frames; none where the store does not hold them."""
+        """Return the marks of a part of a camera's frames; empty if the store does not hold them."""
         from bodycap_batch.report.serving import FRAMES_PER_PART
 
         with self._lock:
@@ -114,10 +121,10 @@ class _StoredMarks:
         try:
             inputs = _stored_inputs(*self._of)
         except BodycapError as error:
-            lacking = error.message
+            reason = error.message
         else:
             if inputs.registrations:
                 return FrameOverlays(inputs)
-            lacking = "the store no longer holds this job's camera paths (run it again)"
-        typer.echo(f"points and skeleton are drawn over the stored pictures only: {lacking}", err=True)
+            reason = "the store no longer holds this job's camera paths (run it again)"
+        typer.echo(f"points and skeleton are drawn over the stored pictures only: {reason}", err=True)
         return None

@@ -22,26 +22,26 @@ if TYPE_CHECKING:
 
 RootOption = Annotated[
     list[Path] | None,
-    typer.Option(metavar="DIR", help="A folder whose files any job may name; may be given several times."),
+    typer.Option(metavar="DIR", help="A folder with files that every job may name. Repeatable."),
 ]
 LimitOption = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME=VALUE",
-        help="How large a job may be (default: video_gb=64 video_hours=4 video_px=8192 files=10000 "
-        "yaml_kb=1024 yaml_depth=20); may be given several times.",
+        help="Limit of a job's size (default: video_gb=64 video_hours=4 video_px=8192 files=10000 "
+        "yaml_kb=1024 yaml_depth=20). Repeatable.",
     ),
 ]
 
 WebOption = Annotated[
     str | None,
-    typer.Option(metavar="HOST:PORT", help="Serve a live page of the jobs, e.g. on 127.0.0.1:8080."),
+    typer.Option(metavar="HOST:PORT", help="Serve a live page of the jobs, for example on 127.0.0.1:8080."),
 ]
 TokenOption = Annotated[
     str,
     typer.Option(
         metavar="TOKEN",
-        help="What a browser has to show (?token=…); needed where --web is not a loopback address.",
+        help="Token that a browser must send (?token=…); required if --web is not a loopback address.",
         envvar="BODYCAP_WEB_TOKEN",
         show_envvar=True,
         show_default=False,
@@ -49,52 +49,54 @@ TokenOption = Annotated[
 ]
 
 
-@app.command(short_help="Work on every folder of videos dropped into an inbox.")
+@app.command(short_help="Run every folder of videos that is dropped into an inbox.")
 def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
     inbox: Annotated[
         Path,
-        typer.Argument(
-            metavar="[INBOX]", help="The folder to watch, or the one that holds it.", show_default=True
-        ),
+        typer.Argument(metavar="[INBOX]", help="The folder to watch, or its parent.", show_default=True),
     ] = Path("jobs/inbox"),
-    jobs: Annotated[int, typer.Option(min=1, max=64, help="Jobs worked on side by side.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Number of jobs at the same time.")] = 1,
     threads: ThreadsOption = None,
     store: WatchStoreOption = None,
     root: RootOption = None,
     limit: LimitOption = None,
     settle: Annotated[
-        float, typer.Option(min=0.0, metavar="SECONDS", help="A drop is complete when unchanged for so long.")
+        float,
+        typer.Option(
+            min=0.0, metavar="SECONDS", help="Time without changes after which a folder is complete."
+        ),
     ] = 10.0,
     poll: Annotated[
         bool | None,
-        typer.Option("--poll/--no-poll", help="Look for changes by polling (default: on network disks)."),
+        typer.Option("--poll/--no-poll", help="Poll the folder for changes (default: on network disks)."),
     ] = None,
     stale: Annotated[
         float,
         typer.Option(
-            min=1.0, metavar="SECONDS", help="Take jobs over whose watcher gave no sign for so long."
+            min=1.0, metavar="SECONDS", help="Time without a heartbeat after which a job is taken over."
         ),
     ] = 60.0,
     web: WebOption = None,
     web_token: TokenOption = "",
-    once: Annotated[bool, typer.Option("--once", help="Leave when nothing is left to do.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="Stop when nothing is left to do.")] = False,
 ) -> None:
-    """Work on every folder of videos, or job file, that is dropped into INBOX.
+    """Run every folder of videos, or job file, that is dropped into INBOX.
 
-    A folder is taken when nothing in it has changed for a while and no *.part or hidden file is left, or at
-    once when it holds a file READY. Jobs move from inbox/ to running/ and then to done/ or failed/ beside it;
-    done/NAME/result/ holds the results, done/NAME/input/ what was dropped. Stop it with Ctrl-C at any time:
-    it goes on where it was. Several watchers, also on several machines, may share the folders.
+    A folder is complete when it has not changed for a while and holds no *.part or hidden file, or at once
+    when it holds a file named READY. Jobs move from inbox/ to running/ and then to done/ or failed/ beside
+    it. done/NAME/result/ holds the results, done/NAME/input/ the dropped files. Stop the command with Ctrl-C
+    at any time: the jobs continue at the next start. Several watchers, also on several machines, may share
+    the folders.
 
-    A dropped job may name files of its own folder and below --root, nothing else.
+    A dropped job may name files in its own folder and below --root, nothing else.
 
     \b
     Examples:
       bodycap watch jobs/inbox
       bodycap watch /mnt/nas/jobs/inbox --root /mnt/nas/footage --jobs 2 --poll
-      bodycap watch jobs/inbox --once          work off what is there, then leave
+      bodycap watch jobs/inbox --once          run the jobs that are there, then stop
       bodycap watch jobs/inbox --web 127.0.0.1:8080
-      bodycap status jobs                      how the jobs are
+      bodycap status jobs                      list the jobs
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.config.limits import limits_from
     from bodycap_batch.watch import JobPermissions, Watcher, WatchOptions, spool_from_path
@@ -118,7 +120,7 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
         with _live_page(watcher, options, web, web_token):
             worst = _run(watcher, stop)
     if stop.is_set():
-        _write_line("stopped; running jobs go on at the next start")
+        _write_line("stopped; running jobs continue at the next start")
         raise typer.Exit(signal_exit_code())
     raise typer.Exit(worst)
 
@@ -136,7 +138,7 @@ def _run(watcher: Watcher, stop: threading.Event) -> int:
 
 @contextmanager
 def _live_page(watcher: Watcher, options: WatchOptions, address: str | None, token: str) -> Iterator[None]:
-    """Serve the live page meanwhile, where an address is given."""
+    """Serve the live page in the meantime if an address is given."""
     if address is None:
         yield
         return
@@ -152,7 +154,7 @@ def _existing_folder(path: Path) -> Path:
     from bodycap_batch.core.errors import JobError
 
     if not path.is_dir():
-        raise JobError("no such folder", path=path, field="--root", hint="name a folder that exists")
+        raise JobError("there is no such folder", path=path, field="--root", hint="name an existing folder")
     return path.resolve()
 
 

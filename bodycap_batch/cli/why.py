@@ -1,4 +1,4 @@
-"""`bodycap why` and `bodycap gc`: what the store holds for a job, and what for none."""
+"""`bodycap why` and `bodycap gc`: explain which stages a job would run, and remove unused artefacts."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ def why(
     store: StoreOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Say which stages of a job would run, and why.
+    """Show which stages of a job would run, and why.
 
-    A stage runs when its own options, one of its inputs, the program or a library is another than before.
-    Nothing is computed.
+    A stage runs if its options, its inputs, the program or a library have changed since the last run. Nothing
+    is computed.
 
     \b
     Example:
@@ -71,15 +71,17 @@ def why(
 def gc(
     store: Annotated[
         Path | None,
-        typer.Argument(metavar="STORE", help="The store (default: BODYCAP_STORE, else out/.store)."),
+        typer.Argument(
+            metavar="STORE", help="Folder of the store (default: BODYCAP_STORE, else out/.store)."
+        ),
     ] = None,
-    delete: Annotated[bool, typer.Option("--delete", help="Really remove it.")] = False,
+    delete: Annotated[bool, typer.Option("--delete", help="Remove the listed artefacts.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """List what the store holds for no job; with --delete, remove it.
+    """List the artefacts that no job uses, or remove them.
 
-    Kept is what the last run of each job used, as long as its folder of results exists. Results are never
-    touched.
+    The artefacts of each job's last run are kept as long as its results folder exists. Results are never
+    removed.
 
     \b
     Example:
@@ -88,17 +90,19 @@ def gc(
     from bodycap_batch.store.artefacts import Store
     from bodycap_batch.store.references import collect_garbage
 
-    named = store or Path(os.environ.get(STORE_VARIABLE) or default_store(default_out()))
-    if not (named / "artefacts").is_dir():
-        raise StoreError("there is no store", path=named, hint="name it: bodycap gc FOLDER")
-    garbage = collect_garbage(Store(named), delete=delete)
+    store_dir = store or Path(os.environ.get(STORE_VARIABLE) or default_store(default_out()))
+    if not (store_dir / "artefacts").is_dir():
+        raise StoreError("there is no store", path=store_dir, hint="name its folder: bodycap gc FOLDER")
+    garbage = collect_garbage(Store(store_dir), delete=delete)
     if as_json:
         typer.echo(json.dumps({**asdict(garbage), "deleted": delete}, indent=1))
         return
     for name in (*garbage.artefacts, *(f"corrupt/{name}" for name in garbage.corrupt)):
         typer.echo(name)
     for owner in garbage.gone:
-        typer.echo(f"its results are gone: {owner or 'an unreadable list'}")
+        typer.echo(f"results that no longer exist: {owner or 'an unreadable list'}")
     count, size = len(garbage.artefacts) + len(garbage.corrupt), f"{garbage.freed_bytes / 1e6:.1f} MB"
     verb = "removed" if delete else "would remove"
-    typer.echo(f"{verb} {count} of {count + garbage.kept}, {size}{'' if delete else ' (--delete does it)'}")
+    typer.echo(
+        f"{verb} {count} of {count + garbage.kept}, {size}{'' if delete else ' (--delete removes them)'}"
+    )

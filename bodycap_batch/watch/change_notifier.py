@@ -22,7 +22,7 @@ _NETWORK_FILE_SYSTEMS = (
 )
 """Prefixes of the kernel's names of file systems that report no changes made by another machine."""
 _POLL_MS = 1000
-"""Milliseconds between two looks at a folder that is polled. Evidence: none."""
+"""Milliseconds between two scans of a folder that is polled. Evidence: none."""
 _STOP_CHECK_MS = 2000
 """Milliseconds after which `watchfiles` checks the stop event, and the pause after an error. Evidence: none.
 """

@@ -75,7 +75,7 @@ class Claim:
 
     def _write(self, *, released: bool = False) -> None:
         self._beat += 1
-        write_owner(self.job, self._token, self.generation, write_heartbeat=self._beat, released=released)
+        write_owner(self.job, self._token, self.generation, beat=self._beat, released=released)
 
 
 def write_owner(job: JobDir, token: str, generation: int, *, beat: int = 0, released: bool = False) -> None:

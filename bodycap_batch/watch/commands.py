@@ -42,7 +42,7 @@ from bodycap_batch.watch.spool import (
 _MAX_SNAPSHOT_FILES = 1000
 """Number of files of a waiting entry that are inspected for a list of jobs. Evidence: none."""
 _POLL_S = 0.1
-"""Seconds between two looks at a job that is being cancelled. Evidence: none."""
+"""Seconds between two checks of a job that is being cancelled. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

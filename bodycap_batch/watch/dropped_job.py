@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import yaml
@@ -116,8 +117,7 @@ def read_job(job_dir: JobDir, permissions: JobPermissions) -> Job:
 
 
 def make_result_paths_relative(job_dir: JobDir, job: Job) -> None:
-    """Make the paths to the videos in the results' `job.yaml` relative, because the job's folder will be
-    moved.
+    """Make the video paths in the results' `job.yaml` relative, because the job's folder will be moved.
 
     Args:
         job_dir: The job's folder.
@@ -128,10 +128,8 @@ def make_result_paths_relative(job_dir: JobDir, job: Job) -> None:
     """
     for file in (job_dir.result / "job.yaml", job_dir.result / "partial" / "job.yaml"):
         if file.is_file():
-            text = yaml_from_job(
-                with_changed_paths(job, lambda path, file=file: _relative_to_file(path, job_dir.path, file))
-            )  # type: ignore[misc]
-            write_results_file(file.parent, file.name, text)
+            change = partial(_relative_to_file, job_dir=job_dir.path, file=file)
+            write_results_file(file.parent, file.name, yaml_from_job(with_changed_paths(job, change)))
 
 
 def with_changed_paths(job: Job, change: Callable[[Path], Path]) -> Job:

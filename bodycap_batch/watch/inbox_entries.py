@@ -13,7 +13,7 @@ from pathlib import Path
 from bodycap_batch.watch.spool import visible_entries
 
 READY = "READY"
-NOT_A_JOB = "no job: neither a folder nor a YAML file"
+NOT_A_JOB = "not a job: neither a folder nor a YAML file"
 """Reason to ignore a path in the inbox."""
 YAML_SUFFIXES = (".yaml", ".yml")
 _PARTIAL_SUFFIX = ".part"
@@ -117,7 +117,7 @@ def take_snapshot(entry: InboxEntry, max_files: int) -> EntrySnapshot:
         ready=ready,
         unfinished=unfinished,
         special=special,
-        undecodable=garbled,
+        undecodable=undecodable,
     )
 
 
@@ -138,7 +138,7 @@ class CompletionTracker:
     def __init__(
         self, unchanged_s: float, max_files: int, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._settle_s = unchanged_s
+        self._unchanged_s = unchanged_s
         self._most = max_files
         self._clock = clock
         self._seen: dict[Path, tuple[str, float]] = {}
@@ -157,7 +157,7 @@ class CompletionTracker:
             last_state, since = previous.get(entry.path, ("", now))
             since = since if last_state == state else now
             self._seen[entry.path] = (state, since)
-            still = now - since >= self._settle_s
+            still = now - since >= self._unchanged_s
             if snapshot is not None and (snapshot.ready or (still and not snapshot.incomplete_reason)):
                 found.append((since, entry, snapshot))
             elif still and (reason := error or (snapshot.incomplete_reason if snapshot is not None else "")):
@@ -197,7 +197,7 @@ def _is_special_file(path: Path) -> bool:
 
 
 def _is_utf8(name: str) -> bool:
-    """Return False for bytes that are not UTF-8: such a name cannot be written to a text file."""
+    """Return False for a name with bytes that are not UTF-8. It cannot be written to a text file."""
     try:
         name.encode()
     except UnicodeEncodeError:

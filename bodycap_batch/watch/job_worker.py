@@ -139,9 +139,7 @@ class JobWorker:
             raise Cancelled("stopped before it started", hint="retry it")
 
     def _handle_cancelled(self, claim: Claim, status: JobStatusFile, error: Cancelled) -> JobOutcome:
-        """Handle the three causes: the user cancelled the job, the watcher ends, or another watcher has the
-        job.
-        """
+        """Handle a stop: the user cancelled the job, the watcher ends, or another watcher has the job."""
         name = claim.job.name
         if not claim.ownership.is_held():
             claim.lost.set()
@@ -154,7 +152,7 @@ class JobWorker:
         return self._leave(claim, status, error)
 
     def _postpone(self, claim: Claim, status: JobStatusFile, error: DiskAway) -> JobOutcome:
-        """Stop the heartbeat after a disk failure. The job starts again when its claim is stale."""
+        """Stop the heartbeat after a disk failure, so that the job starts again when its claim is stale."""
         name = claim.job.name
         if any(not stage["reused"] for stage in status.document["finished_stages"]):
             del self._disk_failures[name]  # the job has finished a stage since the last failure
@@ -162,16 +160,17 @@ class JobWorker:
             self._disk_failures[name] += 1
         if self._disk_failures[name] > _MAX_DISK_FAILURES:
             return self._end(claim, status, "failed", error)
-        claim.end()
+        claim.stop_heartbeat()
         append_log(claim.job, f"postponed: {error}")
         status.update(state="stopped", active={}, error=error.to_dict())
         return self._stuck(claim, error)
 
     def _stuck(self, claim: Claim, error: Exception) -> JobOutcome:
-        """Stop the heartbeat because the spool's own disk fails. The job is processed again when its claim is
-        stale.
+        """Stop the heartbeat after a failure of the spool's own disk.
+
+        The job is processed again when its claim is stale.
         """
-        claim.end()
+        claim.stop_heartbeat()
         code, name = StoreError.exit_code, claim.job.name
         return JobOutcome(name=name, state="stuck", exit_code=code, message=f"continues later: {error}")
 
@@ -201,7 +200,7 @@ class JobWorker:
     def _file(
         self, claim: Claim, state: State, error: BodycapError | None, status: JobStatusFile | None
     ) -> JobOutcome:
-        """Write the final status and file the job. If the store is being cleaned, leave the move for later."""
+        """Write the final status and file the job. If the store is being cleaned, the move follows later."""
         try:
             return self._move(claim, state, error, status)
         except StoreBusy as busy:
@@ -217,7 +216,7 @@ class JobWorker:
     ) -> JobOutcome:
         folder = self._folder(state)
         with moving(self._store, claim.job.result, wait=False) as keep_for:
-            claim.end()
+            claim.stop_heartbeat()
             if not claim.ownership.is_held():
                 return JobOutcome(
                     name=claim.job.name, state="lost", message="another watcher has taken it over"

@@ -58,7 +58,7 @@ class Ownership:
             raise Cancelled(
                 "another watcher has taken this job over",
                 path=self.owner,
-                hint="nothing to do: it goes on there, from the finished stages",
+                hint="nothing to do: the job continues there, after the finished stages",
             )
 
 

@@ -12,9 +12,10 @@ _PID_NAMESPACE = Path("/proc/self/ns/pid")
 
 
 def machine_id() -> str:
-    """Return an identifier of this machine since its last start, and of its namespace of process numbers.
+    """Return an identifier of this machine since its last start, and of its process namespace.
 
-    A container has a process namespace of its own. The result is "" if the system has no such information.
+    A container has a process namespace of its own. The result is "" if the system does not provide this
+    information.
     """
     try:
         boot = _BOOT_ID.read_text(encoding="ascii").strip()
@@ -25,7 +26,7 @@ def machine_id() -> str:
 
 
 def process_start(pid: int) -> str:
-    """Return the start time of a process of this machine in kernel ticks; "" if there is no such process."""
+    """Return the start time of a process of this machine in kernel ticks; "" if there is none."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2]
     except OSError:
@@ -40,14 +41,18 @@ def process_tag() -> str:
 
 
 def is_process_running(tag: str) -> bool:
-    """Return True if the process whose `process_tag` begins the name runs on this machine."""
+    """Return True if the process of a tag runs on this machine.
+
+    Args:
+        tag: Text that begins with a `process_tag`.
+    """
     machine, pid, start, *_ = [*tag.split("-"), "", ""]
     here = bool(machine_id()) and machine == _machine_tag()
     return here and pid.isdecimal() and bool(start) and process_start(int(pid)) == start
 
 
 def is_from_this_machine(tag: str) -> bool:
-    """Return True if a process of this machine, since its last start, wrote the `process_tag`."""
+    """Return True if a process of this machine, since its last start, wrote the tag."""
     return bool(machine_id()) and tag.split("-", maxsplit=1)[0] == _machine_tag()
 
 

@@ -142,7 +142,8 @@ class Spool:
             if error.errno != errno.EXDEV:
                 raise
             raise StoreError(
-                f"{self.inbox} and {folder_after} are on different file systems, so no job can be moved in one step",
+                f"{self.inbox} and {folder_after} are on different file systems, "
+                "so no job can be moved in one step",
                 path=self.root,
                 hint=f"put the folders {INBOX}, {RUNNING}, {DONE} and {FAILED} on one disk",
             ) from error
@@ -151,7 +152,7 @@ class Spool:
 
 
 def spool_from_path(path: Path) -> Spool:
-    """Return the spool that a user means by its inbox or by the parent folder of the inbox.
+    """Return the spool of a path: the path is the inbox, or the parent folder of the inbox.
 
     A folder with another name is an inbox only if `running`, `done` and `failed` exist beside it. Any other
     folder is the parent of the inbox, so that its content is never taken for jobs.
@@ -176,8 +177,7 @@ def spool_from_path(path: Path) -> Spool:
 def move_to_free_name(
     source: Path, folder: Path, name: str, before_move: Callable[[Path], None] | None = None, suffix: str = ""
 ) -> Path:
-    """Rename a file or folder into another folder, under the first free name (name, name-2, name-3 and so
-    on).
+    """Rename a file or folder into another folder, under the first free name (name, name-2, name-3 ...).
 
     Args:
         source: Path to move.
@@ -207,9 +207,7 @@ def move_to_free_name(
 
 
 def visible_entries(folder: Path) -> list[Path]:
-    """Return the entries of a folder whose names do not start with a dot, sorted; empty if there is no
-    folder.
-    """
+    """Return the entries of a folder without a leading dot, sorted; empty if there is no folder."""
     try:
         return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except (FileNotFoundError, NotADirectoryError):
@@ -217,9 +215,7 @@ def visible_entries(folder: Path) -> list[Path]:
 
 
 def folder_name_from_text(text: str) -> str:
-    """Return a name for a job's folder: without control characters, not too long, without a leading dash or
-    dot.
-    """
+    """Return a name for a job's folder: not too long, without control characters or a leading dash or dot."""
     clean = "".join("_" if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") else c for c in text).strip()
     clean = unicodedata.normalize("NFC", clean)
     short = clean.encode()[:_MAX_NAME_BYTES].decode(errors="ignore").strip()

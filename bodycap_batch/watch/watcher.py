@@ -36,7 +36,8 @@ MessageSink = Callable[[str], None]
 _BUSY_POLL_S = 1.0
 """Seconds between two scans of the inbox while something is running or being copied. Evidence: none."""
 _IDLE_POLL_S = 5.0
-"""Seconds between two scans without such activity, in case a change was not reported. Evidence: none."""
+"""Seconds between two scans while nothing is running or copied, in case a change is not reported. Evidence:
+none."""
 _SCAN_PAUSE_FACTOR = 20.0
 """Least time between two scans as a multiple of a scan's duration, so that scans take at most 5 % of the
 time. A scan of a thousand large folders on a slow disk takes seconds."""
@@ -84,7 +85,7 @@ class Watcher:
         self._worst_exit_code = 0
 
     def stop(self) -> None:
-        """End the watcher; may be called from any thread. Running jobs stop and continue at the next start."""
+        """End the watcher; running jobs continue at the next start. May be called from any thread."""
         self._stop.set()
         self._woken.set()
 
@@ -243,7 +244,7 @@ class Watcher:
             return None
 
     def _take_over_abandoned(self, max_jobs: int) -> list[Claim]:
-        """Take over up to `max_jobs` jobs whose watcher is gone."""
+        """Take over up to `max_jobs` jobs that their watchers abandoned."""
         now = time.monotonic()
         if max_jobs <= 0 or now < self._next_takeover_at:
             return []

@@ -52,8 +52,9 @@ class WatcherStatus:
 
 
 class WatcherStatusFile:
-    """The status file of this watcher. Write errors are ignored, because the disk may be the failure to
-    report.
+    """The status file of this watcher.
+
+    Write errors are ignored, because the disk may be the failure to report.
 
     Args:
         spool: The folders that are watched.

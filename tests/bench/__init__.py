@@ -1,1 +1,1 @@
-"""Benchmarks: slow figures against ground truth, printed by ``make bench``."""
+"""Benchmarks: slow measurements against ground truth, printed by ``make bench``."""

@@ -1,4 +1,4 @@
-"""Many short jobs on two cores: what a second worker gains, and what handing a task over costs."""
+"""Many short jobs on two cores: the gain from a second worker, and the cost of scheduling a task."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TASKS = 100
 JOB = """
 name: {name}
 capture:
-  # Another microsecond, another millimetre: the same work, nothing shared in the store.
+  # Each job differs by a microsecond and a millimetre: the same work, but nothing shared in the store.
   start_s: {start}
   calibration: capture/calib.json
   cameras:
@@ -35,7 +35,7 @@ LAYOUTS = (
 
 
 def run(folder: Path, jobs: int = JOBS, rounds: int = 1) -> dict[str, Any]:
-    """Time the jobs on each layout of workers, the layouts in turns, and a hundred empty tasks."""
+    """Time the jobs on each layout of workers, in alternating order, and a hundred empty tasks."""
     folder.mkdir(parents=True)
     options = ["--seconds", "2", "--size", "320x240", "--cameras", "torso,left_palm"]
     if main(["synth", str(folder / "capture"), *options]) != 0:
@@ -43,17 +43,17 @@ def run(folder: Path, jobs: int = JOBS, rounds: int = 1) -> dict[str, Any]:
     for index in range(jobs):
         text = JOB.format(name=f"job{index}", start=f"{index * 1e-6:.6f}", height=1.75 + 1e-3 * index)
         (folder / f"job{index}.yaml").write_text(text)
-    tried = [
+    rounds_seconds = [
         {name: _batch(folder, f"out-{turn}", jobs, workers, threads) for name, workers, threads in LAYOUTS}
         for turn in range(rounds)
     ]
-    seconds = {name: min(times[name] for times in tried) for name, *_ in LAYOUTS}
+    seconds = {name: min(times[name] for times in rounds_seconds) for name, *_ in LAYOUTS}
     sizes = {"jobs": jobs, "rounds": rounds}
     return {"row": "batch", "exit": 0, **sizes, "seconds": seconds, **_overhead(folder / "overhead")}
 
 
 def lines_of(result: dict[str, Any]) -> Iterator[str]:
-    """The figures as one reads them."""
+    """Return the figures as text."""
     if result["exit"]:
         yield "batch: the capture could not be rendered"
         return
@@ -62,11 +62,11 @@ def lines_of(result: dict[str, Any]) -> Iterator[str]:
     yield f"batch of {result['jobs']} short jobs{rounds}"
     for name, value in result["seconds"].items():
         yield f"  {name}: {value:.1f} s"
-    yield f"  two workers / one worker: {one / both:.2f} times as fast (aim 1.8)"
-    yield f"  two workers / one worker with two threads: {threads / both:.2f} (aim 1.2)"
+    yield f"  two workers / one worker: {one / both:.2f} times as fast (target 1.8)"
+    yield f"  two workers / one worker with two threads: {threads / both:.2f} (target 1.2)"
     yield (
-        f"  a task: {result['here_ms']:.1f} ms here, {result['dask_ms']:.1f} ms through Dask, "
-        f"scheduling {result['scheduling_ms']:.1f} ms (aim 20); "
+        f"  a task: {result['here_ms']:.1f} ms in this process, {result['dask_ms']:.1f} ms through Dask, "
+        f"scheduling {result['scheduling_ms']:.1f} ms (target 20); "
         f"starting a child {result['child_ms']:.0f} ms"
     )
 
@@ -83,32 +83,32 @@ def _batch(folder: Path, name: str, jobs: int, workers: int, threads: int) -> fl
             client.wait_for_workers(workers, timeout=60)
         out = folder / f"{name}-{workers}-{threads}"
         files = [f"job{index}.yaml" for index in range(jobs)]
-        begun = time.perf_counter()
+        started = time.perf_counter()
         code, _, err = site.run(
             *files, "--executor", address, "--out", str(out), "--threads", str(threads), command=REAL
         )
         assert code == 0, err
-        return time.perf_counter() - begun
+        return time.perf_counter() - started
     finally:
         site.close()
 
 
 def _overhead(folder: Path) -> dict[str, float]:
-    """Milliseconds of a task that does nothing, by a child that runs already."""
+    """Return the milliseconds of an empty task in a child that is already running."""
     from bodycap_batch.runner.dask_cluster import Cluster
 
     folder.mkdir()
     site, store = Site(folder), Store(folder / "store")
     children = Children(FAKE)
     try:
-        begun = time.perf_counter()
+        started = time.perf_counter()
         _make(children, store, folder, "first")
-        child_ms = 1e3 * (time.perf_counter() - begun)
+        child_ms = 1e3 * (time.perf_counter() - started)
         address = site.scheduler()
         site.worker("one", "--nthreads", "1")
         with Cluster(address, FAKE) as cluster:
             _make(cluster, store, folder, "warm")
-            # In turns, so that a machine that is busy now and then is busy for both.
+            # Alternate the two, so that other load on the machine affects both.
             pairs = [
                 (_ms(children, store, folder, f"here{index}"), _ms(cluster, store, folder, f"dask{index}"))
                 for index in range(TASKS)
@@ -122,9 +122,9 @@ def _overhead(folder: Path) -> dict[str, float]:
 
 
 def _ms(executor: Executor, store: Store, folder: Path, name: str) -> float:
-    begun = time.perf_counter()
+    started = time.perf_counter()
     _make(executor, store, folder, name)
-    return 1e3 * (time.perf_counter() - begun)
+    return 1e3 * (time.perf_counter() - started)
 
 
 def _make(executor: Executor, store: Store, folder: Path, value: str) -> None:

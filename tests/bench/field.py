@@ -1,8 +1,9 @@
-"""Captures as the field makes them: rendered, and recorded anew the way phones and covered lenses do.
+"""Captures as in practice: rendered, and recorded again as by phones and with covered lenses.
 
-``python -m tests.bench field``: one rendered walk of 5 seconds as phones film it (upright, strongly
-compressed, of varying rate and exposure), with lenses that are covered for a while, and with cameras of
-unlike rates and sizes; and one of somebody who turns on the spot, so that the cameras hardly move.
+``python -m tests.bench field``: one rendered walk of 5 seconds in three variants: as phones film it (upright,
+strongly compressed, with variable rate and exposure), with lenses that are covered for some time, and with
+cameras of different rates and sizes. The fourth capture is a person who turns on the spot, so that the
+cameras hardly translate.
 """
 
 from __future__ import annotations
@@ -40,6 +41,6 @@ def _rendered(folder: Path, *options: str) -> Path:
 
 
 def _row(capture: Path) -> Row:
-    """Scored against the wearer's own skeleton, which a rendered capture keeps with its truth."""
+    """Return a row that is evaluated with the person's own skeleton, which a rendered capture contains."""
     shutil.copy(capture / "gt" / "motion.bvh", capture / "skeleton.bvh")
     return row_of(capture)

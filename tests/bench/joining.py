@@ -1,9 +1,9 @@
-"""Whether the body puts maps together that share no view: where the cameras end up, over random walks.
+"""Alignment of maps without common views, by the body: errors of the cameras over random walks.
 
-``python -m tests.bench joining``: the walker of ``bodycap synth --poses`` whose cameras' poses come in three
-maps, each with a scale and axes of its own; mounts and noise as in ``simulation``. A camera counts as placed
-when the median distance of its path from the true one, in the main map, is below 5 cm. In pieces:
-``--seeds 0-5 --json FILE``, then ``--seeds 6-11`` with the same file, whose summary covers both.
+``python -m tests.bench joining``: the walker of ``bodycap synth --poses`` with camera poses in three maps,
+each with its own scale and axes; mounts and noise as in ``simulation``. A camera counts as placed if the
+median distance of its path from the true path, in the main map, is below 5 cm. A run can be split: ``--seeds
+0-5 --json FILE``, then ``--seeds 6-11`` with the same file; the last summary covers both.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ PLACED_M = 0.05
 
 
 def run_case(split: str, seed: int, seconds: float) -> dict[str, Any]:
-    """Draw one walk, place its maps, and compare with the truth."""
+    """Simulate one walk, align its maps, and compare with the truth."""
     from bodycap_batch.merging.camera_selection import candidate_main_maps  # gtsam takes a second to import
     from bodycap_batch.merging.map_alignment.align import align_cameras
 
@@ -62,7 +62,7 @@ def run_case(split: str, seed: int, seconds: float) -> dict[str, Any]:
 
 
 def _off(capture: Posed, places: Mapping[str, Any], main: str) -> dict[str, float]:
-    """By camera of a further map, median distance (m) of its path from where it truly was."""
+    """Return, per camera of a further map, the median distance (m) of its path from the true path."""
     out = {}
     for each in capture.inputs.trajectories:
         if each.gauge != main and each.gauge in places:
@@ -74,7 +74,7 @@ def _off(capture: Posed, places: Mapping[str, Any], main: str) -> dict[str, floa
 
 
 def summary(outcomes: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Share of cameras placed, refused, and how the errors compare with what was stated."""
+    """Return the fraction of cameras placed and refused, and the ratio of errors to stated sigmas."""
     off = [value for each in outcomes for value in each["off_m"].values()]
     stated = [each["sigma_m"][camera] for each in outcomes for camera in each["off_m"]]
     refused = sum(len(each["refused"]) for each in outcomes)
@@ -94,15 +94,15 @@ def summary(outcomes: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run and print; one line per seed and one per split."""
+    """Run all cases; print one line per seed and one per split."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench joining", description=__doc__)
     parser.add_argument("--splits", nargs="*", default=list(SPLITS), candidate_main_maps=list(SPLITS))
     parser.add_argument(
-        "--seeds", type=_seeds, default=range(24), help="the first so many, or FIRST-LAST, both included"
+        "--seeds", type=_seeds, default=range(24), help="number of seeds, or FIRST-LAST, both included"
     )
     parser.add_argument("--seconds", type=float, default=1000 / 30)
     parser.add_argument(
-        "--json", type=Path, help="also write all outcomes here; those of earlier runs stay and count too"
+        "--json", type=Path, help="file for all outcomes; those of earlier runs in it are kept and counted"
     )
     options = parser.parse_args(arguments)
     path: Path | None = options.json
@@ -111,10 +111,10 @@ def main(arguments: Sequence[str]) -> int:
         outcomes = known.setdefault(split, {})
         for seed in options.seeds:
             outcomes[str(seed)] = run_case(split, seed, options.seconds)
-            _tell(f"    {split}, seed {seed}: {_one_line(outcomes[str(seed)])}")
+            _write_line(f"    {split}, seed {seed}: {_one_line(outcomes[str(seed)])}")
             if path is not None:
                 path.write_text(json.dumps(known, indent=1), encoding="utf-8")
-        _tell(f"{split}: {_all_lines(list(outcomes.values()))}")
+        _write_line(f"{split}: {_all_lines(list(outcomes.values()))}")
     return 0
 
 
@@ -141,6 +141,6 @@ def _all_lines(outcomes: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def _tell(line: str) -> None:
+def _write_line(line: str) -> None:
     sys.stdout.write(line + "\n")
     sys.stdout.flush()

@@ -1,6 +1,7 @@
-"""A capture of many minutes: a rendered one played to and fro, with new noise and light each time.
+"""A capture of many minutes: a rendered one played forwards and backwards, with new noise and light each
+time.
 
-Rendering ten minutes takes hours; a person who walks through one room again and again sees about the same.
+Rendering ten minutes takes hours. A person who walks through one room again and again sees about the same.
 """
 
 from __future__ import annotations
@@ -30,12 +31,14 @@ _QUALITY = {"crf": "20", "preset": "ultrafast"}
 
 
 def main(argv: Sequence[str]) -> int:
-    """Render, play to and fro, run and tell; the exit code is the job's."""
+    """Render, replay, run the job and print its figures; the exit code is the job's."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench long", description=__doc__)
-    parser.add_argument("--minutes", type=float, default=10.0, help="length of each camera's video (10)")
-    parser.add_argument("--seconds", type=float, default=60.0, help="how much of it is rendered (60)")
-    parser.add_argument("--seed", type=int, default=3, help="body, walk and room (3)")
-    parser.add_argument("--noise", type=float, default=2.0, help="new noise each time, grey levels (2)")
+    parser.add_argument("--minutes", type=float, default=10.0, help="duration of each camera's video (10)")
+    parser.add_argument("--seconds", type=float, default=60.0, help="duration of the rendered part (60)")
+    parser.add_argument("--seed", type=int, default=3, help="seed of body, walk and room (3)")
+    parser.add_argument(
+        "--noise", type=float, default=2.0, help="noise added at each repetition, grey levels (2)"
+    )
     options = parser.parse_args(argv)
     with tempfile.TemporaryDirectory(prefix="bodycap-long-") as folder:
         once, long = Path(folder) / "once", Path(folder) / "long"
@@ -50,38 +53,38 @@ def main(argv: Sequence[str]) -> int:
 
 def _stages(result: dict[str, Any]) -> list[str]:
     mapping = result.get("metrics", {}).get("mapping", {})
-    told = {name: mapping.get(name) for name in ("keyframes", "pairs", "placed")}
-    return [f"    {told}"]
+    figures = {name: mapping.get(name) for name in ("keyframes", "pairs", "placed")}
+    return [f"    {figures}"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """How often a capture is played, forwards and backwards in turn, and the noise that comes on top.
+    """Number of repetitions of a capture, alternating forwards and backwards, and the added noise.
 
     Attributes:
-        times: How often.
-        noise: Standard deviation of what is added the second time and later, grey levels.
+        times: Number of repetitions.
+        noise: Standard deviation of the noise from the second repetition on, grey levels.
     """
 
     times: int
     noise: float = 0.0
 
     def order(self, count: int) -> list[int]:
-        """Frame numbers in the order in which they are played; those at the turns once."""
-        there = list(range(count))
-        out = there[:1]
+        """Return frame numbers in the order in which they are played; those at the ends once."""
+        forwards = list(range(count))
+        out = forwards[:1]
         for number in range(self.times):
-            out += there[::-1][1:] if number % 2 else there[1:]
+            out += forwards[::-1][1:] if number % 2 else forwards[1:]
         return out
 
 
 def play(source: Path, target: Path, replay: Replay) -> None:
-    """Write a capture's videos and its cameras' truth as they are played to and fro.
+    """Write the replayed videos of a capture and the true paths of its cameras.
 
     Args:
         source: Folder of a rendered capture.
-        target: Folder that is made, with skeleton and calibration.
-        replay: How often.
+        target: New folder, which also gets the skeleton and the calibration.
+        replay: The repetitions.
     """
     (target / "gt").mkdir(parents=True)
     for name in ("calib.json", "skeleton.bvh"):
@@ -96,7 +99,7 @@ def play(source: Path, target: Path, replay: Replay) -> None:
 
 
 def _play_video(source: Path, target: Path, replay: Replay) -> int:
-    """Write one video; how many frames the source has."""
+    """Write one replayed video; return the number of frames of the source."""
     import av
 
     with av.open(str(source)) as opened:
@@ -106,7 +109,7 @@ def _play_video(source: Path, target: Path, replay: Replay) -> int:
     with av.open(str(target), "w") as written:
         out = written.add_stream("libx264", rate=rate, options=_QUALITY)
         out.width, out.height, out.pix_fmt = frames[0].shape[1], frames[0].shape[0] * 2 // 3, "yuv420p"
-        for number, picture in enumerate(_seen_anew(frames, replay)):
+        for number, picture in enumerate(_replayed_pictures(frames, replay)):
             image = av.VideoFrame.from_ndarray(picture, format="yuv420p")
             image.pts, image.time_base = number, 1 / rate
             written.mux(out.encode(image))
@@ -114,8 +117,8 @@ def _play_video(source: Path, target: Path, replay: Replay) -> int:
     return len(frames)
 
 
-def _seen_anew(frames: Sequence[Picture], replay: Replay) -> Iterator[Picture]:
-    """The pictures as they are played, brighter or darker each time, and with noise of its own."""
+def _replayed_pictures(frames: Sequence[Picture], replay: Replay) -> Iterator[Picture]:
+    """Yield the pictures in the order of the replay, with new brightness and noise at each repetition."""
     rng = np.random.default_rng(0)
     height, width = frames[0].shape[0] * 2 // 3, frames[0].shape[1]
     size = (_PATTERNS, height + _SHIFT_PX, width + _SHIFT_PX)

@@ -1,4 +1,4 @@
-"""Run a whole job through the command line a user types, score it and tell its figures."""
+"""Run a whole job through the command line, evaluate it and print its figures."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from tests.bench import poses
 from tests.bench.rows import BODYCAP, REPOSITORY, Row
 
 MAPPING = ("map", "registration", "recover")
-"""Stages that do what the peers do: pose every frame."""
+"""Stages that do the same as the peers: they estimate the pose of every frame."""
 
 
 def run(row: Row, work: Path) -> dict[str, Any]:
-    """Run one job from nothing in a store of its own and score it; the outcome as plain values."""
+    """Run one job without earlier results, in a store of its own, and evaluate it; return plain values."""
     out = work / "out"
     work.mkdir(parents=True, exist_ok=True)
     command = [*BODYCAP, "run", str(row.capture), "--out", str(out), "--store", str(work / "store")]
@@ -37,9 +37,9 @@ def run(row: Row, work: Path) -> dict[str, Any]:
             wall = _wall_seconds(job.stdout or ())
         wall_s, cpu_s = time.monotonic() - started, _children_cpu_s() - before
         errors.seek(0)
-        complaint = errors.read().strip().splitlines()[-3:]
+        last_errors = errors.read().strip().splitlines()[-3:]
     if not (out / "run.json").exists():
-        return {"name": row.name, "exit": job.returncode, "error": complaint}
+        return {"name": row.name, "exit": job.returncode, "error": last_errors}
     record = json.loads((out / "run.json").read_text(encoding="utf-8"))
     metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
     stages: dict[str, float] = defaultdict(float)
@@ -62,20 +62,20 @@ def run(row: Row, work: Path) -> dict[str, Any]:
 
 
 def registration_cpu_s(stages: Iterable[dict[str, Any]]) -> tuple[float, float]:
-    """Processor seconds of the first round, which tracks every frame, and of all rounds."""
-    mine = [stage for stage in stages if stage["stage"] == "registration"]
-    first = sum(stage["cpu_seconds"] for stage in mine if stage["round"] == 0)
-    return first, sum(stage["cpu_seconds"] for stage in mine)
+    """Return the processor seconds of the first round, which tracks every frame, and of all rounds."""
+    registrations = [stage for stage in stages if stage["stage"] == "registration"]
+    first = sum(stage["cpu_seconds"] for stage in registrations if stage["round"] == 0)
+    return first, sum(stage["cpu_seconds"] for stage in registrations)
 
 
 def _children_cpu_s() -> float:
-    """Processor seconds of all child processes that have ended, theirs included."""
+    """Return the processor seconds of all ended child processes, including their own children."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
 def score(results: Path, row: Row) -> dict[str, Any]:
-    """Figures of `bodycap evaluate`, or why there are none."""
+    """Return the figures of `bodycap evaluate`, or its error."""
     command = [*BODYCAP, "evaluate", str(results), str(row.truth), "--json"]
     if row.reference:
         command += ["--reference", row.reference]
@@ -84,7 +84,7 @@ def score(results: Path, row: Row) -> dict[str, Any]:
 
 
 def _wall_seconds(lines: Iterable[str]) -> dict[str, float]:
-    """Seconds during which each stage ran on any camera, from the events of ``--json-progress``."""
+    """Return the seconds during which each stage ran, from the events of ``--json-progress``."""
     out: dict[str, float] = defaultdict(float)
     running: dict[str, int] = defaultdict(int)
     since: dict[str, float] = {}
@@ -104,7 +104,7 @@ def _wall_seconds(lines: Iterable[str]) -> dict[str, float]:
 
 
 def camera_seconds(frames: Path) -> float:
-    """Length of all cameras' videos together, from a job's frames.csv."""
+    """Return the duration of all cameras' videos together, from a job's frames.csv."""
     with frames.open(newline="", encoding="utf-8") as stream:
         times: dict[str, list[float]] = defaultdict(list)
         for line in csv.DictReader(row for row in stream if not row.startswith("#")):
@@ -113,12 +113,12 @@ def camera_seconds(frames: Path) -> float:
 
 
 def mapping_seconds(result: dict[str, Any]) -> float:
-    """Wall seconds of map and registration."""
+    """Return the wall seconds of map and registration."""
     return sum(result["wall_seconds"].get(stage, 0.0) for stage in MAPPING)
 
 
 def lines_of(result: dict[str, Any]) -> list[str]:
-    """The outcome as a person reads it."""
+    """Return the outcome as text."""
     if "report" not in result or "trajectories" not in result["report"]:
         return [f"{result['name']}: failed, exit {result['exit']}: {result.get('error') or result['report']}"]
     trajectories = result["report"]["trajectories"]
@@ -134,10 +134,10 @@ def lines_of(result: dict[str, Any]) -> list[str]:
         text.append("    " + poses.line_of(result["covariance"]))
     text.append("    seconds: " + stage_text(result["wall_seconds"]))
     frames = trajectories["total"]["frames"]
-    tracked_ms, each_ms = (1000 * seconds / max(frames, 1) for seconds in result["registration_cpu_s"])
+    tracked_ms, all_rounds_ms = (1000 * seconds / max(frames, 1) for seconds in result["registration_cpu_s"])
     text.append(
-        f"    registration {tracked_ms:.1f} ms of a core a frame to track and solve every one, "
-        f"{each_ms:.1f} with all further rounds"
+        f"    registration {tracked_ms:.1f} ms of a core per frame to track and solve every frame, "
+        f"{all_rounds_ms:.1f} with all further rounds"
     )
     wall_s = result["wall_s"]
     text.append(
@@ -149,7 +149,7 @@ def lines_of(result: dict[str, Any]) -> list[str]:
 
 
 def frames_and_error(trajectories: dict[str, Any]) -> str:
-    """Coverage and error of all cameras together."""
+    """Return the coverage and the error of all cameras together, as text."""
     total = trajectories["total"]
     text = f"{total['registered']}/{total['frames']} frames, ATE {_centimetres(total)}"
     return text + (f" (max {100 * total['ate_m']['max']:.1f})" if total["ate_m"] else "")
@@ -160,5 +160,5 @@ def _centimetres(figures: dict[str, Any]) -> str:
 
 
 def stage_text(seconds: dict[str, float]) -> str:
-    """Seconds of each stage in one line."""
+    """Return the seconds of each stage in one line."""
     return ", ".join(f"{name} {value:.1f}" for name, value in seconds.items())

@@ -1,8 +1,8 @@
 """The child process of a peer: COLMAP on every frame, with its own features and matcher and our retrieval.
 
-``python -m tests.bench.peer TASK.json``: what the parent, `tests.bench.peers`, writes. ``database`` extracts
-and matches, ``incremental`` and ``global`` map a copy of that database. Figures go to the task's ``report``
-after each step, so that what a stopped child had done is known.
+``python -m tests.bench.peer TASK.json``: the parent, `tests.bench.peers`, writes the task. ``database``
+extracts and matches features; ``incremental`` and ``global`` map a copy of that database. The figures are
+written to the task's ``report`` after each step, so that those of a stopped child are known.
 """
 
 from __future__ import annotations
@@ -27,18 +27,19 @@ from tests.bench import peer_database
 from tests.bench.peer_database import DATABASE_NAME
 
 _MAX_EXTRA_PARAM = 1e3
-"""COLMAP's own limit of 1 drops lenses with k3 > 1 silently; the calibration is given, so it is trusted."""
+"""COLMAP's default limit of 1 silently rejects intrinsics with k3 > 1. The calibration is given, so it is
+trusted."""
 
 
 class Report:
-    """Figures of a child, written anew after each step."""
+    """The figures of a child process, written after each step."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self.values: dict[str, Any] = {"seconds": {}}
 
     def timed(self, step: str, work: Callable[[], Any]) -> Any:
-        """Do a step and note how long it took."""
+        """Run a step and record its duration."""
         started = time.monotonic()
         self.values["running"] = step
         self.write()
@@ -55,7 +56,7 @@ class Report:
 
 
 def prepare(capture: Capture, workspace: Path, threads: int, report: Report) -> None:
-    """Features of every frame, and the matches of one list of pairs for both mappers."""
+    """Extract the features of every frame, and match one list of pairs for both mappers."""
     report.timed("features", lambda: peer_database.write_features(capture, workspace, threads))
     pairs = report.timed("pairs", lambda: peer_database.choose(capture, workspace))
     report.values["pairs"] = len(pairs)
@@ -63,7 +64,7 @@ def prepare(capture: Capture, workspace: Path, threads: int, report: Report) -> 
 
 
 def incremental(workspace: Path, threads: int) -> list[Any]:
-    """COLMAP's incremental mapper as it comes, given intrinsics held."""
+    """Run COLMAP's incremental mapper with default options; given intrinsics are held constant."""
     settings = pycolmap.IncrementalPipelineOptions()
     settings.random_seed = 0
     settings.num_threads = threads
@@ -78,7 +79,7 @@ def incremental(workspace: Path, threads: int) -> list[Any]:
 
 
 def globally(workspace: Path, threads: int) -> list[Any]:
-    """COLMAP's global mapper as it comes, given intrinsics held."""
+    """Run COLMAP's global mapper with default options; given intrinsics are held constant."""
     settings = pycolmap.GlobalPipelineOptions()
     settings.random_seed = 0
     settings.num_threads = threads
@@ -98,7 +99,7 @@ def _folders(workspace: Path) -> tuple[str, str, str]:
 
 
 def write_results(capture: Capture, models: list[Any], out: Path, report: Report) -> None:
-    """Paths of the largest model's cameras, and frames.csv with every frame, as a job leaves them."""
+    """Write the camera paths of the largest model, and frames.csv with every frame, in a job's format."""
     sizes = sorted((int(model.num_reg_images()) for model in models), reverse=True)
     report.values["models"] = sizes
     out.mkdir(parents=True)
@@ -123,7 +124,7 @@ def write_results(capture: Capture, models: list[Any], out: Path, report: Report
 
 
 def main(task_path: str) -> None:
-    """Do the task of a file."""
+    """Run the task of a file."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     task = json.loads(Path(task_path).read_text(encoding="utf-8"))
     report, workspace = Report(Path(task["report"])), Path(task["workspace"])

@@ -1,4 +1,4 @@
-"""The peers' database: COLMAP's own features and matches of every frame, whatever the product does."""
+"""The peers' database: COLMAP's own features and matches of every frame, independent of our own."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ FEATURES = 2048
 
 
 def name_of(camera: str, frame: int) -> str:
-    """Image name of a frame."""
+    """Return the image name of a frame."""
     return f"{camera}/{frame:07d}"
 
 
 def write_features(capture: Capture, workspace: Path, threads: int) -> None:
-    """Cameras with the given lens, and SIFT features of every frame, first octave 0."""
+    """Write the cameras with the given intrinsics, and SIFT features of every frame from octave 0."""
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         for camera in capture.cameras:
             model = camera.camera.to_pycolmap()
@@ -49,7 +49,7 @@ def write_features(capture: Capture, workspace: Path, threads: int) -> None:
 
 
 def _extracted(camera: CaptureCamera, threads: int) -> Iterator[tuple[int, Any, Any]]:
-    """Frame, keypoints (N,4) and descriptors, in order, extracted side by side."""
+    """Yield frame, keypoints (N,4) and descriptors in order, extracted in parallel."""
     settings = pycolmap.FeatureExtractionOptions()
     settings.num_threads = 1
     settings.use_gpu = False
@@ -63,7 +63,7 @@ def _extracted(camera: CaptureCamera, threads: int) -> Iterator[tuple[int, Any, 
 
     frames = camera.grey_frames()
     with ThreadPoolExecutor(threads) as pool:
-        # One extractor a thread: it is not to be shared.
+        # One extractor per thread, because an extractor is not thread-safe.
         while batch := list(islice(frames, threads)):
             slots = range(len(batch))
             results = pool.map(extract, slots, [image for _, image in batch])
@@ -72,7 +72,7 @@ def _extracted(camera: CaptureCamera, threads: int) -> Iterator[tuple[int, Any, 
 
 
 def choose(capture: Capture, workspace: Path) -> list[tuple[str, str]]:
-    """The peers' one list of pairs, by image name."""
+    """Return the peers' common list of pairs, by image name."""
     frames = [(camera, index) for camera in capture.cameras for index in range(len(camera.times_ns))]
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
@@ -86,7 +86,7 @@ def choose(capture: Capture, workspace: Path) -> list[tuple[str, str]]:
 
 
 def match(capture: Capture, workspace: Path, pairs: list[tuple[str, str]], threads: int) -> None:
-    """COLMAP's matcher and geometric verification on the list."""
+    """Run COLMAP's matcher and geometric verification on the list of pairs."""
     listed = workspace / "pairs.txt"
     listed.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
     matching = pycolmap.FeatureMatchingOptions()

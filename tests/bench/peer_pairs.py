@@ -1,4 +1,4 @@
-"""Which frames the peers match: one list for both mappers, linear in the number of frames."""
+"""The frame pairs that the peers match: one list for both mappers, linear in the number of frames."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import numpy as np
 import numpy.typing as npt
 
 STEPS = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 16, 32)
-"""Along a camera's own frames: COLMAP's sequential overlap of ten, then powers of two."""
+"""Steps between matched frames of one camera: COLMAP's sequential overlap of ten, then powers of two."""
 OWN_AGAIN = 8
-"""Looks retrieved from the same camera, away in time: the product's quotas."""
+"""Number of retrieved frames of the same camera at other times, and of each other camera, as in our own
+mapping. AWAY_NS is the least time difference for the same camera, nanoseconds."""
 FROM_OTHER = 6
 AWAY_NS = 2_000_000_000
 
@@ -18,10 +19,10 @@ IntArray = npt.NDArray[np.int64]
 def pairs_of(
     cameras: npt.NDArray[np.str_], times_ns: IntArray, alike: npt.NDArray[np.float64]
 ) -> list[tuple[int, int]]:
-    """Pairs of rows (a < b), in order.
+    """Return pairs of rows (a < b), in order.
 
     Args:
-        cameras: (N,) camera of each frame, frames of one camera in the order of their times.
+        cameras: (N,) camera of each frame; frames of one camera are in the order of their times.
         times_ns: (N,) common times.
         alike: (N,N) similarity of the pictures.
     """

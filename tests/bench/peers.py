@@ -1,4 +1,4 @@
-"""COLMAP on every frame, incremental and global, each in a process of its own that may be stopped."""
+"""COLMAP on every frame, incremental and global, each in a process of its own with a time limit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _POLL_S = 0.2
 
 
 def run_peers(row: Row, work: Path, limit_s: float) -> list[dict[str, Any]]:
-    """Run both peers on a capture; a peer's time is that of its features, matches and mapper."""
+    """Run both peers on a capture. The time of a peer includes features, matches and mapper."""
     shared = work / "database"
     shared.mkdir(parents=True)
     base = _child("database", row, shared, limit_s)
@@ -44,7 +44,7 @@ def run_peers(row: Row, work: Path, limit_s: float) -> list[dict[str, Any]]:
 
 
 def _child(step: str, row: Row, workspace: Path, limit_s: float) -> dict[str, Any]:
-    """Run one step, at most so long; what it reported, its exit code and whether it was stopped."""
+    """Run one step with a time limit; return its report, exit code and whether it was stopped."""
     report, task = workspace / f"{step}.report.json", workspace / f"{step}.task.json"
     values = {
         "step": step,
@@ -82,7 +82,7 @@ def _child(step: str, row: Row, workspace: Path, limit_s: float) -> dict[str, An
 
 
 def _peak_memory_mb(pid: int) -> float:
-    """Largest resident size a running process has had (Linux), 0 elsewhere."""
+    """Return the largest resident size of a running process (Linux); 0 on other systems."""
     try:
         for line in Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines():
             if line.startswith("VmHWM:"):
@@ -93,7 +93,7 @@ def _peak_memory_mb(pid: int) -> float:
 
 
 def lines_of(result: dict[str, Any], own: dict[str, Any] | None) -> list[str]:
-    """A peer's outcome, and how many times as long it took as the product's map and registration."""
+    """Return a peer's outcome, and the ratio of its time to that of our map and registration."""
     name = f"  COLMAP {result['peer']} on every frame"
     seconds = result["seconds"]
     total_s = sum(seconds.values())

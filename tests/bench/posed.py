@@ -1,4 +1,4 @@
-"""Captures without pictures: the walker's camera paths with noise, gaps and gross errors."""
+"""Simulated captures without pictures: the walker's camera paths with noise, gaps and gross errors."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Posed:
     """A simulated capture.
 
     Attributes:
-        inputs: As the merge takes them, mounts nominal, the body's own skeleton.
-        gauges: By gauge id, map_from_world.
+        inputs: Inputs of the merge, with nominal mounts and the body's own skeleton.
+        gauges: map_from_world per gauge id.
         mounts: The true mounts.
         motion: The true motion.
-        options: What it was drawn from.
+        options: Options of the simulation.
     """
 
     inputs: MergeInputs
@@ -41,21 +41,21 @@ class Posed:
     options: SynthOptions = field(repr=False)
 
     def by_mount(self, mounts: Sequence[Mount]) -> list[Trajectory]:
-        """The trajectories of the mounts' cameras, in their order."""
+        """Return the trajectories of the mounts' cameras, in the order of the mounts."""
         found = {each.camera: each for each in self.inputs.trajectories}
         return [found[mount.camera] for mount in mounts]
 
     def world_from_joint(self) -> FloatArray:
-        """True (T,J,4,4) at the merge's ticks."""
+        """Return the true poses (T,J,4,4) at the ticks of the merge."""
         return joint_poses_at(self.motion, seconds_from_ns(common_ticks_ns(self.options)))
 
 
 def posed(options: SynthOptions, maps: Mapping[str, str] | None = None) -> Posed:
-    """Simulate what registration delivers.
+    """Simulate the output of registration.
 
     Args:
-        options: Cameras, noise, gaps; the mounts and the walk follow its seed.
-        maps: By camera, the gauge its poses are in; all in one where it is missing.
+        options: Cameras, noise and gaps; the seed determines the mounts and the walk.
+        maps: Gauge per camera; cameras without an entry share one gauge.
     """
     subject = draw_subject(options)
     rng = np.random.default_rng([options.seed, 77])

@@ -1,8 +1,9 @@
-"""Whether the stated covariances of tracked poses are right: normalised errors of a job's frames.
+"""Check the stated covariances of tracked poses: normalised errors of a job's frames.
 
-The squared error of a pose over its stated covariance and dimensions, 1 where that is right, and the share of
-frames inside the region that holds 95 of 100. Frames beside each other err together, so that a clip's mean
-has no band of its own worth the name: the share of frames is what is held against 95 %.
+The first figure is the squared error of a pose over its stated covariance and its dimensions; it is 1 if the
+covariance is correct. The second is the fraction of frames inside the 95 % region. Errors of successive
+frames are correlated, so a clip's mean has no useful confidence band; the fraction of frames is compared with
+95 %.
 """
 
 from __future__ import annotations
@@ -27,12 +28,12 @@ _MAX_GAP_S = 0.1
 _LEAST_POSES = 3
 _INSIDE = 0.95
 _GROSS = 3.0
-"""Sigmas beyond which an error pulls less and less at the alignment."""
+"""Scale of the Cauchy loss in sigmas: larger errors have less and less influence on the alignment."""
 _PARTS = {"rotation": slice(0, 3), "centre": slice(3, 6), "pose": slice(0, 6)}
 
 
 def last_poses(results: Path, store: Path) -> dict[str, Trajectory]:
-    """Every camera's poses as the last stage that solved them left them."""
+    """Return the poses of every camera after the last stage that estimated them."""
     record = json.loads((results / "run.json").read_text(encoding="utf-8"))
     folders = {
         stage["camera"]: store / stage["artefact"]
@@ -43,12 +44,12 @@ def last_poses(results: Path, store: Path) -> dict[str, Trajectory]:
 
 
 def consistency(results: Path, store: Path, truth: Path) -> dict[str, dict[str, float]]:
-    """By camera, and for ``all`` in the map of most cameras under one similarity, what `figures` gives.
+    """Return `figures` per camera, and for ``all`` cameras in the map of most cameras under one similarity.
 
     Args:
         results: A job's results.
-        store: The store it ran in.
-        truth: Folder with ``<camera>.tum``, or the one camera's file.
+        store: The store in which it ran.
+        truth: Folder with ``<camera>.tum``, or the file of the only camera.
     """
     paths, true = _with_truth(last_poses(results, store), truth)
     if sum(map(len, true)) < _LEAST_POSES:
@@ -64,7 +65,9 @@ def consistency(results: Path, store: Path, truth: Path) -> dict[str, dict[str, 
 def _with_truth(
     paths: dict[str, Trajectory], truth: Path
 ) -> tuple[list[tuple[Trajectory, BoolArray]], list[FloatArray]]:
-    """Paths in the map of most cameras with the frames (N,) that have a truth, and that truth (K,4,4)."""
+    """Return the paths in the map of most cameras with a mask (N,) of frames with a truth, and that truth
+    (K,4,4).
+    """
     gauges = Counter(path.gauge for path in paths.values() if path.localised.any())
     known, poses = [], []
     for name, path in paths.items():
@@ -80,10 +83,10 @@ def _with_truth(
 
 
 def least_errors(mine: FloatArray, true: FloatArray, covariance: FloatArray) -> FloatArray:
-    """(N,6) `pose_errors` under the similarity that makes them smallest in units of their covariances.
+    """Return `pose_errors` (N,6) under the similarity that minimises them relative to their covariances.
 
-    One that brings centres together alone is turned by more than the stated sigmas where the path is short
-    (walk12 by 0.2 degrees); few gross errors do not pull.
+    A similarity that aligns only the centres of a short path is rotated by more than the stated sigmas. Gross
+    errors have little influence. Evidence: docs/decisions/bench.md.
     """
     start = align_points(true[:, :3, 3], mine[:, :3, 3])
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -106,17 +109,20 @@ def least_errors(mine: FloatArray, true: FloatArray, covariance: FloatArray) -> 
 
 
 def pose_errors(mine: FloatArray, true: FloatArray) -> FloatArray:
-    """(N,6) rotation (rad) and centre by which true poses (N,4,4) are off, in each estimate's camera."""
+    """Return the errors (N,6) of rotation (rad) and centre against true poses (N,4,4), in each estimate's
+    camera.
+    """
     difference = invert(mine) @ true
     return np.concatenate([so3_log(difference[:, :3, :3]), difference[:, :3, 3]], axis=1)
 
 
 def figures(errors: FloatArray, covariance: FloatArray) -> dict[str, float]:
-    """Normalised errors of poses (N,6) with stated covariances (N,6,6).
+    """Return normalised errors of poses (N,6) with stated covariances (N,6,6).
 
     Returns:
-        For rotation, centre and both: the median squared error over that of a chi-squared, 1 where the
-        covariance is right, and ``<part>_inside``, the share of frames in the region that holds 0.95.
+        For rotation, centre and both: the median squared error over the median of a chi-squared distribution,
+        which is 1 if the covariance is correct; and ``<part>_inside``, the fraction of frames in the 95 %
+        region.
     """
     out: dict[str, float] = {"frames": len(errors)}
     for name, part in _PARTS.items():
@@ -128,7 +134,7 @@ def figures(errors: FloatArray, covariance: FloatArray) -> dict[str, float]:
 
 
 def line_of(scores: dict[str, dict[str, float]]) -> str:
-    """All cameras' figures as a person reads them."""
+    """Return the figures of all cameras as text."""
     parts = [
         f"{name} {scores['all'][name]:.2f} ({scores['all'][name + '_inside']:.0%} inside)" for name in _PARTS
     ]

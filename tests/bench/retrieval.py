@@ -1,4 +1,4 @@
-"""Which keyframes look alike: VLAD vectors over a vocabulary learnt from the capture itself."""
+"""Image retrieval for the peers: VLAD vectors over a vocabulary learnt from the capture itself."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Descriptors = npt.NDArray[np.uint8]
 
 
 def similarity(descriptors: Sequence[Descriptors], seed: int) -> FloatArray:
-    """Similarity (K,K) in [−1, 1] of images given by their descriptors (N,128) uint8.
+    """Return the similarity (K,K) in [−1, 1] of images with descriptors (N,128) uint8.
 
-    Source: Jégou et al., "Aggregating local descriptors into a compact image representation", CVPR
-        2010, with the per-word normalisation of Arandjelović, Zisserman, "All about VLAD", CVPR 2013.
+    Source: Jégou et al., "Aggregating local descriptors into a compact image representation", CVPR 2010, with
+        the per-word normalisation of Arandjelović, Zisserman, "All about VLAD", CVPR 2013.
     """
     words = _vocabulary(descriptors, seed)
     vectors = np.array([_vlad(each, words) for each in descriptors])
@@ -44,7 +44,7 @@ def _vocabulary(descriptors: Sequence[Descriptors], seed: int) -> npt.NDArray[np
 
 
 def _vlad(descriptors: Descriptors, words: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Sum of residuals to the nearest word, normalised word by word and as a whole."""
+    """Return the sum of residuals to the nearest word, normalised per word and as a whole."""
     values = descriptors.astype(np.float32)
     total = np.zeros_like(words)
     if len(values):

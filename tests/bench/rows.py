@@ -1,4 +1,4 @@
-"""Which captures the benchmark runs on."""
+"""The captures on which the benchmark runs."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class Row:
     """One benchmark job.
 
     Attributes:
-        name: What the table calls it.
+        name: Name in the table.
         capture: Folder or job file.
         truth: Folder or file of the truth.
-        arguments: More of the command line.
-        reference: Camera the others are compared with in metres.
+        arguments: Further arguments of the command line.
+        reference: Camera with which the others are compared in metres.
     """
 
     name: str
@@ -34,7 +34,7 @@ class Row:
 
 
 def rows_in(data: Path, lab: Path, work: Path) -> list[Row]:
-    """The captures that are there."""
+    """Return the captures that exist."""
     rows = [row_of(data / "tum_fr1_xyz")]
     rows += [row_of(data / name) for name in ("walk12", "room12", "walk131", "room131")]
     rows.append(Row("cpl_lab", REPOSITORY / "jobs" / "cpl_lab.yaml", lab / "gt", (), "torso"))
@@ -48,7 +48,7 @@ def rows_in(data: Path, lab: Path, work: Path) -> list[Row]:
 
 
 def row_of(capture: Path) -> Row:
-    """A folder of videos with its truth inside: ``gt/`` or ``groundtruth.txt``."""
+    """Return the row of a folder of videos with its truth inside: ``gt/`` or ``groundtruth.txt``."""
     skeleton = capture / "skeleton.bvh"
     truth = capture / "groundtruth.txt"
     if not skeleton.exists():
@@ -58,7 +58,7 @@ def row_of(capture: Path) -> Row:
 
 
 def _write_true_mounts(lab: Path, target: Path) -> None:
-    """A job like the embedded one that states the cameras' true mounts."""
+    """Write a job like that of the repository, with the true mounts of the cameras."""
     import yaml
 
     mounts = json.loads((lab / "gt" / "mounts.json").read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""How cost grows: the same walk for 1, 2 and 4 times as long, with 1, 2, 3 and 5 cameras, in three sizes."""
+"""Growth of cost: one walk in three durations, with 1, 2, 3 and 5 cameras, and in three image sizes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CAMERAS = ("torso", "left_palm", "right_palm", "left_upper_arm", "right_upper_ar
 COUNTS = (1, 2, 3, 5)
 _USUAL = 3
 SIZES = ("640x480", "1440x1080", "2880x2160")
-"""The last two have the height of 1080p and 4K video, and all the same view."""
+"""Image sizes with the same view; the last two have the height of 1080p and 4K video."""
 SIZED_S = 3
 
 
@@ -28,11 +28,11 @@ class Case:
     """One capture of a series.
 
     Attributes:
-        row: What is run.
-        seconds: Length of each video.
-        cameras: How many cameras.
+        row: The benchmark job.
+        seconds: Duration of each video.
+        cameras: Number of cameras.
         pixels: Image size.
-        decoding_s: Seconds of one thread to read every frame of all cameras once, at the work size.
+        decoding_s: Seconds of one thread to decode every frame of all cameras once, at the work size.
     """
 
     row: Row
@@ -42,7 +42,7 @@ class Case:
     decoding_s: float = 0.0
 
     def size(self) -> dict[str, Any]:
-        """What varies, for the table."""
+        """Return the varied values, for the table."""
         return {
             "scaling_seconds": self.seconds,
             "scaling_cameras": self.cameras,
@@ -56,11 +56,11 @@ SERIES: dict[str, tuple[tuple[int, int, str], ...]] = {
     "cameras": tuple((BASE_S, count, SIZES[0]) for count in COUNTS),
     "size": tuple((SIZED_S, 1, pixels) for pixels in SIZES),
 }
-"""Seconds, cameras and image size of each case; each series is told relative to its first."""
+"""Seconds, cameras and image size of each case; each series is compared with its first case."""
 
 
 def cases(series: str, work: Path) -> Iterator[Case]:
-    """Render the captures of a series one by one: a longer one is the same walk, continued."""
+    """Render the captures of a series one by one; a longer one continues the same walk."""
     for seconds, count, pixels in SERIES[series]:
         folder = work / f"{seconds}s_{count}cameras_{pixels}"
         command = [*BODYCAP, "synth", str(folder), "--seconds", str(seconds), "--seed", "1"]
@@ -75,7 +75,7 @@ def cases(series: str, work: Path) -> Iterator[Case]:
 
 
 def decoding_seconds(capture: Path) -> float:
-    """Processor seconds to read every frame of a capture once, as the stages see it."""
+    """Return the processor seconds to read every frame of a capture once, as the stages do."""
     from bodycap_batch.capture import open_capture
     from bodycap_batch.config.job import load_job
 
@@ -88,7 +88,7 @@ def decoding_seconds(capture: Path) -> float:
 
 
 def lines_of(result: dict[str, Any], case: Case) -> list[str]:
-    """One case in two or three lines."""
+    """Return one case as two or three lines of text."""
     lines = ours.lines_of(result)
     if len(lines) < 2:
         return lines
@@ -102,7 +102,7 @@ def lines_of(result: dict[str, Any], case: Case) -> list[str]:
 
 
 def summary(series: str, results: list[dict[str, Any]]) -> list[str]:
-    """Time, pairs, memory and error of each case of a series over those of its first."""
+    """Return time, pairs, memory and error of each case of a series relative to the first."""
     found = {_case_of(each): each for each in results if "scaling_seconds" in each and "wall_seconds" in each}
     wanted = SERIES[series]
     if wanted[0] not in found:
@@ -115,7 +115,7 @@ def summary(series: str, results: list[dict[str, Any]]) -> list[str]:
             f"whole job {result['wall_s'] / base['wall_s']:.2f}",
             f"its processor seconds {result['cpu_s'] / base['cpu_s']:.2f}",
             f"map and registration {ours.mapping_seconds(result) / ours.mapping_seconds(base):.2f}",
-            f"vision without decoding {_seeing_s(result) / _seeing_s(base):.2f}",
+            f"vision without decoding {_vision_seconds(result) / _vision_seconds(base):.2f}",
             f"pairs {_pairs(result) / max(_pairs(base), 1):.2f}",
             f"peak memory {result['peak_memory_mb'] / base['peak_memory_mb']:.2f}",
         ]
@@ -132,11 +132,11 @@ def _words(case: tuple[int, int, str]) -> str:
 
 
 _PASSES = 2
-"""Keyframes and registration read every frame once; of large videos registration reads copies."""
+"""Keyframes and registration read every frame once; of large videos, registration reads stored copies."""
 
 
-def _seeing_s(result: dict[str, Any]) -> float:
-    """Seconds of the stages that look at frames, one core each, less what decoding takes of them."""
+def _vision_seconds(result: dict[str, Any]) -> float:
+    """Return the seconds of the stages that process frames, one core each, without the time for decoding."""
     stages = ("keyframes", "map", "registration")
     total = sum(result["stage_seconds"].get(stage, 0.0) for stage in stages)
     passes = _PASSES if result["scaling_pixels"] == SIZES[0] else 1
@@ -144,5 +144,5 @@ def _seeing_s(result: dict[str, Any]) -> float:
 
 
 def _pairs(result: dict[str, Any]) -> int:
-    """Keyframe pairs matched, as the job's metrics tell (0 where they do not)."""
+    """Return the number of matched keyframe pairs from the job's metrics; 0 if they do not state it."""
     return int(result["metrics"].get("mapping", {}).get("pairs", 0))

@@ -1,4 +1,4 @@
-"""What a map owes to chance: the same keyframes mapped with several seeds, keyframes against the truth."""
+"""Influence of chance on a map: the same keyframes mapped with several seeds and compared with the truth."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog="make bench ARGS='seeds …'", description=__doc__)
     parser.add_argument("captures", nargs="+", help="names of captures with truth, or folders")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
-    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="how many (5)")
+    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="number of seeds (5)")
     options = parser.parse_args(arguments)
     for name in options.captures:
         folder = Path(name) if Path(name).is_dir() else options.data / name
         rms_m = []
         for seed, errors_m in enumerate(_errors_by_seed(folder, options.seeds)):
             rms_m.append(float(np.sqrt((errors_m**2).mean())))
-            _tell(
+            _write_line(
                 f"{folder.name}, seed {seed}: {len(errors_m)} keyframes in the largest map, "
                 f"{100 * rms_m[-1]:.2f} cm, worst {100 * errors_m.max():.1f}"
             )
-        _tell(summary(folder.name, rms_m))
+        _write_line(summary(folder.name, rms_m))
     return 0
 
 
 def summary(name: str, rms_m: Sequence[float]) -> str:
-    """Mean error, and how far single seeds are from it."""
+    """Return the mean error and the deviation of single seeds from it, as text."""
     mean, deviation = float(np.mean(rms_m)), float(np.std(rms_m, ddof=1)) if len(rms_m) > 1 else 0.0
     width = max(rms_m) - min(rms_m)
     return (
@@ -54,7 +54,7 @@ def summary(name: str, rms_m: Sequence[float]) -> str:
 
 
 def _errors_by_seed(folder: Path, seeds: int) -> list[FloatArray]:
-    """Errors (K,) in metres of the largest map's keyframes, by seed."""
+    """Return the errors (K,) in metres of the largest map's keyframes, per seed."""
     capture = open_capture(load_job(folder).capture)
     truth = {camera.name: read_tum(folder / "gt" / f"{camera.name}.tum") for camera in capture.cameras}
     with tempfile.TemporaryDirectory(prefix="bodycap-bench-") as work:
@@ -73,7 +73,12 @@ def _errors_by_seed(folder: Path, seeds: int) -> list[FloatArray]:
 
 
 def keyframe_errors_m(scene_map: Map, truth: dict[str, FloatArray]) -> FloatArray:
-    """Errors (K,) of keyframes' centres under one similarity; `truth` has a pose a frame, by camera."""
+    """Return the errors (K,) of keyframe centres after alignment by one similarity.
+
+    Args:
+        scene_map: The map.
+        truth: Per camera, a true pose (4,4) for each frame.
+    """
     expected = np.array(
         [
             truth[camera][frame, :3, 3]
@@ -86,6 +91,6 @@ def keyframe_errors_m(scene_map: Map, truth: dict[str, FloatArray]) -> FloatArra
     return np.asarray(np.linalg.norm(align_points(centres, expected).apply(centres) - expected, axis=1))
 
 
-def _tell(line: str) -> None:
+def _write_line(line: str) -> None:
     sys.stdout.write(line + "\n")
     sys.stdout.flush()

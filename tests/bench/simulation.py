@@ -1,13 +1,13 @@
-"""The skeleton stage alone on simulated camera poses: joints, angles, palms, scale and solve time.
+"""The merge stage on simulated camera poses: joints, angles, palms, scale and time.
 
 ``python -m tests.bench simulation``: captures of ``bodycap synth --poses``: a walker who reaches out, 1,000
-frames at 30 Hz, cameras whose mounts are off by 15° and 5 cm in all, poses with 5 mm and 0.3° of noise, 2 %
-gross errors in bursts and 2 % of the frames lost in gaps of 10 to 20. The body's own proportions are given.
+frames at 30 Hz, cameras with mount errors of 15° and 5 cm in all, poses with 5 mm and 0.3° of noise, 2 %
+gross errors in bursts, and 2 % of the frames lost in gaps of 10 to 20. The body's own proportions are given.
 
-Errors of joints: translation removed at the hips where a camera measures them, else at the chest; the axes
-are those the poses came in (the merge's own choice of up and heading is undone, its scale is not); joints
-and ticks that are ``observed``, without the one that is held fixed. Angles: local rotations of joints whose
-parent was solved too, after each joint's constant offset over the clip is taken out; raw beside it.
+Errors of joints: the translation is removed at the hips if a camera measures them, else at the chest. The
+axes are those of the input poses: the merge's vertical and heading are undone, its scale is not. Only
+``observed`` joints and ticks count, without the joint that is held fixed. Angles are local rotations of
+joints with a solved parent, after removal of each joint's constant offset; the raw angles are printed too.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ CAMERAS = {
 GAUGE = "map-0"
 SECONDS = 1000 / 30
 SHIFTS_S = (0.0, 0.011, 0.022)
-"""Clock offsets handed out in turn where cameras are not synchronous; the last camera runs at 24 fps."""
+"""Clock offsets of the cameras in turn if they are not synchronous; the last camera runs at 24 fps."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,7 +79,7 @@ class Case:
 
 
 def load_inputs(folder: Path, height_m: float | None = None) -> MergeInputs:
-    """What the merge gets from a ``--poses`` capture: the body's own skeleton, or one by height."""
+    """Return the merge inputs of a ``--poses`` capture, with the body's own skeleton or one by height."""
     calibration = json.loads((folder / "calib.json").read_text(encoding="utf-8"))
     settings = json.loads((folder / "gt" / "synth.json").read_text(encoding="utf-8"))
     measured = height_m is None
@@ -125,7 +125,7 @@ def _trajectory(path: Path, sigmas: FloatArray) -> Trajectory:
 
 
 def score(folder: Path, result: MergeResult) -> dict[str, float]:
-    """Errors against the truth of the capture: metres, degrees, log scale."""
+    """Return errors against the truth of the capture: metres, degrees, log scale."""
     _, truth = read_bvh(folder / "gt" / "motion.bvh")
     assert truth is not None
     assert abs(int(truth.times_ns()[0]) - result.start_ns) < 1_000_000
@@ -161,7 +161,7 @@ def score(folder: Path, result: MergeResult) -> dict[str, float]:
 def _angles(
     result: MergeResult, mine: FloatArray, true: FloatArray, chosen: Sequence[int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Angles (T,J) of local rotations, each joint's constant offset taken out, and as they are."""
+    """Return angles (T,J) of local rotations: without each joint's constant offset, and raw."""
     parents = result.skeleton.parents[list(chosen)]
     local = [
         np.swapaxes(part[:, parents], -1, -2) @ part[:, list(chosen)]
@@ -185,7 +185,7 @@ def _mount_errors(folder: Path, result: MergeResult) -> dict[str, float]:
 
 
 def run_case(case: Case, work: Path, height_m: float | None = None) -> dict[str, float]:
-    """Make one capture, merge it and score it."""
+    """Simulate one capture, merge it and evaluate the result."""
     from bodycap_batch.merging import merge_trajectories  # gtsam takes a second to import
 
     folder = work / f"{case.cameras}-{case.seed}-{case.t_pose}-{case.shifted}"
@@ -198,14 +198,14 @@ def run_case(case: Case, work: Path, height_m: float | None = None) -> dict[str,
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run and print all cases; one line per seed and one per set-up."""
+    """Run all cases; print one line per seed and one per set-up."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench simulation", description=__doc__)
     parser.add_argument("--cameras", type=int, nargs="*", default=sorted(CAMERAS), choices=sorted(CAMERAS))
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--only", choices=("t-pose", "no-t-pose", "shifted"), nargs="*")
-    parser.add_argument("--height-only", action="store_true", help="the stature instead of the skeleton")
-    parser.add_argument("--json", type=Path, help="also write all figures here")
+    parser.add_argument("--height-only", action="store_true", help="use the height and not the skeleton")
+    parser.add_argument("--json", type=Path, help="file for all figures as JSON")
     options = parser.parse_args(arguments)
     kinds = {
         "t-pose": {"t_pose": True},

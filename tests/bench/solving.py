@@ -1,8 +1,8 @@
-"""Time and memory of the skeleton stage by length and size of the body, each case in a process of its own.
+"""Time and memory of the merge stage by duration and size of the body, each case in a process of its own.
 
-``python -m tests.bench solving``: simulated captures (see `simulation`) of 1,000 and ten times as many frames
-with the nine bones of chest and arms, and 10,000 frames of fifteen bones. CPU seconds of one core for the
-whole stage and for its motion alone; largest resident memory, libraries and simulation included.
+``python -m tests.bench solving``: simulated captures (see `simulation`) of 1,000 and 10,000 frames with the
+nine bones of chest and arms, and of 10,000 frames with fifteen bones. Prints CPU seconds of one core for the
+whole stage and for its motion, and the largest resident memory including libraries and simulation.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ ONE_CORE = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "TBB_NUM_TH
 
 
 class _Phases:
-    """CPU seconds at which each phase was first heard of."""
+    """CPU seconds at the start of each phase."""
 
     def __init__(self) -> None:
         self.began: dict[str, float] = {}
@@ -69,7 +69,7 @@ def measure(frames: int, bones: int) -> dict[str, Any]:
 
 
 def lines_of(case: dict[str, Any], first: dict[str, Any] | None) -> str:
-    """One line a person reads; compared with the first case of the same body."""
+    """Return one case as a line of text, compared with the first case of the same body."""
     text = (
         f"{case['frames']:6} frames x {case['bones']} bones, {case['cameras']} cameras: "
         f"{case['seconds']:.1f} s ({case['motion_seconds']:.1f} for the motion), peak "
@@ -82,11 +82,11 @@ def lines_of(case: dict[str, Any], first: dict[str, Any] | None) -> str:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run and print; one line per case."""
+    """Run all cases; print one line per case."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench solving", description=__doc__)
-    parser.add_argument("--frames", type=int, help="one case alone, in this process, as JSON")
+    parser.add_argument("--frames", type=int, help="run a single case in this process and print JSON")
     parser.add_argument("--bones", type=int, choices=sorted(BODIES), default=9)
-    parser.add_argument("--json", type=Path, help="also write all figures here")
+    parser.add_argument("--json", type=Path, help="file for all figures as JSON")
     options = parser.parse_args(arguments)
     if options.frames:
         sys.stdout.write(json.dumps(measure(options.frames, options.bones)) + "\n")

@@ -1,7 +1,7 @@
 """The watched folder under load: memory over a thousand jobs, and a thousand folders dropped at once.
 
-The watcher is the real one, a process of its own, as is everything about a job but its stages: these are the
-stand-ins of the tests (`tests/pipeline/fake_stages.py`), since a thousand real captures would take days.
+The watcher is real and runs in a process of its own. Only the stages are stand-ins
+(`tests/pipeline/fake_stages.py`), because a thousand real captures would take days.
 """
 
 from __future__ import annotations
@@ -22,16 +22,17 @@ COMMAND = (sys.executable, str(ROOT / "tests" / "pipeline" / "fake_bodycap.py"))
 JOBS = 1000
 SAMPLES = 10
 COMPUTED_EVERY = 20
-"""One job in so many is new to the store, so that children run for it; the others are answered by it."""
+"""One job in this many is new to the store, so that child processes run for it. The store answers the
+others."""
 
 
 def run(work: Path, jobs: int = JOBS) -> list[dict[str, Any]]:
-    """Both measurements."""
+    """Run both measurements."""
     return [memory(work / "memory", jobs), at_once(work / "at_once", jobs)]
 
 
 def lines_of(result: dict[str, Any]) -> list[str]:
-    """A measurement as a person reads it."""
+    """Return a measurement as text."""
     seconds, jobs = f"{result['seconds']:.0f} s", result["jobs"]
     if result["name"] == "spool memory":
         levels = ", ".join(f"{level:.1f}" for level in result["memory_mb"])
@@ -44,13 +45,13 @@ def lines_of(result: dict[str, Any]) -> list[str]:
     return [
         f"{jobs} folders dropped at once, {seconds}: {result['lost']} lost",
         f"  {result['done']} done, {result['answered']} of them answered by the store but for the report",
-        f"  {result['refused']} refused by pre-flight: {result['refused_by_name']} by what the job says, "
-        f"{result['refused_by_check']} by a look at the videos",
+        f"  {result['refused']} refused by the check: {result['refused_by_name']} because of the job, "
+        f"{result['refused_by_check']} because of the videos",
     ]
 
 
 def memory(work: Path, jobs: int) -> dict[str, Any]:
-    """Resident memory of a watcher after every tenth of its jobs."""
+    """Measure the resident memory of a watcher after every tenth of its jobs."""
     inbox = _inbox(work)
     dropped = iter(range(jobs))
     levels: list[float] = []
@@ -77,7 +78,7 @@ def memory(work: Path, jobs: int) -> dict[str, Any]:
 
 
 def at_once(work: Path, jobs: int) -> dict[str, Any]:
-    """Half of the folders known to the store, a quarter with an impossible name, a quarter unreadable."""
+    """Drop folders at once: half known to the store, a quarter with an invalid name, a quarter unreadable."""
     inbox = _inbox(work)
     _drop(inbox, "first", new=False)
     _watch(work, lambda _: None, lambda: _ended(work) == 1)
@@ -113,7 +114,7 @@ def at_once(work: Path, jobs: int) -> dict[str, Any]:
 
 
 def _computed(status: dict[str, Any]) -> set[str]:
-    """Stages that the store did not answer; the report bears the job's name, so each job has its own."""
+    """Return the stages that the store did not answer. Each job has its own report, which holds its name."""
     return {stage["stage"] for stage in status["finished_stages"] if not stage["reused"]}
 
 
@@ -124,7 +125,7 @@ def _inbox(work: Path) -> Path:
 
 
 def _drop(folder: Path, name: str, *, new: bool, kind: str = "known") -> None:
-    """A folder of two stand-in videos; moved in whole, so that no half of it is ever seen."""
+    """Drop a folder of two stand-in videos. It is moved at once, so that it is never seen half complete."""
     capture = folder.parent / f"making {name}"
     capture.mkdir()
     text = f"{'unreadable ' if kind == 'unreadable' else ''}frames{f' of {name}' if new else ''}"
@@ -137,7 +138,7 @@ def _drop(folder: Path, name: str, *, new: bool, kind: str = "known") -> None:
 
 
 def _watch(work: Path, tick: Callable[[subprocess.Popen[bytes]], None], ended: Callable[[], bool]) -> float:
-    """Run a watcher until all has ended; returns the seconds it took."""
+    """Run a watcher until all jobs have ended; return the seconds."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     environment.pop("BODYCAP_STORE", None)
     started = time.monotonic()

@@ -1,15 +1,16 @@
-"""Whether the stated uncertainty of the joints is right: normalised squared errors over simulated captures.
+"""Check the stated uncertainty of the joints: normalised squared errors over simulated captures.
 
-``python -m tests.bench uncertainty``: per joint, the squared error of its centre relative to the first solved
-joint over the stated covariance, divided by its three dimensions, so that 1 is ideal; for ticks at which
-every camera that decides the joint was measured, and for those in a gap of one of them. Within a capture the
-errors share mounts and scale, so that each seed counts as one draw; the 95 % band is chi-square's for three
-times as many. Below the band the stated sigmas are too large, above it too small.
+``python -m tests.bench uncertainty``: for each joint, the squared error of its centre relative to the first
+solved joint, over the stated covariance and the three dimensions, so that 1 is ideal. Ticks at which every
+camera that determines the joint was measured are separate from ticks in a gap of one of them. The errors
+within a capture share mounts and scale, so each seed counts as one draw; the 95 % band is that of a
+chi-squared distribution with three times as many degrees of freedom. Below the band the stated sigmas are too
+large, above it too small.
 
-A claim about people is tested on people: each seed's walker holds its joints as one of them does
-(``--posture-spread 1``). Walkers who are all everyone's mean (``--posture-spread 0``) leave most of what is
-stated of shoulders and elbows untested, and lie far below the band. In a T-pose all
-stretch their arms out, from a trunk and shoulders held as ever: the arms of some are a few degrees off level.
+The stated uncertainty covers the variation between people, so each seed's walker has a posture of its own
+(``--posture-spread 1``). Walkers with the mean posture (``--posture-spread 0``) do not test most of the
+stated uncertainty of shoulders and elbows, and lie far below the band. In a T-pose all walkers stretch out
+their arms; the trunk and shoulders keep their posture, and some arms are a few degrees off the horizontal.
 """
 
 from __future__ import annotations
@@ -36,17 +37,17 @@ KINDS = ("observed", "gap")
 
 
 def band(seeds: int) -> tuple[float, float]:
-    """Where the mean normalised squared error of that many captures lies in 95 of 100 cases."""
+    """Return the 95 % interval of the mean normalised squared error of that many captures."""
     low, high = chi2.ppf((0.025, 0.975), 3 * seeds) / (3 * seeds)
     return float(low), float(high)
 
 
 def normalised_errors(capture: Posed, result: MergeResult) -> dict[str, FloatArray]:
-    """By role, (T,) squared error over covariance and dimensions; 1 is ideal."""
+    """Return, per role, the squared error (T,) over covariance and dimensions; 1 is ideal."""
     assert result.joint_covariance_m2 is not None
     true = capture.world_from_joint()[: len(result.graph_world_from_joint), :, :3, 3]
     mine = result.graph_world_from_joint[: len(true), :, :3, 3]
-    # The world's own axes are no part of the claim: both are compared in the axes of the truth.
+    # The uncertainty does not include the world's axes, so both are compared in the axes of the truth.
     turn = capture.gauges[GAUGE].inverse().rotation @ result.world_from_map[GAUGE].inverse().rotation
     root, *others = np.flatnonzero(result.solved).tolist()
     covariance = turn @ result.joint_covariance_m2[: len(true)] @ turn.T
@@ -59,9 +60,9 @@ def normalised_errors(capture: Posed, result: MergeResult) -> dict[str, FloatArr
 
 
 def in_gap(capture: Posed, result: MergeResult, role: str) -> BoolArray:
-    """(T,) ticks at which a camera that decides a joint was not measured.
+    """Return the ticks (T,) at which a camera that determines a joint was not measured.
 
-    These are the root's cameras and those on the joint's own limb: above it, on it, or below it.
+    These are the cameras of the root, and those of the joint's own limb: above it, on it, or below it.
     """
     skeleton = result.skeleton
     joint, root = skeleton.roles.index(role), int(np.flatnonzero(result.solved)[0])
@@ -87,7 +88,7 @@ def in_gap(capture: Posed, result: MergeResult, role: str) -> BoolArray:
 
 
 def run_case(case: Case, scores: Scores) -> None:
-    """Simulate, merge, and add each joint's mean normalised squared errors to `scores`."""
+    """Simulate and merge; add each joint's mean normalised squared errors to `scores`."""
     from bodycap_batch.merging import merge_trajectories  # gtsam takes a second to import
 
     capture = posed(case.options())
@@ -101,7 +102,7 @@ def run_case(case: Case, scores: Scores) -> None:
 
 
 def lines_of(scores: Scores) -> list[str]:
-    """The table a person reads: mean per joint and kind, and whether it lies in its band."""
+    """Return the table: the mean per joint and kind, and whether it is in its band."""
     text, inside, total = [], 0, 0
     for role, kinds in scores.items():
         parts = []
@@ -119,14 +120,14 @@ def lines_of(scores: Scores) -> list[str]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run and print; one table per set of cameras."""
+    """Run all cases; print one table per set of cameras."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench uncertainty", description=__doc__)
     parser.add_argument("--cameras", type=int, nargs="*", default=sorted(CAMERAS), choices=sorted(CAMERAS))
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--seconds", type=float, default=1000 / 30)
     parser.add_argument("--only", choices=("t-pose", "no-t-pose"), nargs="*", default=["t-pose", "no-t-pose"])
     parser.add_argument("--posture-spread", type=float, default=1.0)
-    parser.add_argument("--json", type=Path, help="also write all figures here")
+    parser.add_argument("--json", type=Path, help="file for all figures as JSON")
     options = parser.parse_args(arguments)
     figures: dict[str, Scores] = {}
     for cameras in options.cameras:

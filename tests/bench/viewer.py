@@ -1,4 +1,4 @@
-"""How smoothly the report's viewer draws in software, without a graphics card."""
+"""Frame rate of the report's viewer in software, without a graphics card."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _FILL = "position:fixed;left:0;top:0;width:{}px;height:{}px;z-index:99;aspect-ra
 
 
 def chromium() -> str | None:
-    """The installed browser, None where there is none."""
+    """Return the path of the installed browser, or None."""
     import shutil
 
     return next((path for name in CHROMIUM if (path := shutil.which(name))), None)
 
 
 def run(seconds: float = 4.0) -> dict[str, Any]:
-    """Frames a second while the scene turns and plays, and the share of the points drawn meanwhile."""
+    """Return the frames per second while the scene turns and plays, and the fraction of points drawn."""
     from playwright.sync_api import sync_playwright
 
     from bodycap_batch.core.context import StageContext
@@ -47,7 +47,7 @@ def run(seconds: float = 4.0) -> dict[str, Any]:
 
 
 def lines_of(result: dict[str, Any]) -> list[str]:
-    """The figures as a person reads them."""
+    """Return the figures as text."""
     if "fps" not in result:
         return [f"viewer: {result['viewer']}"]
     width, height = SIZE

@@ -141,7 +141,7 @@ def test_two_large_tasks_do_not_meet_on_a_small_worker_though_it_comes_late(site
     process = site.start("monday", "tuesday", "--executor", address, "--json")
     assert process.stderr is not None
     assert process.stdout is not None
-    assert "no worker is there yet" in process.stderr.readline()
+    assert "no worker is connected yet" in process.stderr.readline()
     site.worker("one", "--nthreads", "2", "--resources", "memory=2000")  # a map declares 1,500 MB
     begun = set()
     while len(begun) < 2:

@@ -10,13 +10,13 @@ import pytest
 from bodycap_batch.cli import main
 from tests.broken import sound
 from tests.pipeline.fake_stages import ORDERS
-from tests.pipeline.spools import SpoolBench
+from tests.pipeline.spools import SpoolFixture
 from tests.pipeline.tiny_job import STAGES, Place
 
 
 @pytest.fixture(scope="session")
 def sound_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sound job of two cameras, rendered once; whoever changes it works on a copy."""
+    """A valid job of two cameras, rendered once; a test that changes it works on a copy."""
     folder = tmp_path_factory.mktemp("sound")
     sound(folder)
     return folder
@@ -24,7 +24,7 @@ def sound_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> Place:
-    """The job has been run, uninterrupted."""
+    """The job after an uninterrupted run."""
     place = Place(tmp_path_factory.mktemp("reference"))
     assert main(["run", str(place.folder / "tiny.yaml"), "--out", str(place.out)]) == 0
     names = set(place.content())
@@ -39,9 +39,9 @@ def place(tmp_path: Path, reference: Place) -> Place:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SpoolBench]:
-    """A watched folder with stand-in stages; the working directory is beside it."""
-    bench = SpoolBench(tmp_path)
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SpoolFixture]:
+    """A watched folder with stand-in stages; the working directory is its parent."""
+    bench = SpoolFixture(tmp_path)
     monkeypatch.setenv(ORDERS, str(bench.orders))
     monkeypatch.chdir(tmp_path)
     yield bench

@@ -1,4 +1,4 @@
-"""The `bodycap` command with stand-in stages, as a process or within the test's."""
+"""The `bodycap` command with stand-in stages, in a process of its own or in that of the test."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ _STARTING_CHILDREN = (
 
 
 @contextmanager
-def stand_ins() -> Iterator[None]:
-    """Let the commands start children with stand-in stages."""
-    before = [(module, name, getattr(module, name)) for module, name in _STARTING_CHILDREN]
+def stand_in_stages() -> Iterator[None]:
+    """Let the commands start child processes with stand-in stages."""
+    originals = [(module, name, getattr(module, name)) for module, name in _STARTING_CHILDREN]
     try:
-        for module, name, value in before:
+        for module, name, value in originals:
             setattr(module, name, functools.partial(value, command=CHILD))
         yield
     finally:
-        for module, name, value in before:
+        for module, name, value in originals:
             setattr(module, name, value)
 
 
 def run_here(folder: Path, environment: Mapping[str, str], *arguments: str) -> tuple[int, str, str]:
-    """Run the command in this process: exit code, standard output and standard error."""
+    """Run the command in this process; return the exit code, standard output and standard error."""
     out, err = io.StringIO(), io.StringIO()
     with (
-        stand_ins(),
+        stand_in_stages(),
         chdir(folder),
         mock.patch.dict(os.environ, environment, clear=True),
         redirect_stdout(out),
@@ -52,5 +52,5 @@ def run_here(folder: Path, environment: Mapping[str, str], *arguments: str) -> t
 
 
 if __name__ == "__main__":
-    with stand_ins():
+    with stand_in_stages():
         main()

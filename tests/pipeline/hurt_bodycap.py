@@ -1,11 +1,11 @@
-"""The `bodycap` command that is killed, or whose disk fills up, at a chosen moment.
+"""The `bodycap` command that is killed, or that gets a full disk, at a chosen moment.
 
-Orders come in a JSON file named by the environment:
+The environment names a JSON file with the orders:
 
-- ``{"kill": "before" | "after", "at": text, "done": file}``: at the first renaming of a file or folder that
-  no earlier run was killed at, the command and all its children get SIGKILL, just before or just after it
-  happens. Only renamings whose target holds the text count.
-- ``{"fill": stage, "disk": folder}``: the disk is filled to the last byte when this stage begins.
+- ``{"kill": "before" | "after", "at": text, "done": file}``: the command and all its children get SIGKILL
+just before or just after the first rename at which no earlier run was killed. Only renames with the text in
+their target count.
+- ``{"fill": stage, "disk": folder}``: the disk is filled to the last byte when this stage starts.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ CHILD = (sys.executable, __file__, "--child")
 BALLAST = "ballast.bin"
 
 
-def place_of(target: Path) -> str:
-    """A renaming's name: its target without what differs from run to run."""
+def rename_name(target: Path) -> str:
+    """Return the name of a rename: its target without the parts that differ from run to run."""
     text = re.sub(r"/(\.store/tmp/[a-z]+)-[^/]+", r"/\1", str(target))
     return re.sub(r"/(digests|logs|corrupt)/.*", r"/\1", text)
 
 
 def kill_everything() -> None:
-    """End all processes of this run at once, this one last."""
+    """Kill all processes of this run at once, this one last."""
     for name in os.listdir(os.environ[PIDS]):
         if int(name) != os.getpid():
             try:
@@ -49,13 +49,13 @@ def kill_everything() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def deadly(rename: Callable[..., None], orders: Mapping[str, str]) -> Callable[..., None]:
+def killing(rename: Callable[..., None], orders: Mapping[str, str]) -> Callable[..., None]:
     def wrapped(source: Any, target: Any, **values: Any) -> None:
-        place = place_of(Path(target))
+        place = rename_name(Path(target))
         if orders["at"] not in place:
             return rename(source, target, **values)
         with Path(orders["done"]).open("a+") as done:
-            # Children work side by side: a second one that gets here waits for its end.
+            # Child processes run in parallel: a second one that gets here waits until it is killed.
             fcntl.flock(done, fcntl.LOCK_EX)
             done.seek(0)
             if place not in done.read().splitlines():
@@ -78,7 +78,7 @@ def filling(name: str, disk: Path) -> TaskFunction:
 
 
 def fill(disk: Path) -> None:
-    """Leave no byte."""
+    """Write to the disk until no byte is free."""
     size = 1 << 20
     with (disk / BALLAST).open("ab", buffering=0) as stream:
         while size:
@@ -89,21 +89,21 @@ def fill(disk: Path) -> None:
                 size //= 2
 
 
-def hurt() -> dict[str, TaskFunction]:
-    """Prepare what was ordered; returns the stages to run."""
+def prepare_failure() -> dict[str, TaskFunction]:
+    """Prepare the ordered failure; return the stages to run."""
     orders = json.loads(Path(os.environ[ORDERS]).read_text())
     table: dict[str, TaskFunction] = {name: stage.run for name, stage in STAGES.items()}
     (Path(os.environ[PIDS]) / str(os.getpid())).touch()
     if "kill" in orders:
-        os.replace = deadly(os.replace, orders)
-        os.rename = deadly(os.rename, orders)
+        os.replace = killing(os.replace, orders)
+        os.rename = killing(os.rename, orders)
     if "fill" in orders:
         table[orders["fill"]] = filling(orders["fill"], Path(orders["disk"]))
     return table
 
 
 if __name__ == "__main__":
-    stages = hurt()
+    stages = prepare_failure()
     if sys.argv[1] == "--child":
         sys.exit(child.main(sys.argv[2:], stages))
     from bodycap_batch import pipeline

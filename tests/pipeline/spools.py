@@ -1,4 +1,4 @@
-"""A spool with stand-in stages for tests."""
+"""A spool with stand-in stages, for tests."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ BODYCAP = (sys.executable, str(Path(__file__).with_name("fake_bodycap.py")))
 CAMERAS = ("torso", "left_palm")
 
 
-class SpoolBench:
-    """An empty spool, ways to drop into it, and a watcher that works it off."""
+class SpoolFixture:
+    """An empty spool, methods to drop jobs into it, and a watcher that runs them."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.orders = folder / "orders.json"
         self.spool = Spool(inbox=folder / "jobs" / "inbox", root=folder / "jobs")
         self.spool.make()
-        self.told: list[str] = []
+        self.lines: list[str] = []
         self._processes: list[subprocess.Popen[str]] = []
         self.order()
 
@@ -38,7 +38,7 @@ class SpoolBench:
         self.orders.write_text(json.dumps({"started": started, **orders}))
 
     def drop(self, name: str, job: str | None = None, *, ready: bool = True) -> Path:
-        """Drop a folder of two videos, with a job file where a text is given."""
+        """Drop a folder of two videos, with a job file if a text is given."""
         folder = self.folder / "outside"
         folder.mkdir(exist_ok=True)
         capture = folder / name
@@ -53,26 +53,26 @@ class SpoolBench:
 
     def options(self, **changes: Any) -> WatchOptions:
         terms = JobPermissions(**{key: changes.pop(key) for key in ("roots", "limits") if key in changes})
-        usual: dict[str, Any] = {"settle_s": 0.0, "once": True, "threads": 1, "command": CHILD}
-        return WatchOptions(permissions=terms, **{**usual, **changes})
+        defaults: dict[str, Any] = {"unchanged_s": 0.0, "once": True, "threads": 1, "command": CHILD}
+        return WatchOptions(permissions=terms, **{**defaults, **changes})
 
     def watcher(self, **changes: Any) -> Watcher:
-        return Watcher(self.spool, self.options(**changes), self.told.append)
+        return Watcher(self.spool, self.options(**changes), self.lines.append)
 
-    def work_off(self, **changes: Any) -> int:
-        """Watch until nothing is left to do; returns the exit code."""
+    def run_once(self, **changes: Any) -> int:
+        """Watch until nothing is left to do; return the exit code."""
         return self.watcher(**changes).run()
 
     def job(self, name: str) -> JobDir:
         found = self.spool.find(name)
-        assert found is not None, self.told
+        assert found is not None, self.lines
         return found
 
     def status(self, name: str) -> dict[str, Any]:
         return dict(json.loads(self.job(name).status.read_text()))
 
     def generation(self, name: str) -> int:
-        """How often a running job has been claimed."""
+        """Return how often a running job has been claimed."""
         found = self.spool.find(name)
         return 0 if found is None else len(list(found.path.glob(".generation-*")))
 
@@ -92,14 +92,14 @@ class SpoolBench:
         return process
 
     def close(self) -> None:
-        """End what a failed test left running."""
+        """End the processes that a failed test left running."""
         for process in self._processes:
             if process.poll() is None:
                 process.kill()
                 process.wait()
 
-    def hanging(self) -> int:
-        """Wait until a stage that was ordered to hang does; returns its process id."""
+    def wait_until_hanging(self) -> int:
+        """Wait until a stage hangs as ordered; return its process id."""
         started = self.folder / "started"
         wait_for(lambda: started.exists() and bool(started.read_text()))
         return int(started.read_text())
@@ -108,5 +108,5 @@ class SpoolBench:
 def wait_for(condition: Callable[[], bool], seconds: float = 30.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < end, "it did not happen"
+        assert time.monotonic() < end, "the condition did not become true"
         time.sleep(0.02)

@@ -83,7 +83,7 @@ def partly_black(root: Path) -> None:
         (dropped, "15 frames were dropped"),
         (frozen, "the picture stands still"),
         (no_contrast, "hardly any contrast"),
-        (partly_black, "pictures looked at are black"),
+        (partly_black, "inspected pictures are black"),
         (edit("capture:", "skeleton: none\ncapture:"), "ready to run"),
         (lambda root: (root / "calib.json").unlink() or edit("calib.json", "auto")(root), "not calibrated"),
     ],
@@ -110,7 +110,7 @@ def test_a_missing_chapter_is_no_matter_where_the_times_are_stated(capture: Path
 @pytest.mark.parametrize(
     ("break_it", "code", "message"),
     [
-        (black, 3, "torso.mp4: camera torso shows black pictures only"),
+        (black, 3, "torso.mp4: camera torso shows only black pictures"),
         (edit("capture:", "hight_m: 1\ncapture:"), 2, "job.yaml:1: hight_m: unknown key"),
     ],
 )

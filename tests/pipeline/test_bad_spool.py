@@ -1,4 +1,4 @@
-"""Every broken job of the table in one spool: each is filed away with its reason, and no other suffers."""
+"""Every broken job of the table in one spool: each is filed with its reason, and delays no other."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import pytest
 
 from tests.broken import CASES, Case
 from tests.pipeline.fake_stages import ORDERS
-from tests.pipeline.spools import SpoolBench
+from tests.pipeline.spools import SpoolFixture
 
 pytestmark = pytest.mark.slow
 
 FIRST, LAST = "0 sound", "z sound"
 IN_A_SPOOL = {
-    "results' name is a file": None,  # results go to the spool's own folder, whatever the job says
+    "results' name is a file": None,  # the spool decides where the results go, not the job
     "name of 300 letters": 2,
 }
 
@@ -25,11 +25,11 @@ def folder_of(case: Case) -> str:
 
 
 @pytest.fixture(scope="module")
-def worked_off(tmp_path_factory: pytest.TempPathFactory, sound_folder: Path) -> SpoolBench:
-    """Two sound jobs with all broken ones between them; the videos are really looked at."""
+def finished_spool(tmp_path_factory: pytest.TempPathFactory, sound_folder: Path) -> SpoolFixture:
+    """Run two valid jobs with all broken ones between them; the real check inspects the videos."""
     folder = tmp_path_factory.mktemp("spool")
     with pytest.MonkeyPatch.context() as monkeypatch:
-        bench = SpoolBench(folder)
+        bench = SpoolFixture(folder)
         bench.order(real=["check"])
         monkeypatch.setenv(ORDERS, str(bench.orders))
         monkeypatch.chdir(folder)
@@ -37,11 +37,11 @@ def worked_off(tmp_path_factory: pytest.TempPathFactory, sound_folder: Path) -> 
             _drop(bench, sound_folder, name, None)
         for case in CASES:
             _drop(bench, sound_folder, folder_of(case), case)
-        bench.work_off(jobs=2)
+        bench.run_once(jobs=2)
     return bench
 
 
-def _drop(bench: SpoolBench, sound_folder: Path, name: str, case: Case | None) -> None:
+def _drop(bench: SpoolFixture, sound_folder: Path, name: str, case: Case | None) -> None:
     made = Path(shutil.copytree(sound_folder, bench.folder / "making" / name))
     if case is not None:
         case.break_it(made)
@@ -50,14 +50,14 @@ def _drop(bench: SpoolBench, sound_folder: Path, name: str, case: Case | None) -
 
 
 @pytest.mark.parametrize("name", [FIRST, LAST])
-def test_the_sound_jobs_are_done(worked_off: SpoolBench, name: str) -> None:
-    assert worked_off.status(name)["state"] == "done"
-    assert (worked_off.job(name).result / "metrics.json").is_file()
+def test_the_valid_jobs_are_done(finished_spool: SpoolFixture, name: str) -> None:
+    assert finished_spool.status(name)["state"] == "done"
+    assert (finished_spool.job(name).result / "metrics.json").is_file()
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_a_broken_job_is_filed_under_failed_with_its_reason(worked_off: SpoolBench, case: Case) -> None:
-    status = worked_off.status(folder_of(case))
+def test_a_broken_job_is_filed_under_failed_with_its_reason(finished_spool: SpoolFixture, case: Case) -> None:
+    status = finished_spool.status(folder_of(case))
     code = IN_A_SPOOL.get(case.name, case.code)
     if code is None:
         assert status["state"] == "done"
@@ -69,9 +69,9 @@ def test_a_broken_job_is_filed_under_failed_with_its_reason(worked_off: SpoolBen
     assert Path(error["path"]).name == case.file
     assert error["hint"]
     assert status["stage"] in ("", "check")
-    assert worked_off.job(folder_of(case)).path.parent == worked_off.spool.root / "failed"
+    assert finished_spool.job(folder_of(case)).path.parent == finished_spool.spool.root / "failed"
 
 
-def test_nothing_is_left_waiting_or_running(worked_off: SpoolBench) -> None:
-    assert list(worked_off.spool.inbox.iterdir()) == []
-    assert list(worked_off.spool.running.iterdir()) == []
+def test_nothing_is_left_waiting_or_running(finished_spool: SpoolFixture) -> None:
+    assert list(finished_spool.spool.inbox.iterdir()) == []
+    assert list(finished_spool.spool.running.iterdir()) == []

@@ -27,7 +27,7 @@ BODYCAP = (sys.executable, str(Path(__file__).with_name("fake_bodycap.py")))
 
 
 class Bench:
-    """A folder with two videos to run `bodycap` in."""
+    """A folder with two videos in which `bodycap` runs."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -88,11 +88,11 @@ def test_a_folder_runs_without_a_job_and_the_last_line_names_the_results(bench: 
         assert line in err
 
 
-def test_the_second_run_says_that_nothing_had_to_be_done(bench: Bench) -> None:
+def test_the_second_run_has_nothing_to_do(bench: Bench) -> None:
     bench.run("run", "my walk")
     code, out, _ = bench.run("run", "my walk")
     assert code == 0
-    assert "nothing to do, all 10 stages were done before" in out
+    assert "nothing to do, all 10 stages were finished before" in out
 
 
 def test_results_elsewhere_have_their_store_beside_them(bench: Bench) -> None:
@@ -109,21 +109,24 @@ def test_the_store_can_be_named_by_option_or_variable(bench: Bench) -> None:
     assert "nothing to do" in bench.run("run", "my walk", "--out", "elsewhere")[1]
 
 
-def test_a_stage_asked_for_is_told_by_its_own_name(bench: Bench) -> None:
+def test_a_run_until_registration_names_that_stage(bench: Bench) -> None:
     bench.order(localised=[40], lost={"torso": 3})
     code, out, _ = bench.run("run", "my walk", "--until", "registration")
-    assert (code, out) == (0, "my_walk: stopped after registration, as asked; run it again for the rest\n")
+    assert (code, out) == (
+        0,
+        "my_walk: stopped after registration, as requested; run it again for the rest\n",
+    )
 
 
 @pytest.mark.slow
-def test_stages_are_done_again_left_out_explained_and_cleaned_away(bench: Bench) -> None:
+def test_stages_are_repeated_skipped_explained_and_removed(bench: Bench) -> None:
     code, out, _ = bench.run("run", "my walk", "--until", "keyframes")
-    assert (code, out) == (0, "my_walk: stopped after keyframes, as asked; run it again for the rest\n")
+    assert (code, out) == (0, "my_walk: stopped after keyframes, as requested; run it again for the rest\n")
     code, out, _ = bench.run("why", "my walk")
     assert code == 0
-    said = [" ".join(line.split()) for line in out.splitlines()]
-    assert "map would run: not computed before" in said
-    assert "merge would run: after map" in said
+    lines = [" ".join(line.split()) for line in out.splitlines()]
+    assert "map would run: not computed before" in lines
+    assert "merge would run: after map" in lines
     bench.run("run", "my walk")
     assert bench.run("why", "my walk")[1].splitlines()[-1] == "nothing to do"
     _, _, err = bench.run("run", "my walk", "--from", "merge")
@@ -137,12 +140,12 @@ def test_stages_are_done_again_left_out_explained_and_cleaned_away(bench: Bench)
     code, out, _ = bench.run("gc")
     assert code == 0
     assert "would remove" in out
-    assert "(--delete does it)" in out
+    assert "(--delete removes them)" in out
     assert out.replace("would remove", "removed").partition(" (")[0] in bench.run("gc", "--delete")[1]
     assert json.loads(bench.run("gc", "--json")[1])["artefacts"] == []
 
 
-def test_progress_for_machines_is_json_on_every_line(bench: Bench) -> None:
+def test_json_progress_has_json_on_every_line(bench: Bench) -> None:
     code, out, err = bench.run("run", "my walk", "--json-progress")
     assert code == 0, err
     events = [json.loads(line) for line in out.splitlines()]
@@ -151,7 +154,7 @@ def test_progress_for_machines_is_json_on_every_line(bench: Bench) -> None:
     assert events[-1]["out_dir"] == str(bench.folder / "out" / "my_walk")
 
 
-def test_a_failure_is_told_to_machines_too(bench: Bench) -> None:
+def test_json_progress_includes_a_failure(bench: Bench) -> None:
     bench.order(fail="map")
     code, out, err = bench.run("run", "my walk", "--json-progress")
     last = json.loads(out.splitlines()[-1])
@@ -182,7 +185,7 @@ def test_a_terminal_gets_bars(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_stops_the_children_and_the_next_run_goes_on(
+def test_a_signal_stops_the_children_and_the_next_run_continues(
     bench: Bench, number: signal.Signals, code: int
 ) -> None:
     bench.order(hang="map")
@@ -202,7 +205,7 @@ def test_a_signal_stops_the_children_and_the_next_run_goes_on(
 
 
 @pytest.mark.slow
-def test_kill_9_at_any_stage_costs_that_stage_only(bench: Bench) -> None:
+def test_kill_9_at_any_stage_loses_only_that_stage(bench: Bench) -> None:
     reference = Bench(_made(bench.folder / "reference"))
     reference.run("run", "my walk")
     expected = results_of(reference.folder / "out" / "my_walk")
@@ -222,7 +225,7 @@ def test_kill_9_at_any_stage_costs_that_stage_only(bench: Bench) -> None:
     assert results_of(bench.folder / "out" / "my_walk") == expected
 
 
-def test_the_same_job_run_twice_at_the_same_time_comes_out_right(bench: Bench) -> None:
+def test_two_runs_of_a_job_at_the_same_time_give_its_results(bench: Bench) -> None:
     both = [bench.start("run", "my walk") for _ in range(2)]
     ends = [process.communicate(timeout=90) for process in both]
     assert [process.returncode for process in both] == [0, 0], ends
@@ -277,7 +280,7 @@ def test_a_disk_that_fills_up_leaves_earlier_results_intact(tmp_path: Path) -> N
     assert done.returncode == 0, done.stderr
 
 
-def test_no_answer_from_the_data_is_exit_code_4_with_partial_results(bench: Bench) -> None:
+def test_insufficient_data_is_exit_code_4_with_partial_results(bench: Bench) -> None:
     bench.order(fail="merge")
     code, _, err = bench.run("run", "my walk")
     assert code == 4
@@ -286,7 +289,7 @@ def test_no_answer_from_the_data_is_exit_code_4_with_partial_results(bench: Benc
     assert (bench.folder / "out" / "my_walk" / "partial" / "metrics.json").is_file()
 
 
-def test_a_bug_is_exit_code_70_with_a_traceback_and_what_to_report(bench: Bench) -> None:
+def test_a_bug_is_exit_code_70_with_a_traceback(bench: Bench) -> None:
     (bench.folder / "orders.json").write_text("no JSON")
     code, _, err = bench.run("run", "my walk")
     assert code == 70
@@ -312,7 +315,7 @@ def test_a_bug_is_exit_code_70_with_a_traceback_and_what_to_report(bench: Bench)
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_what_the_user_typed_wrong_is_named(
+def test_wrong_arguments_are_named(
     bench: Bench, capfd: pytest.CaptureFixture[str], arguments: list[str], code: int, words: str
 ) -> None:
     (bench.folder / "empty").mkdir()
@@ -323,7 +326,7 @@ def test_what_the_user_typed_wrong_is_named(
     assert "Traceback" not in captured.err
 
 
-def test_an_unwritable_place_for_results_is_named(bench: Bench) -> None:
+def test_an_unwritable_results_folder_is_named(bench: Bench) -> None:
     (bench.folder / "out").write_text("a file")
     code, _, err = bench.run("run", "my walk")
     assert code == 5
@@ -331,14 +334,14 @@ def test_an_unwritable_place_for_results_is_named(bench: Bench) -> None:
     assert "hint:" in err
 
 
-def test_the_list_of_commands_says_each_in_a_whole_sentence(capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_list_of_commands_has_whole_sentences(capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     listed = capfd.readouterr().out.partition("Commands:")[2]
     assert "gc " in listed
     assert "..." not in listed
 
 
-def test_a_disk_that_does_not_answer_is_no_bug(
+def test_a_disk_that_does_not_answer_is_not_a_bug(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     def stale(path: Path) -> Path:
@@ -346,13 +349,13 @@ def test_a_disk_that_does_not_answer_is_no_bug(
 
     monkeypatch.setattr(Path, "resolve", stale)
     assert main(["check", "walk"]) == 5
-    told = capfd.readouterr().err
-    assert "error: walk: Stale file handle" in told
-    assert "mounted" in told
-    assert "bug" not in told
+    output = capfd.readouterr().err
+    assert "error: walk: Stale file handle" in output
+    assert "mounted" in output
+    assert "bug" not in output
 
 
-def test_the_version_is_told(capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_version_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     assert capfd.readouterr().out.strip() == f"bodycap {bodycap_batch.__version__}"
 

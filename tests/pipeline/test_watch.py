@@ -1,4 +1,4 @@
-"""A watched folder with stand-in stages: claims, results, refusals, resume, cancelling."""
+"""A watched folder with stand-in stages: claims, results, refusals, continuation, cancellation."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from bodycap_batch.watch.commands import job_row
 from bodycap_batch.watch.inbox_entries import EntrySnapshot, InboxEntry, take_snapshot
 from bodycap_batch.watch.job_status import JobStatusFile
 from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir
-from tests.pipeline.spools import SpoolBench, wait_for
+from tests.pipeline.spools import SpoolFixture, wait_for
 from tests.pipeline.test_cli import gone
 
 
-def leftovers(bench: SpoolBench) -> list[str]:
-    """What is neither waiting nor filed away, hidden folders included."""
+def leftovers(bench: SpoolFixture) -> list[str]:
+    """Return the names in `running`, including hidden folders."""
     return sorted(path.name for path in bench.spool.running.iterdir())
 
 
-def test_a_dropped_folder_ends_in_done_with_results_footage_and_a_status(bench: SpoolBench) -> None:
+def test_a_dropped_folder_ends_in_done_with_results_videos_and_a_status(bench: SpoolFixture) -> None:
     bench.drop("küchen gang 1")
-    assert bench.work_off() == 0, bench.told
+    assert bench.run_once() == 0, bench.lines
     job = bench.job("küchen gang 1")
     assert job.path.parent == bench.spool.done
     assert (job.result / "metrics.json").is_file()
@@ -56,13 +56,13 @@ def test_a_dropped_folder_ends_in_done_with_results_footage_and_a_status(bench: 
 
 
 @pytest.mark.slow
-def test_the_job_of_the_results_runs_again_from_where_it_lies(bench: SpoolBench) -> None:
+def test_the_job_file_of_the_results_can_be_run_again(bench: SpoolFixture) -> None:
     bench.drop("walk")
-    bench.work_off()
+    bench.run_once()
     for file in (bench.job("walk").result / "job.yaml", bench.job("walk").job):
         videos = [camera["video"] for camera in yaml.safe_load(file.read_text())["capture"]["cameras"]]
         assert all((file.parent / path).is_file() for paths in videos for path in paths)
-        assert main(["check", str(file), "--json"]) in (0, 3)  # the stand-in videos are no videos
+        assert main(["check", str(file), "--json"]) in (0, 3)  # the stand-in videos cannot be decoded
     process = bench.start("run", "jobs/done/walk/result/job.yaml", "--store", "jobs/.store")
     out, err = process.communicate(timeout=60)
     assert "map: already done" in err
@@ -70,7 +70,7 @@ def test_the_job_of_the_results_runs_again_from_where_it_lies(bench: SpoolBench)
     assert "results:" in out
 
 
-def test_a_job_file_in_the_folder_decides_and_is_resolved_where_it_lay(bench: SpoolBench) -> None:
+def test_a_job_file_in_the_folder_is_used_and_resolved_in_the_inbox(bench: SpoolFixture) -> None:
     dropped = bench.spool.inbox / "walk"
     torso, palm = "{name: torso, video: torso.mp4}", f"{{name: left_palm, video: {dropped}/left_palm.mp4}}"
     job = (
@@ -78,7 +78,7 @@ def test_a_job_file_in_the_folder_decides_and_is_resolved_where_it_lay(bench: Sp
         f"    - {torso}\n    - {palm}\n"
     )
     bench.drop("walk", job)
-    assert bench.work_off() == 0, bench.told
+    assert bench.run_once() == 0, bench.lines
     resolved = yaml.safe_load(bench.job("walk").job.read_text())
     assert resolved["name"] == "walk"
     assert resolved["height_m"] == 1.7
@@ -89,16 +89,16 @@ def test_a_job_file_in_the_folder_decides_and_is_resolved_where_it_lay(bench: Sp
     assert not (bench.folder / "somewhere").exists()
 
 
-def test_a_job_file_alone_names_footage_below_an_opened_folder(bench: SpoolBench) -> None:
+def test_a_single_job_file_may_name_videos_below_a_permitted_folder(bench: SpoolFixture) -> None:
     footage = bench.drop("walk").rename(bench.folder / "footage")
     text = f"capture: {{cameras: [{{name: torso, video: {footage}/torso.mp4}}]}}"
     (bench.spool.inbox / "evening.yaml").write_text(text)
-    assert bench.work_off(roots=(footage,)) == 0, bench.told
+    assert bench.run_once(roots=(footage,)) == 0, bench.lines
     job = bench.job("evening")
     assert [path.name for path in job.input.iterdir()] == ["evening.yaml"]
     assert (footage / "torso.mp4").is_file()
     (bench.spool.inbox / "evening.yaml").write_text(text)
-    assert bench.work_off() == 2
+    assert bench.run_once() == 2
     error = bench.status("evening-2")["error"]
     assert str(footage / "torso.mp4") in error["message"]
     assert "--root" in error["hint"]
@@ -133,14 +133,14 @@ ONE = "capture: {{cameras: [{{name: torso, video: {}}}]}}"
     ],
     ids=lambda value: value[:60],
 )
-def test_a_job_that_names_what_it_may_not_is_refused_with_the_reason(
-    bench: SpoolBench, make: str, words: str
+def test_a_job_with_a_path_that_is_not_permitted_is_refused(
+    bench: SpoolFixture, make: str, words: str
 ) -> None:
     (bench.folder / "secret.mp4").write_text("not yours")
     dropped = bench.drop("walk", make)
     (dropped / "link.mp4").symlink_to(bench.folder / "secret.mp4")
     (dropped / "loop.mp4").symlink_to("loop.mp4")
-    assert bench.work_off() in (2, 3)
+    assert bench.run_once() in (2, 3)
     job = bench.job("walk")
     assert job.path.parent == bench.spool.failed
     error = bench.status("walk")["error"]
@@ -152,51 +152,53 @@ def test_a_job_that_names_what_it_may_not_is_refused_with_the_reason(
     assert (job.input / "torso.mp4").is_file()
 
 
-def test_a_video_that_is_a_link_outside_is_refused_in_a_folder_without_a_job(bench: SpoolBench) -> None:
+def test_a_video_that_is_a_link_outside_is_refused_in_a_folder_without_a_job(bench: SpoolFixture) -> None:
     (bench.folder / "secret.mp4").write_text("not yours")
     (bench.drop("walk") / "head.mp4").symlink_to(bench.folder / "secret.mp4")
-    assert bench.work_off() == 2
+    assert bench.run_once() == 2
     assert "secret.mp4, which is outside" in bench.status("walk")["error"]["message"]
 
 
 @pytest.mark.slow
-def test_a_link_to_an_opened_folder_is_worked_on_where_it_leads(bench: SpoolBench) -> None:
+def test_a_link_to_a_permitted_folder_is_processed(bench: SpoolFixture) -> None:
     footage = bench.drop("walk").rename(bench.folder / "footage")
     (bench.spool.inbox / "linked").symlink_to(Path("../../footage"))
-    assert bench.work_off(roots=(bench.folder / "footage",)) == 0, bench.told
+    assert bench.run_once(roots=(bench.folder / "footage",)) == 0, bench.lines
     assert (footage / "torso.mp4").is_file()
     (bench.spool.inbox / "linked").symlink_to(Path("../../footage"))
-    assert bench.work_off() == 2
+    assert bench.run_once() == 2
     assert bench.job("linked-2").path.parent == bench.spool.failed
 
 
-def test_limits_hold_back_what_is_too_large(bench: SpoolBench) -> None:
+def test_jobs_beyond_the_limits_are_refused(bench: SpoolFixture) -> None:
     (bench.drop("large") / "head.mp4").write_bytes(bytes(3000))
     many = bench.drop("many")
     for number in range(20):
         (many / f"{number}.txt").touch()
     (bench.drop("odd") / "pipe.mp4").unlink(missing_ok=True)
     os.mkfifo(bench.spool.inbox / "odd" / "pipe.mp4")
-    assert bench.work_off(limits=Limits(video_gb=2e-6, files=10)) == 3
+    assert bench.run_once(limits=Limits(video_gb=2e-6, files=10)) == 3
     assert "the limit is 2e-06" in bench.status("large")["error"]["message"]
     assert "more than 10 files" in bench.status("many")["error"]["message"]
     assert "pipe.mp4 is neither" in bench.status("odd")["error"]["message"]
 
 
-def test_names_that_come_again_get_a_number_and_no_job_is_lost(bench: SpoolBench) -> None:
+def test_repeated_names_get_a_number_and_no_job_is_lost(bench: SpoolFixture) -> None:
     for _ in range(3):
         bench.drop("walk")
-        bench.work_off()
+        bench.run_once()
     (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
-    bench.work_off()
+    bench.run_once()
     assert sorted(job.name for job in bench.spool.jobs()) == ["walk", "walk-2", "walk-3", "walk-4"]
     assert bench.job("walk-4").path.parent == bench.spool.failed
 
 
 @pytest.mark.parametrize("name", ["a\nb", "-rf", "n" * 250, "ü" * 120, "e\u0301te", " lead"])
-def test_odd_names_are_worked_on(bench: SpoolBench, name: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_jobs_with_unusual_names_are_processed(
+    bench: SpoolFixture, name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     capture = bench.drop("walk").rename(bench.spool.inbox / name)
-    assert bench.work_off() == 0, bench.told
+    assert bench.run_once() == 0, bench.lines
     assert not capture.exists()
     (job,) = bench.spool.jobs()
     assert job.path.parent == bench.spool.done
@@ -205,18 +207,18 @@ def test_odd_names_are_worked_on(bench: SpoolBench, name: str, capfd: pytest.Cap
     assert "done" in capfd.readouterr().out
 
 
-def test_names_that_are_no_text_are_refused(bench: SpoolBench) -> None:
+def test_names_that_are_not_utf8_are_refused(bench: SpoolFixture) -> None:
     bench.drop("walk").rename(bench.spool.inbox / os.fsdecode(b"walk \xff"))
     torso = bench.drop("other") / "torso.mp4"
     torso.rename(torso.with_name(os.fsdecode(b"torso \xfe.mp4")))
-    assert bench.work_off() == 2
-    assert "walk \\udcff is no UTF-8 text" in bench.status("walk _")["error"]["message"]
-    assert "torso \\udcfe.mp4 is no UTF-8 text" in bench.status("other")["error"]["message"]
+    assert bench.run_once() == 2
+    assert "walk \\udcff is not UTF-8 text" in bench.status("walk _")["error"]["message"]
+    assert "torso \\udcfe.mp4 is not UTF-8 text" in bench.status("other")["error"]["message"]
     assert main(["status"]) == 0
     assert os.path.lexists(retry_job(bench.spool, "walk _"))
 
 
-def test_a_job_waits_while_the_store_is_cleaned(bench: SpoolBench) -> None:
+def test_a_job_waits_while_the_store_is_cleaned(bench: SpoolFixture) -> None:
     bench.drop("walk")
     watcher = bench.watcher(once=False)
     thread = threading.Thread(target=watcher.run)
@@ -224,19 +226,19 @@ def test_a_job_waits_while_the_store_is_cleaned(bench: SpoolBench) -> None:
         with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
             fcntl.flock(cleaning, fcntl.LOCK_EX)
             thread.start()
-            wait_for(lambda: any("goes on later" in line for line in bench.told))
-            cause = f"goes on later: {bench.spool.root / '.store'}: the store is being cleaned"
+            wait_for(lambda: any("continues later" in line for line in bench.lines))
+            cause = f"continues later: {bench.spool.root / '.store'}: the store is being cleaned"
             wait_for(lambda: job_row(bench.job("walk")).cause == cause)
         wait_for((bench.spool.done / "walk").is_dir)
     finally:
         watcher.stop()
         thread.join()
     assert bench.status("walk")["attempts"] == 1
-    message = "walk: stopped: goes on later: the store is being cleaned"
-    assert bench.told == ["walk: started", message, f"walk: done -> {bench.spool.done / 'walk'}"]
+    message = "walk: stopped: continues later: the store is being cleaned"
+    assert bench.lines == ["walk: started", message, f"walk: done -> {bench.spool.done / 'walk'}"]
 
 
-def test_a_job_that_waits_for_a_cleaner_says_so_once(bench: SpoolBench) -> None:
+def test_waiting_for_gc_is_reported_once(bench: SpoolFixture) -> None:
     bench.drop("walk")
     watcher = bench.watcher(once=False)
     thread = threading.Thread(target=watcher.run)
@@ -244,45 +246,45 @@ def test_a_job_that_waits_for_a_cleaner_says_so_once(bench: SpoolBench) -> None:
         fcntl.flock(cleaning, fcntl.LOCK_EX)
         thread.start()
         try:
-            wait_for(lambda: bool(bench.told) and bench.generation("walk") > 2)
-            told = list(bench.told)
+            wait_for(lambda: bool(bench.lines) and bench.generation("walk") > 2)
+            lines = list(bench.lines)
         finally:
             watcher.stop()
             thread.join()
-    assert [line.partition(": goes on")[0] for line in told] == ["walk: started", "walk: stopped"]
+    assert [line.partition(": continues")[0] for line in lines] == ["walk: started", "walk: stopped"]
 
 
-def test_a_watcher_that_works_off_what_is_there_leaves_no_job_behind(bench: SpoolBench) -> None:
-    for name in ("one", "two"):  # left by a watcher that had room for both
+def test_a_watcher_with_once_leaves_no_job_behind(bench: SpoolFixture) -> None:
+    for name in ("one", "two"):  # left by a watcher with two job slots
         bench.drop(name)
-    bench.work_off()
+    bench.run_once()
     for name in ("one", "two"):
-        place = JobDir(Path(shutil.move(bench.job(name).path, bench.spool.running / name)))
-        create_claim(place).release()
+        job_dir = JobDir(Path(shutil.move(bench.job(name).path, bench.spool.running / name)))
+        create_claim(job_dir).release()
     bench.drop("walk")
     with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
         fcntl.flock(cleaning, fcntl.LOCK_EX)
         watcher = bench.watcher()
         thread = threading.Thread(target=watcher.run)
         thread.start()
-        wait_for(lambda: any("goes on later" in line for line in bench.told))
+        wait_for(lambda: any("continues later" in line for line in bench.lines))
     thread.join(30)
     assert not thread.is_alive()
     assert sorted(path.name for path in bench.spool.done.iterdir()) == ["one", "two", "walk"]
     assert leftovers(bench) == []
 
 
-def test_folders_that_were_cleared_away_are_made_again(bench: SpoolBench) -> None:
+def test_removed_folders_are_created_again(bench: SpoolFixture) -> None:
     watcher = bench.watcher()
     shutil.rmtree(bench.spool.done)
     shutil.rmtree(bench.spool.running)
     bench.drop("walk")
-    assert watcher.run() == 0, bench.told
+    assert watcher.run() == 0, bench.lines
     assert bench.job("walk").path == bench.spool.done / "walk"
 
 
 @pytest.mark.slow
-def test_a_job_that_cannot_be_filed_away_is_told_and_filed_later(bench: SpoolBench) -> None:
+def test_a_job_that_cannot_be_filed_is_reported_and_filed_later(bench: SpoolFixture) -> None:
     bench.drop("walk")
     watcher = bench.watcher(stale_s=1.0, once=False)
     bench.spool.done.rmdir()
@@ -290,7 +292,7 @@ def test_a_job_that_cannot_be_filed_away_is_told_and_filed_later(bench: SpoolBen
     thread = threading.Thread(target=watcher.run)
     thread.start()
     try:
-        wait_for(lambda: any(line.startswith("walk: stuck") for line in bench.told))
+        wait_for(lambda: any(line.startswith("walk: stuck") for line in bench.lines))
         assert (bench.spool.running / "walk" / "result" / "metrics.json").is_file()
         bench.spool.done.unlink()
         wait_for((bench.spool.done / "walk" / "status.json").is_file)
@@ -299,7 +301,7 @@ def test_a_job_that_cannot_be_filed_away_is_told_and_filed_later(bench: SpoolBen
         thread.join()
 
 
-def test_a_drop_that_cannot_be_taken_is_told_once_and_tried_again(bench: SpoolBench) -> None:
+def test_an_entry_that_cannot_be_moved_is_reported_once_and_tried_again(bench: SpoolFixture) -> None:
     bench.drop("walk")
     watcher = bench.watcher(stale_s=1.0, once=False)
     shutil.rmtree(bench.spool.running)
@@ -307,52 +309,50 @@ def test_a_drop_that_cannot_be_taken_is_told_once_and_tried_again(bench: SpoolBe
     thread = threading.Thread(target=watcher.run)
     thread.start()
     try:
-        wait_for(lambda: len(bench.told) > 0)
-        assert "cannot be taken" in bench.told[0]
+        wait_for(lambda: len(bench.lines) > 0)
+        assert "cannot be moved" in bench.lines[0]
         bench.spool.running.unlink()
         wait_for((bench.spool.done / "walk").is_dir)
-        assert sum("cannot be taken" in line for line in bench.told) == 1
+        assert sum("cannot be moved" in line for line in bench.lines) == 1
     finally:
         watcher.stop()
         thread.join()
 
 
-def test_footage_is_given_back_where_it_cannot_be_looked_at_any_more(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+def test_an_entry_is_returned_if_it_cannot_be_read_any_more(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = {path.name: path.read_bytes() for path in bench.drop("walk").iterdir()}
 
-    def fail(
-        *_: object,
-    ) -> EntrySnapshot:  # a copying program renames a file just now, a network disk hiccups
+    def fail(*_: object) -> EntrySnapshot:  # as if a copying program renames a file
         raise FileNotFoundError(errno.ENOENT, "gone", "head.mp4")
 
-    terms = JobPermissions()
-    drop = InboxEntry(bench.spool.inbox / "walk")
-    look = take_snapshot(drop, 100)
+    permissions = JobPermissions()
+    entry = InboxEntry(bench.spool.inbox / "walk")
+    snapshot = take_snapshot(entry, 100)
     monkeypatch.setattr(inbox_transfer, "take_snapshot", fail)
     with pytest.raises(StoreError):
-        inbox_transfer.claim_entry(bench.spool, drop, look, terms)
-    assert {path.name: path.read_bytes() for path in drop.path.iterdir()} == before
+        inbox_transfer.claim_entry(bench.spool, entry, snapshot, permissions)
+    assert {path.name: path.read_bytes() for path in entry.path.iterdir()} == before
     assert leftovers(bench) == []
 
 
-def test_an_abandoned_claim_is_removed_only_while_nothing_is_in_it(bench: SpoolBench) -> None:
+def test_an_abandoned_claim_is_removed_only_if_it_is_empty(bench: SpoolFixture) -> None:
     for name, dropped in (("empty", False), ("full", True)):
-        place = JobDir(bench.spool.running / f"{CLAIM_PREFIX}{name}")
-        place.path.mkdir()
-        create_claim(place).release()
+        job_dir = JobDir(bench.spool.running / f"{CLAIM_PREFIX}{name}")
+        job_dir.path.mkdir()
+        create_claim(job_dir).release()
         if dropped:
-            bench.drop("walk").rename(place.input)
-            JobStatusFile(place).update(dropped="walk")
-    assert bench.work_off() == JobError.exit_code
+            bench.drop("walk").rename(job_dir.input)
+            JobStatusFile(job_dir).update(dropped="walk")
+    assert bench.run_once() == JobError.exit_code
     assert bench.status("walk")["error"]["message"] == "the job was never read"
     assert (bench.job("walk").input / "torso.mp4").is_file()
     assert leftovers(bench) == []
 
 
 def test_a_job_that_cannot_be_taken_over_stops_no_watcher(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     create_claim(JobDir(bench.drop("left").rename(bench.spool.running / "left"))).release()
     bench.drop("walk")
@@ -361,24 +361,24 @@ def test_a_job_that_cannot_be_taken_over_stops_no_watcher(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("bodycap_batch.watch.watcher.take_over_job", fail)
-    assert bench.work_off() == StoreError.exit_code
+    assert bench.run_once() == StoreError.exit_code
     assert bench.status("walk")["state"] == "done"
-    assert any(line.startswith("left: cannot be taken over") for line in bench.told)
+    assert any(line.startswith("left: cannot be taken over") for line in bench.lines)
 
 
-def test_what_is_no_job_stays_in_the_inbox_and_is_told(bench: SpoolBench) -> None:
+def test_paths_that_are_not_jobs_stay_in_the_inbox_and_are_listed(bench: SpoolFixture) -> None:
     (bench.spool.inbox / "torso.mp4").write_text("a video without a folder")
     (bench.spool.inbox / ".hidden").mkdir()
     (bench.spool.inbox / "copying.part").mkdir()
-    assert bench.work_off() == 0
+    assert bench.run_once() == 0
     states = {row.name: row.state for row in job_rows(bench.spool)}
     assert states == {"torso.mp4": "ignored", "copying.part": "ignored"}
 
 
-def test_a_failed_job_says_why_keeps_what_there_is_and_can_be_retried(bench: SpoolBench) -> None:
+def test_a_failed_job_keeps_partial_results_and_can_be_retried(bench: SpoolFixture) -> None:
     bench.order(fail="merge")
     bench.drop("walk")
-    assert bench.work_off() == 4
+    assert bench.run_once() == 4
     job = bench.job("walk")
     assert job.path.parent == bench.spool.failed
     status = bench.status("walk")
@@ -390,32 +390,32 @@ def test_a_failed_job_says_why_keeps_what_there_is_and_can_be_retried(bench: Spo
     assert video.is_file()
     bench.order()
     assert retry_job(bench.spool, "walk") == bench.spool.inbox / "walk"
-    assert bench.work_off() == 0
+    assert bench.run_once() == 0
     status = bench.status("walk")
     fresh = {stage["stage"].split()[0] for stage in status["finished_stages"] if not stage["reused"]}
     assert {"merge", "export"} <= fresh
     assert fresh.isdisjoint({"check", "keyframes", "map", "registration"})
 
 
-def test_a_job_file_comes_back_as_a_file_when_it_is_retried(bench: SpoolBench) -> None:
+def test_a_retried_job_file_is_a_file_again(bench: SpoolFixture) -> None:
     (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
-    assert bench.work_off() == 2
+    assert bench.run_once() == 2
     assert retry_job(bench.spool, "walk") == bench.spool.inbox / "walk.yaml"
     assert (bench.spool.inbox / "walk.yaml").read_text() == "capture: {}"
     assert list(bench.spool.jobs()) == []
 
 
-def test_a_bug_fails_its_job_alone(bench: SpoolBench) -> None:
+def test_a_bug_fails_only_its_job(bench: SpoolFixture) -> None:
     bench.orders.write_text("no JSON")
     bench.drop("first")
-    assert bench.work_off() == 70
+    assert bench.run_once() == 70
     assert "Traceback" in "".join(path.read_text() for path in bench.job("first").result.glob("logs/*.log"))
     bench.order()
     bench.drop("second")
-    assert bench.work_off() == 0
+    assert bench.run_once() == 0
 
 
-def test_a_copy_in_progress_is_left_alone_until_it_is_complete(bench: SpoolBench) -> None:
+def test_a_copy_in_progress_stays_in_the_inbox_until_it_is_complete(bench: SpoolFixture) -> None:
     dropped = bench.drop("walk", ready=False)
     (dropped / "head.mp4.part").write_text("half")
     watcher = bench.watcher(once=False)
@@ -436,13 +436,13 @@ def test_a_copy_in_progress_is_left_alone_until_it_is_complete(bench: SpoolBench
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow)]
 )
-def test_a_stopped_watcher_leaves_its_job_and_the_next_one_goes_on(
-    bench: SpoolBench, number: signal.Signals, code: int
+def test_the_next_watcher_continues_the_job_of_a_stopped_one(
+    bench: SpoolFixture, number: signal.Signals, code: int
 ) -> None:
     bench.drop("walk")
     bench.order(hang="map")
     process = bench.start("watch", "jobs/inbox", "--threads", "1")
-    child = bench.hanging()
+    child = bench.wait_until_hanging()
     process.send_signal(number)
     _, err = process.communicate(timeout=30)
     assert process.returncode == code, err
@@ -452,7 +452,7 @@ def test_a_stopped_watcher_leaves_its_job_and_the_next_one_goes_on(
     assert job.path.parent == bench.spool.running
     assert bench.status("walk")["state"] == "stopped"
     bench.order()
-    assert bench.work_off() == 0
+    assert bench.run_once() == 0
     status = bench.status("walk")
     assert status["attempts"] == 2
     reused = [stage["stage"] for stage in status["finished_stages"] if stage["reused"]]
@@ -462,26 +462,26 @@ def test_a_stopped_watcher_leaves_its_job_and_the_next_one_goes_on(
 
 
 @pytest.mark.slow
-def test_a_killed_watcher_is_replaced_at_once_on_the_same_machine(bench: SpoolBench) -> None:
+def test_a_killed_watcher_is_replaced_at_once_on_the_same_machine(bench: SpoolFixture) -> None:
     bench.drop("walk")
     bench.order(hang="map")
     process = bench.start("watch", "jobs/inbox", "--threads", "1")
-    bench.hanging()
+    bench.wait_until_hanging()
     process.kill()
     process.wait()
     (row,) = job_rows(bench.spool)
     assert row.state == "interrupted"
     bench.order()
-    assert bench.work_off(stale_s=1000.0) == 0
+    assert bench.run_once(stale_s=1000.0) == 0
     assert bench.job("walk").path.parent == bench.spool.done
 
 
 @pytest.mark.slow
-def test_a_job_is_cancelled_within_five_seconds_and_goes_on_when_retried(bench: SpoolBench) -> None:
+def test_a_job_is_cancelled_within_five_seconds_and_continues_when_retried(bench: SpoolFixture) -> None:
     bench.drop("walk")
     bench.order(hang="map")
     process = bench.start("watch", "jobs/inbox", "--threads", "1")
-    child = bench.hanging()
+    child = bench.wait_until_hanging()
     assert cancel_job(bench.spool, "walk", wait_s=5.0) is not None
     assert gone(child)
     assert bench.status("walk")["state"] == "cancelled"
@@ -494,12 +494,12 @@ def test_a_job_is_cancelled_within_five_seconds_and_goes_on_when_retried(bench: 
     assert {"stage": "check", "reused": True}.items() <= bench.status("walk")["finished_stages"][0].items()
 
 
-def test_what_done_and_failed_jobs_were_made_from_is_not_taken_for_garbage(bench: SpoolBench) -> None:
+def test_artefacts_of_done_and_failed_jobs_are_not_garbage(bench: SpoolFixture) -> None:
     bench.drop("good")
-    bench.work_off()
+    bench.run_once()
     bench.order(fail="merge")
     bench.drop("bad")
-    bench.work_off()
+    bench.run_once()
     store = Store(bench.spool.root / ".store")
     assert collect_garbage(store, delete=True).artefacts == ()
     shutil.rmtree(bench.job("bad").path)
@@ -507,21 +507,21 @@ def test_what_done_and_failed_jobs_were_made_from_is_not_taken_for_garbage(bench
     assert {"keyframes", "map", "registration", "export"} <= unused
 
 
-def test_a_waiting_job_is_cancelled_where_it_lies(bench: SpoolBench) -> None:
+def test_a_waiting_job_can_be_cancelled(bench: SpoolFixture) -> None:
     bench.drop("walk")
     job = cancel_job(bench.spool, "walk")
     assert job is not None
     assert job.path == bench.spool.failed / "walk"
     assert bench.status("walk")["state"] == "cancelled"
     assert retry_job(bench.spool, "walk") == bench.spool.inbox / "walk"
-    assert bench.work_off() == 0
+    assert bench.run_once() == 0
     for action in (retry_job, cancel_job):
         with pytest.raises(JobError, match="done"):
             action(bench.spool, "walk")
 
 
 @pytest.mark.slow
-def test_two_watchers_share_the_work_and_never_a_job(bench: SpoolBench) -> None:
+def test_two_watchers_share_the_work_and_never_a_job(bench: SpoolFixture) -> None:
     names = [f"walk {number}" for number in range(6)]
     for name in names:
         bench.drop(name)
@@ -538,15 +538,15 @@ def test_two_watchers_share_the_work_and_never_a_job(bench: SpoolBench) -> None:
 
 
 @pytest.mark.slow
-def test_a_watcher_that_was_suspended_gives_up_when_it_wakes(bench: SpoolBench) -> None:
+def test_a_suspended_watcher_gives_up_a_lost_job_when_it_resumes(bench: SpoolFixture) -> None:
     bench.drop("walk")
     bench.order(hang="map")
     process = bench.start("watch", "jobs/inbox", "--threads", "1")
-    child = bench.hanging()
+    child = bench.wait_until_hanging()
     process.send_signal(signal.SIGSTOP)
     bench.order()
     try:
-        # Another machine, to which the suspended process is but a heartbeat that stands still.
+        # As seen from another machine, which sees only that the heartbeat has stopped.
         owner = bench.job("walk").owner
         owner.write_text(json.dumps({**json.loads(owner.read_text()), "machine": "elsewhere"}))
         watcher = bench.watcher(stale_s=1.0, once=False)
@@ -567,7 +567,7 @@ def test_a_watcher_that_was_suspended_gives_up_when_it_wakes(bench: SpoolBench) 
     assert leftovers(bench) == []
 
 
-def test_an_owner_that_was_replaced_writes_nothing_more(bench: SpoolBench) -> None:
+def test_a_replaced_owner_writes_nothing_more(bench: SpoolFixture) -> None:
     job = JobDir(bench.drop("walk").rename(bench.spool.running / "walk"))
     first = create_claim(job)
     status = JobStatusFile(job, None, first.ownership.is_held)
@@ -581,7 +581,7 @@ def test_an_owner_that_was_replaced_writes_nothing_more(bench: SpoolBench) -> No
     assert {path: path.read_bytes() for path in before} == before
 
 
-def test_only_one_takes_a_job_over(bench: SpoolBench) -> None:
+def test_only_one_watcher_takes_a_job_over(bench: SpoolFixture) -> None:
     job = JobDir(bench.drop("walk").rename(bench.spool.running / "walk"))
     first = create_claim(job)
     claims: list[object] = []
@@ -597,29 +597,29 @@ def test_only_one_takes_a_job_over(bench: SpoolBench) -> None:
     for thread in threads:
         thread.join()
     held = [claim for claim in claims if claim is not None]
-    # Each that came too late for a number may still get the next one; the last of them alone holds the job.
+    # A watcher that fails to get a generation may get the next one. Only the last one holds the job.
     assert sum(claim.ownership.is_held() for claim in held) == 1  # type: ignore[attr-defined]
     assert not first.ownership.is_held()
     first.write_heartbeat()
     assert first.lost.is_set()
 
 
-def test_a_watcher_that_ends_between_the_last_word_and_the_move_is_finished_by_the_next(
-    bench: SpoolBench,
+def test_a_job_with_a_final_status_is_filed_by_the_next_watcher(
+    bench: SpoolFixture,
 ) -> None:
     bench.drop("walk")
-    bench.work_off()
+    bench.run_once()
     job = bench.job("walk")
     metrics = (job.result / "metrics.json").stat().st_mtime_ns
-    place = JobDir(Path(shutil.move(job.path, bench.spool.running / "walk")))
-    create_claim(place).release()
-    assert bench.work_off() == 0
+    job_dir = JobDir(Path(shutil.move(job.path, bench.spool.running / "walk")))
+    create_claim(job_dir).release()
+    assert bench.run_once() == 0
     assert (bench.job("walk").result / "metrics.json").stat().st_mtime_ns == metrics
     assert bench.job("walk").path.parent == bench.spool.done
 
 
-def test_folders_on_different_disks_are_refused_with_the_remedy(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+def test_folders_on_different_disks_are_refused_with_a_remedy(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = Path("/dev/shm") / f"bodycap-{os.getpid()}"  # noqa: S108
     if not other.parent.is_dir() or other.parent.stat().st_dev == bench.folder.stat().st_dev:
@@ -638,18 +638,18 @@ def test_folders_on_different_disks_are_refused_with_the_remedy(
         shutil.rmtree(other)
 
 
-def test_the_table_of_jobs_is_for_people_and_for_programs(
-    bench: SpoolBench, capfd: pytest.CaptureFixture[str]
+def test_jobs_are_listed_as_a_table_and_as_json(
+    bench: SpoolFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
     bench.drop("good")
-    bench.work_off()
+    bench.run_once()
     bench.order(fail="map")
     bench.drop("bad")
-    bench.work_off()
+    bench.run_once()
     bench.drop("next")
     (bench.spool.inbox / "empty").mkdir()
-    for place in ("jobs", "jobs/inbox"):
-        assert main(["status", place]) == 0
+    for folder in ("jobs", "jobs/inbox"):
+        assert main(["status", folder]) == 0
         lines = capfd.readouterr().out.splitlines()
         words = {line.split()[0]: line for line in lines}
         assert words["good"].split()[1] == "done"

@@ -1,4 +1,4 @@
-"""A watched folder whose disk goes away, fails or refuses: the watcher waits, tells it, and loses nothing."""
+"""A watched folder with a failing disk: the watcher waits, reports it once, and loses nothing."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from bodycap_batch.watch.job_status import JobStatusFile, read_status
 from bodycap_batch.watch.job_worker import JobWorker
 from bodycap_batch.watch.spool import JobDir
 from bodycap_batch.watch.watcher_status import WatcherStatusFile
-from tests.pipeline.spools import SpoolBench, wait_for
+from tests.pipeline.spools import SpoolFixture, wait_for
 
 
 @contextmanager
@@ -41,7 +41,7 @@ def running(watcher: Watcher) -> Iterator[Watcher]:
 
 
 def failing(times: int, function: Callable[..., Any], number: int = errno.EIO) -> Callable[..., Any]:
-    """The function, which the disk fails under so many times."""
+    """Return the function, which raises a disk error for the first `times` calls."""
     left = [times]
 
     def fail(*arguments: Any, **values: Any) -> Any:
@@ -54,8 +54,8 @@ def failing(times: int, function: Callable[..., Any], number: int = errno.EIO) -
 
 
 @pytest.mark.parametrize("name", ["entries_in", "visible_entries", "ignored_paths_in"])
-def test_a_folder_that_cannot_be_read_for_a_while_is_waited_for(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, name: str
+def test_the_watcher_waits_for_a_folder_that_cannot_be_read(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     """`visible_entries` lists the running jobs, `entries_in` and `ignored_paths_in` list the inbox."""
     from bodycap_batch.watch import watcher as module
@@ -63,14 +63,14 @@ def test_a_folder_that_cannot_be_read_for_a_while_is_waited_for(
     bench.drop("walk")
     watcher = bench.watcher()
     monkeypatch.setattr(module, name, failing(2, getattr(module, name)))
-    assert watcher.run() == 0, bench.told
+    assert watcher.run() == 0, bench.lines
     assert bench.status("walk")["state"] == "done"
-    trouble = [line for line in bench.told if "Input/output error" in line]
-    assert len(trouble) == 1, "told once"
-    assert any("answers again" in line for line in bench.told)
+    failures = [line for line in bench.lines if "Input/output error" in line]
+    assert len(failures) == 1, "reported once"
+    assert any("answers again" in line for line in bench.lines)
 
 
-def test_an_inbox_that_vanishes_is_waited_for_and_not_made_anew(bench: SpoolBench) -> None:
+def test_the_watcher_waits_for_a_missing_inbox_and_does_not_create_it(bench: SpoolFixture) -> None:
     away = bench.folder / "unmounted"
     with running(bench.watcher(once=False)) as watcher:
         bench.spool.inbox.rename(away)
@@ -80,51 +80,49 @@ def test_an_inbox_that_vanishes_is_waited_for_and_not_made_anew(bench: SpoolBenc
         bench.drop("walk")
         wait_for((bench.spool.done / "walk").is_dir)
     assert watcher.access_failures.text == ""
-    assert sum("the inbox is gone" in line for line in bench.told) == 1
+    assert sum("the inbox is gone" in line for line in bench.lines) == 1
 
 
-def test_a_watcher_that_is_to_leave_does_not_wait_for_ever(bench: SpoolBench) -> None:
+def test_a_watcher_with_once_does_not_wait_for_ever(bench: SpoolFixture) -> None:
     watcher = bench.watcher(stale_s=1.0)
     bench.spool.inbox.rmdir()
     assert watcher.run() == StoreError.exit_code
-    assert any("the inbox is gone" in line for line in bench.told)
+    assert any("the inbox is gone" in line for line in bench.lines)
 
 
-def test_pauses_grow_and_each_cause_is_told_once(bench: SpoolBench) -> None:
+def test_pauses_grow_and_each_cause_is_reported_once(bench: SpoolFixture) -> None:
     now = [0.0]
-    trouble = AccessFailures(bench.spool, bench.told.append, lambda: now[0])
-    pauses = [trouble.record(OSError(errno.EIO, "x", "a")) for _ in range(9)]
+    failures = AccessFailures(bench.spool, bench.lines.append, lambda: now[0])
+    pauses = [failures.record(OSError(errno.EIO, "x", "a")) for _ in range(9)]
     assert pauses == [1, 2, 4, 8, 16, 32, 60, 60, 60]
-    trouble.record(OSError(errno.EACCES, "x", "a"))
+    failures.record(OSError(errno.EACCES, "x", "a"))
     now[0] = 90.0
-    trouble.over()
-    trouble.over()
-    assert len(bench.told) == 3
-    assert "after 90 s" in bench.told[-1]
-    assert trouble.record(OSError(errno.EIO, "x", "a")) == 1
+    failures.clear()
+    failures.clear()
+    assert len(bench.lines) == 3
+    assert "after 90 s" in bench.lines[-1]
+    assert failures.record(OSError(errno.EIO, "x", "a")) == 1
 
 
-def test_trouble_that_ends_while_it_is_asked_for_stops_no_heartbeat(bench: SpoolBench) -> None:
-    trouble = AccessFailures(bench.spool, bench.told.append)
-    trouble.record(OSError(errno.EIO, "x", "a"))
+def test_a_failure_that_ends_while_it_is_read_stops_no_heartbeat(bench: SpoolFixture) -> None:
+    failures = AccessFailures(bench.spool, bench.lines.append)
+    failures.record(OSError(errno.EIO, "x", "a"))
 
-    class Over(AccessFailures):
-        """The disk answers again as soon as somebody has looked."""
+    class EndsWhenRead(AccessFailures):
+        """The disk answers again as soon as the failure has been read."""
 
         @property
-        def now(self) -> StoreError | None:
-            found, trouble.now = trouble.now, None
+        def current(self) -> StoreError | None:
+            found, failures.current = failures.current, None
             return found
 
-        @now.setter
-        def now(self, _: StoreError | None) -> None: ...
+        @current.setter
+        def current(self, _: StoreError | None) -> None: ...
 
-    assert Over(bench.spool, bench.told.append).text == "a: Input/output error"
+    assert EndsWhenRead(bench.spool, bench.lines.append).text == "a: Input/output error"
 
 
-def test_a_watcher_that_is_told_to_stop_at_any_moment_does_not_sleep(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_at_any_moment_ends_the_wait(bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     watcher = bench.watcher(once=False)
     woken, clear = watcher._woken, watcher._woken.clear
     overslept: list[bool] = []
@@ -142,9 +140,9 @@ def test_a_watcher_that_is_told_to_stop_at_any_moment_does_not_sleep(
 
 
 def test_a_full_disk_while_the_store_is_cleaned_stops_no_watcher(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """To clean up is what one does about a full disk; just then a job has only to be filed away."""
+    """A user runs `gc` on a full disk while a finished job waits to be filed."""
     claim = inbox_transfer.create_claim(JobDir(bench.drop("walk").rename(bench.spool.running / "walk")))
     JobStatusFile(claim.job).update(state="done")
     worker = JobWorker(bench.spool, bench.options(), threading.Event())
@@ -158,29 +156,29 @@ def test_a_full_disk_while_the_store_is_cleaned_stops_no_watcher(
     assert worker.process(claim).path == bench.spool.done / "walk"
 
 
-def test_a_job_that_ends_while_the_store_is_cleaned_holds_nobody_up(bench: SpoolBench) -> None:
+def test_a_job_that_ends_while_the_store_is_cleaned_is_filed_later(bench: SpoolFixture) -> None:
     (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
-    drop = inbox_transfer.InboxEntry(bench.spool.inbox / "walk.yaml")
+    entry = inbox_transfer.InboxEntry(bench.spool.inbox / "walk.yaml")
     claimed = inbox_transfer.claim_entry(
-        bench.spool, drop, inbox_transfer.take_snapshot(drop, 100), bench.options().permissions
+        bench.spool, entry, inbox_transfer.take_snapshot(entry, 100), bench.options().permissions
     )
     assert claimed is not None
     worker = JobWorker(bench.spool, bench.options(), threading.Event())
     with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
         fcntl.flock(cleaning, fcntl.LOCK_EX)
         outcome = worker.process(*claimed)
-    assert (outcome.state, outcome.message) == ("stopped", "goes on later: the store is being cleaned")
+    assert (outcome.state, outcome.message) == ("stopped", "continues later: the store is being cleaned")
     before = bench.status("walk")
-    assert bench.work_off() == 2
+    assert bench.run_once() == 2
     assert bench.job("walk").path == bench.spool.failed / "walk"
-    assert bench.status("walk") == before, "all was said"
+    assert bench.status("walk") == before, "the final status was written before"
     assert bench.status("walk")["error"]["path"] == str(bench.job("walk").input / "walk.yaml")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["in the watcher", "in a stage"])
-def test_a_job_whose_disk_goes_away_goes_on_later(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, how: str
+def test_a_job_with_a_missing_disk_continues_later(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     from bodycap_batch.watch import job_worker
 
@@ -196,23 +194,23 @@ def test_a_job_whose_disk_goes_away_goes_on_later(
     monkeypatch.setattr(job_worker, "run_job", fail)
     with running(bench.watcher(once=False, stale_s=1.0)):
         wait_for((bench.spool.done / "walk").is_dir)
-    (told,) = [line for line in bench.told if line.startswith("walk: stuck")]
-    assert "Stale file handle" in told
-    assert "put off" in bench.job("walk").log.read_text()
+    (line,) = [line for line in bench.lines if line.startswith("walk: stuck")]
+    assert "Stale file handle" in line
+    assert "postponed" in bench.job("walk").log.read_text()
     assert bench.status("walk")["attempts"] == 2
 
 
-def test_a_job_whose_disk_never_answers_has_failed_in_the_end(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+def test_a_job_with_repeated_disk_failures_fails(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: Any, **__: Any) -> None:
         raise DiskAway("Input/output error", path="videos", hint="is the disk mounted?")
 
     monkeypatch.setattr("bodycap_batch.watch.job_worker.run_job", fail)
     worker = JobWorker(bench.spool, bench.options(), threading.Event())
-    look = inbox_transfer.take_snapshot(drop := inbox_transfer.InboxEntry(bench.drop("walk")), 100)
+    snapshot = inbox_transfer.take_snapshot(entry := inbox_transfer.InboxEntry(bench.drop("walk")), 100)
     claim, _ = inbox_transfer.claim_entry(
-        bench.spool, drop, look, bench.options().permissions
+        bench.spool, entry, snapshot, bench.options().permissions
     ) or pytest.fail("no claim")
     states = []
     while not states or states[-1] == "stuck":
@@ -224,10 +222,10 @@ def test_a_job_whose_disk_never_answers_has_failed_in_the_end(
 
 
 @pytest.mark.parametrize("away", [True, False])
-def test_a_job_whose_footage_is_away_waits_as_long_as_that_takes(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], away: bool
+def test_a_job_waits_for_missing_videos_without_a_limit(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], away: bool
 ) -> None:
-    """While the disk answers a fault counts, unless the job has come further since the one before."""
+    """If the disk answers, a failure counts, unless the job has finished a stage since the last one."""
     footage = bench.folder / "footage"
     footage.mkdir()
     listdir = os.listdir
@@ -245,22 +243,22 @@ def test_a_job_whose_footage_is_away_waits_as_long_as_that_takes(
     monkeypatch.setattr("bodycap_batch.watch.job_worker.os.listdir", look)
     monkeypatch.setattr("bodycap_batch.watch.job_worker.run_job", fail)
     worker = JobWorker(bench.spool, bench.options(), threading.Event())
-    look_ = inbox_transfer.take_snapshot(drop := inbox_transfer.InboxEntry(bench.drop("walk")), 100)
+    snapshot = inbox_transfer.take_snapshot(entry := inbox_transfer.InboxEntry(bench.drop("walk")), 100)
     claim, _ = inbox_transfer.claim_entry(
-        bench.spool, drop, look_, bench.options().permissions
+        bench.spool, entry, snapshot, bench.options().permissions
     ) or pytest.fail("no claim")
     for _ in range(20):
         assert worker.process(claim).state == "stuck"
         claim = inbox_transfer.Claim(claim.job, claim.generation, claim._token)
     assert main(["status"]) == 0
-    assert f"goes on later: {footage / 'torso.mp4'}: Stale file handle" in capfd.readouterr().out
+    assert f"continues later: {footage / 'torso.mp4'}: Stale file handle" in capfd.readouterr().out
     claim.job.cancel.touch()
     assert worker.process(claim).path == bench.spool.failed / "walk"
     assert bench.status("walk")["state"] == "cancelled"
 
 
-def test_what_holds_a_job_up_again_and_again_is_told_once(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+def test_a_repeated_disk_failure_is_reported_once(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from bodycap_batch.watch import job_worker
 
@@ -268,41 +266,41 @@ def test_what_holds_a_job_up_again_and_again_is_told_once(
     monkeypatch.setattr(job_worker, "run_job", failing(2, job_worker.run_job, errno.ESTALE))
     with running(bench.watcher(once=False, stale_s=0.2)):
         wait_for((bench.spool.done / "walk").is_dir)
-    assert sum("Stale file handle" in line for line in bench.told) == 1
-    assert bench.told.count("walk: started") == 1
+    assert sum("Stale file handle" in line for line in bench.lines) == 1
+    assert bench.lines.count("walk: started") == 1
 
 
-def test_footage_is_never_removed_because_the_disk_did_not_answer(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+def test_videos_are_never_removed_because_the_disk_did_not_answer(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place = JobDir(bench.spool.running / ".claim-1")
-    place.path.mkdir()
-    bench.drop("walk").rename(place.input)
+    job_dir = JobDir(bench.spool.running / ".claim-1")
+    job_dir.path.mkdir()
+    bench.drop("walk").rename(job_dir.input)
     monkeypatch.setattr(Path, "lstat", failing(1, Path.lstat))
     with pytest.raises(OSError, match="Input/output"):
-        inbox_transfer.return_to_inbox(bench.spool, place)
-    assert (place.input / "torso.mp4").is_file()
-    assert inbox_transfer.return_to_inbox(bench.spool, place) == bench.spool.inbox / ".claim-1"
+        inbox_transfer.return_to_inbox(bench.spool, job_dir)
+    assert (job_dir.input / "torso.mp4").is_file()
+    assert inbox_transfer.return_to_inbox(bench.spool, job_dir) == bench.spool.inbox / ".claim-1"
 
 
-def test_what_stays_in_the_inbox_is_told_when_a_watcher_leaves(bench: SpoolBench) -> None:
+def test_paths_left_in_the_inbox_are_reported_when_a_watcher_ends(bench: SpoolFixture) -> None:
     (bench.spool.inbox / "empty").mkdir()
     (bench.drop("copied", ready=False) / "head.mp4.part").touch()
     (bench.spool.inbox / "torso.mp4").touch()
     bench.drop("walk")
-    assert bench.work_off(unchanged_s=0.5) == 0
+    assert bench.run_once(unchanged_s=0.5) == 0
     assert bench.status("walk")["state"] == "done"
-    left = dict(line.split(": left in the inbox: ") for line in bench.told if "left in the inbox" in line)
+    left = dict(line.split(": left in the inbox: ") for line in bench.lines if "left in the inbox" in line)
     assert left == {
         "empty": "the folder is empty",
         "copied": "head.mp4.part is being copied",
-        "torso.mp4": "no job: neither a folder nor a YAML file",
+        "torso.mp4": "not a job: neither a folder nor a YAML file",
     }
     assert (bench.spool.inbox / "copied" / "head.mp4.part").exists()
 
 
-def test_a_folder_that_cannot_be_looked_at_is_told_and_holds_nobody_up(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+def test_an_unreadable_entry_is_reported_and_delays_no_other(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.drop("locked")
     bench.drop("walk")
@@ -314,10 +312,10 @@ def test_a_folder_that_cannot_be_looked_at_is_told_and_holds_nobody_up(
         return scandir(path)
 
     monkeypatch.setattr(os, "scandir", refuse)
-    assert bench.work_off() == StoreError.exit_code
+    assert bench.run_once() == StoreError.exit_code
     assert bench.status("walk")["state"] == "done"
-    assert "locked: cannot be looked at: Permission denied" in bench.told
-    assert "locked: left in the inbox: Permission denied" in bench.told
+    assert "locked: cannot be read: Permission denied" in bench.lines
+    assert "locked: left in the inbox: Permission denied" in bench.lines
 
 
 @pytest.mark.parametrize(
@@ -327,9 +325,9 @@ def test_a_folder_that_cannot_be_looked_at_is_told_and_holds_nobody_up(
         '{"attempts": "many", "notes": 3, "error": "x", "active": 1, "dropped": 5, "progress": "a"}',
     ],
 )
-def test_a_status_that_somebody_garbled_harms_nothing(bench: SpoolBench, text: str) -> None:
+def test_a_damaged_status_file_does_no_harm(bench: SpoolFixture, text: str) -> None:
     bench.drop("walk")
-    bench.work_off()
+    bench.run_once()
     job = bench.job("walk")
     job.status.write_text(text)
     assert [row.name for row in job_rows(bench.spool)] == ["walk"]
@@ -337,7 +335,7 @@ def test_a_status_that_somebody_garbled_harms_nothing(bench: SpoolBench, text: s
     inbox_transfer.create_claim(left)
     left.owner.write_text('{"generation": "one", "pid": [], "token": 5, "machine": null, "process": {}}')
     assert [row.name for row in job_rows(bench.spool)] == ["walk"]
-    assert bench.work_off() == 0, "nobody's: it is waited for as for another machine's"
+    assert bench.run_once() == 0, "a job without an owner is treated as that of another machine"
     with running(bench.watcher(once=False, stale_s=1.0)):
         wait_for((bench.spool.done / "walk").is_dir)
     assert json.loads(bench.job("walk").status.read_text())["attempts"] in (1, 2)
@@ -345,43 +343,45 @@ def test_a_status_that_somebody_garbled_harms_nothing(bench: SpoolBench, text: s
     assert Store(bench.spool.root / ".store").root.is_dir()
 
 
-def test_who_watches_and_what_holds_it_up_is_told_with_the_jobs(
-    bench: SpoolBench, capfd: pytest.CaptureFixture[str]
+def test_watchers_and_their_failures_are_listed_with_the_jobs(
+    bench: SpoolFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    def told() -> list[str]:
+    def reported() -> list[str]:
         capfd.readouterr()
         assert main(["status"]) == 0
         return [line for line in capfd.readouterr().out.splitlines() if "watche" in line]
 
     bench.drop("walk", ready=False)
-    assert told() == [f"no watcher is at work here: `bodycap watch {bench.spool.inbox}` starts one"]
+    assert reported() == [f"no watcher runs here: `bodycap watch {bench.spool.inbox}` starts one"]
     with running(bench.watcher(once=False, unchanged_s=1000.0, stale_s=1.0)):
-        wait_for(lambda: any(f"(process {os.getpid()}) since" in line for line in told()))
-        assert len(told()) == 1
+        wait_for(lambda: any(f"(process {os.getpid()}) since" in line for line in reported()))
+        assert len(reported()) == 1
         assert main(["status", "--json"]) == 0
         (watching,) = json.loads(capfd.readouterr().out)["watchers"]
         assert (watching["pid"], watching["trouble"]) == (os.getpid(), "")
         away = bench.spool.inbox.rename(bench.folder / "unmounted")
-        wait_for(lambda: any("held up" in line and "the inbox is gone" in line for line in told()))
+        wait_for(
+            lambda: any("cannot continue" in line and "the inbox is gone" in line for line in reported())
+        )
         away.rename(bench.spool.inbox)
-        wait_for(lambda: not any("held up" in line for line in told()))
-    assert told() == [f"no watcher is at work here: `bodycap watch {bench.spool.inbox}` starts one"]
+        wait_for(lambda: not any("cannot continue" in line for line in reported()))
+    assert reported() == [f"no watcher runs here: `bodycap watch {bench.spool.inbox}` starts one"]
     assert list(bench.spool.running.iterdir()) == []
 
 
-def test_a_killed_watcher_is_not_taken_for_one_at_work(bench: SpoolBench) -> None:
-    presence = WatcherStatusFile(bench.spool)
-    presence.tell("")
-    (mine,) = bench.spool.running.glob(".watcher-*")
-    machine, pid, start, *rest = mine.name.removeprefix(".watcher-").split("-")
-    text = mine.read_text()
+def test_a_killed_watcher_is_not_listed(bench: SpoolFixture) -> None:
+    status_file = WatcherStatusFile(bench.spool)
+    status_file.write("")
+    (own,) = bench.spool.running.glob(".watcher-*")
+    machine, pid, start, *rest = own.name.removeprefix(".watcher-").split("-")
+    text = own.read_text()
     for name in (f"{machine}-{pid}-{int(start) - 1}", f"elsewhere-{pid}-{start}", f"yesterday-{pid}-{start}"):
-        mine.with_name("-".join((f".watcher-{name}", *rest))).write_text(text)
+        own.with_name("-".join((f".watcher-{name}", *rest))).write_text(text)
     old = time.time() - 90_000
     (yesterday,) = bench.spool.running.glob(".watcher-yesterday*")
     os.utime(yesterday, (old, old))
     (bench.spool.running / ".watcher-garbled.json").write_text("{")
     assert [bool(found.seen) for found in active_watchers(bench.spool)] == [False, True]
-    presence.end()
+    status_file.remove()
     assert [bool(found.seen) for found in active_watchers(bench.spool)] == [True]
     assert not yesterday.exists()

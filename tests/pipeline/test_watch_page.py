@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import http.client
 import json
-import math
 import os
 import shutil
 import threading
@@ -19,13 +18,13 @@ from bodycap_batch.config.limits import Limits
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.watch.web import Access, LivePage
 from bodycap_batch.watch.web.job_list import JobList
-from tests.pipeline.spools import SpoolBench, wait_for
+from tests.pipeline.spools import SpoolFixture, wait_for
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 class Client:
-    """Requests as the page sends them."""
+    """Send requests as the page does."""
 
     def __init__(self, page: LivePage) -> None:
         self.host = f"127.0.0.1:{page.access.port}"
@@ -52,7 +51,7 @@ class Client:
 
 
 @pytest.fixture
-def page(bench: SpoolBench) -> Iterator[LivePage]:
+def page(bench: SpoolFixture) -> Iterator[LivePage]:
     with LivePage(bench.spool, Access(host="127.0.0.1", port=0), Limits(video_gb=1e-5)) as page:
         yield page
 
@@ -62,9 +61,9 @@ def client(page: LivePage) -> Client:
     return Client(page)
 
 
-def test_jobs_logs_and_results_are_shown(bench: SpoolBench, client: Client) -> None:
+def test_jobs_logs_and_results_are_shown(bench: SpoolFixture, client: Client) -> None:
     bench.drop("küche 1")
-    bench.work_off()
+    bench.run_once()
     bench.drop("next")
     found = {job["name"]: job for job in client.json("GET", "/api/jobs")["jobs"]}
     assert (found["küche 1"]["state"], found["next"]["state"]) == ("done", "waiting")
@@ -77,29 +76,29 @@ def test_jobs_logs_and_results_are_shown(bench: SpoolBench, client: Client) -> N
     assert "allow-same-origin" not in headers["content-security-policy"]
 
 
-def test_a_disk_that_does_not_answer_is_told_and_the_jobs_stay_in_sight(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+def test_a_missing_disk_is_reported_and_the_last_jobs_stay_listed(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.drop("walk")
-    told = [""]
-    feed = JobList(bench.spool, lambda: told[0])
-    assert json.loads(feed.text())["trouble"] == ""
+    failure, now = [""], [0.0]
+    job_list = JobList(bench.spool, lambda: failure[0], lambda: now[0])
+    assert json.loads(job_list.json_text())["trouble"] == ""
 
     def fail(*_: object) -> None:
         raise OSError(errno.EIO, "Input/output error")
 
     monkeypatch.setattr("bodycap_batch.watch.web.job_list.inbox_rows", fail)
-    for trouble, shown in (("", "Input/output error"), ("the inbox is gone", "the inbox is gone")):
-        told[0] = trouble
-        feed._read_at = -math.inf
-        found = json.loads(feed.text())
+    for message, shown in (("", "Input/output error"), ("the inbox is gone", "the inbox is gone")):
+        failure[0] = message
+        now[0] += 10.0
+        found = json.loads(job_list.json_text())
         assert shown in found["trouble"]
         assert [job["name"] for job in found["jobs"]] == ["walk"]
 
 
-def test_nothing_but_results_is_served(bench: SpoolBench, client: Client) -> None:
+def test_nothing_but_results_is_served(bench: SpoolFixture, client: Client) -> None:
     bench.drop("walk")
-    bench.work_off()
+    bench.run_once()
     (bench.job("walk").result / "link").symlink_to("/etc/passwd")
     for path in (
         "/results/walk/../status.json",
@@ -116,7 +115,7 @@ def test_nothing_but_results_is_served(bench: SpoolBench, client: Client) -> Non
         assert client.ask("GET", path)[0] == 404, path
 
 
-def test_requests_of_other_pages_are_refused(bench: SpoolBench, client: Client) -> None:
+def test_requests_of_other_pages_are_refused(bench: SpoolFixture, client: Client) -> None:
     bench.drop("walk")
     for headers in (
         {"Origin": "http://evil.example"},
@@ -135,7 +134,7 @@ def test_requests_of_other_pages_are_refused(bench: SpoolBench, client: Client) 
     assert json.loads(data)["hint"]
 
 
-def test_a_token_is_asked_for_and_remembered_in_a_cookie(bench: SpoolBench) -> None:
+def test_a_token_is_required_and_stored_in_a_cookie(bench: SpoolFixture) -> None:
     token = "0123456789abcdef0123"  # noqa: S105
     with LivePage(bench.spool, Access(host="127.0.0.1", port=0, token=token), Limits()) as page:
         client = Client(page)
@@ -149,13 +148,13 @@ def test_a_token_is_asked_for_and_remembered_in_a_cookie(bench: SpoolBench) -> N
         assert client.ask("GET", "/", cookie=headers["set-cookie"].split(";")[0])[0] == 200
 
 
-def test_a_folder_that_is_sent_becomes_a_job(bench: SpoolBench, client: Client) -> None:
+def test_an_uploaded_folder_becomes_a_job(bench: SpoolFixture, client: Client) -> None:
     key = client.begin("kitchen walk")
     client.json("PUT", f"/api/uploads/{key}/torso.mp4", b"frames of torso")
     client.json("PUT", f"/api/uploads/{key}/left_palm/GX010001.MP4", b"frames of left_palm")
-    assert client.json("GET", "/api/jobs")["jobs"] == []  # nothing half sent is ever seen
+    assert client.json("GET", "/api/jobs")["jobs"] == []  # an incomplete upload is not a job
     assert client.json("POST", f"/api/uploads/{key}/finish")["name"] == "kitchen walk"
-    assert bench.work_off() == 0, bench.told
+    assert bench.run_once() == 0, bench.lines
     assert (
         bench.job("kitchen walk").input / "left_palm" / "GX010001.MP4"
     ).read_bytes() == b"frames of left_palm"
@@ -176,18 +175,18 @@ def test_a_folder_that_is_sent_becomes_a_job(bench: SpoolBench, client: Client) 
     ],
     ids=lambda value: str(value)[:30],
 )
-def test_what_is_sent_is_checked(
-    bench: SpoolBench, client: Client, name: str, body: bytes, code: tuple[int, ...]
+def test_uploaded_files_are_checked(
+    bench: SpoolFixture, client: Client, name: str, body: bytes, code: tuple[int, ...]
 ) -> None:
     key = client.begin("walk")
     found, data, _ = client.ask("PUT", f"/api/uploads/{key}/{name}", body)
     assert found in code, data
-    assert client.ask("POST", f"/api/uploads/{key}/finish")[0] == 400  # no video came
+    assert client.ask("POST", f"/api/uploads/{key}/finish")[0] == 400  # there is no video
     files = [path for path in bench.folder.rglob("*") if path.is_file()]
     assert files == [bench.orders]
 
 
-def test_uploads_are_counted_and_swept(bench: SpoolBench, client: Client) -> None:
+def test_the_number_of_uploads_is_limited(bench: SpoolFixture, client: Client) -> None:
     keys = [client.begin(f"walk {number}") for number in range(8)]
     assert client.ask("POST", "/api/uploads", {"name": "one more"})[0] == 400
     assert client.ask("DELETE", f"/api/uploads/{keys[0]}")[0] == 200
@@ -197,8 +196,8 @@ def test_uploads_are_counted_and_swept(bench: SpoolBench, client: Client) -> Non
     assert client.ask("PUT", "/api/uploads/unknown/torso.mp4", b"x")[0] == 400
 
 
-class Slow:
-    """A file of 1,000 bytes of which the first half has been sent."""
+class PartialUpload:
+    """A file of 1,000 bytes; the first half has been sent."""
 
     def __init__(self, client: Client, key: str, name: str) -> None:
         self.connection = http.client.HTTPConnection(client.host, timeout=30)
@@ -208,7 +207,7 @@ class Slow:
         self.connection.endheaders()
         self.connection.send(b"x" * 500)
 
-    def rest(self) -> tuple[int, bytes]:
+    def send_rest(self) -> tuple[int, bytes]:
         self.connection.send(b"x" * 500)
         answer = self.connection.getresponse()
         found = answer.status, answer.read()
@@ -217,60 +216,58 @@ class Slow:
 
 
 @pytest.mark.parametrize("name", ["torso.mp4", "TORSO.mp4"])
-def test_a_file_that_is_being_sent_is_not_sent_by_another_request(
-    bench: SpoolBench, client: Client, name: str
-) -> None:
+def test_a_file_cannot_be_sent_by_two_requests(bench: SpoolFixture, client: Client, name: str) -> None:
     key = client.begin("walk")
-    slow = Slow(client, key, "torso.mp4")
+    partial = PartialUpload(client, key, "torso.mp4")
     wait_for(lambda: any(bench.spool.inbox.glob(".upload-*/*.part")))
     code, data, _ = client.ask("PUT", f"/api/uploads/{key}/{name}", b"y" * 1000)
     assert (code, json.loads(data)["message"]) == (400, f"{name} was sent twice")
     code, data, _ = client.ask("PUT", f"/api/uploads/{key}/torso.mp4/a.mp4", b"y")
-    assert (code, json.loads(data)["message"]) == (400, "torso.mp4/a.mp4 is a file and a folder")
-    assert slow.rest()[0] == 200
+    assert (code, json.loads(data)["message"]) == (400, "torso.mp4/a.mp4 is both a file and a folder")
+    assert partial.send_rest()[0] == 200
     assert client.json("POST", f"/api/uploads/{key}/finish")["name"] == "walk"
     assert (bench.spool.inbox / "walk" / "torso.mp4").read_bytes() == b"x" * 1000
 
 
-def test_a_folder_is_not_finished_while_a_file_is_being_sent(bench: SpoolBench, client: Client) -> None:
+def test_a_folder_is_not_finished_while_a_file_is_being_sent(bench: SpoolFixture, client: Client) -> None:
     key = client.begin("walk")
     client.json("PUT", f"/api/uploads/{key}/head.mp4", b"frames of head")
-    slow = Slow(client, key, "torso.mp4")
+    partial = PartialUpload(client, key, "torso.mp4")
     wait_for(lambda: any(bench.spool.inbox.glob(".upload-*/*.part")))
     code, data, _ = client.ask("POST", f"/api/uploads/{key}/finish")
     assert (code, json.loads(data)["message"]) == (400, "torso.mp4: still being sent")
-    assert slow.rest()[0] == 200
+    assert partial.send_rest()[0] == 200
     client.json("POST", f"/api/uploads/{key}/finish")
     code, _, _ = client.ask("POST", f"/api/uploads/{key}/finish")
-    assert code == 400, "it is known no more"
+    assert code == 400, "there is no such upload any more"
     files = sorted(path.name for path in (bench.spool.inbox / "walk").iterdir())
     assert files == ["READY", "head.mp4", "torso.mp4"]
 
 
-def test_a_folder_that_is_dropped_while_a_file_is_being_sent_is_gone(
-    bench: SpoolBench, client: Client
+def test_a_discarded_upload_is_removed_while_a_file_is_being_sent(
+    bench: SpoolFixture, client: Client
 ) -> None:
     key = client.begin("walk")
-    slow = Slow(client, key, "torso.mp4")
+    partial = PartialUpload(client, key, "torso.mp4")
     wait_for(lambda: any(bench.spool.inbox.glob(".upload-*/*.part")))
     assert client.ask("DELETE", f"/api/uploads/{key}")[0] == 200
-    code, data = slow.rest()
-    assert (code, json.loads(data)["message"]) == (400, "this upload is not known (any more)")
+    code, data = partial.send_rest()
+    assert (code, json.loads(data)["message"]) == (400, "there is no such upload, or no longer")
     assert list(bench.spool.inbox.iterdir()) == []
 
 
-def test_what_is_left_of_a_broken_upload_vanishes_with_the_page(bench: SpoolBench) -> None:
+def test_an_interrupted_upload_is_removed_with_the_page(bench: SpoolFixture) -> None:
     with LivePage(bench.spool, Access(host="127.0.0.1", port=0), Limits()) as page:
         client = Client(page)
         key = client.begin("walk")
-        slow = Slow(client, key, "torso.mp4")
+        partial = PartialUpload(client, key, "torso.mp4")
         wait_for(lambda: any(bench.spool.inbox.glob(".upload-*/*.part")))
-        slow.connection.close()
+        partial.connection.close()
         wait_for(lambda: not any(bench.spool.inbox.glob(".upload-*/*.part")))
     assert list(bench.spool.inbox.iterdir()) == []
 
 
-def test_a_page_that_starts_removes_only_what_killed_pages_left(bench: SpoolBench, client: Client) -> None:
+def test_a_starting_page_removes_only_uploads_of_killed_pages(bench: SpoolFixture, client: Client) -> None:
     client.begin("walk")
     (mine,) = bench.spool.inbox.glob(".upload-*")
     machine, pid, start, key = mine.name.removeprefix(".upload-").split("-")
@@ -284,12 +281,12 @@ def test_a_page_that_starts_removes_only_what_killed_pages_left(bench: SpoolBenc
         assert set(bench.spool.inbox.iterdir()) == {mine, elsewhere}
 
 
-def test_a_port_in_use_is_named(bench: SpoolBench, page: LivePage) -> None:
+def test_a_port_in_use_is_named(bench: SpoolFixture, page: LivePage) -> None:
     with pytest.raises(JobError, match=str(page.access.port)):
         LivePage(bench.spool, page.access, Limits())
 
 
-def test_the_command_serves_the_page_and_ends_with_it(bench: SpoolBench) -> None:
+def test_the_command_serves_the_page_and_ends_with_it(bench: SpoolFixture) -> None:
     process = bench.start("watch", "jobs/inbox", "--web", "127.0.0.1:0")
     assert process.stderr is not None
     lines = iter(process.stderr.readline, "")
@@ -317,18 +314,18 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.mark.browser
-def test_the_page_follows_the_jobs_and_takes_videos_in(
-    bench: SpoolBench, page: LivePage, browser: Any
+def test_the_page_shows_the_jobs_and_accepts_videos(
+    bench: SpoolFixture, page: LivePage, browser: Any
 ) -> None:
-    told: list[str] = []
+    messages: list[str] = []
     tab = browser.new_page(viewport={"width": 900, "height": 900})
-    tab.on("console", lambda message: told.append(message.text))
-    tab.on("pageerror", lambda error: told.append(str(error)))
+    tab.on("console", lambda message: messages.append(message.text))
+    tab.on("pageerror", lambda error: messages.append(str(error)))
     tab.goto(page.access.url)
     tab.wait_for_function("document.getElementById('connection').textContent === 'live'")
     assert tab.inner_text("#summary") == "No jobs yet."
 
-    # A folder's videos, dropped onto the page.
+    # Drop the videos of a folder onto the page.
     tab.evaluate(
         """() => {
         const transfer = new DataTransfer();
@@ -341,7 +338,7 @@ def test_the_page_follows_the_jobs_and_takes_videos_in(
         }"""
     )
     tab.wait_for_selector("#jobs .state.waiting")
-    assert tab.inner_text("#jobs .name") == "<img src=x"  # shown, not obeyed
+    assert tab.inner_text("#jobs .name") == "<img src=x"  # shown as text, not as HTML
     bench.order(hang="map")
     watcher = bench.watcher(once=False)
     thread = threading.Thread(target=watcher.run)
@@ -363,18 +360,18 @@ def test_the_page_follows_the_jobs_and_takes_videos_in(
             tab.click("text=metrics.json")
         assert "partial" in tab.content()
         tab.go_back()
-        # A file the page does not take is told, with what to do.
+        # A file that the page does not accept is reported, with a remedy.
         tab.set_input_files("#files", files=[{"name": "notes.doc", "mimeType": "text/plain", "buffer": b"x"}])
-        tab.wait_for_selector("#uploads .cause >> text=no video")
+        tab.wait_for_selector("#uploads .cause >> text=neither a video")
     finally:
         watcher.stop()
         thread.join()
-    # The browser itself tells of the refused file, and of the icon it wanted for the result in its sandbox.
-    assert [line for line in told if "400" not in line and "NotSameOrigin" not in line] == []
+    # The browser itself reports the refused file, and the icon that it requested for the sandboxed result.
+    assert [line for line in messages if "400" not in line and "NotSameOrigin" not in line] == []
 
 
 @pytest.mark.browser
-def test_another_site_cannot_use_the_page(bench: SpoolBench, page: LivePage, browser: Any) -> None:
+def test_another_site_cannot_use_the_page(bench: SpoolFixture, page: LivePage, browser: Any) -> None:
     bench.drop("walk")
     tab = browser.new_page()
     tab.route(
@@ -383,15 +380,15 @@ def test_another_site_cannot_use_the_page(bench: SpoolBench, page: LivePage, bro
     tab.goto("http://evil.example/")
     outcome = tab.evaluate(
         """async (url) => {
-        const told = [];
+        const outcomes = [];
         for (const [method, mode] of [["GET", "cors"], ["POST", "cors"], ["POST", "no-cors"]]) {
           try {
             const path = method === "GET" ? "api/jobs" : "api/jobs/walk/cancel";
             const answer = await fetch(url + path, {method, mode});
-            told.push(answer.type === "opaque" ? "opaque" : answer.status);
-          } catch { told.push("failed"); }
+            outcomes.push(answer.type === "opaque" ? "opaque" : answer.status);
+          } catch { outcomes.push("failed"); }
         }
-        return told;
+        return outcomes;
         }""",
         page.access.url,
     )

@@ -1,4 +1,4 @@
-"""What people ask of a spool while a watcher, a cleaner or another person is at the same job."""
+"""Commands on a spool while a watcher, `gc` or another user works on the same job."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from bodycap_batch.watch.inbox_entries import InboxEntry, take_snapshot
 from bodycap_batch.watch.job_status import JobStatusFile
 from bodycap_batch.watch.process_identity import process_tag
 from bodycap_batch.watch.spool import CLAIM_PREFIX, RETRY_PREFIX, JobDir
-from tests.pipeline.spools import SpoolBench, wait_for
+from tests.pipeline.spools import SpoolFixture, wait_for
 
 
-def kept(bench: SpoolBench) -> bool:
-    """Whether `gc --delete` would leave every finished stage alone just now."""
+def keeps_all_artefacts(bench: SpoolFixture) -> bool:
+    """Return True if `gc --delete` removes no finished stage now."""
     return collect_garbage(Store(bench.spool.root / ".store"), delete=True).artefacts == ()
 
 
-def between(function: Callable[..., Any], action: Callable[[], None]) -> Callable[..., Any]:
-    """The function, and something that happens just before it."""
+def preceded_by(function: Callable[..., Any], action: Callable[[], None]) -> Callable[..., Any]:
+    """Return the function, preceded by an action."""
 
     def both(*arguments: Any, **values: Any) -> Any:
         action()
@@ -37,25 +37,25 @@ def between(function: Callable[..., Any], action: Callable[[], None]) -> Callabl
     return both
 
 
-def test_a_retried_jobs_finished_stages_are_kept_until_it_has_run_again(bench: SpoolBench) -> None:
+def test_finished_stages_of_a_retried_job_are_kept_until_it_has_run_again(bench: SpoolFixture) -> None:
     bench.order(fail="merge")
     bench.drop("walk")
-    bench.work_off()
+    bench.run_once()
     for _ in range(2):
         retry_job(bench.spool, "walk")
-        assert kept(bench)
-        place = cancel_job(bench.spool, "walk")  # and it stays so on every way back
-        assert place is not None
-        assert kept(bench)
+        assert keeps_all_artefacts(bench)
+        job_dir = cancel_job(bench.spool, "walk")  # the stages are also kept after a cancellation
+        assert job_dir is not None
+        assert keeps_all_artefacts(bench)
     retry_job(bench.spool, "walk")
     bench.order()
-    drop = InboxEntry(bench.spool.inbox / "walk")
+    entry = InboxEntry(bench.spool.inbox / "walk")
     claim, _ = inbox_transfer.claim_entry(
-        bench.spool, drop, take_snapshot(drop, 100), bench.options().permissions
+        bench.spool, entry, take_snapshot(entry, 100), bench.options().permissions
     ) or pytest.fail("not claimed")
-    assert kept(bench), "claimed, but not yet at work"
+    assert keeps_all_artefacts(bench), "claimed, but not yet running"
     claim.release()
-    assert bench.work_off() == 0
+    assert bench.run_once() == 0
     fresh = {
         stage["stage"].split()[0] for stage in bench.status("walk")["finished_stages"] if not stage["reused"]
     }
@@ -63,27 +63,29 @@ def test_a_retried_jobs_finished_stages_are_kept_until_it_has_run_again(bench: S
 
 
 def test_the_store_is_not_cleaned_in_the_middle_of_a_retry(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.order(fail="merge")
     bench.drop("walk")
-    bench.work_off()
-    told = []
+    bench.run_once()
+    exit_codes = []
     store = str(bench.spool.root / ".store")
     for name in ("os.rename", "return_to_inbox"):
         *_, last = name.split(".")
         module = commands.os if name.startswith("os") else commands  # type: ignore[attr-defined]
-        action = between(getattr(module, last), lambda: told.append(main(["gc", store, "--delete"])))
+        action = preceded_by(
+            getattr(module, last), lambda: exit_codes.append(main(["gc", store, "--delete"]))
+        )
         monkeypatch.setattr(module, last, action)
     retry_job(bench.spool, "walk")
     monkeypatch.undo()
-    assert set(told) == {5}, "it is told to wait"
-    assert kept(bench)
+    assert set(exit_codes) == {5}, "gc must wait"
+    assert keeps_all_artefacts(bench)
 
 
-def test_of_two_who_retry_a_job_one_is_told(bench: SpoolBench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_second_of_two_retries_is_an_error(bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
-    assert bench.work_off() == 2
+    assert bench.run_once() == 2
     rename = commands.os.rename  # type: ignore[attr-defined]
     first: list[Path] = []
 
@@ -91,18 +93,18 @@ def test_of_two_who_retry_a_job_one_is_told(bench: SpoolBench, monkeypatch: pyte
         monkeypatch.setattr(commands.os, "rename", rename)  # type: ignore[attr-defined]
         first.append(retry_job(bench.spool, "walk"))
 
-    monkeypatch.setattr(commands.os, "rename", between(rename, other))  # type: ignore[attr-defined]
-    with pytest.raises(JobError, match="just being retried"):
+    monkeypatch.setattr(commands.os, "rename", preceded_by(rename, other))  # type: ignore[attr-defined]
+    with pytest.raises(JobError, match="being retried already"):
         retry_job(bench.spool, "walk")
     assert first == [bench.spool.inbox / "walk.yaml"]
     assert first[0].read_text() == "capture: {}"
 
 
-def test_a_watcher_that_starts_leaves_a_retry_under_way_alone_and_ends_a_killed_one(
-    bench: SpoolBench,
+def test_a_watcher_finishes_a_killed_retry_but_not_a_running_one(
+    bench: SpoolFixture,
 ) -> None:
     (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
-    assert bench.work_off() == 2
+    assert bench.run_once() == 2
     job = bench.job("walk")
     alive = JobDir(job.path.rename(bench.spool.failed / f"{RETRY_PREFIX}{process_tag()}-1"))
     inbox_transfer.finish_interrupted_retries(bench.spool)
@@ -114,8 +116,8 @@ def test_a_watcher_that_starts_leaves_a_retry_under_way_alone_and_ends_a_killed_
     assert list(bench.spool.failed.iterdir()) == []
 
 
-def test_a_retry_that_is_killed_while_a_watcher_runs_is_ended_by_it(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
+def test_a_running_watcher_finishes_a_killed_retry(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
     watcher = bench.watcher(once=False)
@@ -124,85 +126,87 @@ def test_a_retry_that_is_killed_while_a_watcher_runs_is_ended_by_it(
     try:
         wait_for((bench.spool.failed / "walk" / "status.json").is_file)
         (bench.spool.failed / "walk").rename(bench.spool.failed / f"{RETRY_PREFIX}killed-1-1-x")
-        wait_for((bench.spool.failed / "walk" / "status.json").is_file)  # it was tried again
+        wait_for((bench.spool.failed / "walk" / "status.json").is_file)  # the job has run again
     finally:
         watcher.stop()
         thread.join()
-    assert sum(line.startswith("walk: failed") for line in bench.told) == 2
+    assert sum(line.startswith("walk: failed") for line in bench.lines) == 2
 
 
-def test_two_who_put_a_drop_back_do_it_once(bench: SpoolBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    place = JobDir(bench.spool.failed / f"{RETRY_PREFIX}1")
-    place.path.mkdir()
-    bench.drop("walk").rename(place.input)
+def test_two_processes_return_an_entry_once(bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    job_dir = JobDir(bench.spool.failed / f"{RETRY_PREFIX}1")
+    job_dir.path.mkdir()
+    bench.drop("walk").rename(job_dir.input)
     move = inbox_transfer.move_to_free_name
     first: list[Path | None] = []
 
     def other() -> None:
         monkeypatch.setattr(inbox_transfer, "move_to_free_name", move)
-        first.append(inbox_transfer.return_to_inbox(bench.spool, place))
+        first.append(inbox_transfer.return_to_inbox(bench.spool, job_dir))
 
-    monkeypatch.setattr(inbox_transfer, "move_to_free_name", between(move, other))
-    assert inbox_transfer.return_to_inbox(bench.spool, place) is None
-    assert first == [bench.spool.inbox / place.name]
-    assert (bench.spool.inbox / place.name / "torso.mp4").is_file()
+    monkeypatch.setattr(inbox_transfer, "move_to_free_name", preceded_by(move, other))
+    assert inbox_transfer.return_to_inbox(bench.spool, job_dir) is None
+    assert first == [bench.spool.inbox / job_dir.name]
+    assert (bench.spool.inbox / job_dir.name / "torso.mp4").is_file()
     assert list(bench.spool.failed.iterdir()) == []
 
 
-@pytest.mark.parametrize("moment", ["before it is taken", "while it has no name"])
-def test_a_job_that_is_claimed_while_it_is_cancelled_is_cancelled(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, moment: str
+@pytest.mark.parametrize("moment", ["before it is moved", "while it has no name"])
+def test_a_job_that_is_claimed_during_the_cancellation_is_cancelled(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch, moment: str
 ) -> None:
-    drop = InboxEntry(bench.drop("walk"))
-    look, terms = take_snapshot(drop, 100), bench.options().permissions
+    entry = InboxEntry(bench.drop("walk"))
+    snapshot, permissions = take_snapshot(entry, 100), bench.options().permissions
     asked = threading.Event()
     cancelled: list[JobDir | None] = []
 
     def cancel() -> None:
         cancelled.append(cancel_job(bench.spool, "walk", wait_s=1.0))
 
-    if moment == "before it is taken":  # it waits when it is looked for, and is gone when it is moved
+    if moment == "before it is moved":  # it waits when it is searched, and is gone when it is moved
 
         def claim() -> None:
             monkeypatch.undo()
             monkeypatch.chdir(bench.folder)
-            assert inbox_transfer.claim_entry(bench.spool, drop, look, terms) is not None
+            assert inbox_transfer.claim_entry(bench.spool, entry, snapshot, permissions) is not None
 
         rename = commands.os.rename  # type: ignore[attr-defined]
-        monkeypatch.setattr(commands.os, "rename", between(rename, claim))  # type: ignore[attr-defined]
+        monkeypatch.setattr(commands.os, "rename", preceded_by(rename, claim))  # type: ignore[attr-defined]
         cancel()
     else:
         thread = threading.Thread(target=cancel)
 
         def ask() -> None:
             thread.start()
-            asked.wait(0.5)  # some looks find neither a drop nor a job
+            asked.wait(0.5)  # meanwhile the command finds neither an entry nor a job
 
-        monkeypatch.setattr(inbox_transfer, "move_to_running", between(inbox_transfer.move_to_running, ask))
-        assert inbox_transfer.claim_entry(bench.spool, drop, look, terms) is not None
+        monkeypatch.setattr(
+            inbox_transfer, "move_to_running", preceded_by(inbox_transfer.move_to_running, ask)
+        )
+        assert inbox_transfer.claim_entry(bench.spool, entry, snapshot, permissions) is not None
         thread.join()
-    assert cancelled == [None], "no watcher has noticed yet"
+    assert cancelled == [None], "no watcher has reacted yet"
     assert bench.job("walk").cancel.exists()
     assert [path.name for path in bench.spool.running.iterdir()] == ["walk"]
 
 
-def test_a_job_whose_watcher_was_killed_while_it_claimed_it_can_be_cancelled(bench: SpoolBench) -> None:
-    place = JobDir(bench.spool.running / f"{CLAIM_PREFIX}1")
-    place.path.mkdir()
-    inbox_transfer.create_claim(place).release()
-    bench.drop("walk").rename(place.input)
-    JobStatusFile(place).update(dropped="walk")
-    assert cancel_job(bench.spool, "walk", wait_s=0.0) is None, "no watcher has noticed yet"
-    bench.work_off()
+def test_a_half_claimed_job_can_be_cancelled(bench: SpoolFixture) -> None:
+    job_dir = JobDir(bench.spool.running / f"{CLAIM_PREFIX}1")
+    job_dir.path.mkdir()
+    inbox_transfer.create_claim(job_dir).release()
+    bench.drop("walk").rename(job_dir.input)
+    JobStatusFile(job_dir).update(dropped="walk")
+    assert cancel_job(bench.spool, "walk", wait_s=0.0) is None, "no watcher has reacted yet"
+    bench.run_once()
     assert bench.status("walk")["state"] == "cancelled"
     assert (bench.job("walk").input / "torso.mp4").is_file()
 
 
-def test_a_job_that_ends_while_it_is_cancelled_is_not_called_cancelled(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+def test_a_job_that_ends_during_the_cancellation_is_done(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     bench.drop("walk")
-    bench.work_off()
+    bench.run_once()
     job = bench.job("walk")
     left = job.path.rename(bench.spool.running / "walk")
     touch = Path.touch
@@ -216,9 +220,7 @@ def test_a_job_that_ends_while_it_is_cancelled_is_not_called_cancelled(
     assert "it ended before it could be stopped: done" in capfd.readouterr().out
 
 
-def test_jobs_side_by_side_do_not_make_the_same_twice(
-    bench: SpoolBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_parallel_jobs_share_their_stage_turns(bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     shared: list[object] = []
 
     def run(job: object, *, out_dir: Path, settings: Settings) -> None:
@@ -227,6 +229,6 @@ def test_jobs_side_by_side_do_not_make_the_same_twice(
     monkeypatch.setattr(job_worker, "run_job", run)
     bench.drop("one")
     bench.drop("two")
-    assert bench.work_off(jobs=2) == 0
+    assert bench.run_once(jobs=2) == 0
     assert len(shared) == 2
     assert shared[0] is shared[1] is not None

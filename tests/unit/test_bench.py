@@ -1,4 +1,4 @@
-"""The benchmark's own parts: the peers' pairs, stopping them, reading a job's events."""
+"""Parts of the benchmarks: the peers' pairs, their time limit, reading a job's events."""
 
 import av
 import numpy as np
@@ -43,11 +43,11 @@ def test_peer_pairs_grow_with_the_frames_not_their_square():
         counts.append(len(pairs_of(names, times, rng.uniform(size=(2 * length, 2 * length)))))
     most = len(STEPS) + OWN_AGAIN + FROM_OTHER + 1
     assert counts[1] <= most * 800
-    # Twice the frames, twice the pairs; pairs found from both sides vary by some percent.
+    # Twice the frames give twice the pairs; pairs found from both sides vary by some percent.
     assert 1.9 < counts[1] / counts[0] < 2.2
 
 
-def test_a_peer_over_its_limit_is_stopped_and_told(tmp_path):
+def test_a_peer_over_its_time_limit_is_stopped_and_reported(tmp_path):
     row = Row("nothing", tmp_path, tmp_path)
     results = peers.run_peers(row, tmp_path / "work", 0.0)
     assert [result["peer"] for result in results] == list(peers.PEERS)
@@ -55,7 +55,7 @@ def test_a_peer_over_its_limit_is_stopped_and_told(tmp_path):
     assert "stopped after 0 minutes" in peers.lines_of(results[0], None)[0]
 
 
-def test_a_peer_that_fails_is_told_with_its_last_words(tmp_path):
+def test_a_failed_peer_is_reported_with_its_error(tmp_path):
     result = peers._child("database", Row("nothing", tmp_path / "missing", tmp_path), tmp_path, 60.0)
     assert result["exit"] != 0
     assert not result["stopped"]
@@ -72,13 +72,13 @@ def test_a_stage_on_two_cameras_at_once_counts_once(monkeypatch):
     assert ours._wall_seconds(["no event", '{"exit": 0}', *lines]) == {"registration": 5.0}
 
 
-def test_registration_is_told_with_its_first_round_apart():
+def test_the_first_round_of_registration_is_reported_separately():
     each = [("registration", 0, 2.0), ("registration", 0, 3.0), ("extend", 1, 9.0), ("registration", 1, 0.5)]
     stages = [{"stage": stage, "round": number, "cpu_seconds": cpu} for stage, number, cpu in each]
     assert ours.registration_cpu_s(stages) == (5.0, 5.5)
 
 
-def test_the_ratio_is_that_of_map_and_registration():
+def test_the_ratio_compares_map_and_registration():
     own = {"wall_seconds": {"keyframes": 9.0, "map": 3.0, "registration": 1.0}}
     total = {"registered": 9, "frames": 10, "ate_m": {"rmse": 0.01, "max": 0.02}}
     peer = {
@@ -91,7 +91,7 @@ def test_the_ratio_is_that_of_map_and_registration():
     assert "3.0 times as long" in text
 
 
-def test_scaling_is_told_relative_to_its_first_case():
+def test_scaling_is_reported_relative_to_its_first_case():
     def case(seconds, cameras, wall_s):
         return {
             "scaling_seconds": seconds, "scaling_cameras": cameras, "wall_s": wall_s, "cpu_s": 2 * wall_s,
@@ -133,13 +133,13 @@ def test_solving_compares_a_longer_capture_with_the_first():
     assert "times" not in solving.lines_of({**longer, "bones": 15}, first)
 
 
-def test_seeds_are_told_with_their_spread():
+def test_seeds_are_reported_with_their_spread():
     assert seeds.summary("walk", [0.01, 0.012, 0.008]) == (
         "walk: 1.00 cm on the average of 3 seeds, standard deviation 20%, from least to largest 40% of it"
     )
 
 
-def test_keyframes_are_scored_under_one_similarity():
+def test_keyframes_are_evaluated_after_one_similarity():
     scene_map = small_map()
     turn = so3_exp([0.1, 0.2, 0.3])
     truth = {name: np.tile(np.eye(4), (10, 1, 1)) for name in scene_map.cameras}
@@ -153,7 +153,7 @@ def test_keyframes_are_scored_under_one_similarity():
 
 
 def _poses_with_noise(rng, count, sigma):
-    """Random true poses, what was measured of them in another gauge, and the covariances it states."""
+    """Return random true poses, noisy measurements of them in another gauge, and their covariances."""
     true = make_transform(so3_exp(rng.normal(0.0, 0.5, (count, 3))), rng.normal(0.0, 1.0, (count, 3)))
     gauge = Similarity(3.0, so3_exp(np.array([0.4, -0.2, 1.0])), np.array([1.0, 2.0, 3.0]))
     noise = rng.normal(0.0, sigma, (count, 6))
@@ -161,20 +161,20 @@ def _poses_with_noise(rng, count, sigma):
     return gauge.apply_to_poses(true) @ step, true, np.tile(np.eye(6) * sigma**2, (count, 1, 1))
 
 
-def test_stated_covariances_of_poses_score_one_in_any_gauge():
-    mine, true, stated = _poses_with_noise(np.random.default_rng(4), 400, 0.01)
-    mine[:8, :3, 3] += 0.5  # gross errors count as such and pull at nothing
-    found = poses.figures(poses.least_errors(mine, true, stated), stated)
+def test_correct_covariances_of_poses_give_one_in_any_gauge():
+    estimates, true, stated = _poses_with_noise(np.random.default_rng(4), 400, 0.01)
+    estimates[:8, :3, 3] += 0.5  # gross errors must not change the alignment
+    found = poses.figures(poses.least_errors(estimates, true, stated), stated)
     for part in ("rotation", "centre", "pose"):
-        # A median of 400 draws of chi-squared (3) is good to 6 %, three sigmas of that and some for 8 gross.
+        # The median of 400 draws of chi-squared (3) has a sigma of 6 %; three sigmas and a margin.
         assert 0.8 < found[part] < 1.25
         assert found[f"{part}_inside"] > 0.9
-    wide = poses.figures(poses.least_errors(mine, true, 4.0 * stated), 4.0 * stated)
+    wide = poses.figures(poses.least_errors(estimates, true, 4.0 * stated), 4.0 * stated)
     assert np.isclose(wide["centre"], found["centre"] / 4.0, rtol=0.02)
     assert wide["centre_inside"] > 0.97
 
 
-def test_a_long_capture_is_a_short_one_played_to_and_fro(tmp_path):
+def test_a_long_capture_is_a_short_one_played_forwards_and_backwards(tmp_path):
     once, long_one = tmp_path / "once", tmp_path / "long"
     (once / "gt").mkdir(parents=True)
     frames = [np.full((48, 64), 60 + 30 * number, np.uint8) for number in range(4)]
@@ -193,5 +193,5 @@ def test_a_long_capture_is_a_short_one_played_to_and_fro(tmp_path):
         seen = [frame.to_ndarray(format="gray").mean() for frame in opened.decode(opened.streams.video[0])]
     assert len(seen) == 10
     assert np.argmax(seen[:4]) == 3
-    # Brighter by a tenth the second time, with noise of its own.
+    # The second time the picture is brighter by a tenth and has other noise.
     assert 1.05 < seen[5] / seen[1] < 1.2

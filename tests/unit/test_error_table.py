@@ -8,7 +8,7 @@ from tests.error_table import CODES, README, inserted, messages, table
 def test_the_table_holds_the_errors_of_the_code() -> None:
     texts = {message.text: message for message in messages()}
     assert len(texts) > 150
-    black = texts["camera … shows black pictures only (… of … looked at)"]
+    black = texts["camera … shows only black pictures (… of … inspected)"]
     assert black.code == 3
     assert "was the lens covered?" in black.remedy
     assert any("unknown key" in text for text in texts)

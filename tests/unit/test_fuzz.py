@@ -1,6 +1,6 @@
-"""Whatever a file holds, its reader answers or raises one of our errors: never another exception.
+"""For any content of a file, its reader gives an answer or raises one of our errors.
 
-A few hundred inputs here, some thousands with the slow tests; ``make fuzz`` takes 52,000.
+The fast tests take a few hundred inputs, the slow tests some thousands, ``make fuzz`` 52,000.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ CALIBRATION = {
     "pixel_origin": "opencv",
 }
 
-ODD = [
+UNUSUAL = [
     *(
         "",
         "~",
@@ -113,9 +113,11 @@ ODD = [
 
 
 def mutations(text: str) -> st.SearchStrategy[str]:
-    """A sound file with pieces cut out, doubled, swapped or replaced by odd ones."""
+    """Generate a valid file with pieces removed, doubled, swapped or replaced by unusual ones."""
     edit = st.tuples(
-        st.integers(0, len(text)), st.integers(0, 40), st.one_of(st.sampled_from(ODD), st.text(max_size=12))
+        st.integers(0, len(text)),
+        st.integers(0, 40),
+        st.one_of(st.sampled_from(UNUSUAL), st.text(max_size=12)),
     )
 
     def apply(edits: list[tuple[int, int, str]]) -> str:
@@ -137,7 +139,7 @@ SCALARS = st.one_of(
         [*CAMERA_MODELS, "torso", "auto", "walk", "LeftHand", "torso.mp4", "torso:10", 0, -1, 1e308]
     ),
 )
-JUNK = st.recursive(
+RANDOM_VALUES = st.recursive(
     SCALARS,
     lambda inner: st.one_of(
         st.lists(inner, max_size=6), st.dictionaries(st.text(max_size=8), inner, max_size=4)
@@ -147,7 +149,7 @@ JUNK = st.recursive(
 
 
 def replaced(document: Any) -> st.SearchStrategy[Any]:
-    """A sound document with the values at some places replaced by junk."""
+    """Generate a valid document with some values replaced by random ones."""
     places = list(_places(document, ()))
 
     def apply(changes: list[tuple[tuple[Any, ...], Any]]) -> Any:
@@ -156,7 +158,7 @@ def replaced(document: Any) -> st.SearchStrategy[Any]:
             _put(out, place, value)
         return out
 
-    return st.lists(st.tuples(st.sampled_from(places), JUNK), min_size=1, max_size=3).map(apply)
+    return st.lists(st.tuples(st.sampled_from(places), RANDOM_VALUES), min_size=1, max_size=3).map(apply)
 
 
 def _places(value: Any, at: tuple[Any, ...]) -> list[tuple[Any, ...]]:
@@ -179,7 +181,7 @@ def _put(document: Any, place: tuple[Any, ...], value: Any) -> None:
 
 
 def all_job_blocks() -> dict[str, Any]:
-    """A job with every block of options spelled out."""
+    """Return a job with every block of options."""
     options = Job.model_validate({"capture": {"cameras": [{"name": "torso", "video": ["torso.mp4"]}]}})
     return {**yaml.safe_load(JOB), **{
         name: getattr(options, name).model_dump(mode="json", exclude_none=True)
@@ -193,7 +195,7 @@ FOLDER = Path(tempfile.mkdtemp(prefix="bodycap-fuzz-"))
 def reads_or_refuses(
     content: bytes, name: str, reader: Callable[[Path], object], *errors: type[BodycapError]
 ) -> None:
-    """The reader gives an answer, or one of its documented errors with a message and a path or field."""
+    """Check that the reader answers, or raises a documented error with a message and a path or field."""
     path = FOLDER / name
     path.write_bytes(content)
     refused: BodycapError | None = None
@@ -245,10 +247,10 @@ CASES = {
     "calibration values": (calibration, replaced(CALIBRATION).map(json_of), 6_000),
     "calibration text": (calibration, mutations(json.dumps(CALIBRATION, indent=1)).map(utf8), 8_000),
 }
-"""Reader, inputs, and how many of them ``make fuzz`` takes: 52,000 in all, by what one costs."""
-SHARE = "BODYCAP_FUZZ_SHARE"
-"""Of them, the slow tests take this share."""
-USUAL_SHARE = "0.2"
+"""Reader, inputs, and their number in ``make fuzz``: 52,000 in all, chosen by the cost of one input."""
+FRACTION_VARIABLE = "BODYCAP_FUZZ_SHARE"
+"""Environment variable with the fraction of these inputs that the slow tests take."""
+DEFAULT_FRACTION = "0.2"
 
 
 def run(name: str, count: int) -> None:
@@ -270,11 +272,11 @@ def test_readers_answer_or_refuse(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_readers_answer_or_refuse_thousands_of_inputs(name: str) -> None:
-    run(name, round(float(os.environ.get(SHARE, USUAL_SHARE)) * CASES[name][2]))
+    run(name, round(float(os.environ.get(FRACTION_VARIABLE, DEFAULT_FRACTION)) * CASES[name][2]))
 
 
-def test_the_sound_files_are_read() -> None:
-    """What is mutated is accepted as it is, so that mutations reach behind the first check."""
+def test_the_valid_files_are_read() -> None:
+    """The unmutated files are valid, so that mutations are tested beyond the first check."""
     (FOLDER / "torso.mp4").write_bytes(b"")
     for name in ("a.mp4", "b.mp4"):
         (FOLDER / name).write_bytes(b"")

@@ -1,4 +1,4 @@
-"""Decide who may use the live page.
+"""Decide which requests may use the live page.
 
 A server that listens on loopback only is still open to other web pages. A page in the user's browser can send
 requests to 127.0.0.1; with a name server of its own (DNS rebinding) it can even read the answers. Therefore
@@ -32,7 +32,7 @@ _TOKEN_HINT = "python3 -c 'import secrets; print(secrets.token_urlsafe())' makes
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Access:
-    """Where the page listens, and the token that it requires.
+    """Address of the page, and the token that it requires.
 
     Attributes:
         host: Address to listen on.

@@ -178,7 +178,7 @@ class _Routes:
         key, name = request.path_params["key"], request.path_params["name"]
         try:
             await self._uploads.write(key, name, int(size), request.stream())
-        except ClientDisconnect:  # nobody receives an error message
+        except ClientDisconnect:  # the browser cannot receive an error message any more
             return Response(status_code=400)
         return JSONResponse({}, headers=_COMMON_HEADERS)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -28,22 +29,27 @@ class JobList:
     Args:
         spool: The spool.
         trouble: Returns why the watcher cannot access its folders; "" if it can.
+        clock: This process's own clock, seconds.
     """
 
-    def __init__(self, spool: Spool, trouble: Callable[[], str]) -> None:
+    def __init__(
+        self, spool: Spool, trouble: Callable[[], str], clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self.spool = spool
         self._trouble = trouble
+        self._clock = clock
         self._last_jobs: dict[str, Any] = {"jobs": [], "more": 0}
         self._lock = threading.Lock()
-        self._text, self._read_at = "", -_MAX_AGE_S
+        self._text, self._read_at = "", -math.inf
         self._ended: dict[Path, tuple[int, dict[str, Any]]] = {}
 
     def json_text(self) -> str:
-        """Return all jobs as JSON text, at most a second old. While the disk is missing, return the last
-        known jobs.
+        """Return all jobs as JSON text, at most a second old.
+
+        While the disk is missing, return the last known jobs.
         """
         with self._lock:
-            now = time.monotonic()
+            now = self._clock()
             if now - self._read_at >= _MAX_AGE_S:
                 trouble = self._trouble()
                 try:

@@ -1,4 +1,4 @@
-"""Receive videos from browsers: each upload is written to a hidden folder of the inbox until it is complete."""
+"""Receive videos from browsers in hidden folders of the inbox, until they are complete."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Uploads:
     """The folders that browsers are uploading.
 
     Args:
-        spool: Spool whose inbox gets the complete folders.
+        spool: Complete folders are moved to its inbox.
         limits: Largest files and their number.
     """
 
@@ -150,7 +150,7 @@ class Uploads:
                 self._remove(upload)
 
     def clear(self) -> None:
-        """Remove all incomplete uploads: nobody can continue them after the page ends."""
+        """Remove all incomplete uploads, because they cannot be continued after the page ends."""
         for key in list(self._open):
             self.discard(key)
 
@@ -202,7 +202,7 @@ class Uploads:
         if not 0 < size <= most:
             hint = "cut the recording, or ask the operator to raise --limit video_gb"
             raise CaptureError(f"{size / 1e9:.3g} GB, the limit is {most / 1e9:.3g}", path=name, hint=hint)
-        # Other uploads may not have received all their bytes yet; count them so that the disk does not fill up.
+        # Other uploads may not have received all their bytes yet. Count them, so that the disk does not fill.
         coming = sum(sum(other.coming.values()) for other in self._open.values())
         if shutil.disk_usage(upload.folder).free - coming - size < _MIN_FREE_BYTES:
             raise StoreError(

@@ -1,4 +1,4 @@
-"""Lenses from clips of boards: boards drawn through a known lens must give that lens back."""
+"""Calibration from clips of boards: boards drawn with known intrinsics must give these intrinsics."""
 
 import json
 
@@ -33,7 +33,7 @@ CHESSBOARD = CalibrationBoard(kind="chessboard", columns=9, rows=6)
 
 
 def _clip(folder, lens, board, views=16):
-    """A clip of five pictures a second, each of the board elsewhere."""
+    """Write a clip of five pictures a second; each shows the board at another position."""
     plain = board.kind == "chessboard"
     picture = chessboard_picture(9, 6) if plain else board.picture(SQUARE_TEXELS)
     images = board_clip(lens, with_margin(picture), views, np.random.default_rng(1), whole=plain)
@@ -53,7 +53,7 @@ def result(clip):
 def _close(result, lens):
     focal, centre = np.array(result.fit.params[:2]), np.array(result.fit.params[2:4])
     assert np.abs(focal / lens.params[:2] - 1).max() < 0.005
-    # Corners are good to 0.1 px, 600 of them; tilt and centre trade off, a factor of 100.
+    # 600 corners with errors of 0.1 px. Tilt and centre are correlated, which costs a factor of 100.
     assert np.abs(centre - lens.params[2:4]).max() < 1.0
     rays = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(-0.35, 0.35, 5)), axis=-1).reshape(
         -1, 2
@@ -62,26 +62,26 @@ def _close(result, lens):
     found = type(lens)(
         model=result.fit.model, width_px=640, height_px=480, params=np.array(result.fit.params)
     )
-    # All of the lens together: half a pixel anywhere in the picture.
+    # All parameters together: at most half a pixel anywhere in the picture.
     assert np.abs(found.project(points) - lens.project(points)).max() < 0.5
 
 
-def test_a_charuco_clip_gives_the_lens_back(result):
+def test_a_charuco_clip_gives_the_true_intrinsics(result):
     assert result.fit.model == "OPENCV"
     assert result.found >= 15
     assert result.coverage > 0.8
     _close(result, PINHOLE_LENS)
-    # Noise of two grey levels and H.264 move a corner by hundredths of a pixel: not nothing, not more.
+    # Noise of two grey levels and H.264 move a corner by hundredths of a pixel.
     assert 0.01 < result.fit.rms_px < 0.2
     assert not result.notes
 
 
-def test_the_stated_sigma_is_about_the_error(result):
+def test_the_stated_sigma_agrees_with_the_error(result):
     errors = np.abs(np.array(result.fit.params[:2]) - PINHOLE_LENS.params[:2])
     sigmas = np.array(result.fit.focal_sigma_px)
     assert (sigmas > 0).all()
     assert (sigmas < 0.005 * 430).all()
-    # Corner errors are not quite independent: four sigma rather than three.
+    # Corner errors are not fully independent, hence four sigma and not three.
     assert (errors < 4 * sigmas).all()
 
 
@@ -89,14 +89,14 @@ def test_the_stated_sigma_is_about_the_error(result):
 @pytest.mark.parametrize(
     ("lens", "board"), [(PINHOLE_LENS, CHESSBOARD), (FISHEYE_LENS, CHARUCO), (FISHEYE_LENS, CHESSBOARD)]
 )
-def test_other_boards_and_lenses_too(tmp_path, lens, board):
+def test_other_boards_and_camera_models(tmp_path, lens, board):
     clip = _clip(tmp_path, lens, board, views=30)
     found = calibrate_clip(clip, board, "auto", StageContext(work_dir=tmp_path))
     assert found.fit.model == lens.model
     _close(found, lens)
 
 
-def test_a_job_reads_the_file_that_is_written(result, clip, tmp_path):
+def test_a_job_reads_the_written_file(result, clip, tmp_path):
     write_calibration(result, tmp_path / "calib.json", None)
     entry = read_calibration(tmp_path / "calib.json", "torso")
     assert entry.calibration.camera().params.tolist() == result.fit.params
@@ -104,9 +104,9 @@ def test_a_job_reads_the_file_that_is_written(result, clip, tmp_path):
     camera = open_camera(CaptureConfig(cameras=(config,)), config)
     assert camera.calibrated
     assert camera.camera.params.tolist() == result.fit.params
-    told = json.loads((tmp_path / "calib.json").read_text())["calibrated_with"]
-    assert told["rms_px"] == pytest.approx(result.fit.rms_px, abs=1e-4)
-    assert len(told["view_rms_px"]) == told["views"]
+    report = json.loads((tmp_path / "calib.json").read_text())["calibrated_with"]
+    assert report["rms_px"] == pytest.approx(result.fit.rms_px, abs=1e-4)
+    assert len(report["view_rms_px"]) == report["views"]
 
 
 def test_cameras_are_added_to_one_file(result, tmp_path):
@@ -120,12 +120,12 @@ def test_cameras_are_added_to_one_file(result, tmp_path):
         write_calibration(result, path, "torso")
 
 
-def test_the_preview_straightens_the_board(result, tmp_path):
+def test_the_preview_is_undistorted(result, tmp_path):
     write_preview(result, tmp_path / "calib.png")
     with av.open(str(tmp_path / "calib.png")) as picture:
         image = next(picture.decode(video=0)).to_ndarray(format="gray")
     assert image.shape == (480, 1280)
-    # Corners of a straight row lie on a line; in the picture as filmed they do not.
+    # After undistortion the corners of a row are on a straight line; before, they are not.
     bends = []
     for half in (image[:, :640], image[:, 640:]):
         view = CHARUCO.find(np.ascontiguousarray(half))
@@ -137,7 +137,7 @@ def test_the_preview_straightens_the_board(result, tmp_path):
 
 def test_a_clip_without_the_board_is_refused_with_numbers(tmp_path):
     clip = _clip(tmp_path, PINHOLE_LENS, CHARUCO, views=4)
-    with pytest.raises(CaptureError, match=r"found in 0 of 4 pictures looked at; it takes 8") as refused:
+    with pytest.raises(CaptureError, match=r"found in 0 of 4 inspected pictures; 8 are needed") as refused:
         calibrate_clip(clip, CHESSBOARD, "auto", StageContext(work_dir=tmp_path))
     assert "inner corners" in refused.value.hint
 
@@ -145,9 +145,9 @@ def test_a_clip_without_the_board_is_refused_with_numbers(tmp_path):
 def test_the_command_writes_calibration_and_preview(clip, tmp_path, capsys):
     out = tmp_path / "lens.json"
     assert cli.main(["calibrate", str(clip), "--charuco", "9x6", "--lens", "opencv", "--out", str(out)]) == 0
-    told = capsys.readouterr().out
-    assert "found in 16 of 16 pictures" in told
-    assert "reprojection error" in told
+    output = capsys.readouterr().out
+    assert "found in 16 of 16 pictures" in output
+    assert "reprojection error" in output
     assert read_calibration(out, "any").calibration.model == "OPENCV"
     assert (tmp_path / "lens.png").stat().st_size > 10_000
 
@@ -155,15 +155,15 @@ def test_the_command_writes_calibration_and_preview(clip, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "which board?"),
-        (["--charuco", "9x6", "--chessboard", "9x6"], "which board?"),
-        (["--charuco", "nine"], "no board size"),
+        ([], "name one board"),
+        (["--charuco", "9x6", "--chessboard", "9x6"], "name one board"),
+        (["--charuco", "nine"], "not a board size"),
         (["--charuco", "2x2"], "too small"),
         (["--charuco", "9x6", "--dictionary", "9X9"], "unknown markers"),
         (["--charuco", "9x6", "--marker", "1.5"], "cannot be 1.5 of a square"),
     ],
 )
-def test_wrong_words_are_refused(clip, tmp_path, capsys, words, message):
+def test_wrong_options_are_refused(clip, tmp_path, capsys, words, message):
     assert cli.main(["calibrate", str(clip), *words, "--out", str(tmp_path / "calib.json")]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "calib.json").exists()
@@ -184,12 +184,12 @@ def _exact_views(lens, rng, count, noise_px=0.0):
 @pytest.mark.parametrize("lens", [PINHOLE_LENS, FISHEYE_LENS])
 def test_exact_corners_give_the_exact_lens_and_pixel_origin(lens):
     fit = fit_intrinsics(lens.model, _exact_views(lens, np.random.default_rng(0), 12), (640, 480))
-    # Single precision corners of the pinhole solver: 3e-5 px.
+    # The pinhole solver takes corners in single precision, which is 3e-5 px.
     assert np.abs(np.array(fit.params[:4]) - lens.params[:4]).max() < 0.01
     assert fit.rms_px < 1e-3
 
 
-def test_a_view_that_does_not_fit_is_left_out():
+def test_an_outlier_view_is_removed():
     rng = np.random.default_rng(0)
     views = _exact_views(PINHOLE_LENS, rng, 12, noise_px=0.05)
     views[5] = BoardCorners(board_m=views[5].board_m, px=views[5].px + rng.normal(0, 4.0, views[5].px.shape))
@@ -198,7 +198,7 @@ def test_a_view_that_does_not_fit_is_left_out():
     assert fit.rms_px < 0.1
 
 
-def test_views_are_chosen_to_differ():
+def test_diverse_views_are_selected():
     rng = np.random.default_rng(0)
     near = _exact_views(PINHOLE_LENS, np.random.default_rng(1), 1)
     same = [

@@ -1,4 +1,4 @@
-"""What `check` advises: tied to what the files show, and silent where there is nothing to say."""
+"""Advice of `check`: it follows from the files, and there is none without a reason."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LENS = {"model": "PINHOLE", "params": [300, 300, 160, 120], "width": 320, "heigh
 
 
 def room(seed: int, *, brightness: float = 1.0, texture: bool = True) -> np.ndarray:
-    """A picture with hundreds of corners, or a wall."""
+    """Return a picture with hundreds of corners, or of a wall without texture."""
     rng = np.random.default_rng(seed)
     coarse = (
         rng.integers(60, 220, (24, 32)) if texture else np.full((24, 32), 120) + rng.integers(0, 9, (24, 32))
@@ -40,16 +40,16 @@ def advice(folder: Path, height_m: float | None = None) -> str:
     return "\n".join(report.advice)
 
 
-def test_hand_started_cameras_are_asked_for_their_clap(tmp_path: Path) -> None:
+def test_the_clap_is_asked_for_if_no_offset_is_stated(tmp_path: Path) -> None:
     assert "clap" in advice(walk(tmp_path))
     (tmp_path / "job.yaml").write_text(
         "capture:\n  calibration: calib.json\n  cameras:\n"
         "    - {name: torso, video: torso.mp4}\n    - {name: head, video: head.mp4, offset_s: 0.2}\n"
     )
-    assert advice(tmp_path / "job.yaml") == "", "nothing to say"
+    assert advice(tmp_path / "job.yaml") == ""
 
 
-def test_a_guessed_lens_and_a_bare_height_are_worth_a_word(tmp_path: Path) -> None:
+def test_a_guessed_lens_and_a_height_without_skeleton_give_advice(tmp_path: Path) -> None:
     walk(tmp_path)
     assert "board" not in advice(tmp_path)
     (tmp_path / "calib.json").unlink()
@@ -64,24 +64,24 @@ def test_a_camera_that_ends_early_or_runs_slowly_is_named(tmp_path: Path) -> Non
     assert "head ends 4.0 s before the others" in advice(tmp_path)
 
 
-def test_a_long_capture_says_what_it_will_cost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_duration_of_a_long_capture_is_estimated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bodycap_batch.check.advice._LONG_CAPTURE_S", 4.0)
     assert "5 s of video in all: expect 1 to 1 minutes" in advice(walk(tmp_path))
 
 
 @pytest.mark.parametrize(
-    ("pictures", "said"),
+    ("pictures", "expected"),
     [
-        (lambda seed: room(seed, texture=False), "hardly anything to hold on to"),
+        (lambda seed: room(seed, texture=False), "show hardly any texture"),
         (lambda seed: room(seed, brightness=0.25), "dark pictures (median grey 3"),
     ],
 )
-def test_bare_and_dark_pictures_are_told_of_that_camera_only(
-    tmp_path: Path, pictures: Callable[[int], np.ndarray], said: str
+def test_untextured_and_dark_pictures_are_reported_for_that_camera_only(
+    tmp_path: Path, pictures: Callable[[int], np.ndarray], expected: str
 ) -> None:
     head, torso = check_path(walk(tmp_path, pictures)).cameras
-    assert said in "\n".join(head.notes)
-    assert "hold on" not in "\n".join(torso.notes)
+    assert expected in "\n".join(head.notes)
+    assert "texture" not in "\n".join(torso.notes)
     assert "dark" not in "\n".join(torso.notes)
 
 
@@ -93,4 +93,4 @@ def test_advice_is_wrapped_and_numbered_and_in_the_json(tmp_path: Path) -> None:
     assert any(line.startswith("advice 2: ") for line in lines)
     assert report.to_dict()["advice"] == list(report.advice)
     (tmp_path / "head.mp4").write_bytes(b"")
-    assert check_path(tmp_path).advice == (), "first things first"
+    assert check_path(tmp_path).advice == (), "errors are fixed before advice is given"

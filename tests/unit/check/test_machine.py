@@ -1,4 +1,4 @@
-"""`bodycap doctor`: what is missing is said with the remedy."""
+"""`bodycap doctor`: each missing part is reported with a remedy."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from bodycap_batch.check.machine import MachineFinding, examine_machine
 from bodycap_batch.cli import main
 
 
-def look(name: str, folder: Path) -> MachineFinding:
+def finding(name: str, folder: Path) -> MachineFinding:
     return next(each for each in examine_machine(folder) if each.what == name)
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One small library instead of all: open3d alone takes seconds."""
+    """Test one small library instead of all: open3d alone takes seconds."""
     monkeypatch.setattr(machine, "_LIBRARIES", {"numpy": "numpy"})
     monkeypatch.setattr(
         machine, "_video_finding", lambda: MachineFinding(what="video", state="ok", found="as ever")
     )
 
 
-def test_a_fit_machine_is_called_fit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_machine_without_problems_can_run_jobs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--out", str(tmp_path / "not" / "there")]) == 0
-    told = capsys.readouterr().out
-    assert told.splitlines()[-1] == "fit to run jobs"
-    assert "numpy" in told
+    output = capsys.readouterr().out
+    assert output.splitlines()[-1] == "this machine can run jobs"
+    assert "numpy" in output
     assert list(tmp_path.iterdir()) == [], "nothing is left behind"
 
 
@@ -40,41 +40,41 @@ def test_a_library_that_does_not_load_is_a_problem_with_its_remedy(
         machine, "_LIBRARIES", {"numpy": "numpy", "gone": "no_such_module", "sick": "os; os.abort()"}
     )
     assert main(["doctor", "--out", str(tmp_path), "--json"]) == 5
-    looks = {each["what"]: each for each in json.loads(capsys.readouterr().out)}
-    assert looks["numpy"]["state"] == "ok"
+    findings = {each["what"]: each for each in json.loads(capsys.readouterr().out)}
+    assert findings["numpy"]["state"] == "ok"
     for name in ("gone", "sick"):
-        assert looks[name]["state"] == "problem"
-        assert "requirements.lock" in looks[name]["remedy"]
-    assert "no_such_module" in looks["gone"]["found"]
+        assert findings[name]["state"] == "problem"
+        assert "requirements.lock" in findings[name]["remedy"]
+    assert "no_such_module" in findings["gone"]["found"]
 
 
 def test_a_missing_system_library_names_the_packages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    said = "ImportError: libGL.so.1: cannot open shared object file"
-    monkeypatch.setattr(machine, "_error_of_code", lambda code: said)
-    assert "apt-get install" in look("numpy", tmp_path).remedy
+    error = "ImportError: libGL.so.1: cannot open shared object file"
+    monkeypatch.setattr(machine, "_error_of_code", lambda code: error)
+    assert "apt-get install" in finding("numpy", tmp_path).remedy
 
 
-def test_a_full_disk_and_a_folder_that_takes_no_files(
+def test_a_full_disk_and_an_unwritable_folder_are_problems(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage = machine.shutil._ntuple_diskusage(100, 100, 100 << 20)  # type: ignore[attr-defined]
     monkeypatch.setattr(machine.shutil, "disk_usage", lambda place: usage)
-    disk = look("disk", tmp_path)
+    disk = finding("disk", tmp_path)
     assert disk.state == "problem"
     assert "--store" in disk.remedy
     (tmp_path / "file").write_text("")
-    assert look("writing", tmp_path / "file").state == "problem"
+    assert finding("writing", tmp_path / "file").state == "problem"
 
 
 def test_without_hard_links_results_are_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine, "_can_hard_link", lambda source, target: False)
-    writing = look("writing", tmp_path)
+    writing = finding("writing", tmp_path)
     assert writing.state == "note"
     assert "copied" in writing.remedy
 
 
 def test_a_missing_extra_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine, "_EXTRAS", {"formats": (("no_such_module",), "C3D and USD files")})
-    extra = look("extra [formats]", tmp_path)
+    extra = finding("extra [formats]", tmp_path)
     assert extra.state == "note"
     assert "[formats]" in extra.remedy

@@ -1,4 +1,4 @@
-"""The pre-flight: what it tells of a good capture, and what it says of a doubtful one."""
+"""The check before a job: a good capture gives no notes, and each fault is reported."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_good_capture(walk: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_what_a_colleague_would_mention(walk: Path) -> None:
+def test_an_unlikely_calibration_and_dropped_frames_are_reported(walk: Path) -> None:
     lens = {**LENS, "params": [4, 4, 32, 24]}
     sharp = {**LENS, "params": [40, 40, 55, 24]}
     (walk / "calib.json").write_text(json.dumps({"cameras": {"torso": lens, "left_palm": sharp}}))
@@ -59,12 +59,12 @@ def test_what_a_colleague_would_mention(walk: Path) -> None:
     (walk / "torso.timestamps.txt").write_text("".join(f"{t:.6f}\n" for t in times))
     palm, torso = check_path(walk).cameras
     assert torso.variable_rate
-    assert "4 frames were dropped at 2 places, the longest hole is 0.10 s" in torso.notes
+    assert "4 frames were dropped at 2 places, the longest gap is 0.10 s" in torso.notes
     assert any("focal length" in note for note in torso.notes)
     assert any("principal point" in note for note in palm.notes)
 
 
-def test_short_grey_and_partly_black_videos_are_mentioned(tmp_path: Path) -> None:
+def test_short_grey_and_partly_black_videos_are_reported(tmp_path: Path) -> None:
     flat, black = np.full((48, 64), 120, np.uint8), np.zeros((48, 64), np.uint8)
     write_video(tmp_path / "torso.mp4", [flat] * 20)
     write_video(tmp_path / "head.mp4", [black] * 10 + FRAMES[:20], gop=5)
@@ -93,7 +93,7 @@ def test_cameras_that_never_ran_together(walk: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("named", "told"),
+    ("text", "message"),
     [
         ("merge: {known_distance: ['torso:0', 'torso:75', 2.5]}", "camera torso has no frame 75"),
         ("merge: {known_distance: ['torso:0', 'trso:9', 2.5]}", "there is no camera 'trso'"),
@@ -110,13 +110,13 @@ def test_cameras_that_never_ran_together(walk: Path) -> None:
         ("capture: {start_s: 1.0}\nmerge: {known_distance: ['torso:30', 'torso:74', 2.5]}", ""),
     ],
 )
-def test_frames_that_are_not_there_are_missed_beforehand(walk: Path, named: str, told: str) -> None:
-    (walk / "job.yaml").write_text(f"{named}\n")
+def test_named_frames_that_do_not_exist_or_are_unused_are_errors(walk: Path, text: str, message: str) -> None:
+    (walk / "job.yaml").write_text(f"{text}\n")
     report = check_path(walk)
-    assert report.exit_code == (2 if told else 0)
-    assert [error.message for error in report.errors] == ([told] if told else [])
-    if "frame 0 of" in told:
-        assert "30 to 74 lie between start_s and end_s" in str(report.errors[0].hint)
+    assert report.exit_code == (2 if message else 0)
+    assert [error.message for error in report.errors] == ([message] if message else [])
+    if "frame 0 of" in message:
+        assert "frames 30 to 74, counted from 0" in str(report.errors[0].hint)
 
 
 def test_every_problem_is_collected(walk: Path) -> None:
@@ -143,7 +143,7 @@ def test_the_skeleton_file_must_carry_the_cameras(walk: Path, tmp_path: Path) ->
     assert check_path(walk, Overrides(skeleton=str(bvh))).errors[0].path == str(bvh)
 
 
-def test_formats_that_cannot_be_written_are_refused_beforehand(
+def test_formats_that_cannot_be_written_are_errors(
     walk: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     job = load_job(walk, Overrides(out=tmp_path / "out", height_m=1.8))
@@ -187,11 +187,11 @@ def test_room_on_the_disk(walk: Path, tmp_path: Path, monkeypatch: pytest.Monkey
     assert report.exit_code == 5
     assert report.errors[0].path == str(tmp_path)
     assert "--out" in str(report.errors[0].hint)
-    # Two cameras of 75 frames: 50 MB and 70 kB a frame are the least, four times that is plenty.
+    # Two cameras of 75 frames need at least 50 MB and 70 kB per frame; four times that is ample.
     free = 61 * 10**6
     assert any("easy capture" in note for note in check_job(job).notes)
     with pytest.raises(StoreError, match="61 MB free, the job needs about 83 MB"):
-        require_room(tmp_path, 150, 150)  # so large that all of them are kept
+        require_room(tmp_path, 150, 150)  # large frames, of which copies are stored
     free = 243 * 10**6
     assert len(check_job(job).notes) == 1
 
@@ -214,21 +214,21 @@ def test_the_sample_job_before_it_is_rendered(tmp_path: Path) -> None:
     assert "renders its videos" in report.notes[0]
 
 
-def test_who_stops_a_check_does_not_wait_for_the_cameras_that_are_left(
+def test_a_stopped_check_does_not_wait_for_the_remaining_cameras(
     walk: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = load_job(walk)
-    looked: list[object] = []
+    checked: list[object] = []
 
-    def look(_: object, config: object) -> None:
+    def check_camera(_: object, config: object) -> None:
         if config is job.capture.cameras[0]:
             raise Cancelled("stopped on request")
-        looked.append(config)
-        time.sleep(0.5 if len(looked) == 1 else 0.0)
+        checked.append(config)
+        time.sleep(0.5 if len(checked) == 1 else 0.0)
 
-    monkeypatch.setattr(preflight, "_check_camera", look)
+    monkeypatch.setattr(preflight, "_check_camera", check_camera)
     cameras = (job.capture.cameras[0], *job.capture.cameras[1:] * 50)
     many = job.model_copy(update={"capture": job.capture.model_copy(update={"cameras": cameras})})
     with pytest.raises(Cancelled):
         require_ready(many, threads=1)
-    assert len(looked) < 50
+    assert len(checked) < 50

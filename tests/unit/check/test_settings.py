@@ -1,4 +1,4 @@
-"""What a pre-flight reads of a camera's settings: GoPro's box, a phone's metadata, a varying rate."""
+"""Camera settings that a check reads: GoPro's settings box, a phone's metadata, a variable rate."""
 
 import struct
 
@@ -19,7 +19,7 @@ def _item(key, text):
 
 
 def _with_gopro_box(path, settings):
-    """Add a settings box to an MP4 as the camera does: moov/udta/GPMF, here in a moov of its own."""
+    """Return a settings box as in a GoPro's MP4: moov/udta/GPMF, here in a moov box of its own."""
     items = b"".join(_item(key, text) for key, text in settings.items())
     nested = struct.pack(">4sBBH", b"DEVC", 0, 1, len(items)) + items
     box = struct.pack(">I4s", 8 + len(nested), b"GPMF") + nested
@@ -31,7 +31,7 @@ def _with_gopro_box(path, settings):
 def _notes(folder, frames=FRAMES, settings=None, **values):
     path = write_video(folder / "torso.mp4", frames, **values)
     if settings is not None:
-        # Ahead of the file's own, where a player skips it: kept apart, since moov holds offsets.
+        # A second moov box at the end: the file's own moov must not change, because it holds offsets.
         content = path.read_bytes()
         size = struct.unpack(">I", content[:4])[0]
         box = _with_gopro_box(path, settings)
@@ -40,7 +40,7 @@ def _notes(folder, frames=FRAMES, settings=None, **values):
     return camera.notes
 
 
-def test_a_plain_file_raises_no_alarm(tmp_path):
+def test_a_plain_file_gives_no_note(tmp_path):
     assert _notes(tmp_path) == ()
     assert gopro_settings(tmp_path / "torso.mp4") == {}
 
@@ -59,11 +59,11 @@ def test_gopro_settings_that_spoil_a_capture_are_named(tmp_path, settings, words
 
 
 @pytest.mark.parametrize("settings", [{"EISE": "N", "EISA": "HS High"}, {"EISA": "N/A", "DZOM": "N"}, {}])
-def test_gopro_settings_as_they_should_be_raise_no_alarm(tmp_path, settings):
+def test_good_gopro_settings_give_no_note(tmp_path, settings):
     assert _notes(tmp_path, settings=settings) == ()
 
 
-def test_a_damaged_box_is_left_alone(tmp_path):
+def test_a_damaged_box_is_ignored(tmp_path):
     path = tmp_path / "a.mp4"
     path.write_bytes(struct.pack(">I4s", 4, b"moov") + b"\0" * 40)
     assert gopro_settings(path) == {}
@@ -74,14 +74,14 @@ def test_a_damaged_box_is_left_alone(tmp_path):
     assert set(gopro_settings(path)) <= {"EISE"}
 
 
-def test_a_phone_is_told_to_switch_stabilisation_off(tmp_path):
+def test_a_phone_gives_a_note_on_stabilisation(tmp_path):
     plain = write_video(tmp_path / "plain" / "torso.mp4", FRAMES)
-    told = {"com.apple.quicktime.make": "Apple", "com.apple.quicktime.model": "iPhone 13"}
+    metadata = {"com.apple.quicktime.make": "Apple", "com.apple.quicktime.model": "iPhone 13"}
     (tmp_path / "phone").mkdir()
     named = tmp_path / "phone" / "torso.mov"
     tags = {"movflags": "use_metadata_tags"}
     with av.open(str(plain)) as source, av.open(str(named), "w", options=tags) as target:
-        target.metadata.update(told)
+        target.metadata.update(metadata)
         stream = target.add_stream_from_template(source.streams.video[0])
         for packet in source.demux(video=0):
             if packet.dts is not None:
@@ -92,14 +92,14 @@ def test_a_phone_is_told_to_switch_stabilisation_off(tmp_path):
     assert check_path(plain.parent).cameras[0].notes == ()
 
 
-def test_a_varying_rate_is_told_with_the_setting_to_change(tmp_path):
+def test_a_variable_rate_is_reported_with_the_setting_to_change(tmp_path):
     steps = np.where(np.arange(74) // 20 % 2, 10, 20)
     (note,) = _notes(tmp_path, pts=np.concatenate([[0], np.cumsum(steps)]).tolist())
     assert "varies between 15 and 30 per second" in note
     assert "fixed rate" in note
 
 
-def test_dropped_frames_and_jitter_are_no_varying_rate(tmp_path):
+def test_dropped_frames_and_jitter_are_not_a_variable_rate(tmp_path):
     rng = np.random.default_rng(0)
     steps = np.where(rng.uniform(size=74) < 0.1, 20, 10) + rng.integers(-1, 2, 74)
     notes = _notes(tmp_path, pts=np.concatenate([[0], np.cumsum(steps)]).tolist())

@@ -1,4 +1,4 @@
-"""`bodycap init`: the job file says what the folder holds, and means the same as the folder."""
+"""`bodycap init`: the job file lists what the folder holds, and gives the same job as the folder."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def folder(tmp_path: Path) -> Path:
     return walk
 
 
-def test_the_job_written_means_what_the_folder_means(folder: Path) -> None:
+def test_the_job_file_and_the_folder_give_the_same_job(folder: Path) -> None:
     (folder / "calib.json").write_text(json.dumps(LENS))
     without = load_job(folder)
     path = write_job_template(folder)
@@ -45,7 +45,7 @@ def test_names_that_look_like_numbers_stay_text(tmp_path: Path, named: str) -> N
     assert sorted(camera.name for camera in job.capture.cameras) == ["2", "torso"]
 
 
-def test_no_name_is_given_twice(tmp_path: Path) -> None:
+def test_every_camera_gets_another_name(tmp_path: Path) -> None:
     for video in ("cam 1.mp4", "cam_1.mp4", "CAM-1.mp4", "left palm.mp4", "left_palm.mp4", f"{'x' * 80}.mp4"):
         write_video(tmp_path / video, FRAMES[:5])
     cameras = yaml.safe_load(job_template(tmp_path))["capture"]["cameras"]
@@ -53,14 +53,14 @@ def test_no_name_is_given_twice(tmp_path: Path) -> None:
     assert len({name.lower() for name in names}) == len(names) == 6
     assert {"cam_1", "cam_1_2", "left_palm", "left_palm_2"} <= set(names)
     assert max(map(len, names)) <= 64
-    # what the file's name says of the place is not asked for again
+    # a mount that the file name states is not asked for
     assert [
         camera["name"] for camera in cameras if "mount" in camera and camera["mount"] != UNKNOWN_MOUNT
     ] == []
     assert sum(camera.get("mount") == UNKNOWN_MOUNT for camera in cameras) == 4
 
 
-def test_what_is_found_is_used_and_said(folder: Path) -> None:
+def test_skeleton_video_and_calibration_of_the_folder_are_used(folder: Path) -> None:
     (folder / "subject.bvh").write_text(BVH)
     text = job_template(folder)
     assert yaml.safe_load(text)["skeleton"] == "subject.bvh"
@@ -70,13 +70,13 @@ def test_what_is_found_is_used_and_said(folder: Path) -> None:
     assert yaml.safe_load(job_template(folder))["capture"]["calibration"] == "calib.json"
 
 
-def test_chapters_side_by_side_are_one_camera_whose_place_is_asked_for(
+def test_chapters_are_one_camera_with_an_unknown_mount(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("GX020042.mp4", "GX010042.mp4"):
         write_video(folder / name, FRAMES[:10])
     assert main(["init", str(folder)]) == 0
-    assert "where 1 camera was worn" in capsys.readouterr().out
+    assert "fill in `mount:`, the place on the body, of 1 camera, then" in capsys.readouterr().out
     data = yaml.safe_load((folder / "job.yaml").read_text())
     (gopro,) = (camera for camera in data["capture"]["cameras"] if camera.get("mount"))
     assert gopro["video"] == ["GX010042.mp4", "GX020042.mp4"]
@@ -89,24 +89,22 @@ def test_chapters_side_by_side_are_one_camera_whose_place_is_asked_for(
     assert len(load_job(folder / "job.yaml").capture.cameras) == 3
 
 
-def options_switched_on(text: str) -> dict[str, Any]:
-    """The lines after the last heading, without their comment signs."""
+def options_without_comment_signs(text: str) -> dict[str, Any]:
+    """Return the options after the last heading, without their comment signs."""
     lines = text.partition("change what you need, leave the rest.\n")[2].splitlines()
     assert all(line.startswith("#") for line in lines)
     return dict(yaml.safe_load("\n".join(line.removeprefix("# ") for line in lines)))
 
 
-def test_every_option_of_every_stage_is_there_with_its_default(folder: Path) -> None:
-    found = options_switched_on(job_template(folder))
+def test_every_option_of_every_stage_is_listed_with_its_default(folder: Path) -> None:
+    found = options_without_comment_signs(job_template(folder))
     plain = Job.model_validate({"capture": {"cameras": [{"name": "torso", "video": ["torso.mp4"]}]}})
     for stage, options in found.items():
         assert options == getattr(plain, stage).model_dump(mode="json"), stage
     assert set(found) == {"keyframes", "map", "registration", "merge", "export"}
 
 
-def test_a_job_that_is_there_is_kept_unless_told_otherwise(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_existing_job_file_is_kept_without_force(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "job.yaml").write_text("mine")
     assert main(["init", str(folder)]) == 2
     assert "--force" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""A picture that stands still is told, sensor noise and all; one that moves is not."""
+"""Static pictures are found in spite of sensor noise; moving pictures give no note."""
 
 from __future__ import annotations
 
@@ -38,26 +38,26 @@ def _notes(
 
 
 @pytest.mark.parametrize("gop", [8, 1000])
-def test_a_camera_on_a_table_is_told_and_a_worn_one_is_not(tmp_path: Path, gop: int) -> None:
+def test_a_camera_on_a_table_is_reported_and_a_moving_one_is_not(tmp_path: Path, gop: int) -> None:
     (note,) = _notes(tmp_path / "table", _still, gop)
     assert "throughout" in note
     assert not _notes(tmp_path / "worn", _moving, gop)
 
 
-def test_it_is_told_when_the_picture_stopped(tmp_path: Path) -> None:
+def test_the_time_of_the_static_part_is_reported(tmp_path: Path) -> None:
     def stopping(index: int) -> Image:
         return _moving(index) if index < 35 else _still(index)
 
     (note,) = _notes(tmp_path / "seconds", stopping, 8, fps=10)
     assert "from about 4.8 to 7.9 s (5 pictures" in note
-    # The same pictures in a third of the time are of somebody who waits for a second.
+    # The same pictures in a third of the time show a person who waits for a second.
     assert not _notes(tmp_path / "moment", stopping, 8)
 
 
-def test_nothing_is_told_of_what_lies_behind_the_pictures_looked_at(
+def test_the_part_after_the_inspected_pictures_gives_no_note(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # As of large pictures, few frames are decoded after a key frame.
+    # As with large pictures, few frames are decoded after a key frame.
     monkeypatch.setattr(picture_quality, "_MAX_DECODED_FRAMES", 25)
     assert not _notes(tmp_path / "ready", lambda index: _moving(max(0, index - 30)), 1000)
     assert not _notes(tmp_path / "slow", lambda index: _wide(0.25 * index), 40)
@@ -69,23 +69,23 @@ def _wide(left: float) -> Image:
     return np.round((1.0 - part) * first + part * second).astype(np.uint8)
 
 
-def test_a_moment_is_no_standstill(tmp_path: Path) -> None:
+def test_a_short_clip_is_not_static(tmp_path: Path) -> None:
     assert not _notes(tmp_path / "moving", lambda index: _wide(0.5 * index), 30, count=9)
     assert not _notes(tmp_path / "still", _still, 30, count=9)
 
 
-def test_where_nothing_is_to_be_seen_nothing_stands_still(tmp_path: Path) -> None:
+def test_black_pictures_are_not_static(tmp_path: Path) -> None:
     black = np.full((240, 160), 16, np.uint8)
     assert not _notes(tmp_path, lambda index: black if index > 20 else _moving(index), 8)
 
 
-def test_pictures_are_looked_at_although_key_frames_are_rare(tmp_path: Path) -> None:
+def test_frames_between_rare_key_frames_are_sampled(tmp_path: Path) -> None:
     def samples(name: str, *, gop: int, size: tuple[int, int] = (64, 48)) -> list[int]:
         frames = [textured_frame(index % 40, *size) for index in range(75)]
         write_video(tmp_path / name / "torso.mp4", frames, gop=gop, bframes=False)
         return sample_indices(open_capture(load_job(tmp_path / name).capture).cameras[0], 8).tolist()
 
-    assert samples("lone", gop=1000) == [0, 11, 21, 32, 42, 53, 63, 74]
+    assert samples("single", gop=1000) == [0, 11, 21, 32, 42, 53, 63, 74]
     # Four times the pixels of 640 by 480: a quarter of 250 frames.
     assert samples("large", gop=1000, size=(1280, 960)) == [0, 9, 18, 27, 35, 44, 53, 62]
     assert samples("two", gop=40) == [0, 13, 26, 39, 40, 51, 63, 74]

@@ -1,4 +1,4 @@
-"""Who may use the live page."""
+"""Requests that the live page allows and refuses."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_loopback_is_reached_under_its_names(host: str) -> None:
     "host",
     ["", "evil.example:8080", "127.0.0.1", "127.0.0.1:80", "127.0.0.1.evil.example:8080", "10.0.0.5:8080"],
 )
-def test_another_name_is_refused_where_only_this_machine_can_ask(host: str) -> None:
+def test_another_host_name_is_refused_on_loopback(host: str) -> None:
     assert code(LOCAL, host=host) == 421
 
 
@@ -49,18 +49,18 @@ def test_another_name_is_refused_where_only_this_machine_can_ask(host: str) -> N
     ],
     ids=str,
 )
-def test_what_changes_something_must_come_from_the_page_itself(method: str, headers: dict[str, str]) -> None:
+def test_requests_with_changes_must_come_from_the_page(method: str, headers: dict[str, str]) -> None:
     assert code(LOCAL, method, **headers) == 403
 
 
-def test_other_pages_may_link_here_but_not_read() -> None:
+def test_other_pages_may_link_to_the_page_but_not_read_it() -> None:
     assert code(LOCAL, sec_fetch_site="cross-site", sec_fetch_dest="document") == 200
     assert code(LOCAL, sec_fetch_site="cross-site", sec_fetch_dest="script") == 403
     assert code(LOCAL, origin="http://evil.example") == 403
     assert code(LOCAL, "POST", sec_fetch_site="cross-site", sec_fetch_dest="document", origin="null") == 403
 
 
-def test_elsewhere_a_token_is_needed_for_everything() -> None:
+def test_a_token_is_required_except_on_loopback() -> None:
     assert code(OPEN, host="10.0.0.5:8080") == 401
     assert code(OPEN, host="10.0.0.5:8080", query=f"token={TOKEN}") == 200
     assert code(OPEN, host="10.0.0.5:8080", query="token=wrong") == 401
@@ -76,14 +76,14 @@ def test_elsewhere_a_token_is_needed_for_everything() -> None:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "[::1]", "127.0.0.1:80"])
-def test_the_usual_port_is_not_named_by_browsers(host: str) -> None:
+def test_browsers_omit_the_default_port(host: str) -> None:
     usual = Access(host="127.0.0.1", port=80)
     assert code(usual, host=host) == 200
     assert code(usual, "POST", host=host, origin=f"http://{host}") == 200
     assert code(usual, host="evil.example") == 421
 
 
-def test_addresses_are_read() -> None:
+def test_addresses_are_parsed() -> None:
     assert access_from_address("127.0.0.1:8080", "") == LOCAL
     assert access_from_address("[::1]:80", "").url == "http://[::1]:80/"
     assert access_from_address("0.0.0.0:8080", TOKEN) == OPEN

@@ -1,4 +1,4 @@
-"""Parts of the watched folder: what is complete, whose job it is, what a heartbeat says."""
+"""Parts of the watched folder: complete entries, claims, heartbeats, names and paths."""
 
 from __future__ import annotations
 
@@ -31,75 +31,75 @@ class Clock:
         return self.now
 
 
-def completed(settling: CompletionTracker, inbox: Path) -> list[str]:
-    return [drop.name for drop, _ in settling.complete_entries(entries_in(inbox))]
+def completed(tracker: CompletionTracker, inbox: Path) -> list[str]:
+    return [entry.name for entry, _ in tracker.complete_entries(entries_in(inbox))]
 
 
-def test_a_folder_is_complete_when_it_has_been_still_for_long_enough(tmp_path: Path) -> None:
+def test_a_folder_is_complete_when_it_is_unchanged_for_long_enough(tmp_path: Path) -> None:
     clock = Clock()
-    settling = CompletionTracker(10.0, 100, clock)
+    tracker = CompletionTracker(10.0, 100, clock)
     folder = tmp_path / "walk"
     folder.mkdir()
-    assert completed(settling, tmp_path) == []
+    assert completed(tracker, tmp_path) == []
     clock.now += 60
-    assert completed(settling, tmp_path) == []  # empty: it has just been made
+    assert completed(tracker, tmp_path) == []  # the folder is empty
     video = folder / "torso.mp4"
     for size in (100, 200):
         video.write_bytes(bytes(size))
-        assert completed(settling, tmp_path) == []
+        assert completed(tracker, tmp_path) == []
         clock.now += 9.9
-        assert completed(settling, tmp_path) == []
-    os.utime(video, ns=(1, 1))  # a copy that keeps times ends by setting them
-    assert completed(settling, tmp_path) == []
+        assert completed(tracker, tmp_path) == []
+    os.utime(video, ns=(1, 1))  # a copy that preserves times sets them at its end
+    assert completed(tracker, tmp_path) == []
     clock.now += 10
-    assert completed(settling, tmp_path) == ["walk"]
+    assert completed(tracker, tmp_path) == ["walk"]
 
 
 @pytest.mark.parametrize(
     "left", ["head.mp4.part", ".head.mp4.Xy3", "head/.GX01.MP4.tmp", ".rsync-partial/head.mp4"]
 )
-def test_what_a_copying_program_left_holds_a_folder_back_until_ready(tmp_path: Path, left: str) -> None:
+def test_files_of_a_copying_program_delay_a_folder_until_ready(tmp_path: Path, left: str) -> None:
     clock = Clock()
-    settling = CompletionTracker(10.0, 100, clock)
+    tracker = CompletionTracker(10.0, 100, clock)
     (tmp_path / "walk" / left).parent.mkdir(parents=True)
     (tmp_path / "walk" / left).touch()
     (tmp_path / "walk" / "torso.mp4").touch()
-    completed(settling, tmp_path)
+    completed(tracker, tmp_path)
     clock.now += 1000
-    assert completed(settling, tmp_path) == []
+    assert completed(tracker, tmp_path) == []
     assert left in take_snapshot(InboxEntry(tmp_path / "walk"), 100).incomplete_reason
     (tmp_path / "walk" / "READY").touch()
-    assert completed(settling, tmp_path) == ["walk"]
+    assert completed(tracker, tmp_path) == ["walk"]
 
 
-def test_what_file_managers_leave_holds_nothing_back(tmp_path: Path) -> None:
+def test_files_of_file_managers_delay_nothing(tmp_path: Path) -> None:
     (tmp_path / "walk").mkdir()
     for name in ("torso.mp4", ".DS_Store", "._torso.mp4"):
         (tmp_path / "walk" / name).touch()
     assert completed(CompletionTracker(0.0, 100), tmp_path) == ["walk"]
 
 
-def test_the_drop_that_has_been_complete_for_longest_comes_first(tmp_path: Path) -> None:
+def test_the_entry_that_is_complete_for_longest_comes_first(tmp_path: Path) -> None:
     clock = Clock()
-    settling = CompletionTracker(10.0, 100, clock)
+    tracker = CompletionTracker(10.0, 100, clock)
     for name in ("b", "a", "c.yaml"):
         (tmp_path / name).write_text("x")
-        completed(settling, tmp_path)
+        completed(tracker, tmp_path)
         clock.now += 1
     (tmp_path / "z").mkdir()
     (tmp_path / "z" / "torso.mp4").touch()
     clock.now += 20
-    completed(settling, tmp_path)
+    completed(tracker, tmp_path)
     clock.now += 20
-    assert completed(settling, tmp_path) == ["c", "z"]  # a and b are files, but no job files
+    assert completed(tracker, tmp_path) == ["c", "z"]  # a and b are not job files
 
 
-def test_a_heartbeat_counts_as_stopped_by_the_own_clock_alone(tmp_path: Path) -> None:
+def test_a_stopped_heartbeat_is_detected_with_the_own_clock_alone(tmp_path: Path) -> None:
     job = JobDir(tmp_path / "walk")
     job.path.mkdir()
     claim = create_claim(job)
     clock = Clock()
-    onlooker = HeartbeatMonitor(60.0, clock)
+    monitor = HeartbeatMonitor(60.0, clock)
 
     def elsewhere() -> None:
         owner = json.loads(job.owner.read_text())
@@ -108,36 +108,36 @@ def test_a_heartbeat_counts_as_stopped_by_the_own_clock_alone(tmp_path: Path) ->
     for _ in range(5):
         claim.write_heartbeat()
         elsewhere()
-        os.utime(job.owner, (1e9, 1e9))  # that host's clock is years behind: nobody asks
-        assert onlooker.find_abandoned([job]) == []
+        os.utime(job.owner, (1e9, 1e9))  # the clock of that host is years behind, which must not matter
+        assert monitor.find_abandoned([job]) == []
         clock.now += 59
-    assert onlooker.find_abandoned([job]) == []
+    assert monitor.find_abandoned([job]) == []
     clock.now += 1
-    assert onlooker.find_abandoned([job]) == [job]
+    assert monitor.find_abandoned([job]) == [job]
 
 
 @pytest.mark.parametrize("stale_s", [1.0, 4.0, 60.0, 1000.0])
-def test_a_heart_beats_several_times_before_it_counts_as_stopped(stale_s: float) -> None:
+def test_several_heartbeats_fit_into_the_time_limit(stale_s: float) -> None:
     assert WatchOptions(stale_s=stale_s).heartbeat_period_s <= min(5.0, stale_s / 3)
 
 
-def test_an_owner_that_let_go_or_ended_on_this_machine_is_not_waited_for(tmp_path: Path) -> None:
+def test_there_is_no_wait_for_an_owner_that_released_the_job_or_ended(tmp_path: Path) -> None:
     job = JobDir(tmp_path / "walk")
     job.path.mkdir()
     claim = create_claim(job)
-    onlooker = HeartbeatMonitor(1e9)
-    assert onlooker.find_abandoned([job]) == []
+    monitor = HeartbeatMonitor(1e9)
+    assert monitor.find_abandoned([job]) == []
     owner = json.loads(job.owner.read_text())
     if owner["machine"]:
         job.owner.write_text(json.dumps({**owner, "process": "1"}))
-        # its number belongs to another process now
-        assert onlooker.find_abandoned([job]) == [job]
+        # the process number belongs to another process now
+        assert monitor.find_abandoned([job]) == [job]
     job.owner.write_text(json.dumps(owner))
     claim.release()
-    assert onlooker.find_abandoned([job]) == [job]
+    assert monitor.find_abandoned([job]) == [job]
 
 
-def test_a_late_heartbeat_of_an_earlier_owner_takes_nothing_back(tmp_path: Path) -> None:
+def test_a_late_heartbeat_of_an_earlier_owner_does_not_regain_the_job(tmp_path: Path) -> None:
     job = JobDir(tmp_path / "walk")
     job.path.mkdir()
     first = create_claim(job)
@@ -145,7 +145,7 @@ def test_a_late_heartbeat_of_an_earlier_owner_takes_nothing_back(tmp_path: Path)
     second = take_over_job(job)
     assert second is not None
     assert second.generation == 2
-    job.owner.write_bytes(stale)  # suspended between its look and its write
+    job.owner.write_bytes(stale)  # the first owner was suspended between its check and its write
     assert second.ownership.is_held()
     assert not first.ownership.is_held()
     second.write_heartbeat()
@@ -154,7 +154,7 @@ def test_a_late_heartbeat_of_an_earlier_owner_takes_nothing_back(tmp_path: Path)
     assert not second.ownership.is_held()
 
 
-def test_a_job_of_the_same_name_is_not_mistaken_for_the_one_that_was_taken_away(tmp_path: Path) -> None:
+def test_a_new_job_of_the_same_name_is_another_job(tmp_path: Path) -> None:
     job = JobDir(tmp_path / "walk")
     job.path.mkdir()
     first = create_claim(job)
@@ -191,27 +191,27 @@ def test_names_of_jobs_are_safe_to_show_and_to_type() -> None:
     assert len(folder_name_from_text("日" * 200).encode()) <= 200
 
 
-def test_the_spool_is_found_from_its_inbox_and_from_its_folder(tmp_path: Path) -> None:
+def test_the_spool_is_found_from_its_inbox_and_from_its_parent_folder(tmp_path: Path) -> None:
     (tmp_path / "jobs" / "inbox").mkdir(parents=True)
     want = Spool(inbox=tmp_path / "jobs" / "inbox", root=tmp_path / "jobs")
     assert spool_from_path(tmp_path / "jobs") == want
     assert spool_from_path(tmp_path / "jobs" / "inbox") == want
 
 
-def test_the_videos_of_a_linked_drop_are_those_beside_its_job_file(tmp_path: Path) -> None:
+def test_a_linked_entry_uses_the_videos_beside_its_job_file(tmp_path: Path) -> None:
     footage = tmp_path / "footage"
     footage.mkdir()
     (footage / "torso.mp4").touch()
     (footage / "job.yaml").write_text("height_m: 1.75\n")
     (tmp_path / "tuesday").symlink_to(footage)
-    drop = InboxEntry(tmp_path / "tuesday")
-    job = read_dropped_job(drop, take_snapshot(drop, 100), JobPermissions(roots=(footage,)))
+    entry = InboxEntry(tmp_path / "tuesday")
+    job = read_dropped_job(entry, take_snapshot(entry, 100), JobPermissions(roots=(footage,)))
     assert (job.name, [camera.name for camera in job.capture.cameras]) == ("tuesday", ["torso"])
     with pytest.raises(JobError, match="outside"):
-        read_dropped_job(drop, take_snapshot(drop, 100), JobPermissions())
+        read_dropped_job(entry, take_snapshot(entry, 100), JobPermissions())
 
 
-def test_an_unknown_folder_holds_the_inbox_and_what_is_in_it_is_no_job(tmp_path: Path) -> None:
+def test_an_unknown_folder_is_the_parent_of_the_inbox(tmp_path: Path) -> None:
     (tmp_path / "jobs").mkdir()
     (tmp_path / "jobs" / "mine.yaml").touch()
     for name in ("jobs", "not yet there"):
@@ -219,10 +219,10 @@ def test_an_unknown_folder_holds_the_inbox_and_what_is_in_it_is_no_job(tmp_path:
         assert spool_from_path(tmp_path / name) == want
     Spool(inbox=tmp_path / "drop", root=tmp_path).make()
     assert spool_from_path(tmp_path / "drop") == Spool(inbox=tmp_path / "drop", root=tmp_path)
-    with pytest.raises(StoreError, match="no folder"):
+    with pytest.raises(StoreError, match="not a folder"):
         spool_from_path(tmp_path / "jobs" / "mine.yaml")
     (tmp_path / "broken").symlink_to("nowhere")
-    with pytest.raises(StoreError, match="no folder"):
+    with pytest.raises(StoreError, match="not a folder"):
         spool_from_path(tmp_path / "broken")
 
 
@@ -247,7 +247,7 @@ def test_a_change_wakes_the_watcher(tmp_path: Path, poll: bool) -> None:
     assert woken.is_set()
 
 
-def test_a_network_disk_is_known_by_its_mount(tmp_path: Path) -> None:
+def test_a_network_disk_is_recognised_by_its_mount(tmp_path: Path) -> None:
     mounts = tmp_path / "mounts"
     nas = f"{tmp_path}/my\\040nas"
     mounts.write_text(f"/dev/sda / ext4 rw 0 0\nhost:/x {nas} nfs4 rw 0 0\n/dev/sdb {nas}/disk xfs rw 0 0\n")
@@ -261,7 +261,7 @@ def test_the_service_example_is_a_valid_unit(tmp_path: Path) -> None:
         pytest.skip("needs systemd-analyze")
     text = (ROOT / "examples" / "bodycap-watch.service").read_text()
     unit = tmp_path / "bodycap-watch.service"
-    # The verifier wants the program to be there; where it is installed is for the operator to decide.
+    # systemd-analyze requires that the program exists; the operator chooses where it is installed.
     unit.write_text(text.replace("/opt/bodycap_batch/.venv/bin/bodycap", "/bin/true"))
     assert "/bin/true watch /srv/bodycap/jobs/inbox" in unit.read_text()
     done = subprocess.run(

@@ -1,26 +1,26 @@
 "use strict";
-// Everything shown comes in as text and goes out as text: no value is ever read as HTML.
+// All values are inserted as text, never as HTML.
 
 const element = (tag, cls, text) => {
-  const made = document.createElement(tag);
-  if (cls) made.className = cls;
-  if (text !== undefined) made.textContent = text;
-  return made;
+  const node = document.createElement(tag);
+  if (cls) node.className = cls;
+  if (text !== undefined) node.textContent = text;
+  return node;
 };
-const at = (id) => document.getElementById(id);
+const byId = (id) => document.getElementById(id);
 const path = (...parts) => parts.map((part) => part.split("/").map(encodeURIComponent).join("/")).join("/");
 
-async function ask(method, url, body) {
+async function request(method, url, body) {
   const headers = body === undefined ? {} : { "Content-Type": "application/json" };
-  const answer = await fetch(url, { method, headers, body: body === undefined ? undefined : JSON.stringify(body) });
-  if (answer.ok) return answer;
-  throw new Error(await reason(answer.status, await answer.text()));
+  const response = await fetch(url, { method, headers, body: body === undefined ? undefined : JSON.stringify(body) });
+  if (response.ok) return response;
+  throw new Error(errorText(response.status, await response.text()));
 }
 
-function reason(status, text) {
+function errorText(status, text) {
   try {
-    const told = JSON.parse(text);
-    return told.hint ? `${told.message} (${told.hint})` : told.message;
+    const error = JSON.parse(text);
+    return error.hint ? `${error.message} (${error.hint})` : error.message;
   } catch {
     return `${status}: ${text.trim()}`;
   }
@@ -28,8 +28,8 @@ function reason(status, text) {
 
 // ---- jobs
 
-const opened = new Map(); // name -> "log" | "files": what the user has unfolded
-const shown = new Map(); // name and state -> {text, item}
+const opened = new Map(); // name -> "log" | "files": the part that the user has opened
+const shown = new Map(); // "inbox/name" or "job/name" -> {text, item}
 
 function age(since) {
   const seconds = Math.max(0, (Date.now() - Date.parse(since)) / 1000);
@@ -39,7 +39,7 @@ function age(since) {
   return `${Math.round(seconds)} s`;
 }
 
-function bars(job) {
+function progressBars(job) {
   return Object.entries(job.active).map(([label, step]) => {
     const row = element("div", "bar");
     const bar = element("progress");
@@ -51,45 +51,45 @@ function bars(job) {
   });
 }
 
-function unfold(item, job, kind) {
+function toggle(item, job, kind) {
   opened.get(job.name) === kind ? opened.delete(job.name) : opened.set(job.name, kind);
-  fill(item.querySelector(".more"), job);
+  showDetails(item.querySelector(".more"), job);
 }
 
-async function fill(place, job) {
+async function showDetails(target, job) {
   const kind = opened.get(job.name);
-  if (!kind) return place.replaceChildren();
+  if (!kind) return target.replaceChildren();
   try {
-    const answer = await ask("GET", path("api/jobs", job.name, kind));
+    const response = await request("GET", path("api/jobs", job.name, kind));
     if (kind === "log") {
-      const log = element("pre", "", (await answer.text()) || "nothing yet");
-      place.replaceChildren(log);
+      const log = element("pre", "", (await response.text()) || "no entries yet");
+      target.replaceChildren(log);
       log.scrollTop = log.scrollHeight;
       return;
     }
     const list = element("ul", "files");
-    for (const name of await answer.json()) {
+    for (const name of await response.json()) {
       const link = element("a", "", name);
       link.href = path("results", job.name, name);
       const entry = element("li");
       entry.append(link);
       list.append(entry);
     }
-    place.replaceChildren(list);
+    target.replaceChildren(list);
   } catch (error) {
-    place.replaceChildren(element("p", "cause", error.message));
+    target.replaceChildren(element("p", "cause", error.message));
   }
 }
 
 function button(text, label, action) {
-  const made = element("button", "", text);
-  made.type = "button";
-  made.setAttribute("aria-label", label);
-  made.addEventListener("click", action);
-  return made;
+  const node = element("button", "", text);
+  node.type = "button";
+  node.setAttribute("aria-label", label);
+  node.addEventListener("click", action);
+  return node;
 }
 
-function actions(item, job) {
+function actionRow(item, job) {
   const row = element("div", "actions");
   if (job.report) {
     const link = element("a", "", "Report");
@@ -98,13 +98,13 @@ function actions(item, job) {
   }
   const claimed = !["waiting", "ignored"].includes(job.state);
   if (claimed) {
-    row.append(button("Log", `Log of ${job.name}`, () => unfold(item, job, "log")));
-    row.append(button("Files", `Files of ${job.name}`, () => unfold(item, job, "files")));
+    row.append(button("Log", `Log of ${job.name}`, () => toggle(item, job, "log")));
+    row.append(button("Files", `Files of ${job.name}`, () => toggle(item, job, "files")));
   }
   const post = (what) => async (event) => {
     event.target.disabled = true;
     try {
-      await ask("POST", path("api/jobs", job.name, what));
+      await request("POST", path("api/jobs", job.name, what));
     } catch (error) {
       item.querySelector(".more").replaceChildren(element("p", "cause", error.message));
     }
@@ -117,7 +117,7 @@ function actions(item, job) {
   return row;
 }
 
-function itemOf(job) {
+function listItem(job) {
   const item = element("li");
   item.dataset.name = job.name;
   const head = element("div", "head");
@@ -131,53 +131,53 @@ function itemOf(job) {
   item.append(head);
   if (job.cause) item.append(element("p", "cause", job.cause));
   if (job.hint) item.append(element("p", "hint", job.hint));
-  item.append(...bars(job));
+  item.append(...progressBars(job));
   for (const note of job.notes) item.append(element("p", "hint", note));
-  item.append(actions(item, job), element("div", "more"));
-  fill(item.querySelector(".more"), job);
+  item.append(actionRow(item, job), element("div", "more"));
+  showDetails(item.querySelector(".more"), job);
   return item;
 }
 
-function show(feed) {
-  const list = at("jobs");
-  const wanted = new Set();
+function showJobs(data) {
+  const list = byId("jobs");
+  const keys = new Set();
   let last = null;
-  for (const job of feed.jobs) {
+  for (const job of data.jobs) {
     const key = `${job.state === "waiting" || job.state === "ignored" ? "inbox" : "job"}/${job.name}`;
-    wanted.add(key);
+    keys.add(key);
     const text = JSON.stringify(job);
-    let known = shown.get(key);
-    if (!known || known.text !== text) {
-      const item = itemOf(job);
-      const focus = known && known.item.contains(document.activeElement) ? document.activeElement.ariaLabel : null;
-      if (known) known.item.replaceWith(item);
-      known = { text, item };
-      shown.set(key, known);
-      if (focus) [...item.querySelectorAll("button")].find((each) => each.ariaLabel === focus)?.focus();
+    let entry = shown.get(key);
+    if (!entry || entry.text !== text) {
+      const item = listItem(job);
+      const focus = entry && entry.item.contains(document.activeElement) ? document.activeElement.ariaLabel : null;
+      if (entry) entry.item.replaceWith(item);
+      entry = { text, item };
+      shown.set(key, entry);
+      if (focus) [...item.querySelectorAll("button")].find((node) => node.ariaLabel === focus)?.focus();
     }
-    const place = last ? last.nextSibling : list.firstChild;
-    if (place !== known.item) list.insertBefore(known.item, place);
-    last = known.item;
+    const position = last ? last.nextSibling : list.firstChild;
+    if (position !== entry.item) list.insertBefore(entry.item, position);
+    last = entry.item;
   }
-  for (const [key, known] of shown) {
-    if (!wanted.has(key)) {
-      known.item.remove();
+  for (const [key, entry] of shown) {
+    if (!keys.has(key)) {
+      entry.item.remove();
       shown.delete(key);
     }
   }
   const count = {};
-  for (const job of feed.jobs) count[job.state] = (count[job.state] || 0) + 1;
+  for (const job of data.jobs) count[job.state] = (count[job.state] || 0) + 1;
   const parts = Object.entries(count).map(([state, number]) => `${number} ${state}`);
-  at("summary").textContent = parts.join(", ") || "No jobs yet.";
-  at("trouble").textContent = feed.trouble && `The watcher is held up: ${feed.trouble}`;
-  at("more").textContent = feed.more ? `${feed.more} older jobs are not shown here.` : "";
+  byId("summary").textContent = parts.join(", ") || "No jobs yet.";
+  byId("trouble").textContent = data.trouble && `The watcher cannot continue: ${data.trouble}`;
+  byId("more").textContent = data.more ? `${data.more} older jobs are not shown here.` : "";
 }
 
 function listen() {
   const source = new EventSource("api/events");
-  source.onopen = () => { at("connection").textContent = "live"; };
-  source.onerror = () => { at("connection").textContent = "no connection; trying again …"; };
-  source.onmessage = (event) => show(JSON.parse(event.data));
+  source.onopen = () => { byId("connection").textContent = "live"; };
+  source.onerror = () => { byId("connection").textContent = "no connection; trying again …"; };
+  source.onmessage = (event) => showJobs(JSON.parse(event.data));
 }
 
 setInterval(() => {
@@ -187,99 +187,99 @@ setInterval(() => {
 // ---- uploads
 
 function send(url, file, progress) {
-  return new Promise((done, failed) => {
-    const request = new XMLHttpRequest();
-    request.open("PUT", url);
-    request.upload.onprogress = (event) => progress(event.loaded);
-    request.onload = () => (request.status < 300 ? done() : failed(new Error(reason(request.status, request.responseText))));
-    request.onerror = () => failed(new Error("the connection broke; try again"));
-    request.send(file);
+  return new Promise((resolve, reject) => {
+    const upload = new XMLHttpRequest();
+    upload.open("PUT", url);
+    upload.upload.onprogress = (event) => progress(event.loaded);
+    upload.onload = () => (upload.status < 300 ? resolve() : reject(new Error(errorText(upload.status, upload.responseText))));
+    upload.onerror = () => reject(new Error("the connection failed; try again"));
+    upload.send(file);
   });
 }
 
-const wantedName = (name) => !name.split("/").some((part) => part.startsWith("."));
+const isVisible = (name) => !name.split("/").some((part) => part.startsWith("."));
 
-async function upload(name, files) {
+async function uploadFiles(name, files) {
   const line = element("li", "bar");
   const bar = element("progress");
   const text = element("span", "since", "starting …");
   bar.setAttribute("aria-label", `Sending ${name}`);
   line.append(element("span", "name", name), bar, text);
-  at("uploads").append(line);
+  byId("uploads").append(line);
   let key = null;
   try {
-    key = (await (await ask("POST", "api/uploads", { name })).json()).key;
+    key = (await (await request("POST", "api/uploads", { name })).json()).key;
     const total = files.reduce((sum, [, file]) => sum + file.size, 0);
-    let before = 0;
+    let sentBefore = 0;
     bar.max = total;
-    for (const [place, file] of files) {
-      await send(path("api/uploads", key, place), file, (sent) => {
-        bar.value = before + sent;
-        text.textContent = `${place}: ${Math.round((100 * (before + sent)) / total)} %`;
+    for (const [filePath, file] of files) {
+      await send(path("api/uploads", key, filePath), file, (sent) => {
+        bar.value = sentBefore + sent;
+        text.textContent = `${filePath}: ${Math.round((100 * (sentBefore + sent)) / total)} %`;
       });
-      before += file.size;
+      sentBefore += file.size;
     }
-    const job = (await (await ask("POST", path("api/uploads", key, "finish"))).json()).name;
+    const job = (await (await request("POST", path("api/uploads", key, "finish"))).json()).name;
     text.textContent = `sent as ${job}`;
     setTimeout(() => line.remove(), 10000);
   } catch (error) {
     text.className = "cause";
     text.textContent = error.message;
     bar.remove();
-    if (key) ask("DELETE", path("api/uploads", key)).catch(() => {});
+    if (key) request("DELETE", path("api/uploads", key)).catch(() => {});
   }
 }
 
-function start(name, files) {
-  const chosen = at("name").value.trim() || name;
-  at("name").value = "";
-  const wanted = files.filter(([place]) => wantedName(place));
-  if (wanted.length) upload(chosen, wanted);
+function startUpload(name, files) {
+  const chosen = byId("name").value.trim() || name;
+  byId("name").value = "";
+  const visible = files.filter(([filePath]) => isVisible(filePath));
+  if (visible.length) uploadFiles(chosen, visible);
 }
 
-const entriesIn = (reader) => new Promise((done, failed) => reader.readEntries(done, failed));
-const fileOf = (entry) => new Promise((done, failed) => entry.file(done, failed));
+const entriesIn = (reader) => new Promise((resolve, reject) => reader.readEntries(resolve, reject));
+const fileOf = (entry) => new Promise((resolve, reject) => entry.file(resolve, reject));
 
 async function filesBelow(entry, prefix) {
   if (entry.isFile) return [[`${prefix}${entry.name}`, await fileOf(entry)]];
   const found = [];
   const reader = entry.createReader();
-  for (let some = await entriesIn(reader); some.length; some = await entriesIn(reader)) {
-    for (const each of some) found.push(...(await filesBelow(each, `${prefix}${entry.name}/`)));
+  for (let batch = await entriesIn(reader); batch.length; batch = await entriesIn(reader)) {
+    for (const child of batch) found.push(...(await filesBelow(child, `${prefix}${entry.name}/`)));
   }
   return found;
 }
 
-async function dropped(transfer) {
+async function uploadDropped(transfer) {
   const items = [...transfer.items].filter((item) => item.kind === "file");
-  const loose = items.map((item) => item.getAsFile());
+  const itemFiles = items.map((item) => item.getAsFile());
   const entries = items.map((item) => item.webkitGetAsEntry());
   for (const folder of entries.filter((entry) => entry?.isDirectory)) {
-    const files = (await filesBelow(folder, "")).map(([place, file]) => [place.split("/").slice(1).join("/"), file]);
-    start(folder.name, files);
+    const files = (await filesBelow(folder, "")).map(([filePath, file]) => [filePath.split("/").slice(1).join("/"), file]);
+    startUpload(folder.name, files);
   }
-  const single = loose.filter((file, index) => file && !entries[index]?.isDirectory);
-  if (single.length) start(nameByTime(), single.map((file) => [file.name, file]));
+  const single = itemFiles.filter((file, index) => file && !entries[index]?.isDirectory);
+  if (single.length) startUpload(nameByTime(), single.map((file) => [file.name, file]));
 }
 
 const nameByTime = () => `capture ${new Date().toISOString().slice(0, 16).replace("T", " ").replace(":", "")}`;
 
 function prepare() {
-  const zone = at("drop");
+  const zone = byId("drop");
   for (const type of ["dragover", "drop"]) document.addEventListener(type, (event) => event.preventDefault());
   zone.addEventListener("dragover", () => zone.classList.add("over"));
   zone.addEventListener("dragleave", () => zone.classList.remove("over"));
   zone.addEventListener("drop", (event) => {
     zone.classList.remove("over");
-    dropped(event.dataTransfer);
+    uploadDropped(event.dataTransfer);
   });
-  at("folder").addEventListener("change", (event) => {
+  byId("folder").addEventListener("change", (event) => {
     const files = [...event.target.files].map((file) => [file.webkitRelativePath.split("/").slice(1).join("/"), file]);
-    if (files.length) start(event.target.files[0].webkitRelativePath.split("/")[0], files);
+    if (files.length) startUpload(event.target.files[0].webkitRelativePath.split("/")[0], files);
     event.target.value = "";
   });
-  at("files").addEventListener("change", (event) => {
-    start(nameByTime(), [...event.target.files].map((file) => [file.name, file]));
+  byId("files").addEventListener("change", (event) => {
+    startUpload(nameByTime(), [...event.target.files].map((file) => [file.name, file]));
     event.target.value = "";
   });
 }
