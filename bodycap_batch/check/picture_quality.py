@@ -7,7 +7,7 @@ import numpy as np
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.capture.images import Image
 from bodycap_batch.check.static_pictures import reduced_picture, static_notes
-from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.core.arrays import IntArray, evenly_spaced
 from bodycap_batch.core.errors import CaptureError
 
 _SAMPLES = 8
@@ -128,7 +128,7 @@ def sample_indices(camera: CaptureCamera, count: int) -> IntArray:
         count: Number of frames wanted.
     """
     last = len(camera.frame_numbers) - 1
-    even = np.unique(np.linspace(0, last, min(count, last + 1)).round().astype(np.int64))
+    even = evenly_spaced(last + 1, count)
     keys = camera.key_indices()
     if not len(keys):
         return even[:1]
