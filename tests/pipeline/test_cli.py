@@ -109,7 +109,7 @@ def test_the_store_can_be_named_by_option_or_variable(bench: Bench) -> None:
     assert "nothing to do" in bench.run("run", "my walk", "--out", "elsewhere")[1]
 
 
-def test_a_stage_asked_for_is_told_by_its_own_name(bench: Bench) -> None:
+def test_the_summary_names_the_stage_asked_for(bench: Bench) -> None:
     bench.order(localised=[40], lost={"torso": 3})
     code, out, _ = bench.run("run", "my walk", "--until", "registration")
     assert (code, out) == (0, "my_walk: stopped after registration, as asked; run it again for the rest\n")
@@ -151,7 +151,7 @@ def test_progress_for_machines_is_json_on_every_line(bench: Bench) -> None:
     assert events[-1]["out_dir"] == str(bench.folder / "out" / "my_walk")
 
 
-def test_a_failure_is_told_to_machines_too(bench: Bench) -> None:
+def test_a_failure_is_reported_as_json_too(bench: Bench) -> None:
     bench.order(fail="map")
     code, out, err = bench.run("run", "my walk", "--json-progress")
     last = json.loads(out.splitlines()[-1])
@@ -352,7 +352,7 @@ def test_a_disk_that_does_not_answer_is_no_bug(
     assert "bug" not in told
 
 
-def test_the_version_is_told(capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_version_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     assert capfd.readouterr().out.strip() == f"bodycap {bodycap_batch.__version__}"
 
