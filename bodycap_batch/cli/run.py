@@ -67,7 +67,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap run my_walk/ --height 1.75
       bodycap run my_walk/ --skeleton subject.bvh --out results/my_walk
       bodycap run single_camera/ --skeleton none
-      bodycap run jobs/my_walk.yaml
+      bodycap run jobs/cpl_lab.yaml
       bodycap run my_walk/ --from merge
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.config.folder import job_file_in

@@ -143,11 +143,11 @@ def test_two_large_tasks_do_not_meet_on_a_small_worker_though_it_comes_late(site
     assert process.stdout is not None
     assert "no worker is connected yet" in process.stderr.readline()
     site.worker("one", "--nthreads", "2", "--resources", "memory=2000")  # a map declares 1,500 MB
-    begun = set()
-    while len(begun) < 2:
+    started_jobs = set()
+    while len(started_jobs) < 2:
         event = json.loads(process.stdout.readline())
         if (event.get("stage"), event["kind"]) == ("map", "started"):  # handed over; it may still wait
-            begun.add(event["job"])
+            started_jobs.add(event["job"])
     child = site.hanging()
     time.sleep(3.0)  # the other job's map would start in a tenth of that
     assert site.hanging() == child, "the other job's map waits"
@@ -155,7 +155,7 @@ def test_two_large_tasks_do_not_meet_on_a_small_worker_though_it_comes_late(site
     process.communicate(timeout=60)
 
 
-def test_no_scheduler_is_told_with_what_to_do(site: Site) -> None:
+def test_a_missing_scheduler_is_reported_with_advice(site: Site) -> None:
     code, _, err = site.run("monday", "--executor", "tcp://127.0.0.1:9")
     assert code == 2
     assert "no scheduler answers at tcp://127.0.0.1:9" in err

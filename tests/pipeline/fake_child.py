@@ -1,4 +1,4 @@
-"""A child process with stages made for tests: it computes, fails, crashes or hangs on demand."""
+"""A child process with stages for tests: it computes, fails, crashes or never ends, as ordered."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def fill(arguments: Json, context: StageContext, files: Path) -> None:
 
 
 def fill_quietly(arguments: Json, context: StageContext, files: Path) -> None:
-    """As a library that hides the cause: the disk fills up and something else is raised."""
+    """Fill the disk and raise another error, as a library that hides the cause."""
     try:
         fill(arguments, context, files)
     except OSError:

@@ -1,4 +1,4 @@
-"""All stages of a job as small text files: what each was made of, and what a test asks of it."""
+"""Stand-ins for all stages: small text files of what each was computed from, and failures on order."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def orders() -> dict[str, Any]:
 
 
 def made_of(value: Any) -> Any:
-    """A value with every reference to an artefact replaced by what that artefact holds."""
+    """Replace every reference to an artefact in a value by the content of the artefact."""
     if isinstance(value, Mapping):
         if value.keys() == {"path", "digest"}:
             return made_of(value["path"])

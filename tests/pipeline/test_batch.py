@@ -100,7 +100,7 @@ def test_jobs_of_high_priority_go_first(bench: Bench) -> None:
         (["--executor", "moon"], "there is no executor 'moon'"),
     ],
 )
-def test_wrong_options_are_told(
+def test_wrong_options_are_reported(
     bench: Bench,
     arguments: list[str],
     message: str,
@@ -117,10 +117,10 @@ def test_a_stopped_batch_ends_its_children_and_goes_on_later(bench: Bench) -> No
     bench.order(hang="map")
     process = bench.start("batch", *NAMES)
     child = bench.wait_until_started()
-    begun = time.monotonic()
+    started_s = time.monotonic()
     process.send_signal(signal.SIGTERM)
     _, err = process.communicate(timeout=30)
-    assert time.monotonic() - begun < 20
+    assert time.monotonic() - started_s < 20
     assert process.returncode == 143, err
     assert gone(child)
     assert "Traceback" not in err

@@ -1,4 +1,4 @@
-"""How a job's tasks share the cores, and what is loaded while one of them is idle."""
+"""How the tasks of a job share the cores, and which modules load while a core is idle."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_the_last_cameras_share_all_threads(
 
 
 class Watched(Children):
-    """Children that note what others were to load preload, by stage."""
+    """Children that record the modules that others were to load, by stage."""
 
     def __init__(self) -> None:
         super().__init__(CHILD)
@@ -58,7 +58,7 @@ class Watched(Children):
 
 
 @pytest.mark.parametrize(("threads", "skeleton"), [(2, "upper_body"), (2, "none"), (1, "upper_body")])
-def test_what_comes_later_is_loaded_while_a_core_is_idle(bench: Bench, threads: int, skeleton: str) -> None:
+def test_modules_of_later_stages_load_while_a_core_is_idle(bench: Bench, threads: int, skeleton: str) -> None:
     children = Watched()
     settings = Settings(
         store=Store(bench.folder / "store"),
@@ -76,7 +76,7 @@ def test_what_comes_later_is_loaded_while_a_core_is_idle(bench: Bench, threads: 
 
 
 @pytest.mark.parametrize("board", [None, {"square_m": 0.1, "columns": 7, "rows": 5}])
-def test_a_board_is_looked_for_in_the_pictures_that_keyframes_keep(bench: Bench, board: Any) -> None:
+def test_a_board_is_searched_for_in_the_stored_frames_of_keyframes(bench: Bench, board: Any) -> None:
     children = Watched()
     settings = Settings(
         store=Store(bench.folder / "store"),

@@ -99,7 +99,7 @@ def test_a_folder_that_may_not_be_entered_is_named_with_the_remedy(
     ],
     ids=" ".join,
 )
-def test_results_that_may_not_be_written_are_told_before_anything_is_computed(
+def test_results_that_may_not_be_written_are_reported_before_anything_is_computed(
     walk: Path, arguments: tuple[str, ...]
 ) -> None:
     (walk / "locked").mkdir(mode=0o500)
@@ -111,7 +111,7 @@ def test_results_that_may_not_be_written_are_told_before_anything_is_computed(
     assert list((walk / "locked").iterdir()) == []
 
 
-def test_a_read_only_disk_is_told_with_the_remedy(walk: Path) -> None:
+def test_a_read_only_disk_is_reported_with_the_remedy(walk: Path) -> None:
     mount = ("unshare", "--mount", "--propagation", "private", "sh", "-c")
     if subprocess.run([*mount, "true"], capture_output=True, check=False).returncode:
         pytest.skip("needs the right to mount in a mount namespace of its own (root)")

@@ -1,4 +1,4 @@
-"""What a report is made of, found again in the store: for `bodycap view` and its recording."""
+"""The stored results that a report is made from, for `bodycap view` and its recording."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.pipeline.test_run import CAMERAS, Bench
 
 
 def looking(bench: Bench) -> Settings:
-    """Whatever would be computed fails."""
+    """Settings with which every computation fails."""
     return Settings(
         store=Store(bench.folder / "store"),
         threads=1,
@@ -23,7 +23,7 @@ def looking(bench: Bench) -> Settings:
     )
 
 
-def test_the_finished_stages_are_found_and_nothing_is_computed(
+def test_finished_stages_are_found_and_nothing_is_computed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench = Bench(tmp_path, monkeypatch)
@@ -41,7 +41,7 @@ def test_the_finished_stages_are_found_and_nothing_is_computed(
     assert found.failure["stage"] == "merge"
 
 
-def test_an_empty_store_gives_no_marks_and_is_told_once(
+def test_an_empty_store_gives_no_marks_and_one_message(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bench = Bench(tmp_path, monkeypatch)

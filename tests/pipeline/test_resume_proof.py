@@ -53,9 +53,9 @@ def test_killed_at_random_moments_it_ends_with_the_same_bytes(place: Place, refe
     seed = int(os.environ.get(SEED) or np.random.SeedSequence().generate_state(1)[0])
     print(f"{SEED}={seed}")
     rng = np.random.default_rng(seed)
-    begun = time.monotonic()
+    started_s = time.monotonic()
     assert place.run()[0] == 0
-    whole_s = time.monotonic() - begun
+    whole_s = time.monotonic() - started_s
     same(place, reference)
     kills = completed = 0
     shutil.rmtree(place.out)

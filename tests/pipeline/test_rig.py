@@ -1,4 +1,4 @@
-"""A whole job with a synchronised rig, one of whose cameras is in the dark for a while."""
+"""A whole job with a synchronised rig; one camera of it sees only darkness for a while."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _run(folder: Path, rig: str) -> tuple[list[dict[str, str]], dict[str, Any], 
     return rows, metrics, evaluate_trajectories(paths, truth, frames=dict.fromkeys(paths, FRAMES))
 
 
-def test_a_rig_carries_its_camera_through_the_dark(tmp_path: Path) -> None:
+def test_a_rig_gives_poses_to_its_camera_in_the_dark(tmp_path: Path) -> None:
     body = stroll(FRAMES)["torso"]
     paths = {"torso": body, "torso_2": body @ FIRST_FROM_SECOND}
     write_capture(tmp_path, paths, black={"torso_2": DARK})
@@ -74,7 +74,7 @@ def test_a_rig_carries_its_camera_through_the_dark(tmp_path: Path) -> None:
 
 
 def write_path(path: Path, poses: np.ndarray) -> None:
-    """Truth as the benchmark has it."""
+    """Write the true path in the format of the benchmark."""
     from bodycap_batch.synthetic.truth import write_path as write
 
     path.parent.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""`run_job` with stand-in stages: order, reuse, resume, growth of the map, partial results."""
+"""`run_job` with stand-in stages: order, reuse, resume, extension of the map, partial results."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Bench:
         return run_job(self.job(**changes), out_dir=self.out, settings=self.settings())
 
     def executed(self, **changes: Any) -> list[str]:
-        """Run, and list what was not taken from the store."""
+        """Run, and return the tasks that were computed."""
         summary = self.run(**changes)
         return sorted(f"{s.stage} {s.camera}".strip() for s in summary.stages if not s.reused)
 
@@ -89,7 +89,7 @@ class Bench:
 
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
-    """Nothing has been run yet."""
+    """A bench on which nothing has run yet."""
     return Bench(tmp_path, monkeypatch)
 
 
@@ -103,7 +103,7 @@ def done_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done_once: Path) -> Bench:
-    """The job has been run with its default options."""
+    """A bench on which the job has run with its default options."""
     shutil.copytree(done_once / "store", tmp_path / "store")
     shutil.copytree(done_once / "out", tmp_path / "out")
     return Bench(tmp_path, monkeypatch)
@@ -240,7 +240,7 @@ def test_a_failed_stage_leaves_earlier_results_intact(done: Bench) -> None:
 
 
 @pytest.mark.parametrize("stage", ["keyframes", "registration"])
-def test_one_camera_that_fails_is_told_in_a_report_too(bench: Bench, stage: str) -> None:
+def test_the_failure_of_one_camera_is_in_the_report(bench: Bench, stage: str) -> None:
     bench.order(fail=stage, on="left_palm")
     with pytest.raises(EstimationError, match="does not work out") as caught:
         bench.run()
@@ -249,7 +249,7 @@ def test_one_camera_that_fails_is_told_in_a_report_too(bench: Bench, stage: str)
     assert report.startswith(f"{stage}: {stage} does not work out; ")
 
 
-def test_a_missing_video_is_told_in_a_report_too(bench: Bench) -> None:
+def test_a_missing_video_is_in_the_report(bench: Bench) -> None:
     (bench.folder / "torso.mp4").unlink()
     with pytest.raises(CaptureError, match="no such file") as caught:
         bench.run()
@@ -287,7 +287,7 @@ def test_without_a_skeleton_the_rest_is_kept_and_called_partial(done: Bench) -> 
     assert json.loads((done.out / "metrics.json").read_text()) == {"partial": False}
 
 
-def test_of_two_failures_both_are_told(bench: Bench) -> None:
+def test_two_failures_are_both_reported(bench: Bench) -> None:
     bench.order(fail=["merge", "preview"])
     with pytest.raises(EstimationError, match="merge does not work out") as caught:
         bench.run()
@@ -295,14 +295,14 @@ def test_of_two_failures_both_are_told(bench: Bench) -> None:
     assert str(bench.out / "partial") in str(caught.value.hint)
 
 
-def test_a_machine_that_fails_is_told_before_a_skeleton_that_was_not_found(bench: Bench) -> None:
+def test_a_failure_of_the_machine_precedes_a_missing_skeleton(bench: Bench) -> None:
     bench.order(fail="merge", crash="preview")
     with pytest.raises(BodycapError, match="SIGSEGV") as caught:
         bench.run()
     assert "besides: merge does not work out" in str(caught.value.hint)
 
 
-def test_the_map_grows_until_nothing_is_wanted(bench: Bench) -> None:
+def test_the_map_is_extended_until_no_keyframe_is_wanted(bench: Bench) -> None:
     bench.order(wanted=[[5], [7]], localised=[5, 8, 9])
     executed = bench.executed()
     assert executed.count("extend") == 2
@@ -311,8 +311,10 @@ def test_the_map_grows_until_nothing_is_wanted(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(("last", "rounds_used"), [(7, 1), (8, 2)])
-def test_the_map_stops_growing_when_nothing_is_gained(bench: Bench, last: int, rounds_used: int) -> None:
-    """A round that loses frames is not used; one that gains none is: it may have placed keyframes anew."""
+def test_the_map_is_not_extended_further_if_no_frame_is_gained(
+    bench: Bench, last: int, rounds_used: int
+) -> None:
+    """A round that loses frames is not used; one that gains none is: keyframes may have new poses."""
     bench.order(wanted=[[5], [7], [9]], localised=[5, 8, last])
     summary = bench.run()
     assert max(stage.round for stage in summary.stages) == 2
@@ -324,7 +326,7 @@ def test_the_map_stops_growing_when_nothing_is_gained(bench: Bench, last: int, r
     assert passes == rounds_used + 1
 
 
-def test_rounds_limit_the_growth(bench: Bench) -> None:
+def test_rounds_limit_the_extensions(bench: Bench) -> None:
     bench.order(wanted=[[5]] * 5, localised=[1, 2, 3, 4, 5, 6])
     assert bench.executed(registration={"rounds": 1}).count("extend") == 1
 
@@ -333,7 +335,7 @@ def test_rounds_limit_the_growth(bench: Bench) -> None:
     "order", [{}, {"wanted": [[5], [7]], "localised": [38, 37]}, {"rolling": True}], ids=str
 )
 @pytest.mark.parametrize("rounds", [0, 1])
-def test_lost_frames_are_looked_for_once_in_what_was_kept(
+def test_lost_frames_are_recovered_once_against_the_final_map(
     bench: Bench, order: dict[str, Any], rounds: int
 ) -> None:
     bench.order(lost={"torso": 3, "left_palm": 2}, **{"localised": [40, 40], **order})
@@ -349,12 +351,12 @@ def test_lost_frames_are_looked_for_once_in_what_was_kept(
     assert bench.executed(registration={"rounds": rounds}) == []
 
 
-def test_where_hardly_a_frame_has_a_pose_nothing_is_looked_for(bench: Bench) -> None:
+def test_nothing_is_recovered_if_too_few_frames_have_a_pose(bench: Bench) -> None:
     bench.order(lost={"torso": 9}, localised=[19])
     assert bench.executed() == ALL
 
 
-def test_a_rolling_shutter_is_taken_out_of_the_map_and_every_frame_solved_again(bench: Bench) -> None:
+def test_a_rolling_shutter_refines_the_map_and_solves_every_frame_again(bench: Bench) -> None:
     bench.order(rolling=True)
     executed = bench.executed()
     assert executed.count("refine") == 1
@@ -400,7 +402,7 @@ def test_a_stopped_run_goes_on_where_it_was(bench: Bench, stage: str) -> None:
     assert "metrics.json" in bench.results()
 
 
-def test_the_results_do_not_wait_for_their_video(done: Bench) -> None:
+def test_results_are_published_before_their_video(done: Bench) -> None:
     shutil.rmtree(done.folder / "store")
     (done.out / "result.bvh").write_text("of an earlier run")
     done.order(hang="preview")
@@ -417,7 +419,7 @@ def test_the_results_do_not_wait_for_their_video(done: Bench) -> None:
 
 
 @pytest.mark.parametrize("failed", ["", "merge"])
-def test_where_the_results_are_that_come_before_their_video_is_told(bench: Bench, failed: str) -> None:
+def test_the_folder_of_results_is_reported_before_their_video_is_ready(bench: Bench, failed: str) -> None:
     told: list[Path] = []
 
     def stop(folder: Path) -> None:
@@ -431,7 +433,7 @@ def test_where_the_results_are_that_come_before_their_video_is_told(bench: Bench
     assert (told[0] / "metrics.json").is_file()
 
 
-def test_a_bug_in_a_stage_is_no_estimation_error(bench: Bench) -> None:
+def test_a_bug_in_a_stage_is_not_an_estimation_error(bench: Bench) -> None:
     (bench.folder / "orders.json").write_text("no JSON")
     with pytest.raises(BodycapError, match="check: JSONDecodeError") as caught:
         bench.run()
@@ -449,7 +451,7 @@ def test_a_missing_video_is_named_before_anything_is_computed(bench: Bench) -> N
     assert {stage for stage, _ in told[1:]} <= {"report"}
 
 
-def test_events_tell_every_stage(bench: Bench) -> None:
+def test_events_report_every_stage(bench: Bench) -> None:
     bench.run()
     finished = sorted(event.label for event in bench.events if event.kind == "finished")
     assert finished == ALL

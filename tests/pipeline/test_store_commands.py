@@ -137,7 +137,7 @@ def test_why_names_the_change_and_what_follows(
     assert done.executed() == [], "asking computes nothing"
 
 
-def test_why_tells_of_the_preview_that_is_made_beside_the_export(done: Bench) -> None:
+def test_why_lists_the_preview_that_runs_beside_the_export(done: Bench) -> None:
     shutil.rmtree(done.folder / "store" / "artefacts" / "preview")
     assert steps(done)["preview"] == "not computed before"
     found = steps(done, export={"units": "m"})

@@ -88,7 +88,7 @@ class Place:
         process.communicate()
 
     def content(self) -> dict[str, bytes]:
-        """Results, and the digest of what each artefact holds; the report tells of durations."""
+        """Results, and the digest of each artefact's content; not the report, which shows durations."""
         found = {name: data for name, data in results_of(self.out).items() if name != "report.html"}
         for path in self.manifests():
             if path.parts[-3] == "report":

@@ -100,7 +100,7 @@ def test_the_job_file_of_a_folder_decides(tmp_path: Path) -> None:
     assert load_job(root / "job.yaml") == job
     assert load_job(root, Overrides(height_m=1.7)).height_m == 1.7
     (root / "run.json").write_text("{}")
-    assert len(load_job(root).capture.cameras) == 3, "that of results does not speak for videos"
+    assert len(load_job(root).capture.cameras) == 3, "the job file of results is not used for videos"
 
 
 def test_a_folder_whose_job_file_is_a_link_keeps_its_name_and_videos(tmp_path: Path) -> None:
@@ -138,10 +138,10 @@ def test_a_job_that_names_no_cameras_means_the_videos_beside_it(tmp_path: Path) 
 
 def test_a_job_that_was_dropped_alone_has_no_videos_beside_it(tmp_path: Path) -> None:
     folder(tmp_path, "torso.mp4", "left_palm.mp4")
-    (tmp_path / "lone.yaml").write_text("height_m: 1.8\n")
-    assert load_job(tmp_path / "lone.yaml", policy=PathPolicy(folder=tmp_path)).height_m == 1.8
+    (tmp_path / "single.yaml").write_text("height_m: 1.8\n")
+    assert load_job(tmp_path / "single.yaml", policy=PathPolicy(folder=tmp_path)).height_m == 1.8
     with pytest.raises(JobError, match="missing"):
-        load_job(tmp_path / "lone.yaml", policy=PathPolicy(folder=None))
+        load_job(tmp_path / "single.yaml", policy=PathPolicy(folder=None))
 
 
 def test_results_beside_the_videos_are_no_camera(tmp_path: Path) -> None:

@@ -146,7 +146,7 @@ def test_refusals(
     assert hint is None or hint in str(error.hint)
 
 
-def test_every_problem_is_told_at_once(tmp_path: Path) -> None:
+def test_every_problem_is_reported_at_once(tmp_path: Path) -> None:
     error = refused(tmp_path, MINIMAL + "heigth_m: 1.8\nactivity: run\n")
     assert error.line == 7
     assert "also line 8 activity" in error.message

@@ -50,7 +50,7 @@ def test_nothing_outside_is_read_before_it_is_refused(folder: Path, tmp_path: Pa
         load_job(folder)
 
 
-def test_videos_beside_its_job_file_are_those_of_an_opened_folder_but_not_of_a_lone_file(
+def test_videos_beside_a_job_file_are_used_in_an_opened_folder_but_not_for_a_single_file(
     folder: Path,
 ) -> None:
     (folder / "job.yaml").write_text("height_m: 1.75\n")

@@ -1,4 +1,4 @@
-"""A child that does one task after another starts each with the memory it needs, not with what was freed."""
+"""The memory of a child: freed memory is returned to the system."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _resident_mb() -> float:
 @pytest.mark.skipif(
     sys.platform != "linux", reason="the C library gives memory back by itself, or not at all"
 )
-def test_what_earlier_tasks_freed_goes_back() -> None:
+def test_memory_freed_by_earlier_tasks_is_released() -> None:
     libc = ctypes.CDLL(None)
     if not hasattr(libc, "malloc_trim"):
         pytest.skip("not glibc")

@@ -75,7 +75,7 @@ def test_waiting_for_a_worker_can_be_stopped(tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.mark.parametrize("how", ["closed", "no answer"])
-def test_a_scheduler_that_is_lost_while_it_is_asked_is_told(
+def test_a_scheduler_lost_during_a_request_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     client = Client()
@@ -92,7 +92,7 @@ def test_a_scheduler_that_is_lost_while_it_is_asked_is_told(
         make(client, tmp_path, [])
 
 
-def test_a_scheduler_that_is_lost_with_the_answer_in_hand_is_told(
+def test_a_scheduler_lost_before_the_answer_is_read_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A future can be finished, and the way to what it gave be closed a moment later."""

@@ -22,7 +22,7 @@ def a_task(threads: int = 1, memory_mb: int = 100, priority: int = 0) -> Task:
 
 
 class Busy:
-    """Threads that hold slots until they are told to let go."""
+    """Threads that hold slots until the test releases them."""
 
     def __init__(self, slots: Slots) -> None:
         self.slots = slots
@@ -120,7 +120,9 @@ def environment_in(store: Store, cancelled: threading.Event | None = None) -> Ta
 
 
 @pytest.mark.parametrize("again", [False, True])
-def test_what_two_jobs_need_is_made_once_unless_it_is_to_be_made_again(tmp_path: Path, again: bool) -> None:
+def test_a_task_of_two_jobs_is_computed_once_unless_it_replaces_its_artefact(
+    tmp_path: Path, again: bool
+) -> None:
     turns, store, task = Turns(), Store(tmp_path), replace(a_task(), replaces=again)
     made: list[int] = []
 
@@ -160,7 +162,7 @@ class Counting:
         self.closed += 1
 
 
-def test_jobs_side_by_side_leave_to_each_other_what_is_being_made(tmp_path: Path) -> None:
+def test_jobs_wait_for_tasks_that_other_jobs_compute(tmp_path: Path) -> None:
     store, turns, executors = Store(tmp_path), Turns(), [Counting() for _ in range(3)]
     jobs = [TurnTakingExecutor(own, turns) for own in executors]
     threads = [threading.Thread(target=job.execute, args=[a_task(), environment_in(store)]) for job in jobs]
@@ -174,7 +176,7 @@ def test_jobs_side_by_side_leave_to_each_other_what_is_being_made(tmp_path: Path
     assert [own.closed for own in executors] == [1, 1, 1]
 
 
-def test_who_waits_for_another_job_can_be_stopped_or_takes_over_where_that_failed(tmp_path: Path) -> None:
+def test_a_waiting_job_can_be_stopped_and_takes_over_if_the_other_failed(tmp_path: Path) -> None:
     turns, store, stop = Turns(), Store(tmp_path), threading.Event()
     stop.set()
 

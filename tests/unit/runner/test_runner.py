@@ -129,7 +129,7 @@ def test_a_child_that_failed_unexpectedly_is_not_used_again(bench: Bench, stage:
     assert pid_of(bench, "work", 2) != first
 
 
-def test_children_that_died_while_they_waited_are_replaced_silently(bench: Bench) -> None:
+def test_idle_children_that_died_are_replaced_silently(bench: Bench) -> None:
     bench.children.prepare(bench.logs, [["wave"]])
     first = pid_of(bench, "work", 1)  # the one that waits
     bench.children.prepare(bench.logs, [["wave"], ["colorsys"]])  # it, and another
@@ -143,7 +143,7 @@ def test_children_that_died_while_they_waited_are_replaced_silently(bench: Bench
     assert set(bench.kinds()) == {"started", "progress", "finished"}
 
 
-def test_a_child_ends_with_its_task_where_nobody_can_be_told_of_it(bench: Bench) -> None:
+def test_a_child_ends_with_its_task_if_the_listener_fails(bench: Bench) -> None:
     first = pid_of(bench, "work", 1)
 
     def tell(event: Event) -> None:
@@ -172,7 +172,7 @@ def test_libraries_load_ahead_in_the_child_that_will_need_them(bench: Bench) -> 
     assert loaded == ["colorsys"]
 
 
-def test_what_cannot_be_loaded_ahead_is_left_to_the_stage(bench: Bench) -> None:
+def test_modules_that_cannot_be_loaded_ahead_are_left_to_the_stage(bench: Bench) -> None:
     bench.children.prepare(bench.logs, [["no_such_module_anywhere"]])
     assert bench.runner.run(a_task("work"))[1]
     assert "no_such_module_anywhere" in (bench.logs / "children.log").read_text()
@@ -200,7 +200,7 @@ def test_prints_of_libraries_go_to_the_log(bench: Bench) -> None:
         assert line in log
 
 
-def test_a_typed_error_crosses_whole(bench: Bench) -> None:
+def test_a_typed_error_reaches_the_parent_completely(bench: Bench) -> None:
     with pytest.raises(EstimationError) as caught:
         bench.runner.run(a_task("refuse"))
     error = caught.value
@@ -209,7 +209,7 @@ def test_a_typed_error_crosses_whole(bench: Bench) -> None:
     assert bench.store.find(a_task("refuse").key) is None
 
 
-def test_a_bug_names_the_stage_and_brings_its_traceback(bench: Bench) -> None:
+def test_a_bug_is_reported_with_its_stage_and_traceback(bench: Bench) -> None:
     with pytest.raises(BodycapError, match="bug torso: KeyError") as caught:
         bench.runner.run(a_task("bug"))
     assert caught.value.exit_code == 70
@@ -218,7 +218,7 @@ def test_a_bug_names_the_stage_and_brings_its_traceback(bench: Bench) -> None:
     assert "Traceback" in (bench.logs / "bug_torso.log").read_text()
 
 
-def test_a_native_crash_is_told_with_its_signal_and_log(bench: Bench) -> None:
+def test_a_native_crash_is_reported_with_its_signal_and_log(bench: Bench) -> None:
     with pytest.raises(BodycapError, match="SIGSEGV") as caught:
         bench.runner.run(a_task("crash"))
     assert caught.value.exit_code == 70
@@ -249,7 +249,7 @@ def test_cancelling_stops_the_child_and_cleans_up(bench: Bench, tmp_path: Path, 
     assert bench.kinds()[-1] == "stopped"
 
 
-def test_a_child_killed_with_kill_9_is_told_and_the_task_can_be_run_again(
+def test_a_child_killed_with_sigkill_is_reported_and_its_task_can_run_again(
     bench: Bench, tmp_path: Path
 ) -> None:
     started = tmp_path / "started"
@@ -289,7 +289,7 @@ def test_children_do_not_outlive_a_killed_parent(tmp_path: Path) -> None:
     wait_for(lambda: not alive(child))
 
 
-def test_nothing_is_committed_for_a_job_that_belongs_to_another(bench: Bench) -> None:
+def test_nothing_is_committed_for_a_job_of_another_process(bench: Bench) -> None:
     bench.owner = False
     with pytest.raises(Cancelled, match="taken over"):
         bench.runner.run(a_task("work"))
@@ -299,7 +299,7 @@ def test_nothing_is_committed_for_a_job_that_belongs_to_another(bench: Bench) ->
     assert bench.runner.run(a_task("work"))[1]
 
 
-def test_what_is_not_stored_is_not_computed_when_nothing_may_be(bench: Bench) -> None:
+def test_missing_artefacts_are_not_computed_if_that_is_forbidden(bench: Bench) -> None:
     bench.runner.run(a_task("work", 1))
     looking = bench.with_rules(compute=False)
     assert not looking.run(a_task("work", 1))[1]
@@ -309,7 +309,7 @@ def test_what_is_not_stored_is_not_computed_when_nothing_may_be(bench: Bench) ->
     assert "bodycap why" in str(caught.value.hint)
 
 
-def test_a_stage_to_be_done_again_replaces_what_is_stored(bench: Bench) -> None:
+def test_a_stage_that_is_computed_again_replaces_the_stored_artefact(bench: Bench) -> None:
     before, _ = bench.runner.run(a_task("work", say="first"))
     again = bench.with_rules(redo=frozenset({"work"}))
     after, executed = again.run(a_task("work", say="second"))
@@ -319,7 +319,7 @@ def test_a_stage_to_be_done_again_replaces_what_is_stored(bench: Bench) -> None:
     assert list((bench.store.root / "tmp").iterdir()) == []
 
 
-def test_a_task_may_be_forbidden_before_it_begins(bench: Bench) -> None:
+def test_a_task_may_be_forbidden_before_it_starts(bench: Bench) -> None:
     def forbid(task: Task) -> None:
         raise StoreError("no room")
 
@@ -363,7 +363,7 @@ def test_a_full_disk_is_a_typed_error_and_loses_nothing(tmp_path: Path, stage: s
     assert done.returncode == 0, done.stderr
 
 
-def test_a_store_error_is_what_a_removed_store_gives(bench: Bench) -> None:
+def test_a_removed_store_is_a_store_error(bench: Bench) -> None:
     (bench.store.root / "tmp").rmdir()
     (bench.store.root / "tmp").write_text("in the way")
     with pytest.raises(StoreError):
@@ -381,7 +381,7 @@ def test_a_store_error_is_what_a_removed_store_gives(bench: Bench) -> None:
         (0, 0, False),
     ],
 )
-def test_a_video_is_not_to_blame_where_its_disk_does_not_answer(
+def test_a_disk_that_does_not_answer_is_reported_instead_of_its_video(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: int, asked: int, away: bool
 ) -> None:
     video, store = tmp_path / "torso.mp4", Store(tmp_path / "store")
@@ -398,7 +398,7 @@ def test_a_video_is_not_to_blame_where_its_disk_does_not_answer(
     assert caught.value.path == str(video)
 
 
-def test_what_is_no_plain_file_is_not_asked(tmp_path: Path) -> None:
+def test_only_plain_files_are_read_to_find_the_cause(tmp_path: Path) -> None:
     pipe = tmp_path / "torso.mp4"
     os.mkfifo(pipe)  # opening it would wait for somebody to write
     for path in (pipe, tmp_path, tmp_path / "none"):

@@ -1,4 +1,4 @@
-"""Versions of algorithms follow the source they are made of."""
+"""Versions of algorithms follow from their source."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ IGNORED = {"core"}
 
 
 def forget() -> None:
-    """Clear what was read of the sources."""
+    """Forget the sources that were read."""
     for remembered in (code_version.algorithm_version, code_version._source, code_version._files):
         remembered.cache_clear()
 
@@ -107,14 +107,14 @@ def test_shared_geometry_changes_what_computes_with_it(copied: Path) -> None:
     assert changed_by(copied / "model" / "geometry.py") >= {"map", "registration", "merge", "export"}
 
 
-def test_the_glue_of_a_task_counts_for_its_stages(copied: Path) -> None:
+def test_the_code_of_a_task_counts_for_its_stages(copied: Path) -> None:
     assert changed_by(copied / "tasks" / "export.py") == {"export"}
     assert changed_by(copied / "tasks" / "mapping.py") == {"map", "extend", "refine"}
     assert changed_by(copied / "tasks" / "stage.py") == set(STAGES)
 
 
-def test_words_do_not_count(copied: Path) -> None:
-    """A reworded sentence must not compute a user's results anew."""
+def test_comments_and_docstrings_do_not_count(copied: Path) -> None:
+    """A reworded sentence must not cause new computations."""
     before = versions()
     for path in copied.rglob("*.py"):
         path.write_text(reworded(path.read_text(encoding="utf-8")), encoding="utf-8")
@@ -188,7 +188,7 @@ def test_the_version_is_the_same_on_each_python() -> None:
     assert hashlib.sha256(text.encode()).hexdigest()[:16] == "35e3d844b46998a0"
 
 
-def test_a_further_stage_changes_no_other(copied: Path) -> None:
+def test_another_stage_does_not_change_the_version_of_any(copied: Path) -> None:
     assert changed_by(copied / "tasks" / "stages.py") == set()
 
 
@@ -197,21 +197,21 @@ def test_data_files_of_the_body_count(copied: Path, name: str) -> None:
     assert "merge" in changed_by(copied / "presets" / name, "\n# another body\n")
 
 
-def test_what_reads_a_users_skeleton_counts(copied: Path) -> None:
+def test_the_reader_of_skeleton_files_counts(copied: Path) -> None:
     assert "merge" in changed_by(copied / "formats" / "bvh" / "reader.py")
 
 
-def test_how_results_are_kept_counts(copied: Path) -> None:
+def test_the_format_of_stored_results_counts(copied: Path) -> None:
     assert changed_by(copied / "formats" / "bundle.py") == set(STAGES) - {"synth", "check"}
 
 
-def test_what_only_talks_does_not_count(copied: Path) -> None:
+def test_code_for_output_does_not_count(copied: Path) -> None:
     assert changed_by(copied / "cli" / "display.py") == set()
     assert changed_by(copied / "core" / "progress.py") == set()
     assert changed_by(copied / "config" / "options.py") == set()
 
 
-def test_when_lost_frames_are_looked_for_counts(copied: Path) -> None:
+def test_the_conditions_of_recovery_count(copied: Path) -> None:
     assert changed_by(copied / "config" / "lost_frames.py") == {"registration", "recover", "rig"}
 
 

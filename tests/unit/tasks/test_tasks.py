@@ -1,4 +1,4 @@
-"""What the tasks hand to the stages: mounts, rows, capture digests."""
+"""What tasks give to the stages: mounts, rows, digests of cameras."""
 
 from __future__ import annotations
 
@@ -58,27 +58,27 @@ def test_a_stated_mount_is_trusted_more(tmp_path: Path) -> None:
     assert (found.sigma_rad, found.sigma_m) == (STATED_SIGMA_RAD, STATED_SIGMA_M)
 
 
-def test_stated_sigmas_win(tmp_path: Path) -> None:
+def test_stated_sigmas_are_used(tmp_path: Path) -> None:
     found = mount(tmp_path, joint_from_cam=QUARTER_TURN, sigma_deg=1.0, sigma_m=0.002)
     assert found.sigma_rad == pytest.approx(np.radians(1.0))
     assert found.sigma_m == 0.002
 
 
 @pytest.mark.parametrize("pose", [QUARTER_TURN, None])
-def test_a_stated_uncertainty_is_no_name_however_large(tmp_path: Path, pose: Any) -> None:
+def test_a_mount_with_a_stated_uncertainty_does_not_count_as_known_by_name(tmp_path: Path, pose: Any) -> None:
     found = mount(tmp_path, joint_from_cam=pose, sigma_deg=20.0)
     assert found.sigma_rad == pytest.approx(np.radians(20.0))
     assert not found.by_name
 
 
-def test_the_mount_says_where_it_sits_and_the_name_only_names(tmp_path: Path) -> None:
+def test_the_mount_field_decides_on_the_place_not_the_name(tmp_path: Path) -> None:
     front, back = mount(tmp_path), mount(tmp_path, name="seven", mount="torso_back")
     assert back.camera == "seven"
     assert back.role == "Spine1"
     assert front.joint_from_cam[1, 2] < 0 < back.joint_from_cam[1, 2], "the body faces −Y"
 
 
-def test_a_camera_of_no_known_place_is_named(tmp_path: Path) -> None:
+def test_a_camera_without_a_known_place_is_reported_by_name(tmp_path: Path) -> None:
     with pytest.raises(JobError, match="seven"):
         mount(tmp_path, name="seven")
 
@@ -129,14 +129,16 @@ def test_the_mean_row_follows_the_observations() -> None:
         ({"sigma_deg": 2.0}, False),
     ],
 )
-def test_what_a_cameras_frames_depend_on(tmp_path: Path, change: dict[str, Any], counts: bool) -> None:
+def test_the_digest_of_a_camera_covers_what_its_frames_depend_on(
+    tmp_path: Path, change: dict[str, Any], counts: bool
+) -> None:
     digests = FileDigests(tmp_path / "digests")
     jobs = [a_job(tmp_path), a_job(tmp_path, **change)]
     found = {camera_digest(job.capture, job.capture.cameras[0], digests) for job in jobs}
     assert (len(found) == 2) is counts
 
 
-def test_a_sidecars_content_counts_and_a_missing_one_is_named(tmp_path: Path) -> None:
+def test_the_content_of_a_sidecar_counts_and_a_missing_one_is_reported(tmp_path: Path) -> None:
     digests = FileDigests(tmp_path / "digests")
     sidecar = tmp_path / "torso.timestamps.txt"
     job = a_job(tmp_path, timestamps=[str(sidecar)])
@@ -151,7 +153,7 @@ def test_a_sidecars_content_counts_and_a_missing_one_is_named(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("number", [errno.ESTALE, errno.EIO])
-def test_footage_whose_disk_goes_away_while_it_is_read_is_not_to_blame(
+def test_a_disk_that_fails_while_footage_is_read_is_reported_instead_of_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
     def fail(*_: Any) -> str:
