@@ -20,8 +20,7 @@ OUTLIER_LIMIT_M = 0.12
 """Distance from the quadratic, in metres, above which a pose is wrong: several times a swing's deviation from
 it. Evidence: none."""
 
-MIN_SIGMA_M = 0.004
-MIN_SIGMA_RAD = float(np.radians(0.4))
+MIN_SIGMA_M, MIN_SIGMA_RAD = 0.004, float(np.radians(0.4))
 """Smallest sigmas of a measured pose per axis, metres and radians. The covariance of PnP contains the image
 noise, but neither the error of the map nor the movement of the strap. Evidence: none."""
 

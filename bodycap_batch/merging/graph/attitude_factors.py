@@ -16,8 +16,7 @@ from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.merging.graph.posture import Posture
 
-UPRIGHT_SIGMA_RAD = float(np.radians(5.0))
-HEADING_SIGMA_RAD = float(np.radians(8.0))
+UPRIGHT_SIGMA_RAD, HEADING_SIGMA_RAD = float(np.radians(5.0)), float(np.radians(8.0))
 """Sigmas, in radians, of a walker's mean chest about the vertical and about the direction of walking. They
 contain the person's systematic lean, and how the rig defines the axes of the chest. Evidence: none."""
 STANDING_SIGMA_RAD = float(np.radians(7.0))

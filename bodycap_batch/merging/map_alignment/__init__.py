@@ -1,1 +1,1 @@
-"""Similarities between maps that share no view, found through the body."""
+"""Alignment of maps without common views: similarities between maps, estimated through the body."""

@@ -1,8 +1,9 @@
-"""Maps that share no view: the body whose cameras made them puts them into one.
+"""Alignment of maps that share no view, through the body that carried their cameras.
 
-A joint's centre is the same point of both segments that meet there, whichever map each segment's camera is
-in; so the body's own calibration, with a similarity per further map among its unknowns, places the maps. It
-starts from the walk, which all cameras share once their swinging is averaged out, and from the body at ease.
+A joint's centre is the same point of both segments that meet there, whichever maps their cameras are in. So
+the body's calibration determines the similarity of each further map, as additional unknowns. Initial values
+come from the path of the body, which all cameras share once their swinging is averaged out, and from the rest
+pose.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from bodycap_batch.merging.cameras.track import (
     transform_track,
     transform_trajectory,
 )
-from bodycap_batch.merging.map_alignment.gauss_newton import MapAlignmentProblem
+from bodycap_batch.merging.map_alignment.gauss_newton import AlignmentSigma, MapAlignmentProblem
 from bodycap_batch.merging.map_alignment.initial_alignment import (
     InitialAlignment,
     align_maps_initially,
@@ -47,32 +48,34 @@ from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.scene import Trajectory
 
 MAX_SIGMA_M = 0.06
-"""A map whose cameras are known less well than this, per axis, is not placed."""
+"""Largest position sigma per axis, in metres, of the cameras of a map that is used. Evidence: none."""
 _MAX_SAMPLES = 240
+"""Instants at which the cameras are sampled at most; they bound the time. Evidence: none."""
 _REACH_SIGMA = 0.05
-"""Of the log of the scale that the limbs' reach gives: walking elbows keep 15 to 30 degrees of flexion. With
-maps of their own, mounts and scale can make up for each other."""
+"""Sigma of the logarithm of the scale from the limbs' reach: walking elbows keep 15 to 30 degrees of flexion.
+It is needed because, with separate maps, errors of mounts and scale can compensate each other."""
 _SEPARATE_MAPS_SIGMA = 0.15
-"""The same where no map holds the trunk and a limb's end: mounts are off by a tenth of half an arm. On 12
-walks with cameras on upper arms and palms it was 0 to 27 % too small, 12 % in the mean square."""
+"""The same if no map contains cameras of both the trunk and the end of a limb: mounts are wrong by a tenth of
+half an arm. Evidence: docs/decisions/merging.md."""
 _UNOBSERVABLE_SIGMA = 0.4
-"""The same where nothing tells it but that, or two cameras that sit close together: palms alone gave 0.69
-and 0.72 of the true scale, and lay 20 to 30 cm too low at 5 cm stated."""
+"""The same if the scale rests on that alone, or on two cameras near each other. Evidence:
+docs/decisions/merging.md."""
 _MAX_STRAIN = 2.0
-"""Sigmas between that scale and the solved one above which the body does not tell where the maps lie."""
+"""Largest difference, in sigmas, between that scale and the solved one. Above it, the body does not determine
+the maps. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlignedMap:
-    """A further map's place.
+    """A further map in the main one.
 
     Attributes:
-        gauge: The map.
+        gauge: Of the further map.
         cameras: Its cameras.
-        main_from_gauge: Where it lies in the main map.
-        sigma_rad: How well its rotation is known there, per axis.
-        sigma_m: How well its cameras' positions are, per axis.
-        reason: Why it is not used; None where it is.
+        main_from_gauge: The similarity between the maps.
+        sigma_rad: Sigma of the map's rotation, per axis.
+        sigma_m: Sigma of its cameras' positions, per axis.
+        reason: Why it is not used; None if it is.
     """
 
     gauge: str
@@ -88,22 +91,25 @@ class UsableCameras:
     """The cameras that can be used together.
 
     Attributes:
-        trajectories: In the main map's gauge, the trunk's first.
-        places: By gauge, where each used map lies in the main one.
-        sigmas: By camera of a further map, how well its place is known: rotation (rad), position (m).
-        unused: By camera, why it is left out.
+        trajectories: In the gauge of the main map, the trunk's first.
+        main_from_gauge: By gauge, the similarity of each used map.
+        sigmas: By camera of a further map, the sigmas of the map's alignment.
+        unused: By camera, why it is not used.
     """
 
     trajectories: tuple[Trajectory, ...]
     main_from_gauge: Mapping[str, Similarity]
-    sigmas: Mapping[str, tuple[float, float]]
+    sigmas: Mapping[str, AlignmentSigma]
     unused: Mapping[str, str]
 
     def report(self) -> dict[str, Any]:
-        """Plain JSON values: how well each joined camera is placed."""
+        """Return the sigmas of each aligned camera as plain JSON values."""
         return {
-            camera: {"sigma_deg": round(float(np.degrees(turn)), 3), "sigma_m": round(shift, 5)}
-            for camera, (turn, shift) in self.sigmas.items()
+            camera: {
+                "sigma_deg": round(float(np.degrees(sigma.rotation_rad)), 3),
+                "sigma_m": round(sigma.position_m, 5),
+            }
+            for camera, sigma in self.sigmas.items()
         }
 
 
@@ -114,43 +120,48 @@ def align_cameras(
     step: Callable[[], None],
     options: MergeOptions | None = None,
 ) -> UsableCameras:
-    """Bring the cameras of further maps into the main one, as far as the body tells where they are.
+    """Transform the cameras of further maps into the main one, as far as the body determines the maps.
 
     Args:
         inputs: Skeleton, mounts and clocks.
         main: The main map's cameras, the trunk's first.
         further: Cameras of other maps.
         step: Called after each iteration; may raise to stop.
-        options: What the job states of the scale.
+        options: What the job states about the scale.
     """
-    here = Similarity(1.0, np.eye(3), np.zeros(3))
+    identity = Similarity(1.0, np.eye(3), np.zeros(3))
     if not further:
         return UsableCameras(
-            trajectories=tuple(main), main_from_gauge={main[0].gauge: here}, sigmas={}, unused={}
+            trajectories=tuple(main), main_from_gauge={main[0].gauge: identity}, sigmas={}, unused={}
         )
     bones = kinematic_chain(
         inputs.skeleton, {inputs.mount_of(each.camera).role for each in (*main, *further)}
     )
-    index = {bone.role: place for place, bone in enumerate(bones)}
+    index = {bone.role: position for position, bone in enumerate(bones)}
     tracks: dict[str, list[CameraTrack]] = {}
     for each in (*main, *further):
         track = make_track(inputs, each, index[inputs.mount_of(each.camera).role])
         tracks.setdefault(each.gauge, []).append(track)
-    joined, unused = _align_all(inputs, options or MergeOptions(), bones, tracks, step)
-    good = {item.gauge: item for item in joined if item.reason is None}
-    moved_here = [
-        transform_trajectory(each, good[each.gauge].main_from_gauge, main[0].gauge)
+    found, unused = _align_all(inputs, options or MergeOptions(), bones, tracks, step)
+    aligned = {item.gauge: item for item in found if item.reason is None}
+    transformed = [
+        transform_trajectory(each, aligned[each.gauge].main_from_gauge, main[0].gauge)
         for each in further
-        if each.gauge in good
+        if each.gauge in aligned
     ]
     return UsableCameras(
-        trajectories=(*main, *moved_here),
-        main_from_gauge={main[0].gauge: here} | {gauge: item.main_from_gauge for gauge, item in good.items()},
-        sigmas={camera: (item.sigma_rad, item.sigma_m) for item in good.values() for camera in item.cameras},
+        trajectories=(*main, *transformed),
+        main_from_gauge={main[0].gauge: identity}
+        | {gauge: item.main_from_gauge for gauge, item in aligned.items()},
+        sigmas={
+            camera: AlignmentSigma(item.sigma_rad, item.sigma_m)
+            for item in aligned.values()
+            for camera in item.cameras
+        },
         unused=unused
         | {
-            camera: _exclusion_reason(item.gauge, (main[0].camera, main[0].gauge), item.reason)
-            for item in joined
+            camera: _exclusion_reason(item.gauge, main[0].camera, main[0].gauge, item.reason)
+            for item in found
             if item.reason is not None
             for camera in item.cameras
         },
@@ -164,40 +175,69 @@ def _align_all(
     tracks: dict[str, list[CameraTrack]],
     step: Callable[[], None],
 ) -> tuple[tuple[AlignedMap, ...], dict[str, str]]:
-    """The further maps' places, and by camera why others were not even tried."""
+    """Align all further maps together, or each alone if that fails.
+
+    Args:
+        inputs: Skeleton and mounts.
+        options: What the job states about the scale.
+        bones: The graph's bones, those of all cameras.
+        tracks: By gauge; the main map's first, with the trunk's camera first. Maps that fail are removed.
+        step: Called after each iteration; may raise to stop.
+
+    Returns:
+        The aligned maps, and by camera why its map could not be aligned.
+    """
     (main, (trunk, *_)), *others = tracks.items()
     unused: dict[str, str] = {}
 
-    def leave(gauge: str, why: str) -> None:
+    def exclude(gauge: str, why: str) -> None:
         for track in tracks.pop(gauge):
-            unused[track.camera] = _exclusion_reason(gauge, (trunk.camera, main), why)
+            unused[track.camera] = _exclusion_reason(gauge, trunk.camera, main, why)
 
     for gauge, group in others:
         try:
             require_common_time(trunk, group)
         except EstimationError as error:
-            leave(gauge, error.message)
+            exclude(gauge, error.message)
     if len(tracks) == 1:
         return (), unused
     try:
         return align_maps(inputs, options, bones, tracks, step), unused
     except EstimationError as error:
         if len(tracks) == 2:
-            leave(next(name for name in tracks if name != main), error.message)
+            exclude(next(name for name in tracks if name != main), error.message)
             return (), unused
-    # One map that fits no body spoils all of the others' places: each on its own.
+    # One map that fits no person makes the others fail, too. So each map is aligned alone.
     found: tuple[AlignedMap, ...] = ()
     for gauge in [name for name in tracks if name != main]:
         try:
             found += align_maps(inputs, options, bones, {main: tracks[main], gauge: tracks[gauge]}, step)
         except EstimationError as error:
-            leave(gauge, error.message)
+            exclude(gauge, error.message)
     return found, unused
 
 
-def _exclusion_reason(gauge: str, trunk: tuple[str, str], why: str) -> str:
-    """Why a camera is left out whose map is not the trunk's (camera, gauge)."""
-    return f"its map {gauge} shares no view with {trunk[0]}'s {trunk[1]}, and the body cannot place it: {why}"
+def _exclusion_reason(gauge: str, trunk_camera: str, main_gauge: str, why: str) -> str:
+    """Return the message for a camera of a map that could not be aligned with the trunk's."""
+    return (
+        f"its map {gauge} shares no view with {trunk_camera}'s {main_gauge}, "
+        f"and the body cannot place it: {why}"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Start:
+    """What is known before the alignment is refined.
+
+    Attributes:
+        inputs: With the trunk's camera rolled as it was worn.
+        alignment: Initial similarities and scale.
+        up: The vertical in the main map, if it is known.
+    """
+
+    inputs: MergeInputs
+    alignment: InitialAlignment
+    up: Vertical | None
 
 
 def _initialise(
@@ -206,23 +246,25 @@ def _initialise(
     main: Sequence[CameraTrack],
     others: Sequence[tuple[str, Sequence[CameraTrack]]],
     stated: StatedConstraints,
-) -> tuple[MergeInputs, InitialAlignment, Vertical | None]:
-    """The trunk's camera the way up it sits, where the maps start then, and the vertical if known."""
-    start = align_maps_initially(bones, main, others, {mount.camera: mount for mount in inputs.mounts})
-    own = _without_outliers(inputs, main, start.metres_per_unit)
-    roll, up = reference_camera_roll(inputs, bones, own, start.metres_per_unit, stated.verticals)
+) -> _Start:
+    """Estimate the roll of the trunk's camera and the initial alignment."""
+    alignment = align_maps_initially(bones, main, others, {mount.camera: mount for mount in inputs.mounts})
+    own = _without_outliers(inputs, main, alignment.metres_per_unit)
+    roll, up = reference_camera_roll(inputs, bones, own, alignment.metres_per_unit, stated.verticals)
     if roll:
         inputs = with_rolls(inputs, {main[0].camera: roll})
-        start = align_maps_initially(bones, main, others, {mount.camera: mount for mount in inputs.mounts})
-    return inputs, start, up
+        mounts = {mount.camera: mount for mount in inputs.mounts}
+        alignment = align_maps_initially(bones, main, others, mounts)
+    return _Start(inputs, alignment, up)
 
 
 def _require_one_scale(strain: float, reach_sigma: float) -> None:
+    """Raise if the scale from the limbs' reach and the solved one disagree by too many sigmas."""
     if strain > _MAX_STRAIN:
         raise EstimationError(
             f"the limbs' reach and the way the cameras move disagree on the scale by "
             f"{100 * strain * reach_sigma:.0f} %",
-            hint="a longer walk with turns tells more",
+            hint="a longer walk with turns helps",
         )
 
 
@@ -237,57 +279,62 @@ def align_maps(
     tracks: Mapping[str, Sequence[CameraTrack]],
     step: Callable[[], None],
 ) -> tuple[AlignedMap, ...]:
-    """Place further maps in the main one.
+    """Estimate the similarities of further maps to the main one.
 
     Args:
         inputs: Skeleton and mounts.
-        options: What the job states of the scale.
+        options: What the job states about the scale.
         bones: The graph's bones, those of all cameras.
-        tracks: By gauge, its cameras' tracks; the main map's first, the trunk's camera first in it.
+        tracks: By gauge; the main map's first, with the trunk's camera first.
         step: Called after each iteration; may raise to stop.
 
     Raises:
-        EstimationError: The cameras' distances or their movement fit no person, or they were hardly localised
-            together.
+        EstimationError: The cameras' distances or movements fit no person, or they were hardly localised at
+            the same time.
     """
-    (here, main), *others = tracks.items()
-    stated = stated_constraints(inputs, options, here)
-    inputs, start, up = _initialise(inputs, bones, main, others, stated)
+    (main_gauge, main), *others = tracks.items()
+    stated = stated_constraints(inputs, options, main_gauge)
+    start = _initialise(inputs, bones, main, others, stated)
+    inputs, alignment, up = start.inputs, start.alignment, start.up
     mounts = {mount.camera: mount for mount in inputs.mounts}
-    starts, provisional = start.main_from_gauge, start.metres_per_unit
-    together = [*main, *(transform_track(track, starts[gauge]) for gauge, group in others for track in group)]
+    initial, provisional = alignment.main_from_gauge, alignment.metres_per_unit
+    together = [
+        *main,
+        *(transform_track(track, initial[gauge]) for gauge, group in others for track in group),
+    ]
     together = _without_outliers(inputs, together, provisional)
     samples = take_samples(together, provisional, _MAX_SAMPLES, None if up is None else up.up)
     calibration = CalibrationGraph(inputs.skeleton, bones, samples, mounts, provisional, step)
     names = {gauge: tuple(track.camera for track in group) for gauge, group in others}
-    known = _REACH_SIGMA if start.one_map_spans_a_limb else _SEPARATE_MAPS_SIGMA
-    reach_sigma = known if start.scale_observable else _UNOBSERVABLE_SIGMA
+    observable_sigma = _REACH_SIGMA if alignment.one_map_spans_a_limb else _SEPARATE_MAPS_SIGMA
+    reach_sigma = observable_sigma if alignment.scale_observable else _UNOBSERVABLE_SIGMA
     problem = MapAlignmentProblem(
         calibration, list(names.values()), provisional, reach_sigma=reach_sigma, stated=stated.scales
     )
     problem.solve()
-    # Reach and movement may disagree on what the job states.
+    # If the job states the scale, reach and movement may disagree.
     if not stated.scales:
         _require_one_scale(abs(problem.scale_residual()), reach_sigma)
         points = map_points_of(inputs, together[0].camera)
-        floor = scale_from_walked_floor(inputs, (together[0], up), problem.scale(), points)
+        floor = scale_from_walked_floor(inputs, together[0], up, problem.scale(), points)
         problem.add_scale_sources(() if floor is None else (floor,))
     out = []
     for index, (gauge, cameras) in enumerate(names.items()):
-        sigma_rad, sigma_m = problem.sigmas(index)
+        sigma = problem.sigmas(index)
         why = None
-        if not sigma_m <= MAX_SIGMA_M:
+        if not sigma.position_m <= MAX_SIGMA_M:
             why = (
-                f"the body tells it only to {100 * sigma_m:.0f} cm; bending forward and aside, turns in the "
-                "walk, an upper arm's camera, a common view, a known distance or a marker board settle it"
+                f"the body determines it only to {100 * sigma.position_m:.0f} cm; what helps is bending "
+                "forward and aside, turns in the walk, an upper arm's camera, a common view, "
+                "a known distance or a marker board"
             )
         out.append(
             AlignedMap(
                 gauge=gauge,
                 cameras=cameras,
-                main_from_gauge=problem.corrections[index].after(starts[gauge]),
-                sigma_rad=sigma_rad,
-                sigma_m=sigma_m,
+                main_from_gauge=problem.corrections[index].after(initial[gauge]),
+                sigma_rad=sigma.rotation_rad,
+                sigma_m=sigma.position_m,
                 reason=why,
             )
         )

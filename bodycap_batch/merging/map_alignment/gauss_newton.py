@@ -1,9 +1,10 @@
-"""Where further maps lie in the main one, by Gauss-Newton over a calibration that follows them."""
+"""Refinement of the similarities of further maps, by Gauss-Newton over the body's calibration."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,21 +16,48 @@ from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.model.geometry import Similarity, so3_exp
 
 _SLACK_SCHEDULE = (16.0, 4.0, 1.0)
-"""Slack of the joints in turn: a start that is a decimetre off must pull, not be taken for gross errors."""
+"""Factors on the slack of the joints, one solve after the other. With a large slack, an initial error of a
+decimetre has its full weight, and is not taken for a gross error."""
 _MAX_STEPS = 8
+"""Largest number of steps of one descent. Evidence: none."""
 _CONVERGED = 1e-3
-"""Share of the cost by which a step changes it that is the last."""
+"""Relative change of the cost below which a step is the last. Evidence: none."""
+
+
+class AlignmentSigma(NamedTuple):
+    """The uncertainty of a map's alignment.
+
+    Attributes:
+        rotation_rad: Sigma of the map's rotation, per axis.
+        position_m: Sigma of its cameras' positions, per axis.
+    """
+
+    rotation_rad: float
+    position_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """A Gauss-Newton step for G further maps.
+
+    Attributes:
+        change: (1 + 7 G) of the log scale, and of each map's rotation, log scale and translation.
+        covariance: (1 + 7 G, 1 + 7 G) of the same.
+    """
+
+    change: FloatArray
+    covariance: FloatArray
 
 
 class MapAlignmentProblem:
-    """A calibration whose further maps may move: their similarities by Gauss-Newton, all else eliminated.
+    """The similarities of further maps as unknowns of a calibration; all its other unknowns are eliminated.
 
     Args:
-        calibration: At a provisional place of all maps.
+        calibration: With all maps at their initial similarities.
         groups: The cameras of each further map.
-        scale: Metres per unit of the main map, provisional.
-        reach_sigma: Of its logarithm.
-        stated: What the job itself says of it.
+        scale: Provisional scale, metres per unit of the main map.
+        reach_sigma: Sigma of its logarithm.
+        stated: Scales from the job.
     """
 
     def __init__(
@@ -52,36 +80,37 @@ class MapAlignmentProblem:
         self._covariance = np.zeros((0, 0))
 
     def solve(self) -> None:
-        """Move the maps until the body's cost no longer falls, its joints stiffer step by step."""
+        """Move the maps until the cost no longer falls, with smaller and smaller slack of the joints."""
         for slack in _SLACK_SCHEDULE:
             self._calibration.slack_factor = slack
             self._descend()
-        mounts, shifts = self._linearised()
-        self._calibration.reweigh(mounts, mounts.eliminated(shifts))
+        mounts, derivatives = self._linearised()
+        self._calibration.reweigh(mounts, mounts.eliminated(derivatives))
         self._descend()
-        self._covariance = self._step(0.0)[1]
+        self._covariance = self._step(0.0).covariance
 
     def scale(self) -> ScaleSource:
-        """The solved scale of the main map."""
+        """Return the solved scale of the main map."""
         sigma = float(np.sqrt(self._covariance[0, 0]))
         return ScaleSource(name="body", scale=self._scale, sigma_log=sigma)
 
     def add_scale_sources(self, sources: Sequence[ScaleSource]) -> None:
-        """Weigh what else knows the scale into the solution."""
+        """Solve again with further sources of the scale."""
         if sources:
             self._sources += tuple(sources)
             self._descend()
-            self._covariance = self._step(0.0)[1]
+            self._covariance = self._step(0.0).covariance
 
     def _descend(self) -> None:
+        """Take damped steps until the cost hardly changes."""
         cost = self._cost()
         damping = 1e-4
         for _ in range(_MAX_STEPS):
-            change, _ = self._step(damping)
+            change = self._step(damping).change
             before = self._calibration.samples, self._scale, list(self.corrections)
             self._apply(change)
             trial = self._cost()
-            close = abs(trial - cost) < _CONVERGED * max(cost, 1.0)
+            converged = abs(trial - cost) < _CONVERGED * max(cost, 1.0)
             if trial > cost:
                 self._calibration.move(before[0])
                 _, self._scale, self.corrections = before
@@ -89,73 +118,81 @@ class MapAlignmentProblem:
                 damping = max(100.0 * damping, 1e-2)
             else:
                 cost, damping = trial, 0.1 * damping
-            if close:
+            if converged:
                 break
 
-    def sigmas(self, index: int) -> tuple[float, float]:
-        """Sigma per axis of a map's rotation (rad) and its cameras' positions (m), over the samples."""
+    def sigmas(self, index: int) -> AlignmentSigma:
+        """Return the sigmas of a further map's rotation and of its cameras' positions at the samples."""
         centres, middle = self._centres(index)
-        mine = slice(1 + 7 * index, 8 + 7 * index)
-        values, vectors = np.linalg.eigh(self._covariance[mine, mine])
-        half = vectors * np.sqrt(np.maximum(values, 0.0))
+        unknowns = slice(1 + 7 * index, 8 + 7 * index)
+        values, vectors = np.linalg.eigh(self._covariance[unknowns, unknowns])
+        modes = vectors * np.sqrt(np.maximum(values, 0.0))
         off = (centres - middle)[:, :, None]
-        arms = np.cross(half[None, :3].swapaxes(1, 2), off.swapaxes(1, 2)).swapaxes(1, 2)
-        shifts = arms + off * half[None, 3:4] + half[None, 4:]
+        by_rotation = np.cross(modes[None, :3].swapaxes(1, 2), off.swapaxes(1, 2)).swapaxes(1, 2)
+        shifts = by_rotation + off * modes[None, 3:4] + modes[None, 4:]
         position = (shifts**2).sum(axis=(1, 2)).mean()
-        return float(np.sqrt((half[:3] ** 2).sum() / 3.0)), float(np.sqrt(position / 3.0))
+        return AlignmentSigma(float(np.sqrt((modes[:3] ** 2).sum() / 3.0)), float(np.sqrt(position / 3.0)))
 
     def _centres(self, index: int) -> tuple[FloatArray, FloatArray]:
+        """Return the sampled centres (N,3) of a further map's cameras, metres, and their mean (3,)."""
         samples, members = self._calibration.samples, self._members[index]
         centres = self._scale * samples.map_from_cam[members][samples.valid[members], :3, 3]
         return centres, centres.mean(axis=0)
 
-    def _step(self, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Change (1 + 7 G) of log scale and maps that lowers the cost, and its covariance."""
-        mounts, shifts = self._linearised()
-        solved = mounts.eliminated(shifts)
-        count = shifts.shape[1]
-        told = np.zeros((len(self._sources), solved.influence.shape[1]))
-        told[:, -count] = [1.0 / source.sigma_log for source in self._sources]
-        influence = np.vstack([solved.influence, told])
-        right = np.append(mounts.linear.rhs, -self._source_residuals())
+    def _step(self, damping: float) -> _Step:
+        """Return the step that lowers the cost.
+
+        Args:
+            damping: Relative increase of the diagonal of the normal equations.
+        """
+        mounts, derivatives = self._linearised()
+        solved = mounts.eliminated(derivatives)
+        count = derivatives.shape[1]
+        source_rows = np.zeros((len(self._sources), solved.influence.shape[1]))
+        source_rows[:, -count] = [1.0 / source.sigma_log for source in self._sources]
+        influence = np.vstack([solved.influence, source_rows])
+        rhs = np.append(mounts.linear.rhs, -self._source_residuals())
         normal = influence.T @ influence
         variance = self._calibration.row_variance(mounts, solved)[
-            np.append(mounts.kinds, np.full(len(told), PRIOR))
+            np.append(mounts.kinds, np.full(len(source_rows), PRIOR))
         ]
         gain = _solve_normal_equations(normal, influence.T)
-        # A posture that is the wearer's habit, not the prior's, bends mounts and maps alike.
-        habit = (mounts.habit_shifts().T @ gain[:, : -len(told)].T).T
-        covariance = (gain * variance) @ gain.T + habit @ habit.T
+        # A systematic bias of the posture changes mounts and maps alike.
+        by_bias = (mounts.habit_shifts().T @ gain[:, : -len(source_rows)].T).T
+        covariance = (gain * variance) @ gain.T + by_bias @ by_bias.T
         free = np.arange(len(normal) - count, len(normal))
         normal[free, free] *= 1.0 + damping
-        change = _solve_normal_equations(normal, influence.T @ right)[-count:]
-        return np.asarray(change, dtype=np.float64), np.asarray(covariance[-count:, -count:])
+        change = _solve_normal_equations(normal, influence.T @ rhs)[-count:]
+        return _Step(np.asarray(change, dtype=np.float64), np.asarray(covariance[-count:, -count:]))
 
     def _linearised(self) -> tuple[LinearisedCalibration, FloatArray]:
-        """The graph's derivatives by bones and mounts, and (R,1 + 7 G) those by log scale and maps."""
+        """Return the derivatives by bones and mounts, and those (R,1 + 7 G) by log scale and maps."""
         mounts = self._calibration.solved()
-        shifts = -self._calibration.measurement_shifts(mounts.linear, self._directions())
-        shifts[:, 0] -= self._calibration.unit_shifts(mounts)
-        return mounts, shifts
+        derivatives = -self._calibration.measurement_shifts(mounts.linear, self._directions())
+        derivatives[:, 0] -= self._calibration.unit_shifts(mounts)
+        return mounts, derivatives
 
     def _cost(self) -> float:
         return self._calibration.solve(self._scale) + 0.5 * float((self._source_residuals() ** 2).sum())
 
     def scale_residual(self) -> float:
-        """How far the scale has left the one that the limbs' reach gave, in sigmas."""
+        """Return the difference of the log scale from that of the limbs' reach, in sigmas."""
         return float(self._source_residuals()[0])
 
     def _source_residuals(self) -> FloatArray:
-        """How far the scale is from what each source says, in sigmas."""
+        """Return the difference (S,) of the log scale from that of each source, in sigmas."""
         return np.array([np.log(self._scale / each.scale) / each.sigma_log for each in self._sources])
 
     def _directions(self) -> FloatArray:
-        """(C,K,P,6) movement of each camera's pose in metres, turn and shift in the main map's axes."""
+        """Return the movement (C,K,P,6) of each camera's pose by each of P unknowns.
+
+        It is a rotation (rad) and a translation (m) in the axes of the main map.
+        """
         samples = self._calibration.samples
         centres = self._scale * samples.map_from_cam[..., :3, 3]
         out = np.zeros((*centres.shape[:2], 1 + 7 * len(self._members), 6))
-        seen = samples.valid
-        out[:, :, 0, 3:] = centres - centres[seen].mean(axis=0)
+        valid = samples.valid
+        out[:, :, 0, 3:] = centres - centres[valid].mean(axis=0)
         for index, members in enumerate(self._members):
             first = 1 + 7 * index
             off = centres[members] - self._centres(index)[1]
@@ -167,13 +204,13 @@ class MapAlignmentProblem:
         return out
 
     def _apply(self, change: FloatArray) -> None:
-        """Move the samples and remember where the maps went."""
+        """Move the samples by a step, and add it to the corrections of the maps."""
         samples = self._calibration.samples
         poses = samples.map_from_cam.copy()
         for index, members in enumerate(self._members):
-            turn, stretch, shift = np.split(change[1 + 7 * index : 8 + 7 * index], [3, 4])
+            turn, log_factor, shift = np.split(change[1 + 7 * index : 8 + 7 * index], [3, 4])
             middle = self._centres(index)[1] / self._scale
-            rotation, factor = so3_exp(turn), float(np.exp(stretch[0]))
+            rotation, factor = so3_exp(turn), float(np.exp(log_factor[0]))
             update = Similarity(factor, rotation, middle + shift / self._scale - factor * rotation @ middle)
             poses[members] = update.apply_to_poses(poses[members])
             self.corrections[index] = update.after(self.corrections[index])
@@ -182,7 +219,7 @@ class MapAlignmentProblem:
 
 
 def _solve_normal_equations(normal: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve the normal equations of the maps' places.
+    """Solve the normal equations of the alignment.
 
     Raises:
         EstimationError: They are singular.
@@ -192,5 +229,5 @@ def _solve_normal_equations(normal: FloatArray, right: FloatArray) -> FloatArray
     except np.linalg.LinAlgError as error:
         raise EstimationError(
             "the body's movement does not determine where the map lies",
-            hint="bending, turns in the walk, an upper arm's camera or a common view settle it",
+            hint="bending, turns in the walk, an upper arm's camera or a common view help",
         ) from error

@@ -72,7 +72,7 @@ def test_similarities_chain():
 def test_the_walk_and_the_stance_are_a_start(walk, recorded):
     inputs, bones, tracks = _tracks(walk, recorded)
     mounts = {mount.camera: mount for mount in inputs.mounts}
-    start = align_map(bones, tracks[0], [tracks[2]], (mounts, 1.0))
+    start = align_map(bones, tracks[0], [tracks[2]], mounts, 1.0)
     # A palm strays about half an upper arm from where it hangs at ease; the path itself is a few metres long.
     assert _off_m(start, tracks[2]) < 0.25
     assert start.scale * FURTHER.scale == pytest.approx(1.0, abs=0.1)

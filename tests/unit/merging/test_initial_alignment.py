@@ -86,7 +86,9 @@ def test_a_head_in_a_map_of_its_own_tells_no_scale():
     beside, without = (align_maps_initially(bones, first, each, mounts) for each in ([*others, head], others))
     assert beside.scale_observable
     assert beside.metres_per_unit == without.metres_per_unit
-    with pytest.raises(EstimationError, match="'head' from 'torso' in another map tells no scale"):
+    with pytest.raises(
+        EstimationError, match="'head' from 'torso' in another map does not determine the scale"
+    ):
         _starts({"torso": "a", "head": "b", "left_palm": "c", "right_palm": "d"}, 0)
 
 

@@ -57,7 +57,7 @@ def _asked(capture, options, points=None, off=1.1, up="map"):
     seen = make_track(inputs, trunk, index), _direction(gauge.rotation @ UP, up) if up else None
     points = np.zeros((0, 3)) if points is None else gauge.apply(points)
     stated = stated_constraints(inputs, options, trunk.gauge).scales
-    floor = scale_from_walked_floor(inputs, seen, body, points)
+    floor = scale_from_walked_floor(inputs, *seen, body, points)
     return [
         (each.name, each.scale * gauge.scale, each.sigma_log)
         for each in (*stated, *(() if floor is None else (floor,)))
@@ -126,7 +126,7 @@ def test_who_sits_is_not_as_tall_as_who_walks(short):
     floor = np.column_stack([rng.uniform(-2.0, 2.0, (300, 2)), rng.normal(scale=0.005, size=300)])
     body = ScaleSource(name="body", scale=1.0, sigma_log=0.15)
     seen = [(_sitter(inputs, walks), _direction(UP)) for walks in (1.0, 0.4, 0.0)]
-    always, seldom, never = (scale_from_walked_floor(inputs, each, body, floor) for each in seen)
+    always, seldom, never = (scale_from_walked_floor(inputs, *each, body, floor) for each in seen)
     assert seldom.scale == pytest.approx(always.scale, abs=0.02)
     assert never is None
 
