@@ -77,7 +77,7 @@ def _with_board(
             frames[path.camera] = np.flatnonzero(keyframes)
             lenses[path.camera] = maps[path.gauge].cameras[path.camera]
     views = find_board_views(load_capture(arguments), frames, lenses, wanted, context)
-    return dataclasses.replace(inputs, board=views)
+    return dataclasses.replace(inputs, board_views=views)
 
 
 MERGE = Stage(

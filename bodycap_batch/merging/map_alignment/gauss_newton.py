@@ -9,8 +9,14 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.merging.body_calibration.calibration_covariance import (
+    measurement_jacobian,
+    rescale_sigmas,
+    scale_jacobian,
+    variance_factors,
+)
 from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
-from bodycap_batch.merging.body_calibration.mount_covariance import PRIOR, LinearisedCalibration
+from bodycap_batch.merging.body_calibration.mount_covariance import LinearisedCalibration, RowType
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.model.geometry import Similarity, so3_exp
 
@@ -57,7 +63,7 @@ class Placing:
             self._calibration.slack_factor = slack
             self._descend()
         mounts, shifts = self._linearised()
-        self._calibration.reweigh(mounts, mounts.eliminated(shifts))
+        rescale_sigmas(self._calibration, mounts, mounts.reduced(shifts))
         self._descend()
         self._covariance = self._step(0.0)[1]
 
@@ -83,7 +89,7 @@ class Placing:
             trial = self._cost()
             close = abs(trial - cost) < _CLOSE * max(cost, 1.0)
             if trial > cost:
-                self._calibration.move(before[0])
+                self._calibration.set_samples(before[0])
                 _, self._scale, self.moved = before
                 self._calibration.solve(self._scale)
                 damping = max(100.0 * damping, 1e-2)
@@ -112,19 +118,19 @@ class Placing:
     def _step(self, damping: float) -> tuple[FloatArray, FloatArray]:
         """Change (1 + 7 G) of log scale and maps that lowers the cost, and its covariance."""
         mounts, shifts = self._linearised()
-        solved = mounts.eliminated(shifts)
+        solved = mounts.reduced(shifts)
         count = shifts.shape[1]
-        told = np.zeros((len(self._sources), solved.influence.shape[1]))
+        told = np.zeros((len(self._sources), solved.jacobian.shape[1]))
         told[:, -count] = [1.0 / source.sigma_log for source in self._sources]
-        influence = np.vstack([solved.influence, told])
+        influence = np.vstack([solved.jacobian, told])
         right = np.append(mounts.linear.right, -self._from_sources())
         normal = influence.T @ influence
-        variance = self._calibration.row_variance(mounts, solved)[
-            np.append(mounts.kinds, np.full(len(told), PRIOR))
+        variance = variance_factors(self._calibration.samples, mounts, solved)[
+            np.append(mounts.row_types, np.full(len(told), RowType.PRIOR))
         ]
         gain = _solved(normal, influence.T)
         # A posture that is the wearer's habit, not the prior's, bends mounts and maps alike.
-        habit = (mounts.habit_shifts().T @ gain[:, : -len(told)].T).T
+        habit = (mounts.posture_bias_jacobian().T @ gain[:, : -len(told)].T).T
         covariance = (gain * variance) @ gain.T + habit @ habit.T
         free = np.arange(len(normal) - count, len(normal))
         normal[free, free] *= 1.0 + damping
@@ -133,9 +139,9 @@ class Placing:
 
     def _linearised(self) -> tuple[LinearisedCalibration, FloatArray]:
         """The graph's derivatives by bones and mounts, and (R,1 + 7 G) those by log scale and maps."""
-        mounts = self._calibration.solved()
-        shifts = -self._calibration.measurement_shifts(mounts.linear, self._directions())
-        shifts[:, 0] -= self._calibration.unit_shifts(mounts)
+        mounts = self._calibration.linearised()
+        shifts = -measurement_jacobian(self._calibration, mounts.linear, self._directions())
+        shifts[:, 0] -= scale_jacobian(self._calibration, mounts)
         return mounts, shifts
 
     def _cost(self) -> float:
@@ -177,7 +183,7 @@ class Placing:
             update = Similarity(factor, rotation, middle + shift / self._scale - factor * rotation @ middle)
             poses[members] = update.apply_to_poses(poses[members])
             self.moved[index] = update.after(self.moved[index])
-        self._calibration.move(replace(samples, map_from_cam=poses))
+        self._calibration.set_samples(replace(samples, map_from_cam=poses))
         self._scale *= float(np.exp(change[0]))
 
 

@@ -51,11 +51,13 @@ def stated_in(inputs: MergeInputs, options: MergeOptions, gauge: str) -> Stated:
     distance, board = None, None
     # Of another map: told where all maps are in place.
     with suppress(EstimationError):
-        distance = known_distance(inputs, options, here)
+        distance = known_distance(inputs.trajectories, options.known_distance, here)
     with suppress(EstimationError):
-        board = locate_board(inputs, options, here)
+        board = locate_board(inputs.trajectories, inputs.board_views, options.marker_board, here)
     scales = (distance, None if board is None else board.scale)
-    return Stated(tuple(each for each in scales if each is not None), stated_verticals(options, board))
+    return Stated(
+        tuple(each for each in scales if each is not None), stated_verticals(options.marker_board, board)
+    )
 
 
 def floor_scale(

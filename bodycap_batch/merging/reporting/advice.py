@@ -81,9 +81,9 @@ def describe_hinge(role: str, off_m: float) -> str:
 
 def describe_scale(calibrated: BodyCalibration) -> str:
     """How well the metric scale is known."""
-    text = f"the metric scale is known to {100.0 * calibrated.sigma_log:.1f} % (1 sigma)"
-    used = {source.name for source in calibrated.sources if source.used}
-    if calibrated.sigma_log <= 0.02 or used & {"known distance", "marker board"}:
+    text = f"the metric scale is known to {100.0 * calibrated.scale.sigma_log:.1f} % (1 sigma)"
+    used = {source.name for source in calibrated.scale.sources if source.used}
+    if calibrated.scale.sigma_log <= 0.02 or used & {"known distance", "marker board"}:
         return text
     ways = ["name a known distance (merge.known_distance) or a board in the room (merge.marker_board)"]
     if len({mount.role for mount in calibrated.mounts}) == 1:
@@ -100,7 +100,7 @@ def describe_scale(calibrated: BodyCalibration) -> str:
 
 def describe_vertical(calibrated: BodyCalibration) -> str:
     """How well the vertical is known."""
-    up = calibrated.up
+    up = calibrated.vertical
     text = f"up is known to {up.sigma_deg:.1f}° (1 sigma), from the {up.source}"
     if up.by_habit():
         text = (

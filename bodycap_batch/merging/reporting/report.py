@@ -109,25 +109,25 @@ def _sides(
 ) -> dict[str, Any]:
     """Limbs' cameras on the other side of the body, where all are; nothing of joined maps."""
     own = [each for each in tracks if each.camera not in joined]
-    mounts = {mount.camera: mount for mount in (*inputs.mounts, calibrated.trunk)}
-    wrong = exchanged_sides(own, mounts, calibrated.up.up)
+    mounts = {mount.camera: mount for mount in (*inputs.mounts, calibrated.reference_prior)}
+    wrong = exchanged_sides(own, mounts, calibrated.vertical.up)
     return {"cameras": wrong, "says": describe_swapped_sides(wrong)} if wrong else {}
 
 
 def _scale(calibrated: BodyCalibration) -> dict[str, Any]:
     """The scale, everything that knows it, and how far all of that disagrees."""
-    chi2, freedom = chi_square(calibrated.sources)
+    chi2, freedom = chi_square(calibrated.scale.sources)
     out: dict[str, Any] = {
-        "source": " and ".join(source.name for source in calibrated.sources if source.used),
-        "metres_per_map_unit": calibrated.scale,
-        "relative_sigma": round(calibrated.sigma_log, 5),
-        "sources": [_source(source, calibrated.scale) for source in calibrated.sources],
+        "source": " and ".join(source.name for source in calibrated.scale.sources if source.used),
+        "metres_per_map_unit": calibrated.scale.metres_per_unit,
+        "relative_sigma": round(calibrated.scale.sigma_log, 5),
+        "sources": [_source(source, calibrated.scale.metres_per_unit) for source in calibrated.scale.sources],
         "chi2": round(chi2, 3),
         "degrees_of_freedom": freedom,
         "body_alone": {
-            "metres_per_map_unit": calibrated.estimate.scale,
-            "relative_sigma": round(calibrated.estimate.sigma_log, 5),
-            "costs": [[scale, round(cost, 4)] for scale, cost in calibrated.estimate.costs],
+            "metres_per_map_unit": calibrated.bones_alone.scale,
+            "relative_sigma": round(calibrated.bones_alone.sigma_log, 5),
+            "costs": [[scale, round(cost, 4)] for scale, cost in calibrated.bones_alone.costs],
         },
         "trunk_over_floor_m": calibrated.height_over_floor_m,
         "known_to": describe_scale(calibrated),
@@ -135,7 +135,7 @@ def _scale(calibrated: BodyCalibration) -> dict[str, Any]:
     if calibrated.limbs:
         chi2, freedom = chi_square(calibrated.limbs)
         out["limbs"] = {
-            "alone": [_source(limb, calibrated.scale) for limb in calibrated.limbs],
+            "alone": [_source(limb, calibrated.scale.metres_per_unit) for limb in calibrated.limbs],
             "chi2": round(chi2, 3),
             "degrees_of_freedom": freedom,
         }
@@ -144,7 +144,7 @@ def _scale(calibrated: BodyCalibration) -> dict[str, Any]:
 
 def _up(calibrated: BodyCalibration) -> dict[str, Any]:
     """What up was taken from, and how far off everything else is."""
-    up = calibrated.up
+    up = calibrated.vertical
     return {
         "source": up.source,
         "sigma_deg": round(up.sigma_deg, 2),

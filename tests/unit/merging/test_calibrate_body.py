@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError, JobError
 from bodycap_batch.merging.body.bones import graph_bones
 from bodycap_batch.merging.body_calibration.anthropometry import bone_length_modes, joint_placement_modes
@@ -30,19 +29,15 @@ def inputs():
     return walk, make_inputs(walk, recorded)
 
 
-def _asked(first, second, metres):
-    return MergeOptions(known_distance=(first, second, metres))
-
-
 def test_a_known_distance_gives_the_scale(inputs):
     walk, merged = inputs
     ends = walk.camera("torso", np.array([0.0, 80.0]) / 30.0)[:, :3, 3]
     metres = float(np.linalg.norm(ends[1] - ends[0]))
-    source = known_distance(merged, _asked("torso:0", "torso:80", metres))
+    source = known_distance(merged.trajectories, ("torso:0", "torso:80", metres))
     # 3 mm of noise an axis at both ends, the floor of 4 mm on top, over some 2.5 m.
     assert 0.003 < source.sigma_log < 0.006
     assert abs(np.log(source.scale * GAUGE.scale)) < 3.0 * source.sigma_log
-    assert known_distance(merged, MergeOptions()) is None
+    assert known_distance(merged.trajectories, None) is None
 
 
 @pytest.mark.parametrize(
@@ -56,7 +51,7 @@ def test_a_known_distance_gives_the_scale(inputs):
 )
 def test_a_known_distance_that_cannot_be_says_why(inputs, first, second, error, says):
     with pytest.raises(error, match=says):
-        known_distance(inputs[1], _asked(first, second, 1.0))
+        known_distance(inputs[1].trajectories, (first, second, 1.0))
 
 
 def test_a_known_distance_needs_one_map(inputs):
@@ -66,7 +61,7 @@ def test_a_known_distance_needs_one_map(inputs):
     )
     apart = replace(inputs[1], trajectories=trajectories)
     with pytest.raises(JobError, match="share no view"):
-        known_distance(apart, _asked("torso:0", "left_palm:0", 1.0))
+        known_distance(apart.trajectories, ("torso:0", "left_palm:0", 1.0))
 
 
 def test_every_mount_has_a_movement_that_tells_more():
@@ -91,8 +86,7 @@ def test_the_scales_advice_follows_from_where_cameras_sit(roles, advice):
     skeleton = load_skeleton("upper_body", 1.75)
     calibrated = SimpleNamespace(
         mounts=[nominal_mount(f"camera_{number}", role, skeleton) for number, role in enumerate(roles)],
-        sigma_log=0.27,
-        sources=[],
+        scale=SimpleNamespace(sigma_log=0.27, sources=[]),
         t_pose_ns=None,
     )
     sentence = describe_scale(calibrated)

@@ -75,7 +75,7 @@ def test_the_trunk_leads_then_the_head(capture):
     assert _names(candidate_main_maps(capture.inputs)[0][0])[:2] == ["torso", "head"]
     lost = _lose(capture.inputs, "torso", 6)
     assert _names(candidate_main_maps(lost)[0][0])[0] == "head"
-    assert rarely_localised(lost) == {"torso": f"6 localised frames of {6 * 30}, 15 needed"}
+    assert rarely_localised(lost.trajectories) == {"torso": f"6 localised frames of {6 * 30}, 15 needed"}
 
 
 def _noise(rng, count, sigma_rad=NOISE_RAD, sigma_m=NOISE_M):
@@ -243,7 +243,7 @@ def test_a_limbs_camera_tells_no_vertical(capture):
     trajectory = next(each for each in inputs.trajectories if each.camera == arm.camera)
     assert (
         preliminary_vertical(
-            inputs.skeleton, bones, (make_track(inputs, trajectory, place), arm), np.zeros((0, 3))
+            inputs.skeleton, bones, make_track(inputs, trajectory, place), arm, np.zeros((0, 3))
         )
         is None
     )
@@ -253,7 +253,7 @@ def test_the_timeline_is_that_of_the_cameras_in_use(capture):
     used = capture.inputs.trajectories[:3]
     far = replace(capture.inputs.trajectories[3], times_ns=capture.inputs.trajectories[3].times_ns + 10**13)
     inputs = replace(capture.inputs, trajectories=(*used, far))
-    ticks = timeline(inputs, used, 30.0)
+    ticks = timeline(inputs.clocks, used, 30.0)
     assert len(ticks) == 180
     assert ticks[0] == min(int(each.times_ns[0]) for each in used)
 
@@ -339,4 +339,4 @@ def test_a_map_that_bends_two_cameras_of_a_bone_alike_counts_once(capture):
             count = alike if track.camera.startswith("torso") else 1
             # Their own noise is not alike.
             own = max(float(np.median(track.sigma_rad)), MIN_SIGMA_RAD)
-            assert sigma**2 - own**2 == pytest.approx(count * samples.repeats * MAP_ERROR_RAD**2)
+            assert sigma**2 - own**2 == pytest.approx(count * samples.correlated_samples * MAP_ERROR_RAD**2)

@@ -54,18 +54,18 @@ def _calibrated(sideways_rad: float) -> CalibrationGraph:
 def test_an_elbow_that_swings_sideways_is_let_go():
     calibration = _calibrated(np.radians(15.0))
     assert calibration.test_hinges()
-    (role,) = calibration.off_hinge_m()  # the right one has no camera above it that could tell
+    (role,) = calibration.hinge_violation_m()  # the right one has no camera above it that could tell
     assert role == "LeftForeArm"
     # 15 degrees are 6.5 cm at the wrist of a straight forearm of 25 cm, 5 cm in the distances; the elbow is
     # bent, and the mounts take part of it.
-    assert 0.015 < calibration.off_hinge_m()[role] < 0.06
+    assert 0.015 < calibration.hinge_violation_m()[role] < 0.06
 
 
 def test_an_elbow_that_keeps_to_its_hinge_is_held_as_before():
     calibration = _calibrated(0.0)
     before, mounts = calibration.poses(), dict(calibration.mounts)
     assert not calibration.test_hinges()
-    assert calibration.off_hinge_m() == {}
+    assert calibration.hinge_violation_m() == {}
     assert (calibration.poses() == before).all()
     assert all((calibration.mounts[camera] == mount).all() for camera, mount in mounts.items())
 

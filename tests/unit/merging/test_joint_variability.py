@@ -21,14 +21,14 @@ def solved():
     """Three cameras on a walk of 20 s, calibrated at the true scale."""
     samples, calibration, metric = calibration_of(SynthOptions(seconds=20.0, outliers=0.0, poses_only=True))
     calibration.solve(metric)
-    return calibration.solved(), samples.times_ns
+    return calibration.linearised(), samples.times_ns
 
 
 def _shares(mounts, times_ns, redundancy=None):
-    found = mounts.eliminated()
+    found = mounts.reduced()
     if redundancy is not None:
         found = replace(found, redundancy=np.full_like(found.redundancy, redundancy))
-    return transient_variance_shares(mounts, found, (np.arange(len(times_ns)), times_ns), JOINT_PRIOR_SCALE)
+    return transient_variance_shares(mounts, found, np.arange(len(times_ns)), times_ns, JOINT_PRIOR_SCALE)
 
 
 def test_a_calm_walker_uses_a_part_of_the_everyday_range(solved):
@@ -59,5 +59,5 @@ def test_a_t_pose_alone_says_nothing(solved):
     mounts, times_ns = solved
     none = np.zeros(0, dtype=np.int64)
     assert transient_variance_shares(
-        mounts, mounts.eliminated(), (none, times_ns[:0]), JOINT_PRIOR_SCALE
+        mounts, mounts.reduced(), none, times_ns[:0], JOINT_PRIOR_SCALE
     ) == pytest.approx(EVERYDAY)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ from bodycap_batch.config.job import load_job
 from bodycap_batch.config.options import MarkerBoard, MergeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body_calibration.marker_board import locate_board
+from bodycap_batch.merging.body_calibration.marker_board import LocatedBoard, locate_board
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import Similarity, invert, make_transform, so3_exp, transform_points
@@ -35,8 +36,16 @@ WORLD_FROM_BOARD = make_transform(look(0.1) @ so3_exp([0.2, 0.1, 0.3]), [1.6, 0.
 CAMERA = Camera(model="PINHOLE", width_px=320, height_px=240, params=np.array(LENS["params"]))
 
 
-def _scale(*asked: object) -> ScaleSource:
-    return locate_board(*asked).scale
+def _board(
+    inputs: MergeInputs, options: MergeOptions, main_from_gauge: dict[str, Similarity] | None = None
+) -> LocatedBoard:
+    board = locate_board(inputs.trajectories, inputs.board_views, options.marker_board, main_from_gauge)
+    assert board is not None
+    return board
+
+
+def _scale(*arguments: Any) -> ScaleSource:
+    return _board(*arguments).scale
 
 
 def _path(count: int, centre_noise_m: float = 0.0, half_way_m: float = 0.7) -> np.ndarray:
@@ -68,7 +77,7 @@ def _inputs(world_from_cam: np.ndarray, views: tuple[BoardView, ...] = ()) -> Me
         clocks={"torso": CameraClock(nominal_fps=30.0)},
         skeleton=skeleton,
         mounts=(nominal_mount("torso", "Spine1", skeleton),),
-        board=views,
+        board_views=views,
     )
 
 
@@ -151,7 +160,7 @@ def test_corners_with_numbers_are_not_turned_to_fit_a_view_whose_pose_is_wrong()
     about = make_transform(np.diag([-1.0, -1.0, 1.0]), [0.36, 0.24, 0.0])
     for one in (1, 4, 5):
         views[one] = replace(views[one], cam_from_board=views[one].cam_from_board @ about)
-    source = _scale(replace(inputs, board=tuple(views)), asked)
+    source = _scale(replace(inputs, board_views=tuple(views)), asked)
     # Turned, their corners would be outliers, and the fit rest on the other nine.
     assert source.scale == pytest.approx(right.scale, rel=1e-6)
 
@@ -172,18 +181,18 @@ def test_the_main_map_is_asked_before_one_that_was_joined():
         clocks=inputs.clocks | {"left_palm": inputs.clocks["torso"]},
         mounts=(*inputs.mounts, replace(inputs.mounts[0], camera="left_palm")),
         trajectories=(*inputs.trajectories, palm),
-        board=(*few, *(replace(view, camera="left_palm") for view in views)),
+        board_views=(*few, *(replace(view, camera="left_palm") for view in views)),
     )
     asked = MergeOptions(marker_board=FLAT)
     assert _scale(both, asked, places).scale * GAUGE.scale == pytest.approx(1.0, abs=0.02)
-    fewer = replace(both, board=both.board[2:])
+    fewer = replace(both, board_views=both.board_views[2:])
     assert _scale(fewer, asked, places).scale * GAUGE.scale == pytest.approx(1.0 / 1.2, abs=0.02)
 
 
 def test_a_board_that_tells_nothing_is_refused():
     rng = np.random.default_rng(0)
     asked = MergeOptions(marker_board=FLAT)
-    assert locate_board(_inputs(_path(4)), MergeOptions()) is None
+    assert locate_board(_inputs(_path(4)).trajectories, (), None) is None
     with pytest.raises(EstimationError, match="found in 2 keyframes"):
         _scale(_inputs(_path(2), _views(_path(2), rng)), asked)
     still = np.repeat(_path(1), 6, axis=0)
@@ -242,21 +251,21 @@ def test_a_filmed_board_is_found_and_measured(filmed, tmp_path):
 
 def test_a_board_that_lies_or_hangs_tells_up():
     views = _views(_path(12), np.random.default_rng(0))
-    board = locate_board(_inputs(_path(12), views), MergeOptions(marker_board=FLAT))
-    assert board.ups(None) == ()
+    board = _board(_inputs(_path(12), views), MergeOptions(marker_board=FLAT))
+    assert board.verticals(None) == ()
     edges = GAUGE.rotation @ WORLD_FROM_BOARD[:3, :3]
-    (lying,) = board.ups("lying")
+    (lying,) = board.verticals("lying")
     # It is seen from where its normal points, whichever way the detector has that.
     towards = GAUGE.rotation @ (_path(12)[:, :3, 3].mean(axis=0) - WORLD_FROM_BOARD[:3, 3])
     assert lying.up @ towards > 0.0
     # 0.1 px of noise in a dozen views of 24 corners: a small part of a degree.
     assert abs(lying.up @ edges[:, 2]) > np.cos(np.radians(0.5))
-    hanging = [say.up for say in board.ups("hanging")]
+    hanging = [say.up for say in board.verticals("hanging")]
     assert len(hanging) == 4
     for edge in (edges[:, 0], -edges[:, 0], edges[:, 1], -edges[:, 1]):
         assert max(up @ edge for up in hanging) > np.cos(np.radians(0.5))
     turned = Similarity(0.5, so3_exp([0.0, 0.0, 1.0]), np.zeros(3))
-    (placed,) = locate_board(
+    (placed,) = _board(
         _inputs(_path(12), views), MergeOptions(marker_board=FLAT), {"map-0": turned}
-    ).ups("lying")
+    ).verticals("lying")
     assert np.allclose(placed.up, turned.rotation @ lying.up)

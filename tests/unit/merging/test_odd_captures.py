@@ -8,12 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import graph_bones
 from bodycap_batch.merging.body.initial_poses import anchor_and_reach
 from bodycap_batch.merging.body_calibration import calibration_graph
-from bodycap_batch.merging.body_calibration.anthropometry import bone_length_modes, joint_placement_modes
+from bodycap_batch.merging.body_calibration.anthropometry import skeleton_error_modes
+from bodycap_batch.merging.body_calibration.calibration_covariance import (
+    ScaleUncertainty,
+    error_modes,
+    mounts_with_sigmas,
+)
 from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.known_distance import known_distance
 from bodycap_batch.merging.body_calibration.samples import take_samples
@@ -70,8 +74,9 @@ def test_a_camera_never_seen_with_others_keeps_its_usual_mount_and_weighs_as_lit
     assert np.isfinite(calibration.solve(1.0))
     usual = mounts["right_palm"].joint_from_cam
     assert np.abs(calibration.mounts["right_palm"] - usual).max() < 1e-3
-    constant, _ = calibration.spread(0.05, {name: np.zeros((4, 4)) for name in ROLES}, {})
-    solved = {mount.camera: mount for mount in calibration.solved_mounts(constant)}
+    scale = ScaleUncertainty(0.05, {name: np.zeros((4, 4)) for name in ROLES})
+    constant = error_modes(calibration, scale, {}).constant
+    solved = {mount.camera: mount for mount in mounts_with_sigmas(calibration, constant)}
     loose = loosened(tracks[2], solved["right_palm"])
     # 15 degrees in all, 8.7 per axis.
     assert (loose.sigma_rad > np.radians(8.6)).all()
@@ -87,9 +92,10 @@ def test_bones_of_a_height_alone_may_be_longer_on_both_sides_alike(body):
     mounts = {mount.camera: mount for mount in inputs.mounts}
     calibration = CalibrationGraph(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
     calibration.solve(1.0)
-    follow = {name: np.zeros((4, 4)) for name in ROLES}
-    bodies = bone_length_modes(bones, tuple(ROLES)), joint_placement_modes(bones, tuple(ROLES), 1.75)
-    (known, _), (likely, passing) = (calibration.spread(0.01, follow, {}, each) for each in ((), (bodies,)))
+    scale = ScaleUncertainty(0.01, {name: np.zeros((4, 4)) for name in ROLES})
+    known = error_modes(calibration, scale, {}).constant
+    from_height = error_modes(calibration, scale, {}, skeleton_error_modes(bones, tuple(ROLES), 1.75))
+    likely = from_height.constant
     assert not known.offsets_m.any()
     index = {bone.role: place for place, bone in enumerate(bones)}
     for side in ("Left", "Right"):
@@ -105,7 +111,7 @@ def test_bones_of_a_height_alone_may_be_longer_on_both_sides_alike(body):
     before, after = (np.linalg.norm(each.mounts["left_palm"][3:]) for each in (known, likely))
     assert before < after < 2.0 * before
     # Where another rig has its joints is none of this, but of how far the joints may be off.
-    assert passing.offsets_m.any()
+    assert from_height.transient.offsets_m.any()
 
 
 def test_a_camera_never_seen_with_the_trunk_is_sampled_beside_another(body):
@@ -139,14 +145,14 @@ def test_a_t_pose_is_no_gesture(body, monkeypatch):
     calibration.solve(1.0, iterations=1)
     asked = []
     monkeypatch.setattr(calibration_graph, "widened", lambda *args: asked.append(args[2:]) or bones)
-    calibration.widen_postures()
+    calibration.widen_joint_priors()
     ((poses, times_ns),) = asked
     assert 0 < len(times_ns) < len(posed)
     assert (times_ns == samples.times_ns[~posed]).all()
     assert (poses == calibration.poses()[~posed]).all()
     nothing_else = replace(samples.posture, t_pose=np.ones_like(posed))
-    calibration.move(replace(samples, posture=nothing_else))
-    calibration.widen_postures()
+    calibration.set_samples(replace(samples, posture=nothing_else))
+    calibration.widen_joint_priors()
     assert len(asked) == 1
 
 
@@ -190,13 +196,13 @@ def test_a_known_distance_in_a_further_map_is_in_that_maps_units(body, recorded)
             replace(each, gauge="map-1") if each.camera == "right_palm" else each for each in recorded
         ),
     )
-    asked = MergeOptions(known_distance=("right_palm:0", "right_palm:90", 2.0))
+    asked = ("right_palm:0", "right_palm:90", 2.0)
     half = Similarity(0.5, np.eye(3), np.zeros(3))
-    alone = known_distance(inputs, asked)
-    placed = known_distance(inputs, asked, {"map-0": half, "map-1": half})
+    alone = known_distance(inputs.trajectories, asked)
+    placed = known_distance(inputs.trajectories, asked, {"map-0": half, "map-1": half})
     assert placed.scale == pytest.approx(2.0 * alone.scale)
     with pytest.raises(EstimationError, match="cannot place"):
-        known_distance(inputs, asked, {"map-0": half})
+        known_distance(inputs.trajectories, asked, {"map-0": half})
 
 
 def test_a_swinging_upper_arm_does_not_say_where_the_other_arm_is():
