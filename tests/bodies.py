@@ -7,6 +7,7 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
 from bodycap_batch.model.merge_data import CameraClock, MergeResult
+from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
@@ -128,6 +129,6 @@ def merged(
         trajectories=paths,
         mounts=mounts,
         unused_cameras={},
-        report={"scale": {"source": "height", "value": 1.75}, "floor": float("nan")},
+        report=MergeReport.from_dict({"scale": {"source": "height"}}),
     )
     return result, {camera: CameraClock(nominal_fps=30.0, offset_s=offset_s) for camera in CAMERAS}

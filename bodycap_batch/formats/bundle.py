@@ -1,7 +1,8 @@
 """Frozen dataclasses as ``<name>.json`` (structure and scalars) plus ``<name>.npz`` (arrays).
 
 What is written follows the types of the fields, so every dataclass made of arrays, scalars, enums, paths,
-tuples, mappings and other such dataclasses can be kept. No pickle, and equal values give equal bytes.
+tuples, mappings and other such dataclasses can be kept. A class with ``to_dict`` and ``from_dict`` is kept as
+plain values. No pickle, and equal values give equal bytes.
 """
 
 from __future__ import annotations
@@ -101,6 +102,8 @@ def _encode(value: Any, hint: Any, place: _Place) -> Any:  # noqa: PLR0911 - one
     if origin is np.ndarray:
         place.arrays[place.name] = value
         return place.name
+    if hasattr(hint, "to_dict"):
+        return _plain(value.to_dict())
     if dataclasses.is_dataclass(hint):
         hints = typing.get_type_hints(hint)
         names = [field.name for field in dataclasses.fields(hint)]
@@ -120,13 +123,15 @@ def _encode(value: Any, hint: Any, place: _Place) -> Any:  # noqa: PLR0911 - one
     return _plain(value)
 
 
-def _decode(value: Any, hint: Any, place: _Place) -> Any:
+def _decode(value: Any, hint: Any, place: _Place) -> Any:  # noqa: PLR0911 - one case a kind of type
     hint = _strip_none(hint)
     origin = typing.get_origin(hint) or hint
     if value is None:
         return None
     if origin is np.ndarray:
         return place.arrays[value]
+    if hasattr(hint, "from_dict"):
+        return hint.from_dict(value)
     if dataclasses.is_dataclass(hint):
         hints = typing.get_type_hints(hint)
         parts = {name: _decode(part, hints[name], place.inner(name)) for name, part in value.items()}

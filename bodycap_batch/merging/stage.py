@@ -29,7 +29,7 @@ from bodycap_batch.merging.graph.joint_limits import soft_rules
 from bodycap_batch.merging.graph.motion_graph import MotionGraph, Solution, hinge_errors, joint_gaps
 from bodycap_batch.merging.graph.motion_noise import adapt_psd
 from bodycap_batch.merging.graph.windows import MAX_ITERATIONS, longest_stretch, solve_motion
-from bodycap_batch.merging.reporting.report import build_report
+from bodycap_batch.merging.reporting.report import MotionFacts, build_report
 from bodycap_batch.merging.world.floor import (
     WALKING_HEIGHT,
     Floor,
@@ -43,6 +43,7 @@ from bodycap_batch.merging.world.floor import (
 )
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import CameraClock, MergeInputs, MergeResult
+from bodycap_batch.model.merge_report import AlignedCameraReport
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import SkeletonModel
 
@@ -150,19 +151,19 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
             calibration,
             solution,
             tracks,
-            {
-                "start_ns": int(tick_times[0]),
-                "end_ns": int(tick_times[-1]),
-                "dropped": prepared.dropped,
-                "floor": placed.floor,
-                "unused": aligned.unused,
-                "joined": aligned.report(),
-                "uncertainty": sigma_summary(inputs.skeleton.roles, covariance, observed),
-                "joint_gap_m": joint_gaps(bones, solution.world_from_bone),
-                "hinge_m": hinge_errors(inputs.skeleton, bones, solution.world_from_bone),
-                "contacts": accounts(contacts, solution.world_from_bone, fps),
-                "rules": {rule.name: rule.violation_m(solution.world_from_bone) for rule in rules},
-            },
+            MotionFacts(
+                start_ns=int(tick_times[0]),
+                end_ns=int(tick_times[-1]),
+                dropped=prepared.dropped,
+                floor=placed.floor,
+                unused=aligned.unused,
+                aligned={name: AlignedCameraReport(**sigmas) for name, sigmas in aligned.report().items()},
+                joint_sigma_m=sigma_summary(inputs.skeleton.roles, covariance, observed),
+                joint_gap_m=joint_gaps(bones, solution.world_from_bone),
+                hinge_off_plane_m=hinge_errors(inputs.skeleton, bones, solution.world_from_bone),
+                contacts=accounts(contacts, solution.world_from_bone, fps),
+                rule_violation_m={rule.name: rule.violation_m(solution.world_from_bone) for rule in rules},
+            ),
         ),
         joint_covariance_m2=covariance,
         standing=standing_joints(contacts, len(tick_times), len(placed.solved)),

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.model.geometry import Similarity
+from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
 
@@ -149,7 +150,7 @@ class MergeResult:
             are removed and have the status POSE_JUMP.
         mounts: The solved mounts with their sigmas.
         unused_cameras: Cameras that are no part of the body, with the reason.
-        report: Plain JSON values: sources and values of scale, vertical and floor, residuals, outliers …
+        report: Sources, values, residuals and doubts. It is stored as plain values.
         joint_covariance_m2: (T,J,3,3) covariance of each joint's centre minus the first solved joint's, world
             axes. It covers measurement noise, mounts and scale, but not the world's own axes. NaN if the
             joint was not solved.
@@ -166,7 +167,7 @@ class MergeResult:
     trajectories: tuple[Trajectory, ...]
     mounts: tuple[Mount, ...]
     unused_cameras: Mapping[str, str]
-    report: Mapping[str, Any]
+    report: MergeReport
     joint_covariance_m2: FloatArray | None = None
     standing: BoolArray | None = None
 

@@ -6,7 +6,6 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -264,48 +263,46 @@ def _of_body(inputs: ReportInputs) -> Iterator[Advice]:
     """What the solver itself says would make a constant better known."""
     if inputs.merge is None:
         return
-    report: Mapping[str, Any] = inputs.merge.report
-    sides = report.get("exchanged_sides", {})
-    if sides:
+    report = inputs.merge.report
+    if report.exchanged_sides is not None:
         yield Advice(
             do="Exchange the names (or mounts) of the left and the right cameras, and run again.",
-            because=str(sides["says"]),
+            because=report.exchanged_sides.says,
             weight=2.8,
         )
-    clocks = report.get("doubted_clocks", {})
+    clocks = report.doubted_clocks
     if clocks:
         offsets = ", ".join(
-            f"about {doubt['offset_s']:.1f} for {name}" for name, doubt in sorted(clocks.items())
+            f"about {clock.offset_s:.1f} for {name}" for name, clock in sorted(clocks.items())
         )
         yield Advice(
             do="Clap once in view of all cameras and state each one's `offset_s` (the time of the clap in "
             f"the first video less that in this one), or try {offsets}.",
-            because="; ".join(str(doubt["says"]) for _, doubt in sorted(clocks.items())),
+            because="; ".join(clock.says for _, clock in sorted(clocks.items())),
             weight=2.5,
         )
-    scale = report.get("scale", {})
-    sigma = scale.get("relative_sigma")
-    if sigma is not None and sigma > _SCALE_WELL_KNOWN:
-        _, _, better = str(scale.get("known_to", "")).partition(_BETTER)
+    sigma = report.scale.relative_sigma
+    if sigma > _SCALE_WELL_KNOWN:
+        _, _, better = report.scale.known_to.partition(_BETTER)
         ways = [better] if better else []
-        if all(source["name"] != "skeleton" for source in scale.get("sources", ())):
+        if all(source.name != "skeleton" for source in report.scale.sources):
             ways.append("give the subject's own skeleton (--skeleton subject.bvh)")
         if ways:
             yield Advice(
                 do=_sentence(", or ".join(ways)),
-                because=f"the metric scale rests on the {scale.get('source')} and is known to {sigma:.1%}: "
+                because=f"the metric scale rests on the {report.scale.source} and is known to {sigma:.1%}: "
                 f"{100 * _ARM_M * sigma:.1f} cm on the length of an arm",
                 weight=1.1 + sigma,
             )
-    for hinge in report.get("loose_hinges", {}).values():
-        known, _, way = str(hinge["known_to"]).partition(_BETTER)
-        yield Advice(do=_sentence(way), because=known, weight=1.1 + hinge["sigma_m"])
-    for name, mount in report.get("mounts", {}).items():
-        known, _, way = str(mount.get("known_to", "")).partition(_BETTER)
-        if way or mount["sigma_deg"] > _MOUNT_WELL_KNOWN_DEG:
+    for hinge in report.loose_hinges.values():
+        known, _, way = hinge.known_to.partition(_BETTER)
+        yield Advice(do=_sentence(way), because=known, weight=1.1 + hinge.sigma_m)
+    for name, mount in report.mounts.items():
+        known, _, way = mount.known_to.partition(_BETTER)
+        if way or mount.sigma_deg > _MOUNT_WELL_KNOWN_DEG:
             state = f"state how {name} sits, measured (joint_from_cam)"
             yield Advice(
                 do=_sentence(f"{way}; or {state}" if way else state),
-                because=known if way else f"the mount of {name} is known to {mount['sigma_deg']:.0f}° only",
-                weight=1.0 + mount["sigma_deg"] / 1000.0,
+                because=known if way else f"the mount of {name} is known to {mount.sigma_deg:.0f}° only",
+                weight=1.0 + mount.sigma_deg / 1000.0,
             )

@@ -33,9 +33,9 @@ def _merge(options: Json, arguments: Json, context: StageContext, files: Path) -
         explained(error, load_map(arguments["map"]).log)
         raise
     write_bundle(result, files, "merge")
-    doubts = [*result.report.get("doubted_clocks", {}).values(), result.report.get("exchanged_sides", {})]
     notes = [f"camera {name} is no part of the body: {why}" for name, why in result.unused_cameras.items()]
-    notes += [str(doubt["says"]) for doubt in doubts if doubt]
+    notes += [clock.says for clock in result.report.doubted_clocks.values()]
+    notes += [result.report.exchanged_sides.says] if result.report.exchanged_sides is not None else []
     write_summary(files, unused_cameras=dict(result.unused_cameras), notes=notes)
 
 

@@ -80,7 +80,7 @@ def _palm_error_m(walk: Walk, result: MergeResult, camera: str = "left_palm") ->
 def test_known_mounts_give_scale_and_palms(walk, context):
     result = merge_trajectories(make_inputs(walk, _recorded(walk), **_known(walk)), MergeOptions(), context)
     # It states 3 % for so short a walk; a palm is 0.6 m from the chest, joints have 5 mm of slack.
-    sigma = result.report["scale"]["relative_sigma"]
+    sigma = result.report.scale.relative_sigma
     assert 0.005 < sigma < 0.05
     assert result.world_from_map["map-0"].scale == pytest.approx(1.0 / GAUGE.scale, rel=2.0 * sigma)
     for camera in ("left_palm", "right_palm"):
@@ -103,7 +103,7 @@ def test_nominal_mounts_are_solved_towards_the_truth(walk, base):
         # Three sigma of what the solution itself states, over three axes.
         assert off < 3.0 * np.sqrt(3.0) * mount.sigma_m
         assert 0.005 < mount.sigma_m <= 0.08
-    sigma = base.report["scale"]["relative_sigma"]
+    sigma = base.report.scale.relative_sigma
     assert 0.02 < sigma < 0.15
     assert base.world_from_map["map-0"].scale == pytest.approx(1.0 / GAUGE.scale, rel=2.0 * sigma)
 
@@ -201,7 +201,7 @@ def test_gross_errors_do_not_move_the_body(walk, base, context):
     result = merge_trajectories(make_inputs(walk, recorded), MergeOptions(), context)
     # 18 of 270 poses, 7 %, are wrong by 0.45 to 1.5 m; the rest must carry the answer to a fraction of that.
     assert np.abs(_relative(result, "left_palm") - _relative(base, "left_palm")).max() < 0.04
-    dropped = [camera["dropped_as_gross_errors"] for camera in result.report["cameras"].values()]
+    dropped = [camera.dropped_as_gross_errors for camera in result.report.cameras.values()]
     assert all(6 <= count <= 10 for count in dropped)
     for trajectory, count in zip(result.trajectories, dropped, strict=True):
         refused = np.array([status is FrameStatus.POSE_JUMP for status in trajectory.status])
@@ -282,7 +282,7 @@ def test_a_head_carries_the_body_where_the_torso_is_lost(tmp_path, kept):
     # Eight seconds with nominal mounts state some 6 % of scale and 3 cm of mount: of an arm's length, 5 cm.
     assert off.mean() < 0.08
     assert result.world_from_map["map-0"].scale * capture.gauges["map-0"].scale == pytest.approx(
-        1.0, abs=2.0 * result.report["scale"]["relative_sigma"]
+        1.0, abs=2.0 * result.report.scale.relative_sigma
     )
 
 
@@ -323,7 +323,7 @@ def test_two_cameras_a_hair_apart_share_a_state(walk, context):
         make_inputs(walk, [*recorded, twin], mounts=mounts, clocks=clocks), MergeOptions(), context
     )
     assert np.isfinite(result.world_from_joint).all()
-    assert result.report["cameras"]["torso_2"]["residual_m"]["p50"] < 0.01
+    assert result.report.cameras["torso_2"].residual_m.p50 < 0.01
 
 
 def test_stretches_of_a_long_capture_join_without_a_seam(walk):

@@ -17,6 +17,7 @@ import pytest
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config.models import CaptureConfig, Job
 from bodycap_batch.model.geometry import interpolate_pose
+from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.pipeline.made import Made, report_task
 from bodycap_batch.report import ReportInputs
@@ -212,7 +213,8 @@ def test_what_cannot_be_a_body_is_told_first(
     metrics["merge"] |= doubt
     (found,) = (each for each in judge(metrics, None).criteria if each.name == name)
     assert (found.grade, found.says) == (Grade.POOR, "0.5 s behind")
-    merge = replace(inputs.merge, report={**inputs.merge.report, **doubt})
+    report = MergeReport.from_dict({**inputs.merge.report.to_dict(), **doubt})
+    merge = replace(inputs.merge, report=report)
     told = replace(inputs, metrics=metrics, merge=merge)
     assert do in advise(told, {})[0].do
     assert "0.5 s behind" in written(told, tmp_path)
@@ -517,7 +519,7 @@ def test_nobody_is_asked_for_a_skeleton_that_was_given(inputs: ReportInputs, sou
         "known_to": "the metric scale is known to 3.0 % (1 sigma); to know it better, name a known distance",
         "sources": [{"name": source}, {"name": "floor"}],
     }
-    told = replace(inputs, merge=replace(inputs.merge, report={"scale": scale}))
+    told = replace(inputs, merge=replace(inputs.merge, report=MergeReport.from_dict({"scale": scale})))
     assert [each.do for each in advise(told, {}) if "metric scale" in each.because] == [says]
 
 
@@ -529,7 +531,7 @@ def test_an_elbow_that_is_no_hinge_is_advised_about(inputs: ReportInputs) -> Non
             "known_to": "the left elbow bends 2.1 cm out of its plane; to know it better, strap it",
         }
     }
-    told = replace(inputs, merge=replace(inputs.merge, report={"loose_hinges": loose}))
+    told = replace(inputs, merge=replace(inputs.merge, report=MergeReport.from_dict({"loose_hinges": loose})))
     (advice,) = (each for each in advise(told, {}) if "left elbow" in each.because)
     assert (advice.do, advice.because) == ("Strap it.", "the left elbow bends 2.1 cm out of its plane")
 
@@ -541,7 +543,7 @@ def test_a_t_pose_that_helps_several_constants_is_advised_once(inputs: ReportInp
     def advised(*cameras: str) -> list[str]:
         text = "known to 11°; to know it better, swing the elbow, or stand in a T-pose for two seconds first"
         report = {"mounts": {name: {"known_to": text, "sigma_deg": 11.0} for name in cameras}}
-        found = advise(replace(inputs, merge=replace(merge, report=report)), {})
+        found = advise(replace(inputs, merge=replace(merge, report=MergeReport.from_dict(report))), {})
         return [each.do for each in found if "T-pose" in each.do or "elbow" in each.do]
 
     (alone,) = advised("left_palm")
