@@ -1,4 +1,4 @@
-"""The skeleton stage on odd captures: cameras never seen together, single frames, no scale."""
+"""The merging stage on unusual captures: cameras never measured together, single frames, no scale."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ def _only(track, from_s, to_s):
     return track.keep((track.times_ns >= from_s * 1e9) & (track.times_ns < to_s * 1e9))
 
 
-def test_a_camera_seldom_seen_with_the_others_is_sampled(body):
+def test_a_camera_rarely_measured_with_the_others_is_sampled(body):
     trunk, left, right = body[2]
     samples = take_samples([trunk, _only(left, 0.0, 5.5), _only(right, 5.6, 6.0)], 1.0, 12)
     assert samples.valid[2].sum() >= 8
     assert samples.valid[1].sum() >= 10
 
 
-def test_a_camera_never_seen_with_others_keeps_its_usual_mount_and_weighs_as_little(body):
+def test_a_camera_never_measured_with_others_keeps_its_nominal_mount_and_its_sigma(body):
     inputs, bones, (trunk, left, right) = body
     tracks = [_only(trunk, 0.0, 3.0), _only(left, 0.0, 3.2), _only(right, 3.5, 6.0)]
     samples = take_samples(tracks, 1.0, 12)
@@ -86,7 +86,7 @@ def test_a_camera_never_seen_with_others_keeps_its_usual_mount_and_weighs_as_lit
     assert loosened(tracks[1], turned) is tracks[1]
 
 
-def test_bones_of_a_height_alone_may_be_longer_on_both_sides_alike(body):
+def test_bone_lengths_from_a_height_vary_on_both_sides_alike(body):
     inputs, bones, tracks = body
     samples = take_samples(tracks, 1.0, 12)
     mounts = {mount.camera: mount for mount in inputs.mounts}
@@ -107,14 +107,14 @@ def test_bones_of_a_height_alone_may_be_longer_on_both_sides_alike(body):
         for side in ("Left", "Right")
     ]
     assert columns[0].tolist() == columns[1].tolist()
-    # What a palm's mount follows of an arm that is longer adds to what was uncertain of it.
+    # A palm's mount follows a longer arm, which adds to its uncertainty.
     before, after = (np.linalg.norm(each.mounts["left_palm"][3:]) for each in (known, likely))
     assert before < after < 2.0 * before
-    # Where another rig has its joints is none of this, but of how far the joints may be off.
+    # Another placement of the joints is a transient mode.
     assert from_height.transient.offsets_m.any()
 
 
-def test_a_camera_never_seen_with_the_trunk_is_sampled_beside_another(body):
+def test_a_camera_never_measured_with_the_reference_camera_is_sampled_with_another(body):
     trunk, left, right = body[2]
     samples = take_samples([_only(trunk, 0.0, 3.0), left, _only(right, 3.5, 6.0)], 1.0, 12)
     alone = ~samples.valid[0]
@@ -123,7 +123,7 @@ def test_a_camera_never_seen_with_the_trunk_is_sampled_beside_another(body):
     assert (np.diff(samples.times_ns) > 0).all()
 
 
-def test_cameras_never_seen_together_are_refused(body):
+def test_cameras_never_measured_together_are_refused(body):
     trunk, left, right = body[2]
     with pytest.raises(EstimationError, match="'torso' was localised together with another camera in only 0"):
         take_samples([_only(trunk, 0.0, 2.0), _only(left, 2.5, 4.0), _only(right, 4.5, 6.0)], 1.0, 12)
@@ -174,7 +174,7 @@ def test_bursts_are_no_common_walk(body):
 
 
 class _Sliding:
-    """A calibration whose cost falls without end."""
+    """A calibration graph with a cost that has no minimum."""
 
     def __init__(self):
         self.mounts = {"cam": np.eye(4)}
@@ -183,7 +183,7 @@ class _Sliding:
         return 10.0 - float(np.log(scale))
 
 
-def test_a_cost_that_falls_without_end_leaves_the_scale_open():
+def test_a_cost_without_minimum_leaves_the_scale_unknown():
     estimate = estimate_scale(_Sliding(), 1.0)
     assert estimate.sigma_log == 1.0
     assert np.isfinite(estimate.mount_slope["cam"]).all()
