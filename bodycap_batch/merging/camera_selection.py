@@ -29,7 +29,7 @@ _MIN_TIME_RATIO = 0.25
 
 
 class SelectedCameras(NamedTuple):
-    """The cameras that make the body.
+    """The cameras that the body is solved from.
 
     Attributes:
         inputs: The inputs with correlated mount priors.
@@ -53,7 +53,7 @@ class MainMapCandidate(NamedTuple):
 
 
 def select_cameras(inputs: MergeInputs, step: Callable[[], None], options: MergeOptions) -> SelectedCameras:
-    """Select the cameras that make the body, and correlate the mount priors of cameras at one place.
+    """Select the cameras to solve the body from, and correlate the mount priors at equal positions.
 
     Args:
         inputs: Trajectories, skeleton, mounts and clocks.
@@ -61,7 +61,7 @@ def select_cameras(inputs: MergeInputs, step: Callable[[], None], options: Merge
         options: What the job states of the scale.
 
     Raises:
-        EstimationError: No map has two cameras whose distance follows from the body.
+        EstimationError: No map has two cameras at a distance that the body determines.
     """
     excluded = excluded_cameras(inputs)
     correlated = correlate_mount_priors(inputs, excluded)
@@ -83,7 +83,7 @@ def align_usable_cameras(
         excluded: The result of `excluded_cameras`, if it is known.
 
     Raises:
-        EstimationError: No map has two cameras whose distance follows from the body.
+        EstimationError: No map has two cameras at a distance that the body determines.
     """
     excluded = excluded_cameras(inputs) if excluded is None else excluded
     unused: dict[str, str] = {}
@@ -107,9 +107,9 @@ def align_usable_cameras(
 def correlate_mount_priors(inputs: MergeInputs, excluded: Mapping[str, str] | None = None) -> MergeInputs:
     """Return the inputs with wider mount priors for cameras that share one nominal position.
 
-    Cameras whose names give them the same position form a rig and share one error. With independent priors, n
-    such cameras would pull the body to the nominal position as if each had been strapped on separately. The
-    sigmas of each are therefore multiplied by √n.
+    Cameras with the same nominal position form a rig and share one error. With independent priors, n such
+    cameras would pull the body to the nominal position n times as strongly as one. The sigmas of each are
+    therefore multiplied by √n.
 
     Args:
         inputs: Trajectories and mounts.

@@ -55,10 +55,10 @@ Evidence: none.
 
 
 class _Progress:
-    """Counts the optimiser's iterations, reports them, and stops the work when asked.
+    """Count the optimiser's iterations, report them, and stop the work if it is cancelled.
 
     Attributes:
-        what: Name of the step that is running.
+        what: Name of the running step.
     """
 
     def __init__(self, context: StageContext) -> None:

@@ -84,7 +84,7 @@ class BodyCalibration:
         limbs: The scale of each limb alone, a diagnostic.
         mounts: The solved mounts with their sigmas, that of the reference camera first.
         reference_prior: Mount prior of the reference camera, with its roll.
-        error_modes: Error modes of all this, the constant and the transient ones.
+        error_modes: Error modes of scale, mounts and body, the constant and the transient ones.
         vertical: The vertical.
         height_over_floor_m: Height of the reference camera's joint over the floor; None if none was found.
         t_pose_ns: First and last common time of a T-pose; None without one.
@@ -162,7 +162,7 @@ def calibrate_body(
     )
     up = find_up(body_up(inputs.skeleton, bones, poses), scene, np.random.default_rng(0), verticals)
     walking = samples.posture.walking
-    # A person who bends down or sits is lower than one who walks.
+    # Bending down or sitting lowers the trunk, so that only walking gives its height.
     upright = poses[walking] if walking.sum() >= MIN_WALKING_SAMPLES else poses
     height_m = _height_over_floor(bones[0], upright, up, scene)
     distance = known_distance(inputs.trajectories, options.known_distance, data.main_from_gauge)
@@ -200,7 +200,7 @@ def calibrate_body(
 
 
 class _ResolvedRolls(NamedTuple):
-    """The inputs with the rolls of all cameras, what is known of the posture, and the searches."""
+    """The inputs with the rolls of all cameras, the known facts of the posture, and the roll searches."""
 
     inputs: MergeInputs
     hints: PostureHints
@@ -274,7 +274,7 @@ def preliminary_vertical(
     points_m: FloatArray,
     stated: Sequence[Say] = (),
 ) -> Direction | None:
-    """Estimate the vertical from what the job states, the planes of the map, or the walk, before calibration.
+    """Estimate the vertical before the calibration, from the job, the planes of the map, or the walk.
 
     Args:
         skeleton: The body.

@@ -33,7 +33,7 @@ from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import NAMED_SIGMA_RAD, NOMINAL_SIGMA_RAD
 
 _TRANSIENT_SHARE = float(np.sqrt(1.0 - BETWEEN_SHARE**2))
-"""Part of a joint's everyday sigma that varies within a capture: what `BETWEEN_SHARE` leaves."""
+"""Part of a joint's everyday sigma that varies within a capture. `BETWEEN_SHARE` is the constant part."""
 
 
 class PoseSigma(NamedTuple):
@@ -92,8 +92,8 @@ def error_modes(
         graph: The solved graph.
         scale: Uncertainty of the scale.
         alignment: By camera of a map that was aligned by the body, uncertainty of its map's pose.
-        skeleton: Error modes of the bones; None if they were measured. Those of the joint placement do not
-            reduce the certainty of the mounts, because the mounts are relative to the same placement.
+        skeleton: Error modes of the bones; None if the bones were measured. The modes of joint placement are
+            transient: they do not add to the uncertainty of the mounts, which refer to the same placement.
     """
     samples, cameras = graph.samples, graph.samples.cameras
     linearised = graph.linearised()

@@ -249,7 +249,7 @@ class CalibrationGraph:
         return np.array(out, dtype=np.int64)
 
     def _set_rest_bones(self, bones: tuple[Bone, ...], repetitions: float) -> None:
-        """Use these bones, and weigh their hinges down as if each sample was repeated so often."""
+        """Use these bones. Weigh their hinges down by the number of samples that repeat each other."""
         self._rest_bones = bones
         self._hinges = tuple(
             replace(hinge, sigma_m=float(np.sqrt(repetitions)) * hinge.sigma_m)

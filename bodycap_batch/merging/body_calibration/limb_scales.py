@@ -51,7 +51,8 @@ def limb_scales(
         step: Called after each iteration; may raise to stop.
 
     Returns:
-        One source per limb, without limbs whose cost has no minimum. Empty if there are fewer than two limbs.
+        One source per limb. A limb is left out if its cost has no minimum. Empty if fewer than two limbs have
+        cameras.
     """
     limbs: dict[str, list[Track]] = {}
     for track in tracks[1:]:

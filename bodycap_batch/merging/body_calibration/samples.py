@@ -42,7 +42,7 @@ calibrated alone: half a second at 30 fps. Evidence: none."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PostureHints:
-    """What is known of the posture before the calibration.
+    """Facts on the posture that are known before the calibration.
 
     Attributes:
         vertical: (3,) the vertical in the map; None if unknown.

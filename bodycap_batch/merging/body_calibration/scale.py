@@ -4,7 +4,7 @@ A map has no unit. The scale is the number of metres per map unit. Its sources, 
 
 - ``skeleton``, ``height``, ``mean stature``: the bones. `estimate_scale` finds the scale at which the
   calibration graph has the lowest cost; `scale_from_bones` adds the uncertainty of the bone lengths
-  (`PROPORTION_SIGMA` in ``anthropometry.py``). The name says what the bone lengths rest on.
+  (`PROPORTION_SIGMA` in ``anthropometry.py``). The name is the origin of the bone lengths.
 - ``floor``: the height of the reference camera's joint over the floor, by `scale_from_floor`. The floor that
   the person walks on comes from ``world/floor.py``.
 - ``known distance``: a distance that the job states, by ``known_distance.py``.
@@ -199,7 +199,7 @@ def combine_sources(
     Args:
         bones: The scale from the bones.
         floor: The scale from the floor; None if no floor was found.
-        stated: Scales from what the job states: a distance, a marker board. They replace the others.
+        stated: Scales from a known distance or a marker board. They replace the others.
     """
     measured = [bones] if floor is None else [bones, floor]
     if stated:

@@ -54,7 +54,7 @@ def describe_clock(camera: str, shift_s: float, scatter_left: float, offset_s: f
 
 
 def describe_swapped_sides(swapped: Mapping[str, float]) -> str:
-    """Describe what cameras on the wrong side of the body mean.
+    """Describe cameras on the wrong side of the body, and the likely reasons.
 
     Args:
         swapped: By camera, the part of its time on the wrong side.
