@@ -15,7 +15,7 @@ from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body_calibration.samples import MAP_ERROR_DURATION_S, MAP_ERROR_M
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.merging.world.vertical import Say
-from bodycap_batch.model.geometry import Similarity, invert, so3_exp, so3_log
+from bodycap_batch.model.geometry import Similarity, invert, nearest_rotation, so3_exp, so3_log
 from bodycap_batch.model.merge_data import BoardView
 from bodycap_batch.model.scene import Trajectory
 
@@ -203,8 +203,7 @@ def _initial_fit(seen: _BoardObservations) -> FloatArray:
     The size is in map units per metre. Each view alone gives the middle of the board in metres.
     """
     rotation = seen.map_from_cam[:, :3, :3]
-    u, _, vt = np.linalg.svd((rotation @ seen.cam_from_board[:, :3, :3]).sum(axis=0))
-    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    turn = nearest_rotation((rotation @ seen.cam_from_board[:, :3, :3]).sum(axis=0))
     ray = np.einsum("vij,vj->vi", rotation, seen.cam_from_board[:, :3, 3])
     centre = seen.map_from_cam[:, :3, 3]
     # For every view, centre + size · ray = position. The mean is subtracted from both sides.
