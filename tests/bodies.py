@@ -10,6 +10,7 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.projection.project import Projection, project_motion
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
 from bodycap_batch.model.merge_data import CameraClock, MergeResult, SolvedBody
+from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
@@ -153,6 +154,6 @@ def merged(
         projection_gap=projection.gap,
         world_from_map=world_from_map or {},
         unused_cameras={},
-        report={"scale": {"source": "height", "value": 1.75}, "floor": float("nan")},
+        report=MergeReport.from_dict({"scale": {"source": "height"}}),
     )
     return result, clocks

@@ -13,6 +13,7 @@ from bodycap_batch.export.metrics import collect_metrics
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import Similarity, invert, transform_points
 from bodycap_batch.model.merge_data import CameraClock
+from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 from bodycap_batch.report import ReportInputs, write_report
 from tests.bodies import CAMERAS, merged, reaching
@@ -42,7 +43,7 @@ def report_inputs(frames: int = 60, points: int = 400, *, lost: slice = slice(20
     )
     cloud = rng.uniform(low - 2.0, high + 2.0, size=(points, 3))
     paths = tuple(_with_losses(path, lost) for path in result.trajectories)
-    report = {**result.report, **_merge_report(paths)}
+    report = MergeReport.from_dict({**result.report.to_dict(), **_merge_report(paths)})
     variances = np.where(result.solved[:, None, None], np.diag([1e-4, 2e-4, 3e-4]), np.nan)
     covariance = np.tile(variances, (frames, 1, 1, 1))
     result = replace(result, trajectories=paths, report=report, joint_covariance_m2=covariance)

@@ -60,7 +60,7 @@ def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[st
         out["relative_poses"] = [_relative_pose_metrics(inputs, item) for item in inputs.relative_poses]
     if inputs.merge is not None:
         out["merge"] = {
-            **inputs.merge.report,
+            **inputs.merge.report.to_dict(),
             "unused_cameras": dict(inputs.merge.unused_cameras),
         }
     if motion is not None:

@@ -1,7 +1,8 @@
 """Store frozen dataclasses as ``<name>.json`` (structure and scalars) and ``<name>.npz`` (arrays).
 
 The types of the fields determine the format. Supported are arrays, scalars, enums, paths, tuples, mappings
-and dataclasses of these. Pickle is not used, and equal values give equal bytes.
+and dataclasses of these. A class with ``to_dict`` and ``from_dict`` is stored as plain values. Pickle is not
+used, and equal values give equal bytes.
 """
 
 from __future__ import annotations
@@ -110,6 +111,8 @@ def _encode(value: Any, hint: Any, location: _Location) -> Any:  # noqa: PLR0911
     if origin is np.ndarray:
         location.arrays[location.name] = value
         return location.name
+    if hasattr(hint, "to_dict"):
+        return _json_value(value.to_dict())
     if dataclasses.is_dataclass(hint):
         hints = typing.get_type_hints(hint)
         names = [field.name for field in dataclasses.fields(hint)]
@@ -129,7 +132,7 @@ def _encode(value: Any, hint: Any, location: _Location) -> Any:  # noqa: PLR0911
     return _json_value(value)
 
 
-def _decode(value: Any, hint: Any, location: _Location) -> Any:
+def _decode(value: Any, hint: Any, location: _Location) -> Any:  # noqa: PLR0911 - one case a kind of type
     """Return the value of type `hint` that `_encode` has encoded."""
     hint = _strip_none(hint)
     origin = typing.get_origin(hint) or hint
@@ -137,6 +140,8 @@ def _decode(value: Any, hint: Any, location: _Location) -> Any:
         return None
     if origin is np.ndarray:
         return location.arrays[value]
+    if hasattr(hint, "from_dict"):
+        return hint.from_dict(value)
     if dataclasses.is_dataclass(hint):
         hints = typing.get_type_hints(hint)
         parts = {name: _decode(part, hints[name], location.inner(name)) for name, part in value.items()}

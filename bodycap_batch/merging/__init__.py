@@ -1,4 +1,4 @@
-"""Stage 4: camera paths onto one skeleton, in metres, gravity up. The only room that imports gtsam."""
+"""Stage 4: fit a skeleton to the cameras' trajectories, in metres, z up. Only this package imports gtsam."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ __all__ = ["merge_trajectories"]
 
 
 def merge_trajectories(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> MergeResult:
-    """Solve mounts, metric scale, the world's axes and the body's motion from the cameras' paths.
+    """Estimate mounts, metric scale, world frame and the body's motion from the cameras' trajectories.
 
     Args:
-        inputs: Trajectories in their maps' gauges, clocks, skeleton and mount priors.
-        options: Rate of the timeline and the longest gap filled without a mark.
-        context: Progress and cancellation, asked between the optimiser's iterations.
+        inputs: Trajectories in the gauges of their maps, clocks, skeleton and mount priors.
+        options: Options of the stage, among them the rate of the timeline.
+        context: Progress and cancellation, both used between the optimiser's iterations.
 
     Raises:
-        EstimationError: Too few frames were localised, or nothing fixes the scale.
+        EstimationError: Too few frames were localised, or nothing determines the scale.
+        JobError: The job names a camera or frame that does not exist.
         Cancelled: The work was stopped.
 
-    Source: the body as a factor graph of bones in continuous time (white noise on acceleration:
+    Source: the body is a factor graph of bones in continuous time (white noise on acceleration:
         T. D. Barfoot, C. H. Tong, S. Särkkä, "Batch continuous-time trajectory estimation as exactly
         sparse Gaussian process regression", RSS 2014).
     """

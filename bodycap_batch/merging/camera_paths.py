@@ -1,4 +1,4 @@
-"""The cameras' paths in the world: as measured, or every frame solved together with the body."""
+"""The cameras' paths in the world: as measured, or with centres solved together with the body."""
 
 from __future__ import annotations
 
@@ -15,14 +15,20 @@ from bodycap_batch.model.skeleton import Mount
 
 
 def trajectory_in_world(trajectory: Trajectory, world_from_map: Similarity, dropped: IntArray) -> Trajectory:
-    """The trajectory in the world, without the poses that proved to be gross errors."""
-    placed = transform_trajectory(trajectory, world_from_map, "world")
-    poses, covariance = np.array(placed.gauge_from_cam), np.array(placed.covariance)
+    """Return the trajectory in the world, without the poses that are gross errors.
+
+    Args:
+        trajectory: The trajectory in the main map's gauge.
+        world_from_map: Similarity from the main map to the world.
+        dropped: (N,) frames with gross errors. Their status becomes POSE_JUMP.
+    """
+    in_world = transform_trajectory(trajectory, world_from_map, "world")
+    poses, covariance = np.array(in_world.gauge_from_cam), np.array(in_world.covariance)
     status = list(trajectory.status)
     poses[dropped], covariance[dropped] = np.nan, np.nan
     for frame in dropped.tolist():
         status[frame] = FrameStatus.POSE_JUMP
-    return replace(placed, gauge_from_cam=poses, covariance=covariance, status=tuple(status))
+    return replace(in_world, gauge_from_cam=poses, covariance=covariance, status=tuple(status))
 
 
 def with_solved_centres(
@@ -32,24 +38,22 @@ def with_solved_centres(
     solution: MotionSolution,
     world_from_solved: Similarity,
 ) -> Trajectory:
-    """The trajectory with each localised frame where the body's joint solution has its camera.
+    """Return the trajectory with the camera centres of the solved motion.
 
-    All frames of all cameras are unknowns of one problem with the skeleton: a stretch of map that is off by
-    half a centimetre is pulled back by the joints it shares with the other cameras, and noise by the motion.
-    Camera error over all frames: walk12 3.1 to 3.0 mm, walk131 3.7 to 3.5, cpl_lab 2.35 to 2.28, room131
-    15.2 to 13.6, and with cameras on the upper arms, too, room12 5.4 to 3.7. With keyframes' landmarks as
-    unknowns of the same problem it was no better: 3.1, 3.7, 2.5, 3.5 to 4.1 (room12).
+    The motion graph has all frames of all cameras and the skeleton as unknowns. The joints that cameras share
+    reduce the local errors of the map, and the motion prior reduces noise. Evidence:
+    docs/decisions/body_calibration.md.
 
-    A pose moves as far as the body believed it: where both differ by centimetres, either may be wrong.
-    Orientations stay measured: joints say nothing about a tenth of a degree (walk131: 0.23° instead of
-    0.11°). A camera whose mount was not calibrated keeps its measured path.
+    A centre moves by its robust weight in the solution. If measurement and solution differ by centimetres,
+    either may be wrong. Orientations stay as measured, because joints do not determine them to a tenth of a
+    degree. A camera with an uncalibrated mount keeps its measured path.
 
     Args:
-        trajectory: In the world, as measured.
-        track: The measurements the solution rests on.
-        mount: Of this camera, as solved.
+        trajectory: The trajectory in the world, as measured.
+        track: The measurements that the solution rests on.
+        mount: The camera's solved mount.
         solution: The solved motion.
-        world_from_solved: From the solution's axes.
+        world_from_solved: Rigid transform from the frame of the solution to the world.
     """
     if is_uncalibrated(mount):
         return trajectory
@@ -60,7 +64,7 @@ def with_solved_centres(
 
 
 def _blend_centres(measured: FloatArray, solved: FloatArray, weight: FloatArray) -> FloatArray:
-    """Measured poses (N,4,4) with centres moved to the solved ones, by their weight (N,)."""
+    """Return measured poses (N,4,4) with centres moved towards the solved ones by a weight (N,)."""
     out = measured.copy()
     out[:, :3, 3] += weight[:, None] * (solved[:, :3, 3] - measured[:, :3, 3])
     return out

@@ -1,9 +1,11 @@
-"""Which cameras make the body: whose map is the main one, which camera leads, and who is left out."""
+"""Select the main map, the reference camera and the cameras that can be used with them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import permutations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,20 +18,42 @@ from bodycap_batch.merging.cameras.stationary import stationary_cameras
 from bodycap_batch.merging.map_alignment.align import UsableCameras, align_cameras
 from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.scene import Trajectory
-from bodycap_batch.model.skeleton import Mount
+from bodycap_batch.model.skeleton import Mount, SkeletonModel
 
 MIN_LOCALISED_FRAMES = 15
-"""Localised frames below which a camera tells nothing about a motion: half a second at 30 fps."""
+"""Minimum number of localised frames of a camera: half a second at 30 fps. Evidence: none."""
 REFERENCE_ROLES = ("Spine1", "Spine", "Hips", "Neck", "Head")
-"""Bones whose camera can lead, the best first: limbs are judged against it."""
+"""Bones whose camera can be the reference camera, the best first. Limbs move relative to them."""
 _MIN_TIME_RATIO = 0.25
-"""Share of the longest camera's time below which a camera does not lead, nor its map become the main one."""
+"""Minimum localised time of the reference camera, as a part of that of the longest one. Evidence: none."""
 
 
-def select_cameras(
-    inputs: MergeInputs, step: Callable[[], None], options: MergeOptions
-) -> tuple[MergeInputs, UsableCameras]:
-    """The inputs with priors that cameras at one place share, and the cameras that make the body.
+class SelectedCameras(NamedTuple):
+    """The cameras that the body is solved from.
+
+    Attributes:
+        inputs: The inputs with correlated mount priors.
+        aligned: The usable cameras in the main map's gauge.
+    """
+
+    inputs: MergeInputs
+    aligned: UsableCameras
+
+
+class MainMapCandidate(NamedTuple):
+    """A map that may become the main one.
+
+    Attributes:
+        cameras: Its cameras' trajectories, that of the reference camera first.
+        further: The trajectories in other maps.
+    """
+
+    cameras: list[Trajectory]
+    further: list[Trajectory]
+
+
+def select_cameras(inputs: MergeInputs, step: Callable[[], None], options: MergeOptions) -> SelectedCameras:
+    """Select the cameras to solve the body from, and correlate the mount priors at equal positions.
 
     Args:
         inputs: Trajectories, skeleton, mounts and clocks.
@@ -37,69 +61,75 @@ def select_cameras(
         options: What the job states of the scale.
 
     Raises:
-        EstimationError: No map holds two cameras whose distance the body knows.
+        EstimationError: No map has two cameras at a distance that the body determines.
     """
-    useless = excluded_cameras(inputs)
-    shared = correlate_mount_priors(inputs, useless)
-    return shared, align_usable_cameras(shared, step, options, useless)
+    excluded = excluded_cameras(inputs)
+    correlated = correlate_mount_priors(inputs, excluded)
+    return SelectedCameras(correlated, align_usable_cameras(correlated, step, options, excluded))
 
 
 def align_usable_cameras(
     inputs: MergeInputs,
     step: Callable[[], None],
     options: MergeOptions | None = None,
-    useless: Mapping[str, str] | None = None,
+    excluded: Mapping[str, str] | None = None,
 ) -> UsableCameras:
-    """Gather the cameras that can be used together, from the first main map that makes a body.
+    """Align the usable cameras to the first main map with which they determine the scale.
 
     Args:
         inputs: Trajectories, skeleton, mounts and clocks.
         step: Called after each iteration; may raise to stop.
         options: What the job states of the scale.
-        useless: What `excluded_cameras` says, where that is known.
+        excluded: The result of `excluded_cameras`, if it is known.
 
     Raises:
-        EstimationError: No map holds two cameras whose distance the body knows.
+        EstimationError: No map has two cameras at a distance that the body determines.
     """
-    useless = excluded_cameras(inputs) if useless is None else useless
-    left_out: dict[str, str] = {}
-    for main, further in candidate_main_maps(inputs, useless):
-        together = align_cameras(inputs, main, further, step, options)
-        if _determine_scale(inputs, together.trajectories):
-            return replace(together, unused={**useless, **together.unused})
-        left_out = left_out or dict(together.unused)
-    left_out = {**useless, **left_out}
-    usable = [each.camera for each in inputs.trajectories if each.camera not in left_out]
-    reasons = "; ".join(f"{camera!r}: {why}" for camera, why in sorted(left_out.items()))
+    excluded = excluded_cameras(inputs) if excluded is None else excluded
+    unused: dict[str, str] = {}
+    for candidate in candidate_main_maps(inputs, excluded):
+        aligned = align_cameras(inputs, candidate.cameras, candidate.further, step, options)
+        roles = [inputs.mount_of(each.camera).role for each in aligned.trajectories]
+        if _can_determine_scale(inputs.skeleton, roles):
+            return replace(aligned, unused={**excluded, **aligned.unused})
+        unused = unused or dict(aligned.unused)
+    unused = {**excluded, **unused}
+    usable = [each.camera for each in inputs.trajectories if each.camera not in unused]
+    reasons = "; ".join(f"{camera!r}: {reason}" for camera, reason in sorted(unused.items()))
     raise EstimationError(
-        f"no two cameras tell how large the body is: {', '.join(map(repr, usable)) or 'none'} can be used"
+        f"no two cameras determine the size of the body: {', '.join(map(repr, usable)) or 'none'} can be used"
         + (f"; {reasons}" if reasons else ""),
         hint="a skeleton needs one map with two cameras on trunk, head or the same limb; frames.csv has the "
-        "reasons of lost frames, more texture, light or a slower start help",
+        "reasons of lost frames; more texture, more light or a slower start help",
     )
 
 
-def correlate_mount_priors(inputs: MergeInputs, useless: Mapping[str, str] | None = None) -> MergeInputs:
-    """Cameras that are expected at the same place by their names alone are off it together, as a rig is.
+def correlate_mount_priors(inputs: MergeInputs, excluded: Mapping[str, str] | None = None) -> MergeInputs:
+    """Return the inputs with wider mount priors for cameras that share one nominal position.
 
-    Each alone would say where the body is as if the others had been strapped on by somebody else.
+    Cameras with the same nominal position form a rig and share one error. With independent priors, n such
+    cameras would pull the body to the nominal position n times as strongly as one. The sigmas of each are
+    therefore multiplied by √n.
+
+    Args:
+        inputs: Trajectories and mounts.
+        excluded: The result of `excluded_cameras`, if it is known.
     """
-    useless = excluded_cameras(inputs) if useless is None else useless
-    paths = [each.camera for each in inputs.trajectories if each.camera not in useless]
-    worn = [inputs.mount_of(camera) for camera in paths]
+    excluded = excluded_cameras(inputs) if excluded is None else excluded
+    used = [inputs.mount_of(each.camera) for each in inputs.trajectories if each.camera not in excluded]
 
-    def shared(mount: Mount) -> Mount:
-        beside = sum(
+    def correlated(mount: Mount) -> Mount:
+        others = sum(
             has_unknown_roll(other) and other.role == mount.role and _at_same_position(other, mount)
-            for other in worn
+            for other in used
             if other.camera != mount.camera
         )
-        if not beside or not has_unknown_roll(mount):
+        if not others or not has_unknown_roll(mount):
             return mount
-        factor = float(np.sqrt(1.0 + beside))
+        factor = float(np.sqrt(1.0 + others))
         return replace(mount, sigma_rad=factor * mount.sigma_rad, sigma_m=factor * mount.sigma_m)
 
-    return replace(inputs, mounts=tuple(shared(mount) for mount in inputs.mounts))
+    return replace(inputs, mounts=tuple(correlated(mount) for mount in inputs.mounts))
 
 
 def _at_same_position(first: Mount, second: Mount) -> bool:
@@ -107,61 +137,61 @@ def _at_same_position(first: Mount, second: Mount) -> bool:
 
 
 def excluded_cameras(inputs: MergeInputs) -> dict[str, str]:
-    """By camera that tells nothing of the body's motion, why."""
-    seldom = rarely_localised(inputs)
-    still = stationary_cameras(inputs, [each for each in inputs.trajectories if each.camera not in seldom])
-    why = "it stands still while the others move: nobody wears it, or it is frozen"
-    return {**seldom, **dict.fromkeys(still, why)}
+    """Return the cameras that carry no information about the body's motion, with the reason."""
+    rare = rarely_localised(inputs.trajectories)
+    still = stationary_cameras(inputs, [each for each in inputs.trajectories if each.camera not in rare])
+    reason = "it stands still while the others move: nobody wears it, or it is frozen"
+    return {**rare, **dict.fromkeys(still, reason)}
 
 
-def rarely_localised(inputs: MergeInputs) -> dict[str, str]:
-    """By camera that is of no use, why."""
-    counts = {each.camera: int(each.localised.sum()) for each in inputs.trajectories}
+def rarely_localised(trajectories: Sequence[Trajectory]) -> dict[str, str]:
+    """Return the cameras with fewer than `MIN_LOCALISED_FRAMES`, with the reason."""
+    counts = {each.camera: int(each.localised.sum()) for each in trajectories}
+    needed = f"{MIN_LOCALISED_FRAMES} needed"
     return {
-        each.camera: f"{counts[each.camera]} localised frames of {len(each.status)}, {MIN_LOCALISED_FRAMES} needed"
-        for each in inputs.trajectories
+        each.camera: f"{counts[each.camera]} localised frames of {len(each.status)}, {needed}"
+        for each in trajectories
         if counts[each.camera] < MIN_LOCALISED_FRAMES
     }
 
 
 def candidate_main_maps(
-    inputs: MergeInputs, useless: Mapping[str, str] | None = None
-) -> list[tuple[list[Trajectory], list[Trajectory]]]:
-    """Each map as the main one, the best first: its cameras, the leading one first, and those of other maps.
+    inputs: MergeInputs, excluded: Mapping[str, str] | None = None
+) -> list[MainMapCandidate]:
+    """Return each map as the main one, the best first.
 
-    A trunk's camera leads before a head's, a head's before a limb's; one that was hardly localised leads
-    after all others.
+    Reference cameras are ranked by their bone: trunk, head, limb. A camera that was localised for a short
+    time comes after all others.
+
+    Args:
+        inputs: Trajectories, mounts and clocks.
+        excluded: The result of `excluded_cameras`, if it is known.
     """
     counts = {each.camera: int(each.localised.sum()) for each in inputs.trajectories}
     seconds = {camera: count / inputs.clocks[camera].nominal_fps for camera, count in counts.items()}
+    excluded = excluded_cameras(inputs) if excluded is None else excluded
 
     def rank(trajectory: Trajectory) -> tuple[bool, int, int]:
-        role, camera = inputs.mount_of(trajectory.camera).role, trajectory.camera
-        short = seconds[camera] < _MIN_TIME_RATIO * max(seconds.values())
-        return (
-            short,
-            REFERENCE_ROLES.index(role) if role in REFERENCE_ROLES else len(REFERENCE_ROLES),
-            -counts[camera],
-        )
+        camera, role = trajectory.camera, inputs.mount_of(trajectory.camera).role
+        is_short = seconds[camera] < _MIN_TIME_RATIO * max(seconds.values())
+        order = REFERENCE_ROLES.index(role) if role in REFERENCE_ROLES else len(REFERENCE_ROLES)
+        return is_short, order, -counts[camera]
 
-    without = excluded_cameras(inputs) if useless is None else useless
-    ranked = sorted((each for each in inputs.trajectories if each.camera not in without), key=rank)
+    ranked = sorted((each for each in inputs.trajectories if each.camera not in excluded), key=rank)
     return [
-        ([each for each in ranked if each.gauge == gauge], [each for each in ranked if each.gauge != gauge])
+        MainMapCandidate(
+            [each for each in ranked if each.gauge == gauge], [each for each in ranked if each.gauge != gauge]
+        )
         for gauge in dict.fromkeys(each.gauge for each in ranked)
     ]
 
 
-def _determine_scale(inputs: MergeInputs, used: Sequence[Trajectory]) -> bool:
-    """Whether the body knows the distance of any two cameras."""
-    roles = [inputs.mount_of(each.camera).role for each in used]
+def _can_determine_scale(skeleton: SkeletonModel, roles: Sequence[str]) -> bool:
+    """Return True if the distance of any two cameras on these bones follows from the body."""
     if len(roles) < 2:
         return False
-    bones = kinematic_chain(inputs.skeleton, set(roles))
-    place = {bone.role: index for index, bone in enumerate(bones)}
+    bones = kinematic_chain(skeleton, set(roles))
+    index = {bone.role: number for number, bone in enumerate(bones)}
     return any(
-        reach_constraint(bones, place[one], place[other]) is not None
-        for number, one in enumerate(roles)
-        for index, other in enumerate(roles)
-        if number != index
+        reach_constraint(bones, index[one], index[other]) is not None for one, other in permutations(roles, 2)
     )

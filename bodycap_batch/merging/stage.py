@@ -1,15 +1,14 @@
-"""The stage, step by step: select cameras, calibrate, solve, place in the world, complete, project, report."""
+"""The merging stage: select cameras, calibrate the body, solve its motion, place it in the world, report."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bodycap_batch.config.options import MergeOptions
-from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.merging.body.bones import Bone, kinematic_chain
 from bodycap_batch.merging.body.completion import complete_skeleton, observed_joints
@@ -20,6 +19,7 @@ from bodycap_batch.merging.body_calibration.calibrate_body import (
     calibrate_body,
     map_points_of,
 )
+from bodycap_batch.merging.body_calibration.calibration_covariance import PoseSigma
 from bodycap_batch.merging.camera_paths import trajectory_in_world, with_solved_centres
 from bodycap_batch.merging.camera_selection import select_cameras
 from bodycap_batch.merging.cameras.track import CameraTrack, inflate_sigmas, make_track, remove_outliers
@@ -35,7 +35,7 @@ from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution
 from bodycap_batch.merging.graph.motion_noise import scale_motion_noise
 from bodycap_batch.merging.graph.windows import MAX_ITERATIONS, max_window_ticks, solve_windows
 from bodycap_batch.merging.projection.project import project_motion
-from bodycap_batch.merging.reporting.report import build_report
+from bodycap_batch.merging.reporting.report import MotionFacts, build_report
 from bodycap_batch.merging.world.floor import (
     WALKING_HEIGHT_RATIO,
     Floor,
@@ -46,15 +46,27 @@ from bodycap_batch.merging.world.floor import (
 )
 from bodycap_batch.merging.world.world_frame import initial_heading, rotation_to_z_up, world_from_solved_frame
 from bodycap_batch.model.geometry import Similarity
-from bodycap_batch.model.merge_data import MergeInputs, MergeResult, SolvedBody
+from bodycap_batch.model.merge_data import CameraClock, MergeInputs, MergeResult, SolvedBody
+from bodycap_batch.model.merge_report import AlignedCameraReport
 from bodycap_batch.model.scene import Trajectory
+from bodycap_batch.model.skeleton import SkeletonModel
+
+_EXPECTED_ITERATIONS = 80
+"""Iterations of a whole stage from which the progress starts to count; it grows if there are more.
+
+Evidence: none.
+"""
 
 
 class _Progress:
-    """Counts the optimiser's iterations, reports them and the parts of the work, and stops it when asked."""
+    """Count the optimiser's iterations, report them, and stop the work if it is cancelled.
+
+    Attributes:
+        what: Name of the running step.
+    """
 
     def __init__(self, context: StageContext) -> None:
-        self._context, self._done, self._total = context, 0, 80
+        self._context, self._done, self._total = context, 0, _EXPECTED_ITERATIONS
         self.what = "calibrating"
 
     def __call__(self, what: str = "", /) -> None:
@@ -67,29 +79,43 @@ class _Progress:
         self._context.progress(self._done, self._total, self.what)
 
     def finish(self) -> None:
-        """Report the whole as done."""
+        """Report that all work is done."""
         self._context.progress(self._total, self._total, "merged")
 
 
 def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> MergeResult:
-    """See `bodycap_batch.merging.merge_trajectories`."""
+    """Run the stage. See `bodycap_batch.merging.merge_trajectories`."""
     step = _Progress(context)
-    inputs, together = select_cameras(inputs, step, options)
-    used = together.trajectories
+    inputs, aligned = select_cameras(inputs, step, options)
+    used = aligned.trajectories
     bones = kinematic_chain(inputs.skeleton, {inputs.mount_of(each.camera).role for each in used})
     fps = options.fps or inputs.clocks[used[0].camera].nominal_fps
-    tick_times = timeline(inputs, used, fps)
-    tracks, provisional, dropped = _prepare_tracks(inputs, used, bones)
-    cleaned = CalibrationInput(tracks, provisional, together.sigmas, together.main_from_gauge)
-    calibrated = calibrate_body(inputs, options, bones, cleaned, step)
+    tick_times = timeline(inputs.clocks, used, fps)
+    prepared = _prepare_tracks(inputs, used, bones)
+    tracks = prepared.tracks
+    calibration = calibrate_body(
+        inputs,
+        options,
+        bones,
+        CalibrationInput(
+            tracks,
+            prepared.provisional,
+            {camera: PoseSigma(*sigmas) for camera, sigmas in aligned.sigmas.items()},
+            aligned.main_from_gauge,
+        ),
+        step,
+    )
     step.what = "solving"
-    metric = [track.scaled(calibrated.scale) for track in tracks]
+    scale = calibration.scale.metres_per_unit
+    metric = [track.scaled(scale) for track in tracks]
     rules = soft_limits(inputs.skeleton, bones, inputs.activity)
-    loose = tuple(replace(bone, off_hinge_m=calibrated.off_hinge_m.get(bone.role, 0.0)) for bone in bones)
+    loose = tuple(replace(bone, off_hinge_m=calibration.off_hinge_m.get(bone.role, 0.0)) for bone in bones)
     psd_bones = scale_motion_noise(loose, metric)
-    mounts = {mount.camera: mount.joint_from_cam for mount in calibrated.mounts}
-    asked = metric if options.foot_contact else ()
-    contacts = find_contacts(inputs.skeleton, bones, asked, mounts, calibrated.up.up, tick_times)
+    mounts = {mount.camera: mount.joint_from_cam for mount in calibration.mounts}
+    contact_tracks = metric if options.foot_contact else ()
+    contacts = find_contacts(
+        inputs.skeleton, bones, contact_tracks, mounts, calibration.vertical.up, tick_times
+    )
     solution = solve_windows(
         lambda ticks, seen: MotionGraph(
             inputs.skeleton,
@@ -100,30 +126,36 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
             (*rules, *contacts_in_window(contacts, tick_times, ticks)),
         ),
         tick_times,
-        [inflate_sigmas(track, mount) for track, mount in zip(metric, calibrated.mounts, strict=True)],
+        [inflate_sigmas(track, mount) for track, mount in zip(metric, calibration.mounts, strict=True)],
         step,
         window_ticks=max_window_ticks(len(bones), tracks, tick_times),
-        error_modes=calibrated.spread,
+        error_modes=calibration.error_modes,
     )
-    world_from_solved, joints, solved, floor = _place_in_world(inputs, bones, solution, calibrated, fps)
-    place = Similarity(calibrated.scale, world_from_solved.rotation, world_from_solved.translation)
-    paths = tuple(trajectory_in_world(each, place, dropped[each.camera]) for each in used)
+    # The first mount is that of the reference camera, which the first window of a long capture may lack.
+    points = map_points_of(inputs, calibration.mounts[0].camera)
+    placed = _place_in_world(inputs.skeleton, bones, solution, calibration, scale * points, fps)
+    to_world = placed.world_from_solved
+    world_from_map = Similarity(scale, to_world.rotation, to_world.translation)
+    paths = tuple(trajectory_in_world(each, world_from_map, prepared.dropped[each.camera]) for each in used)
     if options.camera_paths == "joint":
-        paths = _camera_paths(paths, metric, calibrated, solution, world_from_solved)
+        own = {track.camera: track for track in metric}
+        solved_mounts = {mount.camera: mount for mount in calibration.mounts}
+        paths = tuple(
+            with_solved_centres(path, own[path.camera], solved_mounts[path.camera], solution, to_world)
+            for path in paths
+        )
     observed = observed_joints(inputs.skeleton, bones, tracks, tick_times, options.max_gap_s)
-    covariance = skeleton_covariance(
-        world_from_solved.rotation, bones, solution.joint_covariance, len(solved)
-    )
+    covariance = skeleton_covariance(to_world.rotation, bones, solution.joint_covariance, len(placed.solved))
     body = SolvedBody(
         skeleton=inputs.skeleton,
         fps=fps,
         start_ns=int(tick_times[0]),
-        graph_world_from_joint=joints,
-        solved=solved,
+        graph_world_from_joint=placed.world_from_joint,
+        solved=placed.solved,
         observed=observed,
         trajectories=paths,
-        mounts=calibrated.mounts,
-        standing=standing_joints(contacts, len(tick_times), len(solved)),
+        mounts=calibration.mounts,
+        standing=standing_joints(contacts, len(tick_times), len(placed.solved)),
     )
     step("projecting")
     projection = project_motion(body, inputs.clocks, inputs.row_fraction)
@@ -140,45 +172,66 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         standing=body.standing,
         motion=projection.motion,
         projection_gap=projection.gap,
-        world_from_map={gauge: place.after(here) for gauge, here in together.main_from_gauge.items()},
-        unused_cameras=together.unused,
+        world_from_map={gauge: world_from_map.after(main) for gauge, main in aligned.main_from_gauge.items()},
+        unused_cameras=aligned.unused,
         report=build_report(
             inputs,
-            calibrated,
+            calibration,
             solution,
             tracks,
-            {
-                "start_ns": int(tick_times[0]),
-                "end_ns": int(tick_times[-1]),
-                "dropped": dropped,
-                "floor": floor,
-                "unused": together.unused,
-                "joined": together.report(),
-                "uncertainty": sigma_percentiles(inputs.skeleton.roles, covariance, observed),
-                "joint_gap_m": joint_gaps(bones, solution.world_from_bone),
-                "hinge_m": hinge_deviations(inputs.skeleton, bones, solution.world_from_bone),
-                "contacts": contact_statistics(contacts, solution.world_from_bone, fps),
-                "rules": {rule.name: rule.violation_m(solution.world_from_bone) for rule in rules},
-            },
+            MotionFacts(
+                start_ns=int(tick_times[0]),
+                end_ns=int(tick_times[-1]),
+                dropped=prepared.dropped,
+                floor=placed.floor,
+                unused=aligned.unused,
+                aligned={name: AlignedCameraReport(**sigmas) for name, sigmas in aligned.report().items()},
+                joint_sigma_m=sigma_percentiles(inputs.skeleton.roles, covariance, observed),
+                joint_gap_m=joint_gaps(bones, solution.world_from_bone),
+                hinge_off_plane_m=hinge_deviations(inputs.skeleton, bones, solution.world_from_bone),
+                contacts=contact_statistics(contacts, solution.world_from_bone, fps),
+                rule_violation_m={rule.name: rule.violation_m(solution.world_from_bone) for rule in rules},
+            ),
         ),
         joint_covariance_m2=covariance,
     )
 
 
-def timeline(inputs: MergeInputs, used: Sequence[Trajectory], fps: float) -> IntArray:
-    """Ticks (T,) on the common clock, from the earliest timestamp of the cameras in use to their latest."""
-    times = [inputs.clocks[each.camera].common_times_ns(each.times_ns) for each in used]
+def timeline(clocks: Mapping[str, CameraClock], used: Sequence[Trajectory], fps: float) -> IntArray:
+    """Return the common times (T,) of the ticks, from the first timestamp of the used cameras to the last.
+
+    Args:
+        clocks: By camera.
+        used: Trajectories of the used cameras.
+        fps: Rate of the timeline.
+    """
+    times = [clocks[each.camera].common_times_ns(each.times_ns) for each in used]
     start, end = min(int(each.min()) for each in times), max(int(each.max()) for each in times)
     count = int(np.floor((end - start) * 1e-9 * fps + 1e-6)) + 1
     return np.asarray(start + np.round(np.arange(count) * (1e9 / fps)), dtype=np.int64)
 
 
+@dataclass(frozen=True, slots=True)
+class _PreparedTracks:
+    """Tracks without gross errors.
+
+    Attributes:
+        tracks: One per camera.
+        provisional: Provisional scale, metres per map unit.
+        dropped: By camera, (N,) frames with gross errors.
+    """
+
+    tracks: list[CameraTrack]
+    provisional: float
+    dropped: dict[str, IntArray]
+
+
 def _prepare_tracks(
     inputs: MergeInputs, used: Sequence[Trajectory], bones: Sequence[Bone]
-) -> tuple[list[CameraTrack], float, dict[str, IntArray]]:
-    """Tracks without gross errors, a provisional scale, and the frames that were dropped."""
-    index = {bone.role: position for position, bone in enumerate(bones)}
-    mounts = {mount.camera: mount for mount in inputs.mounts}
+) -> _PreparedTracks:
+    """Put the trajectories onto the common clock, drop gross errors, and estimate a provisional scale."""
+    index = {bone.role: number for number, bone in enumerate(bones)}
+    mounts = inputs.mount_by_camera()
     tracks = [make_track(inputs, each, index[mounts[each.camera].role]) for each in used]
     provisional = provisional_scale(bones, tracks, mounts)
     cleaned, dropped = [], {}
@@ -186,52 +239,63 @@ def _prepare_tracks(
         kept = remove_outliers(track, provisional, inputs.clocks[track.camera].nominal_fps)
         dropped[track.camera] = np.setdiff1d(track.frames, kept.frames)
         cleaned.append(kept)
-    return cleaned, provisional_scale(bones, cleaned, mounts), dropped
+    return _PreparedTracks(cleaned, provisional_scale(bones, cleaned, mounts), dropped)
+
+
+@dataclass(frozen=True, slots=True)
+class _PlacedBody:
+    """The whole body in the world.
+
+    Attributes:
+        world_from_solved: Rigid transform from the frame of the solution.
+        world_from_joint: (T,J,4,4) pose of every joint.
+        solved: (J,) True if the joint was a variable of the graph.
+        floor: The floor.
+    """
+
+    world_from_solved: Similarity
+    world_from_joint: FloatArray
+    solved: BoolArray
+    floor: Floor
+
+
+def _place_in_world(
+    skeleton: SkeletonModel,
+    bones: Sequence[Bone],
+    solution: MotionSolution,
+    calibration: BodyCalibration,
+    points_m: FloatArray,
+    fps: float,
+) -> _PlacedBody:
+    """Complete the body, find the floor, and transform the body to the world.
+
+    Args:
+        skeleton: The body.
+        bones: The graph's bones.
+        solution: The solved motion.
+        calibration: The calibration of the body.
+        points_m: (P,3) points of the map of the reference camera, metres, in the frame of the solution.
+        fps: Rate of the timeline.
+    """
+    up = calibration.vertical
+    rotation = rotation_to_z_up(up.up)
+    joints, solved = complete_skeleton(skeleton, bones, _rotate_poses(rotation, solution.world_from_bone))
+    hips = joints[:, 0, :3, 3]
+    standing = standing_height(skeleton, 0)
+    path_m = solution.world_from_bone[:, 0, :3, 3]
+    expected = float(np.median(hips[:, 2])) - WALKING_HEIGHT_RATIO * standing
+    floor = floor_beside_path(points_m, path_m, up, expected, standing) or floor_from_points(
+        points_m @ rotation[2], up, expected, standing
+    )
+    if floor.source != "map":
+        floor = floor_from_feet(skeleton, joints, solved) or floor
+    forward = -joints[:, 0, :3, 1]
+    world_from_solved = world_from_solved_frame(
+        rotation, hips[0], floor.height_m, initial_heading(forward, hips, fps)
+    )
+    to_world = Similarity(1.0, world_from_solved.rotation @ rotation.T, world_from_solved.translation)
+    return _PlacedBody(world_from_solved, to_world.apply_to_poses(joints), solved, floor)
 
 
 def _rotate_poses(rotation: FloatArray, poses: FloatArray) -> FloatArray:
     return Similarity(1.0, rotation, np.zeros(3)).apply_to_poses(poses)
-
-
-def _place_in_world(
-    inputs: MergeInputs,
-    bones: Sequence[Bone],
-    solution: MotionSolution,
-    calibrated: BodyCalibration,
-    fps: float,
-) -> tuple[Similarity, FloatArray, Any, Floor]:
-    """Find the world and put the whole body into it."""
-    rotation = rotation_to_z_up(calibrated.up.up)
-    turned = _rotate_poses(rotation, solution.world_from_bone)
-    joints, solved = complete_skeleton(inputs.skeleton, bones, turned)
-    hips = joints[:, 0, :3, 3]
-    standing = standing_height(inputs.skeleton, 0)
-    # The first mount is the trunk camera's: in a long capture the first stretch may lack it.
-    points = map_points_of(inputs, calibrated.mounts[0].camera)
-    points_m, path_m = calibrated.scale * points, solution.world_from_bone[:, 0, :3, 3]
-    expected = float(np.median(hips[:, 2])) - WALKING_HEIGHT_RATIO * standing
-    floor = floor_beside_path(points_m, path_m, calibrated.up, expected, standing) or floor_from_points(
-        points_m @ rotation[2], calibrated.up, expected, standing
-    )
-    if floor.source != "map":
-        floor = floor_from_feet(inputs.skeleton, joints, solved) or floor
-    forward = -joints[:, 0, :3, 1]
-    placed = world_from_solved_frame(rotation, hips[0], floor.height_m, initial_heading(forward, hips, fps))
-    to_world = Similarity(1.0, placed.rotation @ rotation.T, placed.translation)
-    return placed, to_world.apply_to_poses(joints), solved, floor
-
-
-def _camera_paths(
-    paths: Sequence[Trajectory],
-    tracks: Sequence[CameraTrack],
-    calibrated: BodyCalibration,
-    solution: MotionSolution,
-    world_from_solved: Similarity,
-) -> tuple[Trajectory, ...]:
-    """All paths as solved together with the body."""
-    mounts = {mount.camera: mount for mount in calibrated.mounts}
-    own = {track.camera: track for track in tracks}
-    return tuple(
-        with_solved_centres(path, own[path.camera], mounts[path.camera], solution, world_from_solved)
-        for path in paths
-    )

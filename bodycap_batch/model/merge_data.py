@@ -1,4 +1,4 @@
-"""What goes into the skeleton stage and what comes out of it; shared with export and the pipeline."""
+"""Inputs and result of the merging stage, shared with export and the pipeline."""
 
 from __future__ import annotations
 
@@ -11,31 +11,37 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.model.geometry import Similarity
+from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
 
 Activity = Literal["walk", "generic"]
 
-_STANDING_SPEED_M_PER_S, _STANDING_RATE_HZ = 0.05, 30.0
-"""Speed of a standing foot's ankle, one sigma at 30 ticks a second: the shin rolls over the foot."""
+_STANDING_SPEED_M_PER_S = 0.05
+"""Sigma of the speed of a standing foot's ankle at `_STANDING_RATE_HZ`. The shin rolls over the foot.
+
+Evidence: none.
+"""
+_STANDING_RATE_HZ = 30.0
+"""Rate of the timeline for which `_STANDING_SPEED_M_PER_S` holds."""
 
 
 def standing_sigma_m(fps: float) -> float:
-    """How far a standing foot's ankle moves from tick to tick, one sigma.
+    """Return the sigma of a standing ankle's movement from tick to tick, metres.
 
-    Per tick the square root of the rate less: over a second a foot is held as firmly at every rate.
+    It falls with the square root of the rate per tick. Over a second, a foot is held as firmly at every rate.
     """
     return _STANDING_SPEED_M_PER_S / math.sqrt(_STANDING_RATE_HZ * fps)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraClock:
-    """How a camera's timestamps relate to the common clock.
+    """How a camera's timestamps are related to the common clock.
 
     Attributes:
-        nominal_fps: The camera's nominal rate (dropped frames do not change it).
+        nominal_fps: Nominal frame rate of the camera. Dropped frames do not change it.
         offset_s: Common time = camera time + offset.
-        rolling_shutter_s: Time from the first row's exposure to the last row's.
+        rolling_shutter_s: Time from the exposure of the first row to that of the last row.
     """
 
     nominal_fps: float
@@ -47,12 +53,12 @@ class CameraClock:
             raise ValueError(f"nominal_fps must be positive, not {self.nominal_fps}")
 
     def common_times_ns(self, times_ns: IntArray, row_fraction: FloatArray | None = None) -> IntArray:
-        """Common time (N,) of poses with the camera's own timestamps (N,).
+        """Return the common time (N,) of poses.
 
         Args:
             times_ns: (N,) camera time of each frame.
-            row_fraction: (N,) mean image row of the observations a pose rests on, over the image height.
-                Without it the pose is that of the middle row, whose exposure is the frame time.
+            row_fraction: (N,) mean image row of the pose's observations, over the image height. Without it,
+                the pose is that of the middle row; the exposure of this row is the frame time.
         """
         shift_s = np.full(len(times_ns), self.offset_s)
         if row_fraction is not None:
@@ -68,8 +74,8 @@ class BoardView:
         camera: Camera name.
         frame: Index of the frame in the camera's trajectory.
         board_m: (N,3) corners on the board, metres, z = 0.
-        rays: (N,2) where they were seen, undistorted, at depth 1.
-        cam_from_board: (4,4) the board's pose from this view alone.
+        rays: (N,2) observations of the corners, undistorted, at depth 1.
+        cam_from_board: (4,4) pose of the board from this view alone, metres.
     """
 
     camera: str
@@ -81,20 +87,20 @@ class BoardView:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MergeInputs:
-    """Everything the skeleton stage works on.
+    """The inputs of the merging stage.
 
     Attributes:
         trajectories: One per camera, each in the gauge of the map it was solved in.
         clocks: By camera name.
         skeleton: Zero pose, metres: a preset scaled to the height, or the user's own file.
-        mounts: One per camera, the prior: nominal pose with a large sigma, or the job's with a small one.
-        skeleton_is_measured: True when the skeleton is the subject's own (metric scale follows it).
-        height_m: The subject's stature, if given.
-        activity: ``walk`` adds walking's soft rules.
-        map_points: (P,3) points by gauge; the floor is looked for in them.
-        row_fraction: By camera, (N,) mean row of the observations behind each pose over the image height
-            (NaN where not localised); a camera that is missing is taken at the middle row.
-        board: Where keyframes see the marker board the job names.
+        mounts: One per camera, the prior: the nominal pose with a large sigma, or the job's with a small one.
+        skeleton_is_measured: True if the skeleton is the subject's own. It then determines the metric scale.
+        height_m: The subject's stature; None if it is not given.
+        activity: ``walk`` adds the soft rules of walking.
+        map_points: By gauge, (P,3) points of the map. Planes and the floor are found in them.
+        row_fraction: By camera, (N,) mean row of the observations of each pose over the image height (NaN if
+            not localised). The poses of a missing camera are those of the middle row.
+        board_views: Views of the job's marker board in keyframes.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -106,7 +112,7 @@ class MergeInputs:
     activity: Activity = "generic"
     map_points: Mapping[str, FloatArray] = field(default_factory=dict)
     row_fraction: Mapping[str, FloatArray] = field(default_factory=dict)
-    board: tuple[BoardView, ...] = ()
+    board_views: tuple[BoardView, ...] = ()
 
     def __post_init__(self) -> None:
         cameras = [trajectory.camera for trajectory in self.trajectories]
@@ -118,8 +124,12 @@ class MergeInputs:
             raise ValueError(f"no mount or no clock for {', '.join(missing)}")
 
     def mount_of(self, camera: str) -> Mount:
-        """The mount prior of a camera."""
+        """Return the mount prior of a camera."""
         return next(mount for mount in self.mounts if mount.camera == camera)
+
+    def mount_by_camera(self) -> dict[str, Mount]:
+        """Return the mount priors by camera."""
+        return {mount.camera: mount for mount in self.mounts}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,7 +188,7 @@ class MergeResult(SolvedBody):
             fast standing feet slide in it.
         world_from_map: By gauge; a gauge whose place is unknown is missing.
         unused_cameras: Cameras whose map could not be linked to the body, with the reason.
-        report: Plain JSON values: sources and values of scale, vertical and floor, residuals, outliers.
+        report: Sources, values, residuals and doubts. It is stored as plain values.
         joint_covariance_m2: (T,J,3,3) covariance of each joint's centre minus the centre of the first solved
             joint, world axes: measurement noise, mounts and scale together; not the world's own axes. NaN if
             the joint was not solved.
@@ -188,7 +198,7 @@ class MergeResult(SolvedBody):
     projection_gap: Mapping[str, Any]
     world_from_map: Mapping[str, Similarity]
     unused_cameras: Mapping[str, str]
-    report: Mapping[str, Any]
+    report: MergeReport
     joint_covariance_m2: FloatArray | None = None
 
     def __post_init__(self) -> None:
@@ -200,9 +210,9 @@ class MergeResult(SolvedBody):
             set_array(self, "joint_covariance_m2", (*self.observed.shape, 3, 3), finite=False)
 
     def joint_sigma_m(self) -> FloatArray:
-        """Return the sigma (T,J) per axis of each joint's centre relative to the first solved joint's.
+        """Return the sigma (T,J) per axis of each joint's centre relative to the first solved one's, metres.
 
-        NaN if the joint was not solved.
+        It is NaN if the joint was not solved.
         """
         if self.joint_covariance_m2 is None:
             return np.full(self.observed.shape, np.nan)

@@ -6,12 +6,12 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.percent import format_percent
+from bodycap_batch.model.merge_report import ScaleReport
 from bodycap_batch.model.scene import Map
 from bodycap_batch.report.drawn_scene import common_times_s
 from bodycap_batch.report.frame_losses import LossCause
@@ -233,7 +233,7 @@ def _about_parallax(inputs: ReportInputs) -> Iterator[Recommendation]:
             "" if angle_deg is None else f"half of the map's points are seen at angles below {angle_deg:.1f}°"
         )
         forward = (
-            f"every camera moved along its line of sight for {format_percent(min(forward_shares))} of its path"
+            f"every camera moved along its view for {format_percent(min(forward_shares))} of its path"
             if only_forward
             else ""
         )
@@ -295,54 +295,51 @@ def _about_body(inputs: ReportInputs) -> Iterator[Recommendation]:
     """Yield merging's advice on constants of the body that are not well known."""
     if inputs.merge is None:
         return
-    report: Mapping[str, Any] = inputs.merge.report
-    sides = report.get("exchanged_sides", {})
-    if sides:
+    report = inputs.merge.report
+    if report.exchanged_sides is not None:
         yield Recommendation(
             action="Exchange the names (or mounts) of the left and the right cameras, and run again.",
-            reason=str(sides["says"]),
+            reason=report.exchanged_sides.says,
             priority=2.8,
         )
-    clocks = report.get("doubted_clocks", {})
+    clocks = report.doubted_clocks
     if clocks:
         offsets = ", ".join(
-            f"about {doubt['offset_s']:.1f} for {name}" for name, doubt in sorted(clocks.items())
+            f"about {clock.offset_s:.1f} for {name}" for name, clock in sorted(clocks.items())
         )
         yield Recommendation(
             action="Clap once in view of all cameras and state each one's `offset_s` (the time of the clap "
             f"in the first video minus its time in this video), or try {offsets}.",
-            reason="; ".join(str(doubt["says"]) for _, doubt in sorted(clocks.items())),
+            reason="; ".join(clock.says for _, clock in sorted(clocks.items())),
             priority=2.5,
         )
-    yield from _about_scale(report.get("scale", {}))
-    for hinge in report.get("loose_hinges", {}).values():
-        finding, _, advice = str(hinge["known_to"]).partition(_ADVICE_SEPARATOR)
-        yield Recommendation(action=_as_sentence(advice), reason=finding, priority=1.1 + hinge["sigma_m"])
-    for name, mount in report.get("mounts", {}).items():
-        finding, _, advice = str(mount.get("known_to", "")).partition(_ADVICE_SEPARATOR)
-        if advice or mount["sigma_deg"] > GOOD_MOUNT_DEG:
+    yield from _about_scale(report.scale)
+    for hinge in report.loose_hinges.values():
+        finding, _, advice = hinge.known_to.partition(_ADVICE_SEPARATOR)
+        yield Recommendation(action=_as_sentence(advice), reason=finding, priority=1.1 + hinge.sigma_m)
+    for name, mount in report.mounts.items():
+        finding, _, advice = mount.known_to.partition(_ADVICE_SEPARATOR)
+        if advice or mount.sigma_deg > GOOD_MOUNT_DEG:
             measure = f"measure how {name} is mounted and state it (joint_from_cam)"
             yield Recommendation(
                 action=_as_sentence(f"{advice}; or {measure}" if advice else measure),
-                reason=finding
-                if advice
-                else f"the mount of {name} is known to {mount['sigma_deg']:.0f}° only",
-                priority=1.0 + mount["sigma_deg"] / 1000.0,
+                reason=finding if advice else f"the mount of {name} is known to {mount.sigma_deg:.0f}° only",
+                priority=1.0 + mount.sigma_deg / 1000.0,
             )
 
 
-def _about_scale(scale: Mapping[str, Any]) -> Iterator[Recommendation]:
-    sigma = scale.get("relative_sigma")
-    if sigma is None or sigma <= _SUFFICIENT_SCALE_SIGMA:
+def _about_scale(scale: ScaleReport) -> Iterator[Recommendation]:
+    sigma = scale.relative_sigma
+    if sigma <= _SUFFICIENT_SCALE_SIGMA:
         return
-    _, _, advice = str(scale.get("known_to", "")).partition(_ADVICE_SEPARATOR)
+    _, _, advice = scale.known_to.partition(_ADVICE_SEPARATOR)
     ways = [advice] if advice else []
-    if all(source["name"] != "skeleton" for source in scale.get("sources", ())):
+    if all(source.name != "skeleton" for source in scale.sources):
         ways.append("give the subject's own skeleton (--skeleton subject.bvh)")
     if ways:
         yield Recommendation(
             action=_as_sentence(", or ".join(ways)),
-            reason=f"the metric scale comes from {scale.get('source')} and is known to {sigma:.1%}: "
+            reason=f"the metric scale comes from {scale.source} and is known to {sigma:.1%}: "
             f"{100 * _ARM_LENGTH_M * sigma:.1f} cm on the length of an arm",
             priority=1.1 + sigma,
         )

@@ -68,9 +68,9 @@ def run_merge(task: MergeTask, context: StageContext, files: Path) -> None:
         add_flip_hint(error, load_map(task.map.path).log)
         raise
     write_dataclass(result, files, "merge")
-    doubts = [*result.report.get("doubted_clocks", {}).values(), result.report.get("exchanged_sides", {})]
     notes = [f"camera {name} is no part of the body: {why}" for name, why in result.unused_cameras.items()]
-    notes += [str(doubt["says"]) for doubt in doubts if doubt]
+    notes += [clock.says for clock in result.report.doubted_clocks.values()]
+    notes += [result.report.exchanged_sides.says] if result.report.exchanged_sides is not None else []
     write_summary(files, unused_cameras=dict(result.unused_cameras), notes=notes)
 
 
@@ -113,7 +113,7 @@ def _with_board(
             lenses[path.camera] = maps[path.gauge].cameras[path.camera]
     capture = load_capture(footage.capture, footage.keyframes, threads=context.threads)
     views = find_board_views(capture, frames, lenses, board, context)
-    return dataclasses.replace(inputs, board=views)
+    return dataclasses.replace(inputs, board_views=views)
 
 
 MERGE = Stage(

@@ -27,7 +27,8 @@ class RegisteredCameras:
     Attributes:
         trajectories: One per camera.
         clocks: By camera.
-        row_fraction: By camera whose poses are not corrected for its rolling shutter, see `mean_row_fraction`.
+        row_fraction: By camera whose poses are not corrected for its rolling shutter: see
+            `mean_row_fraction`.
     """
 
     trajectories: tuple[Trajectory, ...]

@@ -153,7 +153,7 @@ def score(folder: Path, result: MergeResult) -> dict[str, float]:
         "raw_angle_deg": float(raw[:, turning][seen[:, turning]].mean()),
         "palm_m": float(np.linalg.norm(apart[0] - apart[1], axis=-1).mean()),
         "log_scale": float(np.log(place.scale)),
-        "stated_log_scale": float(result.report["scale"]["relative_sigma"]),
+        "stated_log_scale": float(result.report.scale.relative_sigma),
         **_mount_errors(folder, result),
     }
 

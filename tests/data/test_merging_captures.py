@@ -94,9 +94,9 @@ def test_palms_and_scale_with_the_bodys_own_skeleton(data_root, tmp_path, captur
 def test_a_height_alone_says_how_uncertain_it_is(data_root, tmp_path):
     result = _merge(data_root / "walk12", tmp_path, height_m=1.75)
     off = abs(np.log(result.world_from_map["map-0"].scale * GAUGE.scale))
-    assert result.report["scale"]["source"] == "height"
+    assert result.report.scale.source == "height"
     # The rig has no textbook proportions (its forearm is 16 cm); two of the stated sigmas cover it.
-    assert off < 2.0 * result.report["scale"]["relative_sigma"]
+    assert off < 2.0 * result.report.scale.relative_sigma
 
 
 @pytest.mark.parametrize("capture", ["walk12", "room12", "walk131"])

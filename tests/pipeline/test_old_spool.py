@@ -1,7 +1,7 @@
 """A spool and a store that version 0.1.0 left: this version takes them over and loses no job.
 
-The archive was made with version 0.1.0 and stand-in stages. Job "first" is done. The watcher was killed during
-the merge of job "second". Job "third" waits in the inbox.
+The archive was made with version 0.1.0 and stand-in stages. Job "first" is done. The watcher was killed
+during the merge of job "second". Job "third" waits in the inbox.
 """
 
 from __future__ import annotations

@@ -152,8 +152,8 @@ def test_metrics_hold_the_tables(tmp_path: Path) -> None:
     assert second["mean_reprojection_error_px"] < 1e-9
     assert torso["registration"]["mean_reprojection_error_px"] == pytest.approx(0.5)
     assert metrics["frame"] == "world"
-    assert metrics["merge"]["scale"]["value"] == 1.75
-    assert metrics["merge"]["floor"] is None
+    assert metrics["merge"]["scale"]["source"] == "height"
+    assert metrics["merge"]["scale"]["relative_sigma"] is None
     assert metrics["mapping"] == {"initial_pairs": [["torso/1", "torso/5"]]}
 
 

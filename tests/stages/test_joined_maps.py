@@ -43,7 +43,7 @@ def test_all_cameras_are_used_in_one_world(capture, result):
     assert len(result.trajectories) == 5
     for role in ("LeftHand", "RightHand", "LeftArm", "RightArm"):
         assert result.solved[result.skeleton.roles.index(role)]
-    stated = result.report["joined_cameras"]
+    stated = result.report.joined_cameras
     assert set(stated) == {"left_palm", "left_upper_arm", "right_palm", "right_upper_arm"}
 
 
@@ -55,7 +55,7 @@ def test_the_maps_lie_where_they_were_within_what_is_stated(capture, result):
         centres = each.gauge_from_cam[each.localised, :3, 3]
         true = main.after(capture.gauges["a"]).after(capture.gauges[each.gauge].inverse()).apply(centres)
         off = np.linalg.norm(result.world_from_map[each.gauge].apply(centres) - true, axis=1)
-        sigma = result.report["joined_cameras"][each.camera]["sigma_m"]
+        sigma = result.report.joined_cameras[each.camera].sigma_m
         # Three sigmas of each of three axes; a claim as loose as 6 cm would have been refused.
         assert np.median(off) < 3.0 * np.sqrt(3.0) * sigma
         assert sigma < 0.06
@@ -100,7 +100,7 @@ def test_every_map_is_written_into_the_world(capture, result, tmp_path):
         assert_allclose(written.world_from_cam, merged.gauge_from_cam[merged.localised], atol=1e-5)
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert {model["frame"] for model in metrics["models"]} == {"world"}
-    assert metrics["merge"]["joined_cameras"] == dict(result.report["joined_cameras"])
+    assert metrics["merge"]["joined_cameras"] == result.report.to_dict()["joined_cameras"]
 
 
 def test_sigmas_of_joined_arms_are_larger_than_of_the_same_arms_in_one_map(capture, result, tmp_path):

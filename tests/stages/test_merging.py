@@ -1,4 +1,4 @@
-"""The skeleton stage on a simulated walk: accuracy, clocks, gauges, gaps, gross errors, refusals."""
+"""The merging stage on a simulated walk: accuracy, clocks, gauges, gaps, gross errors, refusals."""
 
 from __future__ import annotations
 
@@ -79,8 +79,8 @@ def _palm_error_m(walk: Walk, result: MergeResult, camera: str = "left_palm") ->
 
 def test_known_mounts_give_scale_and_palms(walk, context):
     result = merge_trajectories(make_inputs(walk, _recorded(walk), **_known(walk)), MergeOptions(), context)
-    # It states 3 % for so short a walk; a palm is 0.6 m from the chest, joints have 5 mm of slack.
-    sigma = result.report["scale"]["relative_sigma"]
+    # The stated sigma is 3 % for this short walk. A palm is 0.6 m from the chest; joints have 5 mm of slack.
+    sigma = result.report.scale.relative_sigma
     assert 0.005 < sigma < 0.05
     assert result.world_from_map["map-0"].scale == pytest.approx(1.0 / GAUGE.scale, rel=2.0 * sigma)
     for camera in ("left_palm", "right_palm"):
@@ -100,10 +100,10 @@ def test_nominal_mounts_are_solved_towards_the_truth(walk, base):
     for mount in base.mounts:
         truth = walk.mounts[mount.camera].joint_from_cam
         off = np.linalg.norm(mount.joint_from_cam[:3, 3] - truth[:3, 3])
-        # Three sigma of what the solution itself states, over three axes.
+        # Three stated sigmas, over three axes.
         assert off < 3.0 * np.sqrt(3.0) * mount.sigma_m
         assert 0.005 < mount.sigma_m <= 0.08
-    sigma = base.report["scale"]["relative_sigma"]
+    sigma = base.report.scale.relative_sigma
     assert 0.02 < sigma < 0.15
     assert base.world_from_map["map-0"].scale == pytest.approx(1.0 / GAUGE.scale, rel=2.0 * sigma)
 
@@ -201,9 +201,9 @@ def test_gross_errors_do_not_move_the_body(walk, base, context):
             poses[burst, :3, 3] += GAUGE.scale * rng.uniform(0.3, 1.0) * np.array([1.0, -1.0, 0.5])
         recorded.append(replace(each, gauge_from_cam=poses))
     result = merge_trajectories(make_inputs(walk, recorded), MergeOptions(), context)
-    # 18 of 270 poses, 7 %, are wrong by 0.45 to 1.5 m; the rest must carry the answer to a fraction of that.
+    # 18 of 270 poses, 7 %, are wrong by 0.45 to 1.5 m. The others must give the result to a fraction of that.
     assert np.abs(_relative(result, "left_palm") - _relative(base, "left_palm")).max() < 0.04
-    dropped = [camera["dropped_as_gross_errors"] for camera in result.report["cameras"].values()]
+    dropped = [camera.dropped_as_gross_errors for camera in result.report.cameras.values()]
     assert all(6 <= count <= 10 for count in dropped)
     for trajectory, count in zip(result.trajectories, dropped, strict=True):
         refused = np.array([status is FrameStatus.POSE_JUMP for status in trajectory.status])
@@ -212,7 +212,7 @@ def test_gross_errors_do_not_move_the_body(walk, base, context):
         assert np.isnan(trajectory.gauge_from_cam[refused]).all()
 
 
-def test_world_trajectories_carry_poses_and_metric_covariance(walk, context):
+def test_world_trajectories_have_poses_and_metric_covariance(walk, context):
     measured = MergeOptions(camera_paths="measured")
     result = merge_trajectories(make_inputs(walk, _recorded(walk)), measured, context)
     place = result.world_from_map["map-0"]
@@ -235,7 +235,7 @@ def test_cameras_solved_with_the_body_are_nearer_to_the_truth_than_measured(walk
             np.sqrt(((poses - exact)[:, :3, 3] ** 2).sum(axis=1).mean())
             for poses in (after.gauge_from_cam, measured)
         )
-        # White noise and a smooth motion: three frames and more tell of each centre (1/sqrt(3) is 0.58).
+        # With white noise and a smooth motion, at least three frames determine a centre (1/sqrt(3) is 0.58).
         assert off < 0.8 * noise
         assert_allclose(after.gauge_from_cam[:, :3, :3], measured[:, :3, :3], atol=1e-9)
 
@@ -257,7 +257,7 @@ def test_a_lost_torso_is_refused_with_numbers(walk, context):
 
 
 @pytest.mark.parametrize("kept", [6, pytest.param(24, marks=pytest.mark.slow)])
-def test_a_head_carries_the_body_where_the_torso_is_lost(tmp_path, kept):
+def test_the_head_is_the_reference_if_the_torso_is_lost(tmp_path, kept):
     cameras = ("torso", "head", "left_palm", "right_palm")
     capture = posed(SynthOptions(seconds=8.0, cameras=cameras, seed=5, poses_only=True))
     trajectories = list(capture.inputs.trajectories)
@@ -284,7 +284,7 @@ def test_a_head_carries_the_body_where_the_torso_is_lost(tmp_path, kept):
     # Eight seconds with nominal mounts state some 6 % of scale and 3 cm of mount: of an arm's length, 5 cm.
     assert off.mean() < 0.08
     assert result.world_from_map["map-0"].scale * capture.gauges["map-0"].scale == pytest.approx(
-        1.0, abs=2.0 * result.report["scale"]["relative_sigma"]
+        1.0, abs=2.0 * result.report.scale.relative_sigma
     )
 
 
@@ -311,8 +311,8 @@ def test_same_inputs_same_result(walk, base, context):
     assert again.report == base.report
 
 
-def test_two_cameras_a_hair_apart_share_a_state(walk, context):
-    # Two torso cameras 12.0 and 12.4 ms behind the ticks: two states that close would be singular.
+def test_two_cameras_with_nearly_equal_times_share_a_state(walk, context):
+    # Two torso cameras are 12.0 and 12.4 ms behind the ticks. Two states that close would be singular.
     recorded = _recorded(walk, torso={"shift_s": 0.0120}, left_palm={"shift_s": 0.0})
     twin = replace(
         record(walk, "torso", np.random.default_rng(9), gauge=GAUGE, shift_s=0.0124), camera="torso_2"
@@ -325,10 +325,10 @@ def test_two_cameras_a_hair_apart_share_a_state(walk, context):
         make_inputs(walk, [*recorded, twin], mounts=mounts, clocks=clocks), MergeOptions(), context
     )
     assert np.isfinite(result.graph_world_from_joint).all()
-    assert result.report["cameras"]["torso_2"]["residual_m"]["p50"] < 0.01
+    assert result.report.cameras["torso_2"].residual_m.p50 < 0.01
 
 
-def test_stretches_of_a_long_capture_join_without_a_seam(walk):
+def test_windows_of_a_long_capture_join_without_a_discontinuity(walk):
     recorded = _recorded(walk, **{name: {"seconds": 7.0} for name in ROLES})
     bones = kinematic_chain(walk.skeleton, set(ROLES.values()))
     index = {bone.role: position for position, bone in enumerate(bones)}
@@ -352,7 +352,7 @@ def test_stretches_of_a_long_capture_join_without_a_seam(walk):
         )
 
     whole, pieces = solve(1000), solve(70)
-    # Three stretches; measurements 3 s away weigh nothing: the stopping rule's millimetre.
+    # Three windows. Measurements 3 s away have no weight; the tolerance is that of the stopping rule.
     assert_allclose(pieces.world_from_bone[..., :3, 3], whole.world_from_bone[..., :3, 3], atol=1e-3)
     for camera, residual in whole.residual_m.items():
         assert_allclose(pieces.residual_m[camera], residual, atol=1e-3)

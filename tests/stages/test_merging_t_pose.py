@@ -1,4 +1,4 @@
-"""The skeleton stage on simulated poses that begin with a T-pose: found, used, and said how well."""
+"""The merging stage on simulated poses that begin with a T-pose: detection, use and stated uncertainty."""
 
 import json
 
@@ -24,15 +24,15 @@ def merged(tmp_path_factory):
     return folder / "capture", merge_trajectories(inputs, MergeOptions(), context)
 
 
-def test_the_t_pose_is_found_where_it_stands(merged):
+def test_the_t_pose_is_found_at_its_time(merged):
     _, result = merged
-    found = result.report["t_pose"]
+    found = result.report.t_pose
     # The walker stands for two seconds and lowers its arms in the third; a palm is lost from 0.8 to 1 s.
-    assert 0.0 <= found["from_s"] < 1.1
-    assert found["from_s"] + 0.5 <= found["to_s"] < 2.6
+    assert 0.0 <= found.from_s < 1.1
+    assert found.from_s + 0.5 <= found.to_s < 2.6
 
 
-def test_joints_and_mounts_are_as_near_as_is_said(merged):
+def test_joints_and_mounts_are_within_their_stated_uncertainty(merged):
     folder, result = merged
     errors = simulation.score(folder, result)
     # Three times what the long capture reaches (2.6 cm): a third of its length, one seed.
@@ -45,18 +45,18 @@ def test_joints_and_mounts_are_as_near_as_is_said(merged):
         assert np.linalg.norm(off) < 3.0 * np.sqrt(3.0) * mount.sigma_m
 
 
-def test_every_constant_has_its_sentence_and_sources_their_share(merged):
+def test_every_constant_has_its_sentence_and_its_sources(merged):
     _, result = merged
     report = result.report
-    assert report["up"]["source"] == "walk"  # there is no map
-    assert [source["name"] for source in report["scale"]["sources"]] == ["skeleton"]
-    assert {limb["name"] for limb in report["scale"]["limbs"]["alone"]} == {"left arm", "right arm"}
-    assert report["scale"]["limbs"]["degrees_of_freedom"] == 1
-    assert "1 sigma" in report["scale"]["known_to"]
-    for camera, mount in report["mounts"].items():
-        assert mount["known_to"].startswith(camera)
-        assert "T-pose" not in mount["known_to"]
+    assert report.up.source == "walk"  # there is no map
+    assert [source.name for source in report.scale.sources] == ["skeleton"]
+    assert {limb.name for limb in report.scale.limbs.alone} == {"left arm", "right arm"}
+    assert report.scale.limbs.degrees_of_freedom == 1
+    assert "1 sigma" in report.scale.known_to
+    for camera, mount in report.mounts.items():
+        assert mount.known_to.startswith(camera)
+        assert "T-pose" not in mount.known_to
     for camera in ("left_palm", "right_palm"):
-        assert report["mounts"][camera]["roll_deg"] == 0.0
-        assert report["mounts"][camera]["roll_runner_up"]["half_squared_sigmas_more"] > -8.0
-    assert "Left elbow not overstretched" in report["activity"]["rules_active"]
+        assert report.mounts[camera].roll_deg == 0.0
+        assert report.mounts[camera].roll_runner_up.half_squared_sigmas_more > -8.0
+    assert "Left elbow not overstretched" in report.activity.rules_active

@@ -17,6 +17,7 @@ import pytest
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config.models import CaptureConfig, Job
 from bodycap_batch.model.geometry import interpolate_pose
+from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.pipeline.stage_results import StageResults, report_task
 from bodycap_batch.report import ReportInputs
@@ -211,7 +212,8 @@ def test_contradictions_of_the_body_are_recommended_first(
     metrics["merge"] |= doubt
     (found,) = (each for each in judge(metrics, None).criteria if each.name == name)
     assert (found.grade, found.finding) == (Grade.POOR, "0.5 s behind")
-    merge = replace(inputs.merge, report={**inputs.merge.report, **doubt})
+    report = MergeReport.from_dict({**inputs.merge.report.to_dict(), **doubt})
+    merge = replace(inputs.merge, report=report)
     contradicted = replace(inputs, metrics=metrics, merge=merge)
     assert action in recommend_changes(contradicted, {})[0].action
     assert "0.5 s behind" in written(contradicted, tmp_path)
@@ -528,7 +530,7 @@ def test_a_given_skeleton_is_not_recommended_again(inputs: ReportInputs, source:
         "known_to": "the metric scale is known to 3.0 % (1 sigma); to know it better, name a known distance",
         "sources": [{"name": source}, {"name": "floor"}],
     }
-    changed = replace(inputs, merge=replace(inputs.merge, report={"scale": scale}))
+    changed = replace(inputs, merge=replace(inputs.merge, report=MergeReport.from_dict({"scale": scale})))
     assert [each.action for each in recommend_changes(changed, {}) if "metric scale" in each.reason] == [says]
 
 
@@ -540,7 +542,9 @@ def test_an_elbow_that_violates_its_hinge_model_gets_a_recommendation(inputs: Re
             "known_to": "the left elbow bends 2.1 cm out of its plane; to know it better, strap it",
         }
     }
-    changed = replace(inputs, merge=replace(inputs.merge, report={"loose_hinges": loose}))
+    changed = replace(
+        inputs, merge=replace(inputs.merge, report=MergeReport.from_dict({"loose_hinges": loose}))
+    )
     (advice,) = (each for each in recommend_changes(changed, {}) if "left elbow" in each.reason)
     assert (advice.action, advice.reason) == ("Strap it.", "the left elbow bends 2.1 cm out of its plane")
 
@@ -552,7 +556,9 @@ def test_a_t_pose_that_improves_several_constants_is_recommended_once(inputs: Re
     def recommended_actions(*cameras: str) -> list[str]:
         text = "known to 11°; to know it better, swing the elbow, or stand in a T-pose for two seconds first"
         report = {"mounts": {name: {"known_to": text, "sigma_deg": 11.0} for name in cameras}}
-        found = recommend_changes(replace(inputs, merge=replace(merge, report=report)), {})
+        found = recommend_changes(
+            replace(inputs, merge=replace(merge, report=MergeReport.from_dict(report))), {}
+        )
         return [each.action for each in found if "T-pose" in each.action or "elbow" in each.action]
 
     (single,) = recommended_actions("left_palm")

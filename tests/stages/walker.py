@@ -1,4 +1,4 @@
-"""A person walking a curve and reaching out, made of sines: nothing the solver believes made this motion."""
+"""A person who walks a curve and reaches out, made of sines, without any assumption of the solver."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ NOISE_RAD = float(np.radians(0.2))
 
 @dataclass(frozen=True)
 class Walk:
-    """The truth: joint poses as a function of time."""
+    """The true motion: joint poses as a function of time."""
 
     skeleton: SkeletonModel
     mounts: dict[str, Mount]
 
     def joints(self, seconds: np.ndarray) -> np.ndarray:
-        """(T,J,4,4) world_from_joint at any times (T,)."""
+        """Return world_from_joint (T,J,4,4) at any times (T,)."""
         t, step = seconds, 2.0 * np.pi * 0.95 * seconds
         yaw = 0.9 * np.sin(0.5 * t)
         speed, heading = 1.1, yaw - 0.5 * np.pi
@@ -68,13 +68,13 @@ class Walk:
         return forward_kinematics(self.skeleton, root, local)
 
     def camera(self, name: str, seconds: np.ndarray) -> np.ndarray:
-        """(T,4,4) world_from_cam."""
+        """Return world_from_cam (T,4,4) of a camera."""
         joint = self.skeleton.roles.index(self.mounts[name].role)
         return self.joints(seconds)[:, joint] @ self.mounts[name].joint_from_cam
 
 
 def make_walk(rng: np.random.Generator, *, off_deg: float = 0.0, off_m: float = 0.0) -> Walk:
-    """A walk with mounts that sit off their nominal places."""
+    """Return a walk with mounts that are off their nominal poses."""
     skeleton = load_skeleton("upper_body", HEIGHT_M)
     mounts = {}
     for name, role in ROLES.items():
@@ -100,13 +100,13 @@ def record(
     shift_s: float = 0.0,
     lost: tuple[float, float] | None = None,
 ) -> Trajectory:
-    """What registration would give for one camera.
+    """Return the trajectory that registration would give for one camera.
 
     Args:
-        walk: The truth.
-        name: Camera.
-        rng: Noise.
-        seconds: Length.
+        walk: The true motion.
+        name: Camera name.
+        rng: Draws the noise.
+        seconds: Length of the recording.
         gauge: map_from_world.
         shift_s: Common time minus the camera's own time.
         lost: First and last second without a pose.
@@ -138,7 +138,7 @@ def record(
 
 
 def make_inputs(walk: Walk, trajectories: list[Trajectory], **changes: object) -> MergeInputs:
-    """Merge inputs with nominal mounts and the person's own skeleton."""
+    """Return merge inputs with nominal mounts and the person's own skeleton."""
     values: dict[str, object] = {
         "trajectories": tuple(trajectories),
         "clocks": {each.camera: CameraClock(nominal_fps=FPS) for each in trajectories},

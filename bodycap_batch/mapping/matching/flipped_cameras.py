@@ -47,7 +47,10 @@ _HINT = (
     "a front camera's setting, or an app, may flip the picture; flip it back: ffmpeg -i in -vf hflip out.mp4"
 )
 
-_UNDECIDED_HINT = "that is right if one of them films a wall mirror, or if the room's halves are mirror images of each other; else the picture in which text reads backwards is flipped, and the result is wrong"
+_UNDECIDED_HINT = (
+    "that is right if one of them films a wall mirror, or if the room's halves are mirror images of each other; "
+    "else the picture in which text reads backwards is flipped, and the result is wrong"
+)
 
 
 def mirror_descriptors(descriptors: ByteDescriptors) -> ByteDescriptors:

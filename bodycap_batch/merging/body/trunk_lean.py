@@ -52,7 +52,7 @@ class TrunkOrientation:
         return modal_direction(self.axes[:, :, 2])
 
     def mean_up(self) -> FloatArray:
-        """Return the trunk's mean up direction (3,): closer to upright than the mode of mostly bent trunks."""
+        """Return the trunk's mean up direction (3,), closer to upright than the mode if it is mostly bent."""
         return _normalised(self.axes[:, :, 2].mean(axis=0))
 
     def upright_up(self) -> FloatArray:

@@ -1,1 +1,1 @@
-"""What is constant about a body: mounts, bone lengths, metric scale, and their uncertainty."""
+"""Calibration of the body: mounts, metric scale and vertical, with their uncertainties."""

@@ -1,21 +1,24 @@
-"""What is constant over a capture: mounts, metric scale, the vertical; and what each of them rests on."""
+"""Calibrate the body: mounts, metric scale and vertical, with their uncertainties."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from bodycap_batch.config.options import MergeOptions
+from bodycap_batch.config.options import MarkerBoard, MergeOptions
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.body.t_pose import arm_span, find_t_pose
 from bodycap_batch.merging.body.trunk_lean import trunk_orientation, trunk_orientation_from_prior
-from bodycap_batch.merging.body_calibration.anthropometry import (
-    PROPORTION_SIGMA,
-    bone_length_modes,
-    joint_placement_modes,
+from bodycap_batch.merging.body_calibration.anthropometry import skeleton_error_modes
+from bodycap_batch.merging.body_calibration.calibration_covariance import (
+    PoseSigma,
+    ScaleUncertainty,
+    error_modes,
+    mounts_with_sigmas,
 )
 from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.camera_roll import (
@@ -27,16 +30,18 @@ from bodycap_batch.merging.body_calibration.camera_roll import (
 from bodycap_batch.merging.body_calibration.known_distance import known_distance
 from bodycap_batch.merging.body_calibration.limb_scales import limb_scales
 from bodycap_batch.merging.body_calibration.marker_board import LocatedBoard, locate_board
-from bodycap_batch.merging.body_calibration.samples import take_samples
+from bodycap_batch.merging.body_calibration.samples import PostureHints, take_samples
 from bodycap_batch.merging.body_calibration.scale import (
+    MetricScale,
     ScaleEstimate,
     ScaleSource,
+    combine_sources,
     estimate_scale,
+    scale_from_bones,
     scale_from_floor,
-    weighted_mean,
 )
 from bodycap_batch.merging.cameras.track import CameraTrack
-from bodycap_batch.merging.graph.error_modes import ErrorModes, stack_modes
+from bodycap_batch.merging.graph.error_modes import ErrorModes
 from bodycap_batch.merging.graph.posture import is_mostly_walking
 from bodycap_batch.merging.world.floor import WALKING_HEIGHT_RATIO, floor_beside_path, standing_height
 from bodycap_batch.merging.world.vertical import SceneContext, Vertical, VerticalHypothesis, estimate_vertical
@@ -46,149 +51,182 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import MEAN_HEIGHT_M, split_side
 
 _SAMPLES = 80
+"""Samples of the calibration of the whole body. Evidence: none."""
 MIN_WALKING_SAMPLES = 10
-STATURE_SIGMA = 0.055
-"""Spread of adults' stature about one mean for both sexes (7 cm within each, means 14 cm apart)."""
+"""Minimum number of walking samples, to take the height over the floor from these alone. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationInput:
-    """Cleaned tracks in one gauge.
+    """Camera tracks that are ready for the calibration.
 
     Attributes:
-        tracks: The trunk's camera first.
-        provisional: A scale near the right one, metres per map unit.
-        placed: By camera whose map the body joined, sigmas (rad, m) of where it lies.
-        places: By gauge, where each used map lies in the tracks' gauge; None where all are in one map.
+        tracks: Cleaned tracks in the main map's gauge, that of the reference camera first.
+        provisional: Approximate scale, metres per map unit.
+        alignment: By camera of an aligned map, uncertainty of its map's pose.
+        main_from_gauge: By gauge, similarity from each used map to the main one. None if all cameras are in
+            one map.
     """
 
     tracks: Sequence[CameraTrack]
     provisional: float
-    placed: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    places: Mapping[str, Similarity] | None = None
+    alignment: Mapping[str, PoseSigma] = field(default_factory=dict)
+    main_from_gauge: Mapping[str, Similarity] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BodyCalibration:
-    """What is constant over the capture.
+    """What is constant over a capture.
 
     Attributes:
-        scale: Metres per map unit.
-        sigma_log: Sigma of its logarithm.
-        estimate: What the bones alone say.
-        sources: All that know the scale, used or not.
-        limbs: The scale at which each limb alone fits.
-        mounts: Solved mounts with their sigmas.
-        trunk: The prior of the leading camera's, the way up it sits.
-        spread: How far off all of this may be, and what passing postures add.
-        up: The vertical.
-        height_over_floor_m: Of the trunk's joint, where a walked floor was seen.
-        t_pose_ns: From when to when a T-pose stands, None without one.
-        rolls: Which way up each limb's camera was tried.
-        off_hinge_m: By role, sigma by which a bone's far end leaves its hinge's plane; those that do.
+        scale: The metric scale.
+        bones_alone: The scale at which the calibration graph has the lowest cost.
+        limbs: The scale of each limb alone, a diagnostic.
+        mounts: The solved mounts with their sigmas, that of the reference camera first.
+        reference_prior: Mount prior of the reference camera, with its roll.
+        error_modes: Error modes of scale, mounts and body, the constant and the transient ones.
+        vertical: The vertical.
+        height_over_floor_m: Height of the reference camera's joint over the floor; None if none was found.
+        t_pose_ns: First and last common time of a T-pose; None without one.
+        rolls: The search for the roll of each limb's camera.
+        off_hinge_m: By role, sigma by which a bone's far end leaves its hinge's plane; violated hinges only.
     """
 
-    scale: float
-    sigma_log: float
-    estimate: ScaleEstimate
-    sources: tuple[ScaleSource, ...]
+    scale: MetricScale
+    bones_alone: ScaleEstimate
     limbs: tuple[ScaleSource, ...]
     mounts: tuple[Mount, ...]
-    trunk: Mount
-    spread: ErrorModes
-    up: Vertical
+    reference_prior: Mount
+    error_modes: ErrorModes
+    vertical: Vertical
     height_over_floor_m: float | None
     t_pose_ns: tuple[int, int] | None
     rolls: tuple[RollSearch, ...]
     off_hinge_m: Mapping[str, float] = field(default_factory=dict)
 
 
+class ReferenceCameraRoll(NamedTuple):
+    """The roll of the reference camera, and the vertical.
+
+    Attributes:
+        roll_deg: The roll.
+        vertical: The vertical; None if nothing but the body itself would give it.
+    """
+
+    roll_deg: float
+    vertical: Vertical | None
+
+
 def calibrate_body(
     inputs: MergeInputs,
     options: MergeOptions,
     bones: Sequence[Bone],
-    cleaned: CalibrationInput,
+    data: CalibrationInput,
     step: Callable[[], None],
 ) -> BodyCalibration:
-    """Solve mounts and scale from the body's free motion, weighed with whatever else knows the scale."""
-    tracks, provisional = cleaned.tracks, cleaned.provisional
-    points = map_points_of(inputs, tracks[0].camera)
-    t_pose_ns = _t_pose_interval(inputs, options, bones, cleaned)
-    board = locate_board(inputs, options, cleaned.places)
-    says = stated_verticals(options, board)
-    inputs, known_up, rolls = _resolve_camera_rolls(inputs, bones, cleaned, (t_pose_ns, says), step)
-    priors = {mount.camera: mount for mount in inputs.mounts}
-    samples = take_samples(tracks, provisional, _SAMPLES, known_up, t_pose_ns)
-    calibration = CalibrationGraph(inputs.skeleton, bones, samples, priors, provisional, step)
-    calibration.solve(provisional)
-    calibration.widen_postures()
-    estimate = estimate_scale(calibration, provisional)
-    if calibration.test_hinges():
-        estimate = estimate_scale(calibration, estimate.scale)
-    poses = calibration.poses()
-    path_m = estimate.scale * tracks[0].map_from_cam[:, :3, 3]
-    around = SceneContext(
-        points_m=estimate.scale * points,
-        path_m=path_m,
+    """Estimate mounts, metric scale and vertical.
+
+    Mounts and scale come from the free motion of the body. The scale is combined with its other sources, see
+    ``scale.py``.
+
+    Args:
+        inputs: Skeleton, mount priors, trajectories and map points.
+        options: T-pose, known distance and marker board of the job.
+        bones: The graph's bones.
+        data: Cleaned tracks.
+        step: Called after each iteration; may raise to stop.
+
+    Raises:
+        JobError: The known distance does not exist.
+        EstimationError: The data do not determine the calibration.
+    """
+    tracks, provisional = data.tracks, data.provisional
+    t_pose_ns = _t_pose_interval(inputs.skeleton, options.t_pose_s, bones, data)
+    board = locate_board(inputs.trajectories, inputs.board_views, options.marker_board, data.main_from_gauge)
+    verticals = stated_verticals(options.marker_board, board)
+    inputs, hints, rolls = _resolve_camera_rolls(inputs, bones, data, t_pose_ns, verticals, step)
+    priors = inputs.mount_by_camera()
+    samples = take_samples(tracks, provisional, _SAMPLES, hints.vertical, t_pose_ns)
+    graph = CalibrationGraph(inputs.skeleton, bones, samples, priors, provisional, step)
+    graph.solve(provisional)
+    graph.widen_joint_priors()
+    estimate = estimate_scale(graph, provisional)
+    if graph.test_hinges():
+        estimate = estimate_scale(graph, estimate.scale)
+    poses = graph.poses()
+    scene = SceneContext(
+        points_m=estimate.scale * map_points_of(inputs, tracks[0].camera),
+        path_m=estimate.scale * tracks[0].map_from_cam[:, :3, 3],
         standing_m=standing_height(inputs.skeleton, bones[0].joint),
         walks=not split_side(bones[0].role)[0] and is_mostly_walking(tracks[0].scaled(estimate.scale)),
     )
     up = estimate_vertical(
-        trunk_orientation(inputs.skeleton, bones, poses), around, np.random.default_rng(0), says
+        trunk_orientation(inputs.skeleton, bones, poses), scene, np.random.default_rng(0), verticals
     )
     walking = samples.posture.walking
-    # Who bends down or sits is not as tall as who walks.
-    erect = poses[walking] if walking.sum() >= MIN_WALKING_SAMPLES else poses
-    height = _height_over_floor(inputs, bones, erect, up, (estimate.scale * points, path_m))
-    stated = (known_distance(inputs, options, cleaned.places), board.scale if board else None)
-    known = tuple(source for source in stated if source is not None)
-    sources = _sources(inputs, bones, estimate, height, known)
-    scale, sigma = weighted_mean(sources)
-    if not inputs.skeleton_is_measured and inputs.height_m is None and sources[0].used:
-        sigma = float(np.hypot(sigma, STATURE_SIGMA))
-    if scale != estimate.scale:
-        calibration.solve(scale)
-    bodies = () if inputs.skeleton_is_measured else (_skeleton_error_modes(inputs, bones, samples.cameras),)
-    constant, passing = calibration.spread(sigma, estimate.mount_slope, cleaned.placed, bodies)
+    # Bending down or sitting lowers the trunk, so that only walking gives its height.
+    upright = poses[walking] if walking.sum() >= MIN_WALKING_SAMPLES else poses
+    height_m = _height_over_floor(bones[0], upright, up, scene)
+    distance = known_distance(inputs.trajectories, options.known_distance, data.main_from_gauge)
+    stated = (distance, None if board is None else board.scale)
+    bones_alone = scale_from_bones(
+        estimate, is_measured=inputs.skeleton_is_measured, has_height=inputs.height_m is not None
+    )
+    scale = combine_sources(
+        bones_alone,
+        None if height_m is None else scale_from_floor(bones_alone, height_m, scene.standing_m),
+        [source for source in stated if source is not None],
+    )
+    if scale.metres_per_unit != estimate.scale:
+        graph.solve(scale.metres_per_unit)
+    stature_m = MEAN_HEIGHT_M if inputs.height_m is None else inputs.height_m
+    modes = error_modes(
+        graph,
+        ScaleUncertainty(scale.sigma_log, estimate.mount_slope),
+        data.alignment,
+        None if inputs.skeleton_is_measured else skeleton_error_modes(bones, samples.cameras, stature_m),
+    )
     return BodyCalibration(
         scale=scale,
-        sigma_log=sigma,
-        estimate=estimate,
-        sources=sources,
-        limbs=limb_scales(inputs, tracks, scale, (known_up, t_pose_ns), step),
-        mounts=calibration.solved_mounts(constant),
-        trunk=priors[tracks[0].camera],
-        spread=stack_modes([constant, passing]),
-        up=up,
-        height_over_floor_m=height,
+        bones_alone=estimate,
+        limbs=limb_scales(inputs.skeleton, priors, tracks, scale.metres_per_unit, hints, step),
+        mounts=mounts_with_sigmas(graph, modes.constant),
+        reference_prior=priors[tracks[0].camera],
+        error_modes=modes.stacked(),
+        vertical=up,
+        height_over_floor_m=height_m,
         t_pose_ns=t_pose_ns,
         rolls=rolls,
-        off_hinge_m=calibration.off_hinge_m(),
+        off_hinge_m=graph.hinge_violation_m(),
     )
 
 
-def _skeleton_error_modes(
-    inputs: MergeInputs, bones: Sequence[Bone], cameras: Sequence[str]
-) -> tuple[ErrorModes, ErrorModes]:
-    """How people, and rigs, of one stature differ."""
-    stature_m = MEAN_HEIGHT_M if inputs.height_m is None else inputs.height_m
-    return bone_length_modes(bones, cameras), joint_placement_modes(bones, cameras, stature_m)
+class _ResolvedRolls(NamedTuple):
+    """The inputs with the rolls of all cameras, the known facts of the posture, and the roll searches."""
+
+    inputs: MergeInputs
+    hints: PostureHints
+    searches: tuple[RollSearch, ...]
 
 
 def _resolve_camera_rolls(
     inputs: MergeInputs,
     bones: Sequence[Bone],
-    cleaned: CalibrationInput,
-    known: tuple[tuple[int, int] | None, Sequence[VerticalHypothesis]],
+    data: CalibrationInput,
+    t_pose_ns: tuple[int, int] | None,
+    stated: Sequence[VerticalHypothesis],
     step: Callable[[], None],
-) -> tuple[MergeInputs, FloatArray | None, tuple[RollSearch, ...]]:
-    """The priors with each camera the way up it sits, the vertical where it is known, and what was tried."""
-    t_pose_ns, stated = known
-    roll, found = reference_camera_roll(inputs, bones, cleaned.tracks, cleaned.provisional, stated)
-    up = None if found is None else found.up
-    inputs = with_rolls(inputs, {cleaned.tracks[0].camera: roll})
-    rolls = search_rolls(inputs, cleaned.tracks, cleaned.provisional, (up, t_pose_ns), step)
-    return with_rolls(inputs, {each.camera: each.chosen_deg for each in rolls}), up, rolls
+) -> _ResolvedRolls:
+    """Find the roll of each camera, that of the reference camera first."""
+    roll_deg, found = reference_camera_roll(inputs, bones, data.tracks, data.provisional, stated)
+    hints = PostureHints(vertical=None if found is None else found.up, t_pose_ns=t_pose_ns)
+    inputs = with_rolls(inputs, {data.tracks[0].camera: roll_deg})
+    searches = search_rolls(
+        inputs.skeleton, inputs.mount_by_camera(), data.tracks, data.provisional, hints, step
+    )
+    return _ResolvedRolls(
+        with_rolls(inputs, {search.camera: search.chosen_deg for search in searches}), hints, searches
+    )
 
 
 def reference_camera_roll(
@@ -197,126 +235,121 @@ def reference_camera_roll(
     tracks: Sequence[CameraTrack],
     provisional: float,
     stated: Sequence[VerticalHypothesis],
-) -> tuple[float, Vertical | None]:
-    """Roll (degrees) of the leading camera of a map's tracks, and the vertical where it is known early."""
-    trunk = tracks[0].scaled(provisional)
-    points_m = provisional * map_points_of(inputs, trunk.camera)
-    prior = inputs.mount_of(trunk.camera)
-    ways: dict[float, Vertical] = {}
+) -> ReferenceCameraRoll:
+    """Find the roll of the reference camera, and the vertical if something else than the body gives it.
 
-    def up_of(degrees: float) -> FloatArray | None:
-        found = preliminary_vertical(
-            inputs.skeleton, bones, (trunk, with_roll(prior, degrees)), points_m, stated
+    Args:
+        inputs: Skeleton, mount priors and map points.
+        bones: The graph's bones.
+        tracks: Cleaned tracks of one map, that of the reference camera first.
+        provisional: Approximate scale, metres per map unit.
+        stated: Verticals that the job states.
+    """
+    reference = tracks[0].scaled(provisional)
+    points_m = provisional * map_points_of(inputs, reference.camera)
+    prior = inputs.mount_of(reference.camera)
+    found: dict[float, Vertical] = {}
+
+    def vertical_of(roll_deg: float) -> FloatArray | None:
+        vertical = preliminary_vertical(
+            inputs.skeleton, bones, reference, with_roll(prior, roll_deg), points_m, stated
         )
-        if found is None:
+        if vertical is None:
             return None
-        ways[degrees] = found
-        return found.up
+        found[roll_deg] = vertical
+        return vertical.up
 
-    def own_up(degrees: float) -> FloatArray | None:
-        if split_side(bones[trunk.bone].role)[0]:
+    def trunk_up_of(roll_deg: float) -> FloatArray | None:
+        if split_side(bones[reference.bone].role)[0]:
             return None
-        return trunk_orientation_from_prior(bones, trunk, with_roll(prior, degrees)).upright_up()
+        return trunk_orientation_from_prior(bones, reference, with_roll(prior, roll_deg)).upright_up()
 
-    roll, _ = reference_roll(inputs, tracks, up_of, own_up)
-    return roll, ways.get(roll)
-
-
-def stated_verticals(options: MergeOptions, board: LocatedBoard | None) -> tuple[VerticalHypothesis, ...]:
-    """What the job itself says of up."""
-    if board is None or options.marker_board is None:
-        return ()
-    return board.ups(options.marker_board.placed)
-
-
-def with_rolls(inputs: MergeInputs, degrees: Mapping[str, float]) -> MergeInputs:
-    """The priors with cameras turned about their optical axes."""
-    mounts = tuple(with_roll(mount, degrees.get(mount.camera, 0.0)) for mount in inputs.mounts)
-    return replace(inputs, mounts=mounts)
-
-
-def map_points_of(inputs: MergeInputs, camera: str) -> FloatArray:
-    """Points (P,3) of the map a camera is in, none where it is not known."""
-    gauge_name = next(each.gauge for each in inputs.trajectories if each.camera == camera)
-    return inputs.map_points.get(gauge_name, np.zeros((0, 3)))
-
-
-def _t_pose_interval(
-    inputs: MergeInputs, options: MergeOptions, bones: Sequence[Bone], cleaned: CalibrationInput
-) -> tuple[int, int] | None:
-    """Where a T-pose stands: where the job says, else where one is seen."""
-    if options.t_pose_s is not None:
-        start = min(int(track.times_ns[0]) for track in cleaned.tracks)
-        return (start, start + round(options.t_pose_s * 1e9)) if options.t_pose_s > 0.0 else None
-    return find_t_pose(bones, cleaned.tracks, arm_span(bones, inputs.skeleton) / cleaned.provisional)
+    roll_deg = reference_roll(inputs.mount_by_camera(), tracks, vertical_of, trunk_up_of).roll_deg
+    return ReferenceCameraRoll(roll_deg, found.get(roll_deg))
 
 
 def preliminary_vertical(
     skeleton: SkeletonModel,
     bones: Sequence[Bone],
-    worn: tuple[CameraTrack, Mount],
+    reference: CameraTrack,
+    mount: Mount,
     points_m: FloatArray,
     stated: Sequence[VerticalHypothesis] = (),
 ) -> Vertical | None:
-    """The vertical where the job, planes or the walk tell it, before anything is solved.
+    """Estimate the vertical before the calibration, from the job, the planes of the map, or the walk.
 
-    None from a limb's camera: a swinging arm tells neither the vertical nor the way the body faces.
+    Args:
+        skeleton: The body.
+        bones: The graph's bones.
+        reference: Track of the reference camera, metres.
+        mount: Mount prior of the reference camera.
+        points_m: (P,3) points of its map, metres.
+        stated: Verticals that the job states.
+
+    Returns:
+        The vertical. None if it is ambiguous, or if the reference camera is on a limb: a swinging arm gives
+        neither the vertical nor the direction that the body faces.
     """
-    trunk, prior = worn
-    if split_side(bones[trunk.bone].role)[0]:
+    if split_side(bones[reference.bone].role)[0]:
         return None
-    around = SceneContext(
+    scene = SceneContext(
         points_m=points_m,
-        path_m=trunk.map_from_cam[:, :3, 3],
-        standing_m=standing_height(skeleton, bones[trunk.bone].joint),
+        path_m=reference.map_from_cam[:, :3, 3],
+        standing_m=standing_height(skeleton, bones[reference.bone].joint),
     )
     found = estimate_vertical(
-        trunk_orientation_from_prior(bones, trunk, prior), around, np.random.default_rng(0), stated
+        trunk_orientation_from_prior(bones, reference, mount), scene, np.random.default_rng(0), stated
     )
     return None if found.source == "body" or not found.is_determined() else found
 
 
-def _height_over_floor(
-    inputs: MergeInputs,
-    bones: Sequence[Bone],
-    poses: FloatArray,
-    up: Vertical,
-    around: tuple[FloatArray, FloatArray],
-) -> float | None:
-    """Median height of the trunk's first solved joint over the walked floor, None if none was seen."""
-    points_m, path_m = around
-    if split_side(bones[0].role)[0]:
+def stated_verticals(asked: MarkerBoard | None, board: LocatedBoard | None) -> tuple[VerticalHypothesis, ...]:
+    """Return the verticals that the job states by the marker board.
+
+    Args:
+        asked: The board that the job describes.
+        board: The board in the map.
+    """
+    return () if board is None or asked is None else board.verticals(asked.placed)
+
+
+def with_rolls(inputs: MergeInputs, rolls_deg: Mapping[str, float]) -> MergeInputs:
+    """Return the inputs with the mount priors of these cameras rotated about their optical axes."""
+    mounts = tuple(with_roll(mount, rolls_deg.get(mount.camera, 0.0)) for mount in inputs.mounts)
+    return replace(inputs, mounts=mounts)
+
+
+def map_points_of(inputs: MergeInputs, camera: str) -> FloatArray:
+    """Return the points (P,3) of a camera's map, in its gauge; P is 0 if they are unknown."""
+    gauge = next(each.gauge for each in inputs.trajectories if each.camera == camera)
+    return inputs.map_points.get(gauge, np.zeros((0, 3)))
+
+
+def _t_pose_interval(
+    skeleton: SkeletonModel, stated_s: float | None, bones: Sequence[Bone], data: CalibrationInput
+) -> tuple[int, int] | None:
+    """Return the first and last time of the T-pose that the job states, or else of one that is detected."""
+    if stated_s is not None:
+        start = min(int(track.times_ns[0]) for track in data.tracks)
+        return (start, start + round(stated_s * 1e9)) if stated_s > 0.0 else None
+    return find_t_pose(bones, data.tracks, arm_span(bones, skeleton) / data.provisional)
+
+
+def _height_over_floor(first: Bone, poses: FloatArray, up: Vertical, scene: SceneContext) -> float | None:
+    """Return the median height (m) of the first bone's joint over the floor that the person walks on.
+
+    Args:
+        first: The first bone, that of the reference camera.
+        poses: (K,B,4,4) bone poses while the person walks.
+        up: The vertical.
+        scene: Map points and path.
+
+    Returns:
+        The height; None if no floor was found, or if the reference camera is on a limb.
+    """
+    if split_side(first.role)[0]:
         return None
     height = float(np.median(poses[:, 0, :3, 3] @ up.up))
-    standing = standing_height(inputs.skeleton, bones[0].joint)
-    floor = floor_beside_path(points_m, path_m, up, height - WALKING_HEIGHT_RATIO * standing, standing)
+    expected = height - WALKING_HEIGHT_RATIO * scene.standing_m
+    floor = floor_beside_path(scene.points_m, scene.path_m, up, expected, scene.standing_m)
     return None if floor is None else height - floor.height_m
-
-
-def _sources(
-    inputs: MergeInputs,
-    bones: Sequence[Bone],
-    estimate: ScaleEstimate,
-    height_m: float | None,
-    known: Sequence[ScaleSource],
-) -> tuple[ScaleSource, ...]:
-    """The bones, the floor, and what was measured (a distance, a board), which overrules the others."""
-    name, spread = "skeleton", 0.0
-    if not inputs.skeleton_is_measured:
-        name, spread = "height" if inputs.height_m is not None else "mean stature", PROPORTION_SIGMA
-    body = ScaleSource(
-        name=name,
-        scale=estimate.scale,
-        sigma_log=float(np.hypot(estimate.sigma_log, spread)),
-        used=not known,
-    )
-    out = [body]
-    if height_m is not None:
-        standing = standing_height(inputs.skeleton, bones[0].joint)
-        floor = scale_from_floor(body, height_m, standing)
-        out.append(
-            floor
-            if not known
-            else ScaleSource(name="floor", scale=floor.scale, sigma_log=floor.sigma_log, used=False)
-        )
-    return (*out, *known)

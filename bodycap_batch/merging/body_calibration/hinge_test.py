@@ -1,11 +1,11 @@
-"""Hinges that the motion does not keep to: found where cameras on both sides contradict them, and loosened.
+"""Test whether the motion keeps to the hinges of the skeleton, and loosen those that it violates.
 
-No elbow is a perfect hinge, a rig's may be none at all, and a strap that slides looks like one that bends
-sideways. Held to a centimetre, such a hinge bends mounts and scale instead, and hides in them: how far it
-gives shows only where it is let go.
+No elbow is a perfect hinge, the joint may be no hinge in a rig, and a sliding strap looks like sideways
+bending. If such a hinge is held to a centimetre, mounts and scale absorb its violation and hide it. The
+violation can be measured only if the hinge is free.
 
 Source: variance components by redundancy, W. Foerstner, "Ein Verfahren zur Schaetzung von Varianz- und
-Kovarianzkomponenten", AVN 1979; one component a hinge.
+Kovarianzkomponenten", AVN 1979. Each hinge has one component.
 """
 
 from __future__ import annotations
@@ -18,22 +18,26 @@ import numpy as np
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.merging.body.bones import JOINT_SLACK_M, Bone, Hinge
 from bodycap_batch.merging.body_calibration.mount_covariance import LinearisedCalibration
-from bodycap_batch.merging.graph.error_modes import BodyModel
 from bodycap_batch.merging.graph.factors import HINGE_SLACK_RATIO
 
 FREE_SIGMA_M = 0.1
-"""Sigma of the distances of a hinge that is let go: ten times that of one that holds."""
+"""Sigma of the distances of a freed hinge, metres: ten times that of a tight one. Evidence: none."""
 TIGHT_SIGMA_M = HINGE_SLACK_RATIO * JOINT_SLACK_M
+"""Sigma of the distances of a hinge that the motion keeps to, metres."""
 _MIN_VARIANCE_RATIO = 1.5
-"""Times the variance of a hinge that is kept to, beyond which it gives. Let go, distances are off by 3 to 6
-mm where elbows are hinges, by 14 and 24 mm where they turn by 6 and 12 degrees about another axis, too."""
+"""Minimum variance of a violated hinge's distances, over that of a tight hinge.
+
+Evidence: docs/decisions/body_calibration.md.
+"""
 
 
 def observable_hinges(hinges: Sequence[Hinge], measured: Collection[int]) -> list[Hinge]:
-    """Hinges with a camera on the bone above and on one of the two below: only they can be contradicted.
+    """Return the hinges with a camera on the bone above and on one of the two bones below.
+
+    Only these can be contradicted by measurements.
 
     Args:
-        hinges: Of the body.
+        hinges: Hinges of the body.
         measured: Bones that carry cameras.
     """
     return [
@@ -43,35 +47,45 @@ def observable_hinges(hinges: Sequence[Hinge], measured: Collection[int]) -> lis
     ]
 
 
-def hinge_violation_sigma(mounts: LinearisedCalibration) -> dict[int, float]:
-    """By lower bone, sigma by which distances leave a hinge that was let go, beyond `TIGHT_SIGMA_M`; 0 where not.
+def hinge_violation_sigma(linearised: LinearisedCalibration) -> dict[int, float]:
+    """Return by lower bone how far the distances of a freed hinge vary beyond `TIGHT_SIGMA_M`.
 
     Args:
-        mounts: A calibration at its solution.
+        linearised: A calibration at its solution. Hinges that are not free are left out.
+
+    Returns:
+        Sigmas in metres; 0 if the motion keeps to the hinge.
     """
-    out, solved = {}, mounts.eliminated()
-    for number, hinge in enumerate(mounts.body.hinges):
+    out, reduced = {}, linearised.reduced()
+    for number, hinge in enumerate(linearised.body.hinges):
         if hinge.sigma_m < FREE_SIGMA_M:
             continue
-        rows = mounts.linear.first_row[_hinge_factors(mounts.body, number, mounts)]
-        residuals = float((mounts.linear.rhs[rows] ** 2).sum())
-        redundancy = max(float(solved.redundancy[rows].sum()), 1.0)
-        variance = hinge.sigma_m**2 * residuals / redundancy
-        gives = variance > _MIN_VARIANCE_RATIO * TIGHT_SIGMA_M**2
-        out[hinge.lower] = float(np.sqrt(variance - TIGHT_SIGMA_M**2)) if gives else 0.0
+        rows = linearised.linear.first_row[_hinge_factors(linearised, number)]
+        squares = float((linearised.linear.rhs[rows] ** 2).sum())
+        redundancy = max(float(reduced.redundancy[rows].sum()), 1.0)
+        variance = hinge.sigma_m**2 * squares / redundancy
+        is_violated = variance > _MIN_VARIANCE_RATIO * TIGHT_SIGMA_M**2
+        out[hinge.lower] = float(np.sqrt(variance - TIGHT_SIGMA_M**2)) if is_violated else 0.0
     return out
 
 
 def with_hinge_slack(bones: Sequence[Bone], off_hinge_m: Mapping[int, float]) -> tuple[Bone, ...]:
-    """Bones whose hinges give by so much, the others as they are."""
+    """Return the bones with other sigmas of their hinges.
+
+    Args:
+        bones: The graph's bones.
+        off_hinge_m: By bone, sigma in metres by which its far end may leave the hinge's plane. Other bones
+            stay as they are.
+    """
     return tuple(
         replace(bone, off_hinge_m=off_hinge_m[index]) if index in off_hinge_m else bone
         for index, bone in enumerate(bones)
     )
 
 
-def _hinge_factors(body: BodyModel, number: int, mounts: LinearisedCalibration) -> IntArray:
-    """Indices of one hinge's two distances at every tick."""
-    ticks = np.arange(len(mounts.world_from_bone))
-    first = mounts.first_joint + sum(bone.parent >= 0 for bone in body.bones) + 2 * number
-    return np.asarray((first + body.factors_per_tick * ticks[:, None] + np.arange(2)).ravel())
+def _hinge_factors(linearised: LinearisedCalibration, number: int) -> IntArray:
+    """Return the indices of one hinge's two distance factors at every tick."""
+    ticks = np.arange(len(linearised.world_from_bone))
+    joints = sum(bone.parent >= 0 for bone in linearised.body.bones)
+    first = linearised.first_joint_factor + joints + 2 * number
+    return np.asarray((first + linearised.body.factors_per_tick * ticks[:, None] + np.arange(2)).ravel())

@@ -1,85 +1,99 @@
-"""A distance the job states: how far a camera went between two of its frames, or two cameras were apart."""
+"""Metric scale from a distance that the job states: between two frames of one camera or of two cameras."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from bodycap_batch.config.options import MergeOptions
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import EstimationError, JobError
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.merging.cameras.track import MIN_SIGMA_M
 from bodycap_batch.model.geometry import Similarity
-from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.scene import Trajectory
 
 _FIELD = "merge.known_distance"
 _MIN_SIGMA = 0.003
-"""Nobody measures the way between two lenses better than to a few millimetres a metre."""
+"""Relative sigma of a measured distance between two lenses: a few millimetres per metre. Evidence: none."""
+_MIN_SIGNAL_TO_NOISE = 10.0
+"""Minimum distance between the two camera centres, in sigmas of that distance. Evidence: none."""
 
 
 def known_distance(
-    inputs: MergeInputs, options: MergeOptions, places: Mapping[str, Similarity] | None = None
+    trajectories: Sequence[Trajectory],
+    stated: tuple[str, str, float] | None,
+    main_from_gauge: Mapping[str, Similarity] | None = None,
 ) -> ScaleSource | None:
-    """The scale from the job's known distance, None where it states none.
+    """Return the scale from the distance that the job states; None if it states none.
 
     Args:
-        inputs: The trajectories, each in its own map's gauge.
-        options: ``known_distance``.
-        places: By gauge, where each used map lies in the main one; None where all are in one map.
+        trajectories: The cameras' trajectories, each in its own map's gauge.
+        stated: Two frames as ``camera:frame``, and the metres between their camera centres.
+        main_from_gauge: By gauge, similarity from each used map to the main one. None if all cameras are in
+            one map.
 
     Raises:
-        JobError: It names a camera or frame that is not there, or the two cameras share no map.
-        EstimationError: One of the frames was not localised, or both are at the same place, or in a map that
-            was not placed in the main one.
+        JobError: A camera or frame does not exist, or the two cameras share no map.
+        EstimationError: A frame was not localised, both centres are too near to each other, or their map was
+            not aligned to the main one.
     """
-    if options.known_distance is None:
+    if stated is None:
         return None
-    first, second, metres = options.known_distance
-    ends = [_find_frame(inputs, name) for name in (first, second)]
-    if ends[0][0].gauge != ends[1][0].gauge:
+    first, second, metres = stated
+    ends = [_find_frame(trajectories, name) for name in (first, second)]
+    gauge = ends[0].gauge
+    if ends[1].gauge != gauge:
         raise JobError(
             f"{first} and {second} are in maps that share no view",
             field=_FIELD,
             hint="name two frames of one camera",
         )
-    gauge = ends[0][0].gauge
-    if places is not None and gauge not in places:
+    if main_from_gauge is not None and gauge not in main_from_gauge:
         raise EstimationError(
             f"{first} and {second} are in map {gauge}, which the body cannot place",
-            hint="name two frames of a camera that is used; metrics.json tells which are not",
+            hint="name two frames of a camera that is used; metrics.json lists the unused ones",
         )
-    unit = 1.0 if places is None else places[gauge].scale
-    centres = [trajectory.gauge_from_cam[index, :3, 3] for trajectory, index in ends]
-    variance = sum(float(np.trace(trajectory.covariance[index, 3:, 3:])) / 3.0 for trajectory, index in ends)
-    apart = float(np.linalg.norm(centres[1] - centres[0]))
-    if apart**2 <= 100.0 * variance:
+    unit = 1.0 if main_from_gauge is None else main_from_gauge[gauge].scale
+    variance = sum(end.centre_variance for end in ends)
+    distance = float(np.linalg.norm(ends[1].centre - ends[0].centre))
+    if distance**2 <= _MIN_SIGNAL_TO_NOISE**2 * variance:
         raise EstimationError(
-            f"{first} and {second} are too near to each other: {np.sqrt(variance) / max(apart, 1e-12):.0%} "
-            "of their distance is uncertain",
+            f"{first} and {second} are too near to each other: "
+            f"{np.sqrt(variance) / max(distance, 1e-12):.0%} of their distance is uncertain",
             hint="name two frames that are farther apart",
         )
-    sigma = np.sqrt(variance / apart**2 + 2.0 * (MIN_SIGMA_M / metres) ** 2 + _MIN_SIGMA**2)
-    return ScaleSource(name="known distance", scale=metres / (unit * apart), sigma_log=float(sigma))
+    sigma = np.sqrt(variance / distance**2 + 2.0 * (MIN_SIGMA_M / metres) ** 2 + _MIN_SIGMA**2)
+    return ScaleSource(name="known distance", scale=metres / (unit * distance), sigma_log=float(sigma))
 
 
-def _find_frame(inputs: MergeInputs, name: str) -> tuple[Trajectory, int]:
-    """Trajectory and row of ``camera:frame``."""
+class _End(NamedTuple):
+    """One end of the distance: the map, the centre (3,) and its variance per axis, in the map's gauge."""
+
+    gauge: str
+    centre: FloatArray
+    centre_variance: float
+
+
+def _find_frame(trajectories: Sequence[Trajectory], name: str) -> _End:
+    """Find the camera centre of ``camera:frame``."""
     camera, _, number = name.rpartition(":")
-    found = next((each for each in inputs.trajectories if each.camera == camera), None)
+    found = next((each for each in trajectories if each.camera == camera), None)
     if found is None:
         raise JobError(
             f"there is no camera {camera!r}",
             field=_FIELD,
-            hint=f"cameras: {', '.join(each.camera for each in inputs.trajectories)}",
+            hint=f"cameras: {', '.join(each.camera for each in trajectories)}",
         )
     rows = np.flatnonzero(found.frame_numbers == int(number))
     if not len(rows):
         raise JobError(f"{camera} has no frame {number}", field=_FIELD, hint="frames are counted from 0")
-    if not found.localised[rows[0]]:
+    row = int(rows[0])
+    if not found.localised[row]:
         raise EstimationError(
-            f"frame {name} of the known distance was not localised: {found.status[rows[0]].name}",
-            hint="name another frame; frames.csv tells which were",
+            f"frame {name} of the known distance was not localised: {found.status[row].name}",
+            hint="name another frame; frames.csv lists the localised ones",
         )
-    return found, int(rows[0])
+    variance = float(np.trace(found.covariance[row, 3:, 3:])) / 3.0
+    return _End(found.gauge, found.gauge_from_cam[row, :3, 3], variance)

@@ -1,24 +1,27 @@
-"""Each limb on its own: the scale at which it fits, as a check of the bones against each other."""
+"""Estimate the scale of each limb alone. This is a diagnostic: it shows whether the bones fit each other."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
-from bodycap_batch.merging.body_calibration.samples import take_samples
+from bodycap_batch.merging.body_calibration.samples import (
+    MIN_COMMON_FRAMES,
+    PostureHints,
+    count_common_frames,
+    sample_subset,
+)
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
-from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack
-from bodycap_batch.model.merge_data import MergeInputs
+from bodycap_batch.merging.cameras.track import CameraTrack
+from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import split_side
 
 _LOG_SCALE_STEP = 0.1
+"""Distance of the three scales at which a limb is calibrated, in log scale. Evidence: none."""
 _SAMPLES = 40
-_ENOUGH_TOGETHER = 15
+"""Samples of a limb's calibration: half of those of the whole body. Evidence: none."""
 _LIMB_OF_PART = {
     **dict.fromkeys(("Shoulder", "Arm", "ForeArm", "Hand"), "arm"),
     **dict.fromkeys(("UpLeg", "Leg", "Foot", "ToeBase"), "leg"),
@@ -27,63 +30,55 @@ _LIMB_OF_PART = {
 
 
 def limb_scales(
-    inputs: MergeInputs,
+    skeleton: SkeletonModel,
+    mounts: Mapping[str, Mount],
     tracks: Sequence[CameraTrack],
     scale: float,
-    known: tuple[FloatArray | None, tuple[int, int] | None],
+    hints: PostureHints,
     step: Callable[[], None],
 ) -> tuple[ScaleSource, ...]:
-    """Scale from the trunk's camera and each limb's alone, by a parabola through three costs.
+    """Estimate the scale from the reference camera and the cameras of one limb, for each limb.
+
+    This is a diagnostic only: the report shows these scales, and nothing else uses them. It costs three
+    solutions of a small calibration graph per limb.
 
     Args:
-        inputs: The body and its mounts' priors.
-        tracks: Cleaned tracks, the trunk's first.
+        skeleton: The body.
+        mounts: By camera, its mount prior.
+        tracks: Cleaned tracks, that of the reference camera first.
         scale: The scale of the whole body, metres per map unit.
-        known: The vertical in the map, and from when to when a T-pose stands, where known.
+        hints: What is known of the posture.
         step: Called after each iteration; may raise to stop.
 
     Returns:
-        One a limb, fewer where a limb's own cost does not curve; empty for a single limb.
+        One source per limb. A limb is left out if its cost has no minimum. Empty if fewer than two limbs have
+        cameras.
     """
     limbs: dict[str, list[CameraTrack]] = {}
     for track in tracks[1:]:
-        side, part = split_side(inputs.mount_of(track.camera).role)
-        if part in _LIMB_OF_PART and _common_frames(tracks[0], track) >= _ENOUGH_TOGETHER:
+        side, part = split_side(mounts[track.camera].role)
+        if part in _LIMB_OF_PART and count_common_frames(tracks[0], track) >= MIN_COMMON_FRAMES:
             limbs.setdefault(f"{side.lower()} {_LIMB_OF_PART[part]}".strip(), []).append(track)
     if len(limbs) < 2:
         return ()
-    found = [
-        _scale_of_limb(name, inputs, [tracks[0], *own], (scale, *known), step)
-        for name, own in sorted(limbs.items())
-    ]
-    return tuple(each for each in found if each is not None)
+    found = []
+    for name, own in sorted(limbs.items()):
+        subset = sample_subset(skeleton, mounts, [tracks[0], *own], scale, _SAMPLES, hints)
+        graph = CalibrationGraph(skeleton, subset.bones, subset.samples, mounts, scale, step)
+        found.append(_scale_of_limb(name, graph, scale))
+    return tuple(source for source in found if source is not None)
 
 
-def _common_frames(trunk: CameraTrack, track: CameraTrack) -> int:
-    return int(track.poses_at(trunk.times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS)[1].sum())
-
-
-def _scale_of_limb(
-    name: str,
-    inputs: MergeInputs,
-    tracks: Sequence[CameraTrack],
-    known: tuple[float, FloatArray | None, tuple[int, int] | None],
-    step: Callable[[], None],
-) -> ScaleSource | None:
-    scale, up, t_pose_ns = known
-    roles = [inputs.mount_of(track.camera).role for track in tracks]
-    bones = kinematic_chain(inputs.skeleton, roles)
-    index = {bone.role: position for position, bone in enumerate(bones)}
-    own = [replace(track, bone=index[role]) for track, role in zip(tracks, roles, strict=True)]
-    samples = take_samples(own, scale, _SAMPLES, up, t_pose_ns)
-    priors = {mount.camera: mount for mount in inputs.mounts}
-    calibration = CalibrationGraph(inputs.skeleton, bones, samples, priors, scale, step)
-    middle = calibration.solve(scale)
-    low, high = (calibration.solve(scale * float(np.exp(sign * _LOG_SCALE_STEP))) for sign in (-1.0, 1.0))
-    bend = low + high - 2.0 * middle
-    if bend <= 0.0:
+def _scale_of_limb(name: str, graph: CalibrationGraph, scale: float) -> ScaleSource | None:
+    """Return the minimum of a parabola through the costs of three scales; None if it has none."""
+    middle = graph.solve(scale)
+    low, high = (graph.solve(scale * float(np.exp(sign * _LOG_SCALE_STEP))) for sign in (-1.0, 1.0))
+    curvature = low + high - 2.0 * middle
+    if curvature <= 0.0:
         return None
-    offset = 0.5 * _LOG_SCALE_STEP * (low - high) / bend
+    offset = 0.5 * _LOG_SCALE_STEP * (low - high) / curvature
     return ScaleSource(
-        name=name, scale=scale * float(np.exp(offset)), sigma_log=float(_LOG_SCALE_STEP / np.sqrt(bend))
+        name=name,
+        scale=scale * float(np.exp(offset)),
+        sigma_log=float(_LOG_SCALE_STEP / np.sqrt(curvature)),
     )

@@ -1,4 +1,4 @@
-"""Metric scale, and up, from a board of known squares that keyframes saw in the room."""
+"""Metric scale and vertical from a marker board of known size that keyframes see in the room."""
 
 from __future__ import annotations
 
@@ -9,43 +9,48 @@ from typing import Literal
 
 import numpy as np
 
-from bodycap_batch.config.options import MergeOptions
+from bodycap_batch.config.options import MarkerBoard
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body_calibration.samples import MAP_ERROR_DURATION_S, MAP_ERROR_M
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.merging.world.vertical import VerticalHypothesis
-from bodycap_batch.model.geometry import Similarity, invert, so3_exp, so3_log
-from bodycap_batch.model.merge_data import BoardView, MergeInputs
+from bodycap_batch.model.geometry import Similarity, invert, nearest_rotation, so3_exp, so3_log
+from bodycap_batch.model.merge_data import BoardView
+from bodycap_batch.model.scene import Trajectory
 
 SOURCE_NAME = "marker board"
 _MIN_VIEWS = 3
-"""Two views always agree on a board's size; the third tells whether they are right."""
+"""Minimum number of views: two always agree on a board's size, the third one checks them."""
 _MIN_SIGMA = 0.003
-"""Printers and rulers: a millimetre in 30 cm."""
+"""Minimum sigma of the log of the scale: printers and rulers are off by a millimetre in 30 cm."""
 _MAX_SIGMA = 0.05
-"""Beyond this the body's own proportions know the scale as well (a height alone: 4 %)."""
+"""Maximum sigma of the log of the scale. The body alone gives 4 % from a height."""
 _REWEIGHTINGS = 3
-"""Times the loss's width is taken from the residuals anew: the third changes it by less than a tenth."""
+"""Number of fits, each with the width of the loss from the residuals of the last one.
+
+The third fit changes the result by less than a tenth of its sigma.
+"""
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+"""Half a turn about the board's normal."""
 _PLACED_SIGMA_DEG = 1.5
-"""A board hung by eye; a level floor or table is off by less."""
+"""Sigma of the vertical from a board that was hung by eye, degrees. Floors and tables are more exact."""
 
 
 @dataclass(frozen=True, slots=True)
 class LocatedBoard:
-    """The marker board in the room.
+    """The marker board in the map.
 
     Attributes:
-        scale: What it says of the scale.
-        axes: (3,3) its two edges and its normal, towards the cameras, as columns in the tracks' gauge.
+        scale: The scale from the board.
+        axes: (3,3) its two edges and its normal (towards the cameras), as columns in the main map's gauge.
     """
 
     scale: ScaleSource
     axes: FloatArray
 
-    def ups(self, placed: Literal["lying", "hanging"] | None) -> tuple[VerticalHypothesis, ...]:
-        """What it says of up: its normal where it lies, any of its edges where it hangs."""
+    def verticals(self, placed: Literal["lying", "hanging"] | None) -> tuple[VerticalHypothesis, ...]:
+        """Return the possible verticals: a lying board's normal, each edge direction of a hanging one."""
         if placed is None:
             return ()
         edges = [sign * self.axes[:, axis] for axis in (0, 1) for sign in (1.0, -1.0)]
@@ -55,15 +60,15 @@ class LocatedBoard:
 
 @dataclass(frozen=True, slots=True)
 class _BoardObservations:
-    """Views of one board in one map.
+    """The views of the board in one map.
 
     Attributes:
-        map_from_cam: (V,4,4).
-        cam_from_board: (V,4,4) metres, each view's own.
-        view: (N,) which view each corner belongs to.
-        board_m: (N,3) corners about the board's middle.
-        rays: (N,2) where they were seen, at depth 1.
-        group: (V,) views that share their map's error.
+        map_from_cam: (V,4,4) pose of each view.
+        cam_from_board: (V,4,4) pose of the board from each view alone, metres.
+        view: (N,) index of each corner's view.
+        board_m: (N,3) corners relative to the middle of the board.
+        rays: (N,2) observations of the corners, undistorted, at depth 1.
+        group: (V,) number of the group that shares an error of the map.
     """
 
     map_from_cam: FloatArray
@@ -75,99 +80,116 @@ class _BoardObservations:
 
 
 def locate_board(
-    inputs: MergeInputs, options: MergeOptions, places: Mapping[str, Similarity] | None = None
+    trajectories: Sequence[Trajectory],
+    views: Sequence[BoardView],
+    board: MarkerBoard | None,
+    main_from_gauge: Mapping[str, Similarity] | None = None,
 ) -> LocatedBoard | None:
-    """The scale and the way up from the job's marker board, None where it names none.
+    """Locate the job's marker board in the map; None if the job names none.
 
-    The board's place, orientation and size in the map are fitted to its corners in all keyframes at once, by
-    reprojection, with the keyframes' poses held; how well that is known is the jackknife's spread over
-    stretches of a second of a camera, whose poses are off together; of few stretches, which hide how far they
-    are off, at least what maps are known to bend over the way.
+    The board's position, orientation and size in the map are fitted to its corners in all keyframes, by
+    reprojection. The keyframe poses are fixed. The uncertainty is that of a jackknife over groups of views. A
+    group holds the views of one camera in one second, because their poses share an error. A few groups cannot
+    show this error. The uncertainty is therefore at least what the usual bends of a map cause over the path.
 
     Args:
-        inputs: ``board``, and the trajectories the keyframes belong to.
-        options: ``marker_board``.
-        places: By gauge, the main one first, where each used map lies in it; None where all are in one map.
+        trajectories: The trajectories of the keyframes.
+        views: The views of the board.
+        board: The board that the job describes.
+        main_from_gauge: By gauge, the main one first, similarity from each used map to the main one. None if
+            all cameras are in one map.
 
     Raises:
-        EstimationError: It was not found, or in too few keyframes, or only from one place.
+        EstimationError: The board was found in too few keyframes, or all of them are near to each other.
 
     Source: B. Efron, C. Stein, "The jackknife estimate of variance", Annals of Statistics 1981.
     """
-    if options.marker_board is None:
+    if board is None:
         return None
-    gauge, seen = _select_observations(inputs, places, turns=options.marker_board.kind == "chessboard")
-    start = _initial_fit(seen)
-    found, weight = _fit(seen, start)
-    sigma = float(
-        np.hypot(max(_jackknife_sigma(seen, found, weight), _map_bend_sigma(seen, found)), _MIN_SIGMA)
+    gauge, seen = _select_observations(
+        trajectories, views, main_from_gauge, has_half_turns=board.kind == "chessboard"
     )
+    found, weight = _fit(seen, _initial_fit(seen))
+    spread = max(_jackknife_sigma(seen, found, weight), _map_bend_sigma(seen, found))
+    sigma = float(np.hypot(spread, _MIN_SIGMA))
     if not sigma < _MAX_SIGMA:
         raise EstimationError(
-            f"the marker board tells the scale to {sigma:.0%} only: its {len(seen.map_from_cam)} views are "
+            f"the marker board gives the scale to {sigma:.0%} only: its {len(seen.map_from_cam)} views are "
             "from nearly the same place, or their poses contradict each other",
             hint="walk past it, so that it is seen from several sides; or leave merge.marker_board out",
         )
-    unit, turn = (1.0, np.eye(3)) if places is None else (places[gauge].scale, places[gauge].rotation)
+    unit, turn = 1.0, np.eye(3)
+    if main_from_gauge is not None:
+        unit, turn = main_from_gauge[gauge].scale, main_from_gauge[gauge].rotation
     axes = so3_exp(found[None, :3])[0]
-    # Whichever way the detector's normal points, a board is seen from its front.
+    # Detectors disagree on the sign of the normal, but a board is always seen from its front.
     axes[:, 2] *= np.sign((seen.map_from_cam[:, :3, 3] - found[3:6]).mean(axis=0) @ axes[:, 2])
     scale = ScaleSource(name=SOURCE_NAME, scale=float(np.exp(-found[6])) / unit, sigma_log=sigma)
     return LocatedBoard(scale, turn @ axes)
 
 
 def _select_observations(
-    inputs: MergeInputs, places: Mapping[str, Similarity] | None, *, turns: bool
+    trajectories: Sequence[Trajectory],
+    views: Sequence[BoardView],
+    main_from_gauge: Mapping[str, Similarity] | None,
+    *,
+    has_half_turns: bool,
 ) -> tuple[str, _BoardObservations]:
-    """The views of the main map; of the map that has most where the main one has too few."""
-    paths = {each.camera: each for each in inputs.trajectories}
+    """Select the views in the main map, or in the map that has most of them if the main one has too few.
+
+    Returns:
+        The gauge of the map, and the observations.
+    """
+    paths = {each.camera: each for each in trajectories}
     by_gauge: dict[str, list[BoardView]] = {}
-    for view in inputs.board:
+    for view in views:
         path = paths[view.camera]
-        if path.localised[view.frame] and (places is None or path.gauge in places):
+        if path.localised[view.frame] and (main_from_gauge is None or path.gauge in main_from_gauge):
             by_gauge.setdefault(path.gauge, []).append(view)
-    gauge, views = max(by_gauge.items(), key=lambda item: len(item[1]), default=("", []))
-    main = next(iter(places or {}), gauge)
+    gauge, selected = max(by_gauge.items(), key=lambda item: len(item[1]), default=("", []))
+    main = next(iter(main_from_gauge or {}), gauge)
     if len(by_gauge.get(main, [])) >= _MIN_VIEWS:
-        gauge, views = main, by_gauge[main]  # a joined map's own scale is known less well
-    if len(views) < _MIN_VIEWS:
+        gauge, selected = main, by_gauge[main]  # the scale of an aligned map is less certain
+    if len(selected) < _MIN_VIEWS:
         raise EstimationError(
-            f"the marker board was found in {len(views)} keyframes of one map, {_MIN_VIEWS} are needed",
+            f"the marker board was found in {len(selected)} keyframes of one map, {_MIN_VIEWS} are needed",
             hint="is merge.marker_board the board that was filmed (kind, columns, rows, dictionary, legacy)? "
             "It has to be sharp, whole (a chessboard) and near: its squares 10 px and more",
         )
-    stretch = round(1e9 * MAP_ERROR_DURATION_S)
-    shared = [f"{v.camera} {int(paths[v.camera].times_ns[v.frame]) // stretch}" for v in views]
+    duration_ns = round(1e9 * MAP_ERROR_DURATION_S)
+    shared = [f"{v.camera} {int(paths[v.camera].times_ns[v.frame]) // duration_ns}" for v in selected]
     _, group = np.unique(shared, return_inverse=True)
-    map_from_cam = np.array([paths[v.camera].gauge_from_cam[v.frame] for v in views])
-    return gauge, _with_one_orientation(views, map_from_cam, group, turns=turns)
+    map_from_cam = np.array([paths[v.camera].gauge_from_cam[v.frame] for v in selected])
+    return gauge, _with_one_orientation(selected, map_from_cam, group, has_half_turns=has_half_turns)
 
 
 def _with_one_orientation(
-    views: Sequence[BoardView], map_from_cam: FloatArray, group: IntArray, *, turns: bool
+    views: Sequence[BoardView], map_from_cam: FloatArray, group: IntArray, *, has_half_turns: bool
 ) -> _BoardObservations:
-    """Views with corners about the board's middle, all the same way round.
+    """Return the views with corners relative to the middle of the board, in one orientation.
 
-    Half a turn maps many a chessboard onto itself (`turns`): its detector may begin at either end. A ChArUco
-    board's markers have numbers: a view half a turn off is wrong.
+    Half a turn maps many chessboards onto themselves, so that a detector may start at either end
+    (`has_half_turns`). The markers of a ChArUco board have numbers; a view of it that is half a turn off is
+    wrong.
     """
     corners = np.concatenate([view.board_m for view in views])
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-    placed, board = [], []
+    poses, board = [], []
     first = map_from_cam[0] @ views[0].cam_from_board
     for view, pose in zip(views, map_from_cam, strict=True):
         own = view.cam_from_board.copy()
         own[:3, 3] += own[:3, :3] @ middle
         flip = np.eye(3)
-        if turns and float(np.trace(first[:3, :3].T @ (pose @ own)[:3, :3])) < 1.0:  # more than a right angle
+        # A trace below 1 is a rotation by more than a right angle.
+        if has_half_turns and float(np.trace(first[:3, :3].T @ (pose @ own)[:3, :3])) < 1.0:
             flip = _HALF_TURN
         own[:3, :3] = own[:3, :3] @ flip
-        placed.append(own)
+        poses.append(own)
         board.append((view.board_m - middle) @ flip)
     counts = [len(view.rays) for view in views]
     return _BoardObservations(
         map_from_cam=map_from_cam,
-        cam_from_board=np.array(placed),
+        cam_from_board=np.array(poses),
         view=np.repeat(np.arange(len(views)), counts),
         board_m=np.concatenate(board),
         rays=np.concatenate([view.rays for view in views]),
@@ -176,69 +198,75 @@ def _with_one_orientation(
 
 
 def _initial_fit(seen: _BoardObservations) -> FloatArray:
-    """Rotation vector, place and log of the size (7,): each view alone has the board's middle in metres."""
+    """Return the rotation vector, the position and the log of the size (7,) of the board in the map.
+
+    The size is in map units per metre. Each view alone gives the middle of the board in metres.
+    """
     rotation = seen.map_from_cam[:, :3, :3]
-    u, _, vt = np.linalg.svd((rotation @ seen.cam_from_board[:, :3, :3]).sum(axis=0))
-    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    turn = nearest_rotation((rotation @ seen.cam_from_board[:, :3, :3]).sum(axis=0))
     ray = np.einsum("vij,vj->vi", rotation, seen.cam_from_board[:, :3, 3])
     centre = seen.map_from_cam[:, :3, 3]
-    # centre + size · ray = place, for every view; the middle is taken out of both sides.
-    moved, apart = ray - ray.mean(axis=0), centre - centre.mean(axis=0)
-    size = -float((moved * apart).sum()) / max(float((moved**2).sum()), 1e-12)
+    # For every view, centre + size · ray = position. The mean is subtracted from both sides.
+    ray_off, centre_off = ray - ray.mean(axis=0), centre - centre.mean(axis=0)
+    size = -float((ray_off * centre_off).sum()) / max(float((ray_off**2).sum()), 1e-12)
     if size <= 0.0:
-        extent = float(np.linalg.norm(apart, axis=1).max())
+        extent = float(np.linalg.norm(centre_off, axis=1).max())
         size = max(extent, 1e-9) / max(float(np.linalg.norm(ray, axis=1).mean()), 1e-9)
-    place = (centre + size * ray).mean(axis=0)
-    return np.concatenate([so3_log(turn[None])[0], place, [np.log(size)]])
+    position = (centre + size * ray).mean(axis=0)
+    return np.concatenate([so3_log(turn[None])[0], position, [np.log(size)]])
 
 
-def _residuals(seen: _BoardObservations, value: FloatArray) -> FloatArray:
-    """(2N,) where the corners are seen less where they should be, at depth 1."""
-    placed = np.exp(value[6]) * seen.board_m @ so3_exp(value[None, :3])[0].T + value[3:6]
-    back = invert(seen.map_from_cam)[seen.view]
-    x_in_cam = np.einsum("nij,nj->ni", back[:, :3, :3], placed) + back[:, :3, 3]
+def _residuals(seen: _BoardObservations, fit: FloatArray) -> FloatArray:
+    """Return the predicted minus the observed corners (2N,), at depth 1."""
+    x_in_map = np.exp(fit[6]) * seen.board_m @ so3_exp(fit[None, :3])[0].T + fit[3:6]
+    cam_from_map = invert(seen.map_from_cam)[seen.view]
+    x_in_cam = np.einsum("nij,nj->ni", cam_from_map[:, :3, :3], x_in_map) + cam_from_map[:, :3, 3]
     depth = np.maximum(x_in_cam[:, 2:], 1e-6)
     return np.asarray((x_in_cam[:, :2] / depth - seen.rays).ravel())
 
 
 def _fit(seen: _BoardObservations, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The fit (7,) under Cauchy's loss at the views' own spread, and each residual's weight (2N,)."""
+    """Return the fit (7,) under Cauchy's loss, and the weight of each residual (2N,).
+
+    The width of the loss is twice the standard deviation of the residuals, from their median.
+    """
     from scipy.optimize import least_squares
 
-    value, limit = start, 1.0
+    fit, width = start, 1.0
     for _ in range(_REWEIGHTINGS):
-        limit = 2.0 * 1.4826 * float(np.median(np.abs(_residuals(seen, value)))) + 1e-9
-        value = least_squares(partial(_residuals, seen), value, loss="cauchy", f_scale=limit, x_scale="jac").x
-    return np.asarray(value), 1.0 / (1.0 + (_residuals(seen, value) / limit) ** 2)
+        width = 2.0 * 1.4826 * float(np.median(np.abs(_residuals(seen, fit)))) + 1e-9
+        fit = least_squares(partial(_residuals, seen), fit, loss="cauchy", f_scale=width, x_scale="jac").x
+    return np.asarray(fit), 1.0 / (1.0 + (_residuals(seen, fit) / width) ** 2)
 
 
-def _jackknife_sigma(seen: _BoardObservations, value: FloatArray, weight: FloatArray) -> float:
-    """Sigma of the log of the size: how far it moves as each group of views is left out."""
-    step = 1e-6 * np.maximum(1.0, np.abs(value))
+def _jackknife_sigma(seen: _BoardObservations, fit: FloatArray, weight: FloatArray) -> float:
+    """Return the sigma of the log of the size, from its changes as each group of views is left out."""
+    step = 1e-6 * np.maximum(1.0, np.abs(fit))
     jacobian = np.stack(
         [
-            (_residuals(seen, value + change) - _residuals(seen, value - change)) / (2.0 * change.sum())
+            (_residuals(seen, fit + change) - _residuals(seen, fit - change)) / (2.0 * change.sum())
             for change in np.diag(step)
         ],
         axis=1,
     )
-    residual, group = _residuals(seen, value), np.repeat(seen.group[seen.view], 2)
+    residual, group = _residuals(seen, fit), np.repeat(seen.group[seen.view], 2)
     weighted = jacobian * weight[:, None]
-    whole = weighted.T @ jacobian
-    moved = []
-    for one in np.unique(group):
-        mine = group == one
-        rest = whole - weighted[mine].T @ jacobian[mine]
-        moved.append(np.linalg.lstsq(rest, weighted[mine].T @ residual[mine], rcond=None)[0][6])
-    count = len(moved)
-    # Few groups know their own spread badly: without (n + 1) / (n - 1) four of them state 0.87 of the error.
-    variance = (count + 1) / count * np.sum((np.array(moved) - np.mean(moved)) ** 2)
+    normal = weighted.T @ jacobian
+    changes = []
+    for number in np.unique(group):
+        rows = group == number
+        rest = normal - weighted[rows].T @ jacobian[rows]
+        changes.append(np.linalg.lstsq(rest, weighted[rows].T @ residual[rows], rcond=None)[0][6])
+    count = len(changes)
+    # A few groups underestimate their own spread. Without (n + 1) / (n - 1), four of them give 0.87 of the
+    # error.
+    variance = (count + 1) / count * np.sum((np.array(changes) - np.mean(changes)) ** 2)
     return float(np.sqrt(variance))
 
 
-def _map_bend_sigma(seen: _BoardObservations, value: FloatArray) -> float:
-    """Sigma of the log of the size where the two ends of the way are off, each by as much as maps are."""
+def _map_bend_sigma(seen: _BoardObservations, fit: FloatArray) -> float:
+    """Return the sigma of the log of the size, if both ends of the path have the usual error of a map."""
     centre = seen.map_from_cam[:, :3, 3]
     along = np.linalg.svd(centre - centre.mean(axis=0), full_matrices=False)[2][0]
-    way_m = float(np.ptp(centre @ along)) / float(np.exp(value[6]))
-    return float(np.sqrt(2.0)) * MAP_ERROR_M / max(way_m, 1e-9)
+    length_m = float(np.ptp(centre @ along)) / float(np.exp(fit[6]))
+    return float(np.sqrt(2.0)) * MAP_ERROR_M / max(length_m, 1e-9)

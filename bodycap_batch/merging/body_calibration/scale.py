@@ -1,4 +1,26 @@
-"""Metric scale: the one at which the body explains the cameras with least strain, weighed with the floor."""
+"""Metric scale: its sources, the estimate from the bones, and the combination of all sources.
+
+A map has no unit. The scale is the number of metres per map unit. Its sources, by their name in the report:
+
+- ``skeleton``, ``height``, ``mean stature``: the bones. `estimate_scale` finds the scale at which the
+  calibration graph has the lowest cost; `scale_from_bones` adds the uncertainty of the bone lengths
+  (`PROPORTION_SIGMA` in ``anthropometry.py``). The name is the origin of the bone lengths.
+- ``floor``: the height of the reference camera's joint over the floor, by `scale_from_floor`. The floor that
+  the person walks on comes from ``world/floor.py``.
+- ``known distance``: a distance that the job states, by ``known_distance.py``.
+- ``marker board``: a board that the job describes and keyframes see, by ``marker_board.py``.
+
+`combine_sources` weighs them: a known distance or a marker board replaces bones and floor; otherwise bones
+and floor are averaged, each by its precision. If neither a skeleton nor a height is given, the result has
+at least the uncertainty `STATURE_SIGMA`.
+
+Scales for other purposes are found elsewhere, and do not enter this result:
+
+- ``body/initial_poses.py``: the provisional scale, the initial value of the calibration.
+- ``map_alignment/gauss_newton.py`` and ``map_alignment/scale_sources.py``: the scale of the main map while
+  other maps are aligned to it. It uses the provisional scale (``reach``), ``floor`` and the stated sources.
+- ``limb_scales.py``: a scale for each limb alone, a diagnostic of the report.
+"""
 
 from __future__ import annotations
 
@@ -8,27 +30,44 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.merging.body_calibration.anthropometry import PROPORTION_SIGMA
 from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
 from bodycap_batch.merging.world.floor import WALKING_HEIGHT_RATIO
 
+MEAN_STATURE = "mean stature"
+"""Name of the scale source if neither the skeleton nor the height of the subject is known."""
 _COARSE_STEP = 0.16
+"""First step of the log of the scale. Evidence: none."""
 _FINE_STEP = 0.05
-"""Steps of the log scale. The cost is skewed (an arm cannot stretch, but it can bend), so that the coarse
-parabola leans to small scales; the fine one decides."""
+"""Second step of the log of the scale. Evidence: none.
+
+The cost is skewed, because an arm can bend but not stretch. The parabola of the coarse step is therefore
+biased towards small scales. The fine step removes most of this bias.
+"""
 _MAX_SOLVES = 14
+"""Maximum number of solutions of the graph while a minimum is sought. Evidence: none."""
 _MIN_SIGMA = 0.01
+"""Minimum sigma of the log of a scale from the bones. Evidence: none."""
 FLOOR_SIGMA = 0.06
-"""Of the log of a trunk joint's height over the floor: knees bend 1 to 6 cm, shoes add 1 to 3."""
+"""Sigma of the log of a joint's height over the floor.
+
+Bent knees lower it by 1 to 6 cm, shoes raise it by 1 to 3 cm. Evidence: none.
+"""
+STATURE_SIGMA = 0.055
+"""Sigma of the log of adults' stature about one mean for both sexes.
+
+It is 7 cm within each sex; the means of the sexes are 14 cm apart. Evidence: none.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScaleEstimate:
-    """Metres per map unit.
+    """The scale at which the calibration graph has the lowest cost.
 
     Attributes:
-        scale: The estimate.
-        sigma_log: Sigma of its logarithm, from the cost's curvature.
-        costs: (scale, cost) of every solve.
+        scale: Metres per map unit.
+        sigma_log: Sigma of its logarithm, from the curvature of the cost.
+        costs: (scale, cost) of every solution.
         mount_slope: By camera, change of joint_from_cam (4,4) per unit of log scale.
     """
 
@@ -40,13 +79,13 @@ class ScaleEstimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScaleSource:
-    """Something that knows the metric scale.
+    """A source of the metric scale.
 
     Attributes:
-        name: For the report.
+        name: Name for the report.
         scale: Metres per map unit.
         sigma_log: Sigma of its logarithm.
-        used: False where it was not believed, or something better was there.
+        used: False if the source was rejected, or replaced by a better one.
     """
 
     name: str
@@ -55,18 +94,35 @@ class ScaleSource:
     used: bool = True
 
 
-def estimate_scale(calibration: CalibrationGraph, provisional: float) -> ScaleEstimate:
-    """Minimise the calibration's cost over the logarithm of the scale, by parabolas of shrinking width.
+@dataclass(frozen=True, slots=True)
+class MetricScale:
+    """The combined metric scale.
 
-    The calibration is left solved at the returned scale.
+    Attributes:
+        metres_per_unit: Metres per map unit.
+        sigma_log: Sigma of its logarithm.
+        sources: All sources, used or not. The bones are the first.
+    """
+
+    metres_per_unit: float
+    sigma_log: float
+    sources: tuple[ScaleSource, ...]
+
+
+def estimate_scale(graph: CalibrationGraph, provisional: float) -> ScaleEstimate:
+    """Minimise the cost of a calibration graph over the log of the scale, by two parabolas.
+
+    Args:
+        graph: The calibration graph. It is left solved at the returned scale.
+        provisional: Initial value, metres per map unit.
     """
     costs: dict[float, float] = {}
     mounts: dict[float, dict[str, FloatArray]] = {}
 
     def cost(log_scale: float) -> float:
         if log_scale not in costs:
-            costs[log_scale] = calibration.solve(float(np.exp(log_scale)))
-            mounts[log_scale] = {name: pose.copy() for name, pose in calibration.mounts.items()}
+            costs[log_scale] = graph.solve(float(np.exp(log_scale)))
+            mounts[log_scale] = {name: pose.copy() for name, pose in graph.mounts.items()}
         return costs[log_scale]
 
     centre, curvature = float(np.log(provisional)), 0.0
@@ -81,11 +137,12 @@ def estimate_scale(calibration: CalibrationGraph, provisional: float) -> ScaleEs
     cost(centre)
     for side in (-_FINE_STEP, _FINE_STEP):
         if not any((x - centre) * side > 0.0 for x in costs):
-            # The cost fell all the way to here.
+            # The search ended at its outermost scale. The slope of the mounts needs one on each side.
             cost(centre + side)
-    before, after = (_nearest_solution(mounts, centre, sign * _FINE_STEP) for sign in (-1.0, 1.0))
-    width = after[0] - before[0]
-    slope = {name: (after[1][name] - before[1][name]) / width for name in after[1]}
+    below, above = (_nearest_solution(mounts, centre, sign * _FINE_STEP) for sign in (-1.0, 1.0))
+    width = above - below
+    slope = {name: (mounts[above][name] - mounts[below][name]) / width for name in mounts[above]}
+    # Solve at the minimum again, because the graph keeps its last solution.
     costs.pop(centre)
     cost(centre)
     return ScaleEstimate(
@@ -98,30 +155,64 @@ def estimate_scale(calibration: CalibrationGraph, provisional: float) -> ScaleEs
 
 def _nearest_solution(
     mounts: Mapping[float, Mapping[str, FloatArray]], centre: float, offset: float
-) -> tuple[float, Mapping[str, FloatArray]]:
-    """The solve nearest to an offset from the centre, and its mounts."""
-    nearest = min((x for x in mounts if (x - centre) * offset > 0.0), key=lambda x: abs(x - centre - offset))
-    return nearest, mounts[nearest]
+) -> float:
+    """Return the solved log scale that is nearest to centre + offset, on that side of the centre."""
+    return min((x for x in mounts if (x - centre) * offset > 0.0), key=lambda x: abs(x - centre - offset))
+
+
+def scale_from_bones(estimate: ScaleEstimate, *, is_measured: bool, has_height: bool) -> ScaleSource:
+    """Return the scale from the bones with the uncertainty of their lengths.
+
+    Args:
+        estimate: The scale at which the calibration graph has the lowest cost.
+        is_measured: True if the skeleton is the subject's own.
+        has_height: True if the skeleton was scaled to the subject's height.
+    """
+    name, lengths_sigma = "skeleton", 0.0
+    if not is_measured:
+        name, lengths_sigma = "height" if has_height else MEAN_STATURE, PROPORTION_SIGMA
+    sigma_log = float(np.hypot(estimate.sigma_log, lengths_sigma))
+    return ScaleSource(name=name, scale=estimate.scale, sigma_log=sigma_log)
 
 
 def scale_from_floor(body: ScaleSource, height_m: float, standing_m: float) -> ScaleSource:
-    """What the height of the trunk over the map's floor says; used within 2 sigma of the body.
+    """Return the scale from a joint's height over the floor. It is used if within 2 sigma of the body's.
 
     Args:
-        body: The bones' own estimate.
-        height_m: Median height of a trunk joint over the floor at that scale.
-        standing_m: Its height in the standing skeleton.
+        body: The scale from the bones.
+        height_m: Median height of the joint over the floor, at that scale.
+        standing_m: Height of the joint over the soles of the standing skeleton.
     """
     if height_m <= 0.0:
         return ScaleSource(name="floor", scale=body.scale, sigma_log=FLOOR_SIGMA, used=False)
     difference = float(np.log(WALKING_HEIGHT_RATIO * standing_m / height_m))
-    believed = difference**2 <= 4.0 * (body.sigma_log**2 + FLOOR_SIGMA**2)
+    is_accepted = difference**2 <= 4.0 * (body.sigma_log**2 + FLOOR_SIGMA**2)
     scale = body.scale * float(np.exp(difference))
-    return ScaleSource(name="floor", scale=scale, sigma_log=FLOOR_SIGMA, used=believed)
+    return ScaleSource(name="floor", scale=scale, sigma_log=FLOOR_SIGMA, used=is_accepted)
+
+
+def combine_sources(
+    bones: ScaleSource, floor: ScaleSource | None, stated: Sequence[ScaleSource]
+) -> MetricScale:
+    """Combine all sources of the scale.
+
+    Args:
+        bones: The scale from the bones.
+        floor: The scale from the floor; None if no floor was found.
+        stated: Scales from a known distance or a marker board. They replace the others.
+    """
+    measured = [bones] if floor is None else [bones, floor]
+    if stated:
+        measured = [replace(source, used=False) for source in measured]
+    sources = (*measured, *stated)
+    scale, sigma_log = weighted_mean(sources)
+    if bones.name == MEAN_STATURE and not stated:
+        sigma_log = float(np.hypot(sigma_log, STATURE_SIGMA))
+    return MetricScale(scale, sigma_log, sources)
 
 
 def weighted_mean(sources: Sequence[ScaleSource]) -> tuple[float, float]:
-    """Scale and sigma of its logarithm from the sources in use, each by its precision."""
+    """Return scale and sigma of its logarithm from the sources in use, weighted by their precision."""
     used = [source for source in sources if source.used]
     weight = np.array([source.sigma_log**-2 for source in used])
     mean = float(weight @ np.log([source.scale for source in used]) / weight.sum())
@@ -129,7 +220,7 @@ def weighted_mean(sources: Sequence[ScaleSource]) -> tuple[float, float]:
 
 
 def chi_square(sources: Sequence[ScaleSource]) -> tuple[float, int]:
-    """Chi-square of all sources about their weighted mean, used or not, and its degrees of freedom."""
+    """Return the chi-square of all sources, used or not, about their mean, and its degrees of freedom."""
     mean, _ = weighted_mean([replace(source, used=True) for source in sources])
     off = np.array([np.log(source.scale / mean) / source.sigma_log for source in sources])
     return float(off @ off), len(sources) - 1

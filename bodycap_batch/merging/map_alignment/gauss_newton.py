@@ -10,8 +10,14 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.merging.body_calibration.calibration_covariance import (
+    measurement_jacobian,
+    rescale_sigmas,
+    scale_jacobian,
+    variance_factors,
+)
 from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
-from bodycap_batch.merging.body_calibration.mount_covariance import PRIOR, LinearisedCalibration
+from bodycap_batch.merging.body_calibration.mount_covariance import LinearisedCalibration, RowType
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.model.geometry import Similarity, so3_exp
 
@@ -85,7 +91,7 @@ class MapAlignmentProblem:
             self._calibration.slack_factor = slack
             self._descend()
         mounts, derivatives = self._linearised()
-        self._calibration.reweigh(mounts, mounts.eliminated(derivatives))
+        rescale_sigmas(self._calibration, mounts, mounts.reduced(derivatives))
         self._descend()
         self._covariance = self._step(0.0).covariance
 
@@ -112,7 +118,7 @@ class MapAlignmentProblem:
             trial = self._cost()
             converged = abs(trial - cost) < _CONVERGED * max(cost, 1.0)
             if trial > cost:
-                self._calibration.move(before[0])
+                self._calibration.set_samples(before[0])
                 _, self._scale, self.corrections = before
                 self._calibration.solve(self._scale)
                 damping = max(100.0 * damping, 1e-2)
@@ -146,19 +152,19 @@ class MapAlignmentProblem:
             damping: Relative increase of the diagonal of the normal equations.
         """
         mounts, derivatives = self._linearised()
-        solved = mounts.eliminated(derivatives)
+        solved = mounts.reduced(derivatives)
         count = derivatives.shape[1]
-        source_rows = np.zeros((len(self._sources), solved.influence.shape[1]))
+        source_rows = np.zeros((len(self._sources), solved.jacobian.shape[1]))
         source_rows[:, -count] = [1.0 / source.sigma_log for source in self._sources]
-        influence = np.vstack([solved.influence, source_rows])
+        influence = np.vstack([solved.jacobian, source_rows])
         rhs = np.append(mounts.linear.rhs, -self._source_residuals())
         normal = influence.T @ influence
-        variance = self._calibration.row_variance(mounts, solved)[
-            np.append(mounts.kinds, np.full(len(source_rows), PRIOR))
+        variance = variance_factors(self._calibration.samples, mounts, solved)[
+            np.append(mounts.row_types, np.full(len(source_rows), RowType.PRIOR))
         ]
         gain = _solve_normal_equations(normal, influence.T)
         # A systematic bias of the posture changes mounts and maps alike.
-        by_bias = (mounts.habit_shifts().T @ gain[:, : -len(source_rows)].T).T
+        by_bias = (mounts.posture_bias_jacobian().T @ gain[:, : -len(source_rows)].T).T
         covariance = (gain * variance) @ gain.T + by_bias @ by_bias.T
         free = np.arange(len(normal) - count, len(normal))
         normal[free, free] *= 1.0 + damping
@@ -167,9 +173,9 @@ class MapAlignmentProblem:
 
     def _linearised(self) -> tuple[LinearisedCalibration, FloatArray]:
         """Return the derivatives by bones and mounts, and those (R,1 + 7 G) by log scale and maps."""
-        mounts = self._calibration.solved()
-        derivatives = -self._calibration.measurement_shifts(mounts.linear, self._directions())
-        derivatives[:, 0] -= self._calibration.unit_shifts(mounts)
+        mounts = self._calibration.linearised()
+        derivatives = -measurement_jacobian(self._calibration, mounts.linear, self._directions())
+        derivatives[:, 0] -= scale_jacobian(self._calibration, mounts)
         return mounts, derivatives
 
     def _cost(self) -> float:
@@ -214,7 +220,7 @@ class MapAlignmentProblem:
             update = Similarity(factor, rotation, middle + shift / self._scale - factor * rotation @ middle)
             poses[members] = update.apply_to_poses(poses[members])
             self.corrections[index] = update.after(self.corrections[index])
-        self._calibration.move(replace(samples, map_from_cam=poses))
+        self._calibration.set_samples(replace(samples, map_from_cam=poses))
         self._scale *= float(np.exp(change[0]))
 
 

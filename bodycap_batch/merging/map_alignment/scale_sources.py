@@ -52,12 +52,12 @@ def stated_constraints(inputs: MergeInputs, options: MergeOptions, gauge: str) -
     distance, board = None, None
     # The errors here concern other maps. They are reported when all maps are aligned.
     with suppress(EstimationError):
-        distance = known_distance(inputs, options, own_map)
+        distance = known_distance(inputs.trajectories, options.known_distance, own_map)
     with suppress(EstimationError):
-        board = locate_board(inputs, options, own_map)
+        board = locate_board(inputs.trajectories, inputs.board_views, options.marker_board, own_map)
     scales = (distance, None if board is None else board.scale)
     return StatedConstraints(
-        tuple(each for each in scales if each is not None), stated_verticals(options, board)
+        tuple(each for each in scales if each is not None), stated_verticals(options.marker_board, board)
     )
 
 

@@ -1,1 +1,1 @@
-"""What the stage reports of its result, and the advice it gives."""
+"""The report of the merging stage, and the advice in it."""

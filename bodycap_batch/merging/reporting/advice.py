@@ -1,4 +1,7 @@
-"""A sentence for every solved constant: how well it is known, and which movement would tell more."""
+"""Describe in a sentence how well each estimated quantity is known, with advice for a better capture.
+
+The sentences are part of the stored results. The report page splits them at "; to know it better, ".
+"""
 
 from __future__ import annotations
 
@@ -7,11 +10,16 @@ from collections.abc import Mapping
 import numpy as np
 
 from bodycap_batch.merging.body_calibration.calibrate_body import BodyCalibration
+from bodycap_batch.merging.world.vertical import Vertical
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import split_side
 
-_WELL_KNOWN_DEG = 5.0
-_WELL_KNOWN_M = 0.02
+_WELL_KNOWN_MOUNT_DEG = 5.0
+"""Sigma of a mount's rotation up to which no advice is given, degrees per axis. Evidence: none."""
+_WELL_KNOWN_MOUNT_M = 0.02
+"""Sigma of a mount's position up to which no advice is given, metres per axis. Evidence: none."""
+_WELL_KNOWN_SCALE = 0.02
+"""Relative sigma of the metric scale up to which no advice is given. Evidence: none."""
 _MOVEMENTS = {
     "Spine1": "walk straight ahead, turn round, and lift both arms to the side",
     "Spine": "walk straight ahead, turn round, and bend and twist the trunk",
@@ -29,33 +37,44 @@ _MOVEMENTS = {
 }
 
 
-def describe_clock(camera: str, doubt: Mapping[str, float], offset_s: float) -> str:
-    """What a doubted clock looks like, and the offset that would suit it."""
-    way = "behind" if doubt["shift_s"] > 0.0 else "ahead"
+def describe_clock(camera: str, shift_s: float, scatter_left: float, offset_s: float) -> str:
+    """Describe a suspicious clock and the offset that fits better.
+
+    Args:
+        camera: Camera name.
+        shift_s: Time to add to the camera's timestamps.
+        scatter_left: Part of the scatter of its positions on the body that remains after the shift, 0 to 1.
+        offset_s: The clock offset that includes the shift.
+    """
+    direction = "behind" if shift_s > 0.0 else "ahead"
     return (
-        f"{camera} moves about the body as if its clock were {abs(doubt['shift_s']):.1f} s {way}; with "
-        f"an offset_s of about {offset_s:.1f} its place would scatter {1.0 - doubt['scatter_left']:.0%} less"
+        f"{camera} moves about the body as if its clock were {abs(shift_s):.1f} s {direction}; with "
+        f"an offset_s of about {offset_s:.1f} its place would scatter {1.0 - scatter_left:.0%} less"
     )
 
 
-def describe_swapped_sides(exchanged: Mapping[str, float]) -> str:
-    """What limbs on the wrong side of the body mean."""
+def describe_swapped_sides(swapped: Mapping[str, float]) -> str:
+    """Describe cameras on the wrong side of the body, and the likely reasons.
+
+    Args:
+        swapped: By camera, the part of its time on the wrong side.
+    """
     return (
-        f"{' and '.join(sorted(exchanged))} stay on the other side of the body: left and right are "
+        f"{' and '.join(sorted(swapped))} stay on the other side of the body: left and right are "
         "exchanged in the cameras' names, or the trunk's camera looks back and its mount is not torso_back"
     )
 
 
 def describe_mount(mount: Mount, *, t_pose: bool) -> str:
-    """How well a camera's place on its bone is known.
+    """Describe how well the pose of a camera on its bone is known.
 
     Args:
-        mount: Solved, with its sigmas.
-        t_pose: A T-pose was used.
+        mount: The solved mount with its sigmas.
+        t_pose: True if a T-pose was used.
     """
     degrees, metres = float(np.degrees(mount.sigma_rad)), mount.sigma_m
     text = f"{mount.camera}'s mount is known to {degrees:.1f}° and {100.0 * metres:.1f} cm (1 sigma)"
-    if degrees <= _WELL_KNOWN_DEG and metres <= _WELL_KNOWN_M:
+    if degrees <= _WELL_KNOWN_MOUNT_DEG and metres <= _WELL_KNOWN_MOUNT_M:
         return text
     side, part = split_side(mount.role)
     movement = _MOVEMENTS[part].format(side=side.lower())
@@ -64,11 +83,11 @@ def describe_mount(mount: Mount, *, t_pose: bool) -> str:
 
 
 def describe_hinge(role: str, off_m: float) -> str:
-    """What it means that a hinged bone leaves its hinge.
+    """Describe a hinge that the motion violates.
 
     Args:
-        role: Of the bone below the hinge.
-        off_m: Sigma by which its far end does.
+        role: Anatomical name of the bone below the hinge.
+        off_m: Sigma by which the bone's far end leaves the hinge's plane, metres.
     """
     side, part = split_side(role)
     joint = f"{side.lower()} {'elbow' if part == 'ForeArm' else 'knee'}"
@@ -79,40 +98,40 @@ def describe_hinge(role: str, off_m: float) -> str:
     )
 
 
-def describe_scale(calibrated: BodyCalibration) -> str:
-    """How well the metric scale is known."""
-    text = f"the metric scale is known to {100.0 * calibrated.sigma_log:.1f} % (1 sigma)"
-    used = {source.name for source in calibrated.sources if source.used}
-    if calibrated.sigma_log <= 0.02 or used & {"known distance", "marker board"}:
+def describe_scale(calibration: BodyCalibration) -> str:
+    """Describe how well the metric scale is known."""
+    scale = calibration.scale
+    text = f"the metric scale is known to {100.0 * scale.sigma_log:.1f} % (1 sigma)"
+    used = {source.name for source in scale.sources if source.used}
+    if scale.sigma_log <= _WELL_KNOWN_SCALE or used & {"known distance", "marker board"}:
         return text
     ways = ["name a known distance (merge.known_distance) or a board in the room (merge.marker_board)"]
-    if len({mount.role for mount in calibrated.mounts}) == 1:
+    if len({mount.role for mount in calibration.mounts}) == 1:
         return (
-            f"{text}: all cameras sit on one bone, so that only their distance on it tells; to know it "
+            f"{text}: all cameras sit on one bone, so that it rests on their distance alone; to know it "
             f"better, wear one on another bone as well (a hand, an upper arm or the head), or {ways[0]}"
         )
     if "mean stature" in used:
         ways.insert(0, "give the subject's height (height_m)")
-    if calibrated.t_pose_ns is None:
+    if calibration.t_pose_ns is None:
         ways.append("stand in a T-pose for two seconds first")
     return f"{text}; to know it better, {' or '.join(ways)}"
 
 
-def describe_vertical(calibrated: BodyCalibration) -> str:
-    """How well the vertical is known."""
-    up = calibrated.up
-    text = f"up is known to {up.sigma_deg:.1f}° (1 sigma), from the {up.source}"
-    if up.rests_on_lean_only():
+def describe_vertical(vertical: Vertical) -> str:
+    """Describe how well the vertical is known."""
+    text = f"up is known to {vertical.sigma_deg:.1f}° (1 sigma), from the {vertical.source}"
+    if vertical.rests_on_lean_only():
         text = (
-            f"{text}, and not for certain: nothing else tells it, and a lean that lasts all the time "
-            "does not show in it"
+            f"{text}, and not for certain: it rests on the posture alone, and a lean that lasts all the time "
+            "cannot be seen in the posture"
         )
-    elif not up.is_determined():
+    elif not vertical.is_determined():
         text = (
-            f"{text}, and not for certain: another direction, at a right angle or so to it, explains the "
-            f"leaning nearly as well"
+            f"{text}, and not for certain: another direction, at about a right angle to it, explains the "
+            f"posture nearly as well"
         )
-    elif up.source != "body":
+    elif vertical.source != "body":
         return text
     return (
         f"{text}; to know it better, walk a few steps upright, film the floor and two walls, or lay a "

@@ -1,13 +1,13 @@
-"""The stage's own account of itself, as plain JSON values."""
+"""Build the report of the merging stage."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.body_calibration.calibrate_body import BodyCalibration
 from bodycap_batch.merging.body_calibration.scale import ScaleSource, chi_square
 from bodycap_batch.merging.cameras.clock_check import suspicious_clocks
@@ -22,199 +22,280 @@ from bodycap_batch.merging.reporting.advice import (
     describe_swapped_sides,
     describe_vertical,
 )
+from bodycap_batch.merging.world.floor import Floor
 from bodycap_batch.merging.world.vertical import angle_deg
 from bodycap_batch.model.geometry import rotation_angle_rad
-from bodycap_batch.model.merge_data import MergeInputs
+from bodycap_batch.model.merge_data import Activity, CameraClock, MergeInputs
+from bodycap_batch.model.merge_report import (
+    ActivityReport,
+    AlignedCameraReport,
+    BodyScaleReport,
+    CameraReport,
+    ClockReport,
+    FloorReport,
+    HingeReport,
+    LimbScalesReport,
+    MergeReport,
+    MountReport,
+    OtherVerticalReport,
+    Percentiles,
+    RunnerUpRollReport,
+    ScaleReport,
+    ScaleSourceReport,
+    SolverReport,
+    SwappedSidesReport,
+    TPoseReport,
+    VerticalReport,
+)
+from bodycap_batch.model.skeleton import Mount
+
+_DOWN_WEIGHTED = 0.25
+"""Robust weight below which a measurement counts as down-weighted. Evidence: none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionFacts:
+    """What the report states of the motion, beside its calibration and solution.
+
+    Attributes:
+        start_ns: Common time of the first tick.
+        end_ns: Common time of the last tick.
+        dropped: By camera, (N,) frames with gross errors.
+        floor: The floor.
+        unused: By camera that is no part of the body, the reason.
+        aligned: By camera of an aligned map, the uncertainty of its map's pose.
+        joint_sigma_m: By role, then ``observed`` or ``filled``, percentiles of the sigma of its centre.
+        joint_gap_m: By role, (T,) gap of the joint.
+        hinge_off_plane_m: By role, (T,) distance of a hinged bone's far end from the hinge's plane.
+        contacts: By foot, how often it stands and how fast it slides meanwhile.
+        rule_violation_m: By soft rule, (T,) by how much it is violated.
+    """
+
+    start_ns: int
+    end_ns: int
+    dropped: Mapping[str, IntArray]
+    floor: Floor
+    unused: Mapping[str, str]
+    aligned: Mapping[str, AlignedCameraReport]
+    joint_sigma_m: Mapping[str, Mapping[str, Mapping[str, float]]]
+    joint_gap_m: Mapping[str, FloatArray]
+    hinge_off_plane_m: Mapping[str, FloatArray]
+    contacts: Mapping[str, Mapping[str, float]]
+    rule_violation_m: Mapping[str, FloatArray]
 
 
 def build_report(
     inputs: MergeInputs,
-    calibrated: BodyCalibration,
+    calibration: BodyCalibration,
     solution: MotionSolution,
     tracks: Sequence[CameraTrack],
-    notes: Mapping[str, Any],
-) -> dict[str, Any]:
-    """Collect sources, values and residuals.
+    facts: MotionFacts,
+) -> MergeReport:
+    """Build the report.
 
     Args:
-        inputs: What came in.
-        calibrated: Scale, mounts and up.
+        inputs: The inputs of the stage.
+        calibration: The calibration of the body.
         solution: The solved motion.
-        tracks: The tracks that were used.
-        notes: ``dropped`` frames by camera, the ``floor``, the ``unused`` and the ``joined`` cameras,
-            ``joint_gap_m`` and ``hinge_m`` and ``uncertainty`` by role, how far the ``rules`` were pressed,
-            the feet's ``contacts``,
-            and ``start_ns`` and ``end_ns``, the first
-            and the last tick.
+        tracks: The tracks that were used, that of the reference camera first.
+        facts: What else the report states.
     """
-    floor = notes["floor"]
-    return {
-        "scale": _scale(calibrated),
-        "t_pose": _t_pose(calibrated, notes["start_ns"]),
-        "up": _up(calibrated),
-        "floor": {"source": floor.source, "points": floor.support},
-        "mounts": {mount.camera: _mount(inputs, mount.camera, calibrated) for mount in calibrated.mounts},
-        "cameras": {
-            track.camera: {
-                "measurements": len(track.times_ns),
-                "dropped_as_gross_errors": len(notes["dropped"][track.camera]),
-                "down_weighted": int((solution.weights[track.camera] < 0.25).sum()),
-                "residual_m": _percentiles(solution.residual_m[track.camera]),
-                "residual_deg": _percentiles(np.degrees(solution.residual_rad[track.camera])),
-                "longest_gap_s": longest_gap_s(track, notes["start_ns"], notes["end_ns"]),
-            }
-            for track in tracks
+    main_tracks = [track for track in tracks if track.camera not in facts.aligned]
+    return MergeReport(
+        scale=_scale_report(calibration),
+        t_pose=_t_pose_report(calibration, facts.start_ns),
+        up=_vertical_report(calibration),
+        floor=FloorReport(source=facts.floor.source, points=facts.floor.support),
+        mounts={
+            mount.camera: _mount_report(inputs.mount_of(mount.camera), mount, calibration)
+            for mount in calibration.mounts
         },
-        "doubted_clocks": _clocks(inputs, [each for each in tracks if each.camera not in notes["joined"]]),
-        "exchanged_sides": _sides(inputs, calibrated, tracks, notes["joined"]),
-        "unused_cameras": dict(notes["unused"]),
-        "joined_cameras": notes["joined"],
-        "joint_gap_m": {role: _percentiles(gap) for role, gap in notes["joint_gap_m"].items()},
-        "joint_sigma_m": notes["uncertainty"],
-        "hinge_off_plane_m": {role: _percentiles(off) for role, off in notes["hinge_m"].items()},
-        "loose_hinges": {
-            role: {"sigma_m": round(off_m, 5), "known_to": describe_hinge(role, off_m)}
-            for role, off_m in calibrated.off_hinge_m.items()
+        cameras={track.camera: _camera_report(track, solution, facts) for track in tracks},
+        doubted_clocks=_clock_reports(inputs.clocks, main_tracks),
+        exchanged_sides=_sides_report(inputs.mounts, calibration, main_tracks),
+        unused_cameras=dict(facts.unused),
+        joined_cameras=dict(facts.aligned),
+        joint_gap_m=_percentiles_by_name(facts.joint_gap_m),
+        joint_sigma_m={
+            role: {name: Percentiles(**figures) for name, figures in sigmas.items()}
+            for role, sigmas in facts.joint_sigma_m.items()
         },
-        "activity": {
-            "name": inputs.activity,
-            "rules_active": {name: float((off > 0.0).mean()) for name, off in notes["rules"].items()},
-            "rules_pressed_m": {
-                name: _percentiles(off[off > 0.0])
-                for name, off in notes["rules"].items()
-                if (off > 0.0).any()
-            },
+        hinge_off_plane_m=_percentiles_by_name(facts.hinge_off_plane_m),
+        loose_hinges={
+            role: HingeReport(sigma_m=round(off_m, 5), known_to=describe_hinge(role, off_m))
+            for role, off_m in calibration.off_hinge_m.items()
         },
-        "foot_contact": notes["contacts"],
-        "solver": {
-            "ticks": len(solution.world_from_bone),
-            "bones": solution.world_from_bone.shape[1],
-            "iterations": solution.iterations,
-            "half_squared_error": {kind: round(error, 4) for kind, error in solution.errors.items()},
-        },
-    }
+        activity=_activity_report(inputs.activity, facts.rule_violation_m),
+        foot_contact=facts.contacts,
+        solver=SolverReport(
+            ticks=len(solution.world_from_bone),
+            bones=solution.world_from_bone.shape[1],
+            iterations=solution.iterations,
+            half_squared_error={kind: round(error, 4) for kind, error in solution.errors.items()},
+        ),
+    )
 
 
-def _clocks(inputs: MergeInputs, tracks: Sequence[CameraTrack]) -> dict[str, Any]:
-    """Cameras whose clock is doubted, and the ``offset_s`` that would suit them; none of joined maps."""
-    out: dict[str, Any] = {}
+def _camera_report(track: CameraTrack, solution: MotionSolution, facts: MotionFacts) -> CameraReport:
+    return CameraReport(
+        measurements=len(track.times_ns),
+        dropped_as_gross_errors=len(facts.dropped[track.camera]),
+        down_weighted=int((solution.weights[track.camera] < _DOWN_WEIGHTED).sum()),
+        residual_m=_percentiles(solution.residual_m[track.camera]),
+        residual_deg=_percentiles(np.degrees(solution.residual_rad[track.camera])),
+        longest_gap_s=longest_gap_s(track, facts.start_ns, facts.end_ns),
+    )
+
+
+def _clock_reports(
+    clocks: Mapping[str, CameraClock], tracks: Sequence[CameraTrack]
+) -> dict[str, ClockReport]:
+    """Report suspicious clocks. Aligned maps are not checked: their alignment absorbs a wrong clock."""
+    out = {}
     for camera, doubt in suspicious_clocks(tracks).items():
-        offset_s = round(inputs.clocks[camera].offset_s + doubt["shift_s"], 2)
-        out[camera] = {**doubt, "offset_s": offset_s, "says": describe_clock(camera, doubt, offset_s)}
+        offset_s = round(clocks[camera].offset_s + doubt["shift_s"], 2)
+        out[camera] = ClockReport(
+            shift_s=doubt["shift_s"],
+            scatter_left=doubt["scatter_left"],
+            offset_s=offset_s,
+            says=describe_clock(camera, doubt["shift_s"], doubt["scatter_left"], offset_s),
+        )
     return out
 
 
-def _sides(
-    inputs: MergeInputs, calibrated: BodyCalibration, tracks: Sequence[CameraTrack], joined: Collection[str]
-) -> dict[str, Any]:
-    """Limbs' cameras on the other side of the body, where all are; nothing of joined maps."""
-    own = [each for each in tracks if each.camera not in joined]
-    mounts = {mount.camera: mount for mount in (*inputs.mounts, calibrated.trunk)}
-    wrong = swapped_sides(own, mounts, calibrated.up.up)
-    return {"cameras": wrong, "says": describe_swapped_sides(wrong)} if wrong else {}
+def _sides_report(
+    priors: Collection[Mount], calibration: BodyCalibration, tracks: Sequence[CameraTrack]
+) -> SwappedSidesReport | None:
+    """Report the limbs' cameras on the other side of the body, if all of them are."""
+    mounts = {mount.camera: mount for mount in (*priors, calibration.reference_prior)}
+    wrong = swapped_sides(tracks, mounts, calibration.vertical.up)
+    return SwappedSidesReport(cameras=wrong, says=describe_swapped_sides(wrong)) if wrong else None
 
 
-def _scale(calibrated: BodyCalibration) -> dict[str, Any]:
-    """The scale, everything that knows it, and how far all of that disagrees."""
-    chi2, freedom = chi_square(calibrated.sources)
-    out: dict[str, Any] = {
-        "source": " and ".join(source.name for source in calibrated.sources if source.used),
-        "metres_per_map_unit": calibrated.scale,
-        "relative_sigma": round(calibrated.sigma_log, 5),
-        "sources": [_source(source, calibrated.scale) for source in calibrated.sources],
-        "chi2": round(chi2, 3),
-        "degrees_of_freedom": freedom,
-        "body_alone": {
-            "metres_per_map_unit": calibrated.estimate.scale,
-            "relative_sigma": round(calibrated.estimate.sigma_log, 5),
-            "costs": [[scale, round(cost, 4)] for scale, cost in calibrated.estimate.costs],
-        },
-        "trunk_over_floor_m": calibrated.height_over_floor_m,
-        "known_to": describe_scale(calibrated),
-    }
-    if calibrated.limbs:
-        chi2, freedom = chi_square(calibrated.limbs)
-        out["limbs"] = {
-            "alone": [_source(limb, calibrated.scale) for limb in calibrated.limbs],
-            "chi2": round(chi2, 3),
-            "degrees_of_freedom": freedom,
-        }
-    return out
+def _scale_report(calibration: BodyCalibration) -> ScaleReport:
+    scale = calibration.scale
+    chi2, freedom = chi_square(scale.sources)
+    return ScaleReport(
+        source=" and ".join(source.name for source in scale.sources if source.used),
+        metres_per_map_unit=scale.metres_per_unit,
+        relative_sigma=round(scale.sigma_log, 5),
+        sources=_source_reports(scale.sources, scale.metres_per_unit),
+        chi2=round(chi2, 3),
+        degrees_of_freedom=freedom,
+        body_alone=BodyScaleReport(
+            metres_per_map_unit=calibration.bones_alone.scale,
+            relative_sigma=round(calibration.bones_alone.sigma_log, 5),
+            costs=tuple((tried, round(cost, 4)) for tried, cost in calibration.bones_alone.costs),
+        ),
+        trunk_over_floor_m=calibration.height_over_floor_m,
+        known_to=describe_scale(calibration),
+        limbs=_limbs_report(calibration),
+    )
 
 
-def _up(calibrated: BodyCalibration) -> dict[str, Any]:
-    """What up was taken from, and how far off everything else is."""
-    up = calibrated.up
-    return {
-        "source": up.source,
-        "sigma_deg": round(up.sigma_deg, 2),
-        "body_off_deg": None if up.body_off_deg is None else round(up.body_off_deg, 3),
-        "plane_points_share": round(up.plane_share, 3),
-        "others": [
-            {
-                "name": say.source,
-                "off_deg": round(angle_deg(say.up, up.up), 2),
-                "sigma_deg": round(say.sigma_deg, 2),
-                "less_likely_nats": round(say.negative_log_likelihood - up.negative_log_likelihood, 2),
-            }
-            for say in up.alternatives
-        ],
-        "known_to": describe_vertical(calibrated),
-    }
-
-
-def _source(source: ScaleSource, scale: float) -> dict[str, Any]:
-    return {
-        "name": source.name,
-        "metres_per_map_unit": source.scale,
-        "relative_sigma": round(source.sigma_log, 5),
-        "off": round(float(np.log(source.scale / scale)), 5),
-        "used": source.used,
-    }
-
-
-def _t_pose(calibrated: BodyCalibration, start_ns: int) -> dict[str, float] | None:
-    """From when to when a T-pose stands, seconds from the first tick."""
-    if calibrated.t_pose_ns is None:
+def _limbs_report(calibration: BodyCalibration) -> LimbScalesReport | None:
+    if not calibration.limbs:
         return None
-    first, last = (round(1e-9 * (time - start_ns), 3) for time in calibrated.t_pose_ns)
-    return {"from_s": first, "to_s": last}
+    chi2, freedom = chi_square(calibration.limbs)
+    return LimbScalesReport(
+        alone=_source_reports(calibration.limbs, calibration.scale.metres_per_unit),
+        chi2=round(chi2, 3),
+        degrees_of_freedom=freedom,
+    )
 
 
-def _mount(inputs: MergeInputs, camera: str, calibrated: BodyCalibration) -> dict[str, Any]:
-    solved = next(mount for mount in calibrated.mounts if mount.camera == camera)
-    prior = inputs.mount_of(camera)
-    turned = prior.joint_from_cam[:3, :3].T @ solved.joint_from_cam[:3, :3]
-    moved = solved.joint_from_cam[:3, 3] - prior.joint_from_cam[:3, 3]
-    return {
-        "role": solved.role,
-        **_roll(calibrated, camera),
-        "joint_from_cam": solved.joint_from_cam.tolist(),
-        "sigma_deg": round(float(np.degrees(solved.sigma_rad)), 3),
-        "sigma_m": round(solved.sigma_m, 5),
-        "from_prior_deg": round(float(np.degrees(rotation_angle_rad(turned))), 3),
-        "from_prior_m": round(float(np.linalg.norm(moved)), 5),
-        "known_to": describe_mount(solved, t_pose=calibrated.t_pose_ns is not None),
-    }
+def _source_reports(sources: Sequence[ScaleSource], scale: float) -> tuple[ScaleSourceReport, ...]:
+    return tuple(
+        ScaleSourceReport(
+            name=source.name,
+            metres_per_map_unit=source.scale,
+            relative_sigma=round(source.sigma_log, 5),
+            off=round(float(np.log(source.scale / scale)), 5),
+            used=source.used,
+        )
+        for source in sources
+    )
 
 
-def _roll(calibrated: BodyCalibration, camera: str) -> dict[str, Any]:
-    """Which way up the camera sits, and how much worse the next best way explains its motion."""
-    search = next((each for each in calibrated.rolls if each.camera == camera), None)
-    if search is None:
-        return {}
-    roll, cost = search.runner_up()
-    return {
-        "roll_deg": search.chosen_deg,
-        "roll_runner_up": {"roll_deg": roll, "half_squared_sigmas_more": round(cost, 2)},
-    }
+def _vertical_report(calibration: BodyCalibration) -> VerticalReport:
+    up = calibration.vertical
+    return VerticalReport(
+        source=up.source,
+        sigma_deg=round(up.sigma_deg, 2),
+        body_off_deg=None if up.body_off_deg is None else round(up.body_off_deg, 3),
+        plane_points_share=round(up.plane_share, 3),
+        others=tuple(
+            OtherVerticalReport(
+                name=other.source,
+                off_deg=round(angle_deg(other.up, up.up), 2),
+                sigma_deg=round(other.sigma_deg, 2),
+                less_likely_nats=round(other.negative_log_likelihood - up.negative_log_likelihood, 2),
+            )
+            for other in up.alternatives
+        ),
+        known_to=describe_vertical(up),
+    )
 
 
-def _percentiles(values: FloatArray) -> dict[str, float]:
-    return {f"p{q}": round(float(np.percentile(values, q)), 5) for q in (50, 95)}
+def _t_pose_report(calibration: BodyCalibration, start_ns: int) -> TPoseReport | None:
+    if calibration.t_pose_ns is None:
+        return None
+    first, last = (round(1e-9 * (time - start_ns), 3) for time in calibration.t_pose_ns)
+    return TPoseReport(from_s=first, to_s=last)
+
+
+def _mount_report(prior: Mount, solved: Mount, calibration: BodyCalibration) -> MountReport:
+    rotation = prior.joint_from_cam[:3, :3].T @ solved.joint_from_cam[:3, :3]
+    shift = solved.joint_from_cam[:3, 3] - prior.joint_from_cam[:3, 3]
+    search = next((each for each in calibration.rolls if each.camera == solved.camera), None)
+    runner_up = None if search is None else search.runner_up()
+    return MountReport(
+        role=solved.role,
+        roll_deg=None if search is None else search.chosen_deg,
+        roll_runner_up=None
+        if runner_up is None
+        else RunnerUpRollReport(
+            roll_deg=runner_up.roll_deg, half_squared_sigmas_more=round(runner_up.extra_cost, 2)
+        ),
+        joint_from_cam=tuple(tuple(row) for row in solved.joint_from_cam.tolist()),
+        sigma_deg=round(float(np.degrees(solved.sigma_rad)), 3),
+        sigma_m=round(solved.sigma_m, 5),
+        from_prior_deg=round(float(np.degrees(rotation_angle_rad(rotation))), 3),
+        from_prior_m=round(float(np.linalg.norm(shift)), 5),
+        known_to=describe_mount(solved, t_pose=calibration.t_pose_ns is not None),
+    )
+
+
+def _activity_report(activity: Activity, violations_m: Mapping[str, FloatArray]) -> ActivityReport:
+    return ActivityReport(
+        name=activity,
+        rules_active={name: float((violation > 0.0).mean()) for name, violation in violations_m.items()},
+        rules_pressed_m={
+            name: _percentiles(violation[violation > 0.0])
+            for name, violation in violations_m.items()
+            if (violation > 0.0).any()
+        },
+    )
+
+
+def _percentiles_by_name(values: Mapping[str, FloatArray]) -> dict[str, Percentiles]:
+    return {name: _percentiles(each) for name, each in values.items()}
+
+
+def _percentiles(values: FloatArray) -> Percentiles:
+    p50, p95 = (round(float(np.percentile(values, q)), 5) for q in (50, 95))
+    return Percentiles(p50=p50, p95=p95)
 
 
 def longest_gap_s(track: CameraTrack, start_ns: int, end_ns: int) -> float:
-    """Longest time without a measurement; that before the first one and after the last one count, too."""
+    """Return the longest time (s) without a measurement.
+
+    The times before the first measurement and after the last one count as well.
+
+    Args:
+        track: A camera's track.
+        start_ns: Common time of the first tick.
+        end_ns: Common time of the last tick.
+    """
     times = np.concatenate([[start_ns], np.clip(track.times_ns, start_ns, end_ns), [end_ns]])
     return round(float(np.diff(times).max()) * 1e-9, 4)

@@ -17,6 +17,7 @@ from bodycap_batch.formats.dataclass_files import read_dataclass, read_npz, writ
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import CameraClock, MergeResult
+from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.scene import (
     FrameStatus,
     KeyframeSelection,
@@ -94,6 +95,16 @@ def a_skeleton() -> SkeletonModel:
     )
 
 
+def a_report() -> MergeReport:
+    return MergeReport.from_dict(
+        {
+            "scale": {"source": "height", "relative_sigma": 0.05, "body_alone": {"costs": [[1.0, 2.5]]}},
+            "doubted_clocks": {"torso": {"shift_s": 0.5, "says": "late"}},
+            "exchanged_sides": {"cameras": {"left_palm": 1.0}, "says": "swapped"},
+        }
+    )
+
+
 def a_merge(rng: np.random.Generator) -> MergeResult:
     return MergeResult(
         skeleton=a_skeleton(),
@@ -115,7 +126,7 @@ def a_merge(rng: np.random.Generator) -> MergeResult:
         trajectories=(a_trajectory(rng),),
         mounts=(Mount(camera="torso", role="Spine1", joint_from_cam=np.eye(4), sigma_rad=0.1, sigma_m=0.02),),
         unused_cameras={"left_palm": "no map"},
-        report={"scale": {"source": "height", "value": 1.5}, "list": [1, None, True]},
+        report=a_report(),
     )
 
 

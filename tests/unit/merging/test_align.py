@@ -9,8 +9,14 @@ import pytest
 from numpy.testing import assert_allclose
 
 from bodycap_batch.merging.body.bones import kinematic_chain
+from bodycap_batch.merging.body_calibration.calibration_covariance import (
+    measurement_jacobian,
+    rescale_sigmas,
+    scale_jacobian,
+    variance_factors,
+)
 from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
-from bodycap_batch.merging.body_calibration.mount_covariance import JOINED, MEASURED, NAMED
+from bodycap_batch.merging.body_calibration.mount_covariance import RowType
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.cameras.track import make_track
 from bodycap_batch.merging.map_alignment.align import align_cameras
@@ -84,16 +90,16 @@ def test_residuals_follow_moved_cameras_as_predicted(walk, recorded):
     samples = take_samples(tracks, 1.0, 12)
     calibration = CalibrationGraph(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
     calibration.solve(1.0)
-    before = calibration.solved().linear
+    before = calibration.linearised().linear
     twist = np.array([0.3, -0.2, 0.5, 0.1, 0.4, -0.3]) * 1e-5
     directions = np.zeros((*samples.valid.shape, 1, 6))
     directions[1, :, 0] = twist
-    predicted = calibration.measurement_shifts(before, directions)[:, 0]
+    predicted = measurement_jacobian(calibration, before, directions)[:, 0]
     poses = samples.map_from_cam.copy()
     poses[1, :, :3, :3] = so3_exp(twist[:3]) @ poses[1, :, :3, :3]
     poses[1, :, :3, 3] += twist[3:]
-    calibration.move(replace(samples, map_from_cam=poses))
-    after = calibration.solved().linear
+    calibration.set_samples(replace(samples, map_from_cam=poses))
+    after = calibration.linearised().linear
     # The right-hand side grows by what the movement asks for; robust weights change in second order.
     assert np.abs(predicted).max() > 1e-4
     assert_allclose(after.rhs - before.rhs, predicted, atol=0.15 * np.abs(predicted).max())
@@ -103,11 +109,11 @@ def test_the_cost_follows_the_scale_as_predicted(arms):
     samples, calibration, metric = arms
     before, after = (calibration.solve(metric * float(np.exp(step))) for step in (-0.005, 0.005))
     calibration.solve(metric)
-    mounts = calibration.solved()
+    mounts = calibration.linearised()
     directions = np.zeros((*samples.valid.shape, 1, 6))
     directions[..., 0, 3:] = metric * samples.map_from_cam[..., :3, 3]
-    follow = calibration.measurement_shifts(mounts.linear, directions)[:, 0]
-    right, shrink = mounts.linear.rhs, calibration.unit_shifts(mounts)
+    follow = measurement_jacobian(calibration, mounts.linear, directions)[:, 0]
+    right, shrink = mounts.linear.rhs, scale_jacobian(calibration, mounts)
     # The cost is half the sum of squares, and all else is at its minimum: solves end within 1e-5 of theirs.
     end = 1e-5 * before / 0.01
     assert right @ (follow + shrink) == pytest.approx((after - before) / 0.01, abs=2.0 * end)
@@ -117,44 +123,48 @@ def test_the_cost_follows_the_scale_as_predicted(arms):
 def test_what_fits_better_than_believed_counts_more(arms):
     samples, calibration, metric = arms
     calibration.solve(metric)
-    mounts = calibration.solved()
-    left = calibration.row_variance(mounts, mounts.eliminated())[MEASURED]
-    calibration.reweigh(mounts, mounts.eliminated())
+    mounts = calibration.linearised()
+    left = variance_factors(samples, mounts, mounts.reduced())[RowType.MEASUREMENT]
+    rescale_sigmas(calibration, mounts, mounts.reduced())
     found = calibration.samples
-    calibration.move(samples)
+    calibration.set_samples(samples)
     assert left < 0.9
     assert_allclose(found.sigma_map, np.sqrt(left) * samples.sigma_map)
     assert_allclose(found.sigma_rad, np.sqrt(left) * samples.sigma_rad)
     # What is not the map's error stays as large as it was, whatever share it now has.
-    assert_allclose(found.white_share * found.sigma_map**2, samples.white_share * samples.sigma_map**2)
+    assert_allclose(
+        found.white_noise_share * found.sigma_map**2, samples.white_noise_share * samples.sigma_map**2
+    )
 
 
 def test_what_no_residual_can_contradict_is_as_believed(arms):
     samples, calibration, metric = arms
     calibration.solve(metric)
-    mounts = calibration.solved()
+    mounts = calibration.linearised()
     silent = replace(mounts, linear=replace(mounts.linear, rhs=np.zeros_like(mounts.linear.rhs)))
-    free = replace(mounts.eliminated(), redundancy=np.zeros(len(mounts.kinds)))
+    free = replace(mounts.reduced(), redundancy=np.zeros(len(mounts.row_types)))
     # Samples that share the map's error were weighed down for it; that does not make the map bend more.
-    assert samples.repeats > 1.5
-    assert_allclose(calibration.row_variance(silent, free)[[MEASURED, JOINED]], 1.0)
+    assert samples.correlated_samples > 1.5
+    assert_allclose(variance_factors(samples, silent, free)[[RowType.MEASUREMENT, RowType.JOINT_GAP]], 1.0)
 
 
 def test_a_mounts_name_is_believed_better_than_it_is_weighed(arms):
     samples, calibration, metric = arms
     inputs = posed(SynthOptions(seconds=1.0, cameras=ARMS, poses_only=True)).inputs
     calibration.solve(metric)
-    mounts = calibration.solved()
+    mounts = calibration.linearised()
     # 15 degrees an axis against 15 in all; three differences of three rows for each of five cameras.
-    assert calibration.row_variance(mounts, mounts.eliminated())[NAMED] == pytest.approx(1.0 / 3.0)
-    assert (mounts.kinds == NAMED).sum() == 5 * 9
+    assert variance_factors(samples, mounts, mounts.reduced())[RowType.NAMED_MOUNT] == pytest.approx(
+        1.0 / 3.0
+    )
+    assert (mounts.row_types == RowType.NAMED_MOUNT).sum() == 5 * 9
     # A job that knows it to 20 degrees only has said so, and no name.
     told = {
         mount.camera: replace(mount, sigma_rad=np.radians(20.0), by_name=False) for mount in inputs.mounts
     }
     stated = CalibrationGraph(inputs.skeleton, mounts.body.bones, samples, told, metric, lambda: None)
     stated.solve(metric, iterations=1)
-    assert not (stated.solved().kinds == NAMED).any()
+    assert not (stated.linearised().row_types == RowType.NAMED_MOUNT).any()
 
 
 @pytest.mark.slow

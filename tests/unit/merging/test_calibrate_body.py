@@ -1,4 +1,4 @@
-"""What fixes the scale beside the bones, and what is said about how well constants are known."""
+"""Sources of the scale other than the bones, and the sentences on uncertainties."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError, JobError
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body_calibration.anthropometry import bone_length_modes, joint_placement_modes
@@ -30,19 +29,15 @@ def inputs():
     return walk, make_inputs(walk, recorded)
 
 
-def _asked(first, second, metres):
-    return MergeOptions(known_distance=(first, second, metres))
-
-
 def test_a_known_distance_gives_the_scale(inputs):
     walk, merged = inputs
     ends = walk.camera("torso", np.array([0.0, 80.0]) / 30.0)[:, :3, 3]
     metres = float(np.linalg.norm(ends[1] - ends[0]))
-    source = known_distance(merged, _asked("torso:0", "torso:80", metres))
+    source = known_distance(merged.trajectories, ("torso:0", "torso:80", metres))
     # 3 mm of noise an axis at both ends, the floor of 4 mm on top, over some 2.5 m.
     assert 0.003 < source.sigma_log < 0.006
     assert abs(np.log(source.scale * GAUGE.scale)) < 3.0 * source.sigma_log
-    assert known_distance(merged, MergeOptions()) is None
+    assert known_distance(merged.trajectories, None) is None
 
 
 @pytest.mark.parametrize(
@@ -54,9 +49,9 @@ def test_a_known_distance_gives_the_scale(inputs):
         ("torso:5", "torso:5", EstimationError, "too near"),
     ],
 )
-def test_a_known_distance_that_cannot_be_says_why(inputs, first, second, error, says):
+def test_an_unusable_known_distance_is_refused_with_the_reason(inputs, first, second, error, says):
     with pytest.raises(error, match=says):
-        known_distance(inputs[1], _asked(first, second, 1.0))
+        known_distance(inputs[1].trajectories, (first, second, 1.0))
 
 
 def test_a_known_distance_needs_one_map(inputs):
@@ -66,10 +61,10 @@ def test_a_known_distance_needs_one_map(inputs):
     )
     apart = replace(inputs[1], trajectories=trajectories)
     with pytest.raises(JobError, match="share no view"):
-        known_distance(apart, _asked("torso:0", "left_palm:0", 1.0))
+        known_distance(apart.trajectories, ("torso:0", "left_palm:0", 1.0))
 
 
-def test_every_mount_has_a_movement_that_tells_more():
+def test_every_mount_has_a_movement_that_reduces_its_uncertainty():
     skeleton = load_skeleton("full_body", 1.75)
     for role in filter(None, skeleton.roles):
         mount = nominal_mount("cam", role, skeleton)
@@ -87,12 +82,11 @@ def test_every_mount_has_a_movement_that_tells_more():
 @pytest.mark.parametrize(
     ("roles", "advice"), [(("Spine1", "LeftHand"), "T-pose"), (("Spine1",) * 2, "another bone")]
 )
-def test_the_scales_advice_follows_from_where_cameras_sit(roles, advice):
+def test_the_advice_on_the_scale_depends_on_the_bones_with_cameras(roles, advice):
     skeleton = load_skeleton("upper_body", 1.75)
     calibrated = SimpleNamespace(
         mounts=[nominal_mount(f"camera_{number}", role, skeleton) for number, role in enumerate(roles)],
-        sigma_log=0.27,
-        sources=[],
+        scale=SimpleNamespace(sigma_log=0.27, sources=[]),
         t_pose_ns=None,
     )
     sentence = describe_scale(calibrated)
@@ -101,22 +95,22 @@ def test_the_scales_advice_follows_from_where_cameras_sit(roles, advice):
     assert "merge.known_distance" in sentence
 
 
-def test_where_rigs_differ_the_rest_of_the_body_stays():
-    """A chest's joint that lies higher in its rig leaves shoulders where they were beside the hips."""
+def test_another_joint_placement_leaves_its_descendants_in_place():
+    """A higher chest joint leaves the shoulders at the same position relative to the hips."""
     skeleton = load_skeleton("full_body", 1.80)
     bones = kinematic_chain(skeleton, {"Hips", "LeftHand", "RightHand", "Head"})
-    elsewhere = joint_placement_modes(bones, ("torso",), 1.80)
+    modes = joint_placement_modes(bones, ("torso",), 1.80)
     index = {bone.role: position for position, bone in enumerate(bones)}
-    moved = np.zeros_like(elsewhere.offsets_m)
+    moved = np.zeros_like(modes.offsets_m)
     for position, bone in enumerate(bones):
         above = moved[bone.parent] if bone.parent >= 0 else 0.0
-        moved[position] = elsewhere.offsets_m[position] + above
+        moved[position] = modes.offsets_m[position] + above
     # Along the trunk 5.5 % of the stature.
     assert np.abs(moved[index["Spine1"], 2]).max() == pytest.approx(0.055 * 1.80)
     trunk = np.abs(moved[index["Spine1"]]).max(axis=0) > 0.0
     for role in ("LeftShoulder", "RightHand", "Neck", "Head"):
         np.testing.assert_allclose(moved[index[role]][:, trunk], 0.0, atol=1e-12)
-    # Both arms grow alike, and so does all of a person.
+    # Both arms get longer by the same length, and so do all bones of a person.
     np.testing.assert_allclose(moved[index["LeftHand"], 0], -moved[index["RightHand"], 0])
     assert np.linalg.norm(moved[index["LeftHand"], 0]) == pytest.approx(
         np.hypot(0.02, np.hypot(0.025, 0.03)) * 1.8
@@ -124,4 +118,4 @@ def test_where_rigs_differ_the_rest_of_the_body_stays():
     people = bone_length_modes(bones, ("torso",))
     assert people.offsets_m[index["LeftForeArm"]].sum() == pytest.approx(0.04 * 0.186 * 1.80)
     assert not people.mounts["torso"].any()
-    assert not elsewhere.mounts["torso"].any()
+    assert not modes.mounts["torso"].any()

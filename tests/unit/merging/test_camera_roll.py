@@ -1,4 +1,4 @@
-"""Cameras worn sideways or upside down: which of four rolls explains the motion."""
+"""Cameras that are mounted sideways or upside down: selection among four rolls."""
 
 from dataclasses import replace
 
@@ -14,6 +14,7 @@ from bodycap_batch.merging.body_calibration.camera_roll import (
     search_rolls,
     with_roll,
 )
+from bodycap_batch.merging.body_calibration.samples import PostureHints
 from bodycap_batch.merging.cameras.track import make_track
 from bodycap_batch.model.skeleton_presets import STATED_SIGMA_RAD, load_skeleton, nominal_mount
 from tests.stages.walker import ROLES, Walk, make_inputs, make_walk, record
@@ -21,23 +22,33 @@ from tests.stages.walker import ROLES, Walk, make_inputs, make_walk, record
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def _worn(rolls):
-    """Inputs and tracks of a walk whose cameras were turned about their optical axes."""
+def _with_rolls(rolls):
+    """Return inputs and tracks of a walk with cameras rotated about their optical axes."""
     rng = np.random.default_rng(2)
     walk = make_walk(rng, off_deg=5.0, off_m=0.01)
     mounts = {name: with_roll(mount, rolls.get(name, 0.0)) for name, mount in walk.mounts.items()}
-    worn = replace(walk, mounts=mounts)
-    inputs = make_inputs(worn, [record(worn, name, rng) for name in ROLES])
+    rotated = replace(walk, mounts=mounts)
+    inputs = make_inputs(rotated, [record(rotated, name, rng) for name in ROLES])
     index = {
         bone.role: position for position, bone in enumerate(kinematic_chain(inputs.skeleton, ROLES.values()))
     }
     return inputs, [make_track(inputs, each, index[ROLES[each.camera]]) for each in inputs.trajectories]
 
 
+def _reference_roll(inputs, tracks, *verticals):
+    return reference_roll(inputs.mount_by_camera(), tracks, *verticals)
+
+
+def _searched(inputs, tracks):
+    """Search the rolls of all cameras but the reference camera, with a known vertical."""
+    hints = PostureHints(vertical=UP)
+    return search_rolls(inputs.skeleton, inputs.mount_by_camera(), tracks, 1.0, hints, lambda: None)
+
+
 @pytest.mark.parametrize(("camera", "roll"), [("left_palm", 90.0), ("right_palm", 180.0)])
-def test_a_palm_camera_worn_sideways_is_found_out(camera, roll):
-    inputs, tracks = _worn({camera: roll})
-    found = {each.camera: each for each in search_rolls(inputs, tracks, 1.0, (UP, None), lambda: None)}
+def test_the_roll_of_a_palm_camera_is_found(camera, roll):
+    inputs, tracks = _with_rolls({camera: roll})
+    found = {each.camera: each for each in _searched(inputs, tracks)}
     assert found[camera].chosen_deg == roll
     others = [each for name, each in found.items() if name != camera]
     assert all(each.chosen_deg == 0.0 for each in others)
@@ -45,15 +56,15 @@ def test_a_palm_camera_worn_sideways_is_found_out(camera, roll):
 
 
 @pytest.mark.parametrize("sigma_rad", [STATED_SIGMA_RAD, np.radians(40.0)])
-def test_a_stated_orientation_is_not_tried(sigma_rad):
-    inputs, tracks = _worn({})
+def test_a_stated_orientation_is_not_searched(sigma_rad):
+    inputs, tracks = _with_rolls({})
     stated = tuple(replace(mount, sigma_rad=sigma_rad, by_name=False) for mount in inputs.mounts)
     assert not any(has_unknown_roll(mount) for mount in stated)
-    assert search_rolls(replace(inputs, mounts=stated), tracks, 1.0, (UP, None), lambda: None) == ()
+    assert _searched(replace(inputs, mounts=stated), tracks) == ()
 
 
 def _own_up(inputs, tracks):
-    """Where a trunk points whose camera sits at its name's place, by the camera's roll."""
+    """Return a function from a roll to the up direction of a trunk with a nominal camera of that roll."""
     mount = inputs.mount_of(tracks[0].camera)
 
     def own_up(degrees):
@@ -65,26 +76,26 @@ def _own_up(inputs, tracks):
 
 
 @pytest.mark.parametrize("roll", [0.0, 90.0, 180.0])
-def test_the_trunks_camera_is_above_the_hands(roll):
-    inputs, tracks = _worn({"torso": roll})
-    # Walls and floor agree with any of the four: each roll's own up is a direction of the room.
-    chosen, up = reference_roll(inputs, tracks, _own_up(inputs, tracks))
+def test_the_reference_camera_is_above_the_hands(roll):
+    inputs, tracks = _with_rolls({"torso": roll})
+    # Planes agree with any of the four rolls: the up direction of each one is a direction of the room.
+    chosen, up = _reference_roll(inputs, tracks, _own_up(inputs, tracks))
     assert chosen == roll
     assert up @ UP > 0.9
 
 
 @pytest.mark.parametrize("roll", [0.0, 90.0, 180.0, 270.0])
-def test_hands_tell_the_trunk_which_way_up_it_is_where_nothing_around_does(roll):
-    inputs, tracks = _worn({"torso": roll})
+def test_hanging_hands_give_the_roll_if_the_surroundings_give_no_vertical(roll):
+    inputs, tracks = _with_rolls({"torso": roll})
     own_up = _own_up(inputs, tracks)
-    assert reference_roll(inputs, tracks, lambda _: None, own_up) == (roll, None)
-    # One hand alone, or no word of the trunk's own, tells nothing.
-    assert reference_roll(inputs, tracks[:2], lambda _: None, own_up) == (0.0, None)
-    assert reference_roll(inputs, tracks, lambda _: None) == (0.0, None)
+    assert _reference_roll(inputs, tracks, lambda _: None, own_up) == (roll, None)
+    # One hand alone, or an unknown direction of the trunk, decides nothing.
+    assert _reference_roll(inputs, tracks[:2], lambda _: None, own_up) == (0.0, None)
+    assert _reference_roll(inputs, tracks, lambda _: None) == (0.0, None)
 
 
-def _beside(roles, over_m=None):
-    """Inputs and tracks of those roles, the first leading; the others are that far over it."""
+def _record_roles(roles, over_m=None):
+    """Return inputs and tracks of these roles, the reference camera first, the others higher by `over_m`."""
     rng, skeleton = np.random.default_rng(4), load_skeleton("full_body", 1.75)
     mounts = {role: nominal_mount(role, role, skeleton) for role in roles}
     walk = Walk(skeleton, mounts)
@@ -98,31 +109,37 @@ def _beside(roles, over_m=None):
 
 
 @pytest.mark.parametrize("role", ["Hips", "Spine"])
-def test_hands_at_work_do_not_turn_a_camera_at_the_belt(role):
-    inputs, tracks = _beside((role, "LeftHand", "RightHand"), over_m=0.18)
+def test_hands_at_work_do_not_change_the_roll_of_a_camera_at_the_belt(role):
+    inputs, tracks = _record_roles((role, "LeftHand", "RightHand"), over_m=0.18)
     own_up = _own_up(inputs, tracks)
-    assert reference_roll(inputs, tracks, lambda _: None, own_up) == (0.0, None)
-    # Nor where walls and floor agree with any of the four.
-    assert reference_roll(inputs, tracks, own_up)[0] == 0.0
+    assert _reference_roll(inputs, tracks, lambda _: None, own_up) == (0.0, None)
+    # The same holds if planes agree with any of the four rolls.
+    assert _reference_roll(inputs, tracks, own_up)[0] == 0.0
 
 
 @pytest.mark.parametrize("part", ["Shoulder", "Arm"])
-def test_shoulders_are_over_the_chest_and_do_not_turn_it(part):
-    inputs, tracks = _beside(("Spine1", f"Left{part}", f"Right{part}"), over_m=0.17)
-    assert reference_roll(inputs, tracks, lambda _: None, _own_up(inputs, tracks)) == (0.0, None)
+def test_shoulders_above_the_chest_do_not_change_its_roll(part):
+    inputs, tracks = _record_roles(("Spine1", f"Left{part}", f"Right{part}"), over_m=0.17)
+    assert _reference_roll(inputs, tracks, lambda _: None, _own_up(inputs, tracks)) == (
+        0.0,
+        None,
+    )
 
 
 @pytest.mark.parametrize("roll", [90.0, 180.0])
-def test_legs_tell_a_camera_at_the_belt_which_way_up_it_is(roll):
-    inputs, tracks = _beside(("Hips", "LeftHand", "RightHand", "LeftLeg", "RightLeg"))
+def test_legs_give_the_roll_of_a_camera_at_the_belt(roll):
+    inputs, tracks = _record_roles(("Hips", "LeftHand", "RightHand", "LeftLeg", "RightLeg"))
     turn = with_roll(replace(inputs.mounts[0], joint_from_cam=np.eye(4)), roll).joint_from_cam
     leading = replace(tracks[0], map_from_cam=tracks[0].map_from_cam @ turn)
     turned = [leading, *tracks[1:]]
-    assert reference_roll(inputs, turned, lambda _: None, _own_up(inputs, turned)) == (roll, None)
+    assert _reference_roll(inputs, turned, lambda _: None, _own_up(inputs, turned)) == (
+        roll,
+        None,
+    )
 
 
-def test_hands_that_are_lifted_half_of_the_time_turn_no_trunk():
-    inputs, tracks = _worn({})
+def test_hands_lifted_half_of_the_time_do_not_change_the_roll():
+    inputs, tracks = _with_rolls({})
     own_up = _own_up(inputs, tracks)
     lifted = []
     for track in tracks[1:]:
@@ -132,7 +149,10 @@ def test_hands_that_are_lifted_half_of_the_time_turn_no_trunk():
         below = (trunk[late, :3, 3] - poses[late, :3, 3]) @ UP
         poses[late, :3, 3] += 2.0 * below[:, None] * UP
         lifted.append(replace(track, map_from_cam=poses))
-    assert reference_roll(inputs, [tracks[0], *lifted], lambda _: None, own_up) == (0.0, None)
+    assert _reference_roll(inputs, [tracks[0], *lifted], lambda _: None, own_up) == (
+        0.0,
+        None,
+    )
 
 
 def test_the_runner_up_is_the_best_of_the_rest():
@@ -141,11 +161,11 @@ def test_the_runner_up_is_the_best_of_the_rest():
     assert ROLLS_DEG == (0.0, 90.0, 180.0, 270.0)
 
 
-def test_one_hand_alone_does_not_turn_the_trunk():
-    inputs, tracks = _worn({})
+def test_one_hand_alone_does_not_change_the_roll():
+    inputs, tracks = _with_rolls({})
     aside = tracks[0].map_from_cam[:, :3, :3].mean(axis=0)
 
     def up_of(degrees):
         return None if degrees == 0.0 else aside[:, 0] * (1.0 if degrees == 90.0 else -1.0)
 
-    assert reference_roll(inputs, tracks[:2], up_of) == (0.0, None)
+    assert _reference_roll(inputs, tracks[:2], up_of) == (0.0, None)

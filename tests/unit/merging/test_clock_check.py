@@ -61,7 +61,9 @@ def test_a_clock_that_is_off_is_told_with_what_would_suit_it(late_s: float) -> N
     assert doubt["shift_s"] == pytest.approx(-late_s, abs=0.1)
     assert doubt["scatter_left"] < 0.7
     way = "behind" if late_s < 0.0 else "ahead"
-    assert f"s {way}; with an offset_s of about 2.0 its place" in describe_clock("palm", doubt, 2.0)
+    assert f"s {way}; with an offset_s of about 2.0 its place" in describe_clock(
+        "palm", **doubt, offset_s=2.0
+    )
 
 
 def test_right_clocks_straight_walks_and_short_clips_are_not_doubted() -> None:

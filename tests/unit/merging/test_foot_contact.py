@@ -114,7 +114,7 @@ def test_standing_feet_are_held_in_the_solved_motion(tmp_path):
     for held in (True, False):
         options, context = MergeOptions(foot_contact=held), StageContext(work_dir=tmp_path)
         result = merge_trajectories(capture.inputs, options, context)
-        told = result.report["foot_contact"]
+        told = result.report.foot_contact
         assert list(told) == (["Left foot"] if held else [])
         roles = result.skeleton.roles
         still = result.graph_world_from_joint[10:50, roles.index("LeftFoot"), :3, 3]

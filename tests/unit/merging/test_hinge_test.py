@@ -1,4 +1,4 @@
-"""Elbows that bend about more than one axis: seen where cameras on both sides tell, and then let go."""
+"""Violated hinges: detected if cameras on both sides of the joint observe them, and loosened."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ ROLES = {
 
 
 def _calibrated(sideways_rad: float) -> CalibrationGraph:
-    """A body whose left elbow swings sideways by so much, seen by cameras that sit where they should."""
+    """Calibrate a body with a left elbow that swings sideways by this sigma. The mounts are nominal."""
     motion = reaching(240)
     skeleton = motion.skeleton
     local = np.array(motion.local_rotation)
@@ -32,7 +32,7 @@ def _calibrated(sideways_rad: float) -> CalibrationGraph:
     local[:, elbow] = so3_exp(np.outer(sway, [0.0, 1.0, 0.0])) @ local[:, elbow]
     poses = forward_kinematics(skeleton, motion.root_in_world_m, local)
     bones = kinematic_chain(skeleton, ROLES.values())
-    index = {bone.role: place for place, bone in enumerate(bones)}
+    index = {bone.role: number for number, bone in enumerate(bones)}
     mounts = {camera: nominal_mount(camera, role, skeleton) for camera, role in ROLES.items()}
     tracks = [
         CameraTrack(
@@ -51,21 +51,23 @@ def _calibrated(sideways_rad: float) -> CalibrationGraph:
     return calibration
 
 
-def test_an_elbow_that_swings_sideways_is_let_go():
+def test_an_elbow_that_swings_sideways_is_loosened():
     calibration = _calibrated(np.radians(15.0))
     assert calibration.test_hinges()
-    (role,) = calibration.off_hinge_m()  # the right one has no camera above it that could tell
+    (role,) = (
+        calibration.hinge_violation_m()
+    )  # the right elbow has no camera above it, so its hinge is not observable
     assert role == "LeftForeArm"
     # 15 degrees are 6.5 cm at the wrist of a straight forearm of 25 cm, 5 cm in the distances; the elbow is
     # bent, and the mounts take part of it.
-    assert 0.015 < calibration.off_hinge_m()[role] < 0.06
+    assert 0.015 < calibration.hinge_violation_m()[role] < 0.06
 
 
-def test_an_elbow_that_keeps_to_its_hinge_is_held_as_before():
+def test_an_elbow_that_keeps_to_its_hinge_changes_nothing():
     calibration = _calibrated(0.0)
     before, mounts = calibration.poses(), dict(calibration.mounts)
     assert not calibration.test_hinges()
-    assert calibration.off_hinge_m() == {}
+    assert calibration.hinge_violation_m() == {}
     assert (calibration.poses() == before).all()
     assert all((calibration.mounts[camera] == mount).all() for camera, mount in mounts.items())
 
@@ -82,14 +84,14 @@ def test_an_elbow_that_keeps_to_its_hinge_is_held_as_before():
 def test_only_cameras_on_both_sides_contradict_a_hinge(cameras, tested):
     skeleton = load_skeleton("upper_body", 1.75)
     bones = kinematic_chain(skeleton, cameras)
-    measured = {place for place, bone in enumerate(bones) if bone.role in cameras}
+    measured = {number for number, bone in enumerate(bones) if bone.role in cameras}
     assert len(observable_hinges(hinges(skeleton, bones), measured)) == tested
 
 
-def test_a_loose_hinge_is_told_with_what_to_do():
+def test_a_violated_hinge_is_described_with_advice():
     sentence = describe_hinge("LeftForeArm", FREE_SIGMA_M)
     assert "left elbow bends 10.0 cm" in sentence
     assert "; to know it better, strap" in sentence
-    # A palm's clock 60 ms off looks like a loose hinge, too.
+    # A palm's clock that is 60 ms off looks like a violated hinge as well.
     assert "check their clocks (offset_s)" in sentence
     assert "right knee" in describe_hinge("RightLeg", 0.02)

@@ -16,9 +16,9 @@ from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.cameras.track import make_track
 from bodycap_batch.merging.graph.error_modes import ErrorModes, stack_modes
 from bodycap_batch.merging.graph.factors import bone_key
-from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
 from bodycap_batch.merging.graph.joint_covariance import joint_covariance, sigma_percentiles
 from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution
+from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
 from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
 from bodycap_batch.model.geometry import make_transform, se3_adjoint, so3_exp
 from tests.stages.walker import FPS, ROLES, make_inputs, make_walk, record

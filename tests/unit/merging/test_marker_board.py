@@ -1,9 +1,10 @@
-"""The metric scale from a board that keyframes see: found in pictures, fitted, refused where it must be."""
+"""Metric scale from a marker board: detection in images, fit, refusal of unusable views."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ from bodycap_batch.config.job import load_job
 from bodycap_batch.config.options import MarkerBoard, MergeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body_calibration.marker_board import locate_board
+from bodycap_batch.merging.body_calibration.marker_board import LocatedBoard, locate_board
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import Similarity, invert, make_transform, so3_exp, transform_points
@@ -35,12 +36,20 @@ WORLD_FROM_BOARD = make_transform(look(0.1) @ so3_exp([0.2, 0.1, 0.3]), [1.6, 0.
 CAMERA = Camera(model="PINHOLE", width_px=320, height_px=240, params=np.array(LENS["params"]))
 
 
-def _scale(*asked: object) -> ScaleSource:
-    return locate_board(*asked).scale
+def _board(
+    inputs: MergeInputs, options: MergeOptions, main_from_gauge: dict[str, Similarity] | None = None
+) -> LocatedBoard:
+    board = locate_board(inputs.trajectories, inputs.board_views, options.marker_board, main_from_gauge)
+    assert board is not None
+    return board
+
+
+def _scale(*arguments: Any) -> ScaleSource:
+    return _board(*arguments).scale
 
 
 def _path(count: int, centre_noise_m: float = 0.0, half_way_m: float = 0.7) -> np.ndarray:
-    """world_from_cam (N,4,4) of somebody who walks past the board, looking at it."""
+    """Return world_from_cam (N,4,4) of a person who walks past the board and looks at it."""
     rng = np.random.default_rng(3)
     across = np.linspace(-half_way_m, half_way_m, count)
     centres = np.stack([0.3 + 0.2 * across, across, 0.1 * np.sin(5.0 * across)], axis=1)
@@ -68,14 +77,14 @@ def _inputs(world_from_cam: np.ndarray, views: tuple[BoardView, ...] = ()) -> Me
         clocks={"torso": CameraClock(nominal_fps=30.0)},
         skeleton=skeleton,
         mounts=(nominal_mount("torso", "Spine1", skeleton),),
-        board=views,
+        board_views=views,
     )
 
 
 def _views(
     world_from_cam: np.ndarray, rng: np.random.Generator, noise_px: float = 0.3
 ) -> tuple[BoardView, ...]:
-    """What a detector gives: corners with noise, and each view's own idea of the board's pose."""
+    """Return what a detector gives: corners with noise, and a pose of the board from each view alone."""
     x, y = np.meshgrid(np.arange(7), np.arange(5))
     board = 0.06 * np.stack([x.ravel(), y.ravel(), np.zeros(35)], axis=1)
     out = []
@@ -90,7 +99,7 @@ def _views(
     return tuple(out)
 
 
-def test_the_board_gives_the_scale_and_how_well():
+def test_the_board_gives_the_scale_and_its_uncertainty():
     for seed in range(5):
         rng = np.random.default_rng(seed)
         exact = _path(12)
@@ -103,7 +112,7 @@ def test_the_board_gives_the_scale_and_how_well():
 
 
 @pytest.mark.parametrize("half_way_m", [0.25, 0.5])
-def test_a_glimpse_of_the_board_shares_its_maps_error(half_way_m):
+def test_the_sigma_of_a_short_view_covers_the_error_of_the_map(half_way_m):
     off = []
     for seed in range(16):
         rng = np.random.default_rng(seed)
@@ -119,7 +128,7 @@ def test_a_glimpse_of_the_board_shares_its_maps_error(half_way_m):
     assert 0.6 < float(np.sqrt(np.mean(np.square(off)))) < 1.5
 
 
-def test_views_that_begin_at_the_other_end_and_a_wrong_one_do_no_harm():
+def test_views_that_start_at_the_other_end_and_a_wrong_view_do_no_harm():
     rng = np.random.default_rng(0)
     exact = _path(12)
     views = list(_views(exact, rng, noise_px=0.1))
@@ -134,7 +143,7 @@ def test_views_that_begin_at_the_other_end_and_a_wrong_one_do_no_harm():
     assert source.scale * GAUGE.scale == pytest.approx(1.0, abs=0.01)
 
 
-def test_a_board_in_a_further_map_is_in_that_maps_units():
+def test_a_board_in_another_map_uses_the_units_of_that_map():
     views = _views(_path(12), np.random.default_rng(0))
     inputs, asked = _inputs(_path(12), views), MergeOptions(marker_board=FLAT)
     half = Similarity(0.5, np.eye(3), np.zeros(3))
@@ -144,25 +153,25 @@ def test_a_board_in_a_further_map_is_in_that_maps_units():
         _scale(inputs, asked, {"map-1": half})
 
 
-def test_corners_with_numbers_are_not_turned_to_fit_a_view_whose_pose_is_wrong():
+def test_numbered_corners_are_not_rotated_to_fit_a_wrong_view():
     views = list(_views(_path(12), np.random.default_rng(0), noise_px=0.1))
     inputs, asked = _inputs(_path(12), tuple(views)), MergeOptions(marker_board=FLAT)
     right = _scale(inputs, asked)
     about = make_transform(np.diag([-1.0, -1.0, 1.0]), [0.36, 0.24, 0.0])
     for one in (1, 4, 5):
         views[one] = replace(views[one], cam_from_board=views[one].cam_from_board @ about)
-    source = _scale(replace(inputs, board=tuple(views)), asked)
-    # Turned, their corners would be outliers, and the fit rest on the other nine.
+    source = _scale(replace(inputs, board_views=tuple(views)), asked)
+    # If they were rotated, their corners would be outliers, and the fit would use the other nine views.
     assert source.scale == pytest.approx(right.scale, rel=1e-6)
 
 
-def test_the_main_map_is_asked_before_one_that_was_joined():
+def test_views_in_the_main_map_come_before_those_in_an_aligned_one():
     rng = np.random.default_rng(0)
     views = _views(_path(12), rng)
     inputs = _inputs(_path(12))
     palm = replace(inputs.trajectories[0], camera="left_palm", gauge="map-1")
     few = tuple(view for view in views if view.frame % 3 == 0)
-    # The joined map's place is a fifth too large; its views are three times as many.
+    # The scale of the aligned map is 20 % too large; it has three times as many views.
     places = {
         "map-0": Similarity(1.0, np.eye(3), np.zeros(3)),
         "map-1": Similarity(1.2, np.eye(3), np.zeros(3)),
@@ -172,18 +181,18 @@ def test_the_main_map_is_asked_before_one_that_was_joined():
         clocks=inputs.clocks | {"left_palm": inputs.clocks["torso"]},
         mounts=(*inputs.mounts, replace(inputs.mounts[0], camera="left_palm")),
         trajectories=(*inputs.trajectories, palm),
-        board=(*few, *(replace(view, camera="left_palm") for view in views)),
+        board_views=(*few, *(replace(view, camera="left_palm") for view in views)),
     )
     asked = MergeOptions(marker_board=FLAT)
     assert _scale(both, asked, places).scale * GAUGE.scale == pytest.approx(1.0, abs=0.02)
-    fewer = replace(both, board=both.board[2:])
+    fewer = replace(both, board_views=both.board_views[2:])
     assert _scale(fewer, asked, places).scale * GAUGE.scale == pytest.approx(1.0 / 1.2, abs=0.02)
 
 
-def test_a_board_that_tells_nothing_is_refused():
+def test_a_board_without_enough_views_is_refused():
     rng = np.random.default_rng(0)
     asked = MergeOptions(marker_board=FLAT)
-    assert locate_board(_inputs(_path(4)), MergeOptions()) is None
+    assert locate_board(_inputs(_path(4)).trajectories, (), None) is None
     with pytest.raises(EstimationError, match="found in 2 keyframes"):
         _scale(_inputs(_path(2), _views(_path(2), rng)), asked)
     still = np.repeat(_path(1), 6, axis=0)
@@ -194,7 +203,7 @@ def test_a_board_that_tells_nothing_is_refused():
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory) -> tuple[Path, np.ndarray]:
-    """A clip of the ChArUco board on a grey wall, and its poses."""
+    """Write a clip of the ChArUco board on a grey wall; return its folder and the camera poses."""
     folder, poses = tmp_path_factory.mktemp("filmed"), _path(8)
     texels = 24
     picture = cv2.copyMakeBorder(
@@ -240,23 +249,23 @@ def test_a_filmed_board_is_found_and_measured(filmed, tmp_path):
     assert find_board_views(capture, every, {"torso": CAMERA}, other, context) == ()
 
 
-def test_a_board_that_lies_or_hangs_tells_up():
+def test_a_lying_or_hanging_board_gives_the_vertical():
     views = _views(_path(12), np.random.default_rng(0))
-    board = locate_board(_inputs(_path(12), views), MergeOptions(marker_board=FLAT))
-    assert board.ups(None) == ()
+    board = _board(_inputs(_path(12), views), MergeOptions(marker_board=FLAT))
+    assert board.verticals(None) == ()
     edges = GAUGE.rotation @ WORLD_FROM_BOARD[:3, :3]
-    (lying,) = board.ups("lying")
-    # It is seen from where its normal points, whichever way the detector has that.
+    (lying,) = board.verticals("lying")
+    # The normal points towards the cameras, whatever its sign from the detector.
     towards = GAUGE.rotation @ (_path(12)[:, :3, 3].mean(axis=0) - WORLD_FROM_BOARD[:3, 3])
     assert lying.up @ towards > 0.0
     # 0.1 px of noise in a dozen views of 24 corners: a small part of a degree.
     assert abs(lying.up @ edges[:, 2]) > np.cos(np.radians(0.5))
-    hanging = [say.up for say in board.ups("hanging")]
+    hanging = [say.up for say in board.verticals("hanging")]
     assert len(hanging) == 4
     for edge in (edges[:, 0], -edges[:, 0], edges[:, 1], -edges[:, 1]):
         assert max(up @ edge for up in hanging) > np.cos(np.radians(0.5))
     turned = Similarity(0.5, so3_exp([0.0, 0.0, 1.0]), np.zeros(3))
-    (placed,) = locate_board(
+    (placed,) = _board(
         _inputs(_path(12), views), MergeOptions(marker_board=FLAT), {"map-0": turned}
-    ).ups("lying")
+    ).verticals("lying")
     assert np.allclose(placed.up, turned.rotation @ lying.up)

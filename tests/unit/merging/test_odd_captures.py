@@ -1,4 +1,4 @@
-"""The skeleton stage on odd captures: cameras never seen together, single frames, no scale."""
+"""The merging stage on unusual captures: cameras never measured together, single frames, no scale."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body.provisional_scale import reach_constraint
 from bodycap_batch.merging.body_calibration import calibration_graph
-from bodycap_batch.merging.body_calibration.anthropometry import bone_length_modes, joint_placement_modes
+from bodycap_batch.merging.body_calibration.anthropometry import skeleton_error_modes
+from bodycap_batch.merging.body_calibration.calibration_covariance import (
+    ScaleUncertainty,
+    error_modes,
+    mounts_with_sigmas,
+)
 from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.known_distance import known_distance
 from bodycap_batch.merging.body_calibration.samples import take_samples
@@ -53,14 +57,14 @@ def _only(track, from_s, to_s):
     return track.keep((track.times_ns >= from_s * 1e9) & (track.times_ns < to_s * 1e9))
 
 
-def test_a_camera_seldom_seen_with_the_others_is_sampled(body):
+def test_a_camera_rarely_measured_with_the_others_is_sampled(body):
     trunk, left, right = body[2]
     samples = take_samples([trunk, _only(left, 0.0, 5.5), _only(right, 5.6, 6.0)], 1.0, 12)
     assert samples.valid[2].sum() >= 8
     assert samples.valid[1].sum() >= 10
 
 
-def test_a_camera_never_seen_with_others_keeps_its_usual_mount_and_weighs_as_little(body):
+def test_a_camera_never_measured_with_others_keeps_its_nominal_mount_and_its_sigma(body):
     inputs, bones, (trunk, left, right) = body
     tracks = [_only(trunk, 0.0, 3.0), _only(left, 0.0, 3.2), _only(right, 3.5, 6.0)]
     samples = take_samples(tracks, 1.0, 12)
@@ -70,8 +74,9 @@ def test_a_camera_never_seen_with_others_keeps_its_usual_mount_and_weighs_as_lit
     assert np.isfinite(calibration.solve(1.0))
     usual = mounts["right_palm"].joint_from_cam
     assert np.abs(calibration.mounts["right_palm"] - usual).max() < 1e-3
-    constant, _ = calibration.spread(0.05, {name: np.zeros((4, 4)) for name in ROLES}, {})
-    solved = {mount.camera: mount for mount in calibration.solved_mounts(constant)}
+    scale = ScaleUncertainty(0.05, {name: np.zeros((4, 4)) for name in ROLES})
+    constant = error_modes(calibration, scale, {}).constant
+    solved = {mount.camera: mount for mount in mounts_with_sigmas(calibration, constant)}
     loose = inflate_sigmas(tracks[2], solved["right_palm"])
     # 15 degrees in all, 8.7 per axis.
     assert (loose.sigma_rad > np.radians(8.6)).all()
@@ -81,15 +86,16 @@ def test_a_camera_never_seen_with_others_keeps_its_usual_mount_and_weighs_as_lit
     assert inflate_sigmas(tracks[1], turned) is tracks[1]
 
 
-def test_bones_of_a_height_alone_may_be_longer_on_both_sides_alike(body):
+def test_bone_lengths_from_a_height_vary_on_both_sides_alike(body):
     inputs, bones, tracks = body
     samples = take_samples(tracks, 1.0, 12)
     mounts = {mount.camera: mount for mount in inputs.mounts}
     calibration = CalibrationGraph(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
     calibration.solve(1.0)
-    follow = {name: np.zeros((4, 4)) for name in ROLES}
-    bodies = bone_length_modes(bones, tuple(ROLES)), joint_placement_modes(bones, tuple(ROLES), 1.75)
-    (known, _), (likely, passing) = (calibration.spread(0.01, follow, {}, each) for each in ((), (bodies,)))
+    scale = ScaleUncertainty(0.01, {name: np.zeros((4, 4)) for name in ROLES})
+    known = error_modes(calibration, scale, {}).constant
+    from_height = error_modes(calibration, scale, {}, skeleton_error_modes(bones, tuple(ROLES), 1.75))
+    likely = from_height.constant
     assert not known.offsets_m.any()
     index = {bone.role: place for place, bone in enumerate(bones)}
     for side in ("Left", "Right"):
@@ -101,14 +107,14 @@ def test_bones_of_a_height_alone_may_be_longer_on_both_sides_alike(body):
         for side in ("Left", "Right")
     ]
     assert columns[0].tolist() == columns[1].tolist()
-    # What a palm's mount follows of an arm that is longer adds to what was uncertain of it.
+    # A palm's mount follows a longer arm, which adds to its uncertainty.
     before, after = (np.linalg.norm(each.mounts["left_palm"][3:]) for each in (known, likely))
     assert before < after < 2.0 * before
-    # Where another rig has its joints is none of this, but of how far the joints may be off.
-    assert passing.offsets_m.any()
+    # Another placement of the joints is a transient mode.
+    assert from_height.transient.offsets_m.any()
 
 
-def test_a_camera_never_seen_with_the_trunk_is_sampled_beside_another(body):
+def test_a_camera_never_measured_with_the_reference_camera_is_sampled_with_another(body):
     trunk, left, right = body[2]
     samples = take_samples([_only(trunk, 0.0, 3.0), left, _only(right, 3.5, 6.0)], 1.0, 12)
     alone = ~samples.valid[0]
@@ -117,7 +123,7 @@ def test_a_camera_never_seen_with_the_trunk_is_sampled_beside_another(body):
     assert (np.diff(samples.times_ns) > 0).all()
 
 
-def test_cameras_never_seen_together_are_refused(body):
+def test_cameras_never_measured_together_are_refused(body):
     trunk, left, right = body[2]
     with pytest.raises(EstimationError, match="'torso' was localised together with another camera in only 0"):
         take_samples([_only(trunk, 0.0, 2.0), _only(left, 2.5, 4.0), _only(right, 4.5, 6.0)], 1.0, 12)
@@ -141,14 +147,14 @@ def test_a_t_pose_is_no_gesture(body, monkeypatch):
     monkeypatch.setattr(
         calibration_graph, "widen_joint_priors", lambda *args: asked.append(args[2:]) or bones
     )
-    calibration.widen_postures()
+    calibration.widen_joint_priors()
     ((poses, times_ns),) = asked
     assert 0 < len(times_ns) < len(posed)
     assert (times_ns == samples.times_ns[~posed]).all()
     assert (poses == calibration.poses()[~posed]).all()
     nothing_else = replace(samples.posture, t_pose=np.ones_like(posed))
-    calibration.move(replace(samples, posture=nothing_else))
-    calibration.widen_postures()
+    calibration.set_samples(replace(samples, posture=nothing_else))
+    calibration.widen_joint_priors()
     assert len(asked) == 1
 
 
@@ -170,7 +176,7 @@ def test_bursts_are_no_common_walk(body):
 
 
 class _Sliding:
-    """A calibration whose cost falls without end."""
+    """A calibration graph with a cost that has no minimum."""
 
     def __init__(self):
         self.mounts = {"cam": np.eye(4)}
@@ -179,7 +185,7 @@ class _Sliding:
         return 10.0 - float(np.log(scale))
 
 
-def test_a_cost_that_falls_without_end_leaves_the_scale_open():
+def test_a_cost_without_minimum_leaves_the_scale_unknown():
     estimate = estimate_scale(_Sliding(), 1.0)
     assert estimate.sigma_log == 1.0
     assert np.isfinite(estimate.mount_slope["cam"]).all()
@@ -192,13 +198,13 @@ def test_a_known_distance_in_a_further_map_is_in_that_maps_units(body, recorded)
             replace(each, gauge="map-1") if each.camera == "right_palm" else each for each in recorded
         ),
     )
-    asked = MergeOptions(known_distance=("right_palm:0", "right_palm:90", 2.0))
+    asked = ("right_palm:0", "right_palm:90", 2.0)
     half = Similarity(0.5, np.eye(3), np.zeros(3))
-    alone = known_distance(inputs, asked)
-    placed = known_distance(inputs, asked, {"map-0": half, "map-1": half})
+    alone = known_distance(inputs.trajectories, asked)
+    placed = known_distance(inputs.trajectories, asked, {"map-0": half, "map-1": half})
     assert placed.scale == pytest.approx(2.0 * alone.scale)
     with pytest.raises(EstimationError, match="cannot place"):
-        known_distance(inputs, asked, {"map-0": half})
+        known_distance(inputs.trajectories, asked, {"map-0": half})
 
 
 def test_a_swinging_upper_arm_does_not_say_where_the_other_arm_is():

@@ -37,7 +37,6 @@ from bodycap_batch.merging.world.floor import (
     floor_from_points,
     standing_height,
 )
-from bodycap_batch.merging.world.world_frame import initial_heading, rotation_to_z_up, world_from_solved_frame
 from bodycap_batch.merging.world.planes import (
     BENT_TILT_LIMIT_DEG,
     TILT_LIMIT_DEG,
@@ -45,6 +44,7 @@ from bodycap_batch.merging.world.planes import (
     vertical_from_planes,
 )
 from bodycap_batch.merging.world.vertical import Vertical
+from bodycap_batch.merging.world.world_frame import initial_heading, rotation_to_z_up, world_from_solved_frame
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp, so3_log
 from bodycap_batch.model.merge_data import CameraClock
 from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount, rest_positions

@@ -11,8 +11,8 @@ from bodycap_batch.merging.body.t_pose import arm_span, find_t_pose, with_t_pose
 from bodycap_batch.merging.body.trunk_lean import modal_direction
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.graph.error_modes import POSTURE_BIAS_SHARE
-from bodycap_batch.merging.graph.posture import find_posture, vertical_from_path
 from bodycap_batch.merging.graph.joint_priors import GESTURE_DURATION_S, widen_joint_priors
+from bodycap_batch.merging.graph.posture import find_posture, vertical_from_path
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.skeleton import forward_kinematics
 from bodycap_batch.model.skeleton_presets import load_skeleton, rest_positions

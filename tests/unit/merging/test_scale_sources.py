@@ -155,8 +155,8 @@ def test_a_join_is_told_what_the_job_states_of_up_and_how_the_trunks_camera_is_r
         raise EstimationError("enough")
 
     monkeypatch.setattr(align, "stated_constraints", lambda *_: StatedConstraints(verticals=(lying,)))
-    monkeypatch.setattr(align, "trunk_way_up", way_up)
-    monkeypatch.setattr(align, "Calibration", calibration)
+    monkeypatch.setattr(align, "reference_camera_roll", way_up)
+    monkeypatch.setattr(align, "CalibrationGraph", calibration)
     main, further = candidate_main_maps(short.inputs)[0]
     assert "enough" in align_cameras(short.inputs, main, further[:1], lambda: None).unused[further[0].camera]
     assert told[0] == (lying,)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -108,7 +106,7 @@ def test_a_lean_that_lasts_does_not_show_unless_it_walks(forward_deg, share):
     assert 38.0 < found.sigma_deg < 50.0
     assert _off_deg(found) < 2.5 * found.sigma_deg
     assert not found.is_determined()
-    assert "not for certain: nothing else tells it" in describe_vertical(SimpleNamespace(up=found))
+    assert "not for certain: it rests on the posture alone" in describe_vertical(found)
     if share == 1.0:
         walked = _found(axes, path, np.zeros((0, 3)), walks=True)
         assert walked.sigma_deg == pytest.approx(15.0, abs=0.5)
@@ -181,7 +179,7 @@ def test_a_board_on_the_floor_tells_who_is_upside_down():
     assert _off_deg(found) < 0.5
     # However strange it is beside what the job does not say.
     assert found.is_determined()
-    assert describe_vertical(SimpleNamespace(up=found)).endswith("from the map")
+    assert describe_vertical(found).endswith("from the map")
 
 
 def test_a_board_hung_at_half_a_right_angle_leaves_two_of_its_edges():

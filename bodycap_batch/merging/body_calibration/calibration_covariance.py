@@ -1,0 +1,248 @@
+"""Estimate the uncertainty of a solved calibration graph, and how its residuals depend on camera poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.merging.body_calibration.anthropometry import SkeletonErrorModes
+from bodycap_batch.merging.body_calibration.calibration_graph import JOINT_PRIOR_SCALE, CalibrationGraph
+from bodycap_batch.merging.body_calibration.joint_variability import transient_variance_shares
+from bodycap_batch.merging.body_calibration.mount_covariance import (
+    LinearisedCalibration,
+    ReducedSystem,
+    RowType,
+)
+from bodycap_batch.merging.body_calibration.samples import CalibrationSamples
+from bodycap_batch.merging.graph.error_modes import (
+    POSTURE_BIAS_SHARE,
+    ErrorModes,
+    map_error_modes,
+    mount_perturbation,
+    posture_bias_modes,
+    scale_modes,
+    stack_modes,
+)
+from bodycap_batch.merging.graph.factors import MountPoints, mount_keys
+from bodycap_batch.merging.graph.linearisation import LinearisedGraph
+from bodycap_batch.model.skeleton import Mount
+from bodycap_batch.model.skeleton_presets import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_RAD
+
+_TRANSIENT_SHARE = float(np.sqrt(1.0 - POSTURE_BIAS_SHARE**2))
+"""Part of a joint's everyday sigma that varies within a capture; `POSTURE_BIAS_SHARE` is constant."""
+
+
+class PoseSigma(NamedTuple):
+    """One-sigma uncertainty of a pose, per axis.
+
+    Attributes:
+        rotation_rad: Of the rotation.
+        position_m: Of the position.
+    """
+
+    rotation_rad: float
+    position_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleUncertainty:
+    """Uncertainty of the metric scale, and how the mounts depend on it.
+
+    Attributes:
+        sigma_log: Sigma of the logarithm of the scale.
+        mount_slope: By camera, change of joint_from_cam (4,4) per unit of log scale.
+    """
+
+    sigma_log: float
+    mount_slope: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationErrorModes:
+    """The error modes of a calibration.
+
+    Attributes:
+        constant: Modes that are constant over the capture: noise of the calibration, bias of the posture,
+            scale, bone lengths.
+        transient: Modes that act on single intervals of the motion only: bends of the map, varying posture,
+            placement of the joints.
+    """
+
+    constant: ErrorModes
+    transient: ErrorModes
+
+    def stacked(self) -> ErrorModes:
+        """Return all modes."""
+        return stack_modes([self.constant, self.transient])
+
+
+def error_modes(
+    graph: CalibrationGraph,
+    scale: ScaleUncertainty,
+    alignment: Mapping[str, PoseSigma],
+    skeleton: SkeletonErrorModes | None = None,
+) -> CalibrationErrorModes:
+    """Return the error modes of the last solution of a calibration graph.
+
+    Args:
+        graph: The solved graph.
+        scale: Uncertainty of the scale.
+        alignment: By camera of a map that was aligned by the body, uncertainty of its map's pose.
+        skeleton: Error modes of the bones; None if the bones were measured. The modes of joint placement are
+            transient: they do not add to the uncertainty of the mounts, which refer to the same placement.
+    """
+    samples, cameras = graph.samples, graph.samples.cameras
+    linearised = graph.linearised()
+    reduced = linearised.reduced()
+    factors = variance_factors(samples, linearised, reduced)
+    map_error = _map_error_variance(samples, linearised, reduced)
+    body_modes = [posture_bias_modes(linearised.body.bones, cameras, POSTURE_BIAS_SHARE)]
+    body_modes += [] if skeleton is None else [skeleton.bone_lengths]
+    follow = {name: mount_perturbation(graph.mounts[name], scale.mount_slope[name]) for name in cameras}
+    bends = np.sqrt(map_error) * np.stack([samples.sigma_rad, graph.scale * samples.sigma_map], axis=1)
+    bends = np.hypot(bends, [alignment.get(name, (0.0, 0.0)) for name in cameras])
+    constant = stack_modes(
+        [
+            linearised.error_modes(reduced, factors, stack_modes(body_modes)),
+            scale_modes(graph.bones, scale.sigma_log, follow),
+        ]
+    )
+    transient = [
+        posture_bias_modes(graph.bones, cameras, _transient_shares(samples, linearised, reduced)),
+        map_error_modes(graph.bones, dict(zip(cameras, bends, strict=True))),
+    ]
+    transient += [] if skeleton is None else [linearised.propagated(reduced, skeleton.joint_placement)]
+    return CalibrationErrorModes(constant, stack_modes(transient))
+
+
+def mounts_with_sigmas(graph: CalibrationGraph, modes: ErrorModes) -> tuple[Mount, ...]:
+    """Return the mounts of the last solution with their sigmas.
+
+    Args:
+        graph: The solved graph.
+        modes: Error modes that are constant over the capture.
+    """
+    out = []
+    for name in graph.samples.cameras:
+        variance = (modes.mounts[name] ** 2).sum(axis=1)
+        out.append(
+            Mount(
+                camera=name,
+                role=graph.priors[name].role,
+                joint_from_cam=graph.mounts[name],
+                sigma_rad=float(np.sqrt(variance[:3].mean())),
+                sigma_m=float(np.sqrt(variance[3:].mean())),
+            )
+        )
+    return tuple(out)
+
+
+def variance_factors(
+    samples: CalibrationSamples, linearised: LinearisedCalibration, reduced: ReducedSystem
+) -> FloatArray:
+    """Estimate the variance factor (5,) of each `RowType` from the residuals."""
+    correlated = samples.correlated_samples
+    map_error = _map_error_variance(samples, linearised, reduced)
+    # Remaining gaps may be correlated in the same way as the errors of the map.
+    gap = correlated * linearised.variance_factor(reduced, RowType.JOINT_GAP, 1.0 / correlated)
+    factors = {
+        RowType.PRIOR: 1.0,
+        RowType.MEASUREMENT: samples.white_noise_share + correlated * map_error,
+        RowType.JOINT_GAP: gap,
+        # Joint rotations are weighed at widened sigmas. Their transient part differs between samples.
+        RowType.JOINT_ROTATION: (_TRANSIENT_SHARE / JOINT_PRIOR_SCALE) ** 2,
+        # Mounts by name are weighed at a larger sigma than they have.
+        RowType.NAMED_MOUNT: (NOMINAL_ERROR_RAD / NOMINAL_SIGMA_RAD) ** 2,
+    }
+    return np.array([factors[row_type] for row_type in RowType])
+
+
+def rescale_sigmas(
+    graph: CalibrationGraph, linearised: LinearisedCalibration, reduced: ReducedSystem
+) -> None:
+    """Reduce the sigmas of measurements and gaps to those estimated from the residuals.
+
+    Residuals below the usual error of a map mean that this map is better. Sigmas never grow.
+
+    Args:
+        graph: The solved graph; its sigmas are changed.
+        linearised: Its linearisation.
+        reduced: The reduced system of that.
+    """
+    factors = variance_factors(graph.samples, linearised, reduced)
+    graph.rescale_sigmas(
+        min(float(factors[RowType.MEASUREMENT]), 1.0), min(float(factors[RowType.JOINT_GAP]), 1.0)
+    )
+
+
+def measurement_jacobian(
+    graph: CalibrationGraph, linear: LinearisedGraph, directions: FloatArray
+) -> FloatArray:
+    """Return the change of the residuals (R,P) if the measured camera poses move along P directions.
+
+    Args:
+        graph: The solved graph.
+        linear: The Jacobian at the last solution.
+        directions: (C,K,P,6) rotation (rad), then translation (m), of each camera in the axes of the map.
+    """
+    samples = graph.samples
+    poses, all_points = graph.poses(), samples.mount_points(graph.scale)
+    out = np.zeros((linear.matrix.shape[0], directions.shape[2]))
+    for camera in range(len(samples.cameras)):
+        ticks = np.flatnonzero(samples.valid[camera])
+        rotation = samples.map_from_cam[camera, ticks, :3, :3]
+        all_factors = graph.measurement_factors(camera)
+        for point, key in enumerate(mount_keys(camera)):
+            factors = all_factors[:, point]
+            arm = rotation @ all_points[camera].x_in_cam()[point]
+            shift = directions[camera, ticks, :, 3:] + np.cross(
+                directions[camera, ticks, :, :3], arm[:, None]
+            )
+            in_bone = np.einsum("kji,kpj->kip", poses[ticks, samples.bones[camera], :3, :3], shift)
+            derivative = linear.pose_jacobians(factors, 3, [key] * len(ticks))[..., :3]
+            rows = linear.first_row[factors][:, None] + np.arange(3)
+            out[rows] = derivative @ in_bone
+    return out
+
+
+def scale_jacobian(graph: CalibrationGraph, linearised: LinearisedCalibration) -> FloatArray:
+    """Return the change of the residuals (R,) per unit of log scale because their sigmas change.
+
+    Centres and gaps are uncertain in map units, so their whitened residuals shrink as the map grows. Without
+    this term the smallest scale would have the lowest cost. Rotations do not depend on the scale.
+
+    Args:
+        graph: The solved graph.
+        linearised: Its linearisation.
+    """
+    linear = linearised.linear
+    out = np.where(linearised.row_types == RowType.JOINT_GAP, -linear.rhs, 0.0)
+    for camera in range(len(graph.samples.cameras)):
+        centre = linear.first_row[graph.measurement_factors(camera)[:, 0]][:, None] + np.arange(3)
+        for point, share in enumerate((1.0, *[MountPoints.AXIS_WHITENING_RATIO] * 3)):
+            out[centre + 3 * point] = -share * linear.rhs[centre]
+    return out
+
+
+def _transient_shares(
+    samples: CalibrationSamples, linearised: LinearisedCalibration, reduced: ReducedSystem
+) -> FloatArray:
+    """Return the part (B,) of each joint's everyday sigma that varies within the capture."""
+    usual = np.flatnonzero(~samples.posture.t_pose)
+    shares = transient_variance_shares(linearised, reduced, usual, samples.times_ns[usual], JOINT_PRIOR_SCALE)
+    return np.sqrt(shares)
+
+
+def _map_error_variance(
+    samples: CalibrationSamples, linearised: LinearisedCalibration, reduced: ReducedSystem
+) -> float:
+    """Return the variance of the measurements beyond their own noise, relative to their assumed variance."""
+    white, correlated = samples.white_noise_share, samples.correlated_samples
+    # The assumed variance of the map's error was multiplied by the number of samples that share it.
+    # The residuals of single samples show it without this factor.
+    prior = white + (1.0 - white) / correlated
+    return max(linearised.variance_factor(reduced, RowType.MEASUREMENT, prior) - white, 0.0)
