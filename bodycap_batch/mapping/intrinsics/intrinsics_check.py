@@ -285,8 +285,8 @@ def misfit_note(camera: str, factor: float, *, freed: bool = False) -> str:
         fits = "another centre or distortion than" if freed else "a centre that lies elsewhere than where"
         cause = "the picture cropped, or another lens mode or size calibrated? Film the whole picture"
     return (
-        f"{camera}: the pictures fit {fits} the calibration says{instead}: was {cause}, calibrate in the same "
-        "mode, or use calibration: auto"
+        f"{camera}: the pictures fit {fits} the calibration says{instead}: was {cause}, calibrate in the "
+        "same mode, or use calibration: auto"
     )
 
 

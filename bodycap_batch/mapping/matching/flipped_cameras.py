@@ -48,8 +48,8 @@ _HINT = (
 )
 
 _UNDECIDED_HINT = (
-    "that is right if one of them films a wall mirror, or if the room's halves are mirror images of each other; "
-    "else the picture in which text reads backwards is flipped, and the result is wrong"
+    "that is right if one of them films a wall mirror, or if the room's halves are mirror images of each "
+    "other; else the picture in which text reads backwards is flipped, and the result is wrong"
 )
 
 
