@@ -12,6 +12,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray, set_array
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.map_diagnostics import MapDiagnostics
 
 _FEATURE_STRIDE = 1 << 24
 
@@ -193,6 +194,11 @@ class MapResult:
     maps: tuple[Map, ...]
     workspace: Path
     log: Mapping[str, Any]
+
+    @property
+    def diagnostics(self) -> MapDiagnostics:
+        """The typed content of the log."""
+        return MapDiagnostics.from_log(self.log)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

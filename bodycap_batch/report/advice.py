@@ -12,6 +12,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.percent import percent
+from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.model.scene import Map
 from bodycap_batch.report.inputs import ReportInputs
 from bodycap_batch.report.losses import Cause
@@ -105,9 +106,14 @@ def _t_pose_once(found: Sequence[Advice]) -> list[Advice]:
     return [*others, once]
 
 
+def _map_diagnostics(inputs: ReportInputs) -> MapDiagnostics:
+    """Return what mapping reports, from the metrics; empty without metrics."""
+    return MapDiagnostics.from_log((inputs.metrics or {}).get("mapping", {}))
+
+
 def _mirrored(inputs: ReportInputs) -> Sequence[str]:
     """Cameras that the map left out for it."""
-    return list((inputs.metrics or {}).get("mapping", {}).get("mirrored_cameras", ()))
+    return _map_diagnostics(inputs).flipped_cameras
 
 
 def _of_mirrored(inputs: ReportInputs) -> Iterator[Advice]:
@@ -119,7 +125,7 @@ def _of_mirrored(inputs: ReportInputs) -> Iterator[Advice]:
             because="it shows what the other cameras see with left and right exchanged, and was left out",
             weight=3.0,
         )
-    for one, other in (inputs.metrics or {}).get("mapping", {}).get("mirror_images", ()):
+    for one, other in _map_diagnostics(inputs).undecided_groups:
         yield Advice(
             do=f"See whether text reads backwards in the video of {', '.join(one)} or {', '.join(other)}: "
             "flip that one back (ffmpeg -i in -vf hflip out.mp4). If none does, cover wall mirrors.",
@@ -130,7 +136,7 @@ def _of_mirrored(inputs: ReportInputs) -> Iterator[Advice]:
 
 def _of_lenses(inputs: ReportInputs) -> Iterator[Advice]:
     """Calibrations that the map contradicts: nothing else can be right before they are."""
-    misfits = (inputs.metrics or {}).get("mapping", {}).get("misfitting_lenses", {})
+    misfits = _map_diagnostics(inputs).misfit_factors
     if misfits:
         fits = "; ".join(f"{name} has {other_lens(factor)}" for name, factor in sorted(misfits.items()))
         yield Advice(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bodycap_batch.core.percent import percent
+from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.report.beside import of_reach, of_shared_segments
 from bodycap_batch.report.grades import Criterion, Grade, graded
 
@@ -147,11 +148,12 @@ def _of_map(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
         why="A camera outside the main map has no known place in the room; nothing of it reaches the body, "
         "unless the body itself tells where it was, and then less exactly.",
     )
-    mapping, merge = metrics.get("mapping", {}), metrics.get("merge", {})
+    mapping = MapDiagnostics.from_log(metrics.get("mapping", {}))
+    merge = metrics.get("merge", {})
     unused = merge.get("unused_cameras", {})
-    yield from of_reach(mapping.get("reach"), unused)
+    yield from of_reach(mapping.reach, unused)
     yield from of_shared_segments(metrics.get("relative_poses", ()), merge.get("mounts", {}), unused)
-    misfits, freed = mapping.get("misfitting_lenses", {}), mapping.get("freed_lenses", ())
+    misfits, freed = mapping.misfit_factors or {}, mapping.recalibrated
     # A lens of the wrong kind, a wide one given as a pinhole, leaves more than sharp corners do.
     yield from _of_lenses(misfits, freed if error is not None and float(error) <= _SHARP_PX else ())
 

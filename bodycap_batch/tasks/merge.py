@@ -30,7 +30,7 @@ def _merge(options: Json, arguments: Json, context: StageContext, files: Path) -
     except EstimationError as error:
         from bodycap_batch.mapping.matching.flipped_cameras import add_flip_hint
 
-        add_flip_hint(error, load_map(arguments["map"]).log)
+        add_flip_hint(error, load_map(arguments["map"]).diagnostics)
         raise
     write_bundle(result, files, "merge")
     doubts = [*result.report.get("doubted_clocks", {}).values(), result.report.get("exchanged_sides", {})]
