@@ -38,6 +38,7 @@ from bodycap_batch.mapping.validation.camera_distance_check import Reach, check_
 from bodycap_batch.mapping.validation.epipolar_consistency import check_consistency, check_coverage
 from bodycap_batch.mapping.validation.remaining_keyframes import resect_remaining
 from bodycap_batch.mapping.validation.repair import repair_model
+from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.model.scene import KeyframeSelection, MapResult
 
 
@@ -114,7 +115,7 @@ def build_map_once(
         for item in selections
     ]
     add_keyframes(workspace, keyframes, options, context)
-    selections, options, flip_log = exclude_flipped_cameras(workspace, selections, options)
+    selections, options, flips = exclude_flipped_cameras(workspace, selections, options)
     ids = read_camera_ids(workspace)
     refs = [ImageRef(item.camera, int(frame)) for item in selections for frame in item.frames]
     calibrated_ids = calibrated_camera_ids(capture, ids)
@@ -124,7 +125,7 @@ def build_map_once(
     tried, match_log = match_keyframes(skeletal, workspace, intrinsics_of(capture), context)
     uncalibrated = {number: name for name, number in ids.items() if capture.camera(name).camera.refine}
     models, initial_log = reconstruct_with_intrinsics(mapping, options, uncalibrated, len(skeletal.refs))
-    log: dict[str, Any] = {"keyframes": len(refs), **match_log, **initial_log, **flip_log}
+    log: dict[str, Any] = {"keyframes": len(refs), **match_log, **initial_log, **flips.to_log()}
     if models:
         models[0], log["repair"] = repair_model(models[0], tried, mapping, skeletal.refs)
         resected: Sequence[set[int] | None] = [None] * len(models)
@@ -132,14 +133,15 @@ def build_map_once(
             resected, log["placed"] = resect_remaining(models, generator, tried, mapping)
         log["unconfirmed_points"] = finalise_models(models, mapping, capture, resected)
     attempts = log.get("initial_candidates", log["initial_pair_ladder"])
-    refused = add_flip_hint(check_coverage(models, len(refs), attempts, options), flip_log)
+    refused = add_flip_hint(check_coverage(models, len(refs), attempts, options), flips)
     if refused is not None and not models:
         raise refused
     write_models(workspace, models)
     calibrated = {number: name for name, number in ids.items() if capture.camera(name).calibrated}
-    log["misfitting_lenses"] = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
+    misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
+    log = MapDiagnostics(misfit_factors=misfits, details=log).to_log()
     result = make_result(models, workspace, log)
     reach_log = check_distances(result.maps[0], common_times_ns(capture), reach).to_log() if reach else None
     ratios = [log[step]["contradicted_share"] for step in ("repair", "placed") if step in log]
-    refused = refused or add_flip_hint(check_consistency(max(ratios), reach_log), flip_log)
+    refused = refused or add_flip_hint(check_consistency(max(ratios), reach_log), flips)
     return replace(result, log={**result.log, "reach": reach_log}), refused

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -98,9 +99,13 @@ def extend_map(
         "unconfirmed_points": transient,
         **match_log,
     }
-    growth = [*previous.log.get("growth", []), entry]
-    log = {**previous.log, "keyframes": len(existing) + len(new), "growth": growth}
-    return make_result(models, workspace, log)
+    diagnostics = previous.diagnostics
+    diagnostics = replace(
+        diagnostics,
+        extensions=(*diagnostics.extensions, entry),
+        details={**diagnostics.details, "keyframes": len(existing) + len(new)},
+    )
+    return make_result(models, workspace, diagnostics.to_log())
 
 
 def _image_refs(frames: Mapping[str, IntArray]) -> list[ImageRef]:

@@ -31,6 +31,8 @@ def refine_map(
     trajectories: Sequence[Trajectory],
     options: MapOptions,
     context: StageContext,
+    *,
+    skeletal_above: int = SKELETAL_ABOVE,
 ) -> MapResult:
     """Correct a map for rolling shutters, with the motion that registration found.
 
@@ -44,6 +46,7 @@ def refine_map(
         trajectories: Poses of every frame in one of the previous map's gauges, by camera.
         options: The stage's options.
         context: Work folder.
+        skeletal_above: Number of keyframes above which a model is adjusted in two steps.
 
     Returns:
         The corrected models, each in a new gauge; models without a rolling shutter unchanged.
@@ -58,7 +61,7 @@ def refine_map(
     workspace = context.work_dir / "workspace"
     shutil.copytree(previous.workspace, workspace)
     calibrated_ids = calibrated_camera_ids(capture, read_camera_ids(workspace))
-    mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, SKELETAL_ABOVE)
+    mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, skeletal_above)
     settings = mapping.mapper_options()
     cameras = {camera.name: camera for camera in capture.cameras}
     models, all_readouts = [], []

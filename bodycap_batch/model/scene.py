@@ -16,6 +16,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray, set_array
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.map_diagnostics import MapDiagnostics
 
 _FEATURE_STRIDE = 1 << 24
 """Number of feature indices per frame in a combined (frame, feature) key. Derivation: above any SIFT count,
@@ -224,6 +225,11 @@ class MapResult:
     maps: tuple[Map, ...]
     workspace: Path
     log: Mapping[str, Any]
+
+    @property
+    def diagnostics(self) -> MapDiagnostics:
+        """The typed content of the log."""
+        return MapDiagnostics.from_log(self.log)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

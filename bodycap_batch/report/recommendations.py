@@ -11,6 +11,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.percent import format_percent
+from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.model.merge_report import ScaleReport
 from bodycap_batch.model.scene import Map
 from bodycap_batch.report.drawn_scene import common_times_s
@@ -120,9 +121,14 @@ def _combine_t_poses(found: Sequence[Recommendation]) -> list[Recommendation]:
     return [*others, combined]
 
 
+def _map_diagnostics(inputs: ReportInputs) -> MapDiagnostics:
+    """Return what mapping reports, from the metrics; empty without metrics."""
+    return MapDiagnostics.from_log((inputs.metrics or {}).get("mapping", {}))
+
+
 def _mirrored_cameras(inputs: ReportInputs) -> Sequence[str]:
     """Return the cameras that the map excludes because their videos are mirrored."""
-    return list((inputs.metrics or {}).get("mapping", {}).get("mirrored_cameras", ()))
+    return _map_diagnostics(inputs).flipped_cameras
 
 
 def _about_mirrored_cameras(inputs: ReportInputs) -> Iterator[Recommendation]:
@@ -134,7 +140,7 @@ def _about_mirrored_cameras(inputs: ReportInputs) -> Iterator[Recommendation]:
             reason="it shows what the other cameras see with left and right exchanged, and was excluded",
             priority=3.0,
         )
-    for one, other in (inputs.metrics or {}).get("mapping", {}).get("mirror_images", ()):
+    for one, other in _map_diagnostics(inputs).undecided_groups:
         yield Recommendation(
             action=f"See whether text reads backwards in the video of {', '.join(one)} or "
             f"{', '.join(other)}: flip that one back (ffmpeg -i in -vf hflip out.mp4). "
@@ -146,7 +152,7 @@ def _about_mirrored_cameras(inputs: ReportInputs) -> Iterator[Recommendation]:
 
 def _about_lenses(inputs: ReportInputs) -> Iterator[Recommendation]:
     """Recommend to correct calibrations that the map contradicts; all other results depend on them."""
-    misfits = (inputs.metrics or {}).get("mapping", {}).get("misfitting_lenses", {})
+    misfits = _map_diagnostics(inputs).misfit_factors
     if misfits:
         fits = "; ".join(
             f"{name} has {describe_lens_misfit(factor)}" for name, factor in sorted(misfits.items())

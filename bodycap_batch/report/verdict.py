@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bodycap_batch.core.percent import format_percent
+from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.report.camera_pairs import distance_criteria, shared_segment_criteria
 from bodycap_batch.report.grades import Criterion, Grade, grade_value
 
@@ -156,11 +157,12 @@ def _map_criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
             value=float(error),
         )
     yield _one_map_criterion(metrics)
-    mapping, merge = metrics.get("mapping", {}), metrics.get("merge", {})
+    mapping = MapDiagnostics.from_log(metrics.get("mapping", {}))
+    merge = metrics.get("merge", {})
     unused = merge.get("unused_cameras", {})
-    yield from distance_criteria(mapping.get("reach"), unused)
+    yield from distance_criteria(mapping.reach, unused)
     yield from shared_segment_criteria(metrics.get("relative_poses", ()), merge.get("mounts", {}), unused)
-    misfits, freed = mapping.get("misfitting_lenses", {}), mapping.get("freed_lenses", ())
+    misfits, freed = mapping.misfit_factors or {}, mapping.recalibrated
     # A wrong camera model, such as a pinhole for a wide lens, leaves a larger error than sharp corners have.
     # Then the lenses that were estimated together with the map do not count as corrected.
     yield from _lens_criteria(misfits, freed if error is not None and float(error) <= _GOOD_ERROR_PX else ())

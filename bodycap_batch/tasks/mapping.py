@@ -131,23 +131,22 @@ def _save_map(result: MapResult, files: Path) -> None:
     """Store a map with the workspace that is needed to extend it."""
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.mapping.intrinsics.intrinsics_check import misfit_note
-    from bodycap_batch.mapping.intrinsics.recalibration import RECALIBRATED
     from bodycap_batch.mapping.matching.flipped_cameras import flip_notes
 
     workspace = files / "workspace"
     os.rename(result.workspace, workspace)
     write_dataclass(dataclasses.replace(result, workspace=workspace), files, "map")
     largest = result.maps[0]
-    wrong: Mapping[str, float] = result.log.get("misfitting_lenses", {})
+    diagnostics = result.diagnostics
     write_summary(
         files,
         keyframes=len(largest.keyframe_camera),
         points=len(largest.points),
         notes=[
-            *flip_notes(result.log),
+            *flip_notes(diagnostics),
             *(
-                misfit_note(camera, factor, freed=camera in result.log.get(RECALIBRATED, ()))
-                for camera, factor in sorted(wrong.items())
+                misfit_note(camera, factor, freed=camera in diagnostics.recalibrated)
+                for camera, factor in sorted((diagnostics.misfit_factors or {}).items())
             ),
         ],
     )

@@ -65,7 +65,7 @@ def run_merge(task: MergeTask, context: StageContext, files: Path) -> None:
     except EstimationError as error:
         from bodycap_batch.mapping.matching.flipped_cameras import add_flip_hint
 
-        add_flip_hint(error, load_map(task.map.path).log)
+        add_flip_hint(error, load_map(task.map.path).diagnostics)
         raise
     write_dataclass(result, files, "merge")
     notes = [f"camera {name} is no part of the body: {why}" for name, why in result.unused_cameras.items()]

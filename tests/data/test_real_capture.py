@@ -16,7 +16,7 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.keyframes import select_keyframes
-from bodycap_batch.mapping import build_map, refine, refine_map
+from bodycap_batch.mapping import build_map, refine_map
 from bodycap_batch.model.geometry import align_points
 from bodycap_batch.model.rolling_shutter import has_visible_rolling_shutter
 from bodycap_batch.model.scene import KeyframeSelection, Map, MapResult, Registration, Trajectory
@@ -97,7 +97,6 @@ def test_the_rolling_shutter_is_found_and_taken_out(outcome: Outcome, data_root:
 def test_a_very_large_map_loses_its_rolling_shutter_too(
     outcome: Outcome, data_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(refine, "MANY", 20)
     adjusted = list[int]()
     create = pycolmap.create_default_bundle_adjuster
 
@@ -109,7 +108,8 @@ def test_a_very_large_map_loses_its_rolling_shutter_too(
 
     monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", noted)
     surroundings = StageContext(work_dir=tmp_path, threads=2)
-    refined = refine_map(outcome.capture, outcome.maps[0], [outcome.before.trajectory], OPTIONS, surroundings)
+    paths = [outcome.before.trajectory]
+    refined = refine_map(outcome.capture, outcome.maps[0], paths, OPTIONS, surroundings, skeletal_above=20)
     assert max(adjusted) < len(refined.maps[0].keyframe_camera)
     camera = outcome.capture.cameras[0]
     after = register_frames(

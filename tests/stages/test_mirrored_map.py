@@ -16,7 +16,6 @@ from bodycap_batch.config.job import load_job
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build, build_map
 from bodycap_batch.mapping.matching.database import CameraKeyframes
-from bodycap_batch.mapping.matching.flipped_cameras import FLIPPED_CAMERAS, UNDECIDED_GROUPS
 from bodycap_batch.model.scene import KeyframeSelection
 from tests.rooms import stroll, write_capture
 from tests.stages.conftest import context
@@ -70,7 +69,7 @@ def test_the_map_is_the_same_as_without_the_flipped_camera(
     monkeypatch.setattr(build, "add_keyframes", counted)
     options = MapOptions(init_frames=("left_palm:3", "torso:20"))
     found = build_map(flipped_capture, list(selections.values()), options, context(tmp_path / "all"))
-    assert found.log[FLIPPED_CAMERAS] == ["left_palm"]
+    assert found.diagnostics.flipped_cameras == ("left_palm",)
     assert len(extracted) == len(set(extracted)) == sum(len(each.frames) for each in selections.values())
     straight = [each for each in selections.values() if each.camera != "left_palm"]
     alone = build_map(
@@ -86,8 +85,8 @@ def test_two_cameras_that_see_mirror_images_get_a_map_each(
 ) -> None:
     two = [each for each in selections.values() if each.camera != "head"]
     found = build_map(_without(flipped_capture, "head"), two, MapOptions(), context(tmp_path))
-    assert found.log[UNDECIDED_GROUPS] == [[["left_palm"], ["torso"]]]
-    assert FLIPPED_CAMERAS not in found.log
+    assert found.diagnostics.undecided_groups == ((("left_palm",), ("torso",)),)
+    assert not found.diagnostics.flipped_cameras
     assert [set(each.keyframe_camera) for each in found.maps] in (
         [{"left_palm"}, {"torso"}],
         [{"torso"}, {"left_palm"}],

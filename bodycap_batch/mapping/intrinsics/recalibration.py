@@ -5,21 +5,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from bodycap_batch.capture import Capture
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.map_diagnostics import RefinedIntrinsics
 from bodycap_batch.model.scene import Map, MapResult
 
-RECALIBRATED = "freed_lenses"
-"""Key of the log: names of the cameras whose given intrinsics were replaced by refined ones."""
-
-_INTRINSICS = "found_lenses"
-"""Key of the log: the refined intrinsics of these cameras. A later map may hold no keyframe of such a
-camera."""
 _MIN_KEYFRAME_RATIO = 0.95
 """Ratio of a map's keyframes, in total and of each camera, that a better map must hold. Evidence: none."""
 
@@ -35,8 +29,8 @@ def recalibrate_if_misfit(
     Evidence: docs/decisions/mapping.md.
 
     Args:
-        result: The map with all calibrated intrinsics held constant. ``misfitting_lenses`` in its log names
-            the cameras that it contradicts.
+        result: The map with all calibrated intrinsics held constant. Its diagnostics name the cameras that
+            it contradicts.
         capture: All cameras.
         build: Builds a map of the capture with other intrinsics.
         refused: Why that map cannot be used, if it cannot: wrong intrinsics may be the cause.
@@ -45,7 +39,7 @@ def recalibrate_if_misfit(
         EstimationError: `refused`, if refined intrinsics give no better map.
     """
     refined = _recalibrate(result, capture, build, usable=refused is None)
-    if refused is not None and RECALIBRATED not in refined.log:
+    if refused is not None and not refined.diagnostics.recalibrated:
         raise refused
     return refined
 
@@ -54,7 +48,7 @@ def _recalibrate(
     result: MapResult, capture: Capture, build: Callable[[Capture], MapResult], *, usable: bool
 ) -> MapResult:
     """Return the map with refined intrinsics if it is better, else the given map; the log says which."""
-    misfits: Mapping[str, float] = result.log["misfitting_lenses"]
+    misfits = result.diagnostics.misfit_factors or {}
     if not misfits:
         return result
     given = {name: capture.camera(name).camera for name in misfits}
@@ -69,16 +63,17 @@ def _recalibrate(
         return replace(result, log={**result.log, "freeing_refused": comparison})
     cameras = {name: other.cameras[name] for name in sorted(misfits)}
     factors = {name: round(camera.focal_px / given[name].focal_px, 3) for name, camera in cameras.items()}
-    log = {
-        **again.log,
-        "misfitting_lenses": {**again.log["misfitting_lenses"], **factors},
-        RECALIBRATED: list(cameras),
-        _INTRINSICS: {
-            name: {"model": camera.model, "params": camera.params.tolist()}
+    diagnostics = again.diagnostics
+    diagnostics = replace(
+        diagnostics,
+        misfit_factors={**(diagnostics.misfit_factors or {}), **factors},
+        recalibrated=tuple(cameras),
+        refined_intrinsics={
+            name: RefinedIntrinsics(camera.model, tuple(camera.params.tolist()))
             for name, camera in cameras.items()
         },
-    }
-    return replace(again, log=log)
+    )
+    return replace(again, log=diagnostics.to_log())
 
 
 def with_map_intrinsics(capture: Capture, previous: MapResult) -> Capture:
@@ -88,17 +83,15 @@ def with_map_intrinsics(capture: Capture, previous: MapResult) -> Capture:
     """
     mapped = previous.maps[0].cameras
     cameras = {
-        name: mapped[name]
-        if name in mapped
-        else replace(capture.camera(name).camera, **_camera_params_from_log(logged))
-        for name, logged in previous.log.get(_INTRINSICS, {}).items()
+        name: mapped[name] if name in mapped else _with_intrinsics(capture.camera(name).camera, refined)
+        for name, refined in previous.diagnostics.refined_intrinsics.items()
     }
     return with_intrinsics_to_refine(capture, cameras)
 
 
-def _camera_params_from_log(logged: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of a `Camera` that the log holds."""
-    return {"model": logged["model"], "params": np.array(logged["params"])}
+def _with_intrinsics(camera: Camera, refined: RefinedIntrinsics) -> Camera:
+    """Return a camera with another model and parameters."""
+    return replace(camera, model=refined.model, params=np.array(refined.params))
 
 
 def with_intrinsics_to_refine(capture: Capture, cameras: Mapping[str, Camera]) -> Capture:

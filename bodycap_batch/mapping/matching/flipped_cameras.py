@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import combinations, product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,19 +19,11 @@ from bodycap_batch.mapping.matching.database import (
 )
 from bodycap_batch.mapping.matching.descriptors import ByteDescriptors
 from bodycap_batch.mapping.matching.retrieval import count_ratio_test_matches, largest_descriptors
+from bodycap_batch.model.map_diagnostics import CameraGroups, MapDiagnostics
 from bodycap_batch.model.scene import KeyframeSelection
 
 CameraDescriptors = npt.NDArray[np.float32]
 """(K,128,128) `largest_descriptors` of K keyframes of one camera."""
-
-FLIPPED_CAMERAS = "mirrored_cameras"
-"""Key of the log: names of the cameras that were left out because their picture is flipped."""
-
-UNDECIDED_GROUPS = "mirror_images"
-"""Key of the log: pairs of groups (camera names each) that see mirror images of each other, all kept."""
-
-_NAMED, _LEFT_OUT = "named_initial_pair", "left_out"
-"""Keys of the log: the user's initial pair, and the flipped cameras in it."""
 
 _KEYFRAMES_PER_CAMERA = 12
 """Keyframes of each camera that are compared, evenly spaced. Evidence: none."""
@@ -64,7 +55,7 @@ def mirror_descriptors(descriptors: ByteDescriptors) -> ByteDescriptors:
 
 def exclude_flipped_cameras(
     workspace: Path, selections: Sequence[KeyframeSelection], options: MapOptions
-) -> tuple[list[KeyframeSelection], MapOptions, dict[str, Any]]:
+) -> tuple[list[KeyframeSelection], MapOptions, MapDiagnostics]:
     """Remove cameras with a flipped picture from the database: the smaller of two groups of cameras.
 
     Pictures alone cannot distinguish a flipped picture from one of a wall mirror, or of the other half of
@@ -78,32 +69,37 @@ def exclude_flipped_cameras(
 
     Returns:
         The selections of the remaining cameras. The options, without an initial pair that names a camera
-        that is left out. Entries for the log: `FLIPPED_CAMERAS` and `UNDECIDED_GROUPS`, if any.
+        that is left out. The diagnostics on flipped cameras.
     """
     if len(selections) < 2:
-        return list(selections), options, {}
+        return list(selections), options, MapDiagnostics()
     cameras = [item.camera for item in selections]
     flipped, undecided = label_cameras(cameras, _pair_evidence(workspace, selections))
-    log: dict[str, Any] = {UNDECIDED_GROUPS: undecided} if undecided else {}
     if not flipped:
-        return list(selections), options, log
+        return list(selections), options, MapDiagnostics(undecided_groups=undecided)
     rewrite_without_cameras(workspace, flipped)
-    log[FLIPPED_CAMERAS] = sorted(flipped)
-    if lost := flipped & {name.rpartition(":")[0] for name in options.init_frames or ()}:
+    lost = flipped & {name.rpartition(":")[0] for name in options.init_frames or ()}
+    if lost:
         options = options.model_copy(update={"init_frames": None})
-        log[_NAMED] = {"failed": "a mirrored camera was left out", _LEFT_OUT: sorted(lost)}
-    return [item for item in selections if item.camera not in flipped], options, log
+    diagnostics = MapDiagnostics(
+        undecided_groups=undecided,
+        flipped_cameras=tuple(sorted(flipped)),
+        excluded_from_pair=tuple(sorted(lost)),
+    )
+    return [item for item in selections if item.camera not in flipped], options, diagnostics
 
 
-def flip_notes(log: Mapping[str, Any]) -> list[str]:
-    """Return the notes for the user on flipped cameras, given a map's log."""
-    named = log.get(_NAMED, {}).get(_LEFT_OUT, ())
+def flip_notes(diagnostics: MapDiagnostics) -> list[str]:
+    """Return the notes for the user on flipped cameras."""
     return [
-        *map(excluded_camera_note, log.get(FLIPPED_CAMERAS, ())),
-        *(f"map.init_frames names camera {name}, which is left out: it is not used" for name in named),
+        *map(excluded_camera_note, diagnostics.flipped_cameras),
+        *(
+            f"map.init_frames names camera {name}, which is left out: it is not used"
+            for name in diagnostics.excluded_from_pair
+        ),
         *(
             f"{_undecided_sentence(groups)}: {_UNDECIDED_HINT}; {_HINT}"
-            for groups in log.get(UNDECIDED_GROUPS, ())
+            for groups in diagnostics.undecided_groups
         ),
     ]
 
@@ -113,15 +109,15 @@ def excluded_camera_note(camera: str) -> str:
     return f"camera {camera} shows the room mirrored (left and right exchanged) and is left out: {_HINT}"
 
 
-def add_flip_hint(error: EstimationError | None, log: Mapping[str, Any]) -> EstimationError | None:
-    """Return the same error; put undecided groups of cameras, if the log has any, in front of its hint."""
-    if error is not None and log.get(UNDECIDED_GROUPS):
-        groups = map(_undecided_sentence, log[UNDECIDED_GROUPS])
+def add_flip_hint(error: EstimationError | None, diagnostics: MapDiagnostics) -> EstimationError | None:
+    """Return the same error; put undecided groups of cameras, if there are any, in front of its hint."""
+    if error is not None and diagnostics.undecided_groups:
+        groups = map(_undecided_sentence, diagnostics.undecided_groups)
         error.hint = "; ".join([*groups, _UNDECIDED_HINT, _HINT, *filter(None, [error.hint])])
     return error
 
 
-def _undecided_sentence(groups: Sequence[Sequence[str]]) -> str:
+def _undecided_sentence(groups: CameraGroups) -> str:
     """Return the sentence that names two groups of cameras."""
     one, other = (", ".join(names) for names in groups)
     return f"cameras {one} and {other} see mirror images of each other"
@@ -180,7 +176,7 @@ def _sample_descriptors(
 
 def label_cameras(
     cameras: Sequence[str], evidence: Mapping[tuple[str, str], int]
-) -> tuple[set[str], list[list[list[str]]]]:
+) -> tuple[set[str], tuple[CameraGroups, ...]]:
     """Label each camera as one orientation or the other, given signed evidence on pairs of cameras.
 
     Cameras are joined into components, the strongest evidence first. Later evidence that contradicts a
@@ -207,7 +203,7 @@ def label_cameras(
         change = sign * first[one] * second[other]
         first |= {name: change * label for name, label in second.items()}
         components |= dict.fromkeys(second, first)
-    flipped, undecided = set[str](), []
+    flipped, undecided = set[str](), list[CameraGroups]()
     for component in sorted({tuple(sorted(labels.items())) for labels in components.values()}):
         groups = sorted(
             ([name for name, label in component if label == sign] for sign in (1, -1)), key=_size_and_names
@@ -215,12 +211,13 @@ def label_cameras(
         names = {name for name, _ in component}
         if names & contradicted:
             inside = {pair: found for pair, found in evidence.items() if names.issuperset(pair)}
-            undecided.append([[name] for name in min(inside, key=lambda pair: (inside[pair], pair))])
+            one, other = min(inside, key=lambda pair: (inside[pair], pair))
+            undecided.append(((one,), (other,)))
         elif len(groups[0]) == len(groups[1]):
-            undecided.append(groups)
+            undecided.append((tuple(groups[0]), tuple(groups[1])))
         else:
             flipped.update(groups[0])
-    return flipped, undecided
+    return flipped, tuple(undecided)
 
 
 def _size_and_names(names: Sequence[str]) -> tuple[int, Sequence[str]]:

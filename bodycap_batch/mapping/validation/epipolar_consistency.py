@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bodycap_batch.config import MapOptions
-from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.mapping.matching.database import DATABASE_NAME
-from bodycap_batch.model.geometry import skew
 
 if TYPE_CHECKING:
     import pycolmap
@@ -64,7 +62,7 @@ def evaluate_pairs(workspace: Path, model: pycolmap.Reconstruction) -> list[Pair
     """
     import pycolmap
 
-    poses = {int(i): np.asarray(model.image(i).cam_from_world().matrix()) for i in model.reg_image_ids()}
+    poses = {int(i): model.image(i).cam_from_world() for i in model.reg_image_ids()}
     rays, focal_px = {}, {}
     out = []
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
@@ -73,29 +71,20 @@ def evaluate_pairs(workspace: Path, model: pycolmap.Reconstruction) -> list[Pair
             if number in poses:
                 camera = model.image(number).camera  # The model's intrinsics may be refined.
                 pixels = np.asarray(database.read_keypoints(number), dtype=np.float64)[:, :2]
-                rays[number] = np.column_stack([camera.cam_from_img(pixels), np.ones(len(pixels))])
+                rays[number] = np.asarray(camera.cam_from_img(pixels))
                 focal_px[number] = camera.mean_focal_length()
         for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
             a, b = map(int, pycolmap.pair_id_to_image_pair(pair))
             matches = np.asarray(geometry.inlier_matches)
             if a in poses and b in poses and len(matches) >= _MIN_PAIR_MATCHES:
-                error_px = focal_px[a] * _sampson_distance(
-                    rays[a][matches[:, 0]], rays[b][matches[:, 1]], poses[a], poses[b]
+                essential = pycolmap.essential_matrix_from_pose(poses[b] * poses[a].inverse())
+                squared = pycolmap.compute_squared_sampson_error(
+                    rays[a][matches[:, 0]], rays[b][matches[:, 1]], essential
                 )
+                error_px = focal_px[a] * np.sqrt(squared)
                 ratio = float((error_px < _MAX_ERROR_PX).mean())
                 out.append(PairConsistency(a, b, len(matches), ratio))
     return out
-
-
-def _sampson_distance(first: FloatArray, second: FloatArray, pose_a: Any, pose_b: Any) -> FloatArray:
-    """Return the Sampson distances (M,) of rays (M,3) at depth 1 under two poses cam_from_map (3,4)."""
-    b_from_a = pose_b[:, :3] @ pose_a[:, :3].T
-    translation = pose_b[:, 3] - b_from_a @ pose_a[:, 3]
-    essential = skew(translation / max(float(np.linalg.norm(translation)), 1e-12)) @ b_from_a
-    lines_b, lines_a = first @ essential.T, second @ essential
-    numerator = np.abs((second * lines_b).sum(axis=1))
-    slope = (lines_b[:, :2] ** 2).sum(axis=1) + (lines_a[:, :2] ** 2).sum(axis=1)
-    return np.asarray(numerator / np.sqrt(np.maximum(slope, 1e-18)))
 
 
 def find_misregistered_images(pairs: Sequence[PairConsistency]) -> set[int]:

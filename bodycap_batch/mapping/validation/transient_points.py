@@ -1,4 +1,4 @@
-"""Remove points that one camera saw for a moment only: the wearer's sleeve, and points as unreliable."""
+"""Remove points that one camera observed for a moment only: they are often on the wearer's sleeve."""
 
 from __future__ import annotations
 

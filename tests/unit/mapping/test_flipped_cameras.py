@@ -26,8 +26,6 @@ from bodycap_batch.mapping.matching.database import (
     read_keypoint_colours,
 )
 from bodycap_batch.mapping.matching.flipped_cameras import (
-    FLIPPED_CAMERAS,
-    UNDECIDED_GROUPS,
     add_flip_hint,
     exclude_flipped_cameras,
     excluded_camera_note,
@@ -36,6 +34,7 @@ from bodycap_batch.mapping.matching.flipped_cameras import (
     mirror_descriptors,
 )
 from bodycap_batch.mapping.matching.retrieval import count_ratio_test_matches, largest_descriptors
+from bodycap_batch.model.map_diagnostics import CameraGroups, MapDiagnostics
 from bodycap_batch.model.scene import KeyframeSelection
 from bodycap_batch.tasks import merge
 from bodycap_batch.tasks.inputs import ArtefactRef
@@ -54,6 +53,7 @@ def _wall() -> np.ndarray:
 
 
 WALL = _wall()
+LEFT_OR_TORSO = MapDiagnostics(undecided_groups=((("left",), ("torso",)),))
 
 
 class _Pan:
@@ -98,10 +98,10 @@ def _workspace(folder: Path, *cameras: _Pan) -> list[KeyframeSelection]:
     return cast(list[KeyframeSelection], chosen)
 
 
-def _remaining(folder: Path, *cameras: _Pan) -> tuple[list[str], dict[str, Any]]:
-    """Return the names of the remaining cameras, and the log."""
-    left, _, log = exclude_flipped_cameras(folder, _workspace(folder, *cameras), MapOptions())
-    return [item.camera for item in left], log
+def _remaining(folder: Path, *cameras: _Pan) -> tuple[list[str], MapDiagnostics]:
+    """Return the names of the remaining cameras, and the diagnostics."""
+    left, _, diagnostics = exclude_flipped_cameras(folder, _workspace(folder, *cameras), MapOptions())
+    return [item.camera for item in left], diagnostics
 
 
 def _content(folder: Path) -> list[tuple[Any, ...]]:
@@ -141,7 +141,10 @@ def test_descriptors_of_a_mirrored_picture_can_be_computed() -> None:
 
 def test_the_flipped_one_of_three_cameras_is_left_out(tmp_path: Path) -> None:
     cameras = _Pan("head", 300), _Pan("left", 0, mirrored=True), _Pan("torso", 150, upside_down=True)
-    assert _remaining(tmp_path, *cameras) == (["head", "torso"], {FLIPPED_CAMERAS: ["left"]})
+    assert _remaining(tmp_path, *cameras) == (
+        ["head", "torso"],
+        MapDiagnostics(flipped_cameras=("left",)),
+    )
     assert "camera left shows the room mirrored" in excluded_camera_note("left")
 
 
@@ -157,7 +160,7 @@ def test_the_database_is_the_same_as_without_the_flipped_camera(tmp_path: Path) 
 
 def test_cameras_with_equal_orientation_are_kept(tmp_path: Path) -> None:
     cameras = _Pan("head", 300), _Pan("left", 0), _Pan("torso", 150)
-    assert _remaining(tmp_path, *cameras) == (["head", "left", "torso"], {})
+    assert _remaining(tmp_path, *cameras) == (["head", "left", "torso"], MapDiagnostics())
 
 
 def test_a_camera_without_keyframes_is_kept(tmp_path: Path) -> None:
@@ -166,13 +169,13 @@ def test_a_camera_without_keyframes_is_kept(tmp_path: Path) -> None:
 
 
 def test_two_cameras_that_see_mirror_images_are_both_kept_and_named(tmp_path: Path) -> None:
-    left, log = _remaining(tmp_path, _Pan("left", 0, mirrored=True), _Pan("torso", 150))
-    assert (left, log) == (["left", "torso"], {UNDECIDED_GROUPS: [[["left"], ["torso"]]]})
-    (note,) = flip_notes(log)
+    left, diagnostics = _remaining(tmp_path, _Pan("left", 0, mirrored=True), _Pan("torso", 150))
+    assert (left, diagnostics) == (["left", "torso"], LEFT_OR_TORSO)
+    (note,) = flip_notes(diagnostics)
     assert note.startswith("cameras left and torso see mirror images of each other: that is right if")
     assert note.count("wrong") == 1
     assert note.endswith("flip it back: ffmpeg -i in -vf hflip out.mp4")
-    error = add_flip_hint(EstimationError("too few", hint="film more"), log)
+    error = add_flip_hint(EstimationError("too few", hint="film more"), diagnostics)
     assert error is not None
     assert error.hint is not None
     assert error.hint.startswith("cameras left and torso see mirror images")
@@ -185,7 +188,7 @@ def test_the_hint_of_a_failed_merge_names_the_mirror_images(
     def refuse(*_: object) -> None:
         raise EstimationError("the body cannot place left", hint="film more")
 
-    mapped = SimpleNamespace(log={UNDECIDED_GROUPS: [[["left"], ["torso"]]]})
+    mapped = SimpleNamespace(diagnostics=LEFT_OR_TORSO)
     monkeypatch.setattr(merging, "merge_trajectories", refuse)
     monkeypatch.setattr(merge, "_merge_inputs", lambda _: None)
     monkeypatch.setattr(merge, "load_map", lambda _: mapped)
@@ -205,13 +208,14 @@ def test_the_hint_of_a_failed_merge_names_the_mirror_images(
 def test_an_initial_pair_of_an_excluded_camera_is_not_used(tmp_path: Path) -> None:
     cameras = _Pan("head", 300), _Pan("left", 0, mirrored=True), _Pan("torso", 150)
     named = MapOptions(init_frames=("left:1", "torso:2"))
-    _, options, log = exclude_flipped_cameras(tmp_path, _workspace(tmp_path, *cameras), named)
+    _, options, diagnostics = exclude_flipped_cameras(tmp_path, _workspace(tmp_path, *cameras), named)
     assert options.init_frames is None
-    assert "left out" in log["named_initial_pair"]["failed"]
-    assert "map.init_frames names camera left, which is left out: it is not used" in flip_notes(log)
+    assert diagnostics.excluded_from_pair == ("left",)
+    assert "left out" in diagnostics.to_log()["named_initial_pair"]["failed"]
+    assert "map.init_frames names camera left, which is left out: it is not used" in flip_notes(diagnostics)
 
 
-def _labels(evidence: dict[str, int]) -> tuple[set[str], list[list[list[str]]]]:
+def _labels(evidence: dict[str, int]) -> tuple[set[str], tuple[CameraGroups, ...]]:
     """Label five cameras with names of one letter; the result must not depend on their order."""
     found = [
         label_cameras(cameras, {(pair[0], pair[1]): each for pair, each in evidence.items()})
@@ -222,13 +226,13 @@ def _labels(evidence: dict[str, int]) -> tuple[set[str], list[list[list[str]]]]:
 
 
 def test_a_tie_of_two_cameras_does_not_affect_the_others() -> None:
-    assert _labels({"ab": 90, "ae": -80, "cd": -300}) == ({"e"}, [[["c"], ["d"]]])
-    assert _labels({"ab": 90, "cd": 80, "ac": -70}) == (set(), [[["a", "b"], ["c", "d"]]])
+    assert _labels({"ab": 90, "ae": -80, "cd": -300}) == ({"e"}, ((("c",), ("d",)),))
+    assert _labels({"ab": 90, "cd": 80, "ac": -70}) == (set(), ((("a", "b"), ("c", "d")),))
 
 
 def test_contradictory_evidence_excludes_no_camera() -> None:
-    assert _labels({"ab": 100, "bc": 100, "ac": -90, "cd": 100}) == (set(), [[["a"], ["c"]]])
+    assert _labels({"ab": 100, "bc": 100, "ac": -90, "cd": 100}) == (set(), ((("a",), ("c",)),))
     # Evidence three times as strong wins: b, c and d agree with a, in spite of the pair of a and c.
-    assert _labels({"ab": 300, "bc": 300, "ac": -90, "cd": 100, "ae": -100}) == ({"e"}, [])
-    assert _labels({"ab": -300, "bc": -290, "ac": -100}) == (set(), [[["a"], ["b"]]])
-    assert _labels({"ab": -300, "bc": -290, "ac": -70}) == ({"b"}, [])
+    assert _labels({"ab": 300, "bc": 300, "ac": -90, "cd": 100, "ae": -100}) == ({"e"}, ())
+    assert _labels({"ab": -300, "bc": -290, "ac": -100}) == (set(), ((("a",), ("b",)),))
+    assert _labels({"ab": -300, "bc": -290, "ac": -70}) == ({"b"}, ())

@@ -16,7 +16,6 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.mapping import build
 from bodycap_batch.mapping.intrinsics.recalibration import (
-    RECALIBRATED,
     recalibrate_if_misfit,
     with_map_intrinsics,
 )
@@ -74,8 +73,8 @@ def test_misfit_intrinsics_start_from_the_focal_length_that_fits() -> None:
     assert (start.model, start.refine) == ("SIMPLE_RADIAL", True)
     assert np.allclose(start.params, [1.31 * 485, 318, 242, 0])
     assert capture.camera("torso") is CAPTURE.camera("torso")
-    assert found.log["misfitting_lenses"] == {"left_palm": 1.33}
-    assert found.log[RECALIBRATED] == ["left_palm"]
+    assert found.diagnostics.misfit_factors == {"left_palm": 1.33}
+    assert found.diagnostics.recalibrated == ("left_palm",)
     later = with_map_intrinsics(CAPTURE, found)
     kept, mapped = later.camera("left_palm").camera, found.maps[0].cameras["left_palm"]
     assert (kept.model, kept.params.tolist()) == (mapped.model, mapped.params.tolist())
@@ -93,8 +92,8 @@ def test_the_given_intrinsics_stay_if_refinement_gives_no_better_map(again: MapR
     first = _mapped(0.9, {"left_palm": 1.31})
     found = recalibrate_if_misfit(first, CAPTURE, build)
     assert found.maps == first.maps
-    assert found.log["misfitting_lenses"] == {"left_palm": 1.31}
-    assert RECALIBRATED not in found.log
+    assert found.diagnostics.misfit_factors == {"left_palm": 1.31}
+    assert not found.diagnostics.recalibrated
     assert with_map_intrinsics(CAPTURE, found).cameras == CAPTURE.cameras
 
 
@@ -131,7 +130,7 @@ def test_a_map_that_loses_the_misfit_camera_is_not_better() -> None:
     first = _mapped(0.9, {"left_palm": 1.31})
     found = recalibrate_if_misfit(first, CAPTURE, lambda capture: _without_palm(_mapped(0.5, {})))
     assert found.maps == first.maps
-    assert found.log["misfitting_lenses"] == {"left_palm": 1.31}
+    assert found.diagnostics.misfit_factors == {"left_palm": 1.31}
     assert found.log["freeing_refused"] == {"keyframes": {"torso": 3}, "mean_error_px": 0.5}
 
 
@@ -139,7 +138,7 @@ def test_an_unusable_map_is_refused_only_after_refinement() -> None:
     refused = EstimationError("30% of the matches contradict the map", hint="x")
     bad = _mapped(0.4, {"left_palm": 1.31})
     found = recalibrate_if_misfit(bad, CAPTURE, lambda capture: _mapped(0.5, {}, zoom=1.33), refused)
-    assert found.log[RECALIBRATED] == ["left_palm"]
+    assert found.diagnostics.recalibrated == ("left_palm",)
     with pytest.raises(EstimationError, match="30%"):
         recalibrate_if_misfit(bad, CAPTURE, lambda capture: _without_palm(_mapped(0.5, {})), refused)
     with pytest.raises(EstimationError, match="30%"):
@@ -158,7 +157,7 @@ def test_refinement_is_tried_before_a_map_is_given_up(
 
     monkeypatch.setattr(build, "build_map_once", built)
     found = build.build_map(CAPTURE, [], MapOptions(), StageContext(work_dir=tmp_path))
-    assert found.log[RECALIBRATED] == ["left_palm"]
+    assert found.diagnostics.recalibrated == ("left_palm",)
     monkeypatch.setattr(build, "build_map_once", lambda *_: (_mapped(0.4, {"left_palm": 1.31}), refused))
     with pytest.raises(EstimationError, match="30%"):
         build.build_map(CAPTURE, [], MapOptions(), StageContext(work_dir=tmp_path))
