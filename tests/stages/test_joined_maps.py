@@ -1,4 +1,4 @@
-"""Three maps without a common view, joined by the body, through to the files."""
+"""Three maps without a common view, aligned through the body, up to the exported files."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_all_cameras_are_used_in_one_world(capture, result):
     assert set(stated) == {"left_palm", "left_upper_arm", "right_palm", "right_upper_arm"}
 
 
-def test_the_maps_lie_where_they_were_within_what_is_stated(capture, result):
+def test_alignment_errors_are_within_the_stated_sigmas(capture, result):
     main = result.world_from_map["a"]
     for each in capture.inputs.trajectories:
         if each.gauge == "a":
@@ -56,19 +56,19 @@ def test_the_maps_lie_where_they_were_within_what_is_stated(capture, result):
         true = main.after(capture.gauges["a"]).after(capture.gauges[each.gauge].inverse()).apply(centres)
         off = np.linalg.norm(result.world_from_map[each.gauge].apply(centres) - true, axis=1)
         sigma = result.report.joined_cameras[each.camera].sigma_m
-        # Three sigmas of each of three axes; a claim as loose as 6 cm would have been refused.
+        # Three sigmas of each of three axes; a sigma of 6 cm would have been rejected.
         assert np.median(off) < 3.0 * np.sqrt(3.0) * sigma
         assert sigma < 0.06
 
 
-def test_trajectories_and_maps_move_alike(capture, result):
+def test_trajectories_follow_their_maps(capture, result):
     before = {each.camera: each for each in capture.inputs.trajectories}
     for after in result.trajectories:
         place = result.world_from_map[before[after.camera].gauge]
         kept = after.localised
         moved = place.apply_to_poses(before[after.camera].gauge_from_cam)
         assert_allclose(after.gauge_from_cam[kept, :3, :3], moved[kept, :3, :3], atol=1e-9)
-        # The body moves noisy centres, whose sigma is 5 mm; not whole paths.
+        # The solution moves noisy centres (sigma 5 mm), but not whole paths.
         shift = (after.gauge_from_cam - moved)[kept, :3, 3]
         assert np.abs(np.median(shift, axis=0)).max() < 0.005
 

@@ -126,8 +126,8 @@ def trunk_orientation(
 ) -> TrunkOrientation:
     """Return the trunk's orientation from solved bones (T,B,4,4).
 
-    If the graph has no bone of the trunk, up is the direction against which the limbs hang on average, and
-    the front is unknown.
+    If the graph has no bone of the trunk, up is opposite to the mean direction of the limbs, which mostly
+    hang. The front is then unknown.
     """
     trunk = [i for i, bone in enumerate(bones) if not split_side(bone.role)[0]]
     limbs = [

@@ -1,4 +1,4 @@
-"""Maps that share no view, placed by the body: where they start, how residuals follow, where they end."""
+"""The alignment of maps without common views: initial values, derivatives of the residuals, results."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tests.calibrations import calibration_of
 from tests.stages.walker import ROLES, make_inputs, make_walk, record
 
 FURTHER = Similarity(1.7, so3_exp([0.4, 1.1, -0.3]), np.array([0.5, -3.0, 1.0]))
-"""A further map from the main one, which is metric here."""
+"""further_from_main, where the main map is metric."""
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def walk():
 
 @pytest.fixture(scope="module")
 def recorded(walk):
-    """Twelve seconds; the right palm's poses come in a map of its own."""
+    """Return twelve seconds of three cameras, the right palm's in a separate map."""
     out = []
     for number, name in enumerate(ROLES):
         gauge = FURTHER if name == "right_palm" else None
@@ -63,7 +63,7 @@ def arms():
 
 
 def _off_m(place: Similarity, track) -> float:
-    """Median distance of a track from its true place in the main map, metres."""
+    """Return the median distance (m) of a track from its true position in the main map."""
     true = FURTHER.inverse().apply(track.map_from_cam[:, :3, 3])
     return float(np.median(np.linalg.norm(place.apply(track.map_from_cam[:, :3, 3]) - true, axis=1)))
 
@@ -75,11 +75,11 @@ def test_similarities_chain():
     assert_allclose(FURTHER.after(FURTHER.inverse()).apply(x), x)
 
 
-def test_the_walk_and_the_stance_are_a_start(walk, recorded):
+def test_the_path_and_the_rest_pose_give_initial_values(walk, recorded):
     inputs, bones, tracks = _tracks(walk, recorded)
     mounts = {mount.camera: mount for mount in inputs.mounts}
     start = align_map(bones, tracks[0], [tracks[2]], mounts, 1.0)
-    # A palm strays about half an upper arm from where it hangs at ease; the path itself is a few metres long.
+    # A palm moves by about half an upper arm from its rest pose; the path is a few metres long.
     assert _off_m(start, tracks[2]) < 0.25
     assert start.scale * FURTHER.scale == pytest.approx(1.0, abs=0.1)
 
@@ -100,7 +100,7 @@ def test_residuals_follow_moved_cameras_as_predicted(walk, recorded):
     poses[1, :, :3, 3] += twist[3:]
     calibration.set_samples(replace(samples, map_from_cam=poses))
     after = calibration.linearised().linear
-    # The right-hand side grows by what the movement asks for; robust weights change in second order.
+    # The right-hand side changes with the movement; robust weights change in second order.
     assert np.abs(predicted).max() > 1e-4
     assert_allclose(after.rhs - before.rhs, predicted, atol=0.15 * np.abs(predicted).max())
 
@@ -171,7 +171,7 @@ def test_a_mounts_name_is_believed_better_than_it_is_weighed(arms):
 def test_a_walks_arms_are_placed():
     outcome = run_case("an arm each", 3, seconds=1000 / 30)
     assert not outcome["refused"]
-    # All but a centimetre is the height of the trunk's camera over the shoulders: 1.5 cm, twice.
+    # All but a centimetre is the error of the camera's height above the shoulders: 1.5 cm, twice.
     assert max(outcome["off_m"].values()) < 0.03
 
 
@@ -182,7 +182,7 @@ def test_a_palms_map_is_placed_or_refused_by_its_sigma(walk, recorded):
     if "map-1" in together.main_from_gauge:
         turn, shift = together.sigmas["right_palm"]
         assert 0.0 < turn < np.radians(15.0)
-        # Three dimensions of the stated sigma, three times.
+        # The stated sigma in three dimensions, three times.
         assert _off_m(together.main_from_gauge["map-1"], make_track(inputs, recorded[2], 0)) < 9.0 * shift
         assert [each.gauge for each in together.trajectories] == ["map-0"] * 3
     else:

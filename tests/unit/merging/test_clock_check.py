@@ -1,4 +1,4 @@
-"""Cameras whose clock does not suit the body they move with."""
+"""Detection of cameras with a wrong clock offset."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _track(camera: str, poses, times_s) -> CameraTrack:
 
 
 def _walk(turns: float, seconds: float = 8.0) -> tuple[CameraTrack, CameraTrack]:
-    """A trunk that walks and turns by so much there and back, and a palm that swings beside it."""
+    """Return a trunk that walks and turns to and fro by an angle (rad), and a palm that swings beside it."""
     times_s = np.arange(0.0, seconds, 1.0 / 30.0)
     heading = turns * np.sin(2.0 * np.pi * times_s / 3.7) * np.array([[0.0], [0.0], [1.0]])
     place = np.column_stack([0.9 * times_s, 0.0 * times_s, 0.0 * times_s])
@@ -39,7 +39,7 @@ def _walk(turns: float, seconds: float = 8.0) -> tuple[CameraTrack, CameraTrack]
 
 
 def _straight_walk_of_turns_and_swings() -> tuple[CameraTrack, CameraTrack]:
-    """A trunk that walks straight ahead and turns with each step, and a palm that swings across it."""
+    """Return a trunk that walks straight and turns with each step, and a palm that swings across it."""
     times_s = np.arange(0.0, 8.0, 1.0 / 30.0)
     step = np.sin(2.0 * np.pi * times_s / 1.1)
     place = np.column_stack([0.9 * times_s, 0.0 * times_s, 0.0 * times_s])
@@ -54,10 +54,10 @@ def _late(track: CameraTrack, seconds: float) -> CameraTrack:
 
 
 @pytest.mark.parametrize("late_s", [-1.2, -0.5, 0.4, 1.5])
-def test_a_clock_that_is_off_is_told_with_what_would_suit_it(late_s: float) -> None:
+def test_a_wrong_clock_is_reported_with_the_right_offset(late_s: float) -> None:
     trunk, palm = _walk(turns=1.0)
     (doubt,) = suspicious_clocks([trunk, _late(palm, late_s)]).values()
-    # A step of the search, and another for the arm's swing, which follows the turns now and then.
+    # One step of the search, and another one for the swing of the arm, which sometimes follows the turns.
     assert doubt["shift_s"] == pytest.approx(-late_s, abs=0.1)
     assert doubt["scatter_left"] < 0.7
     way = "behind" if late_s < 0.0 else "ahead"
@@ -66,14 +66,14 @@ def test_a_clock_that_is_off_is_told_with_what_would_suit_it(late_s: float) -> N
     )
 
 
-def test_right_clocks_straight_walks_and_short_clips_are_not_doubted() -> None:
+def test_right_clocks_straight_walks_and_short_clips_are_not_suspicious() -> None:
     trunk, palm = _walk(turns=1.0)
     assert suspicious_clocks([trunk, palm]) == {}
     assert suspicious_clocks([trunk, _late(palm, 0.1)]) == {}
     straight, swinging = _walk(turns=0.0)
-    # The body is moved along its way, which looks like another mount.
+    # The body moves along its path, which looks like another mount.
     assert suspicious_clocks([straight, _late(swinging, 0.5)]) == {}
-    # Half a step later the trunk's turns undo the arm's swing, but the arm is half a metre ahead.
+    # Half a step later, the trunk's turns cancel the arm's swing, but the arm is half a metre ahead.
     trunk_turns, arm_swings = _straight_walk_of_turns_and_swings()
     found = best_time_shift(trunk_turns, arm_swings)
     assert found is not None

@@ -1,4 +1,4 @@
-"""Feet that stand: when they are found to, and what holding them does."""
+"""Foot contacts: how they are detected, and what their factors do."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @pytest.fixture(scope="module")
 def shin():
-    """The skeleton, its bones, and a shin that rolls over its foot for 25 ticks, then swings ahead."""
+    """Return the skeleton, its bones, and a shin that rolls over its foot for 25 ticks, then swings."""
     skeleton = load_skeleton("full_body", 1.75)
     bones = kinematic_chain(skeleton, {"Hips", "LeftLeg"})
     index = [bone.role for bone in bones].index("LeftLeg")
@@ -57,12 +57,12 @@ def _track(index, poses, seed=0):
     )
 
 
-def test_a_foot_stands_where_its_ankle_is_slow_and_low(shin):
+def test_a_foot_stands_while_its_ankle_is_slow_and_low(shin):
     skeleton, bones, index, poses = shin
     found = find_contacts(skeleton, bones, [_track(index, poses)], {"left_shin": np.eye(4)}, UP, TICKS)
     assert [each.name for each in found] == ["Left foot"]
     standing = found[0].standing
-    # The speed is taken over five ticks, and a tick at either end is left out.
+    # The speed is taken over five ticks, and the first and last tick of a contact are left out.
     assert standing[3 : STAND - 4].all()
     assert not standing[STAND + 2 : COUNT - 3].any()
     assert find_contacts(skeleton, bones, [], {}, UP, TICKS) == ()
@@ -73,7 +73,7 @@ def test_a_foot_stands_where_its_ankle_is_slow_and_low(shin):
     assert np.array_equal(part[0].standing, standing[10:30])
 
 
-def test_an_ankle_that_rests_costs_nothing_however_the_shin_turns(shin):
+def test_an_ankle_at_rest_costs_nothing_while_the_shin_rotates(shin):
     _, _, _, poses = shin
     contact = FootContact("Left foot", 3, 0, np.array([0.0, 0.0, -0.43]), np.ones(COUNT, dtype=bool), 0.0017)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -82,12 +82,12 @@ def test_an_ankle_that_rests_costs_nothing_however_the_shin_turns(shin):
         contact.add(graph, tick)
     assert graph.size() == COUNT - 1
     assert max(graph.at(tick).error(values) for tick in range(STAND - 1)) < 1e-3
-    # Swinging, the ankle goes several centimetres a tick: tens of sigmas, which Huber's loss counts once.
+    # A swinging ankle moves by several centimetres per tick: tens of sigmas, linear under Huber's loss.
     assert graph.at(STAND + 10).error(values) > 10.0
 
 
 @pytest.mark.parametrize("fps", [24.0, 60.0, 120.0, 240.0])
-def test_a_foot_is_held_as_firmly_over_a_second_at_every_rate(shin, fps):
+def test_sliding_costs_the_same_at_every_rate(shin, fps):
     skeleton, bones, index, poses = shin
     ticks = np.round(np.arange(COUNT) * 1e9 / fps).astype(np.int64)
     (found,) = find_contacts(
@@ -102,22 +102,22 @@ def test_a_foot_is_held_as_firmly_over_a_second_at_every_rate(shin, fps):
     standing = np.zeros(result.observed.shape, dtype=bool)
     standing[:, skeleton.index_of_role("LeftLeg")] = True
     (planted,) = _standing_joints(replace(result, fps=fps, standing=standing))
-    # What sliding by 2 cm in a second costs; at 30 ticks a second each is held to 0.05 m/s.
+    # The cost of sliding by 2 cm in a second; at 30 ticks per second, sigma is 0.05 m/s.
     costs = [fps * (0.02 / fps / sigma_m) ** 2 for sigma_m in (found.sigma_m, planted.sigma_m)]
     assert costs == pytest.approx([30.0 * (0.02 / 0.05) ** 2] * 2, rel=1e-3)
 
 
-def test_standing_feet_are_held_in_the_solved_motion(tmp_path):
+def test_contacts_reduce_sliding_in_the_solved_motion(tmp_path):
     cameras = ("hips", "left_thigh", "left_shin")
     capture = posed(SynthOptions(seconds=2.4, cameras=cameras, seed=1, poses_only=True, t_pose_s=2.0))
     slides = []
     for held in (True, False):
         options, context = MergeOptions(foot_contact=held), StageContext(work_dir=tmp_path)
         result = merge_trajectories(capture.inputs, options, context)
-        told = result.report.foot_contact
-        assert list(told) == (["Left foot"] if held else [])
+        reported = result.report.foot_contact
+        assert list(reported) == (["Left foot"] if held else [])
         roles = result.skeleton.roles
         still = result.graph_world_from_joint[10:50, roles.index("LeftFoot"), :3, 3]
         slides.append(float(np.linalg.norm(np.diff(still, axis=0), axis=1).mean()) * FPS)
-    # In the T-pose, two of 2.4 seconds, the foot stands; poses have 5 mm of noise.
+    # In the T-pose, during two of 2.4 seconds, the foot stands. The poses have 5 mm of noise.
     assert slides[0] < 0.7 * slides[1]

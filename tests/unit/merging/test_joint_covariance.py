@@ -1,4 +1,4 @@
-"""Covariance of the solved body: against dense algebra, GTSAM's own marginals and solving again."""
+"""Covariance of the solved joints, compared with dense algebra, GTSAM's marginals and changed solutions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.stages.walker import FPS, ROLES, make_inputs, make_walk, record
 
 
 @pytest.mark.parametrize("held", [1.0, 600.0, 1e6])  # bytes of one block, of two, of all
-def test_a_chain_of_blocks_is_the_dense_solution(held):
+def test_block_tridiagonal_equals_the_dense_solution(held):
     rng = np.random.default_rng(0)
     bounds = np.array([0, 3, 7, 8, 12])
     rows = np.zeros((0, 12))
@@ -49,7 +49,7 @@ def test_a_chain_of_blocks_is_the_dense_solution(held):
         assert_allclose(found[block], inverse[start:end, start:end], atol=1e-9)
 
 
-def test_a_long_chain_is_not_held_and_its_solution_is_the_same():
+def test_few_factors_in_memory_give_the_same_solution():
     size, count = 12, 300
     rng = np.random.default_rng(0)
     eye, side = 4.0 * np.eye(size), 0.1 * rng.normal(size=(size, size))
@@ -75,19 +75,19 @@ def test_a_long_chain_is_not_held_and_its_solution_is_the_same():
     assert kept[0] - kept[1] > 0.9 * (2 * 8 * size**2 * count - 20_000)
 
 
-def test_a_graph_that_holds_nothing_states_no_covariance(walk):
+def test_a_graph_without_factors_has_no_covariance(walk):
     graph, bones, _ = _graph(walk)
     values, _ = levenberg_marquardt(graph.graph, graph.initial_values(), iterations=1)
     loose = replace(graph.solved_graph(values), graph=gtsam.NonlinearFactorGraph())
     poses = np.tile(np.eye(4), (round(FPS), len(bones), 1, 1))
-    nothing = np.zeros((len(bones), 3, 0))
-    spread = ErrorModes(mounts={}, log_scale=np.zeros(0), rest=nothing, offsets_m=nothing)
-    covariance = joint_covariance(loose, poses, spread)
+    unchanged = np.zeros((len(bones), 3, 0))
+    modes = ErrorModes(mounts={}, log_scale=np.zeros(0), rest=unchanged, offsets_m=unchanged)
+    covariance = joint_covariance(loose, poses, modes)
     assert covariance.shape == (*poses.shape[:2], 3, 3)
     assert np.isnan(covariance).all()
 
 
-def test_the_adjoint_is_gtsams():
+def test_the_adjoint_equals_that_of_gtsam():
     pose = gtsam.Pose3.Expmap(np.array([0.3, -1.1, 0.7, 0.2, 2.0, -0.4]))
     assert_allclose(se3_adjoint(pose.matrix()), pose.AdjointMap(), atol=1e-12)
 
@@ -98,7 +98,7 @@ def walk():
 
 
 def _graph(walk, mounts=None, change=None, scale=1.0, shift_s=0.0):
-    """One second of walking; `change` alters the bones, `scale` the camera paths."""
+    """Return the graph of one second of walking; `change` alters the bones, `scale` the camera paths."""
     bones = list(kinematic_chain(walk.skeleton, set(ROLES.values())))
     if change is not None:
         bones = [change(index, bone) for index, bone in enumerate(bones)]
@@ -120,11 +120,11 @@ def _graph(walk, mounts=None, change=None, scale=1.0, shift_s=0.0):
     return MotionGraph(walk.skeleton, bones, ticks, stretched, held), bones, held
 
 
-def _solve(graph, spread=None) -> MotionSolution:
-    return graph.solve(60, lambda *_: None, spread)
+def _solve(graph, modes=None) -> MotionSolution:
+    return graph.solve(60, lambda *_: None, modes)
 
 
-def _nothing(bones) -> ErrorModes:
+def _no_modes(bones) -> ErrorModes:
     empty = np.zeros((len(bones), 3, 1))
     return ErrorModes(
         mounts={name: np.zeros((6, 1)) for name in ROLES},
@@ -139,9 +139,9 @@ def _relative(solution: MotionSolution) -> np.ndarray:
     return np.asarray(centres - centres[:, :1])
 
 
-def test_without_a_spread_the_covariance_is_gtsams_marginal(walk):
+def test_without_error_modes_the_covariance_is_the_marginal_of_gtsam(walk):
     graph, bones, _ = _graph(walk)
-    solution = _solve(graph, _nothing(bones))
+    solution = _solve(graph, _no_modes(bones))
     values, _ = _optimised(graph)
     marginals = gtsam.Marginals(graph.graph, values)
     hand = next(place for place, bone in enumerate(bones) if bone.role == "RightHand")
@@ -151,7 +151,7 @@ def test_without_a_spread_the_covariance_is_gtsams_marginal(walk):
         turns = solution.world_from_bone[tick, [0, hand], :3, :3]
         reader = np.hstack([np.zeros((3, 3)), -turns[0], np.zeros((3, 3)), turns[1]])
         expected = reader @ joint @ reader.T
-        # The two linearise at solutions a stopping rule apart.
+        # The two are linearised at solutions that differ by the tolerance of the solver.
         assert_allclose(solution.joint_covariance[tick, hand], expected, rtol=1e-3, atol=1e-9)
 
 
@@ -165,49 +165,51 @@ def _optimised(graph):
 def test_the_solution_follows_the_calibration_as_predicted(walk, what):
     shift_s = 0.012 if what == "off the ticks" else 0.0
     graph, bones, held = _graph(walk, shift_s=shift_s)
-    spread = _nothing(bones)
+    modes = _no_modes(bones)
     arm = next(place for place, bone in enumerate(bones) if bone.role == "LeftForeArm")
     changes = {}
     if what in ("mount", "off the ticks"):
         twist = np.array([0.004, -0.006, 0.002, 0.003, 0.001, -0.002])
-        spread.mounts["left_palm"][:, 0] = twist
+        modes.mounts["left_palm"][:, 0] = twist
         moved = gtsam.Pose3(held["left_palm"]).compose(gtsam.Pose3.Expmap(twist)).matrix()
         changes["mounts"] = {"left_palm": moved}
     elif what == "scale":
-        spread.log_scale[0] = 0.004
+        modes.log_scale[0] = 0.004
         changes["scale"] = float(np.exp(0.004))
     elif what == "rest":
         turn = np.array([0.02, -0.01, 0.015])
-        spread.rest[arm, :, 0] = turn
+        modes.rest[arm, :, 0] = turn
         changes["change"] = lambda place, bone: (
             replace(bone, mean_rotation=bone.mean_rotation @ so3_exp(turn)) if place == arm else bone
         )
     else:
         longer = 0.02 * bones[arm].offset_m
-        spread.offsets_m[arm, :, 0] = longer
+        modes.offsets_m[arm, :, 0] = longer
         changes["change"] = lambda place, bone: (
             replace(bone, offset_m=bone.offset_m + longer) if place == arm else bone
         )
-    plain = _solve(graph, _nothing(bones))
-    told = _solve(graph, spread)
+    plain = _solve(graph, _no_modes(bones))
+    with_modes = _solve(graph, modes)
     again = _solve(_graph(walk, shift_s=shift_s, **changes)[0])
     actual = _relative(again) - _relative(plain)
-    predicted = np.sqrt(np.einsum("tbii->tb", told.joint_covariance - plain.joint_covariance).clip(min=0.0))
+    predicted = np.sqrt(
+        np.einsum("tbii->tb", with_modes.joint_covariance - plain.joint_covariance).clip(min=0.0)
+    )
     size = np.linalg.norm(actual, axis=-1)
     assert size[:, 1:].max() > 5e-4
-    # Geman-McClure's own curvature is a tenth below what its weights give (residuals of 2.4 sigmas, c = 6).
+    # Geman-McClure's curvature is a tenth below that of its weights (residuals of 2.4 sigmas, c = 6).
     assert np.sqrt(((predicted - size) ** 2).mean()) < 0.15 * np.sqrt((size**2).mean())
 
 
-def test_directions_of_several_parts_stand_side_by_side(walk):
+def test_stacked_modes_contain_those_of_all_parts(walk):
     bones = kinematic_chain(walk.skeleton, set(ROLES.values()))
-    both = stack_modes([_nothing(bones), _nothing(bones)])
+    both = stack_modes([_no_modes(bones), _no_modes(bones)])
     assert both.log_scale.shape == (2,)
     assert both.rest.shape == (len(bones), 3, 2)
     assert both.mounts["torso"].shape == (6, 2)
 
 
-def test_sigmas_are_told_apart_where_measured_and_where_filled():
+def test_sigmas_of_observed_and_filled_ticks_are_separate():
     covariance = np.tile(np.eye(3) * 1e-4, (10, 3, 1, 1))
     covariance[5:, 1] *= 4.0
     covariance[:, 2] = np.nan
@@ -220,15 +222,17 @@ def test_sigmas_are_told_apart_where_measured_and_where_filled():
     }
 
 
-def test_a_mount_change_in_the_wrong_frame_would_show(walk):
-    # A palm's mount that turns about the camera's own axis moves the wrist by the lever, not the camera.
+def test_a_mounts_error_moves_the_joint_by_its_lever(walk):
+    # A mount that rotates about the camera's own axis moves the wrist by the lever, and not the camera.
     graph, bones, held = _graph(walk)
-    spread = _nothing(bones)
-    spread.mounts["right_palm"][2, 0] = 0.05
+    modes = _no_modes(bones)
+    modes.mounts["right_palm"][2, 0] = 0.05
     hand = next(place for place, bone in enumerate(bones) if bone.role == "RightHand")
-    plain, told = _solve(graph, _nothing(bones)), _solve(graph, spread)
-    added = np.sqrt(np.einsum("tii->t", told.joint_covariance[:, hand] - plain.joint_covariance[:, hand]))
+    plain, with_modes = _solve(graph, _no_modes(bones)), _solve(graph, modes)
+    added = np.sqrt(
+        np.einsum("tii->t", with_modes.joint_covariance[:, hand] - plain.joint_covariance[:, hand])
+    )
     wrist_in_cam = np.linalg.inv(held["right_palm"] @ make_transform(np.eye(3), np.zeros(3)))[:3, 3]
     lever = np.linalg.norm(np.cross([0.0, 0.0, 1.0], wrist_in_cam))
-    # Joints and the pose prior share in it: at most the whole lever, at least a quarter.
+    # Joints and the pose prior take a part of it: between a quarter of the lever and all of it.
     assert 0.25 * 0.05 * lever < np.median(added) <= 1.05 * 0.05 * lever

@@ -1,4 +1,4 @@
-"""The optimiser's full steps: the same answer as damped ones, and damping where full steps fail."""
+"""Gauss-Newton steps: the same solution as with damping, and damping where they fail."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ def _pose_prior():
     return graph
 
 
-def test_full_steps_end_where_damped_ones_do():
+def test_gauss_newton_ends_at_the_solution_of_levenberg_marquardt():
     steps = []
     damped, _ = levenberg_marquardt(_pose_prior(), _start(), iterations=30)
     found, count = gauss_newton_then_lm(
         _pose_prior(), _start(), iterations=30, step=lambda: steps.append(1), tolerance=1e-5
     )
-    # Both stop a step after the error falls by less than 1e-5 of itself, at a residual of zero.
+    # Both stop after a step that lowers the error by less than 1e-5 of itself; the residual is zero.
     assert_allclose(found.atPose3(0).matrix(), damped.atPose3(0).matrix(), atol=1e-6)
     assert len(steps) == count
 
 
-def test_what_nothing_holds_is_left_to_damping():
+def test_unobservable_states_are_left_to_damping():
     graph = gtsam.NonlinearFactorGraph()
     noise = gtsam.noiseModel.Isotropic.Sigma(3, 0.01)
     graph.add(gtsam.PoseTranslationPrior3D(0, gtsam.Pose3(TURNED), noise))
@@ -47,7 +47,7 @@ def test_what_nothing_holds_is_left_to_damping():
 
 
 def _ranges(across):
-    """Two ranges of 0.6 m to points 1 m apart, from a start beside the middle between them."""
+    """Return two ranges of 0.6 m to points 1 m apart, and initial values beside the middle between them."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     values.insert(0, np.array([0.5, across, 0.0]))
     graph.add(gtsam.PriorFactorPoint3(0, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 1e3)))
@@ -58,22 +58,22 @@ def _ranges(across):
     return graph, values
 
 
-# 0.6² - 0.5² across, up to the weak prior's share of a millionth.
+# The square root of 0.6² - 0.5²; the weak prior changes it by a millionth.
 ACROSS = np.sqrt(0.11)
 
 
-def test_a_full_step_that_makes_it_worse_is_not_taken():
-    # The ranges hardly feel a step across: the full one is 50 m.
+def test_a_step_that_raises_the_error_is_not_taken():
+    # The ranges hardly change with a step across, so that the full step is 50 m.
     graph, values = _ranges(1e-3)
     full = gtsam.GaussNewtonOptimizer(graph, values, gtsam.GaussNewtonParams())
     before = full.error()
     full.iterate()
-    assert full.error() > before, "the case is no case: the full step helps"
+    assert full.error() > before, "the full step should raise the error here"
     found, _ = gauss_newton_then_lm(graph, values, iterations=50, step=lambda: None, tolerance=1e-9)
     assert_allclose(np.hypot(*found.atPoint3(0)[1:]), ACROSS, atol=1e-4)
 
 
-def test_a_stop_in_between_is_passed_on():
+def test_an_exception_of_the_callback_is_passed_on():
     class Stop(Exception):
         pass
 
@@ -84,8 +84,8 @@ def test_a_stop_in_between_is_passed_on():
         gauss_newton_then_lm(_pose_prior(), _start(), iterations=30, step=stop, tolerance=1e-5)
 
 
-class _WorseFromTheSecondStep:
-    """GTSAM's own optimiser, but for the error it tells."""
+class _ErrorRisesInTheSecondStep:
+    """GTSAM's optimiser, except that its error is infinite from the second step on."""
 
     def __init__(self, *arguments):
         self._real, self._steps = REAL(*arguments), 0
@@ -101,8 +101,8 @@ class _WorseFromTheSecondStep:
         return self._real.error() if self._steps < 2 else np.inf
 
 
-def test_damping_goes_on_from_the_last_good_step(monkeypatch):
-    monkeypatch.setattr(gtsam, "GaussNewtonOptimizer", _WorseFromTheSecondStep)
+def test_damping_continues_from_the_last_good_step(monkeypatch):
+    monkeypatch.setattr(gtsam, "GaussNewtonOptimizer", _ErrorRisesInTheSecondStep)
     graph, values = _ranges(0.15)
     found, count = gauss_newton_then_lm(graph, values, iterations=20, step=lambda: None, tolerance=1e-9)
     assert found.size() == values.size()

@@ -1,4 +1,4 @@
-"""What standing and walking tell: the plane of a walk, the way ahead, a T-pose and its limits."""
+"""The posture of a capture: level and direction of a walk, standing, a T-pose, and wider joint priors."""
 
 from dataclasses import replace
 
@@ -37,7 +37,7 @@ def _track(poses, bone=0, camera="torso"):
 
 
 def _circle(seconds=20.0):
-    """A level circle of 1.5 m with a walker's bounce, facing along it, seen in a tilted map."""
+    """Return poses on a level circle of 1.5 m with a walker's bounce, facing forward, in a tilted map."""
     t = np.arange(0.0, seconds, 1.0 / FPS)
     angle = 2 * np.pi * t / 10.0
     centre = np.column_stack([1.5 * np.cos(angle), 1.5 * np.sin(angle), 1.2 + 0.02 * np.sin(11.0 * t)])
@@ -46,14 +46,14 @@ def _circle(seconds=20.0):
     return make_transform(TILT, np.zeros(3)) @ poses
 
 
-def test_a_walk_tells_the_vertical_of_a_tilted_map():
+def test_a_walk_gives_the_vertical_of_a_tilted_map():
     path = _circle()[:, :3, 3]
     rng = np.random.default_rng(0)
     body = so3_exp([0.2, 0.1, 0.0]) @ TILT[:, 2]
     up = vertical_from_path(path + rng.normal(scale=0.005, size=path.shape), body)
-    # The bounce averages out over 35 steps: 2 cm / (1 m of spread x sqrt(35)) is 0.2 degrees.
+    # The bounce averages out over 35 steps: 2 cm / (1 m of width x sqrt(35)) is 0.2 degrees.
     assert np.degrees(np.arccos(up @ TILT[:, 2])) < 0.5
-    assert vertical_from_path(path, -body) @ TILT[:, 2] < 0.0  # what is up is the body's word
+    assert vertical_from_path(path, -body) @ TILT[:, 2] < 0.0  # the body gives the sign
 
 
 def test_bending_down_in_between_does_not_tilt_the_walk():
@@ -64,7 +64,7 @@ def test_bending_down_in_between_does_not_tilt_the_walk():
 
 
 @pytest.mark.parametrize("kind", ["straight", "stairs", "short"])
-def test_a_path_that_shows_no_level_gives_none(kind):
+def test_a_path_without_a_level_gives_no_vertical(kind):
     path = _circle()[:, :3, 3]
     if kind == "straight":
         path = np.outer(np.arange(300.0) / 100.0, TILT[:, 0])
@@ -75,7 +75,7 @@ def test_a_path_that_shows_no_level_gives_none(kind):
     assert vertical_from_path(path, TILT[:, 2]) is None
 
 
-def test_the_way_ahead_follows_the_path_and_leaves_side_steps_out():
+def test_the_walking_direction_follows_the_path_and_ignores_side_steps():
     poses = _circle()
     sideways = slice(200, 260)
     poses[sideways, :3, :3] = poses[sideways, :3, :3] @ so3_exp([0.0, 0.0, 0.5 * np.pi])
@@ -86,12 +86,12 @@ def test_the_way_ahead_follows_the_path_and_leaves_side_steps_out():
     assert posture.walking[inner].all()
     angle = 2 * np.pi * track.times_ns[inner] * 1e-9 / 10.0
     tangent = np.column_stack([-np.sin(angle), np.cos(angle), 0.0 * angle]) @ TILT.T
-    # The chord over half a second leaves the tangent's direction alone; the bounce is projected out.
+    # The chord over half a second has the direction of the tangent; the bounce is projected out.
     assert_allclose(posture.walking_direction[inner], tangent, atol=1e-3)
 
 
 def _bending(seconds=20.0):
-    """A chest half a metre over hips that bend by up to 70 degrees every five seconds, in a tilted map."""
+    """Return a chest half a metre above hips that bend by up to 70 degrees every 5 s, in a tilted map."""
     t = np.arange(0.0, seconds, 1.0 / FPS)
     bend = np.radians(70.0) * (0.5 - 0.5 * np.cos(2 * np.pi * t / 5.0)) ** 2
     turn = so3_exp(np.outer(bend, [1.0, 0.0, 0.0]))
@@ -99,20 +99,20 @@ def _bending(seconds=20.0):
     return make_transform(TILT, np.zeros(3)) @ make_transform(turn, centre), bend
 
 
-def test_who_bends_and_lifts_stands_upright_in_between():
+def test_a_person_who_lifts_things_stands_upright_in_between():
     poses, bend = _bending()
     track = _track(poses)
     posture = find_posture(track, track.times_ns, TILT[:, 2], None)
     assert not posture.walking.any()
     assert 0.1 < posture.standing.mean() < 0.5
-    # 2 cm below the highest of a chest half a metre over the hips is arccos(1 - 0.04), 16 degrees.
+    # 2 cm below the highest position, half a metre above the hips, is a bend of arccos(1 - 0.04), 16 degrees.
     assert np.degrees(bend[posture.standing].max()) < 17.0
     assert not find_posture(track, track.times_ns, None, None).standing.any()
-    # The mean of all bends leans by 26 degrees; what is usual does not.
+    # The mean direction leans by 26 degrees; the modal one does not.
     assert np.degrees(np.arccos(modal_direction(poses[:, :3, 2]) @ TILT[:, 2])) < 10.0
 
 
-def test_who_leans_all_the_time_is_nowhere_upright():
+def test_a_constant_lean_is_never_upright():
     time = np.arange(0.0, 20.0, 1.0 / FPS)
     lean = np.radians(30.0 + 8.0 * np.sin(time))
     turn = so3_exp(np.outer(lean, [1.0, 0.0, 0.0]))
@@ -120,18 +120,18 @@ def test_who_leans_all_the_time_is_nowhere_upright():
     assert not find_posture(track, track.times_ns, TILT[:, 2], None).standing.any()
 
 
-def test_a_bowed_walk_does_not_count_as_upright():
+def test_a_bent_walk_does_not_count_as_upright():
     poses = _circle()
-    bowed = np.arange(len(poses)) % 150 > 110
-    poses[bowed, :3, 3] -= 0.3 * TILT[:, 2]
+    bent = np.arange(len(poses)) % 150 > 110
+    poses[bent, :3, 3] -= 0.3 * TILT[:, 2]
     track = _track(poses)
     posture = find_posture(track, track.times_ns[::5], TILT[:, 2], None)
     assert posture.walking.sum() > 50
-    assert not posture.walking[bowed[::5]].any()
+    assert not posture.walking[bent[::5]].any()
     assert not posture.standing.any()
 
 
-def test_a_few_steps_aside_are_no_walk():
+def test_a_few_steps_aside_are_not_a_walk():
     poses, _ = _bending()
     steps = np.clip(np.arange(len(poses)) - 300, 0, 20)
     poses[:, :3, 3] += np.outer(steps, 0.04 * TILT[:, 0])
@@ -141,7 +141,7 @@ def test_a_few_steps_aside_are_no_walk():
     assert posture.standing.any()
 
 
-def test_someone_who_faces_nowhere_in_particular_gets_no_heading():
+def test_random_headings_give_no_walking_direction():
     poses = _circle()
     rng = np.random.default_rng(1)
     poses[:, :3, :3] = poses[:, :3, :3] @ so3_exp(np.outer(rng.uniform(-np.pi, np.pi, len(poses)), [0, 0, 1]))
@@ -152,7 +152,7 @@ def test_someone_who_faces_nowhere_in_particular_gets_no_heading():
 
 
 def _posed_tracks(arm_deg, still=True):
-    """Three seconds of arms lowered by an angle from the side, then two of them hanging."""
+    """Return three seconds of arms lowered by an angle from the horizontal, then two of hanging arms."""
     skeleton = load_skeleton("upper_body", 1.75)
     bones = kinematic_chain(skeleton, ROLES)
     count = 150
@@ -183,7 +183,7 @@ def test_a_t_pose_is_found_while_it_stands():
     skeleton, bones, tracks = _posed_tracks(0.0)
     span = arm_span(bones, skeleton)
     wrists = rest_positions(skeleton)[[skeleton.roles.index("LeftHand"), skeleton.roles.index("RightHand")]]
-    # 0.2 m stand for the shoulders, 0.26 of the stature apart.
+    # 0.2 m replace the width of the shoulders, which is 0.26 of the stature.
     assert span < wrists[0, 0] - wrists[1, 0] < 1.35 * span
     found = find_t_pose(bones, tracks, span)
     assert found is not None
@@ -205,12 +205,12 @@ def test_a_t_pose_is_found_in_any_gauge():
 
 
 @pytest.mark.parametrize("arm_deg", [45.0, 80.0, -60.0])
-def test_other_ways_to_stand_are_none(arm_deg):
+def test_other_arm_positions_are_not_a_t_pose(arm_deg):
     skeleton, bones, tracks = _posed_tracks(arm_deg)
     assert find_t_pose(bones, tracks, arm_span(bones, skeleton)) is None
 
 
-def test_stretched_arms_in_passing_are_none():
+def test_stretched_arms_in_motion_are_not_a_t_pose():
     skeleton, bones, tracks = _posed_tracks(0.0, still=False)
     assert find_t_pose(bones, tracks, arm_span(bones, skeleton)) is None
 
@@ -244,16 +244,16 @@ def test_the_t_pose_of_a_rig_whose_arms_hang_lifts_them():
     [
         (np.linspace(5.0, 7.0, 20), 1.0),
         (np.linspace(5.0, 5.0 + 10.0 * GESTURE_DURATION_S, 20), 0.1),
-        # Two glimpses a long time apart show two gestures.
+        # Two short times a long time apart show two gestures.
         (np.concatenate([np.linspace(0.0, 1.0, 10), np.linspace(60.0, 61.0, 10)]), 0.5),
     ],
 )
-def test_what_a_capture_happens_to_show_widens_a_joints_range(times_s, few):
+def test_variation_in_a_capture_widens_a_joints_prior(times_s, few):
     skeleton = load_skeleton("upper_body", 1.75)
     bones = kinematic_chain(skeleton, ROLES)
     elbow = [bone.role for bone in bones].index("LeftForeArm")
     axes = anatomical_axes(skeleton, "LeftForeArm")
-    # Thirty degrees to either side of a posture that is itself twenty off the usual one.
+    # Thirty degrees to either side of a posture that is twenty degrees from the rest pose.
     flexion = np.radians(20.0 + 30.0 * np.tile([1.0, -1.0], 10))
     poses = np.tile(np.eye(4), (20, len(bones), 1, 1))
     for index, bone in enumerate(bones):
@@ -270,7 +270,7 @@ def test_what_a_capture_happens_to_show_widens_a_joints_range(times_s, few):
 
 
 @pytest.mark.parametrize(("off_deg", "sigma_deg"), [(15.0, 40.0), (50.0, 100.0)])
-def test_a_joint_held_far_off_its_ease_all_the_time_has_that_range(off_deg, sigma_deg):
+def test_a_joint_far_from_its_rest_pose_all_the_time_has_that_range(off_deg, sigma_deg):
     skeleton = load_skeleton("upper_body", 1.75)
     bones = kinematic_chain(skeleton, ROLES)
     elbow = [bone.role for bone in bones].index("LeftForeArm")
@@ -282,5 +282,5 @@ def test_a_joint_held_far_off_its_ease_all_the_time_has_that_range(off_deg, sigm
             poses[:, index, :3, :3] = poses[:, bone.parent, :3, :3] @ bone.mean_rotation @ turn
     wider = widen_joint_priors(skeleton, bones, poses, np.arange(20) * 1_000_000_000)
     sigma = np.degrees(np.sqrt(np.diagonal(axes.T @ wider[elbow].rotation_covariance @ axes)))
-    # A habit is half of a range: 50 degrees of habit need one of 100, 15 lie within the usual 40.
+    # The bias is half of a range: 50 degrees of bias need a range of 100, 15 lie within the usual 40.
     assert_allclose(sigma, [40.0, 40.0, sigma_deg], atol=1e-6)

@@ -1,4 +1,4 @@
-"""What knows the scale of the trunk's own map before others are joined to it, and what joining gains."""
+"""Sources of the main map's scale before further maps are aligned, and their effect on the alignment."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _direction(up, source="map"):
 
 
 def _asked(capture, options, points=None, off=1.1, up="map"):
-    """What is known of the trunk's map, by a body whose own scale is off by a factor."""
+    """Return the sources of the main map's scale, for a body with a scale that is wrong by a factor."""
     inputs = capture.inputs
     bones = kinematic_chain(inputs.skeleton, {mount.role for mount in inputs.mounts})
     trunk = next(each for each in inputs.trajectories if each.camera == "torso")
@@ -100,7 +100,7 @@ def _distance(capture, camera):
 
 
 def _sitter(inputs, walks):
-    """A torso's track that walks to and fro for a share of its 600 frames, then sits 35 cm lower."""
+    """Return the track of a torso that walks for a ratio of its 600 frames, then sits 35 cm lower."""
     count = np.arange(600)
     walking = count < walks * 600
     sway = 1.5 * np.sin(count / 40.0)
@@ -121,7 +121,7 @@ def _sitter(inputs, walks):
     )
 
 
-def test_who_sits_is_not_as_tall_as_who_walks(short):
+def test_sitting_does_not_change_the_scale_from_the_floor(short):
     inputs, rng = short.inputs, np.random.default_rng(0)
     floor = np.column_stack([rng.uniform(-2.0, 2.0, (300, 2)), rng.normal(scale=0.005, size=300)])
     body = ScaleSource(name="body", scale=1.0, sigma_log=0.15)
@@ -131,27 +131,27 @@ def test_who_sits_is_not_as_tall_as_who_walks(short):
     assert never is None
 
 
-def test_a_stated_distance_in_the_trunks_map_is_known_beside_the_floor(short):
+def test_a_stated_distance_in_the_main_map_is_a_source_besides_the_floor(short):
     (name, scale, sigma), _ = _asked(short, _distance(short, "torso"), _floor(short, 0.0))
     assert name == "known distance"
     assert scale == pytest.approx(1.0, abs=1e-6)
     assert sigma < 0.01
 
 
-def test_a_distance_in_another_map_waits_until_that_is_placed(short):
-    told = _asked(short, _distance(short, "left_palm"), _floor(short, 0.0))
-    assert [name for name, _, _ in told] == ["floor"]
+def test_a_distance_in_another_map_is_not_used_before_its_alignment(short):
+    found = _asked(short, _distance(short, "left_palm"), _floor(short, 0.0))
+    assert [name for name, _, _ in found] == ["floor"]
 
 
-def test_a_join_is_told_what_the_job_states_of_up_and_how_the_trunks_camera_is_rolled(short, monkeypatch):
-    lying, told = VerticalHypothesis(source="marker board", up=UP, sigma_deg=1.5), []
+def test_the_alignment_gets_the_stated_vertical_and_the_roll_of_the_trunks_camera(short, monkeypatch):
+    lying, received = VerticalHypothesis(source="marker board", up=UP, sigma_deg=1.5), []
 
     def way_up(*arguments):
-        told.append(arguments[-1])
+        received.append(arguments[-1])
         return 180.0, None
 
     def calibration(skeleton, bones, samples, mounts, *_):
-        told.append(mounts["torso"])
+        received.append(mounts["torso"])
         raise EstimationError("enough")
 
     monkeypatch.setattr(align, "stated_constraints", lambda *_: StatedConstraints(verticals=(lying,)))
@@ -159,12 +159,12 @@ def test_a_join_is_told_what_the_job_states_of_up_and_how_the_trunks_camera_is_r
     monkeypatch.setattr(align, "CalibrationGraph", calibration)
     main, further = candidate_main_maps(short.inputs)[0]
     assert "enough" in align_cameras(short.inputs, main, further[:1], lambda: None).unused[further[0].camera]
-    assert told[0] == (lying,)
+    assert received[0] == (lying,)
     usual = short.inputs.mount_of("torso").joint_from_cam
-    assert np.allclose(told[1].joint_from_cam[:3, :2], -usual[:3, :2])
+    assert np.allclose(received[1].joint_from_cam[:3, :2], -usual[:3, :2])
 
 
-def test_what_is_stated_or_seen_early_says_where_it_is_from(short):
+def test_an_early_vertical_names_its_source(short):
     inputs = short.inputs
     bones = kinematic_chain(inputs.skeleton, {mount.role for mount in inputs.mounts})
     trunk = next(each for each in inputs.trajectories if each.camera == "torso")
@@ -176,7 +176,7 @@ def test_what_is_stated_or_seen_early_says_where_it_is_from(short):
 
 
 class _Strained(MapAlignmentProblem):
-    """Maps whose cameras move as if the scale were nine sigmas from what the limbs reach."""
+    """A problem with a solved scale nine sigmas from that of the limbs' reach."""
 
     def solve(self):
         self._covariance = 1e-4 * np.eye(1 + 7 * len(self.corrections))
@@ -185,7 +185,7 @@ class _Strained(MapAlignmentProblem):
         return 9.0
 
 
-def test_a_stated_scale_saves_a_join_on_whose_scale_reach_and_movement_disagree(short, monkeypatch):
+def test_a_stated_scale_permits_an_alignment_with_inconsistent_scales(short, monkeypatch):
     monkeypatch.setattr(align, "MapAlignmentProblem", _Strained)
     main, further = candidate_main_maps(short.inputs)[0]
     refused, placed = (
@@ -196,7 +196,7 @@ def test_a_stated_scale_saves_a_join_on_whose_scale_reach_and_movement_disagree(
     assert not placed
 
 
-def test_maps_are_placed_at_the_stated_scale():
+def test_the_stated_scale_is_a_residual_of_the_problem():
     problem = MapAlignmentProblem(
         SimpleNamespace(samples=SimpleNamespace(cameras=())),
         [],
@@ -209,7 +209,7 @@ def test_maps_are_placed_at_the_stated_scale():
 
 
 @pytest.mark.slow
-def test_palms_lie_where_they_were_once_the_scale_is_known():
+def test_a_known_scale_improves_the_alignment_of_palms():
     capture = _drawn(1000 / 30)
     main, further = candidate_main_maps(capture.inputs)[0]
     off = []
@@ -219,6 +219,6 @@ def test_palms_lie_where_they_were_once_the_scale_is_known():
         off.append(_off(capture, together.main_from_gauge, main[0].gauge))
         # Three dimensions of the stated sigma, twice.
         assert all(value < 2.0 * np.sqrt(3.0) * together.sigmas[name][1] for name, value in off[-1].items())
-    # By the body's own scale, 11 % too small, they lay 9 and 13 cm off.
+    # With the body's own scale, 11 % too small, they were 9 and 13 cm wrong.
     assert max(off[1].values()) < 0.6 * max(off[0].values())
     assert max(off[1].values()) < 0.07

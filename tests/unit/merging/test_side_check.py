@@ -1,4 +1,4 @@
-"""Left and right cameras whose names were exchanged."""
+"""Detection of swapped left and right cameras."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _track(camera: str, poses) -> CameraTrack:
 
 
 def _tracks(*sides: tuple[str, float], down_rad: float = 0.0, count: int = 90) -> list[CameraTrack]:
-    """A trunk's camera that turns round, looking down by so much, and cameras so far to its right."""
+    """Return a trunk's camera that turns round, pitched down, and cameras at distances to its right."""
     headings = np.linspace(0.0, 6.0, count)
     level = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     turned = so3_exp(headings[:, None] * UP) @ level @ so3_exp(np.array([-down_rad, 0.0, 0.0]))
@@ -48,7 +48,7 @@ def _tracks(*sides: tuple[str, float], down_rad: float = 0.0, count: int = 90) -
     return out
 
 
-def test_exchanged_names_are_told() -> None:
+def test_swapped_sides_are_found() -> None:
     wrong = swapped_sides(_tracks(("left_palm", 0.3), ("right_palm", -0.3), ("head", 0.0)), MOUNTS, UP)
     assert wrong == {"left_palm": 1.0, "right_palm": 1.0}
     assert describe_swapped_sides(wrong).startswith("left_palm and right_palm stay on the other side")
@@ -62,34 +62,34 @@ def test_exchanged_names_are_told() -> None:
         _tracks(("left_palm", 0.3), ("right_palm", 0.3)),
         _tracks(("left_palm", 0.0)),
         _tracks(("head", 0.0)),
-        # Looking at the feet tells nothing of where the body faces.
+        # A camera that looks at the feet does not show where the body faces.
         _tracks(("left_palm", 0.3), ("right_palm", -0.3), down_rad=1.3),
     ],
     ids=["right", "one arm across", "in the middle", "no limb", "looking down"],
 )
-def test_sides_that_do_not_tell_are_left_alone(tracks: list[CameraTrack]) -> None:
+def test_undetermined_sides_are_not_reported(tracks: list[CameraTrack]) -> None:
     assert swapped_sides(tracks, MOUNTS, UP) == {}
 
 
-def test_a_camera_on_its_head_does_not_tell() -> None:
+def test_an_upside_down_camera_is_not_used() -> None:
     assert swapped_sides(_tracks(("left_palm", 0.3), ("right_palm", -0.3)), MOUNTS, -UP) == {}
 
 
 @pytest.mark.parametrize("roll_deg", [0.0, 180.0])
 def test_a_back_camera_has_the_left_hand_on_its_right(roll_deg: float) -> None:
-    own, exchanged = (_tracks(("left_palm", side * 0.3), ("right_palm", side * -0.3)) for side in (1.0, -1.0))
+    own, swapped = (_tracks(("left_palm", side * 0.3), ("right_palm", side * -0.3)) for side in (1.0, -1.0))
     mounts = {**MOUNTS, "torso": with_roll(BACK, roll_deg)}
     turn = so3_exp(np.array([0.0, 0.0, np.radians(roll_deg)]))
-    for tracks in (own, exchanged):
+    for tracks in (own, swapped):
         poses = tracks[0].map_from_cam.copy()
         poses[:, :3, :3] = poses[:, :3, :3] @ turn
         tracks[0] = replace(tracks[0], map_from_cam=poses)
     assert swapped_sides(own, mounts, UP) == {}
-    assert swapped_sides(exchanged, mounts, UP) == {"left_palm": 1.0, "right_palm": 1.0}
+    assert swapped_sides(swapped, mounts, UP) == {"left_palm": 1.0, "right_palm": 1.0}
 
 
-def test_a_limbs_camera_that_leads_does_not_tell() -> None:
+def test_a_reference_camera_on_a_limb_is_not_used() -> None:
     tracks = _tracks(("left_palm", 0.3), ("right_palm", -0.3))
     arm = replace(BACK, role="LeftArm")
-    for worn in (arm, replace(MOUNTS["torso"], role="LeftArm")):
-        assert swapped_sides(tracks, {**MOUNTS, "torso": worn}, UP) == {}
+    for mount in (arm, replace(MOUNTS["torso"], role="LeftArm")):
+        assert swapped_sides(tracks, {**MOUNTS, "torso": mount}, UP) == {}

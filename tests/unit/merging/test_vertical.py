@@ -1,4 +1,4 @@
-"""Which way is up: planes, the walk, the leaning of the body and what the job states, against each other."""
+"""The vertical from planes, the walk, the lean of the body and the job, weighed against each other."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STANDING_M = 1.25
 
 
 def _box_room(rng):
-    """Points (P,3) of the floor, the ceiling and four walls."""
+    """Return points (P,3) of the floor, the ceiling and four walls."""
     low, high = np.array([-3.0, -2.5, 0.0]), np.array([3.0, 2.5, 2.6])
     faces = np.tile(rng.uniform(low, high, (200, 3)), (6, 1, 1))
     for face in range(6):
@@ -29,12 +29,12 @@ def _box_room(rng):
 
 
 def _leaning(rng, forward_deg, share, side_deg=0.0):
-    """Axes (N,3,3) of a trunk that leans for a share of the time, and where its chest is then (N,3)."""
+    """Return axes (N,3,3) and path (N,3) of a trunk that leans for a ratio of the time."""
     leans = np.arange(200) < share * 200
     pitch, side = (
         np.where(leans, most, 0.0) + rng.normal(scale=4.0, size=200) for most in (forward_deg, side_deg)
     )
-    # Left is +X and back +Y: a turn about +X tips up towards the front.
+    # Left is +X and back +Y: a rotation about +X leans forward.
     axes = so3_exp(np.outer(np.radians(pitch), [1.0, 0.0, 0.0])) @ so3_exp(
         np.outer(np.radians(side), [0.0, 1.0, 0.0])
     )
@@ -42,10 +42,10 @@ def _leaning(rng, forward_deg, share, side_deg=0.0):
 
 
 def _found(axes, path, points, front_known=True, stated=(), walks=False) -> Vertical:
-    """What is found in a frame that is turned, and turned back."""
-    around = SceneContext(points_m=points @ TURN.T, path_m=path @ TURN.T, standing_m=STANDING_M, walks=walks)
+    """Estimate the vertical in a rotated frame."""
+    scene = SceneContext(points_m=points @ TURN.T, path_m=path @ TURN.T, standing_m=STANDING_M, walks=walks)
     return estimate_vertical(
-        TrunkOrientation(TURN @ axes, front_known), around, np.random.default_rng(0), stated
+        TrunkOrientation(TURN @ axes, front_known), scene, np.random.default_rng(0), stated
     )
 
 
@@ -68,7 +68,7 @@ def _off_deg(found: Vertical) -> float:
         (-30, 1.0),
     ],
 )
-def test_a_room_is_not_laid_on_its_side_by_who_bends_in_it(forward_deg, share):
+def test_a_bending_person_does_not_turn_the_room_on_its_side(forward_deg, share):
     rng = np.random.default_rng(1)
     found = _found(*_leaning(rng, forward_deg, share), _box_room(rng))
     assert found.source == "map"
@@ -76,30 +76,30 @@ def test_a_room_is_not_laid_on_its_side_by_who_bends_in_it(forward_deg, share):
     assert found.is_determined()
 
 
-def test_a_room_seen_from_one_side_is_not_laid_on_its_side_either():
+def test_a_room_seen_from_one_side_is_not_turned_on_its_side():
     rng = np.random.default_rng(1)
     room = _box_room(rng)
-    # He faces -Y: what lies behind him, and the ceiling, no camera sees.
+    # The person faces -Y: no camera sees what is behind, nor the ceiling.
     ahead = room[(room[:, 1] < 0.2) & (room[:, 2] < 2.0)]
     found = _found(*_leaning(rng, 80.0, 0.7), ahead)
     assert found.source == "map"
     assert _off_deg(found) < 0.5
 
 
-def test_the_body_alone_is_upright_where_it_bends_from():
+def test_the_body_alone_gives_the_direction_it_bends_from():
     rng = np.random.default_rng(1)
     axes, path = _leaning(rng, 60.0, 0.6)
     found = _found(axes, path, np.zeros((0, 3)), walks=True)
     assert found.source == "body"
     assert found.body_off_deg is None
-    # The mean leans by 36 degrees, and the usual direction by 60.
+    # The mean leans by 36 degrees, and the modal direction by 60.
     assert _off_deg(found) < 5.0
-    # Half of the 46 degrees that the trunk moves in the mean square, and a mount's 15.
+    # Half of the 46 degrees (RMS) that the trunk moves, and 15 degrees of the mount.
     assert 20.0 < found.sigma_deg < 35.0
 
 
 @pytest.mark.parametrize(("forward_deg", "share"), [(0, 1.0), (60, 1.0), (90, 1.0), (-30, 1.0), (90, 0.6)])
-def test_a_lean_that_lasts_does_not_show_unless_it_walks(forward_deg, share):
+def test_a_constant_lean_is_unknown_unless_the_person_walks(forward_deg, share):
     axes, path = _leaning(np.random.default_rng(1), forward_deg, share)
     found = _found(axes, path, np.zeros((0, 3)))
     assert found.source == "body"
@@ -113,7 +113,7 @@ def test_a_lean_that_lasts_does_not_show_unless_it_walks(forward_deg, share):
         assert walked.is_determined()
 
 
-def test_who_walks_most_of_the_time_is_told_from_who_bends_on_the_spot():
+def test_walking_is_distinguished_from_bending_on_the_spot():
     seconds = np.arange(300) / 30.0
     still = np.zeros(300)
     for path, walks in (
@@ -146,12 +146,12 @@ def test_a_wall_and_a_sloping_roof_do_not_tilt_a_level_walk():
     found = _found(axes, walk, attic, front_known=False)
     assert found.source == "walk"
     assert _off_deg(found) < 0.5
-    # Who stands still has nothing better than what the planes agree on.
+    # Without a walk, the planes give the best vertical.
     assert _found(axes, walk[:20], attic, front_known=False).source == "map"
 
 
 @pytest.mark.parametrize(("hung_deg", "taken"), [(3.0, "map"), (10.0, "marker board")])
-def test_what_the_job_states_is_taken_and_the_others_are_told_against_it(hung_deg, taken):
+def test_a_stated_vertical_is_selected_and_the_others_are_compared_with_it(hung_deg, taken):
     rng = np.random.default_rng(1)
     room, (axes, path) = _box_room(rng), _leaning(rng, 0.0, 1.0)
     hung = TURN @ so3_exp([np.radians(hung_deg), 0.0, 0.0])
@@ -163,26 +163,26 @@ def test_what_the_job_states_is_taken_and_the_others_are_told_against_it(hung_de
     found = _found(axes, path, room, stated=edges)
     assert found.source == taken
     assert _off_deg(found) == pytest.approx(0.0 if taken == "map" else hung_deg, abs=0.5)
-    told = {
+    off_deg = {
         say.source: np.degrees(np.arccos(np.clip(say.up @ found.up, -1.0, 1.0)))
         for say in reversed(found.alternatives)
     }
-    assert told["map" if taken == "marker board" else "marker board"] == pytest.approx(hung_deg, abs=0.5)
-    assert "body" in told
+    assert off_deg["map" if taken == "marker board" else "marker board"] == pytest.approx(hung_deg, abs=0.5)
+    assert "body" in off_deg
 
 
-def test_a_board_on_the_floor_tells_who_is_upside_down():
+def test_a_board_on_the_floor_reveals_an_upside_down_body():
     rng = np.random.default_rng(1)
     axes, path = _leaning(rng, 0.0, 1.0)
     lying = [VerticalHypothesis(source="marker board", up=TURN @ UP, sigma_deg=1.5)]
     found = _found(so3_exp([np.pi, 0.0, 0.0]) @ axes, path, _box_room(rng), stated=lying)
     assert _off_deg(found) < 0.5
-    # However strange it is beside what the job does not say.
+    # However unlikely it is by everything that the job does not state.
     assert found.is_determined()
     assert describe_vertical(found).endswith("from the map")
 
 
-def test_a_board_hung_at_half_a_right_angle_leaves_two_of_its_edges():
+def test_a_board_hung_at_45_degrees_leaves_two_of_its_edges():
     rng = np.random.default_rng(1)
     axes, path = _leaning(rng, 0.0, 1.0)
     hung = TURN @ so3_exp([0.0, np.radians(45.0), 0.0])
@@ -191,8 +191,8 @@ def test_a_board_hung_at_half_a_right_angle_leaves_two_of_its_edges():
     assert not _found(axes, path, np.zeros((0, 3)), stated=edges).is_determined()
 
 
-def test_two_directions_that_explain_as_much_are_told():
-    """Planes alone, seen by a camera that shows no front: leaning by 45 degrees either may be up."""
+def test_two_equally_likely_directions_are_reported():
+    """With planes and an unknown front, a lean of 45 degrees fits two directions."""
     rng = np.random.default_rng(1)
     axes, _ = _leaning(rng, 45.0, 1.0)
     cabin = _box_room(rng) * [1.0, 0.52, 1.0] - [0.0, 0.0, 1.3]  # as wide as high, about the chest
@@ -202,7 +202,7 @@ def test_two_directions_that_explain_as_much_are_told():
     assert rival.negative_log_likelihood - found.negative_log_likelihood == pytest.approx(found.margin_nats)
 
 
-def test_hanging_limbs_tell_up_but_no_front():
+def test_hanging_limbs_give_up_but_no_front():
     skeleton = load_skeleton("upper_body", 1.75)
     bones = [bone for bone in kinematic_chain(skeleton, {"LeftArm"}) if bone.role == "LeftArm"]
     down = so3_exp([0.0, np.pi / 2.0, 0.0])  # the left arm of the zero pose points along +X
