@@ -2,7 +2,7 @@
 
     blender --background --python examples/blender_import.py -- out/cpl_lab scene.blend
 
-Blender's own importers with their default axes; BVH is in centimetres, hence the scale.
+Blender's own importers are used with their default axes. BVH is in centimetres, hence the scale.
 """
 
 import sys

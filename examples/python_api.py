@@ -23,7 +23,7 @@ from bodycap_batch.store import Store
 
 
 def show(event: Event) -> None:
-    """Print what happens, but not every step of it."""
+    """Print every event except the progress."""
     if event.kind != "progress":
         print(event.kind, event.stage, event.camera)
 
