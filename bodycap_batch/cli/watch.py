@@ -60,7 +60,7 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
     store: WatchStoreOption = None,
     root: RootOption = None,
     limit: LimitOption = None,
-    settle: Annotated[
+    unchanged_s: Annotated[
         float,
         typer.Option(
             min=0.0, metavar="SECONDS", help="Time without changes after which a folder is complete."
@@ -109,7 +109,7 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
         store=store,
         jobs=jobs,
         threads=threads or cores(),
-        unchanged_s=settle,
+        unchanged_s=unchanged_s,
         stale_s=stale,
         poll=poll,
         once=once,

@@ -307,7 +307,7 @@ def test_stops_between_iterations(walk, tmp_path):
 
 def test_same_inputs_same_result(walk, base, context):
     again = merge_trajectories(make_inputs(walk, _recorded(walk)), MergeOptions(), context)
-    assert (again.world_from_joint == base.graph_world_from_joint).all()
+    assert (again.graph_world_from_joint == base.graph_world_from_joint).all()
     assert again.report == base.report
 
 

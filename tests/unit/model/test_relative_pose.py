@@ -184,7 +184,7 @@ def test_relative_poses_of_the_rig_survive_recovery(tmp_path: Path, monkeypatch:
     relative = estimate_relative_pose(*(each.registration.trajectory for each in cameras), 0)
     write_dataclass(RigPoses(relative=(relative,)), folders[0], RIG_POSES)
     capture = SimpleNamespace(cameras=tuple(each.camera for each in cameras))
-    monkeypatch.setattr(recover, "load_capture", lambda *_: capture)
+    monkeypatch.setattr(recover, "load_capture", lambda *_, **__: capture)
     monkeypatch.setattr(recover, "load_map", lambda _: SimpleNamespace(maps=(scene_map,)))
     monkeypatch.setattr(recover, "load_keyframes", lambda _: selection)
     monkeypatch.setattr(

@@ -202,7 +202,7 @@ def test_the_reader_of_skeleton_files_counts(copied: Path) -> None:
 
 
 def test_the_format_of_stored_results_counts(copied: Path) -> None:
-    assert changed_by(copied / "formats" / "bundle.py") == set(STAGES) - {"synth", "check"}
+    assert changed_by(copied / "formats" / "dataclass_files.py") == set(STAGES) - {"synth", "check"}
 
 
 def test_code_for_output_does_not_count(copied: Path) -> None:
