@@ -63,7 +63,10 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
     unchanged_s: Annotated[
         float,
         typer.Option(
-            min=0.0, metavar="SECONDS", help="Time without changes after which a folder is complete."
+            "--settle",
+            min=0.0,
+            metavar="SECONDS",
+            help="Time without changes after which a folder is complete.",
         ),
     ] = 10.0,
     poll: Annotated[
