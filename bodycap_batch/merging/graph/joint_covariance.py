@@ -70,7 +70,7 @@ def joint_covariance(solved: SolvedGraph, world_from_bone: FloatArray, error_mod
     columns = _columns_by_tick(solved, linear)
     order, bounds = columns.order, columns.bounds
     try:
-        normal = BlockTridiagonal((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
+        normal = BlockTridiagonal.from_sparse((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
     except np.linalg.LinAlgError:
         # Some state is not observable. The solution exists, but its covariance does not.
         return np.full((*world_from_bone.shape[:2], 3, 3), np.nan)
