@@ -18,8 +18,8 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 from bodycap_batch.core.arrays import FloatArray, IntArray
 
 _FACTOR_BYTES = 1e7
-"""Memory, in bytes, of the factors that are kept: those of 50 ticks with nine bones. With three times as much,
-the solver took 20 MB more and was not faster."""
+"""Memory, in bytes, of the factors that are kept: those of 50 ticks with nine bones. With three times as
+much, the solver took 20 MB more and was not faster."""
 
 
 class _BlockRow(NamedTuple):
