@@ -4,9 +4,6 @@ Unknowns of a tick are a shift of the root and, for each solved joint, a rotatio
 about its centre, in world axes. Ticks are tied to their neighbours only, so the normal equations are block
 tridiagonal and the solve is linear in time. Long motions are solved in stretches, so that memory does not
 grow with them.
-
-Source: D. C. Fraser, J. E. Potter, "The optimum linear smoother as a combination of two optimum linear
-    filters", IEEE Trans. Automatic Control 1969 (the forward-backward elimination used here).
 """
 
 from __future__ import annotations
@@ -17,6 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
 from bodycap_batch.model.geometry import so3_exp, so3_log
 from bodycap_batch.model.skeleton import SkeletonModel, forward_kinematics
 
@@ -317,26 +315,14 @@ def _jacobian(centres: FloatArray, point: FloatArray, reach: FloatArray) -> Floa
 def _solve_tridiagonal(
     blocks: FloatArray, coupling: FloatArray, right: FloatArray, damping: float
 ) -> FloatArray:
-    """Solve the block tridiagonal system by elimination forwards, substitution backwards.
+    """Solve the damped block-tridiagonal system.
 
     Args:
         blocks: (T,n,n) on the diagonal.
         coupling: (T-1,n,n) of each tick with the next one.
         right: (T,n).
-        damping: Share that is added to the diagonal.
+        damping: Relative increase of the matrix's diagonal.
     """
-    ticks, size = right.shape
-    more = 1.0 + damping * np.eye(size)
-    carried = np.zeros_like(blocks)
-    out = np.empty_like(right)
-    for tick in range(ticks):
-        block, value = blocks[tick] * more, right[tick]
-        if tick:
-            block = block - coupling[tick - 1].T @ carried[tick - 1]
-            value = value - coupling[tick - 1].T @ out[tick - 1]
-        following = coupling[tick] if tick + 1 < ticks else np.zeros((size, 0))
-        both = np.linalg.solve(block, np.column_stack([following, value]))
-        carried[tick, :, : following.shape[1]], out[tick] = both[:, :-1], both[:, -1]
-    for tick in range(ticks - 2, -1, -1):
-        out[tick] -= carried[tick] @ out[tick + 1]
-    return out
+    damped = blocks * (1.0 + damping * np.eye(right.shape[1]))
+    system = BlockTridiagonal.from_blocks(damped, coupling)
+    return np.concatenate(system.solve(right.reshape(-1, 1))).reshape(right.shape)

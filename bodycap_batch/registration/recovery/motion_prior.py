@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
 
 _USUAL = 80.0
 """Percentile of a camera's own third and fourth differences: lost stretches are among its faster ones."""
@@ -163,9 +164,6 @@ def _solved(
         weight: (N−4,) their information.
         known: (N,3,3) information of the places.
         pull: (N,3) the same times the places.
-
-    Source: block elimination, and its way back for the blocks of the inverse, as in Rauch, Tung, Striebel,
-        "Maximum likelihood estimates of linear dynamic systems", AIAA Journal 1965.
     """
     count, size = len(known), 3 * _NEIGHBOURS
     groups = -(-count // _NEIGHBOURS)
@@ -177,16 +175,10 @@ def _solved(
     own += np.eye(size) * (_PRIOR * np.trace(own, axis1=1, axis2=2).sum() / (3 * count))
     towards = np.zeros((groups, size))
     towards.reshape(-1, 3)[:count] = pull
-    for group in range(1, groups):
-        back = np.linalg.solve(own[group - 1], ahead[group - 1]).T
-        own[group] -= back @ ahead[group - 1]
-        towards[group] -= back @ towards[group - 1]
-    covariance = np.linalg.inv(own)
-    centres = np.einsum("gij,gj->gi", covariance, towards)
-    for group in range(groups - 2, -1, -1):
-        follows = covariance[group] @ ahead[group]
-        centres[group] -= follows @ centres[group + 1]
-        covariance[group] += follows @ covariance[group + 1] @ follows.T
+    system = BlockTridiagonal.from_blocks(own, ahead[:-1])
+    centres = np.concatenate(system.solve(towards.reshape(-1, 1)))
+    covariance = np.empty_like(own)
+    system.marginals(covariance.__setitem__)
     blocks = covariance.reshape(groups, _NEIGHBOURS, 3, _NEIGHBOURS, 3)
     diagonal = np.einsum("gaiaj->gaij", blocks).reshape(-1, 3, 3)
     return centres.reshape(-1, 3)[:count], diagonal[:count]
