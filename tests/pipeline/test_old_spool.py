@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from bodycap_batch.store import Store
-from bodycap_batch.watch import rows_of
+from bodycap_batch.watch import job_rows
 from tests.pipeline.spools import SpoolBench
 
 ARCHIVE = Path(__file__).with_name("kept") / "spool_0_1_0.tar.xz"
@@ -33,7 +33,7 @@ def bench(tmp_path: Path) -> SpoolBench:
 
 
 def test_the_states_of_old_jobs_are_known(bench: SpoolBench) -> None:
-    states = {row.name: row.state for row in rows_of(bench.spool)}
+    states = {row.name: row.state for row in job_rows(bench.spool)}
     assert states["first"] == "done"
     assert states["third"] == "waiting"
     assert states["second"] in ("running", "interrupted")
@@ -43,7 +43,7 @@ def test_the_states_of_old_jobs_are_known(bench: SpoolBench) -> None:
 def test_no_old_job_is_lost(bench: SpoolBench) -> None:
     finished = bench.spool.done / "first" / "result" / "run.json"
     before = finished.read_bytes()
-    assert bench.work_off(stale_s=0.0) == 0
+    assert bench.run_once(stale_s=0.0) == 0
     assert {path.name for path in bench.spool.done.iterdir()} >= {"first", "second", "third"}
     assert finished.read_bytes() == before
     assert bench.status("second")["attempts"] == 2

@@ -52,7 +52,7 @@ class TrunkOrientation:
         return modal_direction(self.axes[:, :, 2])
 
     def mean_up(self) -> FloatArray:
-        """Return the trunk's mean up direction (3,), closer to upright than the mode if it is mostly bent."""
+        """Return the trunk's mean up direction (3,): nearer to upright than the mode if it mostly bends."""
         return _normalised(self.axes[:, :, 2].mean(axis=0))
 
     def upright_up(self) -> FloatArray:
@@ -169,7 +169,7 @@ def modal_direction(directions: FloatArray) -> FloatArray:
 
 
 def _subsample(items: FloatArray) -> FloatArray:
-    """Return up to 300 of the items (N,...), evenly spaced."""
+    """Return up to 300 of the items (N,...), evenly spaced. The indices are rounded down."""
     return np.asarray(items[np.unique(np.linspace(0, len(items) - 1, _MAX_SAMPLES).astype(np.int64))])
 
 

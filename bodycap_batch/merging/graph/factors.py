@@ -14,7 +14,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body.bones import JOINT_SLACK_M, Bone, Hinge
-from bodycap_batch.model.geometry import skew
+from bodycap_batch.model.geometry import nearest_rotation, skew
 
 MAX_BONES = 64
 """Stride of a tick in the keys; a graph has at most this many bones."""
@@ -193,8 +193,7 @@ def add_mount_prior(
 def mount_from_points(values: Any, camera: int, points: MountPoints) -> FloatArray:
     """Fit joint_from_cam (4,4) to a mount's four points, the rotation about the centre point."""
     centre, *axes = (np.asarray(values.atPoint3(key)) for key in mount_keys(camera))
-    u, _, vt = np.linalg.svd((np.array(axes) - centre).T)
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    rotation = nearest_rotation((np.array(axes) - centre).T)
     out = np.eye(4)
     out[:3, :3] = rotation
     weight = _AXIS_WEIGHT

@@ -76,7 +76,7 @@ def joint_covariance(
     columns = _columns_by_tick(solved, linear)
     order, bounds = columns.order, columns.bounds
     try:
-        normal = BlockTridiagonal((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
+        normal = BlockTridiagonal.from_sparse((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
     except np.linalg.LinAlgError:
         # Some state is not observable. The solution exists, but its covariance does not.
         return np.full((*world_from_bone.shape[:2], 3, 3), np.nan)

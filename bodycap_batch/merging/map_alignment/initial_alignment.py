@@ -21,7 +21,7 @@ from bodycap_batch.merging.cameras.track import (
     CameraTrack,
     transform_track,
 )
-from bodycap_batch.model.geometry import Similarity, invert, make_transform
+from bodycap_batch.model.geometry import Similarity, invert, make_transform, nearest_rotation
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import split_side
 
@@ -197,8 +197,7 @@ def align_map(
     target, source = (np.concatenate(parts) for parts in zip(*centred, strict=True))
     sizes = [float(np.sqrt((part**2).sum(axis=1).mean())) for part in (target, source)]
     by_path = target.T @ source / (len(target) * sizes[0] * sizes[1])
-    u, _, vt = np.linalg.svd(by_path + _REST_POSE_WEIGHT * np.mean(rotations, axis=0))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    rotation = nearest_rotation(by_path + _REST_POSE_WEIGHT * np.mean(rotations, axis=0))
     scale = sizes[0] / sizes[1]
     shifts = [a.mean(axis=0) - scale * rotation @ b.mean(axis=0) for a, b in pairs]
     return Similarity(scale, rotation, np.mean(shifts, axis=0))

@@ -4,9 +4,6 @@ The unknowns of a tick are a shift of the root and, for each solved joint, a rot
 about its centre, in world axes. Only neighbouring ticks are linked, so the normal equations are
 block-tridiagonal, and the solution takes a time proportional to the number of ticks. Long motions are solved
 in overlapping windows, so that the memory does not grow with their length.
-
-Source: D. C. Fraser, J. E. Potter, "The optimum linear smoother as a combination of two optimum linear
-    filters", IEEE Trans. Automatic Control 1969 (the forward-backward elimination used here).
 """
 
 from __future__ import annotations
@@ -17,6 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
 from bodycap_batch.model.geometry import skew, so3_exp, so3_log
 from bodycap_batch.model.skeleton import SkeletonModel, forward_kinematics
 
@@ -417,25 +415,13 @@ def _jacobian(centres: FloatArray, point: FloatArray, is_ancestor: FloatArray) -
 
 
 def _solve_tridiagonal(equations: NormalEquations, damping: float) -> FloatArray:
-    """Return the Levenberg-Marquardt step (T,n) by forward elimination and backward substitution.
+    """Return the step (T,n) that solves the damped normal equations.
 
     Args:
         equations: The normal equations.
-        damping: Fraction by which the diagonal is increased.
+        damping: Relative increase of the matrix's diagonal.
     """
-    blocks, coupling, right = equations.blocks, equations.coupling, -equations.gradient
-    ticks, size = right.shape
-    diagonal_factor = 1.0 + damping * np.eye(size)
-    eliminated = np.zeros_like(blocks)
-    out = np.empty_like(right)
-    for tick in range(ticks):
-        block, value = blocks[tick] * diagonal_factor, right[tick]
-        if tick:
-            block = block - coupling[tick - 1].T @ eliminated[tick - 1]
-            value = value - coupling[tick - 1].T @ out[tick - 1]
-        following = coupling[tick] if tick + 1 < ticks else np.zeros((size, 0))
-        both = np.linalg.solve(block, np.column_stack([following, value]))
-        eliminated[tick, :, : following.shape[1]], out[tick] = both[:, :-1], both[:, -1]
-    for tick in range(ticks - 2, -1, -1):
-        out[tick] -= eliminated[tick] @ out[tick + 1]
-    return out
+    damped = equations.blocks * (1.0 + damping * np.eye(equations.gradient.shape[1]))
+    system = BlockTridiagonal.from_blocks(damped, equations.coupling)
+    step = np.concatenate(system.solve(-equations.gradient.reshape(-1, 1)))
+    return np.asarray(step.reshape(equations.gradient.shape))

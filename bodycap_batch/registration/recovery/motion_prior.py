@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
 
 _PERCENTILE = 80.0
 """Percentile of a camera's third and fourth differences. It is high because lost intervals belong to the
@@ -203,9 +204,6 @@ def _solve_block_tridiagonal(
 
     Returns:
         Centres (N,3) and their covariances (N,3,3).
-
-    Source: block elimination and back substitution for the blocks of the inverse, as in Rauch, Tung,
-        Striebel, "Maximum likelihood estimates of linear dynamic systems", AIAA Journal 1965.
     """
     count, size = len(information), 3 * _NEIGHBOURS
     groups = -(-count // _NEIGHBOURS)
@@ -217,16 +215,10 @@ def _solve_block_tridiagonal(
     own += np.eye(size) * (_PRIOR * np.trace(own, axis1=1, axis2=2).sum() / (3 * count))
     right = np.zeros((groups, size))
     right.reshape(-1, 3)[:count] = weighted
-    for group in range(1, groups):
-        elimination = np.linalg.solve(own[group - 1], ahead[group - 1]).T
-        own[group] -= elimination @ ahead[group - 1]
-        right[group] -= elimination @ right[group - 1]
-    covariance = np.linalg.inv(own)
-    centres = np.einsum("gij,gj->gi", covariance, right)
-    for group in range(groups - 2, -1, -1):
-        gain = covariance[group] @ ahead[group]
-        centres[group] -= gain @ centres[group + 1]
-        covariance[group] += gain @ covariance[group + 1] @ gain.T
+    system = BlockTridiagonal.from_blocks(own, ahead[:-1])
+    centres = np.concatenate(system.solve(right.reshape(-1, 1)))
+    covariance = np.empty_like(own)
+    system.marginals(covariance.__setitem__)
     blocks = covariance.reshape(groups, _NEIGHBOURS, 3, _NEIGHBOURS, 3)
     diagonal = np.einsum("gaiaj->gaij", blocks).reshape(-1, 3, 3)
     return centres.reshape(-1, 3)[:count], diagonal[:count]

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from dataclasses import replace
-from itertools import pairwise
 
 import gtsam
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy import sparse
 
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.cameras.track import make_track
@@ -19,60 +16,8 @@ from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.merging.graph.joint_covariance import joint_covariance, sigma_percentiles
 from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution
 from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
-from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
 from bodycap_batch.model.geometry import make_transform, se3_adjoint, so3_exp
 from tests.stages.walker import FPS, ROLES, make_inputs, make_walk, record
-
-
-@pytest.mark.parametrize("held", [1.0, 600.0, 1e6])  # bytes of one block, of two, of all
-def test_block_tridiagonal_equals_the_dense_solution(held):
-    rng = np.random.default_rng(0)
-    bounds = np.array([0, 3, 7, 8, 12])
-    rows = np.zeros((0, 12))
-    for block in range(4):
-        reach = np.zeros((9, 12))
-        reach[:, bounds[block] : bounds[min(block + 2, 4)]] = rng.normal(
-            size=(9, bounds[min(block + 2, 4)] - bounds[block])
-        )
-        rows = np.vstack([rows, reach])
-    order = rng.permutation(12)
-    shuffled = np.zeros_like(rows)
-    shuffled[:, order] = rows
-    information = shuffled.T @ shuffled
-    chain = BlockTridiagonal(sparse.csr_matrix(information), order, bounds, held)
-    right = rng.normal(size=(12, 2))
-    assert_allclose(np.vstack(chain.solve(right)), np.linalg.solve(information, right)[order], atol=1e-9)
-    inverse = np.linalg.inv(information)[np.ix_(order, order)]
-    found = {}
-    chain.marginals(found.setdefault)
-    for block, (start, end) in enumerate(pairwise(bounds.tolist())):
-        assert_allclose(found[block], inverse[start:end, start:end], atol=1e-9)
-
-
-def test_few_factors_in_memory_give_the_same_solution():
-    size, count = 12, 300
-    rng = np.random.default_rng(0)
-    eye, side = 4.0 * np.eye(size), 0.1 * rng.normal(size=(size, size))
-    rows = [[None] * count for _ in range(count)]
-    for block in range(count):
-        rows[block][block] = eye
-        if block:
-            rows[block - 1][block], rows[block][block - 1] = side, side.T
-    information = sparse.bmat(rows, format="csr")
-    order, bounds = np.arange(size * count), size * np.arange(count + 1)
-    right = rng.normal(size=(size * count, 2))
-    found, kept = [], []
-    for held in (1e9, 20_000.0):
-        tracemalloc.start()
-        chain = BlockTridiagonal(information, order, bounds, held)
-        kept.append(tracemalloc.get_traced_memory()[0])
-        tracemalloc.stop()
-        covariances = {}
-        chain.marginals(lambda block, each, known=covariances: known.setdefault(block, each[0, 0]))
-        found.append((np.vstack(chain.solve(right)), covariances))
-    assert np.array_equal(found[0][0], found[1][0])
-    assert found[0][1] == found[1][1]
-    assert kept[0] - kept[1] > 0.9 * (2 * 8 * size**2 * count - 20_000)
 
 
 def test_a_graph_without_factors_has_no_covariance(walk):
