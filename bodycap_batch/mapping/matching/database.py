@@ -122,6 +122,7 @@ def add_keyframes(
                 np.save(colours / f"{image_id}.npy", found.rgb)
                 done += 1
                 context.progress(done, total, "features")
+    context.progress(0, 0, "choosing pairs")
 
 
 def drop_images(workspace: Path, cameras: Collection[str]) -> None:

@@ -235,6 +235,7 @@ def link_keyframes(
     while fresh := chooser.wider(held, tried) or chooser.unlinked(held, tried):
         held |= match_pairs(workspace, fresh, lenses, context)
         tried |= set(fresh)
+    context.progress(0, 0, "reconstruction")
     between = Counter(f"{a.camera} - {b.camera}" for a, b in held if a.camera != b.camera)
     log = {
         "pairs": len(tried),
