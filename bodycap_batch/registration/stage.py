@@ -62,7 +62,9 @@ def register_frames(
         return _without_map(camera, tried)
     limits = _limits(camera, selection, options)
     tracks = all_tracks(camera, anchors_of(scene_map, camera.name), Known.of(previous), context)
+    context.progress(0, 0, "misplaced keyframes")
     scene_map, tracks, doubtful = _without_misplaced(camera, scene_map, tracks, limits, context)
+    context.progress(0, 0, "poses")
     poses = solve_frames(camera, scene_map, tracks, limits)
     trajectory = _finished(_trajectory(camera, scene_map.gauge, poses, selection.sharpness))
     asked = np.zeros(0, np.int64) if previous is None else previous.wanted_keyframes

@@ -58,9 +58,7 @@ def all_tracks(
         parts.append(_inside(known.tracks, [stretch for stretch in stretches if stretch in done], count))
     todo = _joined([stretch for stretch in stretches if stretch not in done], count)
     parts += _track(camera, anchors, _shared_out(todo, frames, context.threads), context)
-    tracks = Tracks.join(parts)  # which takes them out one by one: nothing else may hold them
-    context.progress(0, 0, "poses")
-    return tracks
+    return Tracks.join(parts)  # which takes them out one by one: nothing else may hold them
 
 
 def _track(
