@@ -290,7 +290,7 @@ CASES = (
     ),
     Case("no cameras", replace_text(JOB, "capture: {cameras: []}\n"), 2, JOB, "empty list"),
     Case("nothing in it", replace_text(JOB, ""), 2, JOB, "empty"),
-    Case("a list of jobs", replace_text(JOB, "- a\n- b\n"), 2, JOB, "no block of"),
+    Case("a list of jobs", replace_text(JOB, "- a\n- b\n"), 2, JOB, "not a block of"),
     Case("not text", replace_text(JOB, bytes(range(128, 256))), 2, JOB, "cannot read the job"),
     Case("aliases", replace_text(JOB, "a: &x [1]\nb: *x\n"), 2, JOB, "anchor"),
     Case("a Python object", replace_text(JOB, "capture: !!python/object:os.system {}\n"), 2, JOB, "tag"),

@@ -68,7 +68,9 @@ def register_frames(
     criteria = acceptance_criteria(camera, selection, options)
     points_by_keyframe = select_keyframe_points(scene_map, camera.name)
     tracks = track_all(camera, points_by_keyframe, TrackCache.from_registration(previous), context)
+    context.progress(0, 0, "misplaced keyframes")
     scene_map, tracks, misplaced = _track_without_misplaced(camera, scene_map, tracks, criteria, context)
+    context.progress(0, 0, "poses")
     poses = solve_camera(camera, scene_map, tracks, criteria, context.threads)
     trajectory = smooth_if_final(build_trajectory(camera, scene_map.gauge, poses, selection.sharpness))
     already_requested = np.zeros(0, np.int64) if previous is None else previous.wanted_keyframes

@@ -141,6 +141,7 @@ def add_keyframes(
                 np.save(colours / f"{image_id}.npy", features.rgb)
                 done += 1
                 context.progress(done, total, "features")
+    context.progress(0, 0, "choosing pairs")
 
 
 def rewrite_without_cameras(workspace: Path, cameras: Collection[str]) -> None:

@@ -271,6 +271,7 @@ def match_keyframes(
     ):
         verified |= match_pairs(workspace, more, intrinsics, context)
         tried |= set(more)
+    context.progress(0, 0, "reconstruction")
     between = Counter(f"{a.camera} - {b.camera}" for a, b in verified if a.camera != b.camera)
     log = {
         "pairs": len(tried),

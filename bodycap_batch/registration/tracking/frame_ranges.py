@@ -69,9 +69,7 @@ def track_all(
     parts += _track_ranges(
         camera, points_by_keyframe, _split_by_thread(missing, frames, context.threads), context
     )
-    tracks = Tracks.join_and_clear(parts)  # nothing else may hold the parts: it releases them one by one
-    context.progress(0, 0, "poses")
-    return tracks
+    return Tracks.join_and_clear(parts)  # nothing else may hold the parts: it releases them one by one
 
 
 def _track_ranges(
