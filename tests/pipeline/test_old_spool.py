@@ -13,7 +13,7 @@ import pytest
 
 from bodycap_batch.store import Store
 from bodycap_batch.watch import job_rows
-from tests.pipeline.spools import SpoolBench
+from tests.pipeline.spools import SpoolFixture
 
 ARCHIVE = Path(__file__).with_name("kept") / "spool_0_1_0.tar.xz"
 MADE_IN = "/srv/captures"
@@ -21,8 +21,8 @@ MADE_IN = "/srv/captures"
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> SpoolBench:
-    bench = SpoolBench(tmp_path)
+def bench(tmp_path: Path) -> SpoolFixture:
+    bench = SpoolFixture(tmp_path)
     with tarfile.open(ARCHIVE) as archive:
         archive.extractall(tmp_path, filter="data")
     for path in tmp_path.joinpath("jobs").rglob("*.json"):
@@ -32,7 +32,7 @@ def bench(tmp_path: Path) -> SpoolBench:
     return bench
 
 
-def test_the_states_of_old_jobs_are_known(bench: SpoolBench) -> None:
+def test_the_states_of_old_jobs_are_known(bench: SpoolFixture) -> None:
     states = {row.name: row.state for row in job_rows(bench.spool)}
     assert states["first"] == "done"
     assert states["third"] == "waiting"
@@ -40,7 +40,7 @@ def test_the_states_of_old_jobs_are_known(bench: SpoolBench) -> None:
 
 
 @pytest.mark.slow
-def test_no_old_job_is_lost(bench: SpoolBench) -> None:
+def test_no_old_job_is_lost(bench: SpoolFixture) -> None:
     finished = bench.spool.done / "first" / "result" / "run.json"
     before = finished.read_bytes()
     assert bench.run_once(stale_s=0.0) == 0
@@ -51,7 +51,7 @@ def test_no_old_job_is_lost(bench: SpoolBench) -> None:
         assert (bench.job(name).path / "result" / "result.bvh").exists()
 
 
-def test_an_old_store_is_read(bench: SpoolBench) -> None:
+def test_an_old_store_is_read(bench: SpoolFixture) -> None:
     store = Store(bench.spool.root / ".store")
     artefacts = [path.parent for path in store.root.glob("artefacts/*/*/manifest.json")]
     assert {path.parent.name for path in artefacts} >= {"check", "keyframes", "map", "registration"}
