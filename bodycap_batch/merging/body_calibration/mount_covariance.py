@@ -113,7 +113,7 @@ class SolvedMounts:
         redundancy = max(float(solved.redundancy[mine].sum()) - idle, 0.0)
         return (_BELIEF * believed + float((self.linear.rhs[mine] ** 2).sum())) / (_BELIEF + redundancy)
 
-    def habit_shifts(self) -> Any:
+    def posture_bias_jacobian(self) -> Any:
         """How the residuals change with the wearer's habits: rows (R,M), sparse, one sigma each."""
         bias = posture_bias_modes(self.body.bones, tuple(self.mount_columns), POSTURE_BIAS_SHARE)
         return joint_residual_jacobian(self.linear, self.body, self.first_joint, self.world_from_bone, bias)

@@ -158,7 +158,7 @@ class MapAlignmentProblem:
         ]
         gain = _solve_normal_equations(normal, influence.T)
         # A systematic bias of the posture changes mounts and maps alike.
-        by_bias = (mounts.habit_shifts().T @ gain[:, : -len(source_rows)].T).T
+        by_bias = (mounts.posture_bias_jacobian().T @ gain[:, : -len(source_rows)].T).T
         covariance = (gain * variance) @ gain.T + by_bias @ by_bias.T
         free = np.arange(len(normal) - count, len(normal))
         normal[free, free] *= 1.0 + damping
