@@ -122,7 +122,7 @@ class Calibration:
         return float(graph.error(self._values))
 
     def widen_postures(self) -> None:
-        """Believe less in the usual postures where the last solution shows unusual ones; see `widen_joint_priors`."""
+        """Widen the joint priors where the last solution shows other postures; see `widen_joint_priors`."""
         # A T-pose is asked for: it has a prior of its own, and says nothing about the posture at other ticks.
         usual = ~self._samples.posture.t_pose
         if usual.any():
