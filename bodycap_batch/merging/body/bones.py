@@ -199,7 +199,7 @@ def _rest_rotation(skeleton: SkeletonModel, role: str, prior: _JointPrior) -> Fl
 
 
 def hinges(skeleton: SkeletonModel, bones: tuple[Bone, ...]) -> tuple[Hinge, ...]:
-    """Return the elbows and knees whose following bone is in the graph too."""
+    """Return the elbows and knees, if the bone after the lower one is in the graph too."""
     index = {bone.role: position for position, bone in enumerate(bones)}
     out = []
     for bone in bones:

@@ -73,14 +73,14 @@ def provisional_scale(
     """Estimate metres per map unit from the largest distances between cameras of related bones.
 
     At a given scale, each pair of cameras gives the distance between two points of the body, which the
-    lengths of the bones bound. The result is the scale at which the largest distances are those of
+    lengths of the bones bound. The result is the scale at which the largest distances equal those of
     stretched limbs.
 
     Args:
         bones: The graph's bones.
         tracks: All cameras, in the gauge of one map.
         mounts: By camera.
-        ignored_cameras: Cameras whose distance from their kinematic neighbour is not used.
+        ignored_cameras: Their distances from their kinematic neighbours are not used.
 
     Raises:
         EstimationError: No two related cameras were localised at the same time, or the distances fit no
@@ -94,7 +94,7 @@ def provisional_scale(
     constraints = [link for link in links if link is not None]
     if not constraints:
         raise EstimationError(
-            "no two cameras whose distance the body knows were localised at the same time",
+            "no two cameras at places of known distance on the body were localised at the same time",
             hint="metric scale comes from a camera on the trunk and one on a limb (or the head) in one map",
         )
     typical = [constraint.typical_scale() for constraint in constraints]

@@ -123,7 +123,7 @@ def posture_bias_modes(
 
     Args:
         bones: The graph's bones.
-        cameras: Names of the cameras, whose mounts do not change.
+        cameras: Names of the cameras. Their mounts do not change.
         share: Ratio of the joint's everyday range, one for all or (B,) by bone.
     """
     shares = np.broadcast_to(share, len(bones))

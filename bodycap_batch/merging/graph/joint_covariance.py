@@ -90,27 +90,27 @@ def joint_covariance(
     ticks, count = world_from_bone.shape[:2]
     out = np.zeros((ticks, count, 3, 3))
 
-    def reader_at(tick: int) -> FloatArray:
+    def jacobian_at(tick: int) -> FloatArray:
         """Return the derivatives (B-1,3,n) of joint centres minus the first bone's by the tick's states."""
         first = [
             int(position[linear.columns[bone_key(tick, bone)]]) - int(bounds[tick]) for bone in range(count)
         ]
-        reader = np.zeros((count - 1, 3, int(bounds[tick + 1] - bounds[tick])))
-        reader[:, :, first[0] + 3 : first[0] + 6] = -world_from_bone[tick, 0, :3, :3]
+        jacobian = np.zeros((count - 1, 3, int(bounds[tick + 1] - bounds[tick])))
+        jacobian[:, :, first[0] + 3 : first[0] + 6] = -world_from_bone[tick, 0, :3, :3]
         for bone in range(1, count):
-            reader[bone - 1, :, first[bone] + 3 : first[bone] + 6] = world_from_bone[tick, bone, :3, :3]
-        return reader
+            jacobian[bone - 1, :, first[bone] + 3 : first[bone] + 6] = world_from_bone[tick, bone, :3, :3]
+        return jacobian
 
     def add_marginal(tick: int, covariance: FloatArray) -> None:
-        reader = reader_at(tick)
-        out[tick, 1:] += reader @ covariance @ reader.swapaxes(1, 2)
+        jacobian = jacobian_at(tick)
+        out[tick, 1:] += jacobian @ covariance @ jacobian.swapaxes(1, 2)
 
     normal.marginals(add_marginal)
     begin("covariances of the calibration")
     for first in range(0, changes.shape[1], _MODES_PER_SOLVE):
         rhs = (linear.matrix.T @ changes[:, first : first + _MODES_PER_SOLVE]).toarray()
         for tick, states in enumerate(normal.solve(rhs)):
-            moved = reader_at(tick) @ states
+            moved = jacobian_at(tick) @ states
             out[tick, 1:] += moved @ moved.swapaxes(1, 2)
     return out
 

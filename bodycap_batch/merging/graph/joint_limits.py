@@ -19,7 +19,7 @@ from bodycap_batch.model.skeleton_presets import rest_positions, split_side
 _REACH_SIGMA_M = 0.05
 """Sigma in metres of a distance outside its bounds. Evidence: none."""
 _HINGE_SIGMA_M = 0.02
-"""The same for elbows and knees, whose bones are rigid. Evidence: none."""
+"""The same for elbows and knees. Evidence: none."""
 _SHOULDER_MOTION_M = 0.05
 """Distance in metres that a shoulder's centre moves on the trunk when the clavicle rotates by 15 to 20°."""
 _ANCHOR_DISTANCE_M = 1.0

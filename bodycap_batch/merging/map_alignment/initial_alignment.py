@@ -116,8 +116,7 @@ class _ScaleInformation:
     """What the distances between cameras reveal about the scale.
 
     Attributes:
-        uninformative: Cameras whose distance from their kinematic neighbour, in another map, carries no
-            information.
+        uninformative: Cameras with a kinematic neighbour in another map, at a distance without information.
         sigma_log: Sigma of the scale's logarithm from the other distances; infinite without any.
     """
 
@@ -221,7 +220,7 @@ def require_common_time(main: CameraTrack, group: Sequence[CameraTrack]) -> None
             return
     raise EstimationError(
         f"{group[0].camera!r} and {main.camera!r} were localised together for less than {_MIN_COMMON_S:g} s",
-        hint="maps without a common view are joined by the walk; see frames.csv",
+        hint="maps without a common view are aligned by the walk that both cameras record; see frames.csv",
     )
 
 
