@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 EXIT_OK = 0
+"""Exit code of success."""
 EXIT_BUG = 70
 """Exit code of an unexpected exception. Source: EX_SOFTWARE of sysexits.h."""
 

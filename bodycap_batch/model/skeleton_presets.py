@@ -49,6 +49,7 @@ STATED_SIGMA_M = 0.015
 sigmas."""
 
 _UP, _FORWARD, _LEFT = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])
+"""Unit vectors of a standing body in the axes of the skeleton: z up, −y forward."""
 _NEXT_ROLE = {
     "Shoulder": "Arm",
     "Arm": "ForeArm",

@@ -29,6 +29,7 @@ from bodycap_batch.pipeline.task_keys import make_task
 from bodycap_batch.runner import Task
 from bodycap_batch.store.artefacts import Artefact
 from bodycap_batch.tasks.body import camera_distances
+from bodycap_batch.tasks.camera_group import CameraGroupTask
 from bodycap_batch.tasks.check import CHECK, CheckTask
 from bodycap_batch.tasks.export import EXPORT, ExportTask
 from bodycap_batch.tasks.inputs import BodyInput
@@ -36,10 +37,10 @@ from bodycap_batch.tasks.keyframes import KEYFRAMES, KeyframesTask
 from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE, CameraDistance, ExtendTask, MapTask, RefineTask
 from bodycap_batch.tasks.merge import MERGE, BoardFootage, MergeTask
 from bodycap_batch.tasks.preview import PREVIEW
-from bodycap_batch.tasks.recover import RECOVER, RecoverTask
+from bodycap_batch.tasks.recover import RECOVER
 from bodycap_batch.tasks.registration import REGISTRATION, RegistrationTask
 from bodycap_batch.tasks.report import REPORT
-from bodycap_batch.tasks.rig import RIG, RigTask
+from bodycap_batch.tasks.rig import RIG
 from bodycap_batch.tasks.stage import Stage, read_summary
 
 ByCamera = Mapping[str, Artefact]
@@ -309,16 +310,7 @@ class Flow:
         """Yield one task for every camera of a synchronised rig."""
         rigs = self._job.capture.segments() if self._job.capture.rig == "synced" else []
         for own, cameras in ((own, rig) for rig in rigs for own in rig):
-            ordered = _own_first(own, cameras)
-            names = [camera.name for camera in ordered]
-            task = RigTask(
-                options=self._job.registration,
-                cameras=tuple(names),
-                capture=capture_ref(self._job.capture, self._cameras, ordered),
-                keyframes=refs_by_camera({name: keyframes[name] for name in names}),
-                map=artefact_ref(scene_map),
-                registrations=refs_by_camera({name: registrations[name] for name in names}),
-            )
+            task = self._group_task(own, cameras, scene_map, registrations, keyframes)
             yield make_task(RIG, task, camera=own.name)
 
     def _recovery_tasks(
@@ -329,21 +321,28 @@ class Flow:
             summary = read_summary(registrations[own.name].path)
             if not LEAST_POSED <= summary["localised"] <= summary["frames"] - LEAST_LOST:
                 continue
-            ordered = _own_first(own, self._job.capture.cameras)
-            names = [camera.name for camera in ordered]
-            task = RecoverTask(
-                options=self._job.registration,
-                cameras=tuple(names),
-                capture=capture_ref(self._job.capture, self._cameras, ordered),
-                keyframes=refs_by_camera({name: keyframes[name] for name in names}),
-                map=artefact_ref(scene_map),
-                registrations=refs_by_camera({name: registrations[name] for name in names}),
-            )
+            task = self._group_task(own, self._job.capture.cameras, scene_map, registrations, keyframes)
             yield make_task(RECOVER, task, camera=own.name)
 
-
-def _own_first(own: CameraConfig, cameras: Sequence[CameraConfig]) -> list[CameraConfig]:
-    return [own, *(camera for camera in cameras if camera.name != own.name)]
+    def _group_task(
+        self,
+        own: CameraConfig,
+        cameras: Sequence[CameraConfig],
+        scene_map: Artefact,
+        registrations: ByCamera,
+        keyframes: ByCamera,
+    ) -> CameraGroupTask:
+        """Return the task of solving one camera with the help of the others, its own camera first."""
+        ordered = [own, *(camera for camera in cameras if camera.name != own.name)]
+        names = [camera.name for camera in ordered]
+        return CameraGroupTask(
+            options=self._job.registration,
+            cameras=tuple(names),
+            capture=capture_ref(self._job.capture, self._cameras, ordered),
+            keyframes=refs_by_camera({name: keyframes[name] for name in names}),
+            map=artefact_ref(scene_map),
+            registrations=refs_by_camera({name: registrations[name] for name in names}),
+        )
 
 
 def _localised_frames(registrations: ByCamera) -> int:

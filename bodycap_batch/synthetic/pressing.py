@@ -23,8 +23,9 @@ _OFF_CHEST_M = 0.045
 """Distance of the lens from the cloth, metres: above the renderer's nearest distance, and near enough that
 the chest fills the image."""
 _LOW_DEG = np.array([-10.0, -40.0, 0.0, -80.0, -80.0, -80.0, -40.0])
+"""Lower limits of the angles of `ArmAngles`, degrees. Evidence: none."""
 _HIGH_DEG = np.array([110.0, 100.0, 150.0, 90.0, 80.0, 80.0, 40.0])
-"""Limits of the angles of `ArmAngles`, degrees. Evidence: none."""
+"""Upper limits of the angles of `ArmAngles`, degrees. Evidence: none."""
 _COMFORT = 0.002
 """Cost of a degree away from the middle of a joint's range, relative to that of 1 cm or 6 degrees of
 misfit."""

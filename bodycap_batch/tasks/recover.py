@@ -2,44 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 
-from bodycap_batch.config.options import RegistrationOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, paths_of
+from bodycap_batch.tasks.camera_group import CameraGroupTask
+from bodycap_batch.tasks.inputs import paths_of
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.registered_cameras import RIG_POSES
-from bodycap_batch.tasks.registration import NOT_ROUNDS, save_registration
+from bodycap_batch.tasks.registration import save_registration
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, read_summary
 
 _MEMORY_MB = 900
 """Memory to reserve, MB: as many keyframes and frames as recovery holds at most, at half a megabyte each."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecoverTask:
-    """Search for the poses of one camera's lost frames.
-
-    Attributes:
-        options: Options of registration.
-        cameras: Names of all cameras: the task's own camera, then the others.
-        capture: These cameras, in this order.
-        keyframes: By camera.
-        map: The map.
-        registrations: By camera, in this order.
-    """
-
-    options: RegistrationOptions = field(metadata=NOT_ROUNDS)
-    cameras: tuple[str, ...]
-    capture: CaptureRef
-    keyframes: Mapping[str, ArtefactRef]
-    map: ArtefactRef
-    registrations: Mapping[str, ArtefactRef]
-
-
-def run_recover(task: RecoverTask, context: StageContext, files: Path) -> None:
+def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> None:
     """Recover the camera's lost frames; store all its poses."""
     from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
     from bodycap_batch.model.relative_pose import RigPoses
@@ -68,7 +45,7 @@ def run_recover(task: RecoverTask, context: StageContext, files: Path) -> None:
 
 RECOVER = Stage(
     name="recover",
-    task=RecoverTask,
+    task=CameraGroupTask,
     function=run_recover,
     libraries=(*VISION_LIBRARIES, "pycolmap"),
     modules=(*VISION_MODULES, "pycolmap"),

@@ -2,41 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 
-from bodycap_batch.config.options import RegistrationOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
+from bodycap_batch.tasks.camera_group import CameraGroupTask
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.registered_cameras import RIG_POSES
-from bodycap_batch.tasks.registration import NOT_ROUNDS, save_registration
+from bodycap_batch.tasks.registration import save_registration
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RigTask:
-    """Solve one camera of a synchronised rig again, from what all cameras of the rig observe.
-
-    Attributes:
-        options: The stage's options.
-        cameras: Names of the rig's cameras: the task's own camera, then the others.
-        capture: These cameras, in this order.
-        keyframes: By camera.
-        map: The map.
-        registrations: By camera, in this order.
-    """
-
-    options: RegistrationOptions = field(metadata=NOT_ROUNDS)
-    cameras: tuple[str, ...]
-    capture: CaptureRef
-    keyframes: Mapping[str, ArtefactRef]
-    map: ArtefactRef
-    registrations: Mapping[str, ArtefactRef]
-
-
-def run_rig(task: RigTask, context: StageContext, files: Path) -> None:
+def run_rig(task: CameraGroupTask, context: StageContext, files: Path) -> None:
     """Solve the camera's frames within the rig; store their poses and those of the rig."""
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.model.relative_pose import RigPoses, not_rigid_note
@@ -57,7 +33,7 @@ def run_rig(task: RigTask, context: StageContext, files: Path) -> None:
 
 RIG = Stage(
     name="rig",
-    task=RigTask,
+    task=CameraGroupTask,
     function=run_rig,
     libraries=(*VISION_LIBRARIES, "pycolmap"),
     modules=(*VISION_MODULES, "pycolmap"),

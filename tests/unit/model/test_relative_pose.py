@@ -21,6 +21,7 @@ from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Regis
 from bodycap_batch.registration import RegisteredCamera, register_in_rig
 from bodycap_batch.registration.poses.batched_pnp import Observations, linearise, make_observations
 from bodycap_batch.tasks import recover
+from bodycap_batch.tasks.camera_group import CameraGroupTask
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.registered_cameras import RIG_POSES
 from bodycap_batch.tasks.registration import save_registration
@@ -194,7 +195,7 @@ def test_relative_poses_of_the_rig_survive_recovery(tmp_path: Path, monkeypatch:
     out.mkdir()
     stored = {path.name: ArtefactRef(path=path, digest="") for path in folders}
     config = CaptureConfig(cameras=(CameraConfig(name="torso", video=(Path("torso.mp4"),)),))
-    task = recover.RecoverTask(
+    task = CameraGroupTask(
         options=RegistrationOptions(),
         cameras=tuple(stored),
         capture=CaptureRef(config=config, digests={}),

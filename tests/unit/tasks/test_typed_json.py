@@ -21,6 +21,7 @@ from bodycap_batch.config.options import (
 from bodycap_batch.pipeline.inputs import capture_ref
 from bodycap_batch.pipeline.task_keys import artefact_key, make_task
 from bodycap_batch.synthetic.options import SynthOptions
+from bodycap_batch.tasks.camera_group import CameraGroupTask
 from bodycap_batch.tasks.check import CheckTask
 from bodycap_batch.tasks.export import ExportTask
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, FileRef, MountInput
@@ -28,10 +29,8 @@ from bodycap_batch.tasks.keyframes import KeyframesTask
 from bodycap_batch.tasks.mapping import CameraDistance, ExtendTask, MapTask, RefineTask
 from bodycap_batch.tasks.merge import BoardFootage, MergeTask
 from bodycap_batch.tasks.preview import PreviewTask
-from bodycap_batch.tasks.recover import RecoverTask
 from bodycap_batch.tasks.registration import RegistrationTask
 from bodycap_batch.tasks.report import ReportTask
-from bodycap_batch.tasks.rig import RigTask
 from bodycap_batch.tasks.stages import STAGES
 from bodycap_batch.tasks.synth import SynthTask
 from bodycap_batch.tasks.typed_json import from_json, key_inputs, key_options, to_json
@@ -95,8 +94,8 @@ def tasks(folder: Path) -> dict[str, Any]:
             map=scene_map,
             previous=stored["torso"],
         ),
-        "rig": RigTask(**poses),
-        "recover": RecoverTask(**poses),
+        "rig": CameraGroupTask(**poses),
+        "recover": CameraGroupTask(**poses),
         "merge": MergeTask(
             options=MergeOptions(known_distance=("torso:1", "head:2", 1.5)),
             map=scene_map,
