@@ -16,7 +16,6 @@ from bodycap_batch.store import code_version
 from bodycap_batch.tasks.stages import STAGES
 
 PACKAGE = Path(code_version.__file__).parent.parent
-IGNORED = {"core"}
 
 
 def forget() -> None:
@@ -49,7 +48,7 @@ def changed_by(path: Path, text: str = "\nANOTHER = 1\n") -> set[str]:
     return {name for name in before if before[name] != after[name]}
 
 
-def imported_rooms(path: Path) -> Iterator[str]:
+def imported_packages(path: Path) -> Iterator[str]:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("bodycap_batch."):
             yield str(node.module).split(".")[1]
@@ -80,22 +79,43 @@ def test_each_file_is_parsed_once_and_only_when_a_stage_needs_it(
     assert set(parsed.values()) == {1}
 
 
+READ_BY_ALL = {"config", "core", "formats", "model", "tasks"}
+CAMERAS = READ_BY_ALL | {"capture"}
+BODY = CAMERAS | {"presets"}
+HASHED = {
+    "synth": BODY | {"synthetic"},
+    "check": BODY | {"check", "store"},
+    "keyframes": CAMERAS | {"keyframes"},
+    **dict.fromkeys(("map", "extend", "refine"), CAMERAS | {"mapping"}),
+    **dict.fromkeys(("registration", "rig", "recover"), CAMERAS | {"registration"}),
+    # Merging reads marker boards from the images, and explains a failure by mirrored cameras.
+    "merge": BODY | {"merging", "calibration", "mapping"},
+    "export": BODY | {"export"},
+    "report": BODY | {"report", "overlay"},
+    "preview": BODY | {"preview", "overlay"},
+}
+"""Packages whose files are part of a stage's version.
+
+They are those of version 0.1.0 at their new places. The preview alone lost one: it no longer projects the
+motion, so it does not depend on the export.
+"""
+
+
 @pytest.mark.parametrize("stage", sorted(STAGES))
-def test_everything_a_stage_imports_counts(copied: Path, stage: str) -> None:
+def test_the_code_of_a_stage_is_that_of_these_packages(copied: Path, stage: str) -> None:
     found = code_version._closure(STAGES[stage].module)
-    rooms = {path.relative_to(copied).parts[0].removesuffix(".py") for path in found}
-    wanted = {room for path in found if path.suffix == ".py" for room in imported_rooms(path)}
-    assert wanted - rooms - IGNORED - {"config"} == set()
-    room = {
-        "map": "mapping",
-        "extend": "mapping",
-        "refine": "mapping",
-        "recover": "registration",
-        "rig": "registration",
-        "merge": "merging",
-        "synth": "synthetic",
-    }
-    assert room.get(stage, stage) in rooms
+    packages = {path.relative_to(copied).parts[0].removesuffix(".py") for path in found}
+    assert packages == HASHED[stage]
+    wanted = {name for path in found if path.suffix == ".py" for name in imported_packages(path)}
+    assert wanted - packages == set()
+
+
+@pytest.mark.parametrize(
+    ("stage", "package"), [("map", "mapping"), ("registration", "registration"), ("merge", "merging")]
+)
+def test_all_files_of_an_estimator_count(copied: Path, stage: str, package: str) -> None:
+    found = code_version._closure(STAGES[stage].module)
+    assert set((copied / package).rglob("*.py")) <= found
 
 
 def test_a_stage_is_changed_by_its_own_code_and_no_other_stage_is(copied: Path) -> None:
