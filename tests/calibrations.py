@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bodycap_batch.merging.body.bones import kinematic_chain
-from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
+from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import CalibrationSamples, take_samples
 from bodycap_batch.merging.cameras.track import make_track
 from bodycap_batch.synthetic import SynthOptions

@@ -23,6 +23,7 @@ from bodycap_batch.merging.body_calibration.calibration_covariance import PoseSi
 from bodycap_batch.merging.camera_paths import trajectory_in_world, with_solved_centres
 from bodycap_batch.merging.camera_selection import select_cameras
 from bodycap_batch.merging.cameras.track import CameraTrack, inflate_sigmas, make_track, remove_outliers
+from bodycap_batch.merging.graph.adaptive_motion_noise import scale_motion_noise
 from bodycap_batch.merging.graph.foot_contact import (
     contact_statistics,
     contacts_in_window,
@@ -32,7 +33,6 @@ from bodycap_batch.merging.graph.foot_contact import (
 from bodycap_batch.merging.graph.joint_covariance import sigma_percentiles, skeleton_covariance
 from bodycap_batch.merging.graph.joint_limits import soft_limits
 from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution, hinge_deviations, joint_gaps
-from bodycap_batch.merging.graph.motion_noise import scale_motion_noise
 from bodycap_batch.merging.graph.windows import MAX_ITERATIONS, max_window_ticks, solve_windows
 from bodycap_batch.merging.projection.project import project_motion
 from bodycap_batch.merging.reporting.report import MotionFacts, build_report

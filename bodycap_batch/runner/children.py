@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from bodycap_batch.core.errors import BodycapError, Cancelled, error_from_dict
-from bodycap_batch.runner.child import FULL_DISK_BYTES, disk_full
-from bodycap_batch.runner.process import CHILD_COMMAND, Child, crash_hint, describe_end
+from bodycap_batch.runner.child_main import FULL_DISK_BYTES, disk_full
+from bodycap_batch.runner.child_process import CHILD_COMMAND, Child, crash_hint, describe_end
 from bodycap_batch.runner.task import Task
 from bodycap_batch.store.artefacts import Store, disk_errors
 

@@ -2,7 +2,7 @@
 
 import sys
 
-from bodycap_batch.runner.child import main
+from bodycap_batch.runner.child_main import main
 from bodycap_batch.tasks.stages import STAGES
 
 sys.exit(main(sys.argv[1:], {name: stage.run for name, stage in STAGES.items()}))

@@ -18,6 +18,7 @@ from bodycap_batch.core.errors import Cancelled, JobError
 from bodycap_batch.store.artefacts import Store, disk_errors
 from bodycap_batch.store.references import moving
 from bodycap_batch.watch.claim import create_claim, remove_claim_files
+from bodycap_batch.watch.inbox_claim import input_path, move_to_running, path_exists, return_to_inbox
 from bodycap_batch.watch.inbox_entries import (
     NOT_A_JOB,
     InboxEntry,
@@ -25,7 +26,6 @@ from bodycap_batch.watch.inbox_entries import (
     ignored_paths_in,
     take_snapshot,
 )
-from bodycap_batch.watch.inbox_transfer import input_path, move_to_running, path_exists, return_to_inbox
 from bodycap_batch.watch.job_status import FINAL, JobStatusFile, read_status, utc_text
 from bodycap_batch.watch.ownership import read_owner
 from bodycap_batch.watch.process_identity import machine_id, process_start, process_tag

@@ -13,6 +13,12 @@ from bodycap_batch.core.errors import BodycapError, StoreError
 from bodycap_batch.watch.access_failures import AccessFailures
 from bodycap_batch.watch.change_notifier import ChangeNotifier
 from bodycap_batch.watch.claim import Claim, HeartbeatMonitor, take_over_job
+from bodycap_batch.watch.inbox_claim import (
+    claim_entry,
+    finish_interrupted_retries,
+    move_to_running,
+    remove_empty_claim,
+)
 from bodycap_batch.watch.inbox_entries import (
     NOT_A_JOB,
     CompletionTracker,
@@ -20,12 +26,6 @@ from bodycap_batch.watch.inbox_entries import (
     InboxEntry,
     entries_in,
     ignored_paths_in,
-)
-from bodycap_batch.watch.inbox_transfer import (
-    claim_entry,
-    finish_interrupted_retries,
-    move_to_running,
-    remove_empty_claim,
 )
 from bodycap_batch.watch.job_worker import JobOutcome, JobWorker
 from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir, Spool, visible_entries

@@ -13,7 +13,7 @@ from typing import Any
 
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.runner.child import main
+from bodycap_batch.runner.child_main import main
 
 Json = Mapping[str, Any]
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import CaptureError, EstimationError
-from bodycap_batch.runner import child
+from bodycap_batch.runner import child_main
 
 Json = Mapping[str, Any]
 ORDERS = "BODYCAP_FAKE_ORDERS"
@@ -159,5 +159,5 @@ NAMES = (
 
 if __name__ == "__main__":
     # Stand-ins need no libraries; those of the stages they stand for take seconds to load.
-    child.import_ahead = lambda _: None
-    sys.exit(child.main(sys.argv[1:], {name: stage(name) for name in NAMES}))
+    child_main.import_ahead = lambda _: None
+    sys.exit(child_main.main(sys.argv[1:], {name: stage(name) for name in NAMES}))

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.runner import child
+from bodycap_batch.runner import child_main
 from bodycap_batch.runner.task import TaskFunction
 from bodycap_batch.tasks.stages import STAGES
 
@@ -105,7 +105,7 @@ def prepare_failure() -> dict[str, TaskFunction]:
 if __name__ == "__main__":
     stages = prepare_failure()
     if sys.argv[1] == "--child":
-        sys.exit(child.main(sys.argv[2:], stages))
+        sys.exit(child_main.main(sys.argv[2:], stages))
     from bodycap_batch import pipeline
     from bodycap_batch.cli import main
 

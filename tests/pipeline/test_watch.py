@@ -21,7 +21,7 @@ from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.store.artefacts import Store
 from bodycap_batch.store.references import collect_garbage
-from bodycap_batch.watch import JobPermissions, cancel_job, inbox_transfer, job_rows, retry_job
+from bodycap_batch.watch import JobPermissions, cancel_job, inbox_claim, job_rows, retry_job
 from bodycap_batch.watch.claim import Claim, create_claim, take_over_job
 from bodycap_batch.watch.commands import job_row
 from bodycap_batch.watch.inbox_entries import EntrySnapshot, InboxEntry, take_snapshot
@@ -330,9 +330,9 @@ def test_an_entry_is_returned_if_it_cannot_be_read_any_more(
     permissions = JobPermissions()
     entry = InboxEntry(bench.spool.inbox / "walk")
     snapshot = take_snapshot(entry, 100)
-    monkeypatch.setattr(inbox_transfer, "take_snapshot", fail)
+    monkeypatch.setattr(inbox_claim, "take_snapshot", fail)
     with pytest.raises(StoreError):
-        inbox_transfer.claim_entry(bench.spool, entry, snapshot, permissions)
+        inbox_claim.claim_entry(bench.spool, entry, snapshot, permissions)
     assert {path.name: path.read_bytes() for path in entry.path.iterdir()} == before
     assert leftovers(bench) == []
 

@@ -19,7 +19,7 @@ from bodycap_batch.cli import main
 from bodycap_batch.core.errors import DiskAway, StoreError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.store.artefacts import Store
-from bodycap_batch.watch import Watcher, active_watchers, inbox_transfer, job_rows
+from bodycap_batch.watch import Watcher, active_watchers, inbox_claim, job_rows
 from bodycap_batch.watch.access_failures import AccessFailures
 from bodycap_batch.watch.job_status import JobStatusFile, read_status
 from bodycap_batch.watch.job_worker import JobWorker
@@ -143,12 +143,10 @@ def test_a_full_disk_while_the_store_is_cleaned_stops_no_watcher(
     bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A user runs `gc` on a full disk while a finished job waits to be filed."""
-    claim = inbox_transfer.create_claim(JobDir(bench.drop("walk").rename(bench.spool.running / "walk")))
+    claim = inbox_claim.create_claim(JobDir(bench.drop("walk").rename(bench.spool.running / "walk")))
     JobStatusFile(claim.job).update(state="done")
     worker = JobWorker(bench.spool, bench.options(), threading.Event())
-    monkeypatch.setattr(
-        inbox_transfer.Claim, "release", failing(1, inbox_transfer.Claim.release, errno.ENOSPC)
-    )
+    monkeypatch.setattr(inbox_claim.Claim, "release", failing(1, inbox_claim.Claim.release, errno.ENOSPC))
     with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
         fcntl.flock(cleaning, fcntl.LOCK_EX)
         outcome = worker.process(claim)
@@ -158,9 +156,9 @@ def test_a_full_disk_while_the_store_is_cleaned_stops_no_watcher(
 
 def test_a_job_that_ends_while_the_store_is_cleaned_is_filed_later(bench: SpoolFixture) -> None:
     (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
-    entry = inbox_transfer.InboxEntry(bench.spool.inbox / "walk.yaml")
-    claimed = inbox_transfer.claim_entry(
-        bench.spool, entry, inbox_transfer.take_snapshot(entry, 100), bench.options().permissions
+    entry = inbox_claim.InboxEntry(bench.spool.inbox / "walk.yaml")
+    claimed = inbox_claim.claim_entry(
+        bench.spool, entry, inbox_claim.take_snapshot(entry, 100), bench.options().permissions
     )
     assert claimed is not None
     worker = JobWorker(bench.spool, bench.options(), threading.Event())
@@ -208,15 +206,15 @@ def test_a_job_with_repeated_disk_failures_fails(
 
     monkeypatch.setattr("bodycap_batch.watch.job_worker.run_job", fail)
     worker = JobWorker(bench.spool, bench.options(), threading.Event())
-    snapshot = inbox_transfer.take_snapshot(entry := inbox_transfer.InboxEntry(bench.drop("walk")), 100)
-    claim, _ = inbox_transfer.claim_entry(
+    snapshot = inbox_claim.take_snapshot(entry := inbox_claim.InboxEntry(bench.drop("walk")), 100)
+    claim, _ = inbox_claim.claim_entry(
         bench.spool, entry, snapshot, bench.options().permissions
     ) or pytest.fail("no claim")
     states = []
     while not states or states[-1] == "stuck":
         states.append(worker.process(claim).state)
         if states[-1] == "stuck":
-            claim = inbox_transfer.Claim(claim.job, claim.generation, claim._token)
+            claim = inbox_claim.Claim(claim.job, claim.generation, claim._token)
     assert states == ["stuck"] * 5 + ["failed"]
     assert bench.status("walk")["error"]["message"] == "Input/output error"
 
@@ -243,13 +241,13 @@ def test_a_job_waits_for_missing_videos_without_a_limit(
     monkeypatch.setattr("bodycap_batch.watch.job_worker.os.listdir", look)
     monkeypatch.setattr("bodycap_batch.watch.job_worker.run_job", fail)
     worker = JobWorker(bench.spool, bench.options(), threading.Event())
-    snapshot = inbox_transfer.take_snapshot(entry := inbox_transfer.InboxEntry(bench.drop("walk")), 100)
-    claim, _ = inbox_transfer.claim_entry(
+    snapshot = inbox_claim.take_snapshot(entry := inbox_claim.InboxEntry(bench.drop("walk")), 100)
+    claim, _ = inbox_claim.claim_entry(
         bench.spool, entry, snapshot, bench.options().permissions
     ) or pytest.fail("no claim")
     for _ in range(20):
         assert worker.process(claim).state == "stuck"
-        claim = inbox_transfer.Claim(claim.job, claim.generation, claim._token)
+        claim = inbox_claim.Claim(claim.job, claim.generation, claim._token)
     assert main(["status"]) == 0
     assert f"continues later: {footage / 'torso.mp4'}: Stale file handle" in capfd.readouterr().out
     claim.job.cancel.touch()
@@ -278,9 +276,9 @@ def test_videos_are_never_removed_because_the_disk_did_not_answer(
     bench.drop("walk").rename(job_dir.input)
     monkeypatch.setattr(Path, "lstat", failing(1, Path.lstat))
     with pytest.raises(OSError, match="Input/output"):
-        inbox_transfer.return_to_inbox(bench.spool, job_dir)
+        inbox_claim.return_to_inbox(bench.spool, job_dir)
     assert (job_dir.input / "torso.mp4").is_file()
-    assert inbox_transfer.return_to_inbox(bench.spool, job_dir) == bench.spool.inbox / ".claim-1"
+    assert inbox_claim.return_to_inbox(bench.spool, job_dir) == bench.spool.inbox / ".claim-1"
 
 
 def test_paths_left_in_the_inbox_are_reported_when_a_watcher_ends(bench: SpoolFixture) -> None:
@@ -332,7 +330,7 @@ def test_a_damaged_status_file_does_no_harm(bench: SpoolFixture, text: str) -> N
     job.status.write_text(text)
     assert [row.name for row in job_rows(bench.spool)] == ["walk"]
     left = JobDir(job.path.rename(bench.spool.running / "walk"))
-    inbox_transfer.create_claim(left)
+    inbox_claim.create_claim(left)
     left.owner.write_text('{"generation": "one", "pid": [], "token": 5, "machine": null, "process": {}}')
     assert [row.name for row in job_rows(bench.spool)] == ["walk"]
     assert bench.run_once() == 0, "a job without an owner is treated as that of another machine"

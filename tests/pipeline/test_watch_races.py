@@ -14,7 +14,7 @@ from bodycap_batch.core.errors import JobError
 from bodycap_batch.pipeline import Settings
 from bodycap_batch.store.artefacts import Store
 from bodycap_batch.store.references import collect_garbage
-from bodycap_batch.watch import cancel_job, commands, inbox_transfer, job_worker, retry_job
+from bodycap_batch.watch import cancel_job, commands, inbox_claim, job_worker, retry_job
 from bodycap_batch.watch.inbox_entries import InboxEntry, take_snapshot
 from bodycap_batch.watch.job_status import JobStatusFile
 from bodycap_batch.watch.process_identity import process_tag
@@ -50,7 +50,7 @@ def test_finished_stages_of_a_retried_job_are_kept_until_it_has_run_again(bench:
     retry_job(bench.spool, "walk")
     bench.order()
     entry = InboxEntry(bench.spool.inbox / "walk")
-    claim, _ = inbox_transfer.claim_entry(
+    claim, _ = inbox_claim.claim_entry(
         bench.spool, entry, take_snapshot(entry, 100), bench.options().permissions
     ) or pytest.fail("not claimed")
     assert keeps_all_artefacts(bench), "claimed, but not yet running"
@@ -107,11 +107,11 @@ def test_a_watcher_finishes_a_killed_retry_but_not_a_running_one(
     assert bench.run_once() == 2
     job = bench.job("walk")
     alive = JobDir(job.path.rename(bench.spool.failed / f"{RETRY_PREFIX}{process_tag()}-1"))
-    inbox_transfer.finish_interrupted_retries(bench.spool)
+    inbox_claim.finish_interrupted_retries(bench.spool)
     assert alive.input.is_dir()
     machine, pid, start = process_tag().split("-")
     alive.path.rename(bench.spool.failed / f"{RETRY_PREFIX}{machine}-{pid}-{int(start) - 1}-1")
-    inbox_transfer.finish_interrupted_retries(bench.spool)
+    inbox_claim.finish_interrupted_retries(bench.spool)
     assert [path.name for path in bench.spool.inbox.iterdir()] == ["walk.yaml"]
     assert list(bench.spool.failed.iterdir()) == []
 
@@ -137,15 +137,15 @@ def test_two_processes_return_an_entry_once(bench: SpoolFixture, monkeypatch: py
     job_dir = JobDir(bench.spool.failed / f"{RETRY_PREFIX}1")
     job_dir.path.mkdir()
     bench.drop("walk").rename(job_dir.input)
-    move = inbox_transfer.move_to_free_name
+    move = inbox_claim.move_to_free_name
     first: list[Path | None] = []
 
     def other() -> None:
-        monkeypatch.setattr(inbox_transfer, "move_to_free_name", move)
-        first.append(inbox_transfer.return_to_inbox(bench.spool, job_dir))
+        monkeypatch.setattr(inbox_claim, "move_to_free_name", move)
+        first.append(inbox_claim.return_to_inbox(bench.spool, job_dir))
 
-    monkeypatch.setattr(inbox_transfer, "move_to_free_name", preceded_by(move, other))
-    assert inbox_transfer.return_to_inbox(bench.spool, job_dir) is None
+    monkeypatch.setattr(inbox_claim, "move_to_free_name", preceded_by(move, other))
+    assert inbox_claim.return_to_inbox(bench.spool, job_dir) is None
     assert first == [bench.spool.inbox / job_dir.name]
     assert (bench.spool.inbox / job_dir.name / "torso.mp4").is_file()
     assert list(bench.spool.failed.iterdir()) == []
@@ -168,7 +168,7 @@ def test_a_job_that_is_claimed_during_the_cancellation_is_cancelled(
         def claim() -> None:
             monkeypatch.undo()
             monkeypatch.chdir(bench.folder)
-            assert inbox_transfer.claim_entry(bench.spool, entry, snapshot, permissions) is not None
+            assert inbox_claim.claim_entry(bench.spool, entry, snapshot, permissions) is not None
 
         rename = commands.os.rename  # type: ignore[attr-defined]
         monkeypatch.setattr(commands.os, "rename", preceded_by(rename, claim))  # type: ignore[attr-defined]
@@ -180,10 +180,8 @@ def test_a_job_that_is_claimed_during_the_cancellation_is_cancelled(
             thread.start()
             asked.wait(0.5)  # meanwhile the command finds neither an entry nor a job
 
-        monkeypatch.setattr(
-            inbox_transfer, "move_to_running", preceded_by(inbox_transfer.move_to_running, ask)
-        )
-        assert inbox_transfer.claim_entry(bench.spool, entry, snapshot, permissions) is not None
+        monkeypatch.setattr(inbox_claim, "move_to_running", preceded_by(inbox_claim.move_to_running, ask))
+        assert inbox_claim.claim_entry(bench.spool, entry, snapshot, permissions) is not None
         thread.join()
     assert cancelled == [None], "no watcher has reacted yet"
     assert bench.job("walk").cancel.exists()
@@ -193,7 +191,7 @@ def test_a_job_that_is_claimed_during_the_cancellation_is_cancelled(
 def test_a_half_claimed_job_can_be_cancelled(bench: SpoolFixture) -> None:
     job_dir = JobDir(bench.spool.running / f"{CLAIM_PREFIX}1")
     job_dir.path.mkdir()
-    inbox_transfer.create_claim(job_dir).release()
+    inbox_claim.create_claim(job_dir).release()
     bench.drop("walk").rename(job_dir.input)
     JobStatusFile(job_dir).update(dropped="walk")
     assert cancel_job(bench.spool, "walk", wait_s=0.0) is None, "no watcher has reacted yet"

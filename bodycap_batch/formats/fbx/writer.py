@@ -11,7 +11,7 @@ import numpy as np
 
 from bodycap_batch.core.errors import StoreError
 from bodycap_batch.formats.atomic_files import atomic_replacement
-from bodycap_batch.formats.fbx.blender import run_script
+from bodycap_batch.formats.fbx.blender_process import run_script
 from bodycap_batch.formats.gltf import write_glb
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import Motion
@@ -20,7 +20,7 @@ POSITION_TOLERANCE_M = 1e-4
 """Metres. Largest accepted distance of a joint when the file is read back. Derivation: FBX and GLB have
 single precision, and this is below what an animator sees."""
 
-_CONVERT_SCRIPT = Path(__file__).with_name("convert.py")
+_CONVERT_SCRIPT = Path(__file__).with_name("blender_script.py")
 
 _BEFORE_BLENDER_IMPORT = so3_exp([-np.pi / 2, 0.0, 0.0])
 """Rotation of the scene in the GLB. It cancels the quarter turn about X of Blender's glTF importer, so that

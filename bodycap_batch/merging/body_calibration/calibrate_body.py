@@ -20,7 +20,6 @@ from bodycap_batch.merging.body_calibration.calibration_covariance import (
     error_modes,
     mounts_with_sigmas,
 )
-from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.camera_roll import (
     RollSearch,
     reference_roll,
@@ -30,6 +29,7 @@ from bodycap_batch.merging.body_calibration.camera_roll import (
 from bodycap_batch.merging.body_calibration.known_distance import known_distance
 from bodycap_batch.merging.body_calibration.limb_scales import limb_scales
 from bodycap_batch.merging.body_calibration.marker_board import LocatedBoard, locate_board
+from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import PostureHints, take_samples
 from bodycap_batch.merging.body_calibration.scale import (
     MetricScale,

@@ -10,8 +10,8 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body_calibration.anthropometry import SkeletonErrorModes
-from bodycap_batch.merging.body_calibration.calibration_graph import JOINT_PRIOR_SCALE, CalibrationGraph
 from bodycap_batch.merging.body_calibration.joint_variability import transient_variance_shares
+from bodycap_batch.merging.body_calibration.mount_calibration_graph import JOINT_PRIOR_SCALE, CalibrationGraph
 from bodycap_batch.merging.body_calibration.mount_covariance import (
     LinearisedCalibration,
     ReducedSystem,

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
+from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import (
     MIN_COMMON_FRAMES,
     PostureHints,

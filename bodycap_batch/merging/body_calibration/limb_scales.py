@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
+from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import (
     MIN_COMMON_FRAMES,
     PostureHints,

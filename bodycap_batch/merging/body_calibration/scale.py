@@ -31,7 +31,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body_calibration.anthropometry import PROPORTION_SIGMA
-from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
+from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.world.floor import WALKING_HEIGHT_RATIO
 
 MEAN_STATURE = "mean stature"

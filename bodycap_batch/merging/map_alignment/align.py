@@ -22,7 +22,7 @@ from bodycap_batch.merging.body_calibration.calibrate_body import (
     reference_camera_roll,
     with_rolls,
 )
-from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
+from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.cameras.track import (
     CameraTrack,
@@ -31,7 +31,6 @@ from bodycap_batch.merging.cameras.track import (
     transform_track,
     transform_trajectory,
 )
-from bodycap_batch.merging.map_alignment.gauss_newton import AlignmentSigma, MapAlignmentProblem
 from bodycap_batch.merging.map_alignment.initial_alignment import (
     InitialAlignment,
     align_maps_initially,
@@ -42,6 +41,7 @@ from bodycap_batch.merging.map_alignment.scale_sources import (
     scale_from_walked_floor,
     stated_constraints,
 )
+from bodycap_batch.merging.map_alignment.similarity_refinement import AlignmentSigma, MapAlignmentProblem
 from bodycap_batch.merging.world.vertical import Vertical
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.projection.solver import (
+from bodycap_batch.merging.projection.rigid_motion_solver import (
     CameraTarget,
     ProjectionProblem,
     RigidMotion,

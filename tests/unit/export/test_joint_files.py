@@ -17,7 +17,7 @@ from bodycap_batch.export.layout import apply_layout
 from bodycap_batch.export.motion_files import motion_difference, points_from_motion
 from bodycap_batch.formats import optional_libraries, usd
 from bodycap_batch.formats.c3d import LabelledPoints, read_c3d, write_c3d
-from bodycap_batch.formats.fbx import blender
+from bodycap_batch.formats.fbx import blender_process
 from bodycap_batch.formats.trc import write_trc
 from bodycap_batch.model.geometry import rotation_from_quat_xyzw
 from tests.bodies import reaching
@@ -150,13 +150,13 @@ def test_the_error_for_a_missing_library_says_how_to_install_it(monkeypatch: pyt
 def test_blender_is_not_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("BODYCAP_BLENDER", str(tmp_path / "nothing"))
     with pytest.raises(JobError, match="names no program"):
-        blender.find_blender()
+        blender_process.find_blender()
     monkeypatch.delenv("BODYCAP_BLENDER")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(blender, "__file__", str(tmp_path / "a" / "b" / "c" / "blender.py"))
-    monkeypatch.setattr(blender.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(blender_process, "__file__", str(tmp_path / "a" / "b" / "c" / "blender.py"))
+    monkeypatch.setattr(blender_process.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(JobError, match="was not found") as caught:
-        blender.find_blender()
+        blender_process.find_blender()
     assert "make blender" in str(caught.value.hint)
 
 
@@ -166,7 +166,7 @@ def test_blender_does_not_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
     program.chmod(0o755)
     monkeypatch.setenv("BODYCAP_BLENDER", str(program))
     with pytest.raises(JobError, match=r"does not start: libX11"):
-        blender.require_blender()
+        blender_process.require_blender()
 
 
 def test_joint_names_are_quoted_in_the_table(tmp_path: Path) -> None:

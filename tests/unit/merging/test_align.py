@@ -15,7 +15,7 @@ from bodycap_batch.merging.body_calibration.calibration_covariance import (
     scale_jacobian,
     variance_factors,
 )
-from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
+from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.mount_covariance import RowType
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.cameras.track import make_track

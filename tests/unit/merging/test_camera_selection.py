@@ -20,7 +20,7 @@ from bodycap_batch.merging.camera_selection import (
     rarely_localised,
 )
 from bodycap_batch.merging.cameras.track import MIN_SIGMA_RAD, make_track
-from bodycap_batch.merging.map_alignment import align, gauss_newton
+from bodycap_batch.merging.map_alignment import align, similarity_refinement
 from bodycap_batch.merging.map_alignment.align import AlignedMap, align_cameras
 from bodycap_batch.merging.stage import timeline
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
@@ -289,7 +289,7 @@ def test_one_bad_map_does_not_exclude_the_others(capture, monkeypatch):
 
 def test_equations_without_an_answer_are_an_estimation_error():
     with pytest.raises(EstimationError, match="does not determine"):
-        gauss_newton._solve_normal_equations(np.zeros((2, 2)), np.ones(2))
+        similarity_refinement._solve_normal_equations(np.zeros((2, 2)), np.ones(2))
 
 
 def _with_twin(inputs, **changes):

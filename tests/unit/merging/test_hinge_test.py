@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from bodycap_batch.merging.body.bones import hinges, kinematic_chain
-from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.hinge_test import FREE_SIGMA_M, observable_hinges
+from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.reporting.advice import describe_hinge

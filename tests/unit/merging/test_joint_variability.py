@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.merging.body_calibration.calibration_graph import JOINT_PRIOR_SCALE
 from bodycap_batch.merging.body_calibration.joint_variability import transient_variance_shares
+from bodycap_batch.merging.body_calibration.mount_calibration_graph import JOINT_PRIOR_SCALE
 from bodycap_batch.synthetic import SynthOptions
 from tests.calibrations import calibration_of
 

@@ -11,15 +11,15 @@ import pytest
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body.provisional_scale import reach_constraint
-from bodycap_batch.merging.body_calibration import calibration_graph
+from bodycap_batch.merging.body_calibration import mount_calibration_graph
 from bodycap_batch.merging.body_calibration.anthropometry import skeleton_error_modes
 from bodycap_batch.merging.body_calibration.calibration_covariance import (
     ScaleUncertainty,
     error_modes,
     mounts_with_sigmas,
 )
-from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.known_distance import known_distance
+from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.body_calibration.scale import estimate_scale
 from bodycap_batch.merging.cameras.track import inflate_sigmas, make_track
@@ -145,7 +145,7 @@ def test_a_t_pose_is_no_gesture(body, monkeypatch):
     calibration.solve(1.0, iterations=1)
     asked = []
     monkeypatch.setattr(
-        calibration_graph, "widen_joint_priors", lambda *args: asked.append(args[2:]) or bones
+        mount_calibration_graph, "widen_joint_priors", lambda *args: asked.append(args[2:]) or bones
     )
     calibration.widen_joint_priors()
     ((poses, times_ns),) = asked

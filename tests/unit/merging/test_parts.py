@@ -21,6 +21,7 @@ from bodycap_batch.merging.body_calibration.scale import (
     weighted_mean,
 )
 from bodycap_batch.merging.cameras.track import CameraTrack, remove_outliers
+from bodycap_batch.merging.graph.adaptive_motion_noise import scale_motion_noise
 from bodycap_batch.merging.graph.factors import (
     MountPoints,
     add_mount_prior,
@@ -30,7 +31,6 @@ from bodycap_batch.merging.graph.factors import (
     mount_jacobian,
 )
 from bodycap_batch.merging.graph.joint_limits import activity_limits, arm_reach_limits, hinge_limits
-from bodycap_batch.merging.graph.motion_noise import scale_motion_noise
 from bodycap_batch.merging.world.floor import (
     floor_beside_path,
     floor_from_feet,

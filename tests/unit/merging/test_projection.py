@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bodycap_batch.merging.projection.project import initial_motion, project_motion, projection_problem
-from bodycap_batch.merging.projection.solver import (
+from bodycap_batch.merging.projection.rigid_motion_solver import (
     RigidMotion,
     StandingJoint,
     cost,

@@ -16,12 +16,12 @@ from bodycap_batch.merging.camera_selection import candidate_main_maps
 from bodycap_batch.merging.cameras.track import CameraTrack, make_track
 from bodycap_batch.merging.map_alignment import align
 from bodycap_batch.merging.map_alignment.align import align_cameras
-from bodycap_batch.merging.map_alignment.gauss_newton import MapAlignmentProblem
 from bodycap_batch.merging.map_alignment.scale_sources import (
     StatedConstraints,
     scale_from_walked_floor,
     stated_constraints,
 )
+from bodycap_batch.merging.map_alignment.similarity_refinement import MapAlignmentProblem
 from bodycap_batch.merging.world.vertical import Vertical, VerticalHypothesis
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.synthetic import SynthOptions

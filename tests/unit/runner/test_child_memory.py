@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from bodycap_batch.core.memory import release_memory
-from bodycap_batch.runner.child import StepReporter
+from bodycap_batch.runner.child_main import StepReporter
 
 _BLOCK, _COUNT = 64 * 1024, 1600
 

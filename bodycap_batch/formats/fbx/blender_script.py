@@ -1,6 +1,6 @@
 """Convert a GLB file to FBX and report the joints of the result. This script runs in Blender's Python.
 
-    python convert.py in.glb out.fbx report.json fps frames
+    python blender_script.py in.glb out.fbx report.json fps frames
 
 The unit of the Blender scene is the centimetre. Blender's glTF importer converts metres to it, so the FBX
 needs no scale.

@@ -16,7 +16,7 @@ from bodycap_batch.merging.body_calibration.calibration_covariance import (
     scale_jacobian,
     variance_factors,
 )
-from bodycap_batch.merging.body_calibration.calibration_graph import CalibrationGraph
+from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.mount_covariance import LinearisedCalibration, RowType
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.model.geometry import Similarity, so3_exp
