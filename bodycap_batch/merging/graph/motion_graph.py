@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any, Protocol
 
 import gtsam
@@ -32,6 +31,7 @@ from bodycap_batch.merging.graph.factors import (
 from bodycap_batch.merging.graph.foot_contact import FootContact
 from bodycap_batch.merging.graph.joint_covariance import SolvedGraph, joint_covariance
 from bodycap_batch.merging.graph.joint_limits import DistanceLimit
+from bodycap_batch.merging.graph.motion_prior import add_motion_prior
 from bodycap_batch.merging.graph.optimiser import gauss_newton_then_lm
 from bodycap_batch.model.geometry import interpolate_pose, invert, so3_log
 from bodycap_batch.model.skeleton import SkeletonModel
@@ -43,13 +43,6 @@ in a millisecond, a hand at 3 m/s moves 3 mm."""
 _TOLERANCE = 1e-4
 """Relative decrease of the error below which the solver stops. Convergence is quadratic: after a step that
 lowers the error by less, joints move by less than 0.1 mm."""
-
-_VELOCITY_SIGMA = np.array([8.0, 8.0, 8.0, 3.0, 3.0, 3.0])
-"""Sigmas (rad/s, m/s) of a weak prior on a bone's first and last velocity, where the motion prior has only
-one neighbour. Evidence: none."""
-_REST_VELOCITY_SIGMA = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
-"""The same before the first and after the last measurement of all cameras. It makes the body rest there,
-which would otherwise keep its last velocity. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,23 +221,12 @@ class MotionGraph:
 
     def _add_motion(self) -> None:
         before = self._graph.size()
-        start = int(self._times[0])
-        weak = gtsam.noiseModel.Diagonal.Sigmas(_VELOCITY_SIGMA)
-        at_rest = gtsam.noiseModel.Diagonal.Sigmas(_REST_VELOCITY_SIGMA)
-        measured_from = min(int(track.times_ns[0]) for track in self._tracks)
-        measured_to = max(int(track.times_ns[-1]) for track in self._tracks)
+        measured_ns = (
+            min(int(track.times_ns[0]) for track in self._tracks),
+            max(int(track.times_ns[-1]) for track in self._tracks),
+        )
         for bone, chain in zip(self._bones, self._chains, strict=True):
-            states = [
-                gtsam.StateData(state.pose_key, state.velocity_key, 1e-9 * (state.time_ns - start))
-                for state in chain
-            ]
-            for first, second in pairwise(states):
-                self._graph.add(gtsam.WnoaMotionFactorPose3(first, second, bone.psd))
-            for state in chain:
-                outside = state.time_ns < measured_from or state.time_ns > measured_to
-                if outside or state.time_ns in (chain[0].time_ns, chain[-1].time_ns):
-                    noise = at_rest if outside else weak
-                    self._graph.add(gtsam.PriorFactorVector(state.velocity_key, np.zeros(6), noise))
+            add_motion_prior(self._graph, bone, chain, start_ns=int(self._times[0]), measured_ns=measured_ns)
         self._factor_counts["smoothness"] = int(self._graph.size() - before)
 
     def _add_joints(self) -> None:
