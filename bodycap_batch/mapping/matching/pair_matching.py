@@ -1,4 +1,4 @@
-"""Match pairs of keyframes and verify the matches, with one matrix product and one robust fit for each pair."""
+"""Match pairs of keyframes and verify the matches: one matrix product and one robust fit for each pair."""
 
 from __future__ import annotations
 

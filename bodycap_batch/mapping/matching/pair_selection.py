@@ -220,7 +220,7 @@ class PairGenerator:
         return [pair for pair in self._sorted(pairs) if pair not in tried]
 
     def _adjacent_pairs(self, a: int, b: int) -> Iterator[tuple[int, int]]:
-        """Yield the pairs in which row `a` or row `b` is replaced by the next or previous row of its camera."""
+        """Yield the pairs in which row `a` or row `b` is replaced by its neighbour in the same camera."""
         for x, y in ((a - 1, b), (a + 1, b), (a, b - 1), (a, b + 1)):
             inside = min(x, y) >= 0 and max(x, y) < len(self._images)
             if (

@@ -29,7 +29,8 @@ _VISUAL_WORDS = 64
 """Number of visual words of a VLAD descriptor. Evidence: none."""
 _SHORTLIST_SIZE = 128
 """Number of images on the shortlist of an image: the most similar images of all cameras by VLAD descriptor.
-It is twice the maximum number of retrieved partners in pair selection. Evidence: docs/decisions/mapping.md."""
+It is twice the maximum number of retrieved partners in pair selection.
+Evidence: docs/decisions/mapping.md."""
 _SHORTLIST_SIZE_PER_CAMERA = 24
 """Number of most similar images of each camera that are on the shortlist too. It is three times the number
 of retrieved partners of each camera in pair selection. Evidence: docs/decisions/mapping.md."""

@@ -15,7 +15,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, runs
 from bodycap_batch.model.scene import Map
 
 Reach = Mapping[tuple[str, str], tuple[float, float]]
-"""Minimum and maximum distance (metres) between two cameras, by the two camera names in alphabetical order."""
+"""Minimum and maximum distance (metres) between two cameras, by their names in alphabetical order."""
 
 MIN_WITHIN_REACH = 0.8
 """Minimum fraction of the distances that must be within reach at the provisional scale. With a smaller
