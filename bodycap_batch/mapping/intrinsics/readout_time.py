@@ -32,7 +32,8 @@ motion are used. Evidence: none."""
 _MAX_TRIALS = 4
 """Maximum number of trial values of the readout time after 0. Evidence: none."""
 _CONVERGED_S = 0.001
-"""Step of the readout time (seconds) that ends the search: all cameras' steps are smaller. Evidence: none."""
+"""Step of the readout time (seconds). The search ends once the next step of every camera is smaller.
+Evidence: none."""
 _MAX_READOUT_FRAMES = 1.1
 """Maximum estimated readout time, in frame intervals. The physical limit is 1; the rest is a margin for the
 uncertainty of the estimate."""
@@ -44,7 +45,7 @@ _MIN_SIGMAS = 5.0
 _LOSS_PX = 1.0
 """Width (px) of the robust weight function of a residual. Evidence: none."""
 _MAX_RESIDUAL_PX = 8.0
-"""Maximum residual (px) of an observation. Observations with a larger residual are ignored. Evidence: none."""
+"""Maximum residual (px) of an observation that is used. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
