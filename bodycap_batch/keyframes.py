@@ -73,8 +73,9 @@ class _Candidate:
 class _KeyframeTracker:
     """Tracks corners from the last keyframe to the newest frame, in reduced images.
 
-    Tracking in reduced images needs a quarter of the time of tracking in full images. The tracking noise in
-    reduced images is small compared with the parallax of a keyframe.
+    Reduced images (`make_coarse_image`) are smaller copies of the frames. Tracking in reduced images needs a
+    quarter of the time of tracking in full images. The tracking noise in reduced images is small compared
+    with the parallax of a keyframe.
 
     Attributes:
         camera: Intrinsics of the full image.
@@ -250,7 +251,7 @@ def _limit_keyframes(selected: list[int], novelty: list[float], limit: int) -> l
 
     Args:
         selected: Frame indices of the keyframes.
-        novelty: Novelty of each keyframe: how much it shows that the previous keyframe does not show.
+        novelty: Novelty of each keyframe: a measure of what it shows and the previous keyframe does not show.
         limit: Maximum number of keyframes.
 
     Returns:

@@ -42,8 +42,8 @@ Evidence: none."""
 _COVERAGE_CELLS = (8, 6)
 """Number of columns and number of rows of the grid that measures coverage. Evidence: none."""
 _MIN_COVERAGE = 0.5
-"""Minimum fraction of the grid cells with a corner. With a smaller fraction, the distortion is extrapolated in
-a large part of the picture, and the result has a note. Evidence: none."""
+"""Minimum fraction of the grid cells that contain a corner. With a smaller fraction, the distortion is
+extrapolated in a large part of the picture, and the result has a note. Evidence: none."""
 _MAX_FOCAL_SIGMA_RATIO = 0.005
 """Maximum ratio of the focal length's standard deviation to the focal length. With a larger ratio, the result
 has a note. Evidence: none."""

@@ -53,8 +53,8 @@ class Readout:
     """A camera's readout time.
 
     Attributes:
-        seconds: Time (seconds) from the exposure of the sensor's first row to that of its last row; 0 for a
-            global shutter.
+        seconds: Time (seconds) from the exposure of the sensor's first row to the exposure of the last row;
+            0 for a global shutter.
         sigma_s: Standard deviation of the readout time, seconds; 0 if the time is given in the job.
         source: "stated" (given in the job), "estimated", "none found", or the reason why the time could not
             be determined.
@@ -307,7 +307,7 @@ class _ResidualSlope:
         Args:
             before: (N,) residuals after the first adjustment, px.
             after: (N,) residuals after the second adjustment, px.
-            step_s: Readout time of the second adjustment minus that of the first, seconds.
+            step_s: Difference (seconds) of the readout times: second adjustment minus first adjustment.
         """
         change = (after - before) / (step_s if step_s else np.inf)
         # The residuals of points that an adjustment moved far away do not depend on the readout time.

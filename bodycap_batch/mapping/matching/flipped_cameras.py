@@ -34,9 +34,10 @@ _MIN_MATCHES = 14
 """Minimum number of matches of an image pair. Image pairs with fewer matches are ignored.
 Evidence: docs/decisions/mapping.md."""
 _MIN_RATIO = 3.0
-"""Minimum ratio of stronger to weaker evidence. The number of matches in one orientation must be at least
-this many times the number in the other orientation. Evidence that contradicts other evidence is ignored if
-the other evidence is at least this many times as strong. Evidence: docs/decisions/mapping.md."""
+"""Minimum ratio of stronger to weaker evidence, used in two places. A pair of cameras gives evidence only if
+the numbers of matches in the two orientations have at least this ratio. A contradiction between two pieces of
+evidence is ignored if their strengths have at least this ratio; the stronger evidence is then used.
+Evidence: docs/decisions/mapping.md."""
 _MIN_TOTAL_MATCHES = 60
 """Minimum number of matches of two cameras, over all their image pairs. Two cameras with fewer matches give
 no evidence. Evidence: none."""
@@ -196,10 +197,11 @@ def label_cameras(
     """Divide cameras into two groups with opposite orientation, given signed evidence on pairs of cameras.
 
     Pairs of cameras are processed in the order of their evidence, the strongest first. A pair joins the
-    components of its two cameras into one component. If both cameras are already in the same component, the
-    pair's evidence can contradict their orientations. Such evidence is compared with the evidence that
-    joined these two cameras' components. The component is undecided, unless the joining evidence is at least
-    `_MIN_RATIO` times as strong. A component with two groups of the same size is undecided too.
+    components of its two cameras into one component. If the two cameras are already in one component, the
+    pair's evidence may contradict their labels. Then its strength is compared with the strength of the
+    evidence that first joined these two cameras into one component. If the first evidence is less than
+    `_MIN_RATIO` times as strong, the component is undecided. A component with two groups of the same size is
+    undecided too.
 
     Args:
         cameras: Camera names.

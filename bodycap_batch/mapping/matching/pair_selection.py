@@ -170,8 +170,8 @@ class PairGenerator:
         """Return untried pairs near verified pairs, for keyframes with fewer than `_MIN_LINKS` links.
 
         In such a pair, one keyframe of a verified pair is replaced by its neighbour in time. If two cameras
-        see the same place at two times, they also do so shortly before and after. More links are needed
-        because a block of keyframes with few links can have an error of metres in the map.
+        see the same place, they usually see a common place shortly before and after too. More links are
+        needed because a block of keyframes with few links can have an error of metres in the map.
 
         Args:
             verified: Number of matches of every verified pair.

@@ -50,9 +50,9 @@ def register_images(
 ) -> bool:
     """Register images of the database in a model, until no further image fits the model.
 
-    The model may be empty. The steps are those of COLMAP's pipeline, except for the last step. If no further
-    image fits, COLMAP adjusts the whole model and tries once more. Then it adjusts the whole model again,
-    even if no image was added. This function omits that last adjustment.
+    The model may be empty. The function follows COLMAP's pipeline except for the last step. If no further
+    image fits, COLMAP adjusts the whole model and tries once more. Then COLMAP adjusts the whole model again,
+    even if no image was added. This function omits the last adjustment.
     Evidence: docs/decisions/mapping.md.
 
     Args:
@@ -118,7 +118,7 @@ def resect_images(
     image_ids: Collection[int],
     count_one: Callable[[], None],
 ) -> set[int]:
-    """Register images in a model that already contains the places they show, without any adjustment.
+    """Register images in a model without any adjustment. The model must contain the places in the images.
 
     Args:
         workspace: Folder of the database.

@@ -130,7 +130,7 @@ def _with_registered_images(
     context: StageContext,
     total: int,
 ) -> Any:
-    """Register all images that fit a model in a copy of the model; return the larger of copy and model."""
+    """Register all images that fit in a copy of a model; return the copy or the model, the larger of both."""
     extended = copy.deepcopy(model)
     register_images(workspace, settings, extended, progress_counter(context, total, context.check_cancelled))
     return min([extended, model], key=model_order)

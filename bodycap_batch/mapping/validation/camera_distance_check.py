@@ -31,7 +31,8 @@ _MIN_RUN = 3
 """Minimum number of successive keyframes out of reach that are a violation. Shorter runs are treated as noise
 of the keyframes' poses."""
 _SMALLEST_UNIT = 1e-300
-"""Smallest length (map units). It is added to a distance of zero, so that its logarithm is defined."""
+"""Smallest length (map units) of a lower limit of a distance. The limit stays positive, so its logarithm is
+defined."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

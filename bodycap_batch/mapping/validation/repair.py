@@ -38,8 +38,9 @@ def repair_model(
 ) -> tuple[Any, dict[str, object]]:
     """Match misregistered and missing keyframes in untried pairs, and register these keyframes again.
 
-    A round is accepted if the model then holds more keyframes that are not misregistered, or the same number
-    of these and fewer misregistered keyframes. At the end, misregistered keyframes are removed.
+    A round is accepted if it increases the number of correctly registered keyframes. If this number stays the
+    same, the round is accepted if it decreases the number of misregistered keyframes. At the end, all
+    keyframes that are still misregistered are removed.
 
     Args:
         model: The largest model; not changed.
@@ -160,7 +161,8 @@ def re_register_images(
         total: Number of all keyframes, for the progress.
 
     Returns:
-        A copy of the model with these images registered; adjusted as a whole unless the model is large.
+        A copy of the model in which these images are registered, as far as they fit. All poses of the copy
+        are adjusted if the model is not large.
     """
     rest = sub_model(model, set(model.reg_image_ids()) - set(image_ids))
     extended = with_new_images(

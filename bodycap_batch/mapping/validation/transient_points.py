@@ -51,7 +51,9 @@ def remove_transient_points(model: pycolmap.Reconstruction, times_ns: Mapping[st
 
 
 def _is_static(images: list[int], refs: Mapping[int, Any], times_ns: Mapping[str, IntArray]) -> bool:
-    """Return whether several cameras observe a point, or one camera at times more than a moment apart.
+    """Return whether a point is static: several cameras observe it, or one camera observes it for long.
+
+    One camera must observe the point over a time of more than `MIN_STATIC_SPAN_NS`.
 
     Args:
         images: Ids of the images that observe the point.
